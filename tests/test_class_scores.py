@@ -99,6 +99,25 @@ def test_classes_are_the_same_where_their_names_are_whatever_their_numbers():
     ]
 
 
+def test_classes_of_one_kind_of_object_are_compared_if_each_side_has_one():
+    truth, tracks = world(0), world(1, noise=0.3)
+    wanted, _ = scored(truth, tracks, {1: "pedestrian", 2: "REGULAR_VEHICLE"}, {1: "pedestrian", 2: "regular_vehicle"})
+    found, notes = scored(
+        truth, tracks, {1: "pedestrian", 2: "REGULAR_VEHICLE"}, {1: "human.pedestrian.adult", 2: "car"}
+    )
+    assert [row.to_json() for row in found.values()] == [row.to_json() for row in wanted.values()]
+    assert notes == [
+        "a: classes of one kind of object are compared, whatever their names: "
+        "REGULAR_VEHICLE with car, pedestrian with human.pedestrian.adult"
+    ]
+    for names in ({1: "car", 2: "van"}, {1: "blob", 2: "cone"}):  # a taxi is no van where there are cars
+        found, notes = scored(truth, tracks, names, {1: names[1], 2: "taxi"})
+        assert found[names[2]].to_json()["MOTA"] == 0
+        assert len(notes) == 2
+    found, notes = scored(truth, tracks, {1: "car", 2: "van"}, {1: "pedestrian", 2: "taxi"})
+    assert len(notes) == 2
+
+
 def test_what_cannot_be_compared_by_class_is_said():
     truth, tracks = world(0), world(1, noise=0.3)
     people, _ = scored(of_class(truth, 1), of_class(tracks, 1))

@@ -103,7 +103,8 @@ def test_ids_of_a_detector_are_no_tracks_that_were_repaired(tmp_path):
 def test_a_tracker_of_pictures_is_refused_in_one_line_and_one_of_metres_on_pictures(tmp_path, finished):
     path = write(tmp_path / "a.mcap", Robot(shots=2), WAYS["markers"])
     with pytest.raises(
-        McaptrackError, match="/lidar/boxes has positions in metres, and the tracker sort takes boxes in pixels; "
+        McaptrackError,
+        match="/lidar/boxes has positions in metres, and the tracker sort takes boxes in pixels; `tracker='ground'` takes",
     ):
         mcaptrack.track(path, topic="/lidar/boxes", tracker=Sort())
     with pytest.raises(

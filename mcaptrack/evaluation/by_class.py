@@ -1,11 +1,12 @@
 """Classes of ground truth and tracks, brought to common numbers, so that only objects of one class are matched.
 
-Channels number their classes themselves, so classes are the same where their names are.
+Channels number their classes themselves, so classes are the same where their names are, or where data sets and drivers
+name one kind of object differently: REGULAR_VEHICLE and car.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ import numpy as np
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.classes import PERSON, class_name, is_person, majority
+from mcaptrack.transforms.motion_limits import UNKNOWN, limits_row
 
 _SHOWN: Final = 8
 
@@ -66,10 +68,15 @@ def share_classes(
     for number in there:
         first.setdefault(_key(number, ground_truth_names), number)  # two numbers with one name are one class
     places = {number: first[_key(number, ground_truth_names)] for number in there}
-    places_of_tracks = {number: first.get(_key(number, track_names)) for number in found}
+    keys = {number: _key(number, track_names) for number in found}
+    alike = _same_kind(first.keys(), keys.values())
+    places_of_tracks = {number: first.get(alike.get(key, key)) for number, key in keys.items()}
     names = {number: class_name(number, ground_truth_names) for number in first.values()}
     beyond = [number for number, place in places_of_tracks.items() if place is None]
     notes = []
+    if alike:
+        words = ", ".join(f"{class_name(first[there], names)} with {here}" for here, there in alike.items())
+        notes.append(f"{name}: classes of one kind of object are compared, whatever their names: {words}")
     if beyond:
         words = _counted(tracks, beyond, track_names)
         notes.append(
@@ -86,6 +93,25 @@ def share_classes(
         names if len(names) > 1 else {},
         tuple(notes),
     )
+
+
+def _same_kind(ground_truth: Collection[str | int], tracks: Collection[str | int]) -> dict[str | int, str | int]:
+    """The class of the ground truth for each class of tracks with another name of one kind of object, by their keys.
+
+    Only kinds that each side has one class of count: a van is no taxi where there are cars, too.
+    """
+
+    def by_kind(keys: Collection[str | int]) -> dict[str, set[str]]:
+        kinds: dict[str, set[str]] = {}
+        for key in keys:
+            if isinstance(key, str) and (kind := limits_row(key)) != UNKNOWN:
+                kinds.setdefault(kind, set()).add(key)
+        return kinds
+
+    there, here = by_kind(ground_truth), by_kind(tracks)
+    single = [kind for kind in sorted(there.keys() & here.keys()) if len(there[kind]) == len(here[kind]) == 1]
+    pairs = ((next(iter(here[kind])), next(iter(there[kind]))) for kind in single)
+    return {key: other for key, other in pairs if key != other}
 
 
 def _counted(frames: Sequence[Frame], numbers: Sequence[int], names: Mapping[int, str]) -> str:

@@ -75,7 +75,7 @@ def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: st
         if spaces and space not in spaces:
             there = " and ".join(_BOXES[one] for one in sorted(spaces))
             name, others = STAGES["track"].choice(job.transform), _trackers_of(next(iter(sorted(spaces))))
-            other = f"`tracker={others[0]}` takes these" if others else "no built-in one takes these"
+            other = f"`tracker={others[0]!r}` takes these" if others else "no built-in one takes these"
             raise McaptrackError(
                 f"{opened.path}: {job.source} has {there}, and the tracker {name} takes {_BOXES[space]}; " + other
             )
