@@ -24,6 +24,7 @@ from tests.commands import GROUP, call, done
 from tests.interrupted import interrupt
 from tests.models import stocked
 from tests.robots import write_log
+from tests.stores import Store, only_in
 
 PACKAGE = Path(mcaptrack.__file__).parent
 #: A name that is difficult for a shell, an option parser and a parser of messages.
@@ -149,6 +150,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     ),
     "cli/running.py:_next:*": lambda s: s.says("run", "LOG", "--no-tables"),
     "api/running.py:warn_stale:run": lambda s: s.says("detect", "LOG", "--detector", "mog2"),
+    "api/running.py:work:export": lambda s: s.says("run", "s3://bucket/a.mcap"),
     "cli/train.py:_print:predict": lambda s: s.says(
         "train", "synthetic", "--walks", "1000", "--epochs", "1", "-o", "my net"
     ),
@@ -274,7 +276,7 @@ def words_of(line: str) -> list[str]:
 
 
 @pytest.mark.parametrize("where", SCENES)
-def test_a_proposed_command_works(where, template, tmp_path, monkeypatch):
+def test_a_proposed_command_works(where, template, tmp_path, monkeypatch, request):
     if where.startswith("cli/train"):
         pytest.importorskip("torch", reason="training needs torch")
     monkeypatch.chdir(tmp_path)
@@ -283,6 +285,11 @@ def test_a_proposed_command_works(where, template, tmp_path, monkeypatch):
     verb = {"list_tables": "query", "get_model": "models"}.get(verb, verb)
     if verb == "models" or where.startswith("cli/models"):
         stocked(monkeypatch, tmp_path)
+    if where == "api/running.py:work:export":
+        store = Store()
+        request.addfinalizer(store.stop)
+        only_in(monkeypatch, store)
+        store.put("a.mcap", template)
     said = SCENES[where](Scene(template, tmp_path))
     lines = re.findall(r"mcaptrack ((?:" + VERBS + r")\b[^`\n]*?)(?=`|\n|$|    )", said)
     lines = [line for line in lines if verb in ("*", line.split()[0])]
