@@ -10,6 +10,7 @@ _PARTS = {
     "detecting": ["detect", "motion"],
     "demonstration": ["DemoResult", "demo"],
     "fetching": ["FetchedMessage"],
+    "health": ["DoctorResult", "doctor"],
     "ingesting": ["IngestResult", "ingest"],
     "outputs": ["ExportResult", "RenderResult", "ReportResult", "export", "render", "report"],
     "querying": ["ColumnInfo", "TableInfo", "TableList", "list_tables", "query"],

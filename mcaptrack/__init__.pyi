@@ -10,6 +10,8 @@ from mcaptrack.api.demonstration import demo as demo
 from mcaptrack.api.detecting import detect as detect
 from mcaptrack.api.detecting import motion as motion
 from mcaptrack.api.fetching import FetchedMessage as FetchedMessage
+from mcaptrack.api.health import DoctorResult as DoctorResult
+from mcaptrack.api.health import doctor as doctor
 from mcaptrack.api.ingesting import IngestResult as IngestResult
 from mcaptrack.api.ingesting import ingest as ingest
 from mcaptrack.api.outputs import ExportResult as ExportResult
@@ -55,6 +57,7 @@ __all__ = [
     "ChannelInfo",
     "ColumnInfo",
     "DemoResult",
+    "DoctorResult",
     "DropResult",
     "ExportResult",
     "FetchedMessage",
@@ -81,6 +84,7 @@ __all__ = [
     "demo",
     "detect",
     "detections",
+    "doctor",
     "drop",
     "evaluate",
     "events",

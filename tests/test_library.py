@@ -500,7 +500,9 @@ class TestDocumentation:
     @pytest.mark.parametrize("name", FUNCTIONS)
     def test_functions_are_documented_as_numpydoc_has_it(self, name):
         sections, named = sections_of(getattr(mcaptrack, name))
-        assert sections == SECTIONS
+        assert sections == (
+            SECTIONS if name != "doctor" else ["Returns", "Examples"]
+        )  # it has none, and raises nothing
         assert named == list(inspect.signature(getattr(mcaptrack, name)).parameters)
 
     @pytest.mark.parametrize("name", [*FUNCTIONS, *CLASSES, *sorted(METHODS)])

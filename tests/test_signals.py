@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import shutil
 import signal
+import tempfile
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -18,13 +19,20 @@ from tests.effects.commands import line_of
 SOON_S = 2
 SIGNALS = {"Ctrl-C": signal.SIGINT, "kill": signal.SIGTERM}
 #: What is looked at of a command, where it is not the reading, and the writing and publishing of those that write.
-DEEDS = {"demo": ["write"], "models": ["read"], "tune": ["read", "write"], "view": ["read", "serve"]}
+DEEDS = {
+    "demo": ["write"],
+    "doctor": ["write"],
+    "models": ["read"],
+    "tune": ["read", "write"],
+    "view": ["read", "serve"],
+}
 MOMENTS = [
     (command, deed)
     for command, known in GROUP.commands.items()
     for deed in DEEDS.get(command, ["read"] if known.reads else ["read", "write", "publish"])
 ]
-DOCS = Path(__file__).parent.parent / "docs"
+#: Where these commands read or write; all others do so in the working folder.
+ELSEWHERE = {"docs": Path(__file__).parent.parent / "docs", "doctor": Path(tempfile.gettempdir())}
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -46,7 +54,7 @@ def test_a_signal_ends_a_command_and_leaves_the_files_unchanged(number, commands
     command, deed = MOMENTS[number]
     if command == "train" and not find_spec("torch"):
         pytest.skip("train needs torch")
-    where = DOCS if command == "docs" else folder
+    where = ELSEWHERE.get(command, folder)
     name = list(SIGNALS)[number % 2]
     before = contents(folder)
     outcome = commands.end(bounded.Moment(deed, where, SIGNALS[name]), *shlex.split(line_of(command)))

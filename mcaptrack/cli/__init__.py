@@ -14,6 +14,7 @@ from mcaptrack.cli.command import Group
 from mcaptrack.cli.common import register
 from mcaptrack.cli.demo import demo
 from mcaptrack.cli.docs import docs
+from mcaptrack.cli.doctor import doctor
 from mcaptrack.cli.evaluate import evaluate
 from mcaptrack.cli.events import events
 from mcaptrack.cli.files import check, drop, recover
@@ -78,3 +79,4 @@ register(app, _MEASURE, "train", train)
 register(app, _KEEP, "check", check, reads=True)
 register(app, _KEEP, "recover", recover)
 register(app, _KEEP, "drop", drop)
+register(app, _KEEP, "doctor", doctor, reads=True)

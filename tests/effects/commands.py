@@ -212,6 +212,7 @@ CASES: dict[str, dict[str, Case]] = {
         quiet=("models get yolox-nano --from known.onnx", "-q"),
         **{"from": ("models get yolox-nano", "--from known.onnx")},
     ),
+    "doctor": common("doctor"),
     "docs": common("docs", output="-o pages.txt", force=("docs -o clip.mp4", "--force")),
 }
 

@@ -240,6 +240,15 @@ class DetectorNetwork:
 _OPENING: Final = Lock()
 
 
+def providers() -> tuple[str, ...]:
+    """The providers of ONNX Runtime, such as "CPUExecutionProvider"; () if it can't be imported."""
+    try:
+        import onnxruntime
+    except ImportError:
+        return ()
+    return tuple(onnxruntime.get_available_providers())
+
+
 def workers() -> int:
     """The number of pictures to detect in at a time: one for each thread that this process may use."""
     return threads()

@@ -1,0 +1,235 @@
+"""Versions, codecs, memory, folders and plug-ins of an installation, and what it lacks."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Final
+
+from mcaptrack import __version__
+from mcaptrack.api import machine
+from mcaptrack.environment import cache_folder
+from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import Notice, collected, warn
+
+#: Extras for people who work on mcaptrack itself, or read its examples.
+_NOT_SHOWN: Final = ("docs", "examples", "test")
+_THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+_LITTLE_BYTES: Final = 1_000_000_000
+_REQUIREMENT: Final = re.compile(r"([\w.-]+)\s*(?:\[[^]]*\])?\s*(?:[^;]*?>=\s*([\d.]+))?[^;]*(?:;(.*))?")
+
+
+@dataclass(frozen=True)
+class DoctorResult:
+    """An installation: what it has, and what it lacks.
+
+    Attributes
+    ----------
+    version, python, system : str
+        Versions of mcaptrack and Python, and the operating system.
+    packages : dict of str to str
+        Version of each package that mcaptrack needs; "" for one that is missing.
+    extras : dict of str to tuple of str
+        The packages that each extra lacks; () for an extra that is installed.
+    codecs : dict of str to str
+        Why pictures of a codec can't be decoded, or encoded ("h264 encoder"); "" where they can.
+    onnx_providers : tuple of str
+        What ONNX Runtime can run networks on; () if it is not installed.
+    cores : float
+        How many cores this process may use; a quota may be a fraction.
+    memory_bytes : int or None
+        How much memory this process may use; None if that is unknown.
+    threads : dict of str to str
+        Threads of OpenCV, and of the libraries for which the environment sets them.
+    temporary_folder : pathlib.Path or None
+        Where temporary files are written; None if no folder for them can be written.
+    temporary_bytes_free : int or None
+        Free space there.
+    cache_folder : pathlib.Path
+        Where fetched weights of detectors are kept; it is made when it is first needed.
+    cache_can_be_written : bool
+        Whether it can be made and written.
+    plugins : dict of str to str
+        Detectors, trackers, re-trackers and predictors of other packages, as "tracker nearest", and why each can't be
+        imported; "" where it can.
+    faults : tuple of str
+        What a plain run needs, and this installation lacks.
+    warnings : tuple of mcaptrack.Notice
+        What is missing or scarce, but not needed by a plain run.
+
+    """
+
+    version: str
+    python: str
+    system: str
+    packages: dict[str, str]
+    extras: dict[str, tuple[str, ...]]
+    codecs: dict[str, str]
+    onnx_providers: tuple[str, ...]
+    cores: float
+    memory_bytes: int | None
+    threads: dict[str, str]
+    temporary_folder: Path | None
+    temporary_bytes_free: int | None
+    cache_folder: Path
+    cache_can_be_written: bool
+    plugins: dict[str, str]
+    faults: tuple[str, ...]
+    warnings: tuple[Notice, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all but the warnings as values of JSON.
+
+        Returns
+        -------
+        dict
+            What ``mcaptrack doctor --json`` prints.
+
+        Examples
+        --------
+        >>> import mcaptrack
+        >>> mcaptrack.doctor().to_json()["faults"]
+        ()
+
+        """
+        found = asdict(self)
+        del found["warnings"]
+        folder = self.temporary_folder
+        return found | {"temporary_folder": str(folder) if folder else None, "cache_folder": str(self.cache_folder)}
+
+
+def doctor() -> DoctorResult:
+    """Find out what this installation has, and whether a plain run would work.
+
+    Pictures are encoded and decoded, and a log is written to the temporary folder and read back. The network is not
+    used.
+
+    Returns
+    -------
+    DoctorResult
+        Versions, codecs, cores, memory, folders, plug-ins; ``faults`` is () if nothing is missing.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> mcaptrack.doctor().faults
+    ()
+    """
+    from mcaptrack.sources.video.self_test import codec_faults
+    from mcaptrack.transforms.detect.onnx.session import providers
+
+    with collected() as warnings:
+        packages, extras, faults = _packages()
+        codecs = codec_faults()
+        faults += [
+            f"{name}: {_codec_words(name)} ({why}); `pip install av` brings it" for name, why in codecs.items() if why
+        ]
+        folder, why = machine.temporary_folder()
+        if why:
+            place = folder or "the temporary folder"
+            faults.append(
+                f"{place}: a log can't be written there and read back ({why}); TMPDIR may name another folder"
+            )
+        free = machine.free_bytes(folder) if folder else None
+        if free is not None and free < _LITTLE_BYTES:
+            warn(f"{folder} has only {free / 1e6:,.0f} MB free; TMPDIR may name another folder")
+        cache = cache_folder()
+        plugins = _plugins()
+        return DoctorResult(
+            version=__version__,
+            python=platform.python_version(),
+            system=platform.platform(),
+            packages=packages,
+            extras=extras,
+            codecs=codecs,
+            onnx_providers=providers(),
+            cores=machine.cores(),
+            memory_bytes=machine.memory_bytes(),
+            threads=_threads(),
+            temporary_folder=folder,
+            temporary_bytes_free=free,
+            cache_folder=cache,
+            cache_can_be_written=machine.can_be_written(cache),
+            plugins=plugins,
+            faults=tuple(faults),
+            warnings=tuple(warnings),
+        )
+
+
+def _codec_words(name: str) -> str:
+    return "pictures can't be encoded" if name.endswith("encoder") else "pictures can't be decoded"
+
+
+def _packages() -> tuple[dict[str, str], dict[str, tuple[str, ...]], list[str]]:
+    """Return the versions of the packages that are needed, what each extra lacks, and faults."""
+    packages: dict[str, str] = {}
+    lacking: dict[str, list[str]] = {}
+    faults = []
+    for text in _requirements():
+        found = _REQUIREMENT.match(text)
+        if found is None:
+            continue
+        name, least, marker = found.groups(default="")
+        extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", marker)
+        have = _version_of(name)
+        is_enough = bool(have) and _numbers(have) >= _numbers(least)
+        if extra is None:
+            packages[name] = have
+            if not is_enough:
+                there = f"only version {have} is installed" if have else "it is not installed"
+                faults.append(f"{name}: {there}; `pip install '{name}>={least}'` installs what is needed")
+        elif extra[1] not in _NOT_SHOWN:
+            lacking.setdefault(extra[1], []).extend([] if is_enough else [name])
+    return packages, {name: tuple(names) for name, names in lacking.items()}, faults
+
+
+def _requirements() -> list[str]:
+    try:
+        return metadata.requires("mcaptrack") or []
+    except metadata.PackageNotFoundError:
+        warn("mcaptrack is not installed as a package: which versions of others it needs is unknown")
+        return []
+
+
+def _version_of(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return ""
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    """Return the numbers at the beginning of a version; zeros at their end say nothing."""
+    found = re.match(r"\d+(?:\.\d+)*", version)
+    numbers = [int(number) for number in found[0].split(".")] if found else []
+    while numbers and not numbers[-1]:
+        numbers.pop()
+    return tuple(numbers)
+
+
+def _threads() -> dict[str, str]:
+    import cv2
+
+    return {"OpenCV": str(cv2.getNumThreads())} | {name: os.environ[name] for name in _THREADS if name in os.environ}
+
+
+def _plugins() -> dict[str, str]:
+    """Import the plug-ins of installed packages; return why each can't be imported, or "", and warn of it."""
+    from mcaptrack.registry import BUILT_IN, KINDS, find, names
+
+    found = {}
+    for kind in KINDS:
+        for name in names(kind):
+            if name in BUILT_IN[kind]:
+                continue
+            found[f"{kind} {name}"] = ""
+            try:
+                find(kind, name)
+            except McaptrackError as error:
+                found[f"{kind} {name}"] = str(error)
+                warn(str(error), "other")
+    return found

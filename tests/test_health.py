@@ -1,0 +1,152 @@
+"""``doctor``: each thing that is missing is one line, and nothing is left over."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from importlib import metadata
+from pathlib import Path
+from types import SimpleNamespace
+
+import av
+import numpy as np
+import pytest
+
+import mcaptrack
+from mcaptrack.api import machine
+from mcaptrack.errors import McaptrackError
+from mcaptrack.schema import Frame
+from mcaptrack.sources.video.codecs import CODECS
+from tests.commands import call, done
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path, monkeypatch) -> Path:
+    """The folder for temporary files."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return tmp_path
+
+
+def fault() -> str:
+    """The one line that `doctor` prints about the fault."""
+    outcome = call("doctor", "-q")
+    assert (outcome.code, outcome.out) == (1, "")
+    (line,) = outcome.err.splitlines()
+    return line.removeprefix("mcaptrack: ")
+
+
+def test_a_whole_installation_has_no_faults_and_nothing_is_left_over(place):
+    said = json.loads(done("doctor", "--json").out)
+    assert said["faults"] == []
+    assert said["packages"]["numpy"] == np.__version__
+    assert said["packages"]["av"] == metadata.version("av")
+    assert said["codecs"] == dict.fromkeys([*CODECS, "h264 encoder"], "")
+    assert Path(said["temporary_folder"]) == place
+    assert list(place.iterdir()) == []
+    assert said["extras"].keys().isdisjoint({"docs", "examples", "test"})
+    assert said["extras"]["sql"] == []  # the tests need DuckDB
+
+
+def test_the_page_names_what_there_is():
+    page = done("doctor").out
+    for words in ("codec av1", "codec h264 encoder", "ONNX Runtime", "cores", "memory", "temporary files", "faults"):
+        assert f"\n{words}" in page
+    assert "  numpy" in done("doctor", "-v").out.replace(page, "")
+
+
+@pytest.mark.parametrize("name", CODECS)
+def test_a_codec_without_decoder_is_named(name, monkeypatch):
+    create = av.CodecContext.create
+
+    def without(codec: str, mode: str) -> object:
+        if (codec, mode) == (CODECS[name].decoder, "r"):
+            raise ValueError("no codec")
+        return create(codec, mode)
+
+    monkeypatch.setattr(av, "CodecContext", SimpleNamespace(create=without))
+    assert fault() == f"{name}: pictures can't be decoded (no codec); `pip install av` brings it"
+
+
+def test_a_decoder_that_gives_another_picture_is_named(monkeypatch):
+    def black(pictures):
+        (picture,) = pictures
+        return [Frame(0, 0, np.zeros((64, 64), np.uint8))] if picture.format == "vp9" else real([picture])
+
+    from mcaptrack.sources.video import decode
+
+    real = decode.decode_gray
+    monkeypatch.setattr(decode, "decode_gray", black)
+    assert "vp9: pictures can't be decoded (the picture looks different (by 128 of 255 on average))" in fault()
+
+
+def test_a_temporary_folder_that_is_missing_is_named(place, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(place / "none"))
+    assert fault().startswith(f"{place / 'none'}: a log can't be written there and read back (No such file")
+
+
+def test_a_log_that_isnt_read_back_as_it_was_written_is_a_fault(place, monkeypatch):
+    monkeypatch.setattr(
+        machine.log, "check", lambda _: SimpleNamespace(findings=[SimpleNamespace(words="a bit flipped")])
+    )
+    assert "(a bit flipped)" in fault()
+
+
+def test_little_space_is_a_warning(monkeypatch):
+    monkeypatch.setattr(machine, "free_bytes", lambda _: 20_000_000)
+    outcome = done("doctor")
+    assert "has only 20 MB free" in outcome.err
+
+
+@pytest.mark.parametrize(
+    ("requirement", "said"),
+    [
+        ("no-such-package>=1.2", "no-such-package: it is not installed"),
+        (f"numpy<99,>={int(np.__version__.split('.')[0]) + 1}", f"numpy: only version {np.__version__} is installed"),
+    ],
+)
+def test_packages_that_are_missing_or_old_are_faults(requirement, said, monkeypatch):
+    monkeypatch.setattr(metadata, "requires", lambda _: ["scipy>=1", requirement, 'nothing>=1; extra == "test"'])
+    assert fault().startswith(said)
+
+
+def test_what_an_extra_lacks_is_no_fault(monkeypatch):
+    monkeypatch.setattr(metadata, "requires", lambda _: ['numpy>=1.0; extra == "some"', 'nothing>=1; extra == "some"'])
+    assert mcaptrack.doctor().extras == {"some": ("nothing",)}
+    assert "`pip install 'mcaptrack[some]'`" in done("doctor").out
+
+
+def test_a_plug_in_that_cant_be_imported_is_a_warning(monkeypatch):
+    def refuse(kind: str, name: str) -> None:
+        raise McaptrackError(f"{kind} {name} is broken")
+
+    monkeypatch.setattr("mcaptrack.registry.names", lambda kind: ("sort", "mine") if kind == "tracker" else ())
+    monkeypatch.setattr("mcaptrack.registry.find", refuse)
+    said = json.loads(done("doctor", "--json").out)
+    assert said["plugins"] == {"tracker mine": "tracker mine is broken"}
+    assert [warning["message"] for warning in said["warnings"]] == ["tracker mine is broken"]
+
+
+def test_limits_are_those_of_the_control_group_and_of_those_above_it(tmp_path):
+    inner = tmp_path / "a" / "b"
+    inner.mkdir(parents=True)
+    (tmp_path / "a" / "cpu.max").write_text("150000 100000\n")
+    (inner / "cpu.max").write_text("max 100000\n")
+    (tmp_path / "a" / "memory.max").write_text("2000000000\n")
+    (inner / "memory.max").write_text("max\n")
+    assert machine.cpu_quotas(tmp_path, "0::/a/b\n") == [1.5]
+    assert machine.memory_limits(tmp_path, "0::/a/b\n") == [2_000_000_000]
+    assert machine.memory_limits(tmp_path, "") == []
+
+
+def test_limits_of_the_first_version_of_control_groups(tmp_path):
+    for name, text in (
+        ("cpu/cpu.cfs_quota_us", "50000"),
+        ("cpu/cpu.cfs_period_us", "100000"),
+        ("memory/memory.limit_in_bytes", "1000000000"),
+    ):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert machine.cpu_quotas(tmp_path, "") == [0.5]
+    assert machine.memory_limits(tmp_path, "") == [1_000_000_000]
+    (tmp_path / "memory/memory.limit_in_bytes").write_text("9223372036854771712")  # no limit
+    assert machine.memory_limits(tmp_path, "") == []
