@@ -22,7 +22,7 @@ from tests.commands import GROUP, call, toml_value
 
 COMMANDS = GROUP.commands
 #: Arguments of commands, as far as they need any.
-ARGUMENTS = {"drop": ["x.mcap", "/a"], "demo": []}
+ARGUMENTS = {"drop": ["x.mcap", "/a"], "demo": [], "doctor": []}
 EVERY_COMMAND = pytest.mark.parametrize("command", sorted(COMMANDS))
 
 
@@ -161,8 +161,16 @@ def refused(*words: str) -> str:
     return outcome.err
 
 
-#: Modules that read the environment; ``fleet`` passes it on to workers, ``objects`` looks there for credentials.
-READERS = ("environment.py", "cli/settings.py", "cli/plugins.py", "fleet/limits.py", "objects/stores.py")
+#: Modules that read the environment: ``fleet`` passes it on to workers, ``objects`` finds credentials there, and
+#: ``health`` shows numbers of threads.
+READERS = (
+    "environment.py",
+    "cli/settings.py",
+    "cli/plugins.py",
+    "fleet/limits.py",
+    "objects/stores.py",
+    "api/health.py",
+)
 
 
 class TestUnknownNames:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import inspect
 import io
 import json
@@ -28,8 +27,8 @@ from mcaptrack.cli.inputs import check_paths
 from mcaptrack.cli.settings import Declared
 from mcaptrack.cli.text import say
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import publish_bytes, refuse_overwrite, refuse_url
-from mcaptrack.location import Location, is_remote, parse
+from mcaptrack.files import publish_bytes, refuse_overwrite
+from mcaptrack.location import Location
 from mcaptrack.notices import Code, Notice
 from mcaptrack.transforms.protocol import limits
 
@@ -393,42 +392,3 @@ def print_json(data: dict[str, Any]) -> None:
     }
     whole = {"schema_version": SCHEMA_VERSION} | data | added
     print(json.dumps(whole, indent=2, allow_nan=False), flush=True)
-
-
-def expand(paths: Sequence[Path], *, each: bool = False, folders: bool = False) -> list[Location]:
-    """Return paths, with patterns replaced by the files that match.
-
-    With ``folders``, a folder that has logs stands for these, and "-" for a list of logs on standard input.
-    LOG.results.mcap is left out if LOG is among the paths, because it is a part of LOG; with ``each`` it is kept.
-    Raises McaptrackError for a pattern that matches no file.
-    """
-    from mcaptrack.files import place_of
-    from mcaptrack.fleet.expansion import LIST, find_logs, has_logs
-    from mcaptrack.log import results_path
-
-    out: list[Location] = []
-    for path in paths:
-        if is_remote(url := parse(path)):
-            out.append(url)
-            continue
-        refuse_url(path)
-        if folders and (str(path) == LIST or (path.is_dir() and has_logs(path))):
-            out += [one.path for one in find_logs([path])]
-            continue
-        if path.exists() or not glob.has_magic(str(path)):
-            out.append(path)
-            continue
-        found = sorted(Path(name) for name in glob.glob(str(path), recursive=True))
-        if not found:
-            raise McaptrackError(f"no file matches {path}")
-        out += found
-    results = {results_path(place_of(path)) for path in out}
-    return [path for path in out if each or place_of(path) not in results]
-
-
-def only_one_output(paths: Sequence[Location], output: Path | None) -> None:
-    """Raise McaptrackError if several inputs would be written to one output."""
-    if output is not None and len(paths) > 1:
-        raise McaptrackError(
-            f"{len(paths)} inputs can't all be written to {output}; give one input, or no name for the output"
-        )

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import typer
 
 from mcaptrack.cli import common
+from mcaptrack.cli.inputs import expand
 from mcaptrack.cli.text import console, printable, say
 from mcaptrack.errors import McaptrackError
 
@@ -105,7 +106,7 @@ def evaluate(
     limits = dict(_limit(text) for text in fail_under or ())
     gates = _gates(gate_m)
     with common.Talk(quiet, verbose).open() as talk:
-        paths, truths = common.expand(inputs, folders=True), common.expand(truth) if truth else None
+        paths, truths = expand(inputs, folders=True), expand(truth) if truth else None
         scores = mcaptrack.evaluate(
             paths,
             truth=truths,

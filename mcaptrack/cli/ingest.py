@@ -9,6 +9,7 @@ import typer
 
 from mcaptrack.cli import common
 from mcaptrack.cli.flags import with_flags
+from mcaptrack.cli.inputs import expand, only_one_output
 
 if TYPE_CHECKING:
     from mcaptrack import IngestResult
@@ -231,8 +232,8 @@ def ingest(
     """
     import mcaptrack
 
-    sources = common.expand(inputs, each=True)
-    common.only_one_output(sources, output or into)
+    sources = expand(inputs, each=True)
+    only_one_output(sources, output or into)
     given: dict[str, Any] = {
         "camera": camera,
         "fps": fps,

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Final, Generic, TypeVar, get_type_hints
 
 from mcaptrack import notices
 from mcaptrack.cli import common
+from mcaptrack.cli.inputs import only_one_output
 from mcaptrack.cli.live import LiveTable
 from mcaptrack.cli.text import say, stdout_to_stderr
 from mcaptrack.errors import McaptrackError
@@ -224,7 +225,7 @@ def process(
     if work.shares_output and folder is not None:
         options, folder = {**options, "output": folder}, None
     elif not work.shares_output:
-        common.only_one_output([one.path for one in logs], output)
+        only_one_output([one.path for one in logs], output)
     if len(logs) == 1 and not many.concern_one:
         path = logs[0].path
         with notices.about(output or path):

@@ -12,6 +12,7 @@ import typer
 
 from mcaptrack.cli import common
 from mcaptrack.cli.command import warn_unused
+from mcaptrack.cli.inputs import expand
 from mcaptrack.cli.text import console, printable, show
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_url
@@ -106,7 +107,7 @@ def query(
     paths, sql = _asked(words or [], file, tables)
     if tables:
         warn_unused("--tables lists what could be asked", "form", "rows")
-    logs = common.expand(paths, folders=True)
+    logs = expand(paths, folders=True)
     chosen = _form(form, output, json)
     if output is not None:
         from mcaptrack.files import is_same_file, refuse_overwrite

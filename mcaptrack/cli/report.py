@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from mcaptrack.cli import common
+from mcaptrack.cli.inputs import expand
 
 
 @common.one_line
@@ -40,7 +41,7 @@ def report(
     """
     import mcaptrack
 
-    paths = common.expand(logs, folders=True)
+    paths = expand(logs, folders=True)
     with common.Talk(quiet, verbose).open() as talk:
         done = mcaptrack.report(paths, output, camera=camera, force=force, progress=talk.progress)
         talk.say(f"{done.page}: {len(paths)} log{'s' if len(paths) > 1 else ''}, {done.size / 1e6:.2f} MB")

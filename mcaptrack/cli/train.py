@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from mcaptrack.cli import common
+from mcaptrack.cli.inputs import expand
 from mcaptrack.cli.text import console, show
 from mcaptrack.errors import command
 
@@ -224,13 +225,13 @@ def train(
 
     for source in sources:
         refuse_url(source)
-    paths = common.expand([Path(source) for source in sources if source != SYNTHETIC])
+    paths = expand([Path(source) for source in sources if source != SYNTHETIC])
     with common.Talk(quiet, verbose).open() as talk:
         trained = mcaptrack.train(
             [*([SYNTHETIC] if SYNTHETIC in sources else []), *paths],
             output,
             recipe=recipe,
-            validate=common.expand(validate) if validate else None,
+            validate=expand(validate) if validate else None,
             epochs=epochs,
             batch=batch,
             rate=rate,

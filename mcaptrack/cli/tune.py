@@ -10,6 +10,7 @@ import typer
 from mcaptrack.cli import common
 from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.config import NAME, read_toml, write_settings
+from mcaptrack.cli.inputs import expand
 from mcaptrack.cli.settings import old_names
 from mcaptrack.cli.stages import chooser
 from mcaptrack.cli.text import console, show, stdout_to_stderr
@@ -119,8 +120,8 @@ def tune(
         read_toml(output)  # a file that can't be edited is refused before the search
         with stdout_to_stderr():
             done = mcaptrack.tune(
-                common.expand(inputs),
-                truth=common.expand(truth) if truth else None,
+                expand(inputs),
+                truth=expand(truth) if truth else None,
                 stage=stage,
                 tracker=tracker if is_tracker else None,
                 metric=metric,
