@@ -263,6 +263,9 @@ def test_limits_of_users_replace_those_of_the_table():
     for wrong in ("car", "car=", "=4", "car=fast", "car=1:2:3:4:5", "car=-1"):
         with pytest.raises(McaptrackError, match="NAME=SPEED"):
             GroundTracker(class_limits=wrong)
+    for wrong, why in (("car=40, Car=50", "names car twice"), ("car=::0", "NOISE and GATE"), ("car=:::0", "NOISE and")):
+        with pytest.raises(McaptrackError, match=why):
+            GroundTracker(class_limits=wrong)
 
 
 def compared(truth: dict[str, np.ndarray], frames: list[Frame]) -> tuple[int, float, float]:

@@ -144,14 +144,14 @@ def read_limits(text: str) -> dict[str, MotionLimits]:
     SPEED is the most in metres per second, DRIFT how much a velocity changes within a second, NOISE and GATE are in
     metres. Those at the end may be left out, and any may be empty: they stay as in the table.
 
-    Raises McaptrackError if a text has another form.
+    Raises McaptrackError if a text has another form, names a class twice, or has a NOISE or GATE of 0.
 
     Examples
     --------
     >>> read_limits("car=40, forklift=6::0.1")["forklift"].noise_m
     0.1
     """
-    out = {}
+    out: dict[str, MotionLimits] = {}
     for one in filter(str.strip, text.split(",")):
         name, equals, values = one.partition("=")
         name, parts = name.strip().lower(), [part.strip() for part in values.split(":")]
@@ -168,6 +168,10 @@ def read_limits(text: str) -> dict[str, MotionLimits]:
         row = limits_of(name)
         missing: list[float | None] = [None] * (len(_NUMBERS) - len(numbers))
         speed, drift, noise, gate = numbers + missing
+        if 0 in (noise, gate):
+            raise McaptrackError(f"class_limits has {one.strip()!r}; NOISE and GATE have to be more than 0 m")
+        if name in out:
+            raise McaptrackError(f"class_limits names {name} twice; give each class once")
         most = row.max_speed_m_per_s if speed is None else speed
         out[name] = row._replace(
             name=row.name if row.name != UNKNOWN else name,
