@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from mcaptrack import log
+from mcaptrack import environment, log
 from mcaptrack.errors import McaptrackError
 
 _CONTROL_GROUPS: Final = Path("/sys/fs/cgroup")
@@ -19,8 +19,7 @@ _NO_LIMIT: Final = 1 << 60
 
 def cores() -> float:
     """Return how many cores this process may use: those that it may run on, or the quota of its control group."""
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min([float(usable), *cpu_quotas()])
+    return min([float(environment.cores()), *cpu_quotas()])
 
 
 def cpu_quotas(root: Path = _CONTROL_GROUPS, own: str | None = None) -> list[float]:
