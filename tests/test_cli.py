@@ -33,7 +33,7 @@ class TestHelp:
             "from mcaptrack.__main__ import main\n"
             "try: main()\n"
             "except SystemExit: pass\n"
-            "print('LOADED', *[m for m in ('torch', 'cv2', 'scipy', 'pyarrow', 'av', 'google.protobuf') if m in sys.modules])"
+            "print('LOADED', *[m for m in ('torch', 'cv2', 'scipy', 'pyarrow', 'av', 'google.protobuf', 'mcaptrack.fleet') if m in sys.modules])"
         )
         done_ = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
         assert done_.stdout.splitlines()[-1].split() == ["LOADED"]

@@ -10,7 +10,6 @@ import typer
 from mcaptrack.cli import common
 from mcaptrack.cli.many import LogWork, process, takes_many
 from mcaptrack.cli.text import console, show
-from mcaptrack.fleet import find_logs
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:
@@ -41,6 +40,7 @@ def check(
     Example: mcaptrack check log.mcap
     """
     import mcaptrack
+    from mcaptrack.fleet import find_logs
 
     work: LogWork[LogCheck] = LogWork("check", mcaptrack.check, {}, show=lambda *_: None, line=_verdict, writes=False)
     with common.Talk(quiet, verbose).open() as talk:
@@ -114,6 +114,7 @@ def recover(
     Example: mcaptrack recover broken.mcap -o saved.mcap
     """
     import mcaptrack
+    from mcaptrack.fleet import find_logs
 
     def show(_: Location, report: LogRecovery) -> None:
         talk.say(f"{report.output}: {report.messages} messages in {report.chunks} chunks are saved")
@@ -182,6 +183,7 @@ def drop(
     Example: mcaptrack drop log.mcap /camera/video -o small.mcap
     """
     import mcaptrack
+    from mcaptrack.fleet import find_logs
 
     def line(done: DropResult) -> str:
         dropped = f"{', '.join(done.dropped)} with {done.messages} messages left out"

@@ -5,10 +5,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mcaptrack.cli.text import printable
-from mcaptrack.fleet import FleetStatus
+
+if TYPE_CHECKING:
+    from mcaptrack.fleet import FleetStatus
 
 
 class LiveTable:

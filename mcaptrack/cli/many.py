@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Final, Generic, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, TypeVar, get_type_hints
 
 from mcaptrack import notices
 from mcaptrack.cli import common
@@ -18,9 +18,10 @@ from mcaptrack.cli.inputs import only_one_output
 from mcaptrack.cli.live import LiveTable
 from mcaptrack.cli.text import say, stdout_to_stderr
 from mcaptrack.errors import McaptrackError
-from mcaptrack.fleet import FleetResult, LogOutcome, NamedLog
-from mcaptrack.fleet import run as run_fleet
 from mcaptrack.location import Location
+
+if TYPE_CHECKING:
+    from mcaptrack.fleet import FleetResult, LogOutcome, NamedLog
 
 T = TypeVar("T")
 #: Heading of the options in the help.
@@ -233,6 +234,8 @@ def process(
                 result = common.with_progress(work.function, talk.progress)(path, **options)
             work.show(path, result)
         return [result], {}
+    from mcaptrack.fleet import run as run_fleet
+
     listener: _Printer[T] = _Printer(work, talk, [one.path for one in logs])
     try:
         with LiveTable.on_terminal(talk.quiet or work.line is None) as table:

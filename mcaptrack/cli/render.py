@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from mcaptrack.cli import common
 from mcaptrack.cli.many import LogWork, many_options, process, takes_many
-from mcaptrack.fleet import find_logs
 
 if TYPE_CHECKING:
     from mcaptrack import RenderResult
@@ -94,6 +93,7 @@ def render(
     Example: mcaptrack render log.mcap -o walk.gif --width 480 --start-s 2 --end-s 8
     """
     import mcaptrack
+    from mcaptrack.fleet import find_logs
 
     def line(done: RenderResult) -> str:
         return f"{done.pictures} pictures with {', '.join(done.views) or 'nothing drawn'}"

@@ -11,7 +11,6 @@ from mcaptrack.cli import common
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.many import LogWork, process
 from mcaptrack.errors import command
-from mcaptrack.fleet import find_logs
 
 if TYPE_CHECKING:
     from mcaptrack import RunResult
@@ -25,6 +24,8 @@ _UP_TO_DATE = "nothing to do, everything is up to date"
 
 def run_on_logs(given: Mapping[str, Any], name: str, function: Run, options: Mapping[str, Any]) -> None:
     """Run stages on each log, and print the results. ``function`` takes a log and ``options``."""
+    from mcaptrack.fleet import find_logs
+
     where = {name: given[name] for name in ("camera", "sidecar", "force")}
     shows_events = name == "events"
     with common.Talk(given["quiet"], given["verbose"]).open() as talk:

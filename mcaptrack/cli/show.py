@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 from mcaptrack.cli import common
 from mcaptrack.cli.many import LogWork, many_options, process, takes_many
 from mcaptrack.cli.text import console, printable
-from mcaptrack.fleet import find_logs
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:
@@ -43,6 +42,7 @@ def info(
     Example: mcaptrack info robot.mcap --frames
     """
     import mcaptrack
+    from mcaptrack.fleet import find_logs
 
     def show(_: Location, found: LogInfo) -> None:
         if not json:
@@ -207,6 +207,7 @@ def export(
     """
     import mcaptrack
     from mcaptrack.api.outputs import refuse_same_tables
+    from mcaptrack.fleet import find_logs
 
     found, is_bag = find_logs(logs), form.startswith("rosbag2")
     if not is_bag:
