@@ -1,4 +1,4 @@
-"""How the settings of re-tracking were chosen: scores on true tracks that are corrupted in eight ways.
+"""How the settings of re-tracking were chosen: scores on true tracks that are corrupted in many ways.
 
 Takes a folder of TrajNet text files (frame id x y, in metres, annotated at 2.5 Hz), puts their chopped pieces together
 again, corrupts them (`corruptions.py`), and prints IDF1 / MOTA / switches at 1 m for every candidate and every kind of
