@@ -92,9 +92,8 @@ def _online_tracks(true: list[Frame], samples: list[Frame]) -> tuple:
     run = LikelihoodPass(DEFAULT)
     for frame in samples:
         run.step(frame)
-    rows = np.concatenate(run.samples)
-    step, track, _, key = run.assignments.of(rows, run.steps, [len(part) for part in run.samples])
-    xy = np.stack([rows["x_m"][key], rows["y_m"][key]], axis=-1)
+    step, track, _, key = run.assignments.of(run.samples, run.steps)
+    xy = np.stack([run.samples.column(name)[key] for name in ("x_m", "y_m")], axis=-1)
     model = motion_model(DEFAULT, run.noise_m)
     ids, at, paths = to_trajectories(step, track, xy, model.noise_m)
     owner = np.full(len(paths.step), -1)

@@ -156,6 +156,21 @@ class FrameColumns(Sequence[Frame]):
             parts.append(self._rows(number)[self.ends[low] - start : self.ends[high] - start])
         return self.schema.joined(parts)
 
+    def take(self, places: Ints) -> Rows:
+        """The rows at ``places`` (N,) of all rows laid end to end, in any order; a copy.
+
+        Each block is read once, so places that are near one another in time are quick.
+        """
+        width = self.schema.dtype.itemsize
+        out = np.empty((len(places), width), np.uint8)
+        starts = self.ends[np.asarray(self._first, np.int64)]
+        block = np.searchsorted(starts, places, "right") - 1
+        for number in np.unique(block).tolist():
+            here = block == number
+            raw = self._rows(number).view(np.uint8).reshape(-1, width)
+            out[here] = raw[places[here] - starts[number]]
+        return out.view(self.schema.dtype)[:, 0]
+
     def _touched(self, first: int, last: int) -> Iterator[tuple[int, int, int]]:
         """The blocks with frames from ``first`` to before ``last``: number, and first and last of these frames."""
         number = max(bisect_right(self._first, first) - 1, 0)

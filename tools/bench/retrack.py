@@ -27,7 +27,8 @@ def online(samples: list[Frame]) -> None:
     run = LikelihoodPass(Retrack())
     for frame in samples:
         run.step(frame)
-    run.outputs()
+    for _ in run.outputs():
+        pass
 
 
 def best(what: Callable[[list[Frame]], object], members: list[list[Frame]], rounds: int = 3) -> float:

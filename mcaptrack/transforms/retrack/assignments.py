@@ -8,36 +8,34 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Ints
-from mcaptrack.schema import Rows
+from mcaptrack.transforms.retrack.samples import Samples
 
 
 @dataclass
 class Assignments:
     """Assignments: each has a step, a track and a sample. Samples are named by step and input id."""
 
-    _steps: list[Ints] = field(default_factory=list)
-    _tracks: list[Ints] = field(default_factory=list)
-    _sources: list[Ints] = field(default_factory=list)
+    _steps: bytearray = field(default_factory=bytearray)
+    _tracks: bytearray = field(default_factory=bytearray)
+    _sources: bytearray = field(default_factory=bytearray)
     _confirmed: list[tuple[int, Ints]] = field(default_factory=list)
 
     def add(self, step: Ints | int, tracks: Ints, sources: Ints) -> None:
         """Assign the samples of the input ids ``sources`` (C,) at ``step`` to ``tracks`` (C,)."""
-        self._steps.append(np.broadcast_to(step, tracks.shape))
-        self._tracks.append(tracks)
-        self._sources.append(sources)
+        for held, values in ((self._steps, step), (self._tracks, tracks), (self._sources, sources)):
+            held.extend(np.broadcast_to(np.asarray(values, np.int64), tracks.shape).tobytes())
 
     def confirm(self, step: int, tracks: Ints) -> None:
         """Confirm assignments of ``tracks`` (C,) up to ``step``; once this was called, unconfirmed ones are dropped."""
         self._confirmed.append((step, tracks))
 
-    def of(self, samples: Rows, steps: Sequence[int], counts: Sequence[int]) -> tuple[Ints, Ints, Ints, Ints]:
+    def of(self, samples: Samples, steps: Sequence[int]) -> tuple[Ints, Ints, Ints, Ints]:
         """Steps, tracks, input ids and samples of the assignments, in the order in which they were made; (C,) each.
 
-        ``samples`` are the rows of all steps, ``counts`` of them at each of ``steps``. A track has one sample a step.
+        ``samples`` are those of all ``steps``. A track has one sample a step.
         """
-        nothing = [np.empty(0, np.int64)]
-        step, track, source = (np.concatenate(p or nothing) for p in (self._steps, self._tracks, self._sources))
-        row = _find(samples["track_id"], np.repeat(np.array(steps, np.int64), counts), source, step)
+        step, track, source = (np.frombuffer(bytes(h), np.int64) for h in (self._steps, self._tracks, self._sources))
+        row = _find(samples.column("track_id"), np.repeat(np.array(steps, np.int64), samples.counts), source, step)
         kept = np.flatnonzero((row >= 0) & self._is_confirmed(step, track))
         return step[kept], track[kept], source[kept], row[kept]
 

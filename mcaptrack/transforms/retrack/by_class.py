@@ -10,9 +10,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.geometry.ragged import group_index
+from mcaptrack.schema import TRACKS, Frame, Schema
 from mcaptrack.schema.classes import first_classes
-from mcaptrack.schema.framing import join_frames, split_rows
+from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
+from mcaptrack.schema.framing import frame_numbers, has_any, joined_parts, row_ends, unique_values
 from mcaptrack.transforms.motion_limits import ClassNames, limits_by_class, units_m
 
 
@@ -38,60 +40,71 @@ PEOPLE: Final[Movers] = Movers()
 
 def usual_score(frames: Sequence[Frame]) -> float:
     """The median score of the observed rows of a log; 1 where there are none."""
-    parts = [frame.rows["score"][frame.rows["observed"]] for frame in frames if len(frame.rows)]
-    scores = np.concatenate(parts) if parts else np.empty(0)
+    parts = [part.rows["score"][part.rows["observed"]] for _, _, part in joined_parts(TRACKS, frames)]
+    scores = np.concatenate([np.empty(0, np.float32), *parts])
     scores = scores[np.isfinite(scores)]
     return max(float(np.median(scores)), 1e-6) if len(scores) else 1.0
 
 
 def movers_of(frames: Sequence[Frame], class_names: ClassNames, usual_score: float, class_limits: str = "") -> Movers:
     """The unit and the kind of the tracks in frames of one class."""
-    parts = [frame.rows for frame in frames if len(frame.rows)]
-    if not parts:
+    first = next((frame for frame in frames if len(frame.rows)), None)
+    if first is None:
         return PEOPLE
-    on_ground = all(np.isfinite(part["vx_m_per_s"]).all() for part in parts)
-    number = int(parts[0]["class_id"][0])
+    on_ground = not has_any(TRACKS, frames, lambda rows: ~np.isfinite(rows["vx_m_per_s"]))
+    number = int(first.rows["class_id"][0])
     limits = limits_by_class([number], class_names, class_limits)[number]
     drift_m_per_s = limits.drift_m_per_s if on_ground else None
     (unit_m,) = units_m([number], class_names, class_limits)
     return Movers(unit_m, on_ground, usual_score, drift_m_per_s)
 
 
-def split_classes(frames: Sequence[Frame]) -> list[Sequence[Frame]]:
+def split_classes(frames: FrameColumns) -> list[FrameColumns]:
     """The frames of each class (C,), all F of them, in the order in which classes appear.
 
     The class of a track is that of its first row.
     """
-    joined = join_frames(TRACKS, frames)
-    rows = joined.rows
-    if not len(rows) or (rows["class_id"] == rows["class_id"][0]).all():
+    if len(unique_values(TRACKS, frames, "class_id")) < 2:
         return [frames]
-    ids, track = np.unique(rows["track_id"], return_inverse=True)
-    class_id = first_classes(track, rows["class_id"], len(ids))[track]
+    columns = [
+        (part.rows["track_id"].copy(), part.rows["class_id"].copy()) for _, _, part in joined_parts(TRACKS, frames)
+    ]
+    track_id, class_of_row = (np.concatenate(parts) for parts in zip(*columns, strict=True))
+    ends = row_ends(frames)
+    frame_of = group_index(np.diff(ends))
+    ids, track = np.unique(track_id, return_inverse=True)
+    class_id = first_classes(track, class_of_row, len(ids))[track]
     classes, first = np.unique(class_id, return_index=True)
     # Ids of tracks tell classes apart that appear in one frame: the order of rows has no influence.
-    begins = zip(classes.tolist(), joined.frame[first].tolist(), strict=True)
-    lowest = [rows["track_id"][(joined.frame == frame) & (class_id == one)].min() for one, frame in begins]
-    order = np.lexsort((np.array(lowest), joined.frame[first]))
-    index = [frame.index for frame in frames]
-    out: list[Sequence[Frame]] = []
-    for one in classes[order].tolist():
-        mine = class_id == one
-        ends = np.concatenate([[0], mine.cumsum()])[joined.ends[1:]]
-        out.append(split_rows(joined.t_ns, index, TRACKS.joined([rows[mine]]), ends))
-    return out
+    begins = zip(classes.tolist(), frame_of[first].tolist(), strict=True)
+    lowest = [track_id[(frame_of == frame) & (class_id == one)].min() for one, frame in begins]
+    order = np.lexsort((np.array(lowest), frame_of[first]))
+    numbers = frame_numbers(frames)
+    out = [FrameCollector(TRACKS) for _ in classes]
+    for low, high, part in joined_parts(TRACKS, frames):
+        here = class_id[ends[low] : ends[high]]
+        for one, collector in zip(classes[order].tolist(), out, strict=True):
+            mine = here == one
+            collector.extend(part.t_ns, numbers[low:high], np.append(0, mine.cumsum())[part.ends], part.rows[mine])
+    return [collector.done() for collector in out]
 
 
-def join_classes(runs: Sequence[Iterator[tuple[Frame, ...]]]) -> Iterator[tuple[Frame, ...]]:
+def join_classes(runs: Sequence[Iterator[tuple[Frame, ...]]], schemas: Sequence[Schema]) -> Iterator[tuple[Frame, ...]]:
     """The results of each class (C,) as one: ids follow on those of the class before. One result for each of F frames.
 
-    All frames of a result have tracks with the same ids: offline and online tracks, and predictions.
+    All frames of a result have tracks with the same ids: offline and online tracks, and predictions; they are of
+    ``schemas``.
     """
-    results = [list(run) for run in runs]
+    results = []
     taken = [0]
-    for result in results:
-        ids = (frame.rows["track_id"].max() for frames in result for frame in frames if len(frame.rows))
-        taken.append(taken[-1] + int(max(ids, default=0)))
+    for run in runs:
+        collectors, highest = [FrameCollector(schema) for schema in schemas], 0
+        for frames in run:
+            for frame, collector in zip(frames, collectors, strict=True):
+                collector.append(frame)
+                highest = max(highest, int(frame.rows["track_id"].max(initial=0)))
+        taken.append(taken[-1] + highest)
+        results.append(zip(*(collector.done() for collector in collectors), strict=True))
     for parts in zip(*results, strict=True):
         yield tuple(_joined(frames, taken) for frames in zip(*parts, strict=True))
 

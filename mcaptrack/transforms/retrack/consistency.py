@@ -9,6 +9,7 @@ Letters: K tracks, N observations, L past positions, T predicted steps.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -19,7 +20,7 @@ from mcaptrack.geometry.assignment import assign
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories, Holt
 from mcaptrack.predictors import Forecast, Predictor, make
-from mcaptrack.schema import Frame, Rows
+from mcaptrack.schema import Frame
 from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.transforms.retrack.active_tracks import ActiveTracks, SmoothedHistory
 from mcaptrack.transforms.retrack.assignments import Assignments
@@ -27,6 +28,7 @@ from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers
 from mcaptrack.transforms.retrack.distances import metric_distances, position_distances, prediction_distances
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
 from mcaptrack.transforms.retrack.options import ConsistencyOptions
+from mcaptrack.transforms.retrack.samples import OnlineOutputs, Samples
 
 #: Cost of a pair with priority: lower than any sum of other costs.
 _PRIORITY_COST: Final = -100.0
@@ -50,10 +52,10 @@ class ConsistencyPass:
         self._histories = Histories(self._length)
         self._tracks = ActiveTracks.none(self._length, horizon)
         self.assignments = Assignments()
-        self.samples: list[Rows] = []
+        self.samples = Samples()
         self.steps: list[int] = []
         self.noise_m = DEFAULT_NOISE_M if options.noise_m is None else options.noise_m
-        self._outputs: list[tuple[Frame, Frame]] = []
+        self._outputs = OnlineOutputs()
         self._next_id = 1
         self._last_ns: int | None = None
 
@@ -65,7 +67,7 @@ class ConsistencyPass:
         self._last_ns = frame.t_ns
         step = self.steps[-1] + passed if self.steps else 0
         self.steps.append(step)
-        self.samples.append(frame.rows)
+        self.samples.add(frame)
 
         sources = frame.rows["track_id"]
         past, valid = self._histories.push(sources, np.stack([frame.rows["x_m"], frame.rows["y_m"]], axis=-1), passed)
@@ -89,11 +91,11 @@ class ConsistencyPass:
         online = self._online(frame, np.concatenate([row_at[observation], row_at[new]]), track, len(new))
         is_over = (step - self._tracks.last_step) / self._options.rate_hz > self._options.max_age_s + 1e-9
         self._tracks = self._tracks[~is_over]
-        self._outputs.append(online)
+        self._outputs.add(*online)
 
-    def outputs(self) -> list[tuple[Frame, Frame]]:
+    def outputs(self) -> Iterator[tuple[Frame, Frame]]:
         """For each step the online tracks and their predictions, from the past alone."""
-        return self._outputs
+        return iter(self._outputs)
 
     def _match(self, step: int, xy_m: Floats, predictions: Forecast, sources: Ints) -> tuple[Indices, Indices]:
         """Data association: pairs of tracks and observations within the gates (line 4 of Algorithm 1)."""

@@ -5,7 +5,8 @@ Letters: R rows of online tracks, L past positions.
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Iterator, Sequence
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -13,23 +14,31 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.ragged import group_index
 from mcaptrack.predictors import Forecast, Predictor, make
-from mcaptrack.schema import PREDICTIONS, Frame, Rows
+from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
+from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M, MotionModel
-from mcaptrack.transforms.retrack.offline import move_rows
+from mcaptrack.transforms.retrack.offline_rows import move_rows
 from mcaptrack.transforms.retrack.online_tracker import Association, OnlineTracker, Step
 from mcaptrack.transforms.retrack.options import LikelihoodOptions, RetrackOptions
+from mcaptrack.transforms.retrack.samples import Samples
 
 #: Predictions that are made at once: more take memory, fewer take time.
 _BATCH: Final = 4096
+#: Online tracks are written of so many steps at once.
+_STEPS: Final = 256
 #: The least noise (m) and speed (m/s): a covariance of 0 can't be inverted.
 _MIN_SPREAD: Final = 1e-3
 
 
 class LikelihoodPass:
-    """Online tracking over one log: ``step`` for each frame, then ``outputs``."""
+    """Online tracking over one log: ``step`` for each frame, then ``outputs``.
+
+    Rows of online tracks are made of some steps at once (``_write``), because one step has few of them. What later
+    steps need of these is kept: the last sample of each track, and its past positions.
+    """
 
     def __init__(self, options: LikelihoodOptions, movers: Movers = PEOPLE) -> None:
         rate, self._options, self._unit_m = options.rate_hz, options, movers.unit_m
@@ -51,11 +60,22 @@ class LikelihoodPass:
             estimate_noise=options.noise_m is None,
         )
         self.assignments = Assignments()
-        self.samples: list[Rows] = []
+        self.samples = Samples()
         self.steps: list[int] = []
+        self._last_ns = 0
+        # steps that are not written yet
         self._frames: list[Frame] = []
         self._results: list[Step] = []
         self._observed: list[Ints] = []
+        # what is known of earlier ones: tracks and their last samples, and their positions in the recent past
+        self._ids, self._last_rows = np.empty(0, np.int64), TRACKS.empty()
+        self._recent = _Positions(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)))
+        self._online = FrameCollector(TRACKS)
+        self._coasting: list[tuple[Ints, Floats, Ints]] = []  # places of rows in _online, positions in m, times
+        horizon = max(1, round(options.horizon_s * rate))
+        self._predictor: Predictor = make(options.predictor, horizon, 1 / rate)
+        self._forecasts = _Forecasts(self._predictor, movers.unit_m)
+        self._written = 0
 
     @property
     def noise_m(self) -> float:
@@ -65,8 +85,8 @@ class LikelihoodPass:
     def step(self, frame: Frame) -> None:
         """One step: association, update, birth and termination of tracks."""
         passed = 1
-        if self._frames:
-            passed = max(1, round((frame.t_ns - self._frames[-1].t_ns) * self._options.rate_hz / NS_PER_S))
+        if self.steps:
+            passed = max(1, round((frame.t_ns - self._last_ns) * self._options.rate_hz / NS_PER_S))
         step = self.steps[-1] + passed if self.steps else 0
         rows = frame.rows
         observed = np.flatnonzero(rows["observed"]) if not self._options.interpolated else np.arange(len(rows))
@@ -76,92 +96,154 @@ class LikelihoodPass:
         result = self._tracker.step(xy, source, passed)
         is_matched = result.row >= 0
         self.assignments.add(step, result.ids[is_matched], source[result.row[is_matched]])
-        self._frames.append(frame)
-        self.samples.append(rows)
+        self.samples.add(frame)
         self.steps.append(step)
+        self._last_ns = frame.t_ns
+        self._frames.append(frame)
         self._results.append(result)
         self._observed.append(observed)
+        if len(self._frames) >= _STEPS:
+            self._write()
 
-    def outputs(self) -> list[tuple[Frame, Frame]]:
+    def outputs(self) -> Iterator[tuple[Frame, Frame]]:
         """For each step the online tracks and their predictions, from the past alone."""
-        options = self._options
-        if not self._frames:
-            return []
-        rate = options.rate_hz
-        tick = group_index([len(result.ids) for result in self._results])
-        ids, row, mean, hits, missed = (np.concatenate([result[k] for result in self._results]) for k in range(5))
-        offset = np.concatenate([[0], np.cumsum([len(rows) for rows in self.samples])])
+        if not self.steps:
+            return
+        if self._frames:
+            self._write()
+        online, predictions = self._online.done(), self._forecasts.done()
+        # All at once, because the last digits of a product of matrices depend on their size.
+        nothing = np.empty(0, np.int64), np.empty((0, 2)), np.empty(0, np.int64)
+        places, xy_m, t_ns = (np.concatenate(parts) for parts in zip(nothing, *self._coasting, strict=True))
+        coasting = move_rows(online.take(places), xy_m, self._options.ground_planes, t_ns)
+        bounds = np.searchsorted(places, online.ends).tolist()
+        edges = zip(online.ends.tolist(), bounds[:-1], bounds[1:], strict=False)
+        for (start, low, high), tracks, forecast in zip(edges, online, predictions, strict=True):
+            if low == high:
+                yield tracks, forecast
+                continue
+            rows = tracks.rows.copy()
+            rows[places[low:high] - start] = coasting[low:high]
+            yield tracks._replace(rows=rows), forecast
+
+    def _write(self) -> None:
+        """Make the rows of online tracks, and their predictions, of the steps that are not written yet."""
+        options, results, frames = self._options, self._results, self._frames
+        tick = group_index([len(result.ids) for result in results])
+        ids, row, mean, hits, missed = (np.concatenate([result[k] for result in results]) for k in range(5))
+        samples = TRACKS.joined([self._last_rows, *(frame.rows for frame in frames)])
+        known = len(self._last_rows)
+        offset = known + np.cumsum([0, *(len(frame.rows) for frame in frames)])
         at = np.concatenate(
-            [
-                np.where(s.row >= 0, o[s.row] if len(o) else -1, -1)
-                for s, o in zip(self._results, self._observed, strict=True)
-            ]
+            [np.where(s.row >= 0, o[s.row] if len(o) else -1, -1) for s, o in zip(results, self._observed, strict=True)]
         )
         sample = np.where(row >= 0, offset[tick] + at, -1)
-        order = np.lexsort((tick, ids))
-        # the last sample of each track up to each step
-        last = np.maximum.accumulate(np.where(sample[order] >= 0, np.arange(len(order)), -1))
-        last_sample = np.empty_like(sample)
-        last_sample[order] = sample[order][last]
-        is_coasting = (row < 0) & (hits * 2 >= self._confirm_hits * 3) & (missed <= round(options.coast_s * rate))
+        # the last sample of each track up to each step: before the first of these steps, that of ``_last_rows``
+        earlier = np.concatenate([np.arange(known), sample])
+        order = np.lexsort((np.concatenate([np.full(known, -1), tick]), np.concatenate([self._ids, ids])))
+        last = np.maximum.accumulate(np.where(earlier[order] >= 0, np.arange(len(order)), -1))
+        last_sample = np.empty_like(earlier)
+        last_sample[order] = earlier[order][last]
+        last_sample = last_sample[known:]
+        is_coasting = (row < 0) & (hits * 2 >= self._confirm_hits * 3)
+        is_coasting &= missed <= round(options.coast_s * options.rate_hz)
         is_confirmed = (row >= 0) & (hits >= self._confirm_hits)
         shown = np.flatnonzero((is_confirmed | is_coasting) & np.isfinite(mean[:, 0]))
         shown = shown[np.lexsort((ids[shown], tick[shown]))]
 
-        samples = np.concatenate(self.samples)
         rows = samples[last_sample[shown]].copy()
         rows["source_id"] = np.where(row[shown] >= 0, rows["track_id"], -1)
         rows["track_id"] = ids[shown]
         coasts = row[shown] < 0
         rows["observed"] &= ~coasts
-        t_ns = np.array([frame.t_ns for frame in self._frames], np.int64)
-        rows[coasts] = move_rows(
-            rows[coasts], mean[shown[coasts], :2] * self._unit_m, options.ground_planes, t_ns[tick[shown[coasts]]]
-        )
-        steps = np.array(self.steps, np.int64)
+        t_ns = np.array([frame.t_ns for frame in frames], np.int64)
         xy_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
-        predictions = PREDICTIONS.empty()
-        if len(rows):
-            forecast = self._predict(*self._past(ids[shown], steps[tick[shown]], xy_m, samples))
-            predictions = forecast_to_rows(rows["track_id"], forecast, self._predictor.step_s)
-        horizon = self._predictor.steps
-        bounds = np.searchsorted(tick[shown], np.arange(len(self._frames) + 1)).tolist()
-        return [
-            (
-                Frame(frame.t_ns, frame.index, rows[low:high]),
-                Frame(frame.t_ns, frame.index, predictions[low * horizon : high * horizon]),
-            )
-            for frame, low, high in zip(self._frames, bounds[:-1], bounds[1:], strict=True)
-        ]
+        xy_m[coasts] = mean[shown[coasts], :2] * self._unit_m
+        self._coasting.append((self._written + np.flatnonzero(coasts), xy_m[coasts], t_ns[tick[shown[coasts]]]))
+        steps = np.array(self.steps[-len(frames) :], np.int64)
+        is_matched = sample >= 0
+        self._remember(ids[is_matched], steps[tick[is_matched]], samples[sample[is_matched]])
+        past = self._past(ids[shown], steps[tick[shown]], xy_m)
+        ends = np.searchsorted(tick[shown], np.arange(len(frames) + 1))
+        numbers = [frame.index for frame in frames]
+        self._online.extend(t_ns, numbers, ends, rows)
+        self._forecasts.add(t_ns, numbers, ends, rows["track_id"], past)
+        self._written += len(rows)
+        is_last = tick == len(frames) - 1
+        self._ids, self._last_rows = ids[is_last], samples[last_sample[is_last]]
+        self._frames, self._results, self._observed = [], [], []
 
-    @property
-    def _predictor(self) -> Predictor:
-        options = self._options
-        return make(options.predictor, max(1, round(options.horizon_s * options.rate_hz)), 1 / options.rate_hz)
+    def _remember(self, track: Ints, step: Ints, samples: Rows) -> None:
+        """Add positions of tracks to their past; only that which predictions need is kept."""
+        recent = self._recent
+        xy_m = np.stack([samples["x_m"], samples["y_m"]], axis=-1)
+        kept = recent.step > self.steps[-1 - len(self._frames)] - self._predictor.past if len(recent.step) else slice(0)
+        both = zip(recent, (track, step, xy_m), strict=True)
+        self._recent = _Positions(*(np.concatenate([before[kept], new]) for before, new in both))
 
-    def _past(self, ids: Ints, steps: Ints, now_m: Floats, samples: Rows) -> tuple[Floats, Bools]:
+    def _past(self, ids: Ints, steps: Ints, now_m: Floats) -> tuple[Floats, Bools]:
         """Last positions of tracks as known at ``steps`` (R,), (R, L, 2), and which of them are known, (R, L)."""
-        length = self._predictor.past
-        step, track, _, sample = self.assignments.of(samples, self.steps, [len(rows) for rows in self.samples])
+        length, recent = self._predictor.past, self._recent
         width = self.steps[-1] + 2
-        have = track * width + step
+        have = recent.track * width + recent.step
         order = np.argsort(have)
-        have, sample = have[order], sample[order]
+        have, xy_m = have[order], recent.xy_m[order]
         past = np.full((len(ids), length, 2), np.nan)
-        for back in range(1, length):
+        for back in range(1, length if len(have) else 0):
             want = ids * width + steps - back
             place = np.minimum(np.searchsorted(have, want), len(have) - 1)
             found = (have[place] == want) & (steps >= back)
-            rows = samples[sample[place[found]]]
-            past[found, length - 1 - back] = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
+            past[found, length - 1 - back] = xy_m[place[found]]
         past[:, -1] = now_m
         return past, np.isfinite(past[..., 0])
 
-    def _predict(self, past: Floats, known: Bools) -> Forecast:
-        predictor, past = self._predictor, past / self._unit_m
-        parts = [predictor.predict(past[k : k + _BATCH], known[k : k + _BATCH]) for k in range(0, len(past), _BATCH)]
-        mean, cov = (np.concatenate(members) for members in zip(*parts, strict=True))
-        return Forecast(mean * self._unit_m, cov * self._unit_m**2)
+
+class _Positions(NamedTuple):
+    """Positions of tracks: the track of each, its step, and x and y in m."""
+
+    track: Ints
+    step: Ints
+    xy_m: Floats
+
+
+class _Forecasts:
+    """Predictions of tracks, frame by frame, made for ``_BATCH`` tracks at once."""
+
+    def __init__(self, predictor: Predictor, unit_m: float) -> None:
+        self._predictor, self._unit_m = predictor, unit_m
+        self._out = FrameCollector(PREDICTIONS)
+        self._waiting: list[tuple[Ints, Floats, Bools]] = []  # ids and past positions without predictions yet
+        self._made: list[Rows] = []  # predictions of frames that are not complete
+        self._frames: list[tuple[int, int, int]] = []  # time, number and tracks of these frames
+
+    def add(self, t_ns: Ints, numbers: Sequence[int], ends: Ints, ids: Ints, past: tuple[Floats, Bools]) -> None:
+        """Add the tracks of frames, ``ends[f]`` to ``ends[f + 1]`` of frame f, with their past positions."""
+        self._frames += zip(t_ns.tolist(), numbers, np.diff(ends).tolist(), strict=True)
+        self._waiting.append((ids, *past))
+        self._predict(_BATCH)
+
+    def done(self) -> FrameColumns:
+        """The predictions; nothing can be added any more."""
+        self._predict(1)
+        return self._out.done()
+
+    def _predict(self, least: int) -> None:
+        """Predict in batches, as long as at least so many tracks wait."""
+        ids, past, known = (np.concatenate(parts) for parts in zip(*self._waiting, strict=True))
+        done = 0
+        while len(ids) - done >= least:
+            part = slice(done, done + _BATCH)
+            mean, cov = self._predictor.predict(past[part] / self._unit_m, known[part])
+            forecast = Forecast(mean * self._unit_m, cov * self._unit_m**2)
+            self._made.append(forecast_to_rows(ids[part], forecast, self._predictor.step_s))
+            done += len(mean)
+        self._waiting = [(ids[done:], past[done:], known[done:])]
+        rows = PREDICTIONS.joined(self._made)
+        ends = np.cumsum([0, *(count for _, _, count in self._frames)]) * self._predictor.steps
+        complete = int(np.searchsorted(ends, len(rows), "right")) - 1
+        t_ns, numbers, _ = zip(*self._frames[:complete], strict=True) if complete else ((), (), ())
+        self._out.extend(t_ns, numbers, ends[: complete + 1], rows[: ends[complete]])
+        self._frames, self._made = self._frames[complete:], [rows[ends[complete] :]]
 
 
 def motion_model(options: RetrackOptions, noise_m: float, movers: Movers = PEOPLE) -> MotionModel:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Protocol, TypeAlias, TypeVar
 
-import numpy as np
-
-from mcaptrack.schema import Frame, Rows
+from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema.frame_columns import FrameColumns, collect
 from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.by_class import Movers, join_classes, movers_of, split_classes, usual_score
@@ -18,16 +17,19 @@ from mcaptrack.transforms.retrack.kept_ids import KeptIds
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
 from mcaptrack.transforms.retrack.offline import offline_tracks
 from mcaptrack.transforms.retrack.options import ConsistencyOptions, LikelihoodOptions, RetrackOptions
-from mcaptrack.transforms.track_classes import vote
+from mcaptrack.transforms.retrack.samples import Samples
 
 Options = TypeVar("Options", bound=RetrackOptions)
 
 
 class OnlinePass(Protocol):
-    """Online re-tracking of one log: ``step`` for each frame, then ``outputs``; and what it leaves for ``offline``."""
+    """Online re-tracking of one log: ``step`` for each frame, then ``outputs``; and what it leaves for ``offline``.
+
+    It may hold for the whole log what the module ``samples`` says, and no rows.
+    """
 
     assignments: Assignments
-    samples: list[Rows]
+    samples: Samples
     steps: list[int]
 
     @property
@@ -39,7 +41,7 @@ class OnlinePass(Protocol):
         """One step."""
         ...
 
-    def outputs(self) -> list[tuple[Frame, Frame]]:
+    def outputs(self) -> Iterator[tuple[Frame, Frame]]:
         """For each step the online tracks and their predictions."""
         ...
 
@@ -98,29 +100,25 @@ def _retrack(
             online = frame._replace(rows=frame.rows[frame.rows["observed"]])
             yield frame, online, frame._replace(rows=forecaster.predict(frame))
         return
-    frames = list(frames)
+    frames = collect(TRACKS, frames)
     parts = [frames] if options.across_classes else split_classes(frames)
     score = usual_score(frames)
     runs = [_retrack_together(options, new_pass, part, score) for part in parts]
-    yield from runs[0] if len(runs) == 1 else join_classes(runs)
+    yield from runs[0] if len(runs) == 1 else join_classes(runs, tuple(options.writes.values()))
 
 
 def _retrack_together(
-    options: Options, new_pass: Callable[[Options, Movers], OnlinePass], frames: Sequence[Frame], score: float
+    options: Options, new_pass: Callable[[Options, Movers], OnlinePass], frames: FrameColumns, score: float
 ) -> Iterator[tuple[Frame, ...]]:
     """Re-track frames without regard to classes; ``score`` is the usual one of the log."""
     movers = movers_of(frames, options.class_names, score, options.class_limits)
     run: OnlinePass = KeptIds(options, movers) if movers.on_ground else new_pass(options, movers)
-    times_ns = []
     for frame in frames:
         run.step(frame)
-        times_ns.append(frame.t_ns)
     model = motion_model(options, run.noise_m, movers)
-    rows, step = offline_tracks(options, model, run.assignments, run.samples, run.steps, times_ns, movers)
-    vote(rows)
-    first, last = (np.searchsorted(step, run.steps, side) for side in ("left", "right"))
-    for (online, predictions), low, high in zip(run.outputs(), first.tolist(), last.tolist(), strict=True):
-        yield Frame(online.t_ns, online.index, rows[low:high]), online, predictions
+    tracks = offline_tracks(options, model, run.assignments, run.samples, run.steps, frames.t_ns, movers)
+    for frame, rows, (online, predictions) in zip(frames, tracks, run.outputs(), strict=True):
+        yield frame._replace(rows=rows), online, predictions
 
 
 _PAPER: Final = RetrackByConsistency(

@@ -1,0 +1,152 @@
+"""Rows of offline tracks: described by a few numbers each while tracks are decided about, then made part by part.
+
+Letters: C assignments, R rows, N samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.geometry.angles import wrapped
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.boxes import columns_to_boxes
+from mcaptrack.geometry.plane import Planes
+from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
+from mcaptrack.schema import Rows
+from mcaptrack.schema.framing import spans_of
+from mcaptrack.schema.resampling import ANGLES, LINEAR
+from mcaptrack.transforms.retrack.samples import Samples
+from mcaptrack.transforms.track_classes import vote
+
+
+class TrackRows(NamedTuple):
+    """Rows (R,) that are interpolated between samples.
+
+    Attributes
+    ----------
+    track, step : (R,) of int
+    before, after : (R,) of int
+        The samples of the track before and after the row; both are the row's own where it has one.
+    share : (R,) of float
+        How far the row is on the way between the two, from 0 to 1.
+    """
+
+    track: Ints
+    step: Ints
+    before: Ints
+    after: Ints
+    share: Floats
+
+    @classmethod
+    def of(cls, step: Ints, track: Ints, sample: Ints) -> TrackRows:
+        """A row for every step of every track from its first to its last; assignments (C,) are by track, then step."""
+        is_last = run_ends(run_starts(track))
+        count = np.where(is_last, 1, np.append(step[1:], 0)[: len(step)] - step)
+        before, within = group_index(count), ragged_range(0, count)
+        after = np.where(within > 0, before + 1, before)
+        return cls(track[before], step[before] + within, sample[before], sample[after], within / count[before])
+
+    @property
+    def is_sample(self) -> Bools:
+        """Whether each row is a sample, (R,), and not between two."""
+        return np.asarray(self.share == 0)
+
+    def between(self, values: NDArray[Any]) -> NDArray[Any]:
+        """A column of the samples (N,), linearly interpolated, (R,)."""
+        out = values[self.before]
+        out += self.share * (values[self.after] - out)
+        return out
+
+    def take(self, which: Bools | Ints | slice) -> TrackRows:
+        """Some of the rows."""
+        return TrackRows(*(part[which] for part in self))
+
+
+class Moved(NamedTuple):
+    """Where smoothing moves rows (R,) to: positions (R, 2) in m, and what is added to x_px and y_px, (R, 2), if any."""
+
+    xy_m: Floats
+    shift_px: Floats | None
+
+    def take(self, which: Ints) -> Moved:
+        """Those of some of the rows."""
+        return Moved(self.xy_m[which], None if self.shift_px is None else self.shift_px[which])
+
+
+def moved_to(xy_m: Floats, rows: TrackRows, samples: Samples, planes: Planes, t_ns: Ints) -> Moved:
+    """Move rows (R,) to positions (R, 2) in m, and their boxes with them if there is a ground plane at their times."""
+    if not planes:
+        return Moved(xy_m, None)
+    from_m, size = (
+        np.stack([rows.between(samples.column(name)) for name in names], axis=-1)
+        for names in (("x_m", "y_m"), ("w_px", "h_px"))
+    )
+    return Moved(xy_m, _shift(from_m, xy_m, size, planes, t_ns))
+
+
+def move_rows(rows: Rows, xy_m: Floats, planes: Planes, t_ns: Ints) -> Rows:
+    """Move rows (R,) to other positions (R, 2), and their boxes with them if there is a ground plane at their times."""
+    out = rows.copy()
+    if planes:
+        from_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
+        _add(out, _shift(from_m, xy_m, columns_to_boxes(rows)[:, 2:], planes, t_ns))
+    out["x_m"], out["y_m"] = xy_m.T
+    return out
+
+
+def _shift(from_m: Floats, to_m: Floats, size_px: Floats, planes: Planes, t_ns: Ints) -> Floats:
+    """How far in px boxes of this size move if they move between positions in m; all of them (R, 2)."""
+    out = np.zeros((len(from_m), 2))
+    which = np.maximum(np.searchsorted([since_ns for since_ns, _ in planes], t_ns, side="right") - 1, 0)
+    for number in np.unique(which).tolist():
+        plane, here = planes[number][1], which == number
+        size = size_px[here]
+        shift = plane.standing_boxes(to_m[here], size) - plane.standing_boxes(from_m[here], size)
+        out[here] = np.where(np.isfinite(shift), shift, 0.0)[:, :2]
+    return out
+
+
+def _add(rows: Rows, shift_px: Floats) -> None:
+    rows["x_px"] += shift_px[:, 0]
+    rows["y_px"] += shift_px[:, 1]
+
+
+def rows_by_step(rows: TrackRows, samples: Samples, moved: Moved | None, steps: Sequence[int]) -> Iterator[Rows]:
+    """The rows of tracks at each of ``steps``, ordered by id; each track has the class of most of its rows."""
+    order = np.lexsort((rows.track, rows.step))
+    rows, moved = rows.take(order), moved and moved.take(order)
+    ends = np.append(0, np.searchsorted(rows.step, steps, "right"))
+    known = np.empty(len(order), [("track_id", np.int64), ("class_id", np.uint32)])
+    known["track_id"], known["class_id"] = rows.track, samples.column("class_id")[rows.before]
+    vote(known)
+    for low, high in spans_of(ends):
+        here = slice(ends[low], ends[high])
+        part = _rows(rows.take(here), samples)
+        part["class_id"] = known["class_id"][here]
+        if moved is not None:
+            part["x_m"], part["y_m"] = moved.xy_m[here].T
+            if moved.shift_px is not None:
+                _add(part, moved.shift_px[here])
+        bounds = (ends[low : high + 1] - ends[low]).tolist()
+        yield from (part[start:end] for start, end in pairwise(bounds))
+
+
+def _rows(which: TrackRows, samples: Samples) -> Rows:
+    """Rows (R,) of tracks."""
+    before, is_sample = samples.take(which.before), which.is_sample
+    after, rows = before.copy(), before.copy()
+    after[~is_sample] = samples.take(which.after[~is_sample])
+    for name in LINEAR:
+        rows[name] += which.share * (after[name] - before[name])
+    for name in ANGLES:
+        step_rad = wrapped(after[name] - before[name])
+        rows[name] = np.where(is_sample, rows[name], wrapped(rows[name] + which.share * step_rad))
+    rows["source_id"] = np.where(is_sample, rows["track_id"], -1)
+    rows["observed"] &= is_sample
+    rows["track_id"] = which.track
+    return rows
