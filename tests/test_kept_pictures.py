@@ -66,7 +66,7 @@ def test_what_takes_too_much_memory_is_decoded_again(max_bytes, begun):
     check(list(kept))
     check(list(kept))
     assert decoder.begun == begun
-    assert sum(len(one.difference) for one in kept._kept) <= max_bytes
+    assert sum(one.difference.stored for one in kept._kept) <= max_bytes
 
 
 def test_a_reading_that_was_left_is_begun_again():

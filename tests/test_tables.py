@@ -27,6 +27,7 @@ from hypothesis import strategies as st
 from mcaptrack import tables
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import EVENTS, PREDICTIONS, SCHEMAS, TRACKS, Frame
+from mcaptrack.schema.frame_columns import collect
 from mcaptrack.tables import TABLES, Pointers
 from tests.strategies import columns
 from tests.worlds import ns, tracks_at
@@ -139,10 +140,10 @@ def test_rows_of_a_track_stand_together_and_the_file_says_in_which_order(tmp_pat
 
 @given(st.lists(st.integers(-(2**63), 2**63 - 1) | st.integers(-3, 70_000), max_size=40))
 def test_whole_numbers_are_ordered_as_a_stable_sort_does(values):
-    from mcaptrack.tables.build import _stable_order
+    from mcaptrack.tables.ordered import stable_order
 
     array = np.array(values, np.int64)
-    assert _stable_order(array).tolist() == np.argsort(array, kind="stable").tolist()
+    assert stable_order(array).tolist() == np.argsort(array, kind="stable").tolist()
 
 
 def test_columns_are_compressed_and_described_as_they_should_be(tmp_path):
@@ -274,7 +275,7 @@ def test_a_track_is_summed_up(tmp_path):
     for number in range(4):
         there = {who: path[number] for who, path in places.items() if path[number]}
         frames.append(Frame(ns(number / 2), 10 + number, tracks_at(there, observed=number != 1)))
-    first, second = tables.summary_table({"/a": tables.build.frames_to_part(TRACKS, frames)}).to_pylist()
+    first, second = tables.summary_table({"/a": collect(TRACKS, frames)}).to_pylist()
     assert (first["track_id"], first["rows"], first["path_m"], first["duration_s"]) == (1, 4, 6.0, 1.5)
     assert (first["mean_speed_m_s"], first["max_speed_m_s"]) == (4.0, 10.0)
     assert (first["first_t_ns"], first["last_t_ns"], first["first_frame"], first["last_frame"]) == (0, ns(1.5), 10, 13)
@@ -286,7 +287,7 @@ def test_a_track_is_summed_up(tmp_path):
 
 def test_a_track_without_positions_has_no_path_and_one_row_no_speed():
     rows = tracks_at({1: (np.nan, np.nan), 2: (5.0, 6.0)})
-    nowhere, once = tables.summary_table({"/a": tables.build.frames_to_part(TRACKS, [Frame(5, 0, rows)])}).to_pylist()
+    nowhere, once = tables.summary_table({"/a": collect(TRACKS, [Frame(5, 0, rows)])}).to_pylist()
     assert [nowhere[name] for name in ("path_m", "mean_speed_m_s", "max_speed_m_s", "first_x_m", "last_y_m")] == [
         None
     ] * 5
@@ -302,7 +303,7 @@ def test_summaries_are_what_duckdb_makes_of_the_rows(data):
     )
     frames = [Frame(ns(n), n, tracks_at(who)) for n, who in enumerate(data.draw(st.lists(people, max_size=8)))]
     rows = tables.rows_table(TRACKS, {"/a": frames})  # noqa: F841  # DuckDB finds it by name
-    summary = tables.summary_table({"/a": tables.build.frames_to_part(TRACKS, frames)})
+    summary = tables.summary_table({"/a": collect(TRACKS, frames)})
     wanted = duckdb.sql("""
         with known as (select *, lag(x_m) over w as px, lag(y_m) over w as py, lag(t_ns) over w as pt from rows
                        where x_m is not null and y_m is not null window w as (partition by track_id order by t_ns)),

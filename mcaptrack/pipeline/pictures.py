@@ -1,8 +1,8 @@
 """The pictures that a transform reads, decoded.
 
-Those that it reads twice are kept in memory in between, so that they are decoded once: the difference of each picture
-from the one before, compressed, because much of it is zero where a camera stands still, above all in a video. Pictures
-that take more than ``MAX_BYTES`` together aren't kept, but decoded again.
+Those that it reads twice are kept in a temporary file in between, so that they are decoded once: the difference of each
+picture from the one before, compressed, because much of it is zero where a camera stands still, above all in a video.
+Pictures that take more than ``MAX_BYTES`` together, or more room than there is, aren't kept, but decoded again.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from mcaptrack import log
+from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.schema import Frame
+from mcaptrack.schema.spill import SpillFile, Stored
 from mcaptrack.sources import foreign
 from mcaptrack.sources.video import EncodedPicture, decode_bgr, decode_gray
 from mcaptrack.transforms.protocol import traits_of
@@ -27,7 +29,7 @@ class _Kept(NamedTuple):
     t_ns: int
     index: int  # type: ignore[assignment]  # hides tuple.index, which is not needed here
     shape: tuple[int, ...]
-    difference: bytes
+    difference: Stored
 
 
 class KeptPictures:
@@ -40,8 +42,7 @@ class KeptPictures:
     read : callable
         Called for each picture that is read again without being decoded.
     max_bytes : int, optional
-        The memory that they may take; with 0 they are always decoded again.
-
+        The room that they may take in the file; with 0 they are always decoded again.
     """
 
     def __init__(
@@ -49,35 +50,35 @@ class KeptPictures:
     ) -> None:
         self._decoded, self._read, self._max_bytes = decoded, read, max_bytes
         self._kept: list[_Kept] = []
+        self._file = SpillFile()
         self._is_complete = False
 
     def __iter__(self) -> Iterator[Frame]:
         return self._again() if self._is_complete else self._first()
 
     def _first(self) -> Iterator[Frame]:
-        import lz4.block
-
-        kept: list[_Kept] = []
+        kept, file = list[_Kept](), SpillFile()
         left, before = self._max_bytes, np.zeros(0, np.uint8)
         for frame in self._decoded():
             if left > 0:
                 rows = frame.rows.copy()  # a transform may draw into its pictures
                 difference = rows - before if rows.shape == before.shape else rows
-                packed = lz4.block.compress(np.ascontiguousarray(difference), store_size=False)
-                before, left = rows, left - len(packed)
-                kept.append(_Kept(frame.t_ns, frame.index, rows.shape, packed))
+                try:
+                    there = file.put(np.ascontiguousarray(difference).data)
+                except McaptrackError:  # there is no room
+                    left = 0
+                else:
+                    before, left = rows, left - there.stored
+                    kept.append(_Kept(frame.t_ns, frame.index, rows.shape, there))
                 if left <= 0:
-                    kept.clear()
+                    kept, file = [], SpillFile()
             yield frame
-        self._kept, self._is_complete = kept, left > 0
+        self._kept, self._file, self._is_complete = kept, file, left > 0
 
     def _again(self) -> Iterator[Frame]:
-        import lz4.block
-
         before: Image = np.zeros(0, np.uint8)
-        for t_ns, index, shape, packed in self._kept:
-            size = int(np.prod(shape))
-            difference = np.frombuffer(lz4.block.decompress(packed, uncompressed_size=size), np.uint8).reshape(shape)
+        for t_ns, index, shape, there in self._kept:
+            difference = np.frombuffer(self._file.get(there), np.uint8).reshape(shape)
             before = before + difference if before.shape == shape else difference
             self._read()
             yield Frame(t_ns, index, before.copy())

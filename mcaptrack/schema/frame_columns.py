@@ -10,21 +10,18 @@ Letters: F frames, N rows, B blocks.
 
 from __future__ import annotations
 
-import os
-import tempfile
-import weakref
 from array import array
 from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Final, NamedTuple, overload
+from typing import Final, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.schema import Frame, Rows, Schema
+from mcaptrack.schema.spill import SpillFile, Stored
 
 #: The size of a block in bytes of rows.
 BLOCK_BYTES: Final = 2**20
@@ -33,59 +30,6 @@ _IN_MEMORY: Final = 4
 _CACHED: Final = 2
 #: A block ends after so many frames, even if they have few rows.
 _MOST_PARTS: Final = 4096
-
-
-class _Block(NamedTuple):
-    """Rows of a block: themselves, or their place and size in the file, and their size before compression."""
-
-    rows: Rows | None
-    at: int = 0
-    stored: int = 0
-    size: int = 0
-
-
-class _SpillFile:
-    """A temporary file without a name, made when it is needed, with blocks of compressed bytes."""
-
-    def __init__(self) -> None:
-        self._handle: int | None = None
-        self._end = 0
-
-    def put(self, data: bytes) -> _Block:
-        """Append bytes. Raises McaptrackError if there is no room for them."""
-        import lz4.block
-
-        packed = lz4.block.compress(data, store_size=False)
-        try:
-            if self._handle is None:
-                with tempfile.TemporaryFile(prefix="mcaptrack-") as file:
-                    self._handle = os.dup(file.fileno())
-                weakref.finalize(self, os.close, self._handle)
-            done = 0
-            while done < len(packed):
-                done += os.pwrite(self._handle, packed[done:], self._end + done)
-        except OSError as error:
-            raise McaptrackError(
-                f"{tempfile.gettempdir()} takes no more of what is computed ({error.strerror or error}), which needs "
-                "more room than memory; the variable TMPDIR names another folder"
-            ) from error
-        block = _Block(None, self._end, len(packed), len(data))
-        self._end += len(packed)
-        return block
-
-    def get(self, block: _Block) -> bytes:
-        """The bytes of a block."""
-        import lz4.block
-
-        assert self._handle is not None
-        packed = b""
-        while len(packed) < block.stored:
-            more = os.pread(self._handle, block.stored - len(packed), block.at + len(packed))
-            if not more:
-                raise McaptrackError(f"a temporary file in {tempfile.gettempdir()} was made shorter by another process")
-            packed += more
-        data: bytes = lz4.block.decompress(packed, uncompressed_size=block.size)
-        return data
 
 
 class FrameColumns(Sequence[Frame]):
@@ -102,8 +46,9 @@ class FrameColumns(Sequence[Frame]):
         The rows of frame f are ``ends[f]`` to ``ends[f + 1]``.
     first : sequence of int
         The first frame of each block, and the number of frames.
-    blocks : sequence of _Block
-    file : _SpillFile
+    blocks : sequence of Rows or Stored
+        Rows in memory, or their place in the file.
+    file : SpillFile
         The file with the blocks that are not in memory.
     """
 
@@ -114,8 +59,8 @@ class FrameColumns(Sequence[Frame]):
         numbers: Ints,
         ends: Ints,
         first: Sequence[int],
-        blocks: Sequence[_Block],
-        file: _SpillFile,
+        blocks: Sequence[Rows | Stored],
+        file: SpillFile,
     ) -> None:
         self.schema, self.t_ns, self.numbers, self.ends = schema, t_ns, numbers, ends
         self._first, self._blocks, self._file = first, blocks, file
@@ -188,8 +133,8 @@ class FrameColumns(Sequence[Frame]):
 
     def _rows(self, number: int) -> Rows:
         block = self._blocks[number]
-        if block.rows is not None:
-            return block.rows
+        if not isinstance(block, Stored):
+            return block
         rows = self._read.pop(number, None)
         if rows is None:
             rows = np.frombuffer(self._file.get(block), self.schema.dtype)
@@ -213,8 +158,8 @@ class FrameCollector:
         self._t_ns, self._index, self._counts = array("q"), array("q"), array("q")
         self._open: list[Rows] = []
         self._size = 0
-        self._first, self._blocks = [0], list[_Block]()
-        self._file = _SpillFile()
+        self._first, self._blocks = [0], list[Rows | Stored]()
+        self._file = SpillFile()
 
     def append(self, frame: Frame) -> None:
         """Add a frame. Raises ValueError if its rows have other columns."""
@@ -282,7 +227,7 @@ class FrameCollector:
         self._first.append(len(self._t_ns))
         if len(self._blocks) < _IN_MEMORY:
             rows.flags.writeable = False
-            self._blocks.append(_Block(rows))
+            self._blocks.append(rows)
         else:
             self._blocks.append(self._file.put(rows.tobytes()))
 

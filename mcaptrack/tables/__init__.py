@@ -2,6 +2,7 @@
 
 TABLES                               all tables with their columns
 rows_table(schema, channels)         rows -> Arrow; missing numbers are null in tables and NaN in rows
+rows_in_pieces(schema, channels)     the same in pieces, for as many rows as there are
 write(path, table, provenance)       Arrow -> Parquet, Arrow IPC, CSV or JSON lines
 verify(path)                         check that a file holds what was written
 join(parts)                          the same table of several logs as one
@@ -10,17 +11,11 @@ read_tracks(path), read_columns(...) files -> arrays and frames, also of files f
 """
 
 from mcaptrack.tables.build import (
-    Part,
     Pointers,
-    TrackNames,
     columns_of,
     frames_table,
-    frames_to_part,
-    names_by_track,
     records_table,
     rows_of_topic,
-    rows_table,
-    summary_table,
     table_of,
     table_to_array,
     table_to_frames,
@@ -30,8 +25,10 @@ from mcaptrack.tables.fields import RECORDING, TABLE_VERSION, TABLES, Field, Tab
 from mcaptrack.tables.files import FORMATS, Format, file_metadata, verify, write
 from mcaptrack.tables.join import join
 from mcaptrack.tables.messages import messages_table
+from mcaptrack.tables.pieces import TablePieces
 from mcaptrack.tables.read import holds_tracks, read_columns, read_tracks
 from mcaptrack.tables.results import ANSWERS, cells, pieces, tidy, write_answer
+from mcaptrack.tables.rows import TrackNames, names_by_track, rows_in_pieces, rows_table, summary_table
 
 __all__ = [
     "ANSWERS",
@@ -41,15 +38,14 @@ __all__ = [
     "TABLE_VERSION",
     "Field",
     "Format",
-    "Part",
     "Pointers",
     "Table",
+    "TablePieces",
     "TrackNames",
     "cells",
     "columns_of",
     "file_metadata",
     "frames_table",
-    "frames_to_part",
     "holds_tracks",
     "join",
     "messages_table",
@@ -58,6 +54,7 @@ __all__ = [
     "read_columns",
     "read_tracks",
     "records_table",
+    "rows_in_pieces",
     "rows_of_topic",
     "rows_table",
     "summary_table",

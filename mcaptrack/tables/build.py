@@ -1,36 +1,21 @@
 """Arrays and records -> Arrow tables with the columns of ``fields``, and back.
 
-Letters: N rows, M messages.
+Letters: M messages.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.arrays import Floats, Ints
-from mcaptrack.geometry.ragged import group_index
-from mcaptrack.schema import Frame, Rows, Schema
-from mcaptrack.schema.classes import PERSON, majority
+from mcaptrack.geometry.arrays import Ints
+from mcaptrack.schema import Frame, Schema
 from mcaptrack.schema.framing import split_rows
-from mcaptrack.tables.fields import CLASS, RECORDING, TABLES, Table
-
-_BITS: Final = 16
-#: The name of people where a channel names no classes.
-_PERSON: Final = "person"
-
-
-class Part(NamedTuple):
-    """The rows of one channel (N,), and the time, frame and number of rows of each message (M,)."""
-
-    rows: Rows
-    t_ns: Ints
-    frame: Ints
-    counts: Ints
+from mcaptrack.tables.fields import RECORDING, TABLES, Table
 
 
 class Pointers(NamedTuple):
@@ -47,134 +32,13 @@ class Pointers(NamedTuple):
     message_offset: Ints
 
 
-def frames_to_part(schema: Schema, frames: Sequence[Frame]) -> Part:
-    """Frames as the arrays from which tables are made."""
-    t_ns, index = (np.array([getattr(frame, name) for frame in frames], np.int64) for name in ("t_ns", "index"))
-    counts = np.array([len(frame.rows) for frame in frames], np.int64)
-    return Part(np.concatenate([schema.empty(), *(frame.rows for frame in frames)]), t_ns, index, counts)
-
-
 def table_of(schema: Schema) -> Table:
     """The table for rows of a schema."""
     return next(table for table in TABLES.values() if table.rows_of is schema)
 
 
-class TrackNames(NamedTuple):
-    """The names of the classes of tracks by their ids: of the tracks that rows are about, and of the ground truth."""
-
-    tracks: Mapping[int, str] = {}
-    truth: Mapping[int, str] = {}
-
-
-def rows_table(
-    schema: Schema,
-    channels: Mapping[str, Part | Sequence[Frame]],
-    names: Mapping[str, Mapping[int, str]] = {},
-    of_tracks: Mapping[str, TrackNames] = {},
-) -> Any:
-    """All rows of channels of one schema as an Arrow table, in the table's order; missing numbers are null.
-
-    ``names`` are the names of classes by their number, for each channel that names any; ``of_tracks`` those of tracks,
-    for each channel with rows about tracks of another one.
-    """
-    import pyarrow as pa
-
-    table = table_of(schema)
-    members = {
-        topic: part if isinstance(part, tuple) else frames_to_part(schema, part)
-        for topic, part in sorted(channels.items())
-    }
-    pieces = [_rows_of(schema, table, Part(*part)) for part in members.values()]
-    own = [field.name for field in table.arrow if field.name not in ("topic", CLASS.name)]
-    columns = {name: pa.chunked_array([piece[name] for piece in pieces], table.arrow.field(name).type) for name in own}
-    if table.is_of_tracks():
-        columns[CLASS.name] = _names_of_tracks(pieces, [of_tracks.get(topic, TrackNames()) for topic in members])
-    elif CLASS.name in table.arrow.names:
-        ids = [np.asarray(piece["class_id"]) for piece in pieces]
-        columns[CLASS.name] = _class_column(ids, [names.get(topic, {}) for topic in members])
-    columns["topic"] = _repeated(list(members), [len(part[0]) for part in members.values()])
-    return pa.table([columns[field.name] for field in table.arrow], schema=table.arrow)
-
-
-def names_by_track(rows: Rows, names: Mapping[int, str]) -> dict[int, str]:
-    """The names of the classes of tracks by id, as far as they have one; ``names`` are those of classes by number."""
-    ids, track = np.unique(rows["track_id"].astype(np.int64), return_inverse=True)
-    known = {PERSON: _PERSON, **names}
-    classes = majority(track, rows["class_id"], len(ids)).tolist()
-    return {one: known[of] for one, of in zip(ids.tolist(), classes, strict=True) if of in known}
-
-
-def _names_of_tracks(pieces: Sequence[Mapping[str, Any]], names: Sequence[TrackNames]) -> Any:
-    """The names of the classes of tracks as an Arrow dictionary; for rows without a track, of the ground truth."""
-    words: dict[str, int] = {}
-    codes = []
-    for piece, known in zip(pieces, names, strict=True):
-        ids = np.asarray(piece["track_id"])
-        code = _codes(ids, known.tracks, words)
-        if "truth_id" in piece:
-            code = np.where(ids >= 0, code, _codes(np.asarray(piece["truth_id"]), known.truth, words))
-        codes.append(code)
-    return _dictionary(codes, words)
-
-
-def _class_column(ids: Sequence[NDArray[Any]], names: Sequence[Mapping[int, str]]) -> Any:
-    """The names of classes as an Arrow dictionary; ``ids`` and ``names`` are those of each channel."""
-    words: dict[str, int] = {}
-    known = {PERSON: _PERSON}
-    parts = zip(ids, names, strict=True)
-    return _dictionary([_codes(some, {**known, **of_channel}, words) for some, of_channel in parts], words)
-
-
-def _codes(numbers: NDArray[Any], names: Mapping[int, str], words: dict[str, int]) -> NDArray[np.int32]:
-    """The places of names in ``words``, to which new ones are added; -1 for numbers without a name."""
-    there, which = np.unique(numbers, return_inverse=True)
-    called = [names.get(number) for number in there.tolist()]
-    of = [-1 if name is None else words.setdefault(name, len(words)) for name in called]
-    return np.array(of, np.int32)[which]
-
-
-def _dictionary(codes: Sequence[NDArray[np.int32]], words: Mapping[str, int]) -> Any:
-    """Names as an Arrow dictionary; null for -1."""
-    import pyarrow as pa
-
-    joined = np.concatenate([np.empty(0, np.int32), *codes])
-    return pa.DictionaryArray.from_arrays(pa.array(joined, mask=joined < 0), pa.array(list(words), pa.string()))
-
-
-def _rows_of(schema: Schema, table: Table, part: Part) -> dict[str, Any]:
-    """The columns of one channel, except its topic."""
-    import pyarrow as pa
-
-    message = group_index(part.counts)
-    rows, order = part.rows, None
-    if "track_id" in table.order:
-        order = _stable_order(rows["track_id"])
-        message = message[order]
-    t_ns = part.t_ns[message]
-    number = np.arange(len(rows)) if order is None else order
-    out = {"frame": pa.array(part.frame[message]), "t": _times(t_ns), "t_ns": pa.array(t_ns), "row": pa.array(number)}
-    for column in schema.columns:
-        values = np.ascontiguousarray(rows[column.name]) if order is None else rows[column.name][order]
-        missing = np.isnan(values) if column.is_nullable else None
-        out[column.name] = pa.array(values, mask=missing if missing is not None and missing.any() else None)
-    return out
-
-
-def _stable_order(values: NDArray[Any]) -> Ints:
-    """A stable argsort of whole numbers, 16 bits at a time, for which NumPy uses radix sort."""
-    if len(values) == 0:
-        return np.empty(0, np.int64)
-    low, high = int(values.min()), int(values.max())
-    order = np.arange(len(values))
-    rest = values.astype(np.uint64) - np.uint64(low % 2**64)
-    for shift in range(0, max((high - low).bit_length(), 1), _BITS):
-        digit = (rest >> np.uint64(shift)).astype(np.uint16)
-        order = order[np.argsort(digit[order], kind="stable")]
-    return order
-
-
-def frames_table(channels: Mapping[str, Pointers]) -> Any:
-    """The table ``frames`` of channels, by topic."""
+def frames_table(channels: Mapping[str, Pointers], names: Sequence[str] = ()) -> Any:
+    """The table ``frames`` of channels, by topic; for a part of it, ``names`` are those of all topics and files."""
     import pyarrow as pa
 
     parts = dict(sorted(channels.items()))
@@ -186,93 +50,16 @@ def frames_table(channels: Mapping[str, Pointers]) -> Any:
     t_ns, rows, chunk = joined("t_ns"), joined("rows"), joined("chunk_offset")
     schema = TABLES["frames"].arrow
     columns = {
-        "topic": _repeated(list(parts), counts),
+        "topic": repeated(list(parts), counts, names),
         "frame": pa.array(joined("frame")),
-        "t": _times(t_ns),
+        "t": times(t_ns),
         "t_ns": pa.array(t_ns),
         "rows": pa.array(rows, mask=rows < 0),
-        "file": _repeated([part.file for part in parts.values()], counts),
+        "file": repeated([part.file for part in parts.values()], counts, names),
         "chunk_offset": pa.array(chunk, mask=chunk < 0),
         "message_offset": pa.array(joined("message_offset")),
     }
     return pa.table([columns[name] for name in schema.names], schema=schema)
-
-
-def summary_table(channels: Mapping[str, Part], names: Mapping[str, Mapping[int, str]] = {}) -> Any:
-    """The table ``track_summary`` of channels of tracks; ``names`` as in ``rows_table``."""
-    import pyarrow as pa
-
-    table = TABLES["track_summary"]
-    parts = {topic: _summary(part) for topic, part in sorted(channels.items())}
-    columns = {}
-    for field in table.fields[1:]:
-        if field is CLASS:
-            continue
-        values = np.concatenate([part[field.name] for part in parts.values()]) if parts else np.empty(0)
-        if field.kind == "time":
-            columns[field.name] = _times(values.astype(np.int64))
-            continue
-        missing = np.isnan(values) if field.nullable else None
-        columns[field.name] = pa.array(values, table.arrow.field(field.name).type, mask=missing)
-    columns["topic"] = _repeated(list(parts), [len(part["rows"]) for part in parts.values()])
-    ids = [part["class_id"] for part in parts.values()]
-    columns[CLASS.name] = _class_column(ids, [names.get(topic, {}) for topic in parts])
-    return pa.table([columns[name] for name in table.arrow.names], schema=table.arrow)
-
-
-def _summary(part: Part) -> dict[str, NDArray[Any]]:
-    """One row for each track of a channel."""
-    order = _stable_order(part.rows["track_id"])
-    rows = part.rows[order]
-    message = group_index(part.counts)[order]
-    t_ns, frame = part.t_ns[message], part.frame[message]
-    ids, first, count = np.unique(rows["track_id"], return_index=True, return_counts=True)
-    last = first + count - 1
-    out: dict[str, NDArray[Any]] = {"track_id": ids, "rows": count}
-    for name, at in (("first", first), ("last", last)):
-        out |= {f"{name}_t_ns": t_ns[at], f"{name}_t": t_ns[at], f"{name}_frame": frame[at]}
-    out["duration_s"] = (t_ns[last] - t_ns[first]) / 1e9
-    track = group_index(count)
-    share = np.bincount(track, rows["observed"], len(ids))
-    out["class_id"] = majority(track, rows["class_id"], len(ids))
-    out["observed_share"] = share / np.maximum(count, 1)
-    place = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
-    out |= _motion(place, t_ns, track, len(ids))
-    for unit in ("m", "px"):
-        ends = _ends(np.isfinite(rows[f"x_{unit}"]) & np.isfinite(rows[f"y_{unit}"]), first, last)
-        for name, at in zip(("first", "last"), ends, strict=True):
-            for axis in "xy":
-                found = rows[f"{axis}_{unit}"][at] if len(rows) else np.empty(0)
-                out[f"{name}_{axis}_{unit}"] = np.where(at < 0, np.nan, found)
-    return out
-
-
-def _motion(place: Floats, t_ns: Ints, track: Ints, tracks: int) -> dict[str, Floats]:
-    """Path and speeds of tracks over their known positions; NaN for a track without any."""
-    known = np.isfinite(place).all(axis=1)
-    place, t_ns, track = place[known], t_ns[known], track[known]
-    same = track[1:] == track[:-1]
-    step_m = np.hypot(*(place[1:] - place[:-1]).T)[same]
-    step_s, of = (t_ns[1:] - t_ns[:-1])[same] / 1e9, track[1:][same]
-    has = np.bincount(track, minlength=tracks) > 0
-    path = np.where(has, np.bincount(of, step_m, tracks), np.nan)
-    passed = np.bincount(of, step_s, tracks)
-    fastest = np.full(tracks, -1.0)
-    moving = step_s > 0
-    np.maximum.at(fastest, of[moving], step_m[moving] / step_s[moving])
-    mean = np.divide(path, passed, out=np.full(tracks, np.nan), where=passed > 0)
-    return {"path_m": path, "mean_speed_m_s": mean, "max_speed_m_s": np.where(fastest < 0, np.nan, fastest)}
-
-
-def _ends(known: NDArray[np.bool_], first: Ints, last: Ints) -> tuple[Ints, Ints]:
-    """The first and last known position between ``first`` and ``last`` of each track; -1 if there is none."""
-    at = np.flatnonzero(known)
-    if len(at) == 0:
-        return np.full(len(first), -1), np.full(len(first), -1)
-    low = np.searchsorted(at, first)
-    high = np.searchsorted(at, last, "right") - 1
-    none = low > high
-    return tuple(np.where(none, -1, at[np.clip(end, 0, len(at) - 1)]) for end in (low, high))  # type: ignore[return-value]
 
 
 def records_table(table: Table, records: Sequence[Mapping[str, Any]]) -> Any:
@@ -293,7 +80,7 @@ def records_table(table: Table, records: Sequence[Mapping[str, Any]]) -> Any:
 
 def with_recording(table: Any, recording: str) -> Any:
     """The table with the column ``recording`` that reading a folder adds, also at the end."""
-    return table.append_column(RECORDING.arrow, _repeated([recording], [table.num_rows]))
+    return table.append_column(RECORDING.arrow, repeated([recording], [table.num_rows]))
 
 
 def rows_of_topic(table: Any, topic: str) -> Any:
@@ -364,17 +151,18 @@ def table_to_frames(schema: Schema, rows: Any, frames: Any, topic: str) -> list[
     return split_rows(times, numbers, members, np.cumsum(counts))
 
 
-def _repeated(names: Sequence[str], counts: Sequence[int]) -> Any:
-    """Each name, repeated by its count, as an Arrow dictionary."""
+def repeated(names: Sequence[str], counts: Sequence[int], among: Sequence[str] = ()) -> Any:
+    """Each name, repeated by its count, as an Arrow dictionary; ``among`` are all names that it has, if more."""
     import pyarrow as pa
 
-    different = list(dict.fromkeys(names))
+    different = list(dict.fromkeys(among or names))
     numbers = np.array([different.index(name) for name in names], np.int32)
     at = np.repeat(numbers, np.array(counts, np.int64))
     return pa.DictionaryArray.from_arrays(pa.array(at, pa.int32()), pa.array(different, pa.string()))
 
 
-def _times(t_ns: Ints) -> Any:
+def times(t_ns: Ints) -> Any:
+    """Times in ns as an Arrow array of times in UTC."""
     import pyarrow as pa
 
     return pa.array(t_ns).cast(pa.timestamp("ns", tz="UTC"))

@@ -18,13 +18,13 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish
 from mcaptrack.tables.fields import TABLE_VERSION
+from mcaptrack.tables.pieces import PIECE_ROWS, pieces_of
 
 Format = Literal["parquet", "arrow", "csv", "jsonl"]
 FORMATS: Final[tuple[Format, ...]] = get_args(Format)
 #: Formats with metadata, by which a file can be found up to date.
 _DESCRIBED: Final = ("parquet", "arrow")
 
-_ROW_GROUP: Final = 128 * 1024
 _ZSTD_LEVEL: Final = 1  # higher levels hardly make floats that are split by byte smaller
 _PREFIX: Final = "mcaptrack."
 
@@ -37,51 +37,53 @@ def write(
     form: Format = "parquet",
     force: bool = False,
 ) -> bool:
-    """Write an Arrow table; the file appears when it is complete and reads back identically. Returns whether it was
-    written.
+    """Write a table; the file appears when it is complete and reads back identically. Returns whether it was written.
 
-    ``provenance`` goes into the metadata, ``order`` names the columns by which rows are sorted. A file with the same
-    content and metadata is left as it is, unless ``force``. Raises McaptrackError if the file can't be written.
+    ``table`` is an Arrow table or ``TablePieces``; these are written piece by piece. ``provenance`` goes into the
+    metadata, ``order`` names the columns by which rows are sorted. A file with the same content and metadata is left as
+    it is, unless ``force``. Raises McaptrackError if the file can't be written.
     """
     words = {"table_version": TABLE_VERSION} | dict(provenance)
-    with ThreadPoolExecutor(1) as worker:  # computes the digest while the file is written
-        content = worker.submit(digest, table.schema, _pieces(table))
-        if form in _DESCRIBED and not force:
-            known = file_metadata(path, form)
-            if known is not None and _same(known, words | {"digest": content.result()}):
-                return False
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with publish(path) as part:
-                if form == "parquet":
-                    _write_parquet(part, table, words, order, content)
-                elif form == "arrow":
-                    _write_arrow(part, table, words | {"digest": content.result()})
-                else:
-                    from mcaptrack.tables import text
+    if form in _DESCRIBED and not force:
+        known = file_metadata(path, form)
+        may_stay = known is not None and _describes(known, words)
+        if may_stay and digest(table.schema, pieces_of(table)) == (known or {}).get("digest"):
+            return False
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with publish(path) as part:
+            if form == "parquet":
+                _write_parquet(part, table, words, order)
+            elif form == "arrow":
+                _write_arrow(part, table, words | {"digest": digest(table.schema, pieces_of(table))})
+            else:
+                from mcaptrack.tables import text
 
-                    text.write(part, table, form)
-                try:
-                    found = verify(part, form) if form in _DESCRIBED else table.num_rows
-                except McaptrackError:
-                    found = -1
-                if found != table.num_rows:
-                    raise McaptrackError(
-                        f"{path} can't be written: what was written does not read back the same; the disk or the "
-                        "memory of this machine may be at fault"
-                    )
-        except OSError as error:
-            raise McaptrackError(f"{path} can't be written: {error.strerror or error}") from error
+                text.write(part, pieces_of(table), form)
+            try:
+                found = verify(part, form) if form in _DESCRIBED else table.num_rows
+            except McaptrackError:
+                found = -1
+            if found != table.num_rows:
+                raise McaptrackError(
+                    f"{path} can't be written: what was written does not read back the same; the disk or the "
+                    "memory of this machine may be at fault"
+                )
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be written: {error.strerror or error}") from error
     return True
 
 
-def _same(known: Mapping[str, str], words: Mapping[str, str]) -> bool:
-    """Whether metadata are the same, apart from the source, which may change while the content does not."""
-    return {**known, "source": ""} == {**words, "source": ""}
+def _describes(known: Mapping[str, str], words: Mapping[str, str]) -> bool:
+    """Whether metadata are those, apart from the source, which may change while the content does not."""
+    apart = {"source": "", "digest": ""}
+    return {**known, **apart} == {**words, **apart}
 
 
-def _write_parquet(part: Path, table: Any, words: Mapping[str, str], order: Sequence[str], content: Any) -> None:
+def _write_parquet(part: Path, table: Any, words: Mapping[str, str], order: Sequence[str]) -> None:
     import pyarrow.parquet as pq
+
+    content = _TableDigest(table.schema)
 
     metadata = {_PREFIX + key: value for key, value in words.items()}
     ways = [(name, "ascending") for name in order]
@@ -97,8 +99,12 @@ def _write_parquet(part: Path, table: Any, words: Mapping[str, str], order: Sequ
             store_schema=True,
             **_encodings(table.schema),
         )
-        writer.write_table(table, row_group_size=_ROW_GROUP)
-        writer.add_key_value_metadata({_PREFIX + "digest": content.result()})
+        with ThreadPoolExecutor(1) as worker:  # computes the digest while the file is written
+            for piece in pieces_of(table):
+                added = worker.submit(content.add, piece)
+                writer.write_table(piece, row_group_size=PIECE_ROWS)
+                added.result()
+        writer.add_key_value_metadata({_PREFIX + "digest": content.hexdigest()})
         # Not in a finally: closing writes the footer, which would make half a table look complete.
         writer.close()
 
@@ -124,7 +130,8 @@ def _write_arrow(part: Path, table: Any, words: Mapping[str, str]) -> None:
     schema = table.schema.with_metadata({_PREFIX + key: value for key, value in words.items()})
     options = pa.ipc.IpcWriteOptions(compression="zstd", unify_dictionaries=True)
     with part.open("xb") as stream, pa.ipc.new_file(stream, schema, options=options) as writer:
-        writer.write_table(table.combine_chunks())
+        for piece in pieces_of(table):
+            writer.write_table(piece.combine_chunks())
 
 
 def file_metadata(path: Path, form: Format) -> dict[str, str] | None:
@@ -169,8 +176,10 @@ def verify(path: Path, form: Format = "parquet") -> int:
                 found = digest(file.schema_arrow, counted(groups))
         else:
             with path.open("rb") as stream:
-                table = pa.ipc.open_file(stream).read_all()
-            found = digest(table.schema, counted(_pieces(table)))
+                reader = pa.ipc.open_file(stream)
+                batches = (reader.get_batch(number) for number in range(reader.num_record_batches))
+                tables = (pa.Table.from_batches([batch]) for batch in batches)
+                found = digest(reader.schema, counted(tables))
     except (OSError, pa.ArrowException) as error:
         raise McaptrackError(f"{path} can't be read back: {str(error).splitlines()[0]}") from None
     if found != stored:
@@ -178,25 +187,33 @@ def verify(path: Path, form: Format = "parquet") -> int:
     return rows[0]
 
 
-def _pieces(table: Any) -> Iterator[Any]:
-    """A table in slices, so that it is never copied as a whole."""
-    for start in range(0, table.num_rows, _ROW_GROUP):
-        yield table.slice(start, _ROW_GROUP)
-
-
 def digest(schema: Any, pieces: Iterable[Any]) -> str:
-    """SHA-256 of the content of a table: names, types and values, independent of slices."""
-    columns = [_ColumnDigest() for _ in schema]
-    start = 0
+    """SHA-256 of the content of a table: names, types and values, independent of pieces."""
+    total = _TableDigest(schema)
     for piece in pieces:
-        for column, values in zip(columns, piece.columns, strict=True):
+        total.add(piece)
+    return total.hexdigest()
+
+
+class _TableDigest:
+    """The digest of a table: ``add`` its pieces."""
+
+    def __init__(self, schema: Any) -> None:
+        self._schema, self._columns, self._rows = schema, [_ColumnDigest() for _ in schema], 0
+
+    def add(self, piece: Any) -> None:
+        """Add the next rows, an Arrow table."""
+        for column, values in zip(self._columns, piece.columns, strict=True):
             for chunk in values.chunks:
                 column.add(chunk)
-        start += piece.num_rows
-    total = hashlib.sha256(start.to_bytes(8, "little"))
-    for field, column in zip(schema, columns, strict=True):
-        total.update(f"{field.name}\0{_kind(field.type)}\0{column.digest()}\0".encode())
-    return total.hexdigest()
+        self._rows += piece.num_rows
+
+    def hexdigest(self) -> str:
+        """The digest of all added rows."""
+        total = hashlib.sha256(self._rows.to_bytes(8, "little"))
+        for field, column in zip(self._schema, self._columns, strict=True):
+            total.update(f"{field.name}\0{_kind(field.type)}\0{column.digest()}\0".encode())
+        return total.hexdigest()
 
 
 def _kind(kind: Any) -> str:

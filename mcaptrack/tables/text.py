@@ -10,7 +10,7 @@ import hashlib
 import io
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -18,13 +18,14 @@ from typing import Any
 _PIECE = 16_384
 
 
-def write(path: Path, table: Any, form: str) -> None:
-    """Write a table as "csv" or "jsonl". Raises RuntimeError if it does not read back identically."""
+def write(path: Path, pieces: Iterable[Any], form: str) -> None:
+    """Write a table in pieces as "csv" or "jsonl". Raises RuntimeError if it does not read back identically."""
     written = hashlib.sha256()
     with path.open("xb") as stream:
-        for piece in csv(table) if form == "csv" else json_lines(table):
-            written.update(piece)
-            stream.write(piece)
+        for number, table in enumerate(pieces):
+            for piece in csv(table, has_header=number == 0) if form == "csv" else json_lines(table):
+                written.update(piece)
+                stream.write(piece)
     with path.open("rb") as stream:
         found = hashlib.file_digest(stream, "sha256").hexdigest()
     if found != written.hexdigest():
@@ -37,8 +38,8 @@ def json_lines(table: Any) -> Iterator[bytes]:
         yield (json.dumps(row, ensure_ascii=False, allow_nan=False) + "\n").encode("utf-8")
 
 
-def csv(table: Any) -> Iterator[bytes]:
-    """A table as CSV, with a header."""
+def csv(table: Any, has_header: bool = True) -> Iterator[bytes]:
+    """A table as CSV, by default with a header."""
     import pyarrow as pa
     from pyarrow.csv import WriteOptions, write_csv
 
@@ -52,7 +53,7 @@ def csv(table: Any) -> Iterator[bytes]:
             table = table.set_column(number, field.name, pa.array(words, pa.string()))
     for start in range(0, max(table.num_rows, 1), _PIECE):
         piece = io.BytesIO()
-        write_csv(table.slice(start, _PIECE), piece, WriteOptions(include_header=start == 0))
+        write_csv(table.slice(start, _PIECE), piece, WriteOptions(include_header=has_header and start == 0))
         yield piece.getvalue()
 
 

@@ -92,13 +92,6 @@ def timed(calls: dict[str, Callable[[], object]]) -> dict[str, float]:
     return best
 
 
-class Nothing:
-    """In place of a digest, where writing alone is timed."""
-
-    def result(self) -> str:
-        return ""
-
-
 def write_all(folder: Path, parts: Iterable[Part]) -> None:
     """Write logs in all ways, and print what that took."""
     order = tables.TABLES["tracks"].order
@@ -121,7 +114,7 @@ def write_all(folder: Path, parts: Iterable[Part]) -> None:
 
         def alone(path: Path = paths["alone"], table: Any = by_track) -> None:
             path.unlink(missing_ok=True)
-            files._write_parquet(path, table, {}, order, Nothing())
+            files._write_parquet(path, table, {}, order)
 
         calls = {
             "alone": alone,

@@ -136,7 +136,7 @@ class _Job:
         words = {"lineage": self.contents.lineage(name), "source": self.contents.source(name)}
         path = self.path(name)
         if not self._stands(name, path, words["source"]):
-            made = self.contents.table(name)
+            made = self.contents.pieces(name)
             note = self.contents.notes.get(name)
             self._write(name, path, made, words | ({"note": note} if note else {}), TABLES[name].order)
             self.done.notes += [f"{name}: {note}"] if note else []
@@ -171,7 +171,7 @@ class _Job:
         return True
 
     def _write(self, name: str, path: Path, made: object, words: dict[str, str], order: Sequence[str]) -> None:
-        rows = made.num_rows  # type: ignore[attr-defined]  # an Arrow table, which only tables knows
+        rows = made.num_rows  # type: ignore[attr-defined]  # a table, which only tables knows
         words |= {"version": __version__, "recording": file_name(self.contents.opened.path), "rows": str(rows)}
         if tables.write(path, made, words, order, self.form, self.force):
             self.done.written.append(name)

@@ -12,14 +12,15 @@ import numpy as np
 from mcaptrack import __version__, evaluation, log, tables
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import LAST_NS
-from mcaptrack.schema import DETECTIONS
+from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.schema.classes import class_names
+from mcaptrack.schema.frame_columns import FrameColumns, collect
 from mcaptrack.schema.provenance import Provenance, input_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import Camera, cameras, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead, holds_boxes, holds_boxes_3d
 from mcaptrack.sources.foreign.flatten import flattener, message_type_of
-from mcaptrack.tables import TABLES, Part, Pointers, TrackNames
+from mcaptrack.tables import TABLES, Pointers, TablePieces, TrackNames
 from mcaptrack.tables.export.names import file_name, recording_name
 
 #: Tables about the places of messages, or about the whole log.
@@ -27,28 +28,33 @@ _OF_THE_WHOLE: Final = ("frames", "channels", "recordings")
 
 
 class LogTables:
-    """The tables of a log. Rows are read once and kept, because several tables are made of them."""
+    """The tables of a log. Rows are read once and kept as columns, because several tables are made of them."""
 
     def __init__(self, opened: log.Log, boxes: BoxesRead | None = None) -> None:
         self.opened = opened
         self._boxes_read = boxes or BoxesRead()
         self.recording = recording_name(opened.path)
-        self._parts: dict[str, Part] = {}
+        self._kept: dict[str, FrameColumns] = {}
         self._class_names: dict[str, dict[int, str]] = {}
         #: Notes about tables, by name.
         self.notes: dict[str, str] = {}
 
     def table(self, name: str) -> Any:
         """One of ``TABLES`` as Arrow, without the column ``recording``."""
+        made = self.pieces(name)
+        return made.table() if isinstance(made, TablePieces) else made
+
+    def pieces(self, name: str) -> Any:
+        """The same; a table with many rows as ``TablePieces``, which are made while they are read."""
         table = TABLES[name]
         if table.rows_of is not None:
-            parts = {topic: self._part(topic) for topic in self.topics(name)}
-            of_tracks = {topic: self._track_names(topic) for topic in parts} if table.is_of_tracks() else {}
-            return tables.rows_table(table.rows_of, parts, self._class_names, of_tracks)
+            channels = {topic: self._frames(topic) for topic in self.topics(name)}
+            of_tracks = {topic: self._track_names(topic) for topic in channels} if table.is_of_tracks() else {}
+            return tables.rows_in_pieces(table.rows_of, channels, self._class_names, of_tracks)
         made: Mapping[str, Callable[[], Any]] = {
-            "frames": lambda: tables.frames_table({topic: self._pointers(topic) for topic in self.topics("frames")}),
+            "frames": self._places,
             "track_summary": lambda: tables.summary_table(
-                {topic: self._part(topic) for topic in self.topics("tracks")}, self._class_names
+                {topic: self._frames(topic) for topic in self.topics("tracks")}, self._class_names
             ),
             "metrics": lambda: tables.records_table(table, sorted(self._scores(), key=_order_of_scores)),
             "channels": lambda: tables.records_table(
@@ -131,29 +137,39 @@ class LogTables:
 
     # Parts of tables
 
-    def _part(self, topic: str) -> Part:
-        if topic not in self._parts:
+    def _places(self) -> TablePieces:
+        """The places of messages, channel by channel."""
+        topics = self.topics("frames")
+        names = [*topics, *(file_name(part.path) for part in self.opened.parts)]
+
+        def made() -> Iterator[Any]:
+            return (tables.frames_table({topic: self._pointers(topic)}, names) for topic in topics)
+
+        return TablePieces(TABLES["frames"].arrow, sum(self.opened.channel(topic).messages for topic in topics), made)
+
+    def _frames(self, topic: str) -> FrameColumns:
+        if topic not in self._kept:
             if holds_boxes(self.opened, topic):
-                self._parts[topic] = self._boxes(topic)
-                return self._parts[topic]
+                self._kept[topic] = self._boxes(topic)
+                return self._kept[topic]
             schema = next(
                 table.rows_of
                 for table in TABLES.values()
                 if table.rows_of is not None and table.rows_of.name == self.opened.channel(topic).schema_name
             )
-            self._parts[topic] = Part(*self.opened.rows(topic, schema))
+            self._kept[topic] = self.opened.frame_columns(topic, schema)
             self._class_names[topic] = class_names(self.opened.channel(topic).metadata)
-        return self._parts[topic]
+        return self._kept[topic]
 
-    def _boxes(self, topic: str) -> Part:
+    def _boxes(self, topic: str) -> FrameColumns:
         """Foreign boxes; none, and a note, if they can't be read: the other tables don't depend on them."""
         try:
             frames, self._class_names[topic], _ = self._boxes_read.read(self.opened, topic)
         except McaptrackError as error:
             self._note("detections", f"{error}; no boxes of {topic} are in the table")
-            t_ns = self.opened.times(topic)
-            return Part(DETECTIONS.empty(), t_ns, np.arange(len(t_ns)), np.zeros(len(t_ns), np.int64))
-        return tables.frames_to_part(DETECTIONS, frames)
+            times = enumerate(self.opened.times(topic).tolist())
+            return collect(DETECTIONS, (Frame(t_ns, number, DETECTIONS.empty()) for number, t_ns in times))
+        return collect(DETECTIONS, frames)
 
     def _track_names(self, topic: str) -> TrackNames:
         """The names of the classes of the tracks, and of the ground truth, that the rows of a channel are about."""
@@ -166,7 +182,7 @@ class LogTables:
         truth = next((one for one in made.references if one in there), "") if made else ""
 
         def names(of: str) -> dict[int, str]:
-            return tables.names_by_track(self._part(of).rows, self._class_names.get(of, {})) if of else {}
+            return tables.names_by_track(self._frames(of), self._class_names.get(of, {})) if of else {}
 
         return TrackNames(names(tracks), names(truth))
 
@@ -181,8 +197,8 @@ class LogTables:
         # Rows of 3D boxes are at their stamps: several messages may be one frame.
         has_rows = not foreign.holds_pictures(self.opened.channel(topic)) and not holds_boxes_3d(self.opened, topic)
         if of_rows and has_rows:
-            part = self._part(topic)
-            frame, rows = part.frame, part.counts
+            frames = self._frames(topic)
+            frame, rows = frames.numbers, np.diff(frames.ends)
         return Pointers(file, places.t_ns, frame, rows, places.chunk_offset, places.offset)
 
     def _labelled(self) -> list[Camera]:
@@ -212,7 +228,7 @@ class LogTables:
     def _recording(self) -> dict[str, Any]:
         opened = self.opened
         messages = sum(sum(part.index.counts.values()) for part in opened.parts)
-        rows = [row for topic in self.topics("ground_planes") for row in self._part(topic).rows]
+        rows = [row for topic in self.topics("ground_planes") for row in self._frames(topic).rows()]
         planes = {_origin_of_plane(row) for row in rows}
         sources = {
             channel.topic: dict(made.parameters)

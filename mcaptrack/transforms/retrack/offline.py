@@ -63,7 +63,7 @@ def offline_tracks(
     order = np.lexsort((step, track))
     step, track, sample = step[order], track[order], sample[order]
     rows = TrackRows.of(step, track, sample)
-    kept = np.isin(rows.step, np.array(steps, np.int64))  # inside gaps of the log there are no frames
+    is_kept = np.isin(rows.step, np.array(steps, np.int64))  # inside gaps of the log there are no frames
     moved: Moved | None = None
     if len(step) and (options.smooth or options.track_confidence > 0):
         ids, _, trajectories = to_trajectories(step, track, xy[order], model.noise_m)
@@ -88,9 +88,9 @@ def offline_tracks(
     min_track_s = options.min_track_s * (_CONFIRMED_SHARE if movers.on_ground else 1.0)
     min_rows = round(min_track_s * options.rate_hz) + 1
     _, which, lengths = np.unique(rows.track[is_sure], return_inverse=True, return_counts=True)
-    kept &= is_sure
-    kept[is_sure] &= lengths[which] >= min_rows
-    left = np.flatnonzero(kept)
+    is_kept &= is_sure
+    is_kept[is_sure] &= lengths[which] >= min_rows
+    left = np.flatnonzero(is_kept)
     return rows_by_step(rows.take(left), samples, moved and moved.take(left), steps)
 
 

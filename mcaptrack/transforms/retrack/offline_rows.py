@@ -64,7 +64,7 @@ class TrackRows(NamedTuple):
 
     def take(self, which: Bools | Ints | slice) -> TrackRows:
         """Some of the rows."""
-        return TrackRows(*(part[which] for part in self))
+        return TrackRows(self.track[which], self.step[which], self.before[which], self.after[which], self.share[which])
 
 
 class Moved(NamedTuple):
