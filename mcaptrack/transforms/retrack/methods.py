@@ -118,7 +118,8 @@ def _retrack_together(
     model = motion_model(options, run.noise_m, movers)
     tracks = offline_tracks(options, model, run.assignments, run.samples, run.steps, frames.t_ns, movers)
     for frame, rows, (online, predictions) in zip(frames, tracks, run.outputs(), strict=True):
-        yield frame._replace(rows=rows), online, predictions
+        # copies, because what is kept can't be written to
+        yield frame._replace(rows=rows), *(one._replace(rows=one.rows.copy()) for one in (online, predictions))
 
 
 _PAPER: Final = RetrackByConsistency(
