@@ -55,6 +55,7 @@ ONLY_OPTIONS = {
         "output": "Scores.rows",
         "force": "Scores.rows",
         "csv": "Scores.rows",
+        "curves": "Scores.draw_curves",
         "fail_under": "Scores.below",
     },
     "info": {"output": "the result", "force": "the result"},

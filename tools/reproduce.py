@@ -1,7 +1,9 @@
 """The paper's Table I and its curve, from a folder of scenes: SORT, SORT with smoothing, and re-tracking.
 
     .venv/bin/python tools/reproduce.py SCENES --homographies FOLDER -o OUT
-    .venv/bin/python tools/reproduce.py SCENES -o OUT --ablation docs/ablation.md
+
+"SORT + smoothing" is the paper's ablation: the displacements of SORT's tracks are smoothed by Eq. 3 before the same
+predictor predicts.
 
 A folder has either a folder for each scene with detections (det.txt: frame,-1,x,y,w,h,score,... in pixels) and truth
 (gt.txt: frame id x y in metres), or folders world/ and gt/ with a file for each scene, both in metres. Homographies
@@ -23,53 +25,15 @@ import numpy as np
 
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, EvaluationResult, evaluate
 from mcaptrack.evaluation.metrics import summary
-from mcaptrack.evaluation.metrics.displacement import TAU_M2, Displacement
+from mcaptrack.evaluation.metrics.displacement import Displacement
+from mcaptrack.evaluation.smoothing import smoothed_predictions
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.transforms import PROFILES, TRANSFORMS, Predict, Sample
 from mcaptrack.transforms.retrack import Retracking
+from mcaptrack.viewing.curves import curves_svg
 
 RATE_HZ = 2.5
-COLOURS = ("#888888", "#c58b00", "#c0392b", "#8e44ad", "#1f6fb2", "#2e8b57")
-
-PAPER, AUTHORS, DEFAULT = PROFILES["paper"], PROFILES["authors"], PROFILES["default"]
-#: Nothing done after the fact.
-_PLAIN = {"link_s": 0.0, "resolve_swaps": False, "smooth": False, "track_confidence": 0.0}
-_NOW = replace(
-    AUTHORS,
-    distance="now",
-    priority_distance=0.0,
-    birth="raw",
-    interpolated=False,
-    min_history=2,
-    backfill="unclaimed",
-    trim_ends=False,
-)
-#: The way from the paper to the default, one step a row; each row's options are those of `mcaptrack retrack`.
-ABLATION: dict[str, tuple[str, Retracking]] = {
-    "paper": ("--profile paper", PAPER),
-    "authors": ("--profile authors", AUTHORS),
-    "distance of current positions": (
-        "--profile authors --distance now --priority-distance 0 --birth raw --no-interpolated --min-history 2 "
-        "--backfill unclaimed --no-trim-ends",
-        _NOW,
-    ),
-    "computed covariance": (
-        "... --covariance predictor --predictor kalman --gate-m 3 --alpha 1 --beta 0",
-        replace(_NOW, covariance="predictor", predictor="kalman", gate_m=3.0, alpha=1.0, beta=0.0),
-    ),
-    "likelihood, estimated noise": (
-        "--link-s 0 --no-resolve-swaps --no-smooth --track-confidence 0",
-        replace(DEFAULT, **_PLAIN),
-    ),
-    "+ false-track removal": (
-        "--link-s 0 --no-resolve-swaps --no-smooth",
-        replace(DEFAULT, **_PLAIN | {"track_confidence": 0.5}),
-    ),
-    "+ offline linking": ("--no-resolve-swaps --no-smooth", replace(DEFAULT, resolve_swaps=False, smooth=False)),
-    "+ identity swaps at encounters": ("--no-smooth", replace(DEFAULT, smooth=False)),
-    "+ smoothing (the default)": ("", DEFAULT),
-}
 
 
 def truth_frames(path: Path, fps: float, steps: np.ndarray) -> list[Frame]:
@@ -133,9 +97,14 @@ def _tracked(path: Path, homographies: Path, fps: float) -> list[Frame]:
 def methods(predictor: str, profile: str) -> dict[str, Callable[[list[Frame]], Candidate]]:
     """What is compared: from samples to tracks and forecasts."""
 
-    def sort(name: str, which: str) -> Callable[[list[Frame]], Candidate]:
-        made = Predict(predictor=which)
-        return lambda samples: Candidate(name, None, samples, [frame for (frame,) in made(samples)], name)
+    predict = Predict(predictor=predictor)
+
+    def sort(samples: list[Frame]) -> Candidate:
+        return Candidate("SORT", None, samples, [frame for (frame,) in predict(samples)], "SORT")
+
+    def smoothed(samples: list[Frame]) -> Candidate:
+        name = "SORT + smoothing"
+        return Candidate(name, None, samples, list(smoothed_predictions(samples, predict)), name)
 
     def retrack(name: str, options: Retracking, online: bool) -> Callable[[list[Frame]], Candidate]:
         def run(samples: list[Frame]) -> Candidate:
@@ -144,7 +113,7 @@ def methods(predictor: str, profile: str) -> dict[str, Callable[[list[Frame]], C
 
         return run
 
-    out = {"SORT": sort("SORT", predictor), "SORT + smoothing": sort("SORT + smoothing", "holt-cv")}
+    out = {"SORT": sort, "SORT + smoothing": smoothed}
     for name in ("paper", "authors", "default") if profile == "all" else (profile,):
         options = replace(PROFILES[name], predictor=predictor) if name != "default" else PROFILES[name]
         out[f"re-tracking, {name}, online"] = retrack(f"re-tracking, {name}, online", options, online=True)
@@ -170,63 +139,6 @@ def line(result) -> list[object]:
     return [f"{100 * s['IDF1']:.1f}", f"{100 * s['MOTA']:.1f}", s["IDSW"], s["FP"], s["FN"]]
 
 
-def curve_svg(curves: dict[str, Displacement]) -> str:
-    """Squared ADE over recall, with a dot where d_obs reaches tau."""
-    width, height, left, low, top = 640, 420, 60, 370, 8.0
-
-    def at(recall: float, ade: float) -> str:
-        return f"{left + recall * (width - left - 20):.1f},{low - min(ade, top) / top * (low - 20):.1f}"
-
-    parts = [f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" font-family="sans-serif">']
-    parts.append('<rect width="100%" height="100%" fill="white"/>')
-    for tick in np.arange(0, 1.01, 0.2):
-        x, y = at(tick, 0).split(",")
-        parts.append(f'<text x="{x}" y="{float(y) + 18}" font-size="12" text-anchor="middle">{tick:.1f}</text>')
-    for tick in range(0, int(top) + 1, 2):
-        x, y = at(0, tick).split(",")
-        parts.append(f'<text x="{float(x) - 8}" y="{float(y) + 4}" font-size="12" text-anchor="end">{tick}</text>')
-        parts.append(f'<path d="M{at(0, tick)} L{at(1, tick)}" stroke="#ddd"/>')
-    parts.append(f'<text x="{width / 2}" y="{height - 12}" font-size="13" text-anchor="middle">recall</text>')
-    parts.append(f'<text x="16" y="{low / 2}" font-size="13" transform="rotate(-90 16 {low / 2})">ADE, m²</text>')
-    for number, (name, one) in enumerate(curves.items()):
-        order = np.argsort(one.d_obs_m2, kind="stable")
-        count = np.arange(1, len(order) + 1)
-        ade = np.cumsum(one.ade_squared_m2[order]) / count
-        shown = np.unique(np.linspace(0, len(order) - 1, 300).astype(int)) if len(order) else np.empty(0, int)
-        points = " L".join(at(count[k] / one.people, ade[k]) for k in shown if count[k] > 0.02 * one.people)
-        colour = COLOURS[number % len(COLOURS)]
-        if points:
-            parts.append(f'<path d="M{points}" fill="none" stroke="{colour}" stroke-width="2"/>')
-        until = int((one.d_obs_m2 < TAU_M2).sum())
-        if until:
-            x, y = at(until / one.people, ade[until - 1]).split(",")
-            parts.append(f'<circle cx="{x}" cy="{y}" r="4" fill="{colour}"/>')
-        y = 36 + 18 * number
-        parts.append(f'<text x="{left + 14}" y="{y}" font-size="12" fill="{colour}">{name}</text>')
-    return "\n".join([*parts, "</svg>", ""])
-
-
-def ablate(members: list[tuple[str, list[Frame], list[Frame]]], target: Path, folder: str) -> None:
-    """The table of the steps from the paper to the default."""
-    rows = ["| step | options of `mcaptrack retrack` | 0.5 m | 1 m | 2 m |", "|---|---|---|---|---|"]
-    for name, (flags, options) in ABLATION.items():
-        results = of_all(score(members, _offline(options)))
-        cells = [" / ".join(str(v) for v in line(result)[:3]) for result in results]
-        rows.append(f"| {name} | `{flags}` | " + " | ".join(cells) + " |")
-        print(rows[-1], flush=True)
-    marker = f"<!-- {folder} -->"
-    text = target.read_text() if target.exists() else ""
-    before = text.partition(marker)[0]
-    after = text.partition(marker)[2].partition(marker)[2]
-    target.write_text(
-        "\n".join([before.rstrip("\n"), "", marker, "", *rows, "", marker]).lstrip("\n") + (after or "\n")
-    )
-
-
-def _offline(options: Retracking) -> Callable[[list[Frame]], Candidate]:
-    return lambda samples: Candidate("tracks", None, [result[0] for result in options(samples)])
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path)
@@ -234,15 +146,11 @@ def main() -> None:
     parser.add_argument("--fps", type=float, default=30.0, help="frames a second of the frame numbers")
     parser.add_argument("--predictor", default="cv", help="what predicts, but for the default profile")
     parser.add_argument("--profile", default="all", choices=("all", *PROFILES), help="whose re-tracking")
-    parser.add_argument("--ablation", type=Path, help="write the table of steps into this file instead")
     parser.add_argument("-o", "--output", type=Path, default=Path("reproduced"))
     given = parser.parse_args()
     members = list(scenes(given.folder, given.homographies, given.fps))
     if not members:
         parser.error(f"{given.folder} has neither world/ and gt/ nor SCENE/det.txt")
-    if given.ablation:
-        ablate(members, given.ablation, given.folder.name)
-        return
     given.output.mkdir(parents=True, exist_ok=True)
     curves: dict[str, Displacement] = {}
     table = [
@@ -272,11 +180,10 @@ def main() -> None:
         writer = csv.writer(file)
         writer.writerow(["method", "d_obs_m2", "recall", "ADE_m2", "ADE_m"])
         for name, one in curves.items():
-            order = np.argsort(one.d_obs_m2, kind="stable")
-            recall, ade = one.curve()
-            squared = np.cumsum(one.ade_squared_m2[order]) / np.arange(1, len(order) + 1)
-            writer.writerows(zip([name] * len(order), one.d_obs_m2[order], recall, squared, ade, strict=True))
-    (given.output / "curve.svg").write_text(curve_svg(curves))
+            (recall, ade), (_, squared) = one.curve(), one.curve(squared=True)
+            d_obs = np.sort(one.d_obs_m2, kind="stable")
+            writer.writerows(zip([name] * len(d_obs), d_obs, recall, squared, ade, strict=True))
+    (given.output / "curve.svg").write_text(curves_svg(curves))
     print(f"wrote table.csv, curve.csv and curve.svg to {given.output}")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from html import escape
 from itertools import count
@@ -29,10 +29,11 @@ from mcaptrack.api.common import (
     warn_unused,
 )
 from mcaptrack.api.ingesting import parse_fps
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation import (
     COMBINED,
     DEFAULT_GATES_M,
+    Candidate,
     EvaluateOptions,
     EvaluationInput,
     EvaluationRow,
@@ -42,11 +43,18 @@ from mcaptrack.evaluation import (
 from mcaptrack.evaluation import evaluate as score_sequences
 from mcaptrack.evaluation.aligned import IOU_THRESHOLD, Similarity
 from mcaptrack.evaluation.metrics import Rules
+from mcaptrack.evaluation.smoothing import smoothed_predictions
+from mcaptrack.files import publish_bytes, refuse_overwrite
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.plane import Point
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice, collected, warn
+from mcaptrack.pipeline.rebuild import rebuild
+from mcaptrack.schema import TRACKS
+from mcaptrack.schema.classes import class_names
+from mcaptrack.schema.provenance import Provenance
 from mcaptrack.tables.compared import compare_files, pair_files
+from mcaptrack.transforms import STAGES, Predict
 
 #: Ends of names of files of tracks: of tables, which hold several channels, and of all.
 _TABLES: Final = (".parquet", ".pq")
@@ -196,6 +204,46 @@ class Scores:
             raise McaptrackError(f"no class {of_class!r:.60} was scored by itself; there are {there or 'none'}")
         return [row for row in rows if row["sequence"] == COMBINED] or rows
 
+    def draw_curves(self, output: PathLike, force: bool = False) -> Path:
+        """Draw the error of predictions (ADE) over recall, in metres and squared, as an SVG.
+
+        Parameters
+        ----------
+        output : path
+            The file to write.
+        force : bool, default False
+            Replace the file if it exists.
+
+        Returns
+        -------
+        pathlib.Path
+            The file.
+
+        Raises
+        ------
+        McaptrackError
+            If no predictions were scored, or if the file exists.
+
+        Examples
+        --------
+        >>> import mcaptrack
+        >>> scores = mcaptrack.evaluate("log.mcap", smoothed=True)
+        >>> scores.draw_curves("curves.svg").name
+        'curves.svg'
+
+        """
+        from mcaptrack.viewing.curves import curves_svg
+
+        whole = [one for one in self.results if one.of_class is None and one.displacement is not None]
+        whole = [one for one in whole if one.sequence == COMBINED] or whole
+        found = {one.tracks: one.displacement for one in whole if one.displacement is not None}
+        if not found:
+            raise McaptrackError("no predictions were scored; there are no curves to draw")
+        path = as_path(output)
+        refuse_overwrite(path, force)
+        publish_bytes(path, curves_svg(found).encode())
+        return path
+
     def below(self, limits: Mapping[str, float]) -> list[str]:
         """Return the scores that are below a limit.
 
@@ -236,6 +284,7 @@ def evaluate(
     gate_m: float | Sequence[float] | Floats = (0.5, 1.0, 2.0),
     min_iou: float = 0.5,
     rules: Rules = "trackeval",
+    smoothed: bool = False,
     topic: str | Sequence[str] | None = None,
     camera: str | None = None,
     ground_plane: PathLike | None = None,
@@ -261,6 +310,8 @@ def evaluate(
         Least overlap (IoU) of a match.
     rules : {"trackeval", "motmetrics"}, default "trackeval"
         Rules for counting switches and fragments.
+    smoothed : bool, default False
+        Of logs: score predictions from smoothed samples, too, as "samples, smoothed" (the paper's SORT + smoothing).
     topic : str or sequence of str, optional
         Score these channels. By default tracks, samples, retracks and retracks/online, and retracks/full of 3D boxes.
     camera : str, optional
@@ -298,7 +349,7 @@ def evaluate(
     paths = locations_of(tracks)
     with collected() as warnings:
         if truth is None:
-            sequences = _from_logs(paths, camera, topics)
+            sequences = _from_logs(paths, camera, topics, smoothed)
         else:
             plane = optional_path(ground_plane)
             sequences = _from_files(
@@ -320,6 +371,7 @@ def evaluate(
             warn_unused(reason, ground_plane=has_plane, point=has_point, fps=fps is not None)
         else:
             warn_unused("files of tracks are of no camera", camera=camera is not None)
+            warn_unused("files hold no samples with predictions", smoothed=smoothed)
             warn_unused("there is no ground plane", point=has_point and not has_plane)
             warn_unused("only tables hold several channels", topic=bool(topics) and not any(map(holds_tables, paths)))
         compared = {result.similarity for result in outcome.results}
@@ -342,14 +394,39 @@ def holds_tables(path: Location) -> bool:
     return path.suffix.lower() in _TABLES
 
 
-def _from_logs(paths: Sequence[Location], camera: str | None, topics: tuple[str, ...]) -> list[EvaluationInput]:
+def _from_logs(
+    paths: Sequence[Location], camera: str | None, topics: tuple[str, ...], smoothed: bool
+) -> list[EvaluationInput]:
     sequences = []
     for path in paths:
         if path.suffix.lower() in _FILES:
             raise McaptrackError(f"{path} is not a log; to score a file of tracks give the ground truth with `truth=`")
         with logs.read(path) as opened:
-            sequences.append(sequence_of_log(opened, pipeline.find_camera(opened, camera), topics))
+            prefix = pipeline.find_camera(opened, camera)
+            sequence = sequence_of_log(opened, prefix, topics)
+            if smoothed:
+                sequence.candidates = [*sequence.candidates, _smoothed(opened, prefix)]
+            sequences.append(sequence)
     return sequences
+
+
+def _smoothed(opened: logs.Log, prefix: str) -> Candidate:
+    """The samples of a log with predictions from their smoothed pasts, by the predictor of its predictions."""
+    stage = STAGES["predict"]
+    samples, forecasts = (f"{prefix}/{name}" for name in (stage.input_topic, stage.output_topic))
+    if forecasts not in opened.channels or samples not in opened.channels:
+        raise McaptrackError(f"{opened.path} has no {forecasts}; {call('run', opened.path)} makes them")
+    made = Provenance.from_metadata(opened.channel(forecasts).metadata)
+    transform = rebuild(stage, made, {}) if made is not None and made.transform == stage.name else None
+    if made is None or not isinstance(transform, Predict):
+        raise McaptrackError(f"{forecasts} of {opened.path} is recorded: how it was predicted is not known")
+    names = class_names(opened.channel(samples).metadata)
+    known = {"class_names": tuple((number, name) for number, name in names.items())}
+    rate_hz = float(made.parameters.get("rate_hz", transform.rate_hz))
+    frames = opened.frames(samples, TRACKS)
+    predictions = list(smoothed_predictions(frames, replace(transform, rate_hz=rate_hz, **known)))
+    name = f"{samples}, smoothed"
+    return Candidate(name, None, frames, predictions, name, classes=names)
 
 
 def _from_files(

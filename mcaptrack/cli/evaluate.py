@@ -64,6 +64,15 @@ def evaluate(
         Literal["trackeval", "motmetrics"],
         common.option("--rules", panel=common.SCORES, tuning=True, help="Rules for counting switches and fragments."),
     ] = "trackeval",
+    smoothed: Annotated[
+        bool,
+        common.option(
+            "--smoothed",
+            panel=common.SCORES,
+            tuning=True,
+            help="Of logs: score predictions from smoothed samples, too (SORT + smoothing).",
+        ),
+    ] = False,
     topic: Annotated[
         list[str] | None,
         common.option(
@@ -82,6 +91,10 @@ def evaluate(
         common.option(
             "--fail-under", panel=common.SCORES, help="Exit 4 if a score is lower, as in idf1=0.7.", show_default=False
         ),
+    ] = None,
+    curves: Annotated[
+        Path | None,
+        common.option("--curves", panel=common.FILES, help="Draw the error of predictions over recall as an SVG."),
     ] = None,
     csv: Annotated[bool, common.option("--csv", panel=common.FILES, help="Print rows for a spreadsheet.")] = False,
     output: common.Printed = None,
@@ -114,6 +127,7 @@ def evaluate(
             gate_m=gates,
             min_iou=min_iou,
             rules=rules,
+            smoothed=smoothed,
             topic=topic,
             camera=camera,
             ground_plane=ground_plane,
@@ -121,6 +135,8 @@ def evaluate(
             fps=fps,
             progress=talk.progress,
         )
+    if curves is not None:
+        scores.draw_curves(curves, force)
     with common.printed_to(output, force):
         if json:
             common.print_json({"results": scores.rows()})

@@ -138,6 +138,7 @@ class EvaluationRow:
             out["displacement"] = self.displacement.summary() | {
                 "curve_recall": recall.tolist(),
                 "curve_ADE_m": ade.tolist(),
+                "curve_ADE_squared_m2": self.displacement.curve(squared=True)[1].tolist(),
             }
         return out
 

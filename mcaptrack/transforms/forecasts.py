@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from collections.abc import Callable
+from typing import Any, Final, Protocol
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Floats
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories
 from mcaptrack.predictors import Forecast, make
@@ -20,6 +21,14 @@ _RECENT: Final = 7
 _REST_PER_S: Final = 0.15
 _STAYS: Final = 0.95
 _CREEP_PER_S: Final = 0.03
+
+
+class PastPositions(Protocol):
+    """The pasts of tracks, as ``Histories`` keeps them."""
+
+    def push(self, ids: Ints, xy_m: Floats, steps: int = 1) -> tuple[Floats, Bools]:
+        """Add the next positions; returns the past of each track, and which positions of it are known."""
+        ...
 
 
 class Forecaster:
@@ -39,6 +48,8 @@ class Forecaster:
         Names of classes, by which the unit of their positions is chosen: predictors know the speeds of people.
     class_limits : str
         Limits of the motion of classes instead of those of the table, as the option of transforms.
+    histories : callable
+        Called with the number of past positions that are needed; keeps them.
     **options
         Own parameters of the predictor.
     """
@@ -51,12 +62,13 @@ class Forecaster:
         rate_hz: float,
         class_names: ClassNames = (),
         class_limits: str = "",
+        histories: Callable[[int], PastPositions] = Histories,
         **options: Any,
     ) -> None:
         self._rate_hz, self._min_history = rate_hz, min_history
         self._class_names, self._class_limits = class_names, class_limits
         self._predictor = make(predictor, max(1, round(horizon_s * rate_hz)), 1 / rate_hz, **options)
-        self._histories = Histories(max(self._predictor.past, min_history))
+        self._histories = histories(max(self._predictor.past, min_history))
         self._last_ns: int | None = None
 
     def predict(self, frame: Frame) -> Rows:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, make_dataclass
 from functools import cache
 from types import MappingProxyType
 from typing import ClassVar
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.histories import Histories
 from mcaptrack.predictors import PredictorName, entry_of
 from mcaptrack.predictors.own_options import own_options
 from mcaptrack.registry import Entry
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
-from mcaptrack.transforms.forecasts import Forecaster
+from mcaptrack.transforms.forecasts import Forecaster, PastPositions
 from mcaptrack.transforms.motion_limits import LIMITS_HELP, LIMITS_PATTERN, ClassNames, read_limits
 from mcaptrack.transforms.protocol import check_options, context, is_option_type, option
 
@@ -65,10 +66,15 @@ class Predict:
         if self.own_options and predict_with(self.predictor) is not type(self):
             raise McaptrackError(f"{', '.join(self.own_options)} are no parameters of {entry}")
 
-    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
+    def forecaster(self, histories: Callable[[int], PastPositions] = Histories) -> Forecaster:
+        """The predictor with its options; ``histories`` keeps the past positions."""
         own = {name: getattr(self, name) for name in self.own_options}
         classes = self.class_names, self.class_limits
-        forecaster = Forecaster(self.predictor, self.horizon_s, self.min_history, self.rate_hz, *classes, **own)
+        rates = self.predictor, self.horizon_s, self.min_history, self.rate_hz
+        return Forecaster(*rates, *classes, histories, **own)
+
+    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
+        forecaster = self.forecaster()
         for frame in frames:
             yield (frame._replace(rows=forecaster.predict(frame)),)
 

@@ -116,11 +116,16 @@ class Displacement:
     consistency_m: Floats  # |P_t - P_t+1| over the shared steps of consecutive forecasts of one track
     error_m: Floats  # (P, T): distance of each step from the ground truth; NaN beyond the horizon of shorter forecasts
 
-    def curve(self) -> tuple[Floats, Floats]:
-        """Recall (P,) and ADE in m (P,): entry k is for the k + 1 pairs with the most similar pasts."""
+    def curve(self, squared: bool = False) -> tuple[Floats, Floats]:
+        """Recall (P,) and ADE (P,) in m, or squared in m^2: entry k is for the k + 1 pairs with the most similar pasts.
+
+        Pairs are assigned once for each time, whatever the threshold of their pasts (the paper's tau), so that raising
+        it adds pairs one by one: this is the curve for all thresholds.
+        """
         order = np.argsort(self.d_obs_m2, kind="stable")
         count = np.arange(1, len(order) + 1)
-        return count / max(self.people, 1), np.cumsum(self.ade_m[order]) / count
+        error = self.ade_squared_m2 if squared else self.ade_m
+        return count / max(self.people, 1), np.cumsum(error[order]) / count
 
     def squared_at(self, recall: float) -> float:
         """The squared ADE in m^2 of the pairs with the most similar pasts, up to a recall; NaN beyond."""

@@ -34,7 +34,7 @@ POINTS: Final = 160
 class Line:
     """A line through ``x`` and ``y`` (P,), with a band from ``low`` to ``high`` (P,) if they are given.
 
-    ``role`` chooses the colour, ``name`` is printed at the end of the line.
+    ``role`` chooses the colour, ``name`` is printed at the end of the line. ``dot`` is a point to mark.
     """
 
     name: str
@@ -44,6 +44,7 @@ class Line:
     low: Floats | None = None
     high: Floats | None = None
     dashed: bool = False
+    dot: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def line_chart(title: str, lines: Sequence[Line], x: Axis, y: Axis, diagonal: st
         up = bottom - np.clip(values_y / y.most, 0, 1) * height
         return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across.tolist(), up.tolist(), strict=True))
 
-    bands, drawn, ends = [], [], []
+    bands, drawn, dots, ends = [], [], [], []
     if diagonal:
         top = min(x.most, y.most)
         drawn.append({"points": points(np.array([0, top]), np.array([0, top])), "role": "truth", "dashed": True})
@@ -109,6 +110,9 @@ def line_chart(title: str, lines: Sequence[Line], x: Axis, y: Axis, diagonal: st
             band = np.concatenate([line.low[kept], line.high[kept][::-1]])
             bands.append({"points": points(around, band), "role": line.role})
         drawn.append({"points": points(line.x[kept], line.y[kept]), "role": line.role, "dashed": line.dashed})
+        if line.dot is not None:
+            at = points(*(np.array([value]) for value in line.dot)).split(",")
+            dots.append((*at, line.role))
         ends.append((bottom - min(float(line.y[kept][-1]) / y.most, 1) * height, line.name, line.role))
     return {
         "kind": "lines", "title": title, "width": WIDTH, "height": HEIGHT,
@@ -116,7 +120,7 @@ def line_chart(title: str, lines: Sequence[Line], x: Axis, y: Axis, diagonal: st
         "x_ticks": [(_fixed(_LEFT + value / x.most * width), text) for value, text in x.ticks()],
         "y_ticks": [(_fixed(bottom - value / y.most * height), text) for value, text in y.ticks()],
         "x_label": x.label, "y_label": y.label, "x_middle": _LEFT + width / 2,
-        "bands": bands, "lines": drawn, "names": _names(ends, height), "names_x": _LEFT + width + 6,
+        "bands": bands, "lines": drawn, "dots": dots, "names": _names(ends, height), "names_x": _LEFT + width + 6,
     }  # fmt: skip
 
 
