@@ -35,7 +35,7 @@ def curves_svg(forecasts: Mapping[str, Displacement]) -> str:
         _chart(forecasts, squared=False, title="ADE over recall"),
         _chart(forecasts, squared=True, title="Squared ADE over recall (the paper's)"),
     ]
-    return str(render("curves.svg", charts=charts, width=WIDTH + 40))
+    return str(render("curves.svg", charts=charts, width=WIDTH + 100))
 
 
 def _chart(forecasts: Mapping[str, Displacement], squared: bool, title: str) -> dict[str, object]:
