@@ -421,10 +421,10 @@ def _smoothed(opened: logs.Log, prefix: str) -> Candidate:
     if made is None or not isinstance(transform, Predict):
         raise McaptrackError(f"{forecasts} of {opened.path} is recorded: how it was predicted is not known")
     names = class_names(opened.channel(samples).metadata)
-    known = {"class_names": tuple((number, name) for number, name in names.items())}
+    class_of = tuple(names.items())
     rate_hz = float(made.parameters.get("rate_hz", transform.rate_hz))
     frames = opened.frames(samples, TRACKS)
-    predictions = list(smoothed_predictions(frames, replace(transform, rate_hz=rate_hz, **known)))
+    predictions = list(smoothed_predictions(frames, replace(transform, rate_hz=rate_hz, class_names=class_of)))
     name = f"{samples}, smoothed"
     return Candidate(name, None, frames, predictions, name, classes=names)
 
