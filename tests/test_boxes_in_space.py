@@ -263,6 +263,19 @@ def test_numbers_that_can_not_be_are_counted_once():
     assert rows["source_id"].tolist() == [2**40 + 2, -1, 2**40 + 1, 12, 2**40]
 
 
+def test_a_box_without_z_stands_where_x_and_y_say():
+    nan = float("nan")
+    boxes = [Box3d(START_NS, "radar", (3.0, 1.0, z), (0.0, 0.0, 0.0, 1.0), (4.0, 2.0, 1.0)) for z in (0.0, nan)]
+    found = recorded([(START_NS, Message3d(START_NS, "radar", boxes))])
+    assert found.remarks == {"boxes have no z: it is unknown, and 0 in their frame for x and y": 1}
+    tilted = Rotation.from_euler("zyx", [0.5, 0.1, -0.2])
+    rows = rows_of_boxes(found, np.tile(tilted.as_matrix(), (2, 1, 1)), np.tile([5.0, 6.0, 7.0], (2, 1)))
+    x, y, z = tilted.apply([3.0, 1.0, 0.0]) + [5, 6, 7]
+    np.testing.assert_allclose(rows["x_m"], [x, x])
+    np.testing.assert_allclose(rows["y_m"], [y, y])
+    np.testing.assert_allclose(rows["z_m"], [z, nan])
+
+
 # Times
 
 
@@ -295,7 +308,7 @@ def message(*stamps_ms: int | None, is_measured: bool = True) -> Message3d:
 )  # fmt: skip
 def test_messages_are_frames_at_their_stamps(messages, times, frames):
     found = recorded([(START_NS + t_ns * MS, one) for t_ns, one in sorted(messages.items())])
-    starts, frame = found.frames()
+    starts, frame, _ = found.frames()
     assert ((starts - START_NS) / MS).tolist() == times
     log_ms = (found.message_ns[found.message] - START_NS) // MS
     order = np.concatenate([np.flatnonzero(log_ms == t_ns) for t_ns in messages] or [np.empty(0, int)])
@@ -341,7 +354,7 @@ def test_boxes_that_are_recorded_twice_count_once():
             (late, Message3d(late, "lidar", [box(1.0, stamp_ns=late)])),
         ]
     )
-    _, frame = found.frames()
+    _, frame, _ = found.frames()
     assert np.flatnonzero(found.is_repeated(frame)).tolist() == [4, 6]
 
 

@@ -9,11 +9,12 @@ from typing import Any
 
 import pytest
 
+import mcaptrack
 from mcaptrack import log, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance, digest
-from mcaptrack.sources.cameras import camera_at, cameras, find_camera, name_above
+from mcaptrack.sources.cameras import camera_at, cameras, find_camera, name_above, repaired_tracks
 from mcaptrack.transforms import STAGES, TRANSFORMS
 from tests.commands import GROUP, call, done
 from tests.robots import write_log
@@ -279,3 +280,23 @@ def test_a_circular_chain_of_inputs_ends(tmp_path):
     with log.read(path) as opened:
         assert [camera.prefix for camera in cameras(opened)] == ["/x"]
     assert call("run", path).code == 1
+
+
+def test_two_sensors_of_3d_boxes_are_no_cameras(tmp_path):
+    lines = "t,class,x_m,y_m,z_m,length_m,width_m,height_m,heading_rad,score\n0,car,1,2,0,4,2,1.5,0,0.5\n"
+    (tmp_path / "boxes.csv").write_text(lines)
+    path = tmp_path / "a.mcap"
+    for sensor in ("lidar", "radar"):
+        into = {"into": path} if path.exists() else {"output": path}
+        mcaptrack.ingest(tmp_path / "boxes.csv", role="detections", camera=sensor, frame="map", **into)
+    with log.read(path) as opened, pytest.raises(McaptrackError, match="has several sensors, /lidar, /radar; choose"):
+        find_camera(opened)
+
+
+def test_only_repaired_tracks_name_the_tracks_that_they_were():
+    frames = [Frame(0, 0, TRACKS.rows(track_id=[1, 2], observed=[True, True], source_id=[7, -1]))]
+    assert repaired_tracks(frames, None) is frames
+    assert repaired_tracks(frames, Provenance("retrack", {})) is frames
+    (frame,) = repaired_tracks(frames, Provenance("track", {}))
+    assert frame.rows["source_id"].tolist() == [-1, -1]
+    assert frames[0].rows["source_id"].tolist() == [7, -1]

@@ -263,7 +263,8 @@ def test_limits_of_users_replace_those_of_the_table():
     for wrong in ("car", "car=", "=4", "car=fast", "car=1:2:3:4:5", "car=-1"):
         with pytest.raises(McaptrackError, match="NAME=SPEED"):
             GroundTracker(class_limits=wrong)
-    for wrong, why in (("car=40, Car=50", "names car twice"), ("car=::0", "NOISE and GATE"), ("car=:::0", "NOISE and")):
+    zeros = (("car=0", "SPEED, NOISE"), ("car=::0", "NOISE and GATE"), ("car=:::0", "GATE have to be more than 0"))
+    for wrong, why in (("car=40, Car=50", "names car twice"), *zeros):
         with pytest.raises(McaptrackError, match=why):
             GroundTracker(class_limits=wrong)
 

@@ -19,6 +19,7 @@ from mcaptrack.geometry.oriented_boxes import COLUMNS, bev_corners, columns_to_o
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.framing import join_frames
 from tests.commands import call
+from tests.space_logs import START_NS, WAYS, Robot, write
 
 T0 = 315_966_253_660_357_001  # a float64 can't hold it
 HEADER = "t_ns,id,class,x_m,y_m,z_m,length_m,width_m,height_m,heading_rad,points"
@@ -393,7 +394,47 @@ def test_tables_of_argoverse_that_cannot_be_read(tmp_path):
         mcaptrack.ingest(path, tmp_path / "log.mcap", role="truth")
 
 
+def test_boxes_of_argoverse_without_a_category_have_no_class(tmp_path):
+    boxes = argoverse(tmp_path)
+    boxes["category"] = ["REGULAR_VEHICLE", None, "PEDESTRIAN", None, "BUS"]
+    path = tmp_path / "annotations.feather"
+    feather.write_feather(pa.table(boxes), path)
+    result, found, metadata = ingested(path)
+    assert "None" not in metadata["mcaptrack.classes"]
+    assert (found.rows["class_id"] == 0).tolist() == [False, True, False, True, False]
+    assert "2 of 5 boxes have no category: their class is unknown" in " ".join(one.message for one in result.warnings)
+    boxes["track_uuid"][3] = None
+    feather.write_feather(pa.table(boxes), path)
+    with pytest.raises(McaptrackError, match="row 4 has no track_uuid"):
+        ingested(path)
+
+
+def test_folders_of_data_sets_without_labels_are_named(tmp_path):
+    argoverse(tmp_path)
+    (tmp_path / "annotations.feather").rename(tmp_path / "city_SE3_egovehicle.feather")
+    with pytest.raises(McaptrackError, match=r"has no annotations\.feather: it is a log of Argoverse 2 without labels"):
+        ingested(tmp_path)
+    source, _ = nuscenes(tmp_path)
+    (tmp_path / "city_SE3_egovehicle.feather").unlink()
+    (tmp_path / "v1.0-mini" / "sample_annotation.json").unlink()
+    with pytest.raises(McaptrackError, match=r"has no sample_annotation\.json: it is a set without labels; nuScenes"):
+        ingested(source, scene="scene-0061")
+
+
 # Into a log
+
+
+def test_a_frame_that_the_log_does_not_have_is_named(tmp_path):
+    path = write(tmp_path / "robot.mcap", Robot(shots=2), WAYS["scene updates"], "protobuf")
+    labels = table(tmp_path, f"{START_NS},3,pedestrian,1,2,0.9,0.5,0.6,1.8,0,4")
+    said = []
+    for frame in ("nowhere", "base_link", "/map"):
+        result = mcaptrack.ingest(labels, into=path, role="truth", frame=frame, force=True)
+        said.append([one.message for one in result.warnings if one.code == "transforms"])
+    assert said[1:] == [[], []]
+    assert len(said[0]) == 1
+    assert "there is no frame nowhere in " in said[0][0]
+    assert "(but base_link, lidar, map)" in said[0][0]
 
 
 def test_labels_go_beside_the_boxes_of_a_log(tmp_path):

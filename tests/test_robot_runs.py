@@ -55,6 +55,15 @@ def test_recorded_boxes_are_decoded_once_in_a_run(passed, tmp_path, monkeypatch)
     assert decoded[2:] == [("/lidar/boxes", "base_link")]
 
 
+def test_limits_of_classes_that_there_are_not_are_named(passed, tmp_path):
+    path = tmp_path / "a.mcap"
+    path.write_bytes(passed.read_bytes())
+    limits = {"class_limits": "caar=4, pedestrian=5, truck=30", "sidecar": False, "force": True}
+    found = [one for one in mcaptrack.predict(path, **limits).warnings if one.code == "option-not-used"]
+    assert len(found) == 1
+    assert "names caar: no such class is in the table of limits or in the boxes" in found[0].message
+
+
 def test_boxes_that_viewers_cannot_draw_have_a_view_in_the_frame_of_the_tracks(passed, tmp_path):
     with log.read(passed) as opened:
         messages = [SceneUpdate.FromString(one.payload) for one in opened.messages("/lidar/boxes/view/scene")]

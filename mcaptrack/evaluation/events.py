@@ -107,14 +107,13 @@ def find_events(
     name: str = "the log",
     tracks_name: str = "the tracks",
     classes: tuple[Mapping[int, str], Mapping[int, str]] = ({}, {}),
-    are_repaired: bool = True,
 ) -> TrackEvents:
     """Find the events of a channel of tracks and count its rows frame by frame.
 
     Parameters
     ----------
     tracks : sequence of Frame
-        Rows of Tracks.
+        Rows of Tracks. Their ``source_id`` names tracks from before re-tracking, if any.
     ground_truth : sequence of Frame, optional
         Rows of Tracks. If it can't be compared, a note says why and there are no misses, false tracks and switches.
     options : EventOptions
@@ -123,8 +122,6 @@ def find_events(
     classes : tuple of mapping of int to str
         Names of the classes of the ground truth and of the tracks, by number. Only tracks and people (objects) of one
         class are matched.
-    are_repaired : bool
-        Whether ``source_id`` names tracks from before re-tracking. That of tracks of detections may name these.
 
     Returns
     -------
@@ -144,7 +141,7 @@ def find_events(
     compared_ns = comparison.t_ns if comparison else np.empty(0, np.int64)
     t_ns = np.unique(np.concatenate([frame_times(tracks), compared_ns]))
     lifecycle = lifecycle_of(tracks)
-    parts = [lifecycle.births(), lifecycle.ends(), *([lifecycle.repairs()] if are_repaired else [])]
+    parts = [lifecycle.births(), lifecycle.ends(), lifecycle.repairs()]
     if comparison:
         parts += [_switches(comparison), _misses(comparison), _false_tracks(comparison)]
     events, events_ns = _in_order(parts)

@@ -19,6 +19,7 @@ from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.transforms import STAGES, Sample, Transform
+from mcaptrack.transforms.motion_limits import ClassNames, unknown_limits
 
 
 def in_context(
@@ -39,6 +40,7 @@ def in_context(
         known["ground_planes"] = tuple(planes)
     if "class_names" in names:
         known["class_names"] = tuple((int(number), name) for number, name in classes.items())
+        _warn_of_limits(str(getattr(job.transform, "class_limits", "")), known["class_names"])
     if "start_ns" in names:
         known["start_ns"] = _clock_start(opened, prefix)
     if "rate_hz" in names:
@@ -55,6 +57,14 @@ def in_context(
     if "poor_scale" in names and is_assumed(planes):
         known["poor_scale"] = is_poor(frames)
     return replace(job.transform, **known)
+
+
+def _warn_of_limits(class_limits: str, names: ClassNames) -> None:
+    """Warn of limits of classes that there are not."""
+    if unknown := unknown_limits(class_limits, names):
+        there = ", ".join(sorted({name for _, name in names if name})) or "none with a name"
+        words = f"`class_limits=` names {', '.join(unknown)}: no such class is in the table of limits or in the boxes"
+        warn(f"{words} (classes of these are: {there})", "option-not-used")
 
 
 def _clock_start(opened: log.Log, prefix: str) -> int | None:

@@ -41,7 +41,7 @@ from mcaptrack.schema import (
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.framing import join_frames
 from mcaptrack.schema.provenance import VIEW, Provenance
-from mcaptrack.sources.cameras import camera_at, is_tracked_from_boxes, provenance_of
+from mcaptrack.sources.cameras import camera_at, provenance_of, repaired_tracks
 
 #: The name of the stage, in reports and in the provenance.
 STAGE: Final = "events"
@@ -103,8 +103,8 @@ def make_events(opened: log.Log, prefix: str, made: Mapping[str, Made], watch: W
         names = class_names(made[topic].provenance.to_metadata() if topic in made else opened.channel(topic).metadata)
         classes = (truth().classes, names)
         origin = made[topic].provenance if topic in made else provenance_of(opened, topic)
-        are_repaired = not is_tracked_from_boxes(origin)
-        found = find_events(frames, truth().frames, options, opened.path.stem, topic, classes, are_repaired)
+        frames = repaired_tracks(frames, origin)
+        found = find_events(frames, truth().frames, options, opened.path.stem, topic, classes)
         for note in found.notes:
             warn(note, "not-compared")
         parameters = found.parameters(options)

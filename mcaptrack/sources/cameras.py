@@ -9,7 +9,7 @@ a name of their own: they belong to no pictures.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import takewhile
 from typing import Final, NamedTuple
 from weakref import WeakKeyDictionary
@@ -17,7 +17,8 @@ from weakref import WeakKeyDictionary
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
-from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SCHEMAS
+from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SCHEMAS, TRACKS, Frame, Rows
+from mcaptrack.schema.framing import JoinedFrames, has_any, mapped_rows
 from mcaptrack.schema.provenance import Provenance, frame_id_of, input_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.fixed_frame import holds_boxes, holds_boxes_3d
@@ -87,10 +88,11 @@ def find_camera(opened: log.Log, name: str | None = None, topic: str | None = No
     if len(chosen) == 1:
         return chosen[0].prefix
     names = ", ".join(camera.prefix for camera in chosen)
+    kind = "cameras" if not any(camera.in_space for camera in chosen) else "sensors"
     usual = [camera.prefix for camera in chosen if f"/{DEFAULT_CAMERA}" in camera.names]
     if not usual:
-        raise McaptrackError(f"{opened.path} has several cameras, {names}; choose one with `camera=`")
-    warn(f"several cameras, {names}: taking {usual[0]}; `camera=` chooses another", "chosen-camera")
+        raise McaptrackError(f"{opened.path} has several {kind}, {names}; choose one with `camera=`")
+    warn(f"several {kind}, {names}: taking {usual[0]}; `camera=` chooses another", "chosen-camera")
     return usual[0]
 
 
@@ -149,9 +151,18 @@ def provenance_of(opened: log.Log, topic: str) -> Provenance | None:
     return Provenance.from_metadata(channel.metadata) if channel else None
 
 
-def is_tracked_from_boxes(made: Provenance | None) -> bool:
-    """Return whether a stage made tracks of detections, so that ``source_id`` names no tracks."""
-    return made is not None and made.transform in STAGES and STAGES[made.transform].default.reads is DETECTIONS
+def repaired_tracks(tracks: Sequence[Frame], made: Provenance | None) -> Sequence[Frame]:
+    """Return tracks with ``source_id`` only where it names tracks: that of tracks of detections names these."""
+    is_from_boxes = made is not None and made.transform in STAGES and STAGES[made.transform].default.reads is DETECTIONS
+    if not is_from_boxes or not has_any(TRACKS, tracks, lambda rows: rows["source_id"] >= 0):
+        return tracks
+
+    def without_sources(joined: JoinedFrames) -> Rows:
+        rows = joined.rows.copy()
+        rows["source_id"] = -1
+        return rows
+
+    return mapped_rows(TRACKS, tracks, without_sources)
 
 
 def lineage(

@@ -92,7 +92,9 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
         warn(f"{opened.path}: {topic}: {unnamed:,} of {len(found.frame):,} {words}", "transforms")
     fixed = _fixed_frame(opened, topic, found, plain_frame(frame_id))
     is_known, rotation, shift = _poses(opened, topic, found, fixed)
-    start_ns, frame = found.frames()
+    start_ns, frame, assumed = found.frames()
+    if assumed:
+        warn(f"{opened.path}: {topic}: {assumed}", "clock")
     is_repeated = found.is_repeated(frame)
     is_left_out = np.zeros(len(start_ns), bool)
     is_left_out[frame[~is_known]] = True  # nothing is known then, unlike in a frame without boxes
@@ -236,7 +238,8 @@ def rows_of_boxes(found: Recorded3d, rotation: Floats, shift: Floats, where: str
 
     count = len(found.frame)
     axes = np.empty((0, 3, 3)) if not count else rotation @ Rotation.from_quat(found.orientation).as_matrix()
-    centre = turned(rotation, found.centre) + shift
+    has_z = np.isfinite(found.centre[:, 2])
+    centre = turned(rotation, np.where(has_z[:, None] | [True, True, False], found.centre, 0.0)) + shift
     velocity = turned(rotation, found.velocity)
     # The axis that is most upright is that of the height; of the others the first is that of the length.
     up = np.abs(axes[:, 2]).argmax(axis=1) if count else np.empty(0, np.intp)
@@ -250,7 +253,7 @@ def rows_of_boxes(found: Recorded3d, rotation: Floats, shift: Floats, where: str
     return DETECTIONS.rows(
         x_m=centre[:, 0],
         y_m=centre[:, 1],
-        z_m=centre[:, 2],
+        z_m=np.where(has_z, centre[:, 2], np.nan),
         length_m=found.size[here, along],
         width_m=found.size[here, across],
         height_m=found.size[here, up],

@@ -119,6 +119,18 @@ def limits_by_class(numbers: Sequence[int], names: ClassNames, class_limits: str
     return {number: limits_of(known.get(number, UNKNOWN), own) for number in numbers}
 
 
+def unknown_limits(class_limits: str, names: ClassNames) -> list[str]:
+    """The names in ``class_limits`` that are in no row of the table and not among those of classes.
+
+    Examples
+    --------
+    >>> unknown_limits("caar=4, forklift=6, van=30", ((1, "Forklift"), (3, "car")))
+    ['caar']
+    """
+    known = {name.strip().lower() for _, name in names}
+    return [name for name in read_limits(class_limits) if limits_row(name) == UNKNOWN and name not in known | {UNKNOWN}]
+
+
 def units_m(numbers: Sequence[int], names: ClassNames, class_limits: str = "") -> list[float]:
     """For each class the unit of length, in metres, in which its objects move as people do.
 
@@ -144,7 +156,7 @@ def read_limits(text: str) -> dict[str, MotionLimits]:
     SPEED is the most in metres per second, DRIFT how much a velocity changes within a second, NOISE and GATE are in
     metres. Those at the end may be left out, and any may be empty: they stay as in the table.
 
-    Raises McaptrackError if a text has another form, names a class twice, or has a NOISE or GATE of 0.
+    Raises McaptrackError if a text has another form, names a class twice, or has a SPEED, NOISE or GATE of 0.
 
     Examples
     --------
@@ -168,8 +180,8 @@ def read_limits(text: str) -> dict[str, MotionLimits]:
         row = limits_of(name)
         missing: list[float | None] = [None] * (len(_NUMBERS) - len(numbers))
         speed, drift, noise, gate = numbers + missing
-        if 0 in (noise, gate):
-            raise McaptrackError(f"class_limits has {one.strip()!r}; NOISE and GATE have to be more than 0 m")
+        if 0 in (speed, noise, gate):
+            raise McaptrackError(f"class_limits has {one.strip()!r}; SPEED, NOISE and GATE have to be more than 0")
         if name in out:
             raise McaptrackError(f"class_limits names {name} twice; give each class once")
         most = row.max_speed_m_per_s if speed is None else speed

@@ -21,7 +21,7 @@ from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.framing import split_rows
 from mcaptrack.schema.provenance import CLOCK
-from mcaptrack.sources.ingest.boxes_3d_log import boxes_topic, frame_times, root_frame
+from mcaptrack.sources.ingest.boxes_3d_log import boxes_topic, frame_times, root_frame, warn_of_frame
 from mcaptrack.sources.ingest.job import SCHEMA_OF, IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import read_boxes_3d
 from mcaptrack.sources.ingest.labels.boxes_3d.rows import BoxRows3D, TimedLabels
@@ -83,6 +83,8 @@ class Boxes3DJob(IngestJob):
     def _frame_id(self, rows: BoxRows3D) -> str:
         """The frame of reference of rows: as the user says, as the format says, or the root of the log's transforms."""
         if self.options.frame_id is not None:
+            if self.into:
+                warn_of_frame(self.into, self.options.frame_id, rows.path)
             return self.options.frame_id
         root = root_frame(self.into) if self.into else ""
         found = rows.frame_id or root or FRAME

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -9,14 +10,17 @@ import numpy as np
 from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.transform_tree import plain_frame
+from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.framing import frame_times as frame_times_of
-from mcaptrack.schema.provenance import INGEST, Provenance
+from mcaptrack.schema.provenance import INGEST, Provenance, frame_id_of
 from mcaptrack.sources.fixed_frame import holds_boxes_3d, named_detections
 from mcaptrack.sources.frames import transforms_of
 from mcaptrack.sources.ingest.labels.camera import DEFAULT, camera_prefix
 
 _TRUTH: Final = "truth"
+_LISTED: Final = 8
 
 
 def boxes_topic(opened: log.Log, camera: str) -> str:
@@ -64,3 +68,14 @@ def root_frame(opened: log.Log) -> str:
     tree = transforms_of(opened)
     roots = tree.roots() if tree is not None else []
     return roots[0] if len(roots) == 1 else ""
+
+
+def warn_of_frame(opened: log.Log, frame_id: str, labels: Path) -> None:
+    """Warn if a log has frames of reference, and not the one of labels."""
+    tree = transforms_of(opened)
+    known = set(tree.frames() if tree else ()) | {frame_id_of(one.metadata) for one in opened.channels.values()} - {""}
+    if known and plain_frame(frame_id) not in known:
+        listed = sorted(known)
+        there = ", ".join(listed[:_LISTED]) + (", ..." if len(listed) > _LISTED else "")
+        words = f"there is no frame {frame_id} in {opened.path} (but {there}), so that its tracks can't be compared"
+        warn(f"{labels}: {words} with these boxes", "transforms")

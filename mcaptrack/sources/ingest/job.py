@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Final, Literal, Self
+from typing import Any, Final, Literal, Self, TypeAlias
 
 import numpy as np
 
@@ -42,7 +42,7 @@ SCHEMA_OF: Final[Mapping[Role, Schema]] = {"detections": DETECTIONS, "tracks": T
 #: The role of a file with the motion of the camera, and the last part of its topic.
 MOTION: Final = "motion"
 #: What an input that is a text file can hold.
-InputRole = Role | Literal["motion"]
+InputRole: TypeAlias = Role | Literal["motion"]
 _BLOCK: Final = 4096
 
 

@@ -22,7 +22,7 @@ from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.camera_motion import read_ground_truth
-from mcaptrack.sources.cameras import is_tracked_from_boxes, provenance_of
+from mcaptrack.sources.cameras import provenance_of, repaired_tracks
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.transforms import STAGES
 from mcaptrack.viewing.report import statistics
@@ -205,10 +205,8 @@ def _find_events(opened: log.Log, out: LogReport) -> None:
         truth = out.track_sets["truth"].topic if ground_truth is not None else tracks.topic
         classes = (class_names(opened.channel(truth).metadata), class_names(opened.channel(tracks.topic).metadata))
         if known is None:
-            are_repaired = not is_tracked_from_boxes(provenance_of(opened, tracks.topic))
-            found = find_events(
-                tracks.frames, ground_truth, EventOptions(), out.name, tracks.topic, classes, are_repaired
-            )
+            frames = repaired_tracks(tracks.frames, provenance_of(opened, tracks.topic))
+            found = find_events(frames, ground_truth, EventOptions(), out.name, tracks.topic, classes)
             known = found.events, found.rule
         events, rule = known
         out.channel_events.append(

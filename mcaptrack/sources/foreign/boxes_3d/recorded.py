@@ -19,6 +19,7 @@ from mcaptrack.geometry.transform_series import OTHER_CLOCK_S
 from mcaptrack.geometry.transform_tree import plain_frame
 from mcaptrack.sources.foreign.boxes import Classes
 from mcaptrack.sources.foreign.boxes_3d.box import Box3d, Message3d
+from mcaptrack.sources.foreign.boxes_3d.sweeps import are_mixed, find_sweeps
 
 #: Messages with stamps this close are one measurement, as where each box is a message.
 _SAME_NS: Final = 1_000_000
@@ -40,7 +41,7 @@ class Recorded3d:
     stamp_ns, log_ns : (N,) of int64
         Stamp of each box, 0 where it has none; and log time.
     centre, orientation, size, velocity : (N, 3), (N, 4), (N, 3) and (N, 3)
-        In the frame of each box; sizes and velocities are NaN where they are unknown.
+        In the frame of each box; sizes, velocities and z of centres are NaN where they are unknown.
     has_heading : (N,) of bool
         Whether the orientation is known.
     score : (N,)
@@ -107,12 +108,12 @@ class Recorded3d:
         out[some[order[1:]]] = ((before == after) | (np.isnan(before) & np.isnan(after))).all(axis=1)
         return out
 
-    def frames(self) -> tuple[Ints, Ints]:
-        """The times of F frames in ns (F,), increasing, and the frame of each box (N,).
+    def frames(self) -> tuple[Ints, Ints, str]:
+        """The times of F frames in ns (F,), increasing, the frame of each box (N,), and what was assumed, in words.
 
-        A message is a frame, unless the stamps of its boxes are far apart; so are messages with one stamp. Messages
-        without boxes are frames, too. One that only takes drawings away is none next to a frame with boxes: then it
-        makes room for these.
+        A message is a frame, unless the stamps of its boxes are far apart; so are messages with one stamp, and those of
+        one sweep. Messages without boxes are frames, too. One that only takes drawings away is none next to a frame
+        with boxes: then it makes room for these.
         """
         box_ns, _ = self.times()
         count = len(self.message_ns)
@@ -122,7 +123,7 @@ class Recorded3d:
         own_ns = self.message_ns - np.int64(np.median(late) if len(late) else 0)
         own_ns = np.where(is_off, own_ns, self.message_stamp_ns)
         middle, apart = own_ns.copy(), np.zeros(count, np.int64)
-        for number, some in _by_message(self.message, box_ns):
+        for number, some in _groups(self.message, box_ns):
             middle[number], apart[number] = np.sort(some)[(len(some) - 1) // 2], some.max() - some.min()
         has_boxes = np.bincount(self.message, minlength=count).astype(bool)
         usual = _usual_step(middle[has_boxes])
@@ -135,7 +136,25 @@ class Recorded3d:
             away = [np.abs(starts[np.clip(near + side, 0, len(starts) - 1)] - gone) for side in (-1, 0)]
             gone = gone[np.minimum(*away) > usual / 2]
         starts = _starts(np.concatenate([starts, gone]))
-        return starts, np.searchsorted(starts, at, "right") - 1
+        return self._gathered(starts, np.searchsorted(starts, at, "right") - 1, box_ns)
+
+    def _gathered(self, starts: Ints, frame: Ints, box_ns: Ints) -> tuple[Ints, Ints, str]:
+        """Frames (F,) as ``frames`` returns them, those of one sweep of the sensor as one."""
+        log_ns = starts.copy()
+        log_ns[frame[::-1]] = self.log_ns[::-1]
+        sweep = find_sweeps(starts, log_ns, frame, self.centre, self.class_id)
+        if sweep is None:
+            words = "messages have one box each, and their times don't show which are of one sweep: each is a frame"
+            return starts, frame, words if are_mixed(starts, frame, self.centre) else ""
+        t_ns = starts[np.unique(sweep, return_index=True)[1]]
+        for number, some in _groups(sweep[frame], box_ns):
+            t_ns[number] = np.sort(some)[(len(some) - 1) // 2]
+        order = np.argsort(t_ns, kind="stable")
+        place = np.empty(len(order), np.int64)
+        place[order] = np.arange(len(order))
+        apart_ms = max(int(np.ptp(some)) for _, some in _groups(sweep[frame], box_ns)) / 1e6
+        words = f"messages are gathered to {len(order):,} frames, one for each sweep"
+        return t_ns[order], place[sweep][frame], f"{words}: times up to {apart_ms:.0f} ms apart, then longer gaps"
 
 
 def _is_off(stamp_ns: Ints, log_ns: Ints) -> Bools:
@@ -145,10 +164,11 @@ def _is_off(stamp_ns: Ints, log_ns: Ints) -> Bools:
     return np.asarray((stamp_ns <= 0) | (away > OTHER_CLOCK_S * NS_PER_S))
 
 
-def _by_message(message: Ints, values: Ints) -> Iterable[tuple[int, Ints]]:
-    """Each message that has boxes, with the values of its boxes; ``message`` is sorted."""
-    numbers, begins = np.unique(message, return_index=True)
-    return zip(numbers.tolist(), np.split(values, begins[1:]), strict=False) if len(numbers) else ()
+def _groups(group: Ints, values: Ints) -> Iterable[tuple[int, Ints]]:
+    """Each group (message or sweep) that has boxes, with the values (N,) of its boxes."""
+    order = np.argsort(group, kind="stable")
+    numbers, begins = np.unique(group[order], return_index=True)
+    return zip(numbers.tolist(), np.split(values[order], begins[1:]), strict=False) if len(numbers) else ()
 
 
 def _usual_step(t_ns: Ints) -> float:
@@ -232,7 +252,9 @@ def _ids(found: Sequence[int | str | None]) -> Ints:
 def _checked(found: Recorded3d) -> Recorded3d:
     """The boxes that have a position; sizes and orientations that can't be are unknown, and counted as remarks."""
     with np.errstate(invalid="ignore"):
-        is_far: Bools = ~np.asarray((np.abs(found.centre) < _FARTHEST_M).all(axis=1))
+        # Radars know no height: x and y are a position.
+        is_there = (np.abs(found.centre) < _FARTHEST_M) | (np.isnan(found.centre) & [False, False, True])
+        is_far: Bools = ~np.asarray(is_there.all(axis=1))
         found = found.select(~is_far)
         size, turn = found.size, found.orientation
         odd_turn: Bools = ~np.asarray(np.isfinite(turn).all(axis=1))
@@ -240,6 +262,7 @@ def _checked(found: Recorded3d) -> Recorded3d:
         is_unturned = ~odd_turn & (length < np.finfo(np.float64).tiny)
         kinds = {
             "boxes have no position (no finite number) and are left out": is_far,
+            "boxes have no z: it is unknown, and 0 in their frame for x and y": np.isnan(found.centre[:, 2]),
             "boxes have a size that is no finite number: it is unknown": ~np.isfinite(size).all(axis=1),
             "boxes have a negative size: it is unknown": (size < 0).any(axis=1),
             "boxes have a size of 0: it is unknown": (size == 0).any(axis=1),

@@ -9,6 +9,7 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.notices import Code
 from mcaptrack.sources.ingest.labels.boxes_3d.rows import BoxRows3D, headings, numbered
 from mcaptrack.sources.ingest.labels.formats import ClassNames
 
@@ -22,8 +23,8 @@ CITY, VEHICLE = "map", "base_link"
 
 
 def is_argoverse(path: Path) -> bool:
-    """Whether a path is a table of boxes, or the folder of a log that has one."""
-    return path.suffix == ".feather" or (path.is_dir() and (path / BOXES).is_file())
+    """Whether a path is a table of boxes, or the folder of a log, with or without one."""
+    return path.suffix == ".feather" or (path.is_dir() and any((path / name).is_file() for name in (BOXES, POSES)))
 
 
 def read_argoverse(path: Path) -> BoxRows3D:
@@ -31,6 +32,8 @@ def read_argoverse(path: Path) -> BoxRows3D:
 
     Raises McaptrackError if a table can't be read, or if there is no pose at the time of a box.
     """
+    if path.is_dir() and not (path / BOXES).is_file():
+        raise McaptrackError(f"{path} has no {BOXES}: it is a log of Argoverse 2 without labels")
     path = path / BOXES if path.is_dir() else path
     table = _table(path, ("timestamp_ns", "track_uuid", "category", *_SIZE, *_QUATERNION, *_PLACE))
     count = len(table["track_uuid"])
@@ -50,11 +53,16 @@ def read_argoverse(path: Path) -> BoxRows3D:
         place, quaternions = _in_city(poses, t_ns, place, quaternions)
         frame_id, remarks = CITY, [f"{path}: boxes are in the city's frame, by {POSES}"]
     heading = headings(quaternions, path, at)[0]
-    names = ClassNames()
+    if None in table["track_uuid"]:
+        raise McaptrackError(f"{at(table['track_uuid'].index(None))} has no track_uuid")
+    names, unknown = ClassNames(), table["category"].count(None)
     try:
-        kind = np.array([names.number(str(one)) for one in table["category"]], np.int64)
+        kind = np.array([-1 if one is None else names.number(str(one)) for one in table["category"]], np.int64)
     except ValueError as error:
         raise McaptrackError(f"{path}: {error}") from None
+    doubts: list[tuple[str, Code]] = []
+    if unknown:
+        doubts.append((f"{path}: {unknown} of {count} boxes have no category: their class is unknown", "classes"))
     remarks.append(f"{path}: tracks are numbered from 1 on, a number for each track_uuid")
     return BoxRows3D(
         path,
@@ -70,6 +78,7 @@ def read_argoverse(path: Path) -> BoxRows3D:
         labelled=np.unique(t_ns),
         frame_id=frame_id,
         remarks=remarks,
+        doubts=doubts,
     )
 
 

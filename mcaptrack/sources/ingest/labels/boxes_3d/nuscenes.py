@@ -37,11 +37,15 @@ FRAME: Final = "map"
 
 
 def tables_folder(path: Path) -> Path | None:
-    """The folder with the tables: ``path``, or its only ``v1.0-...``; None if it isn't of nuScenes."""
+    """The folder with the tables: ``path``, or its only ``v1.0-...``; None if it isn't of nuScenes.
+
+    One without annotations counts if there is no other.
+    """
     if not path.is_dir():
         return None
     folders = [path, *sorted(path.glob("v1.0-*"))]
     found = [one for one in folders if (one / "sample_annotation.json").is_file()]
+    found = found or [one for one in folders if all((one / f"{name}.json").is_file() for name in TABLES[:2])][:1]
     if len(found) > 1:
         names = ", ".join(one.name for one in found)
         raise McaptrackError(f"{path} has several sets of tables, {names}; give the folder of one")
@@ -133,7 +137,8 @@ def _table(folder: Path, name: str) -> Iterator[dict[str, Any]]:
     try:
         content = json.loads(path.read_bytes())
     except FileNotFoundError:
-        raise McaptrackError(f"{folder} has no {path.name}; nuScenes boxes need {', '.join(TABLES)}") from None
+        why = ": it is a set without labels" if path.stem == TABLES[2] else ""
+        raise McaptrackError(f"{folder} has no {path.name}{why}; nuScenes boxes need {', '.join(TABLES)}") from None
     except OSError as error:
         raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
     except (ValueError, RecursionError):
