@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
@@ -14,7 +15,14 @@ from mcaptrack.cli.text import console, printable, say
 from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
     from mcaptrack import Scores
+    from mcaptrack.evaluation.metrics.displacement import Displacement
+
+#: Name of a sequence, topic of tracks and class, None for all classes.
+_Key = tuple[str, str, str | None]
 
 _COLUMNS: Final = ("MOTA", "IDF1", "HOTA", "IDSW", "FP", "FN", "Frag")
 _FORECAST_COLUMNS: Final = {
@@ -24,6 +32,7 @@ _FORECAST_COLUMNS: Final = {
     "recall": "recall",
     "false_forecasts_per_frame": "false",
     "consistency_m": "drift m",
+    "NLL": "NLL",
     "coverage_50": "in 50 %",
     "coverage_90": "in 90 %",
     "coverage_95": "in 95 %",
@@ -207,25 +216,60 @@ def print_results(scores: Scores) -> None:
             means = [f"{100 * result.class_means[name]:.1f}" if name in result.class_means else "" for name in columns]
             table.add_row(*first, result.tracks, "mean of classes", by, *means)
     out.print(table)
-    forecasts: dict[tuple[str, str, str | None], dict[str, float | None]] = {}
+    forecasts: dict[_Key, Displacement] = {}
     for result in scores.results:
         if result.displacement is not None:
             key = (result.sequence, result.tracks, result.of_class)
-            forecasts.setdefault(key, result.displacement.summary())
+            forecasts.setdefault(key, result.displacement)
     if forecasts:
-        table = Table(box=None, pad_edge=False, header_style="bold")
-        has_classes = any(of_class is not None for _, _, of_class in forecasts)
-        for name in (*(("sequence",) if several else ()), "forecasts of", *(("class",) if has_classes else ())):
-            table.add_column(name, no_wrap=True)
-        for name in _FORECAST_COLUMNS.values():
-            table.add_column(name, justify="right", no_wrap=True)
-        for (sequence, tracks, of_class), values in forecasts.items():
-            numbers = ["-" if values[name] is None else f"{values[name]:.3f}" for name in _FORECAST_COLUMNS]
-            first = [sequence] if several else []
-            own = [_class_cell(of_class)] if has_classes else []
-            table.add_row(*first, tracks, *own, *numbers)
-        out.print()
-        out.print(table)
+        _print_forecasts(out, forecasts, several)
+        _print_reliability(out, forecasts, several)
+
+
+def _print_forecasts(out: Console, forecasts: Mapping[_Key, Displacement], several: bool) -> None:
+    """The errors of forecasts."""
+    table, first = _table_of_forecasts("forecasts of", forecasts, several)
+    for name in _FORECAST_COLUMNS.values():
+        table.add_column(name, justify="right", no_wrap=True)
+    for key, found in forecasts.items():
+        values = found.summary()
+        numbers = ["-" if values[name] is None else f"{values[name]:.3f}" for name in _FORECAST_COLUMNS]
+        table.add_row(*first(key), *numbers)
+    out.print()
+    out.print(table)
+
+
+def _print_reliability(out: Console, forecasts: Mapping[_Key, Displacement], several: bool) -> None:
+    """How many true positions lie in the ellipses of each probability; nothing if no forecast has ellipses."""
+    held = {key: found.reliability() for key, found in forecasts.items()}
+    levels = [f"{100 * part['level']:g} %" for part in next((parts for parts in held.values() if parts), [])]
+    if not levels:
+        return
+    table, first = _table_of_forecasts("% of true positions in ellipses of", forecasts, several)
+    for level in levels:
+        table.add_column(level, justify="right", no_wrap=True)
+    for key, parts in held.items():
+        table.add_row(*first(key), *([f"{100 * part['held']:.1f}" for part in parts] or ["-"] * len(levels)))
+    out.print()
+    out.print(table)
+
+
+def _table_of_forecasts(
+    name: str, forecasts: Collection[_Key], several: bool
+) -> tuple[Table, Callable[[_Key], list[str]]]:
+    """An empty table of forecasts with its first columns, and the cells of these for each key."""
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    has_classes = any(of_class is not None for _, _, of_class in forecasts)
+    for column in (*(("sequence",) if several else ()), name, *(("class",) if has_classes else ())):
+        table.add_column(column, no_wrap=True)
+
+    def first(key: _Key) -> list[str]:
+        sequence, tracks, of_class = key
+        return [*([sequence] if several else []), tracks, *([_class_cell(of_class)] if has_classes else [])]
+
+    return table, first
 
 
 def _class_cell(name: str | None) -> str:

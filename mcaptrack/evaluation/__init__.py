@@ -136,6 +136,7 @@ class EvaluationRow:
         if self.displacement is not None:
             recall, ade = self.displacement.curve()
             out["displacement"] = self.displacement.summary() | {
+                "reliability": self.displacement.reliability(),
                 "curve_recall": recall.tolist(),
                 "curve_ADE_m": ade.tolist(),
                 "curve_ADE_squared_m2": self.displacement.curve(squared=True)[1].tolist(),

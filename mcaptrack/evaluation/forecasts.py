@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.aligned import MAX_GAP_S, on_ground, resample_frames
-from mcaptrack.evaluation.metrics.calibration import LEVELS
+from mcaptrack.evaluation.metrics.calibration import RELIABILITY_LEVELS
 from mcaptrack.evaluation.metrics.displacement import (
     TAU_M2,
     Displacement,
@@ -32,12 +32,13 @@ from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_numbers, frame_times, join_frames, row_ends, spans_of, split_rows
+from mcaptrack.schema.predictions import tails_of
 from mcaptrack.schema.resampling import is_observed_at
 
 #: The channels of forecasts, below the camera's prefix, and the tracks from which each is made.
 FORECAST_INPUTS: Final[Mapping[str, str]] = {"predictions": "samples", "retracks/predictions": "retracks/online"}
 NO_ID: Final = -1
-_WITHIN: Final = LEVELS.index(0.95)
+_WITHIN: Final = RELIABILITY_LEVELS.index(0.95)
 _AHEAD_S: Final = 1.0
 #: The past of a forecast may begin with a gap, and the last observation before it is at most so old, in seconds.
 _BEFORE_S: Final = 120.0
@@ -121,6 +122,7 @@ def _arrays(
         rows["track_id"][::horizon].astype(np.int64),
         on_ground(rows).reshape(-1, horizon, 2),
         cov.reshape(-1, horizon, 2, 2),
+        tails_of(rows, horizon),
     )
     return _ForecastArrays(message[::horizon], forecasts, clock)
 
@@ -241,9 +243,10 @@ def _compare(
     at = found.forecast[near]
     rows[id_column][at] = found.person[near]
     off, cov = found.offset_m[near], arrays.forecasts.cov_m2[at]
-    ade_m, fde_m, _, covered, _ = forecast_errors(off, cov)
+    errors = forecast_errors(off, cov, arrays.forecasts.shapes(at))
     soon_m = _at_s(off, arrays.clock.step_s, _AHEAD_S)
-    for measure, values in zip(_MEASURES, (ade_m, fde_m, soon_m, covered[:, _WITHIN]), strict=True):
+    measured = (errors.ade_m, errors.fde_m, soon_m, errors.covered[:, _WITHIN])
+    for measure, values in zip(_MEASURES, measured, strict=True):
         rows[front + measure][at] = values
     return np.asarray(found.is_judged & (rows[id_column] == NO_ID), np.bool_)
 

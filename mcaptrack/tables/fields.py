@@ -208,6 +208,7 @@ _METRICS: Final = Table(
         Field("AADE_m", _FLOAT, "forecasts: ADE averaged over recalls", "m", True),
         Field("false_forecasts_per_frame", _FLOAT, "forecasts without a person, by frames", nullable=True),
         Field("consistency_m", _FLOAT, "forecasts: distance from the previous one of the same track", "m", True),
+        Field("NLL", _FLOAT, "forecasts: mean negative log-likelihood of a step, in nats", nullable=True),
         Field("coverage_50", _FLOAT, "share of true futures in the 50 % ellipses", nullable=True),
         Field("coverage_90", _FLOAT, "share of true futures in the 90 % ellipses", nullable=True),
         Field("coverage_95", _FLOAT, "share of true futures in the 95 % ellipses", nullable=True),

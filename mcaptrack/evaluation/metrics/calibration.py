@@ -10,8 +10,11 @@ from typing import Final
 import numpy as np
 
 from mcaptrack.geometry.arrays import Floats
+from mcaptrack.geometry.mixtures import Tails, log_density, mass_within, normal_tails
 
-#: The probabilities of the ellipses for which calibration is reported.
+#: The probabilities of the ellipses for which reliability is reported.
+RELIABILITY_LEVELS: Final = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
+#: Those of them that tables have columns for.
 LEVELS: Final = (0.5, 0.9, 0.95)
 
 
@@ -41,7 +44,65 @@ def mahalanobis_squared(off_m: Floats, cov_m2: Floats) -> Floats:
     return np.asarray((yy * x**2 - 2 * xy * x * y + xx * y**2) / (xx * yy - xy**2))
 
 
-def coverage(off_m: Floats, cov_m2: Floats, level: float) -> float:
+def ellipse_levels(off_m: Floats, cov_m2: Floats, tails: Tails) -> Floats:
+    """The probabilities of the smallest ellipses that hold errors: uniform from 0 to 1 if forecasts are calibrated.
+
+    Parameters
+    ----------
+    off_m : array (..., 2), m
+        Errors.
+    cov_m2 : array (..., 2, 2), m^2
+        Covariances of the forecasts.
+    tails : Tails (...)
+        Shapes of their distributions.
+
+    Returns
+    -------
+    array (...)
+        NaN where the covariance is not known.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> cov_m2 = np.tile(np.eye(2), (2, 1, 1))
+    >>> ellipse_levels(np.array([[0.0, 0.0], [3.0, 0.0]]), cov_m2, normal_tails(2)).round(3).tolist()
+    [0.0, 0.989]
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        squared = mahalanobis_squared(off_m, cov_m2)
+    return np.where(np.isfinite(squared), mass_within(squared, tails), np.nan)
+
+
+def negative_log_likelihood(off_m: Floats, cov_m2: Floats, tails: Tails) -> Floats:
+    """The negative log-likelihood of errors, in nats; of errors in metres, so that smaller ellipses can be below 0.
+
+    Parameters
+    ----------
+    off_m : array (..., 2), m
+        Errors.
+    cov_m2 : array (..., 2, 2), m^2
+        Covariances of the forecasts.
+    tails : Tails (...)
+        Shapes of their distributions.
+
+    Returns
+    -------
+    array (...)
+        NaN where the covariance is not known.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> negative_log_likelihood(np.zeros((1, 2)), np.eye(2)[None], normal_tails(1)).round(3).tolist()
+    [1.838]
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        squared = mahalanobis_squared(off_m, cov_m2)
+        log_area = np.log(cov_m2[..., 0, 0] * cov_m2[..., 1, 1] - cov_m2[..., 0, 1] ** 2) / 2
+    return np.where(np.isfinite(squared), -log_density(squared, log_area, tails), np.nan)
+
+
+def coverage(off_m: Floats, cov_m2: Floats, level: float, tails: Tails | None = None) -> float:
     """The share of errors that lie inside the ellipses of a probability. Calibrated forecasts have a share of
     ``level``.
 
@@ -53,6 +114,8 @@ def coverage(off_m: Floats, cov_m2: Floats, level: float) -> float:
         Covariances of the forecasts.
     level : float
         Probability of the ellipses, between 0 and 1.
+    tails : Tails (...), optional
+        Shapes of the distributions; normal distributions if left out.
 
     Returns
     -------
@@ -65,10 +128,11 @@ def coverage(off_m: Floats, cov_m2: Floats, level: float) -> float:
     >>> coverage(np.array([[0.1, 0.0], [9.0, 0.0]]), np.tile(np.eye(2), (2, 1, 1)), 0.95)
     0.5
     """
-    return float((mahalanobis_squared(off_m, cov_m2) <= -2 * np.log(1 - level)).mean())
+    shapes = normal_tails(off_m.shape[:-1]) if tails is None else tails
+    return float((ellipse_levels(off_m, cov_m2, shapes) <= level).mean())
 
 
-def forecast_scores(mean_m: Floats, cov_m2: Floats, future_m: Floats) -> dict[str, float]:
+def forecast_scores(mean_m: Floats, cov_m2: Floats, future_m: Floats, tails: Tails | None = None) -> dict[str, float]:
     """Compare forecasts with the true future.
 
     Parameters
@@ -79,6 +143,8 @@ def forecast_scores(mean_m: Floats, cov_m2: Floats, future_m: Floats) -> dict[st
         Their covariances.
     future_m : array (N, T, 2), m
         True positions.
+    tails : Tails (N, T), optional
+        Shapes of the distributions; normal distributions if left out.
 
     Returns
     -------
@@ -106,12 +172,11 @@ def forecast_scores(mean_m: Floats, cov_m2: Floats, future_m: Floats) -> dict[st
     """
     off = mean_m - future_m
     away = np.hypot(off[..., 0], off[..., 1])
-    area = cov_m2[..., 0, 0] * cov_m2[..., 1, 1] - cov_m2[..., 0, 1] ** 2
-    nll = mahalanobis_squared(off, cov_m2) / 2 + np.log(area) / 2 + np.log(2 * np.pi)
+    shapes = normal_tails(away.shape) if tails is None else tails
     return {
         "ADE_m": float(away.mean()),
         "FDE_m": float(away[:, -1].mean()),
         "ADE_squared_m2": float((away**2).mean()),
-        "NLL": float(nll.mean()),
-        **{f"coverage_{100 * level:g}": coverage(off, cov_m2, level) for level in LEVELS},
+        "NLL": float(negative_log_likelihood(off, cov_m2, shapes).mean()),
+        **{f"coverage_{100 * level:g}": coverage(off, cov_m2, level, shapes) for level in LEVELS},
     }

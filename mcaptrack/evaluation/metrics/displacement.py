@@ -17,15 +17,19 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.evaluation.metrics.calibration import LEVELS, mahalanobis_squared
+from mcaptrack.evaluation.metrics.calibration import (
+    LEVELS,
+    RELIABILITY_LEVELS,
+    ellipse_levels,
+    negative_log_likelihood,
+)
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.assignment import solve
+from mcaptrack.geometry.mixtures import Tails, normal_tails
 from mcaptrack.geometry.ragged import cross_pairs, group_index, ragged_range, run_ends, run_starts
 
 #: The association threshold in m^2 at which single numbers are reported (tau in the paper).
 TAU_M2: Final = 2.0
-#: Quantiles of the chi-squared distribution with 2 degrees of freedom for the levels of calibration.
-_CHI2: Final = -2 * np.log(1 - np.array(LEVELS))
 #: The number of pairs compared at once, to limit memory.
 _PAIRS_AT_ONCE: Final = 200_000
 
@@ -93,12 +97,20 @@ def _sorted_positions(path: Positions, fill: bool) -> _SortedPositions:
 
 @dataclass(frozen=True)
 class Forecasts:
-    """Forecasts made at ``step`` (N,) for ``id`` (N,): mean (N, T, 2) in m, covariance (N, T, 2, 2) in m^2."""
+    """Forecasts made at ``step`` (N,) for ``id`` (N,): mean (N, T, 2) in m, covariance (N, T, 2, 2) in m^2.
+
+    ``tails`` (N, T) are the shapes of their distributions, None if all are normal distributions.
+    """
 
     step: Ints
     id: Ints
     mean_m: Floats
     cov_m2: Floats
+    tails: Tails | None = None
+
+    def shapes(self, which: Ints | Bools) -> Tails:
+        """The shapes of the distributions of some forecasts."""
+        return normal_tails(self.mean_m[which].shape[:2]) if self.tails is None else self.tails.chosen(which)
 
 
 @dataclass(frozen=True)
@@ -109,7 +121,8 @@ class Displacement:
     ade_m: Floats
     fde_m: Floats
     ade_squared_m2: Floats
-    covered: Floats  # (P, 3): share of the future steps inside the 50, 90 and 95 % ellipse; NaN without covariance
+    covered: Floats  # (P, levels): share of the future steps inside the ellipse of each level; NaN without covariance
+    nll: Floats  # mean negative log-likelihood of a future step; NaN without covariance
     people: int
     false_forecasts: int
     frames: int
@@ -150,8 +163,9 @@ class Displacement:
         dict
             ADE_m, FDE_m, ADE_squared_m2: mean errors over all steps, at the last step, and squared. recall: share of
             the people that have a forecast. AADE_m: ADE averaged over recalls. false_forecasts_per_frame.
-            consistency_m: distance between consecutive forecasts of a track. coverage_P: share of future steps inside
-            the P % ellipse. None if there is no value to average.
+            consistency_m: distance between consecutive forecasts of a track. NLL: mean negative log-likelihood of a
+            step, in nats. coverage_P: share of future steps inside the P % ellipse. None if there is no value to
+            average.
         """
         kept = self.d_obs_m2 < tau_m2
 
@@ -167,8 +181,26 @@ class Displacement:
             "AADE_m": mean(running[: int(kept.sum())]),
             "false_forecasts_per_frame": self.false_forecasts / self.frames if self.frames else None,
             "consistency_m": mean(self.consistency_m),
-            **{f"coverage_{100 * p:g}": mean(self.covered[kept, k]) for k, p in enumerate(LEVELS)},
+            "NLL": mean(self.nll[kept]),
+            **{
+                f"coverage_{100 * level:g}": mean(self.covered[kept, k])
+                for k, level in enumerate(RELIABILITY_LEVELS)
+                if level in LEVELS
+            },
         }
+
+    def reliability(self, tau_m2: float = TAU_M2) -> list[dict[str, float]]:
+        """The share of future steps inside the ellipse of each level, at one threshold.
+
+        Each member has ``level``, the probability of the ellipse, and ``held``, the share. Empty without covariances.
+        """
+        kept = self.covered[self.d_obs_m2 < tau_m2]
+        if not len(kept) or not np.isfinite(kept).all():
+            return []
+        return [
+            {"level": level, "held": float(held)}
+            for level, held in zip(RELIABILITY_LEVELS, kept.mean(axis=0), strict=True)
+        ]
 
 
 def combine_displacements(parts: list[Displacement]) -> Displacement:
@@ -185,6 +217,7 @@ def combine_displacements(parts: list[Displacement]) -> Displacement:
         fde_m=pooled("fde_m"),
         ade_squared_m2=pooled("ade_squared_m2"),
         covered=pooled("covered"),
+        nll=pooled("nll"),
         people=sum(part.people for part in parts),
         false_forecasts=sum(part.false_forecasts for part in parts),
         frames=sum(part.frames for part in parts),
@@ -329,34 +362,48 @@ def displacement(
     """
     found = pair_forecasts(ground_truth, tracks, forecasts, t_obs)
     known = np.isfinite(found.offset_m).all(axis=(1, 2))
-    ade_m, fde_m, squared_m2, covered, error_m = forecast_errors(
-        found.offset_m[known], forecasts.cov_m2[found.forecast[known]]
-    )
+    number = found.forecast[known]
+    errors = forecast_errors(found.offset_m[known], forecasts.cov_m2[number], forecasts.shapes(number))
     return Displacement(
         d_obs_m2=found.d_obs_m2[known],
-        ade_m=ade_m,
-        fde_m=fde_m,
-        ade_squared_m2=squared_m2,
-        covered=covered,
+        ade_m=errors.ade_m,
+        fde_m=errors.fde_m,
+        ade_squared_m2=errors.ade_squared_m2,
+        covered=errors.covered,
+        nll=errors.nll,
         people=found.people,
         false_forecasts=int(found.is_judged.sum() - (found.d_obs_m2 < tau_m2).sum()),
         frames=found.frames,
         consistency_m=_consistency_m(forecasts),
-        error_m=error_m,
+        error_m=errors.error_m,
     )
 
 
-def forecast_errors(offset: Floats, cov: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """ADE, FDE, squared ADE, shares inside ellipses and distances (P, T) of P pairs.
+class ForecastErrors(NamedTuple):
+    """The errors of P forecasts, as in ``Displacement``."""
 
-    From errors (P, T, 2) and covariances (P, T, 2, 2).
-    """
+    ade_m: Floats
+    fde_m: Floats
+    ade_squared_m2: Floats
+    covered: Floats
+    nll: Floats
+    error_m: Floats
+
+
+def forecast_errors(offset: Floats, cov: Floats, tails: Tails) -> ForecastErrors:
+    """The errors of P pairs, from offsets (P, T, 2), covariances (P, T, 2, 2) and shapes of distributions (P, T)."""
     squared = (offset**2).sum(axis=-1)
     euclidean = np.sqrt(squared)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        away = mahalanobis_squared(offset, cov)[..., None]
-    inside = np.where(np.isfinite(away), away <= _CHI2, np.nan)
-    return euclidean.mean(axis=-1), euclidean[..., -1], squared.mean(axis=-1), inside.mean(axis=-2), euclidean
+    level = ellipse_levels(offset, cov, tails)[..., None]
+    inside = np.where(np.isfinite(level), level <= np.array(RELIABILITY_LEVELS), np.nan)
+    return ForecastErrors(
+        euclidean.mean(axis=-1),
+        euclidean[..., -1],
+        squared.mean(axis=-1),
+        inside.mean(axis=-2),
+        negative_log_likelihood(offset, cov, tails).mean(axis=-1),
+        euclidean,
+    )
 
 
 def _consistency_m(forecasts: Forecasts) -> Floats:

@@ -16,12 +16,14 @@ from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.clocks import seconds_to_ns
+from mcaptrack.geometry.mixtures import squared_radius
 from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.camera_motion import to_scene
 from mcaptrack.schema.classes import class_name
 from mcaptrack.schema.framing import frame_times, join_frames, row_ends, unique_values
+from mcaptrack.schema.predictions import tails_of
 from mcaptrack.schema.resampling import interval_ns, resample
 
 #: The duration of trails, and their number of lines.
@@ -78,7 +80,8 @@ class Trails(NamedTuple):
 class ForecastPaths(NamedTuple):
     """N forecasts of equal length: index of the message, id, and the path (N, P, 2) m.
 
-    ``end_m`` (N, 2) and ``spread_m2`` (N, 2, 2) are mean and covariance of the last step, NaN if unknown.
+    ``end_m`` (N, 2) is the mean of the last step. ``spread_m2`` (N, 2, 2) is the covariance of the normal distribution
+    with the same 95 % ellipse as the last step, NaN if unknown: of a mixture, another one than its covariance.
     """
 
     message: Ints
@@ -258,6 +261,7 @@ def forecasts(frames: Sequence[Frame], first: int = 0, last: int | None = None) 
         shown = np.unique(np.linspace(0, count - 1, min(count, _FORECAST_POINTS)).round().astype(np.int64))
         names = ("cov_xx_m2", "cov_xy_m2", "cov_xy_m2", "cov_yy_m2")
         spread = np.stack([rows[name][end] for name in names], axis=-1).reshape(-1, 2, 2)
+        spread *= (squared_radius(0.95, tails_of(rows[end])) / CHI2_95)[:, None, None]
         yield ForecastPaths(message[begin], number[begin], xy[begin[:, None] + shown], xy[end], spread)
 
 

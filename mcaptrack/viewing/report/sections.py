@@ -11,6 +11,7 @@ import numpy as np
 from mcaptrack.errors import command
 from mcaptrack.evaluation import EvaluationRow
 from mcaptrack.evaluation.metrics import summary
+from mcaptrack.evaluation.metrics.calibration import LEVELS
 from mcaptrack.viewing.report.charts import Axis, Bars, Line, histogram_chart, line_chart, round_most
 from mcaptrack.viewing.report.contents import LogReport
 from mcaptrack.viewing.report.formatting import counted, number, percent, short
@@ -122,12 +123,10 @@ def forecasts(report: LogReport) -> dict[str, Any]:
     parts = [part for one in found for part in (one["by_horizon"], one["constant_velocity"]) if part]
     most = round_most(np.array(part[key], float) for part in parts for key in ("mean_m", "three_quarters_m"))
     figures += [_by_horizon(one, name, role, most) for one, name, role in members if one["by_horizon"]["n"]]
-    with_covariance = [
-        member for member in members if all(part["held"] is not None for part in member[0]["calibration"])
-    ]
+    with_covariance = [member for member in members if member[0]["reliability"]]
     if with_covariance:
-        return {"figures": [*figures, _calibration(with_covariance)], "missing": []}
-    why = "The calibration of the ellipses is not known: the forecasts have no covariance."
+        return {"figures": [*figures, _reliability(with_covariance)], "missing": []}
+    why = "The reliability of the ellipses is not known: the forecasts have no covariance."
     return {"figures": figures, "missing": [why]}
 
 
@@ -164,22 +163,28 @@ def _by_horizon(one: dict[str, Any], name: str, role: str, most: float) -> Figur
     }
 
 
-def _calibration(members: Sequence[tuple[dict[str, Any], str, str]]) -> Figure:
-    levels = [(name, role, one["calibration"]) for one, name, role in members]
+def _reliability(members: Sequence[tuple[dict[str, Any], str, str]]) -> Figure:
     lines = [
-        Line(short(name), role, np.array([one["nominal"] for one in parts]), np.array([one["held"] for one in parts]))
-        for name, role, parts in levels
+        Line(short(name), role, *(np.array([part[key] for part in one["reliability"]]) for key in ("level", "held")))
+        for one, name, role in members
     ]
     title = "Share of true futures inside the forecast ellipses, against their probability"
     axes = Axis("probability, %", 1.0, percent=True), Axis("share inside, %", 1.0, percent=True)
     text = "; ".join(
-        f"{name}: " + ", ".join(f"{percent(one['held'], 0)} in {percent(one['nominal'], 0)}" for one in parts)
-        for name, _, parts in levels
+        f"{name}: "
+        + ", ".join(
+            f"{percent(part['held'], 0)} in {percent(part['level'], 0)}"
+            for part in one["reliability"]
+            if part["level"] in LEVELS
+        )
+        + f", NLL {number(one['NLL'], 2)}"
+        for one, name, _ in members
     )
     return {
         "chart": line_chart(title, lines, *axes, diagonal="calibrated"),
-        "title": "Calibration.",
-        "caption": f"{text}. Below the dashed line forecasts are overconfident, above it too cautious.",
+        "title": "Reliability.",
+        "caption": f"{text}. Below the dashed line forecasts are overconfident, above it too cautious. NLL: negative "
+        "log-likelihood of the true positions; lower is better.",
     }
 
 

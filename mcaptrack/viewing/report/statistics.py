@@ -13,7 +13,6 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluationInput, EvaluationRow
 from mcaptrack.evaluation.forecasts import score_forecasts
-from mcaptrack.evaluation.metrics.calibration import LEVELS
 from mcaptrack.evaluation.metrics.displacement import Displacement
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
@@ -124,7 +123,8 @@ def forecast_statistics(sequence: EvaluationInput, results: Sequence[EvaluationR
             "curve_ADE_m": ade.tolist(),
             "by_horizon": _by_horizon(found, step_s),
             "constant_velocity": None,
-            "calibration": [{"nominal": level, "held": summary[f"coverage_{100 * level:g}"]} for level in LEVELS],
+            "reliability": found.reliability(),
+            "NLL": summary["NLL"],
         }
         baseline = _constant_velocity(sequence, candidate, step_s, found.error_m.shape[1])
         if baseline is not None:
