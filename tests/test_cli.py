@@ -187,6 +187,8 @@ class TestEvaluate:
             "AADE_m",
             "false_forecasts_per_frame",
             "consistency_m",
+            "NLL",
+            "reliability",
             "coverage_50",
             "coverage_90",
             "coverage_95",

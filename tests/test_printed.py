@@ -66,6 +66,7 @@ class TestEvaluate:
         "recall": "recall",
         "false": "false_forecasts_per_frame",
         "drift m": "consistency_m",
+        "NLL": "NLL",
         "in 50 %": "coverage_50",
         "in 90 %": "coverage_90",
         "in 95 %": "coverage_95",
@@ -92,7 +93,7 @@ class TestEvaluate:
 
     def test_predictions_have_a_table_with_a_row_for_each_channel(self, scored):
         first, results, text, _ = scored
-        _, (head, rows) = tables(text)
+        _, (head, rows), *_ = tables(text)
         assert head == [*first, "forecasts of", *self.FORECASTS]
         made: dict[tuple[str, ...], dict[str, Any]] = {}
         for one in results:

@@ -153,7 +153,10 @@ def test_the_curve_and_the_errors_by_horizon_are_those_of_the_scores(predicted):
     points = list(zip(one["curve_recall"], one["curve_ADE_m"], strict=True))
     assert points[-1] == (whole["curve_recall"][-1], whole["curve_ADE_m"][-1])
     assert set(points) <= set(zip(whole["curve_recall"], whole["curve_ADE_m"], strict=True))
-    assert [part["held"] for part in one["calibration"]] == [whole[f"coverage_{p}"] for p in (50, 90, 95)]
+    assert [(part["nominal"], part["held"]) for part in one["calibration"]] == [
+        (part["level"], part["held"]) for part in whole["reliability"]
+    ]
+    assert one["NLL"] == whole["NLL"]
 
 
 def test_errors_by_horizon_of_two_scenes_go_as_far_as_the_longer_forecasts():

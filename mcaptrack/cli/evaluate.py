@@ -240,16 +240,16 @@ def _print_forecasts(out: Console, forecasts: Mapping[_Key, Displacement], sever
 
 
 def _print_reliability(out: Console, forecasts: Mapping[_Key, Displacement], several: bool) -> None:
-    """How many true positions lie in the ellipses of each probability; nothing if no forecast has ellipses."""
+    """The share of true positions in the ellipses of each probability; nothing if no forecast has ellipses."""
     held = {key: found.reliability() for key, found in forecasts.items()}
-    levels = [f"{100 * part['level']:g} %" for part in next((parts for parts in held.values() if parts), [])]
+    levels = [f"in {100 * part['level']:g} %" for part in next((parts for parts in held.values() if parts), [])]
     if not levels:
         return
-    table, first = _table_of_forecasts("% of true positions in ellipses of", forecasts, several)
+    table, first = _table_of_forecasts("reliability of", forecasts, several)
     for level in levels:
         table.add_column(level, justify="right", no_wrap=True)
     for key, parts in held.items():
-        table.add_row(*first(key), *([f"{100 * part['held']:.1f}" for part in parts] or ["-"] * len(levels)))
+        table.add_row(*first(key), *([f"{part['held']:.3f}" for part in parts] or ["-"] * len(levels)))
     out.print()
     out.print(table)
 

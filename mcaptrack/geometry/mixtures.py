@@ -89,6 +89,6 @@ def log_density(squared: Floats, log_area: Floats, tails: Tails) -> Floats:
     """
     weight, narrow, wide = tails.of_normals()
     half = np.asarray(squared) / 2
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # a weight of 0, an unknown covariance
         parts = np.log1p(-weight) - half / narrow - np.log(narrow), np.log(weight) - half / wide - np.log(wide)
-    return np.asarray(np.logaddexp(*parts) - log_area - np.log(2 * np.pi))
+        return np.asarray(np.logaddexp(*parts) - log_area - np.log(2 * np.pi))

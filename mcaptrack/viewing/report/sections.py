@@ -123,7 +123,7 @@ def forecasts(report: LogReport) -> dict[str, Any]:
     parts = [part for one in found for part in (one["by_horizon"], one["constant_velocity"]) if part]
     most = round_most(np.array(part[key], float) for part in parts for key in ("mean_m", "three_quarters_m"))
     figures += [_by_horizon(one, name, role, most) for one, name, role in members if one["by_horizon"]["n"]]
-    with_covariance = [member for member in members if member[0]["reliability"]]
+    with_covariance = [member for member in members if member[0]["calibration"]]
     if with_covariance:
         return {"figures": [*figures, _reliability(with_covariance)], "missing": []}
     why = "The reliability of the ellipses is not known: the forecasts have no covariance."
@@ -164,18 +164,18 @@ def _by_horizon(one: dict[str, Any], name: str, role: str, most: float) -> Figur
 
 
 def _reliability(members: Sequence[tuple[dict[str, Any], str, str]]) -> Figure:
-    lines = [
-        Line(short(name), role, *(np.array([part[key] for part in one["reliability"]]) for key in ("level", "held")))
-        for one, name, role in members
-    ]
+    lines = []
+    for one, name, role in members:
+        nominal, held = (np.array([part[key] for part in one["calibration"]]) for key in ("nominal", "held"))
+        lines.append(Line(short(name), role, nominal, held))
     title = "Share of true futures inside the forecast ellipses, against their probability"
     axes = Axis("probability, %", 1.0, percent=True), Axis("share inside, %", 1.0, percent=True)
     text = "; ".join(
         f"{name}: "
         + ", ".join(
-            f"{percent(part['held'], 0)} in {percent(part['level'], 0)}"
-            for part in one["reliability"]
-            if part["level"] in LEVELS
+            f"{percent(part['held'], 0)} in {percent(part['nominal'], 0)}"
+            for part in one["calibration"]
+            if part["nominal"] in LEVELS
         )
         + f", NLL {number(one['NLL'], 2)}"
         for one, name, _ in members

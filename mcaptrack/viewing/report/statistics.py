@@ -123,7 +123,7 @@ def forecast_statistics(sequence: EvaluationInput, results: Sequence[EvaluationR
             "curve_ADE_m": ade.tolist(),
             "by_horizon": _by_horizon(found, step_s),
             "constant_velocity": None,
-            "reliability": found.reliability(),
+            "calibration": [{"nominal": part["level"], "held": part["held"]} for part in found.reliability()],
             "NLL": summary["NLL"],
         }
         baseline = _constant_velocity(sequence, candidate, step_s, found.error_m.shape[1])
