@@ -10,6 +10,7 @@ _PARTS = {
     "detecting": ["detect", "motion"],
     "demonstration": ["DemoResult", "demo"],
     "fetching": ["FetchedMessage"],
+    "fusing": ["fuse"],
     "health": ["DoctorResult", "doctor"],
     "ingesting": ["IngestResult", "ingest"],
     "outputs": ["ExportResult", "RenderResult", "ReportResult", "export", "render", "report"],

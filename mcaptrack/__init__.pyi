@@ -10,6 +10,7 @@ from mcaptrack.api.demonstration import demo as demo
 from mcaptrack.api.detecting import detect as detect
 from mcaptrack.api.detecting import motion as motion
 from mcaptrack.api.fetching import FetchedMessage as FetchedMessage
+from mcaptrack.api.fusing import fuse as fuse
 from mcaptrack.api.health import DoctorResult as DoctorResult
 from mcaptrack.api.health import doctor as doctor
 from mcaptrack.api.ingesting import IngestResult as IngestResult

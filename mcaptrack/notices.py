@@ -22,6 +22,7 @@ from typing import Final, Literal, NamedTuple, get_args
 Code = Literal[
     "assumed-ground-plane",
     "camera-moves",
+    "cameras-disagree",
     "chosen-camera",
     "classes",
     "clock",

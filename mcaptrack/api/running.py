@@ -117,6 +117,22 @@ def work(
     plane: PlaneChoice = AS_BEFORE,
 ) -> RunResult:
     """Plan and run on one log. ``tables`` is None where a single stage runs, which neither exports nor summarises."""
+
+    def act(opened: logs.Log, output: Path | None, notes: Notes, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
+        topics = watch.topics if watch else ()
+        prefix = pipeline.find_camera(opened, where.camera, where.topic or next(iter(topics), None))
+        jobs = plan(opened, prefix, notes.say)
+        return prefix, pipeline.run(opened, prefix, jobs, output, progress, watch, plane, boxes)
+
+    return change(where, act, progress, tables)
+
+
+#: Changes an open log, or a copy of it at the path; returns the prefix of the camera, and what was done.
+Act = Callable[[logs.Log, Path | None, Notes, BoxesRead], tuple[str, pipeline.Report]]
+
+
+def change(where: Where, act: Act, progress: Progress, tables: bool | None) -> RunResult:
+    """Change one log; ``tables`` as for ``work``."""
     began = monotonic()
     path = as_location(where.log)
     output = None if where.output is None else log_output(where.output, path)
@@ -134,10 +150,7 @@ def work(
         with logs.read(path, sidecar=None if output else place) as opened:
             if output is None:
                 opened.lock()  # a second process is refused before it computes anything
-            topics = watch.topics if watch else ()
-            prefix = pipeline.find_camera(opened, where.camera, where.topic or next(iter(topics), None))
-            jobs = plan(opened, prefix, notes.say)
-            report = pipeline.run(opened, prefix, jobs, output, progress, watch, plane, boxes)
+            prefix, report = act(opened, output, notes, boxes)
             written_to = output or opened.parts[-1].path
         if written_to == path and isinstance(path, Path):
             update_metadata(path)

@@ -18,6 +18,7 @@ from mcaptrack.cli.doctor import doctor
 from mcaptrack.cli.evaluate import evaluate
 from mcaptrack.cli.events import events
 from mcaptrack.cli.files import check, drop, recover
+from mcaptrack.cli.fuse import fuse
 from mcaptrack.cli.ingest import ingest
 from mcaptrack.cli.models import models
 from mcaptrack.cli.query import query
@@ -64,6 +65,7 @@ _MEASURE, _KEEP = "Measure and improve", "Check and repair logs"
 register(app, _MAKE, "ingest", ingest)
 register(app, _MAKE, "demo", demo)
 add_stages(app, _RUN)
+register(app, _RUN, "fuse", fuse)
 register(app, _RUN, "events", events)
 register(app, _RUN, "models", models)
 register(app, _LOOK, "info", info, reads=True)

@@ -26,7 +26,7 @@ def run_on_logs(given: Mapping[str, Any], name: str, function: Run, options: Map
     """Run stages on each log, and print the results. ``function`` takes a log and ``options``."""
     from mcaptrack.fleet import find_logs
 
-    where = {name: given[name] for name in ("camera", "sidecar", "force")}
+    where = {name: given[name] for name in ("camera", "sidecar", "force") if name in given}
     shows_events = name == "events"
     with common.Talk(given["quiet"], given["verbose"]).open() as talk:
         work: LogWork[RunResult] = LogWork(
@@ -62,6 +62,9 @@ def _next(result: RunResult) -> list[str]:
     """Return commands to run next."""
     show = "view" if isinstance(result.log, Path) else "report"  # viewers open files
     if result.summary is None:
+        if result.stages == ("fuse",):
+            scene = next(iter(result.frames)).split("/")[1]
+            return [command("run", result.log, "--camera", scene).strip("`")]
         steps = [show] if result.stages == ("events",) else ["run"]
     elif not result.summary.tracks:
         steps = ["info"]

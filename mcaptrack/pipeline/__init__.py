@@ -6,6 +6,7 @@ transform and its parameters.
 
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.pipeline.events import Watch
+from mcaptrack.pipeline.fusing import fuse_cameras
 from mcaptrack.pipeline.plan import plan_all, plan_stage
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, read_planes
 from mcaptrack.pipeline.run import Report, input_of, outdated_by, run
@@ -30,6 +31,7 @@ __all__ = [
     "camera_at",
     "find_camera",
     "find_views",
+    "fuse_cameras",
     "input_of",
     "is_stale",
     "layout_path",

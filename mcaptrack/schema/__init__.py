@@ -34,6 +34,7 @@ __all__ = [
     "PLACE_M",
     "PREDICTIONS",
     "SCHEMAS",
+    "SIGHTINGS",
     "SIZES",
     "TRACKS",
     "VIDEO",
@@ -260,6 +261,7 @@ GROUND_PLANE: Final = Schema("mcaptrack.GroundPlane")
 CAMERA_MOTION: Final = Schema("mcaptrack.CameraMotion")
 EVENTS: Final = Schema("mcaptrack.Events")
 COUNTS: Final = Schema("mcaptrack.Counts")
+SIGHTINGS: Final = Schema("mcaptrack.Sightings")
 FORECAST_ERRORS: Final = Schema("mcaptrack.ForecastErrors")
 FORECAST_SCORES: Final = Schema("mcaptrack.ForecastScores")
 #: Row schemas by name.
@@ -275,6 +277,7 @@ SCHEMAS: Final = {
         COUNTS,
         FORECAST_ERRORS,
         FORECAST_SCORES,
+        SIGHTINGS,
     )
 }
 #: Pictures instead of rows: a transform that reads this schema gets their brightness, or their colours if it asks for

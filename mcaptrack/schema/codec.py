@@ -106,7 +106,7 @@ class RowCodec:
     def __init__(self, definition: Definition) -> None:
         self._definition = definition
         columns = definition.columns
-        grew = [at for at in range(1, len(columns)) if columns[at].since != columns[at - 1].since]
+        grew = [at for at in range(1, len(columns)) if columns[at].group != columns[at - 1].group]
         self._layouts = [_Layout(columns[:count]) for count in (*grew, len(columns))]  # the shortest first
         self._later = [columns[count:] for count in grew]
         self.dtype = self._layouts[-1].dtype

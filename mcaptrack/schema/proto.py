@@ -42,7 +42,8 @@ class Column:
 
     A whole number that is missing is -1, in tables, too, as ids of other columns are.
 
-    ``since`` is the version that added the column, "" for those that were there from the beginning.
+    ``since`` is the version that added the column, "" for those that were there from the beginning; ``group`` counts
+    the comments that say so up to it, because columns are added in groups.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Column:
     optional: bool
     doc: str
     since: str = ""
+    group: int = 0
 
     @property
     def unit(self) -> str:
@@ -115,7 +117,7 @@ def parse(text: str, origin: str) -> Definition:
 
     Raises ValueError, with the line, for anything outside the subset.
     """
-    package, depth, closed, since = "", 0, False, ""
+    package, depth, closed, since, group = "", 0, False, "", 0
     names: list[str] = []
     doc: list[str] = []
     columns: list[Column] = []
@@ -126,7 +128,7 @@ def parse(text: str, origin: str) -> Definition:
             if comment and not names:
                 doc.append(comment.group(1).strip())
             elif comment and (added := _SINCE.match(comment.group(1).strip())):
-                since = added.group(1)
+                since, group = added.group(1), group + 1
             continue
         message, field = _MESSAGE.match(line), _FIELD.match(line)
         if line == 'syntax = "proto3";':
@@ -145,7 +147,7 @@ def parse(text: str, origin: str) -> Definition:
             if optional and kind not in _MISSING:
                 raise ValueError(f"{origin}:{number}: only {', '.join(_MISSING)} can be optional, not {kind} {name}")
             words = comment.group(1).strip() if comment else ""
-            columns.append(Column(name, kind, int(tag), bool(optional), words, since))
+            columns.append(Column(name, kind, int(tag), bool(optional), words, since, group))
         else:
             raise ValueError(f"{origin}:{number}: not a row schema (fixed-width fields in message Row): {line}")
     numbers = [column.number for column in columns]

@@ -1,0 +1,106 @@
+"""``mcaptrack fuse``: fuse the detections of several cameras."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields
+from typing import Annotated, Any, Final
+
+from mcaptrack.cli import common
+from mcaptrack.cli.many import takes_many
+from mcaptrack.cli.running import run_on_logs
+from mcaptrack.errors import McaptrackError
+from mcaptrack.transforms.fuse import FootFuser
+
+_FIELDS: Final = {field.name: field for field in fields(FootFuser)}
+_JOINING: Final = "Joining of boxes"
+
+
+def _number(name: str) -> Any:
+    """Return the option for a parameter of the fuser."""
+    field = _FIELDS[name]
+    words = str(field.metadata["help"])
+    return common.option(
+        f"--{name.replace('_', '-')}",
+        panel=_JOINING,
+        tuning=True,
+        help=f"{words[:1].upper()}{words[1:]}.",
+        least=field.metadata.get("least", -math.inf),
+        most=field.metadata.get("most", math.inf),
+        show_default=f"{field.default:g}",
+    )
+
+
+@common.one_line
+@takes_many()
+def fuse(
+    logs: common.Logs,
+    cameras: Annotated[
+        str | None,
+        common.option("--cameras", metavar="A,B", help="Cameras to fuse.", show_default="all with a ground plane"),
+    ] = None,
+    clock_offset_s: Annotated[
+        list[str] | None,
+        common.option(
+            "--clock-offset-s",
+            metavar="CAMERA=SECONDS",
+            help="How late the times of a camera are, as in front=0.3; 0 for none.",
+            show_default="estimated from people who walk",
+        ),
+    ] = None,
+    max_sigma: Annotated[float | None, _number("max_sigma")] = None,
+    max_distance_m: Annotated[float | None, _number("max_distance_m")] = None,
+    min_score: Annotated[float | None, _number("min_score")] = None,
+    noise: Annotated[float | None, _number("noise")] = None,
+    noise_m: Annotated[float | None, _number("noise_m")] = None,
+    to: Annotated[
+        str, common.option("--to", panel=common.FILES, help="Name of the scene; its channels begin with /NAME.")
+    ] = "world",
+    output: common.Output = None,
+    sidecar: common.Sidecar = None,
+    force: common.Force = False,
+    json: common.Json = False,
+    quiet: common.Quiet = False,
+    verbose: common.Verbose = False,
+    config: common.Config = None,
+) -> None:
+    """Fuse the detections of several cameras with one ground to detections of the whole scene.
+
+    From /CAMERA/detections and /CAMERA/ground_plane to /world/detections: boxes that stand at the same place are
+    joined, at most one of each camera, and the score is the probability that a person is there. The ground planes have
+    to be in the same metres. /world/detections/sightings has the boxes that each detection was made of.
+
+    Cameras may have other rates. A camera that sees people elsewhere than the others do, or earlier or later, is named.
+
+    Example: mcaptrack fuse log.mcap, then: mcaptrack run log.mcap --camera world
+    """
+    import mcaptrack
+
+    given = {"logs": logs, "output": output, "sidecar": sidecar, "force": force}
+    numbers = {
+        "max_sigma": max_sigma,
+        "max_distance_m": max_distance_m,
+        "min_score": min_score,
+        "noise": noise,
+        "noise_m": noise_m,
+    }
+    options: dict[str, Any] = {name: value for name, value in numbers.items() if value is not None}
+    options |= {"cameras": cameras, "to": to, "clock_offset_s": _offsets(clock_offset_s or ())}
+    run_on_logs(given | {"json": json, "quiet": quiet, "verbose": verbose}, "fuse", mcaptrack.fuse, options)
+
+
+def _offsets(given: Any) -> dict[str, float]:
+    """Return the offsets of clocks by camera. Raises McaptrackError for others than CAMERA=SECONDS."""
+    out: dict[str, float] = {}
+    for text in given:
+        name, equals, value = text.partition("=")
+        try:
+            seconds = float(value)
+        except ValueError:
+            seconds = math.nan
+        if not equals or not name or not math.isfinite(seconds):
+            raise McaptrackError(f"--clock-offset-s {text} is no CAMERA=SECONDS, as in front=0.3")
+        if name in out:
+            raise McaptrackError(f"--clock-offset-s is given twice for {name}")
+        out[name] = seconds
+    return out

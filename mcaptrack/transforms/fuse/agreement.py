@@ -1,0 +1,146 @@
+"""How well the cameras of a scene agree, from what they see of the same people.
+
+Letters: N boxes, G groups, C cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Floats
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.schema import Frame
+from mcaptrack.transforms.fuse.fuser import FootFuser, places_of
+from mcaptrack.transforms.fuse.view import SHARES, CameraView
+
+#: A place that so many other cameras see is taken for true; others are false if so many should see them.
+_OTHERS, _EXPECTED = 2, 1.5
+#: Counts that stand for what is known before anything is counted.
+_PRIOR: Final = 5.0
+#: Boxes that are nearer than this to a place of other cameras are compared with it.
+_NEAR_M: Final = 1.5
+#: Offsets in time are estimated from people who are faster than this.
+_MOVES_M_PER_S: Final = 0.5
+#: Fewer comparisons say nothing about a camera.
+LEAST_COMPARED: Final = 50
+
+
+class Offset(NamedTuple):
+    """How far the feet of a camera stand from where the others see them: the median.
+
+    ``x_m`` and ``y_m`` are where they stand too far, ``late_s`` is how much later than the others the camera's boxes
+    are, NaN if nobody moves; ``compared`` is the number of boxes.
+    """
+
+    x_m: float
+    y_m: float
+    late_s: float
+    compared: int
+
+    @property
+    def distance_m(self) -> float:
+        """How far apart they stand."""
+        return float(np.hypot(self.x_m, self.y_m))
+
+
+def compare(
+    frames: Iterable[Frame], fuser: FootFuser, offset_ns: Sequence[int] = ()
+) -> tuple[tuple[CameraView, ...], tuple[Offset, ...]]:
+    """Estimate how often each camera detects people and how often its boxes are false, and its offset.
+
+    Parameters
+    ----------
+    frames : iterable of Frame
+        Sightings, in order of time.
+    fuser : FootFuser
+        What groups them, with the views of the cameras.
+    offset_ns : sequence of int
+        What was taken off the times of each camera already, in ns; nothing by default.
+
+    Returns
+    -------
+    views : tuple of CameraView
+        The cameras, with the estimates.
+    offsets : tuple of Offset
+        The offset of each.
+    """
+    count = len(fuser.views)
+    offset_ns = offset_ns or [0] * count
+    hits = np.array([view.detects for view in fuser.views]).reshape(count, -1) * _PRIOR
+    tries = np.full(hits.shape, _PRIOR)
+    false = np.array([view.false_share for view in fuser.views]) * _PRIOR
+    boxes = np.full(count, _PRIOR)
+    off: list[list[Floats]] = [[] for _ in range(count)]
+    late: list[list[Floats]] = [[] for _ in range(count)]
+    last: tuple[int, Floats] | None = None
+    for frame in frames:
+        if not len(frame.rows):
+            last = None
+            continue
+        of, centre, seen = fuser.groups(frame.rows)
+        places, camera = places_of(frame.rows), frame.rows["camera"].astype(np.int64)
+        visible = np.stack([view.visible(centre.xy_m, frame.t_ns) for view in fuser.views], axis=1)
+        rate = np.stack([view.rate(part) for view, part in zip(fuser.views, visible.T, strict=True)], axis=1)
+        sure = seen.sum(axis=1) > _OTHERS
+        speed = _velocities(last, frame.t_ns, centre.xy_m[sure])
+        last = frame.t_ns, centre.xy_m[sure]
+        inverse, weighted = places.information()
+        for number in range(count):
+            others = seen.sum(axis=1) - seen[:, number]
+            there = (others >= _OTHERS) & (visible[:, number] > 0)
+            at = np.minimum(np.searchsorted(SHARES, visible[there, number], "right"), len(SHARES) - 1)
+            tries[number] += np.bincount(at, minlength=len(SHARES))
+            hits[number] += np.bincount(at, seen[there, number], len(SHARES))
+            is_tested = seen[:, number] & (rate.sum(axis=1) - rate[:, number] >= _EXPECTED)
+            boxes[number] += is_tested.sum()
+            false[number] += (is_tested & (others == 0)).sum()
+            # Where the others alone see the people, compared with the nearest box of this camera.
+            mine = np.flatnonzero(camera == number)
+            rest = np.flatnonzero((camera != number) & sure[of])
+            if not len(mine) or not len(rest):
+                continue
+            names, inner = np.unique(of[rest], return_inverse=True)
+            a, b, c = (np.bincount(inner, part) for part in inverse[rest].T)
+            u, v = (np.bincount(inner, part) for part in weighted[rest].T)
+            seen_at = np.stack([c * u - b * v, a * v - b * u], axis=-1) / (a * c - b * b)[:, None]
+            apart = places.xy_m[mine][:, None] - seen_at
+            distance = np.hypot(apart[..., 0], apart[..., 1])
+            nearest = distance.argmin(axis=1)
+            is_pair = (distance.min(axis=1) < _NEAR_M) & (distance.argmin(axis=0)[nearest] == np.arange(len(mine)))
+            difference = apart[np.arange(len(mine)), nearest][is_pair]
+            off[number].append(difference)
+            moving = speed[np.searchsorted(np.flatnonzero(sure), names[nearest[is_pair]])]
+            pace = (moving**2).sum(axis=1)
+            fast = pace > _MOVES_M_PER_S**2  # False where it isn't known
+            away_s = (frame.rows["picture_ns"][mine[is_pair][fast]] - offset_ns[number] - frame.t_ns) / NS_PER_S
+            late[number].append(away_s - (difference[fast] * moving[fast]).sum(axis=1) / pace[fast])
+    views = tuple(
+        replace(view, detects=tuple((hits[i] / tries[i]).tolist()), false_share=float(false[i] / boxes[i]))
+        for i, view in enumerate(fuser.views)
+    )
+    return views, tuple(_offset(*pair) for pair in zip(off, late, strict=True))
+
+
+def _velocities(last: tuple[int, Floats] | None, t_ns: int, now: Floats) -> Floats:
+    """The velocity (G, 2) of each place since the last frame; NaN where none was near."""
+    out = np.full(now.shape, np.nan)
+    if last is None or not len(last[1]) or not len(now) or t_ns <= last[0]:
+        return out
+    apart = now[:, None] - last[1]
+    distance = np.hypot(apart[..., 0], apart[..., 1])
+    nearest = distance.argmin(axis=1)
+    is_same = (distance.min(axis=1) < _NEAR_M) & (distance.argmin(axis=0)[nearest] == np.arange(len(now)))
+    out[is_same] = apart[np.arange(len(now)), nearest][is_same] / ((t_ns - last[0]) / NS_PER_S)
+    return out
+
+
+def _offset(off: list[Floats], late: list[Floats]) -> Offset:
+    apart = np.concatenate(off) if off else np.empty((0, 2))
+    times = np.concatenate(late) if late else np.empty(0)
+    x_m, y_m = np.median(apart, axis=0) if len(apart) else (np.nan, np.nan)
+    late_s = float(np.median(times)) if len(times) >= LEAST_COMPARED else np.nan
+    return Offset(float(x_m), float(y_m), late_s, len(apart))

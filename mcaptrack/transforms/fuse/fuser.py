@@ -1,0 +1,140 @@
+"""Fuse the boxes of several cameras on the ground. Letters: N boxes, G groups, C cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import ClassVar, Final
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.schema import DETECTIONS, SIGHTINGS, Frame, Rows, Schema
+from mcaptrack.transforms.fuse.grouping import Places, group, means
+from mcaptrack.transforms.fuse.view import Views
+from mcaptrack.transforms.protocol import Suited, check_options, context, option
+
+#: How often a box of another object, or a false one, fits a group by chance.
+_CHANCE: Final = 0.1
+_LEAST, _MOST = 0.02, 0.98
+_COV: Final = ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2")
+
+
+def places_of(rows: Rows) -> Places:
+    """The places of sightings (N,)."""
+    xy_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
+    return Places(xy_m, np.stack([rows[name] for name in _COV], axis=-1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FootFuser:
+    """Fuse boxes of several cameras that stand at the same place on the ground.
+
+    Reads sightings: the boxes of all cameras at one time, with the positions and covariances of their feet on one
+    ground plane. Writes detections of the scene: positions in metres, each the mean of the boxes that are joined,
+    weighted by their certainty. No camera is twice in one. Their score is the probability that a person is there: a
+    camera that should see the place, and has no box there, counts against it, as far as the place is in its picture and
+    not hidden by others.
+
+    Examples
+    --------
+    Two cameras see one person, each along its own axis; a box of the first stands alone:
+
+    >>> from mcaptrack.schema import SIGHTINGS, Frame
+    >>> rows = SIGHTINGS.rows(
+    ...     camera=[0, 1, 0], picture_ns=[0, 0, 0], box_row=[0, 0, 1], x_m=[1.3, 1.0, 9.0], y_m=[2.0, 2.2, 2.0],
+    ...     cov_xx_m2=[0.09, 0.01, 0.09], cov_xy_m2=[0, 0, 0], cov_yy_m2=[0.01, 0.04, 0.01], class_id=[1, 1, 1])
+    >>> [(fused, members)] = FootFuser(min_score=0.0)([Frame(0, 0, rows)])
+    >>> fused.rows["x_m"].round(2).tolist(), fused.rows["seen_by"].tolist(), members.rows["detection"].tolist()
+    ([1.03, 9.0], [2, 1], [0, 0, 1])
+    """
+
+    max_sigma: float = option(
+        3.0, "boxes are joined if their feet are at most so many standard deviations apart", least=0.0, most=100.0
+    )
+    max_distance_m: float = option(1.2, "boxes are joined if their feet are at most this far apart", least=0.0)
+    min_score: float = option(
+        0.5, "leave out places where a person is less probable, as the other cameras show", least=0.0, most=1.0
+    )
+    noise: float = option(0.04, "noise of the lower edges of boxes, as a share of their heights", least=0.001, most=1.0)
+    noise_m: float = option(0.1, "noise of the ground planes in metres", least=0.001, most=100.0)
+    views: Views = context(tuple)
+
+    reads: ClassVar[Schema] = SIGHTINGS
+    writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": DETECTIONS, "sightings": SIGHTINGS})
+    suits: ClassVar[Mapping[str, Suited]] = MappingProxyType({"tracker": Suited("ground", {"birth_score": 0.5})})
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    @property
+    def latency_s(self) -> Mapping[str, float]:
+        """Each frame is fused by itself."""
+        return MappingProxyType({"": 0.0, "sightings": 0.0})
+
+    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
+        for frame in frames:
+            yield self._fuse(frame)
+
+    def _fuse(self, frame: Frame) -> tuple[Frame, Frame]:
+        rows = frame.rows[np.lexsort((frame.rows["box_row"], frame.rows["camera"]))]
+        if not len(rows):
+            return frame._replace(rows=DETECTIONS.empty()), frame
+        of, centre, seen = self.groups(rows)
+        begun = len(seen)
+        expected, odds = self._evidence(frame.t_ns, centre, seen)
+        certainty = 1 / (1 + np.exp(-odds))
+        kept = np.flatnonzero(certainty >= self.min_score)
+        kept = kept[np.lexsort((centre.xy_m[kept, 1], centre.xy_m[kept, 0]))]  # whatever the order of the cameras
+        number = np.full(begun, -1, np.int64)
+        number[kept] = np.arange(len(kept))
+        classes = np.zeros(begun, np.int64)
+        classes[of] = rows["class_id"]
+        found = DETECTIONS.rows(
+            x_m=centre.xy_m[kept, 0],
+            y_m=centre.xy_m[kept, 1],
+            cov_xx_m2=centre.cov[kept, 0],
+            cov_xy_m2=centre.cov[kept, 1],
+            cov_yy_m2=centre.cov[kept, 2],
+            score=certainty[kept],
+            class_id=classes[kept],
+            seen_by=seen[kept].sum(axis=1),
+            expected_by=expected[kept],
+        )
+        members = rows.copy()
+        members["detection"] = number[of]
+        return frame._replace(rows=found), frame._replace(rows=members)
+
+    def groups(self, rows: Rows) -> tuple[Ints, Places, Bools]:
+        """The group of each sighting (N,), the place of each group (G,), and which cameras see it (G, C)."""
+        camera, places = rows["camera"].astype(np.int64), places_of(rows)
+        of = np.full(len(rows), -1, np.int64)
+        begun = 0
+        for class_id in np.unique(rows["class_id"]).tolist():  # objects of different classes are never joined
+            mine = np.flatnonzero(rows["class_id"] == class_id)
+            part = Places(places.xy_m[mine], places.cov[mine])
+            of[mine] = begun + group(camera[mine], part, self.max_sigma**2, self.max_distance_m)
+            begun = int(of.max()) + 1
+        seen = np.zeros((begun, max(len(self.views), int(camera.max()) + 1)), bool)
+        seen[of, camera] = True
+        return of, means(places, of, begun), seen
+
+    def _evidence(self, t_ns: int, centre: Places, seen: Bools) -> tuple[Ints, Floats]:
+        """How many cameras should see each place (G,), and the log-odds (G,) that a person is there."""
+        rate = np.full(seen.shape, np.nan)
+        false = np.full(seen.shape[1], 0.5)
+        for number, view in enumerate(self.views):
+            rate[:, number] = view.rate(view.visible(centre.xy_m, t_ns))
+            false[number] = view.false_share
+        expected = np.where(np.isnan(rate), seen, seen | (rate >= 0.5)).sum(axis=1)
+        is_known = ~np.isnan(rate)
+        rate = np.clip(rate, _LEAST, _MOST)
+        # The first box is true or false as the boxes of its camera are; each further one agrees by more than chance.
+        share = np.where(seen, np.clip(false, _LEAST, _MOST), 1.0).min(axis=1)
+        odds = np.log((1 - share) / share)
+        agrees = np.log(np.maximum(np.where(is_known, rate, 0.5), 0.3) / _CHANCE)
+        lacks = np.log((1 - rate) / (1 - _CHANCE))
+        odds += np.where(seen, agrees, np.where(is_known, np.minimum(lacks, 0.0), 0.0)).sum(axis=1)
+        odds -= np.where(seen, agrees, np.inf).min(axis=1)  # the first one
+        return expected, odds

@@ -1,0 +1,130 @@
+"""What one camera sees of a scene: where its boxes stand, and which places it sees. Letters: N boxes, G places."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final, Self
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Bools, Floats
+from mcaptrack.geometry.plane import GroundPlane, Planes, plane_at
+from mcaptrack.transforms.fuse.grouping import Places
+
+#: The usual width of a standing person, as a share of the height.
+_WIDTH: Final = 0.4
+#: Heights of boxes are modelled if there are so many.
+_LEAST_BOXES: Final = 20
+#: Steps of the robust fit of heights, and the relative error above which boxes count less.
+_STEPS, _ERROR = 8, 0.05
+#: Ends of the shares of a person that are visible, for which the rate of detections is counted apart.
+SHARES: Final = (0.25, 0.5, 0.75, 1.01)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraView:
+    """A camera: its ground planes, how high people are in its pictures, and how well it detects them.
+
+    Attributes
+    ----------
+    name : str
+        Its name in the log.
+    planes : Planes
+        Its ground planes, all in the same metres.
+    heights : tuple of 3 floats or None
+        The height in px of a box that touches the ground at (x, y) px is ``h0 x + h1 y + h2``; None if it isn't known.
+    detects : tuple of floats
+        How often it detects people of whom at most ``SHARES`` are visible, for each of these shares.
+    false_share : float
+        The share of its boxes that are false.
+    """
+
+    name: str
+    planes: Planes
+    heights: tuple[float, float, float] | None = None
+    detects: tuple[float, ...] = (0.1, 0.4, 0.7, 0.85)
+    false_share: float = 0.15
+
+    def with_heights(self, xywh: Floats) -> Self:
+        """The same camera with heights as in these boxes (N, 4)."""
+        if len(xywh) < _LEAST_BOXES or not self.planes:
+            return self
+        foot = np.column_stack([self.planes[0][1].feet(xywh), np.ones(len(xywh))])
+        weight = np.ones(len(xywh))
+        for _ in range(_STEPS):
+            root = np.sqrt(weight)
+            fit = np.linalg.lstsq(foot * root[:, None], xywh[:, 3] * root, rcond=None)[0]
+            error = np.abs(xywh[:, 3] - foot @ fit) / np.maximum(xywh[:, 3], 1.0)
+            weight = 1 / np.maximum(error, _ERROR)
+        return replace(self, heights=(float(fit[0]), float(fit[1]), float(fit[2])))
+
+    def places(self, xywh: Floats, t_ns: int, noise: float, noise_m: float) -> Places:
+        """Where boxes (N, 4) stand, NaN beyond the horizon.
+
+        ``noise`` is the noise of their lower edges as a share of their heights, ``noise_m`` that of the plane in m.
+        """
+        plane = plane_at(self.planes, t_ns)
+        if plane is None or not len(xywh):
+            return Places(np.full((len(xywh), 2), np.nan), np.full((len(xywh), 3), np.nan))
+        foot = plane.feet(xywh)
+        steps = [[0.0, 0.0], [0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]]
+        at, right, left, below, above = plane.pixels_to_metres(np.concatenate([foot + step for step in steps])).reshape(
+            5, -1, 2
+        )
+        u, v = (right - left) * (noise * xywh[:, 3:]), (below - above) * (noise * xywh[:, 3:])
+        cov = np.stack(
+            [
+                u[:, 0] ** 2 + v[:, 0] ** 2 + noise_m**2,
+                u[:, 0] * u[:, 1] + v[:, 0] * v[:, 1],
+                u[:, 1] ** 2 + v[:, 1] ** 2 + noise_m**2,
+            ],
+            axis=-1,
+        )
+        is_placed = np.isfinite(at).all(axis=1) & np.isfinite(cov).all(axis=1)
+        return Places(np.where(is_placed[:, None], at, np.nan), np.where(is_placed[:, None], cov, np.nan))
+
+    def visible(self, xy_m: Floats, t_ns: int) -> Floats:
+        """The share (G,) of a person at each place that is in the picture and not hidden by people at the others."""
+        plane = plane_at(self.planes, t_ns)
+        if plane is None:
+            return np.zeros(len(xy_m))
+        foot = plane.metres_to_pixels(xy_m)
+        x, y = foot.T
+        height = self._heights(plane, foot)
+        is_there = np.isfinite(x) & (height > 1)
+        half = _WIDTH / 2 * height
+        left, right, top = x - half, x + half, y - height
+        inside = _overlap(left, right, 0, plane.width_px) * _overlap(top, y, 0, plane.height_px)
+        area = np.maximum(2 * half * height, 1e-9)
+        seen = np.where(is_there, np.nan_to_num(inside) / area, 0.0)
+        if self.heights is None:
+            return np.minimum(seen, 1.0)
+        # How much of each (rows) is covered by each that stands nearer (columns).
+        covered = np.maximum(np.minimum(right[:, None], right) - np.maximum(left[:, None], left), 0)
+        covered *= np.maximum(np.minimum(y[:, None], y) - np.maximum(top[:, None], top), 0)
+        is_nearer: Bools = (y > y[:, None]) & is_there & is_there[:, None]
+        hidden = np.where(is_nearer, covered / area[:, None], 0.0)
+        out: Floats = np.minimum(seen, 1.0) * np.prod(1 - np.clip(hidden, 0, 1), axis=1)
+        return out
+
+    def _heights(self, plane: GroundPlane, foot: Floats) -> Floats:
+        """The heights (G,) in px of people whose boxes touch the ground at these points (G, 2)."""
+        if self.heights is None:
+            return np.full(len(foot), 2.0)
+        return foot @ self.heights[:2] + self.heights[2]
+
+    def rate(self, visible: Floats) -> Floats:
+        """How often people are detected of whom this share (G,) is visible; 0 where nothing is."""
+        at = np.minimum(np.searchsorted(SHARES, visible, "right"), len(SHARES) - 1)
+        out: Floats = np.where(visible > 0, np.asarray(self.detects)[at], 0.0)
+        return out
+
+
+def _overlap(low: Floats, high: Floats, begin: float, end: float) -> Floats:
+    out: Floats = np.maximum(np.minimum(high, end) - np.maximum(low, begin), 0)
+    return out
+
+
+#: The cameras of a scene.
+Views = Sequence[CameraView]

@@ -1,0 +1,341 @@
+"""Several cameras: their boxes become detections of one scene.
+
+The scene is projected here by pinhole cameras of this file; where people walk is known.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import mcaptrack
+from mcaptrack import McaptrackError
+from mcaptrack.schema import SIGHTINGS, Frame
+from mcaptrack.testing import check_transform
+from mcaptrack.transforms.fuse import FootFuser
+from mcaptrack.transforms.fuse.grouping import Places, distances, group, means
+
+PEOPLE, SECONDS = 5, 16
+WIDTH, HEIGHT, FOCAL = 960, 540, 600.0
+NS = 1_000_000_000
+
+
+def walk(t_s: float) -> np.ndarray:
+    """Where people are (PEOPLE, 2): each walks 1.2 m/s on a circle of its own, at least 1.6 m from the others."""
+    angle = 1.2 / 2.0 * t_s + np.arange(PEOPLE) * 2 * np.pi / PEOPLE
+    return np.stack([6 + 2 * np.cos(angle), 5 + 2 * np.sin(angle)], axis=-1)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A camera at ``eye``, which looks at the middle of the scene."""
+
+    name: str
+    eye: tuple[float, float, float]
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """The projection (3, 4)."""
+        ahead = np.array([6.0, 5.0, 0.8]) - self.eye
+        ahead /= np.linalg.norm(ahead)
+        right = np.cross(ahead, [0, 0, 1.0])
+        right /= np.linalg.norm(right)
+        turn = np.stack([right, np.cross(ahead, right), ahead])
+        lens = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+        return lens @ np.column_stack([turn, -turn @ self.eye])
+
+    def boxes(self, at: np.ndarray) -> np.ndarray:
+        """Boxes (N, 4) around people of 1.7 m at (N, 2)."""
+        ends = []
+        for z in (0.0, 1.7):
+            x, y, w = self.matrix @ np.stack([*at.T, np.full(len(at), z), np.ones(len(at))])
+            ends.append(np.stack([x / w, y / w], axis=-1))
+        foot, head = ends
+        high = foot[:, 1] - head[:, 1]
+        return np.column_stack([foot[:, 0] - 0.2 * high, foot[:, 1] - high, 0.4 * high, high])
+
+    def homography(self) -> np.ndarray:
+        """From pixels to metres on the ground."""
+        found = np.linalg.inv(self.matrix[:, [0, 1, 3]])
+        return found / found[2, 2]
+
+
+CAMERAS = (
+    Drawn("north", (6.0, 16.0, 3.0)),
+    Drawn("east", (17.0, 4.0, 3.2)),
+    Drawn("south", (5.0, -6.0, 2.8)),
+    Drawn("west", (-5.0, 6.0, 3.1)),
+)
+
+
+def write_log(
+    path: Path,
+    cameras: Sequence[Drawn] = CAMERAS,
+    *,
+    rate_hz: Mapping[str, float] = {},
+    late_s: Mapping[str, float] = {},
+    moved_m: Mapping[str, float] = {},
+    noise: float = 0.02,
+    people: float = 1.0,
+) -> Path:
+    """A log with the detections of cameras. ``people`` is the share of them that is detected.
+
+    ``late_s``: how late times are; ``moved_m``: how far its homography is off along the first axis.
+    """
+    rng = np.random.default_rng(7)
+    for camera in cameras:
+        shift = np.array([[1, 0, moved_m.get(camera.name, 0.0)], [0, 1, 0], [0, 0, 1]])
+        plane, boxes = path.with_suffix(f".{camera.name}.plane.txt"), path.with_suffix(f".{camera.name}.txt")
+        np.savetxt(plane, shift @ camera.homography(), delimiter=",")
+        boxes.write_text(f"1,-1,{WIDTH - 20},{HEIGHT - 50},20,50,0.9,-1,-1,-1\n")  # for the size; replaced below
+        where = {"into": path} if path.exists() else {"output": path}
+        mcaptrack.ingest(boxes, fps=2, role="detections", camera=camera.name, ground_plane=plane, **where)
+    with mcaptrack.open(path) as log:
+        for camera in cameras:
+            frames = []
+            for number in range(round(SECONDS * rate_hz.get(camera.name, 2.0))):
+                t_s = number / rate_hz.get(camera.name, 2.0)
+                boxes = camera.boxes(walk(t_s))
+                boxes = (boxes + rng.normal(0, noise, boxes.shape) * boxes[:, 3:])[rng.random(PEOPLE) < people]
+                t_ns = round((t_s + late_s.get(camera.name, 0.0) + 1) * NS)
+                frames.append(
+                    mcaptrack.detections(boxes, [0.9] * len(boxes), [1] * len(boxes), t_ns, box_format="xywh")
+                )
+            log.write(f"/{camera.name}/detections", frames, replace=True)
+    return path
+
+
+def fused(path: Path, topic: str = "/world/detections") -> dict[int, np.ndarray]:
+    """Rows by time in ns."""
+    with mcaptrack.open(path) as log:
+        rows = log.array("sightings" if topic.endswith("sightings") else "detections", topic)
+    return {int(t_ns): rows[rows["t_ns"] == t_ns] for t_ns in np.unique(rows["t_ns"])}
+
+
+def errors(found: Mapping[int, np.ndarray]) -> tuple[np.ndarray, int, int]:
+    """Distances of detections to the nearest person in m, the number of detections, and that of people there were."""
+    away = []
+    for t_ns, rows in found.items():
+        at = walk(t_ns / NS - 1)
+        xy = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
+        away.append(np.linalg.norm(xy[:, None] - at, axis=-1).min(axis=1))
+    return np.concatenate(away), sum(map(len, found.values())), PEOPLE * len(found)
+
+
+def said(result: mcaptrack.RunResult, code: str) -> list[str]:
+    return [notice.message for notice in result.warnings if notice.code == code]
+
+
+class TestScene:
+    def test_four_cameras_see_each_person_once_where_he_is(self, tmp_path: Path) -> None:
+        path = write_log(tmp_path / "scene.mcap", people=0.9)
+        result = mcaptrack.fuse(path)
+        away, count, people = errors(fused(path))
+        assert not result.warnings
+        assert abs(count - people) <= 0.03 * people
+        assert np.median(away) < 0.12
+        assert away.max() < 0.8
+
+    def test_each_box_is_in_one_detection_and_each_camera_once(self, tmp_path: Path) -> None:
+        path = write_log(tmp_path / "scene.mcap", people=0.9)
+        mcaptrack.fuse(path)
+        detections = fused(path)
+        for t_ns, rows in fused(path, "/world/detections/sightings").items():
+            used = rows[rows["detection"] >= 0]
+            pairs = list(zip(used["detection"], used["camera"], strict=True))
+            assert len(set(pairs)) == len(pairs)
+            counts = np.bincount(used["detection"], minlength=len(detections[t_ns]))
+            assert counts.tolist() == detections[t_ns]["seen_by"].tolist()
+            assert (detections[t_ns]["expected_by"] >= counts).all()
+
+    def test_pointers_lead_to_the_boxes_of_each_camera(self, tmp_path: Path) -> None:
+        path = write_log(tmp_path / "scene.mcap", people=0.8)
+        mcaptrack.fuse(path)
+        boxes = {camera.name: fused(path, f"/{camera.name}/detections") for camera in CAMERAS}
+        (channel,) = (one for one in mcaptrack.info(path).channels if one.topic == "/world/detections/sightings")
+        names = channel.parameters["cameras"]
+        for rows in fused(path, "/world/detections/sightings").values():
+            for row in rows[:3]:
+                camera = next(one for one in CAMERAS if one.name == names[row["camera"]])
+                box = boxes[camera.name][int(row["picture_ns"])][row["box_row"]]
+                foot = np.array([box["x_px"] + box["w_px"] / 2, box["y_px"] + box["h_px"], 1.0])
+                x, y, w = camera.homography() @ foot
+                assert [row["x_m"], row["y_m"]] == pytest.approx([x / w, y / w], abs=1e-6)
+
+    def test_the_scene_is_tracked_like_a_camera(self, tmp_path: Path) -> None:
+        path = write_log(tmp_path / "scene.mcap", people=0.9)
+        mcaptrack.fuse(path)
+        result = mcaptrack.track(path, camera="world")
+        assert result.tracks == {"/world/tracks": PEOPLE}
+
+    def test_one_camera_gives_what_it_gives_alone(self, tmp_path: Path) -> None:
+        path = write_log(tmp_path / "one.mcap", CAMERAS[:1])
+        mcaptrack.fuse(path)
+        own = fused(path, "/north/detections")
+        for t_ns, rows in fused(path).items():
+            foot = np.stack([own[t_ns]["x_px"] + own[t_ns]["w_px"] / 2, own[t_ns]["y_px"] + own[t_ns]["h_px"]])
+            x, y, w = CAMERAS[0].homography() @ np.vstack([foot, np.ones(PEOPLE)])
+            alone = sorted(zip(x / w, y / w, strict=True))
+            assert np.allclose(sorted(zip(rows["x_m"], rows["y_m"], strict=True)), alone, atol=1e-6)
+
+    def test_boxes_that_no_other_camera_confirms_are_left_out(self, tmp_path: Path) -> None:
+        path = write_log(tmp_path / "scene.mcap")
+        with mcaptrack.open(path) as log:
+            rows = log.array("detections", "/north/detections")
+            ghost = CAMERAS[0].boxes(np.array([[6.0, 5.0]]))[0]  # in the middle, where all others see nobody
+            frames = []
+            for t_ns in np.unique(rows["t_ns"]):
+                part = rows[rows["t_ns"] == t_ns]
+                boxes = np.stack([part[name] for name in ("x_px", "y_px", "w_px", "h_px")], axis=-1)
+                boxes = np.vstack([boxes, ghost])
+                frames.append(
+                    mcaptrack.detections(boxes, [0.9] * len(boxes), [1] * len(boxes), int(t_ns), box_format="xywh")
+                )
+            log.write("/north/detections", frames, replace=True)
+        mcaptrack.fuse(path)
+        away, count, people = errors(fused(path))
+        assert count <= people * 1.02
+        assert (away < 1.0).all()
+
+
+class TestFaults:
+    def test_a_homography_that_is_off_is_named_with_its_distance(self, tmp_path: Path) -> None:
+        path = write_log(tmp_path / "moved.mcap", moved_m={"east": 0.6})
+        lines = said(mcaptrack.fuse(path), "cameras-disagree")
+        assert len(lines) == 1
+        assert lines[0].startswith("east: feet stand 0.")
+        assert 0.45 < float(lines[0].split("stand ")[1].split(" m")[0]) < 0.75
+
+    @pytest.mark.parametrize("late", [0.3, -0.4])
+    def test_a_clock_that_is_off_is_estimated_and_taken_off(self, tmp_path: Path, late: float) -> None:
+        path = write_log(tmp_path / "late.mcap", late_s={"south": late})
+        lines = said(mcaptrack.fuse(path), "clock")
+        assert len(lines) == 1
+        assert lines[0].startswith("south: its times are ")
+        assert ("late" if late > 0 else "early") in lines[0]
+        assert float(lines[0].split("are ")[1].split(" s")[0]) == pytest.approx(abs(late), abs=0.08)
+        away, count, people = errors(fused(path))
+        assert abs(count - people) <= 0.05 * people
+        assert np.median(away) < 0.15
+
+    def test_an_offset_that_is_given_is_not_estimated(self, tmp_path: Path) -> None:
+        path = write_log(tmp_path / "late.mcap", late_s={"south": 0.3})
+        assert not said(mcaptrack.fuse(path, clock_offset_s={"south": 0.3}), "clock")
+        assert "seem" in said(mcaptrack.fuse(path, clock_offset_s={"south": 0.0}), "clock")[0]
+
+    def test_cameras_with_other_rates_are_joined_at_the_times_of_the_slowest(self, tmp_path: Path) -> None:
+        path = write_log(tmp_path / "rates.mcap", rate_hz={"north": 5.0, "east": 3.0})
+        mcaptrack.fuse(path)
+        found = fused(path)
+        assert len(found) == SECONDS * 2
+        away, count, people = errors(found)
+        assert abs(count - people) <= 0.03 * people
+        assert np.median(away) < 0.15
+
+    @pytest.mark.parametrize("dropped", [camera.name for camera in CAMERAS])
+    def test_any_camera_may_be_missing(self, tmp_path: Path, dropped: str) -> None:
+        kept = [camera for camera in CAMERAS if camera.name != dropped]
+        path = write_log(tmp_path / "three.mcap", kept, people=0.9)
+        mcaptrack.fuse(path)
+        _, count, people = errors(fused(path))
+        assert abs(count - people) <= 0.06 * people
+
+
+class TestInput:
+    def test_cameras_that_lack_something_are_left_out_and_named(self, tmp_path: Path) -> None:
+        path = write_log(tmp_path / "scene.mcap", CAMERAS[:2])
+        with mcaptrack.open(path) as log:
+            log.write("/hall/detections", [mcaptrack.detections([[1, 2, 30, 40]], [0.5], [1], NS, box_format="xywh")])
+        assert said(mcaptrack.fuse(path), "left-out")[0].startswith("hall is left out: it has no ground plane; ")
+
+    @pytest.mark.parametrize(
+        ("options", "words"),
+        [
+            ({"cameras": "north,nowhere"}, "has no camera nowhere; it has "),
+            ({"to": "a/b"}, "is no name of a scene"),
+            ({"to": "north"}, "/north/detections was ingested; give the scene another name"),
+            ({"clock_offset_s": {"up": 1.0}}, "has up, which is not fused; east, north are"),
+        ],
+    )
+    def test_what_cannot_be_is_one_line(self, tmp_path: Path, options: Mapping[str, object], words: str) -> None:
+        path = write_log(tmp_path / "scene.mcap", CAMERAS[:2])
+        before = path.read_bytes()
+        with pytest.raises(McaptrackError, match=words):
+            mcaptrack.fuse(path, **options)  # type: ignore[arg-type]
+        assert path.read_bytes() == before
+
+    def test_cameras_are_fused_again_after_one_of_them_changed(self, tmp_path: Path) -> None:
+        path = write_log(tmp_path / "scene.mcap", CAMERAS[:2])
+        first, second = mcaptrack.fuse(path), mcaptrack.fuse(path)
+        assert first.rows == second.rows
+        with mcaptrack.open(path) as log:
+            log.write("/north/detections", [mcaptrack.detections([], t_ns=NS, box_format="xywh")], replace=True)
+        assert mcaptrack.fuse(path).rows != first.rows
+
+
+places = st.lists(
+    st.tuples(
+        st.integers(0, 4), st.floats(-5, 5), st.floats(-5, 5), st.floats(0.05, 0.6), st.floats(0.05, 0.6),
+        st.floats(-0.9, 0.9),
+    ),
+    max_size=14,
+)  # fmt: skip
+
+
+def sightings(drawn: Sequence[tuple[int, float, float, float, float, float]]) -> np.ndarray:
+    camera, x, y, sx, sy, r = (np.array(part) for part in zip(*drawn, strict=True)) if drawn else np.empty((6, 0))
+    return SIGHTINGS.rows(
+        camera=camera.astype(np.int64),
+        picture_ns=np.zeros(len(x), np.int64),
+        box_row=np.arange(len(x)),
+        x_m=x, y_m=y, cov_xx_m2=sx**2, cov_xy_m2=r * sx * sy, cov_yy_m2=sy**2,
+        class_id=np.ones(len(x), np.int64),
+    )  # fmt: skip
+
+
+@settings(max_examples=60, deadline=None)
+@given(places)
+def test_groups_have_each_camera_once_and_can_not_be_joined_further(
+    drawn: list[tuple[int, float, float, float, float, float]],
+) -> None:
+    rows = sightings(drawn)
+    where = Places(
+        np.stack([rows["x_m"], rows["y_m"]], axis=-1),
+        np.stack([rows[name] for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2")], axis=-1),
+    )
+    of = group(rows["camera"].astype(np.int64), where, 9.0, 1.2)
+    count = int(of.max()) + 1 if len(of) else 0
+    for one in range(count):
+        cameras = rows["camera"][of == one].tolist()
+        assert len(set(cameras)) == len(cameras)
+    centre = means(where, of, count)
+    for one in range(count):  # the mean and covariance of a group, by matrices
+        inverse = [np.linalg.inv([[a, b], [b, c]]) for a, b, c in where.cov[of == one]]
+        total = np.linalg.inv(sum(inverse))
+        mean = total @ sum(part @ at for part, at in zip(inverse, where.xy_m[of == one], strict=True))
+        assert centre.xy_m[one] == pytest.approx(mean, abs=1e-6)
+        assert centre.cov[one] == pytest.approx([total[0, 0], total[0, 1], total[1, 1]], abs=1e-6)
+
+
+def test_distances_are_those_of_mahalanobis() -> None:
+    cov = np.array([[0.5, 0.2], [0.2, 0.3]])
+    for x, y in itertools.product((-1.0, 0.0, 0.4), (0.0, 2.0)):
+        way = np.array([x, y])
+        found = distances(*(np.array([value]) for value in (x, y, 0.5, 0.2, 0.3)))
+        assert found[0] == pytest.approx(way @ np.linalg.inv(cov) @ way)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(places, min_size=1, max_size=4))
+def test_a_fuser_obeys_the_laws_of_transforms(
+    drawn: list[list[tuple[int, float, float, float, float, float]]],
+) -> None:
+    frames = [Frame(number * NS, number, sightings(part)) for number, part in enumerate(drawn)]
+    check_transform(FootFuser(min_score=0.0), frames)
