@@ -90,6 +90,7 @@ __all__ = [
     "evaluate",
     "events",
     "export",
+    "fuse",
     "get_model",
     "info",
     "ingest",

@@ -124,7 +124,7 @@ READING: dict[str, Callable[[Path, Path], list[object]]] = {
     "view": lambda log, out: [log, "--layout", "no such layout"],
     **{
         name: lambda log, out: [log, "-o", out / "other.mcap"]
-        for name in ("detect", "motion", "track", "sample", "predict", "retrack", "run", "events")
+        for name in ("detect", "motion", "track", "sample", "predict", "retrack", "run", "fuse", "events")
     },
 }
 if find_spec("torch"):  # without it `train` reads nothing

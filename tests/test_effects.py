@@ -74,6 +74,9 @@ def template(template, tmp_path_factory) -> Path:
     tall = [[*row[:3], str(float(row[3]) - 6), row[4], "14", *row[6:]] for row in rows]  # as before on the ground
     (folder / "tall.txt").write_text("\n".join(map(",".join, tall)) + "\n")
     walk = [f"{row[0]} {row[1]} {0.1 * (float(row[2]) + 4)} 3.2" for row in rows]
+    for camera, where in (("left", "-o"), ("right", "--into")):
+        words = ("--as", "detections", "--fps", 10, "--camera", camera, "--ground-plane", folder / "plane.txt")
+        done("ingest", folder / "truth.txt", *words, where, folder / "two.mcap")
     (folder / "walk.txt").write_text("\n".join(walk) + "\n")
     (folder / "known.onnx").write_bytes(DATA)
     kinds = "".join(

@@ -61,7 +61,10 @@ def test_a_url_is_refused_as_a_url(tmp_path, monkeypatch, name, parameter):
 
 
 #: Arguments that are logs, which may be in a store.
-LOGS = {(name, "logs") for name in (*STAGES, "run", "events", "recover", "render", "info", "check", "export", "report")}
+LOGS = {
+    (name, "logs")
+    for name in (*STAGES, "run", "fuse", "events", "recover", "render", "info", "check", "export", "report")
+}
 LOGS |= {("query", "words"), ("evaluate", "inputs")}
 
 

@@ -149,8 +149,10 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "render", "LOG"
     ),
     "cli/running.py:_next:*": lambda s: s.says("run", "LOG", "--no-tables"),
+    "cli/running.py:_next:run": lambda s: s.says("fuse", "LOG"),
+    "pipeline/fusing.py:_lack:detect": lambda s: s.without("/camera/[!vg]*").says("fuse", "LOG"),
     "api/running.py:warn_stale:run": lambda s: s.says("detect", "LOG", "--detector", "mog2"),
-    "api/running.py:work:export": lambda s: s.says("run", "s3://bucket/a.mcap"),
+    "api/running.py:change:export": lambda s: s.says("run", "s3://bucket/a.mcap"),
     "cli/train.py:_print:predict": lambda s: s.says(
         "train", "synthetic", "--walks", "1000", "--epochs", "1", "-o", "my net"
     ),
@@ -285,7 +287,7 @@ def test_a_proposed_command_works(where, template, tmp_path, monkeypatch, reques
     verb = {"list_tables": "query", "get_model": "models"}.get(verb, verb)
     if verb == "models" or where.startswith("cli/models"):
         stocked(monkeypatch, tmp_path)
-    if where == "api/running.py:work:export":
+    if where == "api/running.py:change:export":
         store = Store()
         request.addfinalizer(store.stop)
         only_in(monkeypatch, store)

@@ -13,9 +13,16 @@ from mcaptrack.api.running import RunResult, Where, change
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.transforms.fuse import FootFuser
+from mcaptrack.transforms.protocol import LARGEST
 
 
-@checked()
+@checked(
+    max_sigma=(0.0, 100.0),
+    max_distance_m=(0.0, LARGEST),
+    min_score=(0.0, 1.0),
+    noise=(0.001, 1.0),
+    noise_m=(0.001, 100.0),
+)
 def fuse(
     log: PathLike,
     *,

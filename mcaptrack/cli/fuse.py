@@ -27,7 +27,6 @@ def _number(name: str) -> Any:
         help=f"{words[:1].upper()}{words[1:]}.",
         least=field.metadata.get("least", -math.inf),
         most=field.metadata.get("most", math.inf),
-        show_default=f"{field.default:g}",
     )
 
 
@@ -44,15 +43,15 @@ def fuse(
         common.option(
             "--clock-offset-s",
             metavar="CAMERA=SECONDS",
-            help="How late the times of a camera are, as in front=0.3; 0 for none.",
+            help="How many seconds the times of a camera are late, as in front=0.3; 0 for none.",
             show_default="estimated from people who walk",
         ),
     ] = None,
-    max_sigma: Annotated[float | None, _number("max_sigma")] = None,
-    max_distance_m: Annotated[float | None, _number("max_distance_m")] = None,
-    min_score: Annotated[float | None, _number("min_score")] = None,
-    noise: Annotated[float | None, _number("noise")] = None,
-    noise_m: Annotated[float | None, _number("noise_m")] = None,
+    max_sigma: Annotated[float, _number("max_sigma")] = FootFuser.max_sigma,
+    max_distance_m: Annotated[float, _number("max_distance_m")] = FootFuser.max_distance_m,
+    min_score: Annotated[float, _number("min_score")] = FootFuser.min_score,
+    noise: Annotated[float, _number("noise")] = FootFuser.noise,
+    noise_m: Annotated[float, _number("noise_m")] = FootFuser.noise_m,
     to: Annotated[
         str, common.option("--to", panel=common.FILES, help="Name of the scene; its channels begin with /NAME.")
     ] = "world",
@@ -72,20 +71,23 @@ def fuse(
 
     Cameras may have other rates. A camera that sees people elsewhere than the others do, or earlier or later, is named.
 
-    Example: mcaptrack fuse log.mcap, then: mcaptrack run log.mcap --camera world
+    `mcaptrack run log.mcap --camera world` tracks them.
+
+    Example: mcaptrack fuse log.mcap --cameras front,left
     """
     import mcaptrack
 
     given = {"logs": logs, "output": output, "sidecar": sidecar, "force": force}
-    numbers = {
+    options = {
+        "cameras": cameras,
+        "to": to,
+        "clock_offset_s": _offsets(clock_offset_s or ()),
         "max_sigma": max_sigma,
         "max_distance_m": max_distance_m,
         "min_score": min_score,
         "noise": noise,
         "noise_m": noise_m,
     }
-    options: dict[str, Any] = {name: value for name, value in numbers.items() if value is not None}
-    options |= {"cameras": cameras, "to": to, "clock_offset_s": _offsets(clock_offset_s or ())}
     run_on_logs(given | {"json": json, "quiet": quiet, "verbose": verbose}, "fuse", mcaptrack.fuse, options)
 
 

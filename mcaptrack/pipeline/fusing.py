@@ -180,9 +180,9 @@ def fuse_cameras(
     )
     out: dict[str, Made] = {}
     for (topic, schema), collector in zip(topics.items(), collectors, strict=True):
-        first = out.get(target)
-        beside = {} if first is None else {"input": target, "input_digest": first.provenance.digest}
-        out[topic] = Made.of(schema, collector.done(), replace(how, **beside))
+        if first := out.get(target):  # the second one belongs to the scene, too, and not to a camera of its own
+            how = replace(how, input=target, input_digest=first.provenance.digest)
+        out[topic] = Made.of(schema, collector.done(), how)
     report = Report(stages=[STAGE], layouts=write(opened, prefix, out, (), {}, output), warnings=list(warnings))
     for topic, channel in out.items():
         report.count(topic, channel)
@@ -216,8 +216,7 @@ def _lack(opened: log.Log, camera: Camera) -> str:
         again = call("detect", opened.path, camera=camera.prefix[1:])
         return f"has no detections; {again} makes them"
     if not planes:
-        give = call("ingest", "HOMOGRAPHY", into=opened.path, camera=camera.prefix[1:])
-        return f"has no ground plane; {give} gives it one"
+        return "has no ground plane; ingest what it recorded with `ground_plane=`"
     if is_assumed(planes):
         return "has a ground plane that was estimated, in metres of its own; the cameras need measured ones"
     return ""
@@ -236,7 +235,10 @@ def _sources(
     for name in clock_offset_s:
         if name not in names:
             raise McaptrackError(f"`clock_offset_s=` has {name}, which is not fused; {', '.join(names)} are")
-    sources, references, classes, frames_of = [], {}, {}, {}
+    sources: list[_Source] = []
+    references: dict[str, str] = {}
+    classes: dict[str, str] = {}
+    frames_of: dict[str, str] = {}
     for camera in chosen:
         name, topic = camera.prefix[1:], _detections(opened, camera)
         assert topic is not None

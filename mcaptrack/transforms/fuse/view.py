@@ -92,7 +92,7 @@ class CameraView:
         foot = plane.metres_to_pixels(xy_m)
         x, y = foot.T
         height = self._heights(plane, foot)
-        is_there = np.isfinite(x) & (height > 1)
+        is_there: Bools = np.asarray(np.isfinite(x) & (height > 1))
         half = _WIDTH / 2 * height
         left, right, top = x - half, x + half, y - height
         inside = _overlap(left, right, 0, plane.width_px) * _overlap(top, y, 0, plane.height_px)
