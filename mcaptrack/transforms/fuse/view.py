@@ -81,8 +81,8 @@ class CameraView:
             ],
             axis=-1,
         )
-        is_placed = np.isfinite(at).all(axis=1) & np.isfinite(cov).all(axis=1)
-        return Places(np.where(is_placed[:, None], at, np.nan), np.where(is_placed[:, None], cov, np.nan))
+        is_placed = np.isfinite(np.concatenate([at, cov], axis=1)).all(axis=1, keepdims=True)
+        return Places(np.where(is_placed, at, np.nan), np.where(is_placed, cov, np.nan))
 
     def visible(self, xy_m: Floats, t_ns: int) -> Floats:
         """The share (G,) of a person at each place that is in the picture and not hidden by people at the others."""
