@@ -58,7 +58,7 @@ class _Source(NamedTuple):
 
 
 class Gathered:
-    """What the cameras see at the times of the slowest one, as frames of sightings; read again at each iteration."""
+    """The boxes of all cameras at the times of the slowest one, as frames of sightings; read again at each iteration."""
 
     def __init__(self, sources: Sequence[_Source], fuser: FootFuser) -> None:
         self._sources, self._noise, self._noise_m = sources, fuser.noise, fuser.noise_m
@@ -210,7 +210,7 @@ def _chosen(opened: log.Log, names: Sequence[str], scene: str) -> list[Camera]:
 
 
 def _lack(opened: log.Log, camera: Camera) -> str:
-    """What a camera lacks, and what to do about it; "" if nothing."""
+    """The reason why a camera can't be fused, and a remedy; "" if it can."""
     planes = read_planes(opened, camera.prefix)
     if _detections(opened, camera) is None:
         again = call("detect", opened.path, camera=camera.prefix[1:])
@@ -327,7 +327,7 @@ def _say(
             )
         if len(views) > 1 and offset.compared < _LEAST:
             warn(
-                f"{name}: only {offset.compared} of its boxes are near people whom two other cameras see, too few to "
+                f"{name}: only {offset.compared} of its boxes are near people seen by two other cameras, too few to "
                 "compare it with the others",
                 "other",
             )

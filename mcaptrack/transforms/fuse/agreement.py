@@ -1,4 +1,4 @@
-"""How well the cameras of a scene agree, from what they see of the same people.
+"""Compare the cameras of a scene by the people that they see together.
 
 Letters: N boxes, G groups, C cameras.
 """
@@ -30,10 +30,10 @@ LEAST_COMPARED: Final = 50
 
 
 class Offset(NamedTuple):
-    """How far the feet of a camera stand from where the others see them: the median.
+    """The median distance of the feet of a camera from where the others see them.
 
     ``x_m`` and ``y_m`` are where they stand too far, ``late_s`` is how much later than the others the camera's boxes
-    are, NaN if nobody moves; ``compared`` is the number of boxes.
+    are, NaN if all stand; ``compared`` is the number of boxes.
     """
 
     x_m: float
@@ -43,7 +43,7 @@ class Offset(NamedTuple):
 
     @property
     def distance_m(self) -> float:
-        """How far apart they stand."""
+        """The distance in metres."""
         return float(np.hypot(self.x_m, self.y_m))
 
 

@@ -53,7 +53,7 @@ class FootFuser:
     max_sigma: float = option(
         3.0, "boxes are joined if their feet are at most so many standard deviations apart", least=0.0, most=100.0
     )
-    max_distance_m: float = option(1.2, "boxes are joined if their feet are at most this far apart", least=0.0)
+    max_distance_m: float = option(1.2, "boxes are joined if their feet are at most so many metres apart", least=0.0)
     min_score: float = option(
         0.5, "leave out places where a person is less probable, as the other cameras show", least=0.0, most=1.0
     )

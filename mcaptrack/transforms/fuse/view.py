@@ -1,4 +1,4 @@
-"""What one camera sees of a scene: where its boxes stand, and which places it sees. Letters: N boxes, G places."""
+"""One camera of a scene: where its boxes stand, and which places it sees. Letters: N boxes, G places."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class CameraView:
     heights : tuple of 3 floats or None
         The height in px of a box that touches the ground at (x, y) px is ``h0 x + h1 y + h2``; None if it isn't known.
     detects : tuple of floats
-        How often it detects people of whom at most ``SHARES`` are visible, for each of these shares.
+        The rate at which it detects people who are visible up to ``SHARES``, for each of these shares.
     false_share : float
         The share of its boxes that are false.
     """
@@ -109,13 +109,13 @@ class CameraView:
         return out
 
     def _heights(self, plane: GroundPlane, foot: Floats) -> Floats:
-        """The heights (G,) in px of people whose boxes touch the ground at these points (G, 2)."""
+        """The heights (G,) in px of boxes that touch the ground at these points (G, 2)."""
         if self.heights is None:
             return np.full(len(foot), 2.0)
         return foot @ self.heights[:2] + self.heights[2]
 
     def rate(self, visible: Floats) -> Floats:
-        """How often people are detected of whom this share (G,) is visible; 0 where nothing is."""
+        """The rate at which people are detected who are visible to this share (G,); 0 where nothing is."""
         at = np.minimum(np.searchsorted(SHARES, visible, "right"), len(SHARES) - 1)
         out: Floats = np.where(visible > 0, np.asarray(self.detects)[at], 0.0)
         return out
