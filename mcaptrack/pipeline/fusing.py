@@ -58,7 +58,7 @@ class _Source(NamedTuple):
 
 
 class Gathered:
-    """The boxes of all cameras at the times of the slowest one, as frames of sightings; read again at each iteration."""
+    """The boxes of all cameras at the times of the slowest one, as frames of sightings; read at each iteration."""
 
     def __init__(self, sources: Sequence[_Source], fuser: FootFuser) -> None:
         self._sources, self._noise, self._noise_m = sources, fuser.noise, fuser.noise_m

@@ -121,7 +121,7 @@ class FootFuser:
         return of, means(places, of, begun), seen
 
     def _evidence(self, t_ns: int, centre: Places, seen: Bools) -> tuple[Ints, Floats]:
-        """How many cameras should see each place (G,), and the log-odds (G,) that a person is there."""
+        """The number of cameras that should see each place (G,), and the log-odds (G,) that a person is there."""
         rate = np.full(seen.shape, np.nan)
         false = np.full(seen.shape[1], 0.5)
         for number, view in enumerate(self.views):

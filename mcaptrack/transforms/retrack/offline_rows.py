@@ -100,7 +100,7 @@ def move_rows(rows: Rows, xy_m: Floats, planes: Planes, t_ns: Ints) -> Rows:
 
 
 def _shift(from_m: Floats, to_m: Floats, size_px: Floats, planes: Planes, t_ns: Ints) -> Floats:
-    """How far in px boxes of this size move if they move between positions in m; all of them (R, 2)."""
+    """The distance in px by which boxes of this size move between positions in m; all of them (R, 2)."""
     out = np.zeros((len(from_m), 2))
     which = np.maximum(np.searchsorted([since_ns for since_ns, _ in planes], t_ns, side="right") - 1, 0)
     for number in np.unique(which).tolist():
