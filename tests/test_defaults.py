@@ -163,6 +163,14 @@ COMMANDS: dict[str, dict[str, Any]] = {
     "detect": {"detector": "median"},
     "evaluate": {"gate_m": "0.5,1,2", "min_iou": 0.5, "rules": "trackeval", "point": "foot"},
     "export": {"form": "parquet"},
+    "fuse": {
+        "to": "world",
+        "max_sigma": 3.0,
+        "max_distance_m": 1.2,
+        "min_score": 0.5,
+        "noise": 0.04,
+        "noise_m": 0.1,
+    },
     "ingest": {
         "image_format": "auto",
         "point": "foot",

@@ -149,6 +149,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "render", "LOG"
     ),
     "cli/running.py:_next:*": lambda s: s.says("run", "LOG", "--no-tables"),
+    "api/scoring.py:_smoothed:run": lambda s: s.without("/camera/predictions*").says("evaluate", "LOG", "--smoothed"),
     "cli/running.py:_next:run": lambda s: s.says("fuse", "LOG"),
     "pipeline/fusing.py:_lack:detect": lambda s: s.without("/camera/[!vg]*").says("fuse", "LOG"),
     "api/running.py:warn_stale:run": lambda s: s.says("detect", "LOG", "--detector", "mog2"),

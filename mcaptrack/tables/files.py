@@ -99,14 +99,17 @@ def _write_parquet(part: Path, table: Any, words: Mapping[str, str], order: Sequ
             store_schema=True,
             **_encodings(table.schema),
         )
-        with ThreadPoolExecutor(1) as worker:  # computes the digest while the file is written
-            for piece in pieces_of(table):
-                added = worker.submit(content.add, piece)
-                writer.write_table(piece, row_group_size=PIECE_ROWS)
-                added.result()
-        writer.add_key_value_metadata({_PREFIX + "digest": content.hexdigest()})
-        # Not in a finally: closing writes the footer, which would make half a table look complete.
-        writer.close()
+        try:
+            with ThreadPoolExecutor(1) as worker:  # computes the digest while the file is written
+                for piece in pieces_of(table):
+                    added = worker.submit(content.add, piece)
+                    writer.write_table(piece, row_group_size=PIECE_ROWS)
+                    added.result()
+            writer.add_key_value_metadata({_PREFIX + "digest": content.hexdigest()})
+            writer.close()
+        except BaseException:
+            writer.is_open = False  # closing it, also when it is deleted, would make half a table look complete
+            raise
 
 
 def _encodings(schema: Any) -> dict[str, Any]:
