@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from mcaptrack import log
-from mcaptrack.geometry.transform_tree import Poses, Recorded, Samples, TransformTree
+from mcaptrack.geometry.transform_tree import Poses, PoseSamples, Recorded, TransformTree
 from mcaptrack.notices import collected
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.sources import moved_tracks
@@ -99,7 +99,7 @@ def test_any_pose_of_sensor_and_box_gives_the_numbers_of_scipy(angles, shifts, l
                 parent,
                 child,
                 True,
-                Samples(np.array([START_NS]), np.array([START_NS]), shift[None], turn.as_quat()[None]),
+                PoseSamples(np.array([START_NS]), np.array([START_NS]), shift[None], turn.as_quat()[None]),
             )
             for parent, child, turn, shift in (("map", "base", robot, base), ("base", "lidar", sensor, mount))
         ]
@@ -399,7 +399,7 @@ def test_a_frame_that_moves_is_said(tmp_path):
 def test_boxes_in_a_root_are_told_why_nothing_is_above_it(tmp_path, monkeypatch):
     path = log_of(tmp_path, lambda _: "lidar")
     zeros, once = np.zeros((1, 3)), np.array([START_NS])
-    useless = [Recorded("base_link", "lidar", True, Samples(once, once, zeros, np.zeros((1, 4))))]
+    useless = [Recorded("base_link", "lidar", True, PoseSamples(once, once, zeros, np.zeros((1, 4))))]
     monkeypatch.setattr("mcaptrack.sources.fixed_frame.transforms_of", lambda _: TransformTree(useless))
     found, warnings = read(path)
     assert found.frame_id == "lidar"

@@ -13,7 +13,7 @@ from mcap.writer import Writer
 from scipy.spatial.transform import Rotation, Slerp
 
 from mcaptrack import foxglove, log
-from mcaptrack.geometry.transform_tree import Reason, Recorded, Samples, TransformTree
+from mcaptrack.geometry.transform_tree import PoseSamples, Reason, Recorded, TransformTree
 from mcaptrack.notices import collected
 from mcaptrack.sources import frames
 from mcaptrack.sources.foreign import MessageType
@@ -38,7 +38,7 @@ def moves(parent, child, seconds, positions, quaternions=None, *, latched=False,
     turned = np.tile([0.0, 0, 0, 1], (len(t_ns), 1)) if quaternions is None else np.asarray(quaternions, float)
     stamp_ns = t_ns if stamps is None else np.asarray(stamps, np.int64)
     positions = np.asarray(positions, float).reshape(-1, 3)
-    return Recorded(parent, child, latched, Samples(stamp_ns, t_ns + round(late_s * S), positions, turned))
+    return Recorded(parent, child, latched, PoseSamples(stamp_ns, t_ns + round(late_s * S), positions, turned))
 
 
 def drive(parent="map", child="base_link", seconds=None, speed=10.0, **more):

@@ -56,7 +56,7 @@ class Reason(IntEnum):
     UNCONNECTED = 4
 
 
-class Samples(NamedTuple):
+class PoseSamples(NamedTuple):
     """Poses as they were recorded, in the order of the log.
 
     ``stamp_ns`` and ``log_ns`` (M,), ``translation`` (M, 3) in metres, ``quaternion`` (M, 4) as x, y, z, w.
@@ -67,9 +67,9 @@ class Samples(NamedTuple):
     translation: Floats
     quaternion: Floats
 
-    def take(self, which: Indices) -> Samples:
+    def take(self, which: Indices) -> PoseSamples:
         """Return the poses at these indices."""
-        return Samples(self.stamp_ns[which], self.log_ns[which], self.translation[which], self.quaternion[which])
+        return PoseSamples(self.stamp_ns[which], self.log_ns[which], self.translation[which], self.quaternion[which])
 
     def is_off_clock(self) -> bool:
         """Whether the stamps are of another clock than the log time, or missing."""
@@ -186,7 +186,7 @@ def _usual_speed(speed: Floats) -> Floats:
 
 
 def clean(
-    parent: str, child: str, samples: Samples, is_latched: bool, on_log_time: bool = False
+    parent: str, child: str, samples: PoseSamples, is_latched: bool, on_log_time: bool = False
 ) -> tuple[TransformSeries | None, list[str]]:
     """Return the series of recorded poses, and findings, each a clause about it; None if no pose is left.
 
@@ -222,14 +222,14 @@ def clean(
     return series, findings + more
 
 
-def _is_constant(samples: Samples) -> bool:
+def _is_constant(samples: PoseSamples) -> bool:
     """Return whether all poses are the same: a frame that never moves, even if it is published again and again."""
     moved = np.abs(samples.translation - samples.translation[0]).max()
     alike = np.abs(samples.quaternion @ samples.quaternion[0]).min()
     return bool(moved <= _SAME_M and 1 - alike <= _SAME_TURN)
 
 
-def _static(parent: str, child: str, samples: Samples, messages: int) -> tuple[TransformSeries, list[str]]:
+def _static(parent: str, child: str, samples: PoseSamples, messages: int) -> tuple[TransformSeries, list[str]]:
     has_stamps = samples.stamp_ns.all() and (np.diff(samples.stamp_ns) >= 0).all()
     since = samples.stamp_ns if has_stamps else samples.log_ns
     is_new = np.append(True, _differs(samples))
@@ -239,7 +239,7 @@ def _static(parent: str, child: str, samples: Samples, messages: int) -> tuple[T
     return series, [many] if len(kept.stamp_ns) > 1 else []
 
 
-def _dynamic(parent: str, child: str, samples: Samples, messages: int) -> tuple[TransformSeries, list[str]]:
+def _dynamic(parent: str, child: str, samples: PoseSamples, messages: int) -> tuple[TransformSeries, list[str]]:
     samples, findings = _one_pass(samples)
     order = np.argsort(samples.stamp_ns, kind="stable")
     samples = samples.take(order)
@@ -248,7 +248,7 @@ def _dynamic(parent: str, child: str, samples: Samples, messages: int) -> tuple[
         findings.append(f"{_count(differing, 'stamp')} have several poses, of which the last is taken")
     kept = samples.take(np.flatnonzero(is_last))
 
-    def series_of(poses: Samples) -> TransformSeries:
+    def series_of(poses: PoseSamples) -> TransformSeries:
         is_static = len(poses.stamp_ns) == 1
         return TransformSeries(parent, child, is_static, messages, poses.stamp_ns, poses.translation, poses.quaternion)
 
@@ -282,7 +282,7 @@ def _single_outliers(series: TransformSeries) -> Indices:
     return back[np.diff(back, prepend=-2) > 1]
 
 
-def _one_pass(samples: Samples) -> tuple[Samples, list[str]]:
+def _one_pass(samples: PoseSamples) -> tuple[PoseSamples, list[str]]:
     """Return the poses without those of times that another, longer pass of the clock has shown, too."""
     stamps = samples.stamp_ns
     starts, newest, back = [0], int(stamps[0]), 0
@@ -310,7 +310,7 @@ def _one_pass(samples: Samples) -> tuple[Samples, list[str]]:
     return samples.take(np.flatnonzero(is_kept)), [f"{told}; {left_out} of times that it had before are left out"]
 
 
-def _differs(samples: Samples) -> Bools:
+def _differs(samples: PoseSamples) -> Bools:
     """Return whether each pose but the first differs from the one before, (M - 1,)."""
     moved = np.abs(np.diff(samples.translation, axis=0)).max(axis=1, initial=0.0)
     alike = np.abs((samples.quaternion[1:] * samples.quaternion[:-1]).sum(axis=1))

@@ -14,12 +14,12 @@ from typing import NamedTuple
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.transform_series import Reason, Samples, TransformSeries, clean
+from mcaptrack.geometry.transform_series import PoseSamples, Reason, TransformSeries, clean
 
 #: The most frames of a loop that are named.
 _SHOWN = 8
 
-__all__ = ["Poses", "Reason", "Recorded", "Remark", "Samples", "TransformTree", "plain_frame"]
+__all__ = ["PoseSamples", "Poses", "Reason", "Recorded", "Remark", "TransformTree", "plain_frame"]
 
 
 def plain_frame(name: str) -> str:
@@ -33,7 +33,7 @@ class Recorded(NamedTuple):
     parent: str
     child: str
     is_latched: bool
-    samples: Samples
+    samples: PoseSamples
 
 
 class Remark(NamedTuple):

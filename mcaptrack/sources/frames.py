@@ -11,7 +11,7 @@ import numpy as np
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Ints
-from mcaptrack.geometry.transform_tree import Poses, Recorded, Samples, TransformTree
+from mcaptrack.geometry.transform_tree import Poses, PoseSamples, Recorded, TransformTree
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.foreign import stamp_of
@@ -126,8 +126,8 @@ def _read(opened: log.Log) -> FramesRead:
     return FramesRead(TransformTree(recorded) if recorded else None, tuple(topics), tuple(unread))
 
 
-def _samples(those: list[tuple[_Transform, int]]) -> Samples:
-    return Samples(
+def _samples(those: list[tuple[_Transform, int]]) -> PoseSamples:
+    return PoseSamples(
         np.array([one.stamp_ns for one, _ in those], np.int64),
         np.array([t_ns for _, t_ns in those], np.int64),
         np.array([one.translation for one, _ in those], np.float64),
