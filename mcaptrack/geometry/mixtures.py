@@ -35,7 +35,9 @@ class Tails(NamedTuple):
 
     def of_normals(self) -> Tails:
         """The same mixtures, with normal distributions written as mixtures of two equal parts."""
-        is_normal = ~(np.isfinite(self.wide_weight) & np.isfinite(self.narrow_scale) & np.isfinite(self.wide_scale))
+        with np.errstate(invalid="ignore"):
+            is_known = (self.wide_weight >= 0) & (self.narrow_scale > 0) & (self.wide_scale > 0)
+        is_normal = ~(is_known & np.isfinite(self.narrow_scale) & np.isfinite(self.wide_scale))
         weight = np.where(is_normal, 0.0, self.wide_weight)
         return Tails(weight, np.where(is_normal, 1.0, self.narrow_scale), np.where(is_normal, 1.0, self.wide_scale))
 
