@@ -458,18 +458,24 @@ def test_a_guessed_scale_is_said_of_what_is_in_metres(tmp_path, stage, assumed, 
 
 
 @pytest.mark.parametrize(
-    ("parameters", "is_said"),
-    [({"poor_scale": True}, True), ({"poor_scale": True, "side_view": True}, False), ({"side_view": False}, False)],
+    ("parameters", "done"),
+    [
+        ({"poor_scale": True, "retracker": "consistency"}, "not re-tracked but passed on"),
+        ({"poor_scale": True, "link_s": 0.0}, "not re-tracked but passed on"),
+        ({"poor_scale": True}, "only linked over gaps, by their boxes in the picture"),
+        ({"poor_scale": True, "side_view": True}, ""),
+        ({"side_view": False}, ""),
+    ],
 )
-def test_tracks_that_are_only_passed_on_are_said(tmp_path, parameters, is_said):
+def test_tracks_that_are_only_linked_or_passed_on_are_said(tmp_path, parameters, done):
     path = written(tmp_path / "a.mcap", finished())
     words = (
-        "tracks were not re-tracked but passed on: without a measured ground plane that needs a camera that looks down, "
-        f"and this one looks along the ground. To insist: `mcaptrack.retrack('{path}', side_view=True)`"
+        f"tracks were {done}: without a measured ground plane, more needs a camera that looks down, and this one looks "
+        f"along the ground. To insist: `mcaptrack.retrack('{path}', side_view=True)`"
     )
     with log.read(path) as opened, notices.listening(lambda _: None), notices.collected() as said:
         findings.warn_findings(opened, "/camera", {"/camera/x": Provenance("retrack", parameters)}, (), is_all=False)
-    assert [(one.message, one.code) for one in said] == [(words, "held-back")] * is_said
+    assert [(one.message, one.code) for one in said] == [(words, "held-back")] * bool(done)
 
 
 def test_little_memory_is_said_in_numbers(monkeypatch):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import TRACKS, Frame
-from mcaptrack.transforms.to_video_rate import to_video_rate, unchanged_tracks
+from mcaptrack.transforms.to_video_rate import linked_tracks, to_video_rate
 from tests.commands import printed
 from tests.worlds import ns
 
@@ -139,15 +139,15 @@ def test_boxes_have_metres_by_the_plane_of_their_time():
         scale = 0.5 if n < 4 else 2.0
         assert (rows[n][2]["x_m"], rows[n][2]["y_m"]) == (scale * 20, scale * 130)
     assert (rows[0][1]["x_m"], rows[4][2]["x_m"]) == (0.0, 1.0)  # those of the samples
-    for frame, before in zip(unchanged_tracks(tracks, planes), tracks, strict=True):
+    for frame, before in zip(linked_tracks(tracks, (), planes), tracks, strict=True):
         scale = 0.5 if frame.index < 4 else 2.0
         assert frame.rows["source_id"].tolist() == frame.rows["track_id"].tolist() == [7, 8]
         np.testing.assert_allclose(frame.rows["x_m"], [scale * 2 * frame.index, scale * 20])
         np.testing.assert_array_equal(frame.rows["y_m"], scale * 130)
         assert np.isnan(before.rows["x_m"]).all()
-    known = unchanged_tracks(samples, planes)[1].rows
+    known = linked_tracks(samples, (), planes)[1].rows
     assert (known["x_m"].tolist(), known["y_m"].tolist()) == ([1.0], [0.0])
-    assert np.isnan(unchanged_tracks(tracks, ())[0].rows["x_m"]).all()
+    assert np.isnan(linked_tracks(tracks, (), ())[0].rows["x_m"]).all()
 
 
 def test_of_two_boxes_with_one_id_the_nearer_to_its_sample_is_taken():

@@ -89,11 +89,14 @@ def warn_findings(opened: log.Log, prefix: str, made: Mapping[str, Provenance], 
     if is_assumed(planes) and stages & _IN_METRES:
         words = plane_in_words(planes, known.get(camera_at(opened, prefix).ground_plane))
         warn(words, "estimated-ground-plane" if is_estimated(planes) else "assumed-ground-plane")
-    if any(
-        known[topic].parameters.get("poor_scale") and not known[topic].parameters.get("side_view") for topic in topics
-    ):
+    given = [known[topic].parameters for topic in topics]
+    held_back = [one for one in given if one.get("poor_scale") and not one.get("side_view")]
+    if held_back:
+        by_likelihood = [one for one in held_back if one.get("retracker", "likelihood") == "likelihood"]
+        is_linked = any(one.get("link_s") != 0 for one in by_likelihood)
+        done = "only linked over gaps, by their boxes in the picture" if is_linked else "not re-tracked but passed on"
         warn(
-            "tracks were not re-tracked but passed on: without a measured ground plane that needs a camera that looks "
-            f"down, and this one looks along the ground. To insist: {call('retrack', opened.path, side_view=True)}",
+            f"tracks were {done}: without a measured ground plane, more needs a camera that looks down, and this one "
+            f"looks along the ground. To insist: {call('retrack', opened.path, side_view=True)}",
             "held-back",
         )

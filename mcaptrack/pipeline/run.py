@@ -37,7 +37,7 @@ from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.transforms import FULL, STAGES, Transform
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.protocol import ModelCard, traits_of
-from mcaptrack.transforms.to_video_rate import to_video_rate, unchanged_tracks
+from mcaptrack.transforms.to_video_rate import linked_tracks, to_video_rate
 from mcaptrack.transforms.track_classes import settle_classes
 
 Progress = Callable[[str, int, int], None]
@@ -218,8 +218,8 @@ def _run_job(
         for (topic, schema), channel in zip(job.outputs().items(), outputs, strict=True)
     }
     if job.target + FULL in job.kept():
-        is_unchanged = traits_of(transform).leaves_unchanged
-        frames = _at_video_rate(opened, job, made, None if is_unchanged else outputs[0], planes, path)
+        carry = linked_tracks if traits_of(transform).leaves_unchanged else to_video_rate
+        frames = _at_video_rate(opened, job, made, outputs[0], planes, path, carry)
         channels |= {job.target + FULL: (TRACKS, frames)} if frames else {}
     seen: Channels = channels
     if not traits_of(transform).keeps_unseen:
@@ -269,14 +269,15 @@ def _at_video_rate(
     opened: log.Log,
     job: Job,
     made: Mapping[str, Made],
-    retracked: Sequence[Frame] | None,
+    retracked: Sequence[Frame],
     planes: Planes,
     path: CameraPath | None,
+    carry: Callable[[Sequence[Frame], Sequence[Frame], Planes], Sequence[Frame]],
 ) -> Sequence[Frame]:
     """Return re-tracked tracks at the rate of the tracks that were sampled; no frames if there are no such tracks.
 
-    None for ``retracked`` stands for the tracks as they are. Where the camera moves by ``path``, ``planes`` and the
-    boxes of ``retracked`` are those of reference pictures.
+    ``carry`` gives these tracks the re-tracked ids. Where the camera moves by ``path``, ``planes`` and the boxes of
+    ``retracked`` are those of reference pictures.
     """
     samples = made[job.source].provenance if job.source in made else provenance_of(opened, job.source)
     source = samples.input if samples else ""
@@ -285,9 +286,7 @@ def _at_video_rate(
     else:
         there = source in opened.channels and opened.channels[source].schema_name == TRACKS.name
         tracks = opened.frame_columns(source, TRACKS) if there else ()
-    tracks = to_scene(tracks, path)
-    frames = unchanged_tracks(tracks, planes) if retracked is None else to_video_rate(tracks, retracked, planes)
-    return to_pictures(frames, path)
+    return to_pictures(carry(to_scene(tracks, path), retracked, planes), path)
 
 
 def _input(

@@ -114,7 +114,8 @@ class Traits:
     keeps_unseen : bool
         Whether rows that are not observed and lie outside of the picture stay in the log.
     leaves_unchanged : bool
-        Whether a re-tracker passes its input on as it is; then so are the tracks at the rate of the video.
+        Whether a re-tracker passes its input on as it is, but that a track may continue another one; then all boxes
+        stay at the rate of the video.
     """
 
     colour: Colour = "grey"

@@ -6,11 +6,12 @@ Letters: N rows of the tracker.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.arrays import Bools, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.geometry.plane import Planes, plane_at
@@ -19,6 +20,7 @@ from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns, collect
 from mcaptrack.schema.framing import (
     JoinedFrames,
+    filtered_rows,
     frame_numbers,
     frame_times,
     has_any,
@@ -26,7 +28,7 @@ from mcaptrack.schema.framing import (
     joined_parts,
     mapped_rows,
 )
-from mcaptrack.schema.resampling import resample
+from mcaptrack.schema.resampling import resample, resample_parts
 
 #: Columns taken from the tracker where it has a box.
 _FROM_TRACKER: Final = ("x_px", "y_px", "w_px", "h_px", "score", "observed")
@@ -120,16 +122,63 @@ def _part(
     return rows, np.searchsorted(rows_at, np.arange(len(frame_ns) + 1), "left")
 
 
-def unchanged_tracks(tracks: Sequence[Frame], planes: Planes) -> FrameColumns:
-    """The frames of ``tracks`` under the ids that they have, in the form of ``to_video_rate``."""
+def linked_tracks(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Planes) -> FrameColumns:
+    """The frames of ``tracks``, of which some continue others in ``retracks``.
 
-    def unchanged(joined: JoinedFrames) -> Rows:
+    The arguments are those of ``to_video_rate``, but here a track has one id in ``retracks`` from its beginning to its
+    end. All boxes stay, but for the second of two that would have one id in a frame: that of the track that began
+    later. The gaps of linked tracks are interpolated between boxes.
+    """
+    roots: dict[int, int] = {}
+    for _, _, joined in joined_parts(TRACKS, retracks):
+        rows = joined.rows[joined.rows["source_id"] >= 0]
+        roots |= dict(zip(rows["source_id"].tolist(), rows["track_id"].tolist(), strict=True))
+    spans_ns: dict[int, tuple[int, int]] = {}
+    for _, _, joined in joined_parts(TRACKS, tracks):
+        for one, t_ns in zip(joined.rows["track_id"].tolist(), joined.row_ns.tolist(), strict=True):
+            spans_ns[one] = spans_ns.get(one, (t_ns, t_ns))[0], t_ns
+
+    def renamed(joined: JoinedFrames) -> Rows:
         rows = joined.rows
         rows["source_id"] = rows["track_id"]
+        rows["track_id"] = [roots.get(one, one) for one in rows["track_id"].tolist()]
         _to_metres(rows, joined.row_ns, planes)
         return rows
 
-    return mapped_rows(TRACKS, tracks, unchanged)
+    def is_first(joined: JoinedFrames) -> Bools:
+        began_ns = np.array([spans_ns[one][0] for one in joined.rows["source_id"].tolist()], np.int64)
+        order = np.lexsort((began_ns, joined.rows["track_id"], joined.frame))
+        kept = np.empty(len(order), bool)
+        kept[order] = run_starts(joined.frame[order], joined.rows["track_id"][order])
+        return kept
+
+    frames = mapped_rows(TRACKS, tracks, renamed)
+    parts: dict[int, list[tuple[int, int]]] = {}
+    for one, span in spans_ns.items():
+        parts.setdefault(roots.get(one, one), []).append(span)
+    linked = {root: sorted(spans) for root, spans in parts.items() if len(spans) > 1}
+    if not linked:
+        return frames
+    gap_ns = max(later[0] - before[1] for spans in linked.values() for before, later in pairwise(spans))
+    return _filled(filtered_rows(TRACKS, frames, is_first), np.array(sorted(linked)), max(gap_ns, 0))
+
+
+def _filled(frames: FrameColumns, ids: Ints, gap_ns: int) -> FrameColumns:
+    """Frames with the gaps of some tracks interpolated that are at most ``gap_ns`` long; these rows aren't observed."""
+    out, width = FrameCollector(TRACKS), int(ids[-1]) + 1
+    for first, last, rows, at in resample_parts(frames, frames.t_ns, gap_ns):
+        own = join_frames(TRACKS, frames, first, last)
+        mine = np.isin(own.rows["track_id"], ids)
+        have = (own.frame[mine] + first) * width + own.rows["track_id"][mine]
+        is_new = np.isin(rows["track_id"], ids) & ~np.isin(at * width + rows["track_id"], have)
+        new = rows[is_new]
+        new["source_id"], new["observed"] = -1, False
+        of = np.concatenate([own.frame, at[is_new] - first])
+        both = np.concatenate([own.rows, new])
+        order = np.lexsort((both["track_id"], of))
+        ends = np.searchsorted(of[order], np.arange(last - first + 1))
+        out.extend(own.t_ns, frames.numbers[first:last], ends, both[order])
+    return out.done()
 
 
 def _retracked_ids(track: Ints, t_ns: Ints, retracks: Sequence[Frame]) -> tuple[Ints, Ints]:

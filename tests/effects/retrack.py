@@ -314,7 +314,7 @@ case(
 )
 case(
     "side_view",
-    "the same seen from the side, on a scale that was guessed: tracks are passed on as they are, unless that is asked for",
+    "the same seen from the side, on a scale that was guessed: tracks without boxes are passed on as they are, unless that is asked for",
     replace(LIKELY, min_track_s=0.4, link_s=20.0, poor_scale=True),
     hidden(range(20, 35), 60),
     people,

@@ -7,12 +7,13 @@ from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Protocol, TypeAlias, TypeVar
 
-from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameColumns, collect
 from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.by_class import Movers, join_classes, movers_of, split_classes, usual_score
 from mcaptrack.transforms.retrack.consistency import ConsistencyPass
+from mcaptrack.transforms.retrack.in_pictures import link_in_picture
 from mcaptrack.transforms.retrack.kept_ids import KeptIds
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
 from mcaptrack.transforms.retrack.offline import offline_tracks
@@ -95,16 +96,26 @@ def _retrack(
 ) -> Iterator[tuple[Frame, ...]]:
     """For each frame the offline tracks, the online tracks and their predictions; each class by itself."""
     if options.leaves_unchanged:
-        forecaster = Forecaster(options.predictor, options.horizon_s, options.min_history, options.rate_hz)
-        for frame in frames:
-            online = frame._replace(rows=frame.rows[frame.rows["observed"]])
-            yield frame, online, frame._replace(rows=forecaster.predict(frame))
+        yield from _keep_ids(options, frames)
         return
     frames = collect(TRACKS, frames)
     parts = [frames] if options.across_classes else split_classes(frames)
     score = usual_score(frames)
     runs = [_retrack_together(options, new_pass, part, score) for part in parts]
     yield from runs[0] if len(runs) == 1 else join_classes(runs, tuple(options.writes.values()))
+
+
+def _keep_ids(options: RetrackOptions, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
+    """For each frame tracks that are linked in the picture, if the method does that; the input and its predictions."""
+    forecaster = Forecaster(options.predictor, options.horizon_s, options.min_history, options.rate_hz)
+    linked: Iterator[Rows] | None = None
+    if options.links_in_picture:
+        frames = collect(TRACKS, frames)
+        linked = link_in_picture(frames, options.link_s, options.link_confidence, options.across_classes)
+    for frame in frames:
+        online = frame._replace(rows=frame.rows[frame.rows["observed"]])
+        offline = frame if linked is None else frame._replace(rows=next(linked))
+        yield offline, online, frame._replace(rows=forecaster.predict(frame))
 
 
 def _retrack_together(

@@ -149,8 +149,13 @@ class RetrackOptions:
 
     @property
     def leaves_unchanged(self) -> bool:
-        """Whether tracks are passed on unchanged, because positions in metres are too wrong to repair them."""
+        """Whether boxes keep their tracks, because positions in metres are too wrong to repair these."""
         return self.poor_scale and not self.side_view
+
+    @property
+    def links_in_picture(self) -> bool:
+        """Whether tracks that are left unchanged are linked over gaps in the picture."""
+        return False
 
     @property
     def shares_samples(self) -> bool:
@@ -169,6 +174,10 @@ class RetrackOptions:
 @dataclass(frozen=True, kw_only=True)
 class LikelihoodOptions(RetrackOptions):
     """The options of re-tracking by likelihood."""
+
+    @property
+    def links_in_picture(self) -> bool:
+        return self.link_s > 0
 
     merge_distance_m: float = option(
         1.0,

@@ -1,0 +1,261 @@
+"""Re-tracking without metres: tracks keep their ids and are linked over gaps in the picture, in heights of their boxes."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mcaptrack.evaluation.aligned import make_matchup
+from mcaptrack.evaluation.metrics import combine, score, summary
+from mcaptrack.geometry.plane import assumed_plane
+from mcaptrack.pipeline.planes import is_poor
+from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.transforms import PROFILES, Retrack, Sample
+from mcaptrack.transforms.to_video_rate import linked_tracks
+from tests.worlds import assert_same_rows, ns
+
+#: Foot (x, y) and height of a box, in px.
+Box = tuple[float, float, float]
+PICTURES = Retrack(poor_scale=True)
+DATA = Path(os.environ.get("MCAPTRACK_DATA", "/nonexistent")) / "mot15"
+
+
+def frame(number: int, boxes: dict[int, Box], rate_hz: float = 2.5) -> Frame:
+    ids, rows = np.array(list(boxes), int), np.array(list(boxes.values()), float).reshape(-1, 3)
+    x, y, h = rows.T
+    content = TRACKS.rows(
+        track_id=ids, x_px=x - 0.2 * h, y_px=y - h, w_px=0.4 * h, h_px=h, x_m=x / 100, y_m=-y / 100,
+        observed=np.ones(len(ids), bool), source_id=ids,
+    )  # fmt: skip
+    return Frame(ns(number / rate_hz), number, content)
+
+
+def walking(number: int, tall: float, speed: float = 0.6, at: tuple[float, float] = (300.0, 400.0)) -> Box:
+    """A person who walks across, at a speed in heights a second."""
+    return at[0] + speed * tall * 0.4 * number, at[1], tall
+
+
+def linked(frames: list[Frame], retrack: Retrack = PICTURES) -> list[Frame]:
+    return [result[0] for result in retrack(frames)]
+
+
+def ids_of(frames: list[Frame]) -> set[int]:
+    return {one for frame in frames for one in frame.rows["track_id"].tolist()}
+
+
+def with_gap(tall: float, gap: range, then: float | None = None, aside: float = 0.0) -> list[Frame]:
+    """A person as track 1, missed in the gap, and then as track 2, as tall as ``then`` and ``aside`` heights lower."""
+
+    def boxes(n: int) -> dict[int, Box]:
+        x, y, _ = walking(n, tall)
+        return {} if n in gap else {1: (x, y, tall)} if n < gap.start else {2: (x, y + aside * tall, then or tall)}
+
+    return [frame(n, boxes(n)) for n in range(20)]
+
+
+@pytest.mark.parametrize("tall", [20.0, 80.0, 400.0])
+@pytest.mark.parametrize(
+    ("gap", "then", "aside", "count"),
+    [
+        (range(8, 10), 1.0, 0.0, 1),
+        (range(8, 13), 1.0, 0.0, 1),
+        (range(8, 10), 1.0, 0.3, 1),
+        (range(8, 10), 1.0, 3.0, 2),  # another place
+        (range(8, 10), 2.5, 0.0, 2),  # another height: somewhere else along the view
+        (range(2, 18), 1.0, 0.0, 2),  # too long
+    ],
+)
+def test_near_and_far_people_are_linked_alike(tall, gap, then, aside, count):
+    assert len(ids_of(linked(with_gap(tall, gap, then * tall, aside)))) == count
+
+
+def test_gaps_are_interpolated_by_hand():
+    frames = with_gap(100.0, range(8, 10))
+    found = linked(frames)
+    for n, one in enumerate(found):
+        (row,) = one.rows
+        x, y, h = walking(n, 100.0)
+        assert (row["track_id"], row["observed"]) == (1, n not in (8, 9))
+        assert row["source_id"] == (1 if n < 8 else -1 if n < 10 else 2)
+        got = (row["x_px"], row["y_px"], row["w_px"], row["h_px"], row["x_m"])
+        assert got == pytest.approx((x - 0.2 * h, y - h, 0.4 * h, h, x / 100), rel=1e-5)
+
+
+def test_of_two_who_come_back_each_goes_on_as_itself():
+    """They walk towards each other and are missed while they pass."""
+
+    def boxes(n: int) -> dict[int, Box]:
+        right, left = walking(n, 100.0), walking(n, 105.0, -0.6, (700.0, 403.0))
+        return {} if 7 <= n <= 9 else {1: right, 2: left} if n < 7 else {3: left, 4: right}
+
+    found = linked([frame(n, boxes(n)) for n in range(20)])
+    assert ids_of(found) == {1, 2}
+    feet = {one["track_id"]: one["x_px"] for one in found[-1].rows}
+    assert feet[1] > feet[2]
+
+
+def crowd(rng: np.random.Generator, count: int = 12, steps: int = 40) -> list[Frame]:
+    """People of all sizes who are missed now and then, sometimes with a new id after it."""
+    tall = rng.uniform(30, 200, count)
+    place, speed = rng.uniform(0, 800, (count, 2)), rng.normal(0, 0.4, (count, 2))
+    name, hidden, top = list(range(count)), np.zeros(count, int), count
+    frames = []
+    for n in range(steps):
+        boxes = {}
+        for k in range(count):
+            if hidden[k] == 0 and rng.random() < 0.1:
+                hidden[k] = rng.integers(1, 6)
+                if rng.random() < 0.7:
+                    name[k], top = top, top + 1
+            hidden[k] = max(hidden[k] - 1, 0)
+            if not hidden[k]:
+                x, y = place[k] + speed[k] * tall[k] * 0.4 * n + rng.normal(0, 0.03 * tall[k], 2)
+                boxes[name[k]] = (x, y, tall[k] * np.exp(rng.normal(0, 0.03)))
+        frames.append(frame(n, boxes))
+    return frames
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_tracks_are_only_joined(seed):
+    """No row is lost, moved or split from its track; what is added lies in gaps; an id is at one place of a frame."""
+    frames = crowd(np.random.default_rng(seed))
+    found = linked(frames)
+    roots: dict[int, set[int]] = {}
+    for before, after in zip(frames, found, strict=True):
+        assert len(np.unique(after.rows["track_id"])) == len(after.rows)
+        own = after.rows[after.rows["source_id"] >= 0]
+        assert sorted(own["source_id"].tolist()) == sorted(before.rows["track_id"].tolist())
+        for row in own:
+            roots.setdefault(int(row["source_id"]), set()).add(int(row["track_id"]))
+            same = before.rows[before.rows["track_id"] == row["source_id"]]
+            assert [row[name] for name in ("x_px", "h_px", "x_m")] == [
+                same[0][name] for name in ("x_px", "h_px", "x_m")
+            ]
+        assert not after.rows[after.rows["source_id"] < 0]["observed"].any()
+    assert all(len(one) == 1 for one in roots.values())
+    assert len(ids_of(found)) < len(ids_of(frames))
+
+
+@pytest.mark.parametrize("factor", [0.25, 3.0])
+def test_pictures_of_any_size_give_the_same_tracks(factor):
+    """A law of heights: pixels have no scale of their own."""
+    frames = crowd(np.random.default_rng(7))
+    scaled = []
+    for one in frames:
+        rows = one.rows.copy()
+        for name in ("x_px", "y_px", "w_px", "h_px"):
+            rows[name] *= factor
+        scaled.append(one._replace(rows=rows))
+    for a, b in zip(linked(frames), linked(scaled), strict=True):
+        assert a.rows["track_id"].tolist() == b.rows["track_id"].tolist()
+
+
+def test_predictions_and_online_tracks_stay_those_of_the_input():
+    frames = crowd(np.random.default_rng(1))
+    for one, (_, online, _) in zip(frames, PICTURES(frames), strict=True):
+        assert_same_rows(online.rows, one.rows)
+
+
+@pytest.mark.parametrize(
+    "retrack",
+    [replace(PICTURES, link_s=0.0), *(replace(PROFILES[name], poor_scale=True) for name in ("paper", "authors"))],
+    ids=["not linked", "paper", "authors"],
+)
+def test_other_methods_pass_tracks_on_as_they_are(retrack):
+    frames = with_gap(100.0, range(8, 10))
+    for one, before in zip(linked(frames, retrack), frames, strict=True):
+        assert_same_rows(one.rows, before.rows)
+
+
+def test_classes_are_not_joined_unless_asked():
+    frames = with_gap(100.0, range(8, 10))
+    for one in frames[10:]:
+        one.rows["class_id"] = 2
+    assert len(ids_of(linked(frames))) == 2
+    assert len(ids_of(linked(frames, replace(PICTURES, across_classes=True)))) == 1
+
+
+def test_links_are_more_certain_where_few_tracks_begin():
+    """The same gap, 0.3 heights aside, with and without forty others who come and go."""
+
+    def boxes(n: int, others: int) -> dict[int, Box]:
+        own = with_gap(100.0, range(8, 11), aside=0.6)[n].rows
+        out = {int(one["track_id"]): (one["x_px"] + 20, one["y_px"] + one["h_px"], 100.0) for one in own}
+        return out | {100 + 20 * k + n: (40.0 * k, 900.0 + 300 * (k % 2), 100.0) for k in range(others)}
+
+    found = [ids_of(linked([frame(n, boxes(n, others)) for n in range(20)])) for others in (0, 40)]
+    assert 2 not in found[0]
+    assert 2 in found[1]
+
+
+def test_at_the_rate_of_the_video_gaps_are_filled_and_short_tracks_come_out():
+    """Ten pictures a second: track 1 to 0.9 s, track 2 from 1.4 s, which continues it; track 3 lasts 0.2 s."""
+
+    def boxes(n: int) -> dict[int, Box]:
+        x = 10.0 * n
+        return ({1: (x, 300, 90)} if n < 10 else {2: (x, 300, 90)} if n >= 14 else {}) | (
+            {3: (900, 300, 90)} if n in (5, 6) else {}
+        )
+
+    tracks = [frame(n, boxes(n), 10.0) for n in range(30)]
+    samples = [frame for (frame,) in Sample(start_ns=0)(tracks)]
+    full = linked_tracks(tracks, linked(samples), ())
+    assert [one.t_ns for one in full] == [one.t_ns for one in tracks]
+    for n, one in enumerate(full):
+        assert one.rows["track_id"].tolist() == ([1, 3] if n in (5, 6) else [1])
+        row = one.rows[0]
+        assert row["x_px"] == pytest.approx(10.0 * n - 18)
+        assert (row["observed"], row["source_id"]) == ((True, 1 if n < 10 else 2) if not 10 <= n < 14 else (False, -1))
+
+
+def test_of_two_boxes_with_one_id_that_of_the_earlier_track_stays():
+    tracks = [
+        frame(n, ({1: (100, 300, 90)} if n < 12 else {}) | ({2: (103, 300, 90)} if n >= 10 else {}), 10.0)
+        for n in range(20)
+    ]
+    retracks = [frame(n, {1: (100, 300, 90)}) for n in range(5)]
+    for one in retracks[3:]:
+        one.rows["source_id"] = 2
+    full = linked_tracks(tracks, retracks, ())
+    assert [one.rows["source_id"].tolist() for one in full] == [[1]] * 12 + [[2]] * 8
+    assert ids_of(list(full)) == {1}
+
+
+def read(path: Path, fps: float, count: int) -> list[Frame]:
+    rows = np.loadtxt(path, delimiter=",", ndmin=2)
+    rows = rows[(rows[:, 6] != 0) & (rows[:, 5] > 0)]
+    out = []
+    for n in range(count):
+        own = rows[rows[:, 0] == n + 1]
+        x, y, w, h = own[:, 2:6].T
+        ids = own[:, 1].astype(int)
+        content = TRACKS.rows(
+            track_id=ids, x_px=x, y_px=y, w_px=w, h_px=h, observed=np.ones(len(ids), bool), source_id=ids
+        )
+        out.append(Frame(ns(n / fps), n, content))
+    return out
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="MCAPTRACK_DATA has no mot15")
+def test_cameras_at_the_height_of_people_gain_and_none_loses():
+    """SORT's tracks of five sequences of the MOTChallenge, by boxes at an overlap of 0.5."""
+    before, after = [], []
+    for name in ("ADL-Rundle-6", "ETH-Sunnyday", "KITTI-17", "TUD-Campus", "TUD-Stadtmitte"):
+        info = dict(line.split("=") for line in (DATA / name / "seqinfo.ini").read_text().splitlines() if "=" in line)
+        fps, count = float(info["frameRate"]), int(info["seqLength"])
+        tracks, truth = (read(DATA / name / part, fps, count) for part in ("reference/sort.txt", "gt/gt.txt"))
+        assert is_poor(tracks)
+        plane = assumed_plane(np.concatenate([one.rows["h_px"] for one in tracks]), 640, 480)
+        samples = [one for (one,) in Sample(start_ns=0, ground_planes=((0, plane),))(tracks)]
+        full = linked_tracks(tracks, linked(samples), ((0, plane),))
+        before.append(score(make_matchup(truth, tracks, "iou", 0.5), "trackeval"))
+        after.append(score(make_matchup(truth, full, "iou", 0.5), "trackeval"))
+        had, has = summary(before[-1]), summary(after[-1])
+        assert has["IDF1"] > had["IDF1"], name
+        assert has["MOTA"] > had["MOTA"], name
+    had, has = summary(combine(before)), summary(combine(after))
+    assert has["IDF1"] > had["IDF1"] + 0.025
