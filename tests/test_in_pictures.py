@@ -183,7 +183,7 @@ def test_links_are_more_certain_where_few_tracks_begin():
     """The same gap, 0.3 heights aside, with and without forty others who come and go."""
 
     def boxes(n: int, others: int) -> dict[int, Box]:
-        own = with_gap(100.0, range(8, 11), aside=0.6)[n].rows
+        own = with_gap(100.0, range(8, 11), aside=0.3)[n].rows
         out = {int(one["track_id"]): (one["x_px"] + 20, one["y_px"] + one["h_px"], 100.0) for one in own}
         return out | {100 + 20 * k + n: (40.0 * k, 900.0 + 300 * (k % 2), 100.0) for k in range(others)}
 
