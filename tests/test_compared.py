@@ -183,6 +183,7 @@ def test_files_are_paired_by_name_or_in_order(tmp_path):
     pairs, words = pair_files(made, [tmp_path / "x.txt", tmp_path / "y.txt"])
     assert [(n, t.name) for n, _, t in pairs] == [("b", "x.txt"), ("a", "y.txt")]
     assert "taken in the order given" in words
+    assert pair_files(made[:1], truth[:1]) == ([("b", made[0], truth[0])], "")  # one of each belong together
     with pytest.raises(McaptrackError, match="2 files of tracks and 1 of ground truth"):
         pair_files(made, truth[:1])
 

@@ -1,6 +1,6 @@
 """Every option has an effect: a command with it has another outcome than without it.
 
-What is seen is everything that a command leaves: exit code, stdout, stderr, and all files of its folder. That an option
+What is seen is everything that a command leaves: exit code, stdout, stderr, and what changed of its folder. That an option
 means the same whichever way it is given is tested in ``test_settings``, what parameters of transforms do in
 ``test_options``.
 """
@@ -35,7 +35,7 @@ from tests.worlds import small_scene
 
 
 class Seen(NamedTuple):
-    """The outcome of a command."""
+    """The outcome of a command: ``files`` are the new and changed ones with their digests, and removed ones."""
 
     code: int
     out: str
@@ -125,6 +125,10 @@ def _add_channels_of_others(path: Path) -> None:
         writer.add_message(channel, 1, 1, b'{"a": 1}')
 
 
+#: Folders of many files, and the word in a command line that needs them there.
+FOLDERS = {"a.tables": "a.mcap", "nuscenes": "nuscenes", "taken": "taken", "yolo": "yolo"}
+
+
 @pytest.fixture
 def see(template, tmp_path, monkeypatch) -> Callable[[str], Seen]:
     """Run a command line in a fresh copy of the template."""
@@ -140,12 +144,15 @@ def see(template, tmp_path, monkeypatch) -> Callable[[str], Seen]:
     def run(line: str) -> Seen:
         folder = tmp_path / "work"
         shutil.rmtree(folder, ignore_errors=True)
-        shutil.copytree(template, folder, copy_function=_copy)
+        unused = [name for name, word in FOLDERS.items() if word not in line]
+        shutil.copytree(template, folder, copy_function=_copy, ignore=lambda *_: unused)
+        given = _digests(folder)
         monkeypatch.chdir(folder)
         code, out, err = call(*shlex.split(line))
         out = re.sub(r"(?<=127\.0\.0\.1)(:|%3A)\d{5}\b", ":any", out)  # a port that was free
         out, err = re.sub(r'"seconds": [\d.]+', "", out), re.sub(r" in [\d.]+ s\b", "", err)  # how long it took
-        files = {str(path.relative_to(folder)): _digest(path) for path in folder.rglob("*") if path.is_file()}
+        left = _digests(folder)
+        files = {name: left.get(name, "removed") for name in given | left if left.get(name) != given.get(name)}
         monkeypatch.chdir(tmp_path)
         return Seen(code, out, err, files)
 
@@ -160,8 +167,17 @@ def _copy(source: str, target: str) -> None:
         shutil.copy2(source, target)
 
 
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def _digests(folder: Path) -> dict[str, str]:
+    """Digests of all files of a folder; of those with a second name that is the place on the disk."""
+    found = {}
+    for path in folder.rglob("*"):
+        if path.is_file():
+            facts = path.stat()
+            is_linked = facts.st_nlink > 1
+            found[str(path.relative_to(folder))] = (
+                str(facts.st_ino) if is_linked else hashlib.sha256(path.read_bytes()).hexdigest()
+            )
+    return found
 
 
 def _interrupted(*_: object, **__: object) -> None:

@@ -21,6 +21,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate, sequence_of_log
 from mcaptrack.evaluation.event_text import log_messages
 from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events
+from mcaptrack.evaluation.track_lifecycle import lifecycle_of
 from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind, Frame
 from mcaptrack.schema.proto import parse
 from mcaptrack.schema.provenance import Provenance, digest
@@ -600,3 +601,14 @@ def test_the_command_drop_and_tables_handle_events(place):
     call("drop", place, "/camera/tracks")
     with log.read(place) as opened:
         assert without_views(opened) == {"/camera/truth"}
+
+
+def test_of_the_life_of_tracks_only_ends_of_tracks_and_of_sources_are_kept():
+    def rows(n: int):
+        found = tracks_at({1: (n, 0.0), 2: (n, 5.0)})
+        found["source_id"] = [7 if n < 20 else 8, -1]
+        return found
+
+    life = lifecycle_of([Frame(ns(n / 10), n, rows(n)) for n in range(50)])
+    found = sorted(zip(life.rows["track_id"].tolist(), life.rows["x_m"].tolist(), strict=True))
+    assert found == [(1, 0), (1, 19), (1, 20), (1, 49), (2, 0), (2, 49)]

@@ -389,3 +389,20 @@ def test_tracks_face_as_true_vehicles_do():
     turned = np.abs(np.angle(np.exp(1j * np.concatenate(off))))
     assert (turned > np.pi / 2).mean() < 0.02
     assert np.median(turned) < 0.08
+
+
+#: Mean length, width and height in metres of boxes of the public data set nuScenes (its training split).
+MEAN_SIZES = {
+    "car": (4.63, 1.97, 1.74),
+    "truck": (6.93, 2.51, 2.84),
+    "bus": (11.1, 2.95, 3.47),
+    "trailer": (12.3, 2.90, 3.87),
+    "motorcycle": (2.11, 0.77, 1.47),
+    "bicycle": (1.70, 0.60, 1.28),
+    "person": (0.73, 0.67, 1.77),
+}
+
+
+@pytest.mark.parametrize("name", MEAN_SIZES)
+def test_usual_sizes_are_near_the_mean_of_recorded_ones(name: str):
+    assert LIMITS[name].size_m == pytest.approx(MEAN_SIZES[name], rel=0.34)

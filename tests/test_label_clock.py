@@ -32,6 +32,7 @@ from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest import IngestOptions, ingest, label_frames
 from mcaptrack.sources.ingest.labels.box_rows import OTHERS
+from mcaptrack.sources.ingest.labels.camera import timeline_of
 from mcaptrack.sources.ingest.labels.formats import FORMATS_3D, READERS, Format, Role
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline
@@ -500,3 +501,17 @@ def test_the_commands_of_the_page_work_as_written(tmp_path, monkeypatch):
         assert all(t == [round(Fraction(k, 7) * 10**9) for k in range(len(t))] for t in times.values())
     result = CliRunner().invoke(app, ["evaluate", "video.mcap", "--json"])
     assert {row["MOTA"] for row in json.loads(result.stdout)["results"] if row["similarity"] == "iou"} == {1.0}
+
+
+@pytest.mark.parametrize("numbers", [(0, 1, 2, 3), (0, 1, 3), (1, 2, 3), (0, 3)])
+def test_pictures_keep_their_numbers_where_some_could_not_be_read(tmp_path, numbers):
+    path = tmp_path / "a.mcap"
+    with log.create(path) as writer:
+        made = Provenance("ingest", {"every": 2}).to_metadata()
+        channel = writer.add_channel("/camera/video", foxglove.schema_record(foxglove.VIDEO), "protobuf", made)
+        for number in numbers:
+            writer.add_message(channel, ns(number), number, b"")
+    with log.read(path) as opened:
+        line = timeline_of(opened, "/camera/video")
+    assert (line.index.tolist(), line.t_ns.tolist()) == (list(numbers), [ns(number) for number in numbers])
+    assert (line.is_complete, line.every) == (len(numbers) == 4, 2)

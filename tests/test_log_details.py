@@ -353,6 +353,26 @@ def chunks_of(path: Path) -> list[list]:
     return [[one for one in breakup_chunk(chunk) if type(one).__name__ == "Message"] for chunk in chunks]
 
 
+def test_chunks_of_messages_that_stood_outside_describe_their_channels(tmp_path):
+    """Readers without an index find the channel of each message before it, in the same chunk."""
+    write_stock(tmp_path / "a.mcap", FORTY, use_chunking=False)
+    with log.read(tmp_path / "a.mcap") as opened, log.extend(opened) as writer:
+        writer.add_message(writer.add_channel("new", SCHEMA, "json", {}), 5, 1, b"new")
+    count = 0
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        chunks = [one for one in StreamReader(stream, emit_chunks=True).records if type(one).__name__ == "Chunk"]
+    for chunk in chunks:
+        known: list[int] = []
+        for one in breakup_chunk(chunk):
+            if type(one).__name__ == "Channel":
+                known.append(one.id)
+            elif type(one).__name__ == "Message":
+                assert one.channel_id in known
+                count += 1
+        assert len(known) == len(set(known))
+    assert count == 41
+
+
 def test_messages_far_apart_in_a_log_without_chunks_are_read(tmp_path):
     """One by one, where more than 16 KiB of others are between them."""
     some = [(topic, 10 * n, n, bytes([n]) * (n if topic == "a" else 40_000)) for n in range(6) for topic in "ab"]

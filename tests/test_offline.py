@@ -13,7 +13,7 @@ from mcaptrack.geometry.assignment import assign_by_gain
 from mcaptrack.transforms import PROFILES
 from mcaptrack.transforms.retrack.identity_swaps import _continuity, find_swaps
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
-from mcaptrack.transforms.retrack.linking import link_tracks
+from mcaptrack.transforms.retrack.linking import link_tracks, misfits
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories, smooth, to_trajectories
 from tests.worlds import places, walk
 
@@ -337,3 +337,13 @@ class TestOffline:
                     for a, b in zip(whole, part, strict=True):
                         for name in a.rows.dtype.names:
                             assert a.rows[name].tobytes() == b.rows[name].tobytes()
+
+
+def test_the_misfit_of_a_continuation_by_hand():
+    """After 2 s at a mean velocity of 2 m/s it is 4 m ahead of the end; a track at rest stays where it was."""
+    before, after = (np.zeros((3, 4)) for _ in range(2))
+    before[:, 2:], after[:, :2] = (1.0, 0.0), [(5.0, 1.0), (0.5, 0.0), (4.0, 3.0)]
+    after[:, 2:] = (3.0, 0.0)
+    cov = np.zeros((3, 3))
+    found = misfits(State(before, cov), State(after, cov), np.array([2.0, 2.0, 2.0]))
+    np.testing.assert_allclose(found, [np.sqrt(2), 0.5, 3.0])

@@ -17,6 +17,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.pipeline import drawing, findings
 from mcaptrack.pipeline import write as writing
+from mcaptrack.pipeline.spaces import check_spaces
 from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, INGEST, VIEW, Provenance, digest
@@ -832,3 +833,12 @@ def test_an_error_of_a_stage_names_log_and_channel_once(tmp_path, monkeypatch):
         with log.read(path) as opened, pytest.raises(McaptrackError) as error:
             pipeline.run(opened, "/camera", pipeline.plan_stage(opened, "/camera", "sample", Sample()))
         assert str(error.value) == shown
+
+
+@pytest.mark.parametrize(("frame_id", "is_said"), [("map", True), ("", False)])
+def test_a_frame_without_boxes_in_space_has_no_effect(tmp_path, frame_id, is_said):
+    channels = {"/camera/tracks": (TRACKS, Provenance(INGEST, {}), paced(2.5))}
+    with log.read(written(tmp_path / "a.mcap", channels)) as opened, notices.collected() as said:
+        check_spaces(opened, "/camera", [], frame_id)
+    wanted = "`frame=` has no effect: only recorded 3D boxes are brought to a frame"
+    assert [(one.code, one.message) for one in said] == ([("option-not-used", wanted)] if is_said else [])

@@ -124,8 +124,16 @@ def test_all_numbers_of_a_fit_are_values_of_json():
     assert {type(value) for value in said.values()} <= {int, float}
 
 
+def nothing() -> np.ndarray:
+    return np.empty((0, 4))
+
+
+def few() -> np.ndarray:
+    return View(5.0, 20.0).boxes(119, seed=2)[0]
+
+
 def lane() -> np.ndarray:
-    boxes, places = View(1.6, 0.0).boxes(9000, seed=2)
+    boxes, places = View(1.6, 0.0).boxes(6000, seed=2)
     return boxes[np.abs(places[:, 1] - 12) < 0.5]
 
 
@@ -140,20 +148,24 @@ def unrelated() -> np.ndarray:
     return boxes
 
 
+def lying() -> np.ndarray:
+    return View(5.0, 20.0).boxes(300, seed=2)[0] * [1, 1, 4, 1]
+
+
 @pytest.mark.parametrize(
     ("boxes", "words"),
     [
-        (np.empty((0, 4)), "0 of 0 boxes show whole people, and 120 are needed"),
-        (View(5.0, 20.0).boxes(119, seed=2)[0], "of 119 boxes show whole people, and 120 are needed"),
-        (lane(), "people are all at about the same distance from the camera"),
-        (unrelated(), "heights of boxes don't follow from where they stand: "),
-        (View(5.0, 20.0).boxes(300, seed=2)[0] * [1, 1, 4, 1], "0% of the boxes have the shape of an upright person"),
+        (nothing, "0 of 0 boxes show whole people, and 120 are needed"),
+        (few, "of 119 boxes show whole people, and 120 are needed"),
+        (lane, "people are all at about the same distance from the camera"),
+        (unrelated, "heights of boxes don't follow from where they stand: "),
+        (lying, "0% of the boxes have the shape of an upright person"),
     ],
     ids=["none", "few", "one distance", "unrelated", "lying"],
 )
 def test_boxes_that_cannot_tell_are_refused(boxes, words):
     with pytest.raises(McaptrackError, match=words):
-        fitted(boxes)
+        fitted(boxes())
 
 
 @pytest.mark.parametrize("seen_m", [1.2, 1.4])

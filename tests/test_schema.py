@@ -476,3 +476,15 @@ def test_a_digest_is_of_times_numbers_and_payloads():
 )
 def test_a_motion_of_a_camera_is_finite_and_can_be_inverted(numbers, is_one):
     assert is_motion(np.array(numbers, float).reshape(2, 3)) is is_one
+
+
+@pytest.mark.parametrize("schema", SCHEMAS.values(), ids=str)
+def test_no_row_may_lack_a_required_number(schema):
+    names = [c.name for c in schema.columns if not c.optional and schema.dtype[c.name].kind == "f"]
+    for name in names:
+        given = {c.name: np.zeros(3, schema.dtype[c.name]) for c in schema.columns}
+        given[name] = np.array([1.0, np.nan, 2.0])
+        with pytest.raises(
+            ValueError, match=f"{name} is required and missing in 1 rows, first in row 1|only a part of"
+        ):
+            schema.rows(**given)

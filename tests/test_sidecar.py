@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from tests.commands import call, printed
-from tests.logs import SCHEMA, SOME, our_messages, write_log
+from tests.logs import FORTY, SCHEMA, SOME, our_messages, write_log, write_stock
 
 
 def add(path: Path, topic: str, payload: bytes, sidecar: bool | None = None) -> None:
@@ -54,6 +54,24 @@ def test_what_the_results_hold_is_seen_instead_of_what_the_log_holds(path):
     assert our_messages(path)["a"] == [(15, 1, b"theirs")]
     with log.read(path, sidecar=False) as opened:
         assert [m.t_ns for m in opened.messages("a")] == [10, 20]
+
+
+def test_attachments_and_metadata_are_those_of_the_results_or_else_of_the_log(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_stock(path, FORTY)
+    add(path, "new", b"one", sidecar=True)
+    with log.read(path) as opened:
+        assert opened.attachment("notes.txt") == b"hello"
+        assert opened.metadata("about") == {"what": "new"}
+        opened.lock()
+        with log.extend(opened) as writer:
+            writer.add_attachment("notes.txt", "text/plain", b"good bye")
+    with log.read(path) as opened:
+        assert opened.attachment("notes.txt") == b"good bye"
+    with log.read(path, sidecar=False) as opened:
+        assert opened.attachment("notes.txt") == b"hello"
+        assert opened.metadata("about") == {"robot": "r2"}
+        assert (opened.attachment("none"), opened.metadata("none")) == (None, None)
 
 
 def test_nothing_is_left_where_nothing_came(path, tmp_path):

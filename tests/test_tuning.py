@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions
 from mcaptrack.evaluation.tuning import Range, Task, declared_ranges, tune
 from mcaptrack.schema import Frame
-from mcaptrack.transforms import TRACKERS, TRANSFORMS, Sort
+from mcaptrack.transforms import STAGES, TRACKERS, TRANSFORMS, Sort
 from tests.commands import call, printed
 from tests.worlds import boxed, boxes_at, detections, ns
 
@@ -45,6 +45,15 @@ def test_every_tracker_declares_ranges_that_it_accepts():
     assert {"max_age_s", "min_iou"} <= set(declared_ranges(Sort))
     assert "inertia" in declared_ranges(TRACKERS["ocsort"])
     assert "high_score" in declared_ranges(TRACKERS["bytetrack"])
+
+
+def test_ranges_of_every_search_are_within_the_limits_of_the_parameter():
+    kinds = {kind for stage in STAGES.values() for kind in stage.built_in().values()}
+    declared = [one.metadata for kind in kinds for one in fields(kind) if one.metadata.get("search")]
+    assert len(declared) > 10
+    for given in declared:
+        low, high = given["search"]
+        assert given["least"] <= low < high <= given["most"], given
 
 
 def test_a_search_finds_the_age_that_keeps_an_identity(chance):
