@@ -540,6 +540,14 @@ def test_a_cut_bag_exits_with_3(tmp_path):
     assert "lost: " in result.stderr
 
 
+def test_one_cut_bag_of_several_is_enough_for_3(tmp_path):
+    for name in ("a.bag", "b.bag"):
+        bag1(tmp_path / name, 10, 1000)
+    (tmp_path / "a.bag").write_bytes((tmp_path / "a.bag").read_bytes()[:-300])
+    assert call("ingest", "b.bag", folder=tmp_path).code == 0
+    assert call("ingest", "a.bag", "b.bag", "--force", folder=tmp_path).code == 3
+
+
 def test_real_recordings_are_kept_whole(data, tmp_path):
     """Every message of every recording there is, by rosbags and by the stock reader."""
     seen = 0

@@ -516,10 +516,10 @@ def test_a_message_of_a_bag_is_not_larger_than_one_of_a_log(commands, folder):
 
 
 def endless_database(path: Path) -> None:
-    """Not quite: more than a million messages."""
+    """Not quite: more messages than are read within a second."""
     database(path, 3, [], TOPICS)
     with sqlite3.connect(path) as db:
-        counted = "WITH RECURSIVE r(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM r LIMIT 1500000)"
+        counted = "WITH RECURSIVE r(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM r LIMIT 600000)"
         db.execute(f"{counted} INSERT INTO messages(topic_id, timestamp, data) SELECT 1, n, x'00010000' FROM r")
     db.close()
 
@@ -532,7 +532,7 @@ def endless_bag(path: Path) -> None:
     connection = record(said, op=b"\7", conn=bytes(4), topic=b"/a")
     message = record(b"a", op=b"\2", conn=bytes(4), time=struct.pack("<II", 5, 5))
     with path.open("ab") as stream:
-        stream.write(connection + message * 300_000)
+        stream.write(connection + message * 200_000)
 
 
 @pytest.mark.parametrize(("make", "sent"), [(endless_database, signal.SIGINT), (endless_bag, signal.SIGTERM)])

@@ -98,6 +98,7 @@ SUMMARIES: dict[str, tuple[Summary, list[str]]] = {
         Summary(ground_plane="estimated"),
         ["estimated: the ground plane, from the boxes of people"],
     ),
+    "a camera that sways": (Summary(camera_motion="shaking"), ["camera: shaking"]),
     "a given plane": (Summary(ground_plane="given"), []),
 }
 
