@@ -59,9 +59,7 @@ class Recording:
     """
 
     def __init__(self, path: Location) -> None:
-        self._place = (
-            path if isinstance(path, Url) else path.absolute()
-        )  # where the log is, wherever the working folder moves
+        self._place = path if isinstance(path, Url) else path.absolute()  # wherever the working folder moves
         self._reading = RLock()  # tables are kept once they were made, and several threads may ask for them
         self._open(path)
 
@@ -289,9 +287,8 @@ class Recording:
         """
         there = {c.topic: SCHEMAS.get(c.schema_name) for c in self._log.channels.values()}
         boxes = {name: schema for name, schema in there.items() if schema in (DETECTIONS, TRACKS)}
-        found = [name for name in boxes if topic == name] or [
-            name for name in boxes if name.endswith("/" + topic.strip("/"))
-        ]
+        end = "/" + topic.strip("/")
+        found = [name for name in boxes if name == topic] or [name for name in boxes if name.endswith(end)]
         if len(found) != 1:
             raise McaptrackError(
                 f"{self.path} has {len(found) or 'no'} channels {topic} of boxes; it has {', '.join(sorted(boxes))}"

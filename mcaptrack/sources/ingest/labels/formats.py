@@ -77,17 +77,8 @@ _KITTI_OCCLUDED: Final = 2
 KITTI_HEIGHT_PX: Final = 25.0
 #: Class ids of the class names in formats; other names get the following ids. Person in the tracking labels of KITTI is
 #: Person_sitting in its detection labels.
-_KITTI_CLASSES: Final = {
-    "pedestrian": PERSON,
-    "cyclist": 2,
-    "car": 3,
-    "van": 4,
-    "truck": 5,
-    "tram": 6,
-    "person_sitting": 7,
-    "person": 7,
-    "misc": 8,
-}
+_KITTI_NAMES: Final = ("pedestrian", "cyclist", "car", "van", "truck", "tram", "person_sitting", "misc")
+_KITTI_CLASSES: Final = {name: number for number, name in enumerate(_KITTI_NAMES, start=PERSON)} | {"person": 7}
 _SDD_CLASSES: Final = {"pedestrian": PERSON, "biker": 2, "skater": 3, "cart": 4, "car": 5, "bus": 6}
 _KITTI_REGION: Final = "dontcare"
 #: The number of class names of a column, at most: there are data sets with 21,841 classes.
