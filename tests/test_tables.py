@@ -5,12 +5,14 @@ from __future__ import annotations
 import csv
 import datetime as dt
 import errno
+import gc
 import importlib.util
 import io
 import json
 import os
 import resource
 import signal
+import sys
 from pathlib import Path
 
 import duckdb
@@ -453,6 +455,21 @@ def test_a_file_that_reads_back_differently_is_not_published(tmp_path, monkeypat
         with pytest.raises(McaptrackError, match="does not read back the same"):
             tables.write(path, new, {})
         assert path.read_bytes() == before
+
+
+def test_a_file_that_could_not_be_written_is_not_written_to_later(tmp_path, monkeypatch):
+    """A writer of Arrow that is deleted while it is open writes the end of the file, or fails unseen."""
+    said: list[object] = []
+    monkeypatch.setattr(sys, "unraisablehook", said.append)
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(pq.ParquetWriter, "write_table", full)
+    with pytest.raises(McaptrackError, match="No space left"):
+        tables.write(tmp_path / "t.parquet", some_tracks([{1: (0.0, 0.0)}]), {})
+    gc.collect()
+    assert said == []
 
 
 @given(st.data())
