@@ -10,8 +10,6 @@ BIN := $(VENV)/bin
 # path with a blank in it for two.
 export PIP_CONSTRAINT := constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
-# Without bytecode each of the hundreds of processes that tests start would compile the package again.
-unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test mutants clean
 
