@@ -13,7 +13,7 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.schema import DETECTIONS, SIGHTINGS, Frame, Rows, Schema
 from mcaptrack.transforms.fuse.grouping import Places, group, means
 from mcaptrack.transforms.fuse.view import Views
-from mcaptrack.transforms.protocol import Suited, check_options, context, option
+from mcaptrack.transforms.protocol import check_options, context, option
 
 #: How often a box of another object, or a false one, fits a group by chance.
 _CHANCE: Final = 0.1
@@ -63,7 +63,6 @@ class FootFuser:
 
     reads: ClassVar[Schema] = SIGHTINGS
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": DETECTIONS, "sightings": SIGHTINGS})
-    suits: ClassVar[Mapping[str, Suited]] = MappingProxyType({"tracker": Suited("ground", {"birth_score": 0.5})})
 
     def __post_init__(self) -> None:
         check_options(self)
