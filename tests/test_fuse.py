@@ -261,6 +261,8 @@ class TestInput:
             ({"cameras": "north,nowhere"}, "has no camera nowhere; it has "),
             ({"to": "a/b"}, "is no name of a scene"),
             ({"to": "north"}, "/north/detections was ingested; give the scene another name"),
+            ({"clock_offset_s": {"north": 1e300}}, "has 1e\\+300 s for north; a clock is late by a day at most"),
+            ({"clock_offset_s": {"north": float("nan")}}, "has nan s for north"),
             ({"clock_offset_s": {"up": 1.0}}, "has up, which is not fused; east, north are"),
         ],
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Final
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
@@ -14,6 +15,9 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.transforms.fuse import FootFuser
 from mcaptrack.transforms.protocol import LARGEST
+
+#: The largest offset of a clock, a day: more is no offset, but another recording.
+_MOST_OFFSET_S: Final = 86_400.0
 
 
 @checked(
@@ -98,6 +102,9 @@ def fuse(
         max_sigma=max_sigma, max_distance_m=max_distance_m, min_score=min_score, noise=noise, noise_m=noise_m
     )
     offsets = {name.strip("/"): float(value) for name, value in (clock_offset_s or {}).items()}
+    for name, value in offsets.items():
+        if not abs(value) <= _MOST_OFFSET_S:
+            raise McaptrackError(f"`clock_offset_s=` has {value:g} s for {name}; a clock is late by a day at most")
     if not to.strip("/") or not to.isprintable() or "/" in to.strip("/"):
         raise McaptrackError(f"`to={to}` is no name of a scene; give one such as world")
 
