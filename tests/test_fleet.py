@@ -18,7 +18,7 @@ import mcaptrack
 from mcaptrack import environment, fleet
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import claims, digests, limits
-from mcaptrack.fleet.claims import Claims, claim_path
+from mcaptrack.fleet.claims import Claims, claim_name
 from mcaptrack.fleet.ledger import Ledger
 from mcaptrack.log import read
 from tests import fleet_tasks
@@ -289,7 +289,7 @@ class TestClaims:
         assert not other.take("x", tmp_path).is_mine
         one.release("x")
         assert other.take("x", tmp_path).is_mine
-        path = claim_path("x", tmp_path)
+        path = tmp_path / claim_name("x")
         owner = json.loads(path.read_text())
         for change in ({"pid": 2**22 - 1}, {"started": "0"}):
             path.write_text(json.dumps(owner | change))
@@ -298,7 +298,7 @@ class TestClaims:
             assert "which has ended" in taken.note
 
     def test_a_claim_of_another_machine_counts_as_long_as_it_shows_life(self, tmp_path):
-        path = claim_path("x", tmp_path)
+        path = tmp_path / claim_name("x")
         path.write_text(json.dumps({"host": "other", "pid": os.getpid(), "started": "1"}))
         assert not Claims().take("x", tmp_path).is_mine
         os.utime(path, (0, time.time() - claims.STALE_S - 1))
@@ -307,7 +307,7 @@ class TestClaims:
     def test_life_is_shown_and_only_own_claims_are_given_up(self, tmp_path, monkeypatch):
         mine = Claims()
         mine.take("x", tmp_path)
-        path = claim_path("x", tmp_path)
+        path = tmp_path / claim_name("x")
         os.utime(path, (0, 0))
         mine.beat()
         assert path.stat().st_mtime == 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import difflib
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar, Final
@@ -15,7 +15,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from mcaptrack.cli.flags import RUNNING
 from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, gather
-from mcaptrack.cli.text import refuse_usage, say
+from mcaptrack.cli.text import log_format, refuse_usage, say
 from mcaptrack.notices import warn
 
 #: The last headings of options in the help.
@@ -133,6 +133,10 @@ class Command(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the command line, and move values of old names of options to the new ones."""
+        with log_format(_said(args, "--log-format"), self.name or ""):
+            return self._parse(ctx, args)
+
+    def _parse(self, ctx: Any, args: list[str]) -> list[str]:
         with _usage_in_one_line(self.name or ""):
             left = super().parse_args(ctx, args)
         if not ctx.resilient_parsing:
@@ -164,9 +168,10 @@ class Command(TyperCommand):
     def invoke(self, ctx: Any) -> Any:
         """Run the command; with --verbose first list the options that differ from the defaults, and their sources."""
         RUNNING.set(ctx)
-        if ctx.params.get("verbose") and not ctx.params.get("quiet"):
-            say(self._options_in_use(ctx))
-        return super().invoke(ctx)
+        with log_format(ctx.params.get("log_format", "text"), self.name or ""):
+            if ctx.params.get("verbose") and not ctx.params.get("quiet"):
+                say(self._options_in_use(ctx))
+            return super().invoke(ctx)
 
     def _options_in_use(self, ctx: Any) -> str:
         found = found_of(self.name or "")
@@ -178,6 +183,16 @@ class Command(TyperCommand):
                 words = " ".join(map(str, value)) if setting.many else str(value)
                 parts.append(f"{setting.name}={words} ({where or 'command line'})")
         return f"options: {', '.join(parts)}"
+
+
+def _said(words: Sequence[str], option: str) -> str:
+    """Return the value of an option on a command line that may be wrong; "" without one."""
+    for number, word in enumerate(words):
+        if word == option:
+            return "".join(words[number + 1 : number + 2])
+        if word.startswith(f"{option}="):
+            return word.partition("=")[2]
+    return ""
 
 
 class Reading(Command):

@@ -9,6 +9,7 @@ import logging
 import math
 import re
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
@@ -25,7 +26,7 @@ from mcaptrack.cli.command import LAST_PANELS, Command, Reading, check_ranges, i
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.inputs import check_paths
 from mcaptrack.cli.settings import Declared
-from mcaptrack.cli.text import say
+from mcaptrack.cli.text import Level, is_json, say
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish_bytes, refuse_overwrite
 from mcaptrack.location import Location
@@ -62,6 +63,9 @@ _BATCH: Final[ContextVar[_Batch]] = ContextVar("batch")
 FILES, COMMON = LAST_PANELS
 LABELS: Final = "Label files"
 SCORES: Final = "Scores"
+
+#: Seconds between two lines about progress, with ``--log-format json``.
+PROGRESS_S: Final = 5.0
 
 DONE, REFUSED, LOST, GATE_MISSED = 0, 1, 3, 4
 
@@ -125,6 +129,14 @@ Config = Annotated[
         "config folder.",
         is_eager=True,
         callback=read_config,
+    ),
+]
+LogFormat = Annotated[
+    Literal["text", "json"],
+    option(
+        "--log-format",
+        panel=COMMON,
+        help="Print notes, progress and errors as lines of text, or as objects of JSON with their times.",
     ),
 ]
 Camera = Annotated[str | None, option("--camera", panel=FILES, help="Which camera, if the log has several.")]
@@ -207,16 +219,21 @@ class Talk:
         self._tasks: dict[str, Any] = {}
         self._shown = 0.0
 
-    def say(self, words: str) -> None:
-        """Print a line to stderr."""
+    def say(self, words: str, level: Level = "info", event: str = "", **about: Any) -> None:
+        """Print a line to stderr; see ``text.say``."""
         if not self.quiet:
             self._stop()
-            say(words)
+            say(words, level, event, **about)
 
     def detail(self, words: str) -> None:
         """Print a line to stderr with --verbose."""
         if self.verbose:
-            self.say(words)
+            self.say(words, "debug")
+
+    def event(self, words: str, event: str, **about: Any) -> None:
+        """Print a line that is for programs: with ``--log-format json`` only."""
+        if is_json():
+            self.say(words, "info", event, **about)
 
     def warn(self, words: str, code: Code = "other") -> None:
         """Print a warning, also with ``quiet``, and add it to the JSON; see ``mcaptrack.notices``."""
@@ -243,9 +260,15 @@ class Talk:
 
     def progress(self, stage: str, done: float, total: float | None) -> None:
         """Show the progress of a stage."""
+        now = monotonic()
+        if is_json():
+            if now - self._shown >= PROGRESS_S:
+                self._shown = now
+                words = f"{stage}: {done:g}" + (f" of {total:g}" if total is not None else "")
+                self.event(words, "progress", stage=stage, done=done, total=total)
+            return
         if total is None or self.quiet or not sys.stderr.isatty():
             return
-        now = monotonic()
         if now - self._shown < 0.1 and done < total:
             return
         self._shown = now
@@ -304,10 +327,14 @@ def _printing_notes(talk: Talk) -> Iterator[None]:
 
 
 def one_line(command: Callable[P, None]) -> Callable[P, None]:
-    """Wrap a command: print a McaptrackError as one line, exit with 1; print warnings, and keep them for the JSON."""
+    """Wrap a command: print a McaptrackError as one line, exit with 1; print warnings, and keep them for the JSON.
+
+    Adds the option ``--log-format``, which ``Command`` puts into effect.
+    """
 
     @wraps(command)
     def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
+        kwargs.pop("log_format", None)  # the command line has set it
         _WARNED.set([])
         batch = _Batch()
         _BATCH.set(batch)
@@ -317,17 +344,27 @@ def one_line(command: Callable[P, None]) -> Callable[P, None]:
             with notices.listening(_show_warning):
                 command(*args, **kwargs)
         except McaptrackError as error:
-            say(f"mcaptrack: {str(error).strip()}")
+            say(str(error).strip(), "error")
             raise typer.Exit(REFUSED) from None
         except typer.Exit:
             if not batch.failed and not batch.is_early:
                 raise
+        except Exception as error:
+            if not is_json() or isinstance(error, BrokenPipeError):
+                raise
+            last = traceback.format_exception_only(error)[-1].strip()
+            say(f"a fault of the program: {last}", "error", traceback=traceback.format_exc())
+            raise typer.Exit(REFUSED) from None
         if batch.failed:
             names = ", ".join(one.input for one in batch.failed)
-            say(f"mcaptrack: {len(batch.failed)} of {batch.tried} failed: {names}")
+            say(f"{len(batch.failed)} of {batch.tried} failed: {names}", "error", failed=len(batch.failed))
         if batch.failed or batch.is_early:
             raise typer.Exit(LOST)
 
+    own = inspect.signature(command)
+    added = inspect.Parameter("log_format", inspect.Parameter.KEYWORD_ONLY, default="text", annotation=LogFormat)
+    guarded.__signature__ = own.replace(parameters=[*own.parameters.values(), added])  # type: ignore[attr-defined]
+    guarded.__annotations__ = {**command.__annotations__, added.name: LogFormat}
     return guarded
 
 
@@ -338,15 +375,18 @@ def tried(inputs: int) -> None:
 
 def end_early(reason: str) -> None:
     """Say why some inputs were not tried; the command ends with exit code 3."""
-    say(f"mcaptrack: {reason}")
+    say(reason, "error")
     _BATCH.get().is_early = True
 
 
-def record_failure(path: Location, error: str, state: str = "failed") -> None:
-    """Print why one of several inputs failed, and keep it for the JSON and the end of the command."""
+def record_failure(path: Location, error: str, state: str = "failed", **about: Any) -> None:
+    """Print why one of several inputs failed, and keep it for the JSON and the end of the command.
+
+    ``about`` is what else ``--log-format json`` prints.
+    """
     words = error.strip()
     words = words if str(path) in words else f"{path}: {words}"
-    say(f"mcaptrack: {words}")
+    say(words, "error", "log", **({"log": str(path), "state": state} | about))
     _BATCH.get().failed.append(Failed(str(path), with_flags(words), state))
 
 
@@ -366,7 +406,7 @@ def _show_warning(notice: Notice) -> None:
     notice = notice._replace(message=with_flags(notice.message))
     if notice not in warned:
         warned.append(notice)
-        say(f"warning: {notice}")
+        say(str(notice), "warning", code=notice.code, log=notice.log)
 
 
 @contextmanager

@@ -33,7 +33,7 @@ def doctor(
         width = max(len(name) for name, _ in lines)
         show(*(f"{name:<{width}}  {words}" for name, words in lines))
     for fault in found.faults:
-        say(f"mcaptrack: {fault}")
+        say(fault, "error")
     if found.faults:
         raise typer.Exit(common.REFUSED)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mcaptrack.cli import common
-from mcaptrack.cli.many import LogWork, process, takes_many
+from mcaptrack.cli.many import LogWork, many_options, process, takes_many
 from mcaptrack.cli.text import console, show
 from mcaptrack.location import Location
 
@@ -42,14 +42,22 @@ def check(
     import mcaptrack
     from mcaptrack.fleet import find_logs
 
-    work: LogWork[LogCheck] = LogWork("check", mcaptrack.check, {}, show=lambda *_: None, line=_verdict, writes=False)
+    work: LogWork[LogCheck] = LogWork(
+        "check",
+        mcaptrack.check,
+        {},
+        show=lambda *_: None,
+        data=lambda one: {"files": [_as_json(file) for file in one.files]},
+        line=_verdict,
+        writes=False,
+    )
     with common.Talk(quiet, verbose).open() as talk:
         found, totals = process(find_logs(logs), work, talk)
     checked = [file for one in found for file in one.files]
     with common.printed_to(output, force):
         if json:
             common.print_json({"results": [_as_json(one) for one in checked], **totals})
-        else:
+        elif not many_options().json_lines:
             for one in checked:
                 _print_check(one, quiet)
     if not all(one.is_sound for one in checked):
@@ -129,22 +137,18 @@ def recover(
         saved = f"{report.messages} messages in {report.chunks} chunks are saved in {report.output}"
         return f"{saved}; {f'{len(report.lost)} losses' if report.lost else 'nothing was lost'}"
 
+    def data(report: LogRecovery) -> dict[str, object]:
+        saved = {"log": str(report.log), "output": str(report.output), "messages": report.messages}
+        return saved | {"chunks": report.chunks, "lost": list(report.lost)}
+
     found = find_logs(logs, each=True, leave_out=_RECOVERED)
     with common.Talk(quiet, verbose).open() as talk:
-        work = LogWork("recover", mcaptrack.recover, {"force": force}, show, line, _RECOVERED)
+        work = LogWork(
+            "recover", mcaptrack.recover, {"force": force}, show, data, line, _RECOVERED, writes_objects=False
+        )
         reports, totals = process(found, work, talk, output)
     if json:
-        results = [
-            {
-                "log": str(r.log),
-                "output": str(r.output),
-                "messages": r.messages,
-                "chunks": r.chunks,
-                "lost": list(r.lost),
-            }
-            for r in reports
-        ]
-        common.print_json({"results": results, **totals})
+        common.print_json({"results": [data(report) for report in reports], **totals})
     if any(report.lost for report in reports):
         raise typer.Exit(common.LOST)
 
@@ -189,13 +193,12 @@ def drop(
         dropped = f"{', '.join(done.dropped)} with {done.messages} messages left out"
         return f"{dropped}; {done.bytes_before} bytes became {done.bytes}"
 
+    def data(done: DropResult) -> dict[str, object]:
+        return {"log": str(done.log), "dropped": list(done.dropped), "messages": done.messages, "bytes": done.bytes}
+
     options = {"topics": topics, "in_place": in_place, "force": force}
     with common.Talk(quiet, verbose).open() as talk:
-        work = LogWork("drop", mcaptrack.drop, options, lambda _, one: talk.say(f"{one.log}: {line(one)}"), line)
+        work = LogWork("drop", mcaptrack.drop, options, lambda _, one: talk.say(f"{one.log}: {line(one)}"), data, line)
         results, totals = process(find_logs([path]), work, talk, output)
     if json:
-        listed = [
-            {"log": str(one.log), "dropped": list(one.dropped), "messages": one.messages, "bytes": one.bytes}
-            for one in results
-        ]
-        common.print_json({"results": listed, **totals})
+        common.print_json({"results": [data(one) for one in results], **totals})

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import inspect
+import json
 import re
 import signal
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextvars import ContextVar
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, TypeVar, get_type_hints
 
-from mcaptrack import notices
+from mcaptrack import SCHEMA_VERSION, notices
 from mcaptrack.cli import common
+from mcaptrack.cli.flags import RUNNING, with_flags
 from mcaptrack.cli.inputs import only_one_output
 from mcaptrack.cli.live import LiveTable
-from mcaptrack.cli.text import say, stdout_to_stderr
+from mcaptrack.cli.text import is_json, say, stdout_to_stderr
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:
-    from mcaptrack.fleet import FleetResult, LogOutcome, NamedLog
+    from mcaptrack.fleet import FleetResult, FleetStatus, LogOutcome, NamedLog
 
 T = TypeVar("T")
 #: Heading of the options in the help.
@@ -110,11 +113,17 @@ class ManyOptions:
             help="How often a log is tried that kills its worker or exceeds a limit.",
         ),
     ] = 2
+    json_lines: Annotated[
+        bool,
+        common.option(
+            "--json-lines", panel=PANEL, help="Print an object of JSON on one line for each log as soon as it has ended."
+        ),
+    ] = False
 
     @property
     def concern_one(self) -> bool:
         """Whether any of them matters for a single log, so that it is processed as many are."""
-        return any((self.scheduler, self.output_dir, self.ledger, self.timeout, self.memory_limit))
+        return any((self.scheduler, self.output_dir, self.ledger, self.timeout, self.memory_limit, self.json_lines))
 
     def for_fleet(self) -> dict[str, Any]:
         """Return the arguments of ``mcaptrack.fleet.run``. Raises McaptrackError for a time that is none."""
@@ -191,8 +200,12 @@ class LogWork(Generic[T]):
         in the order of the logs then.
     suffix : str
         Ending of the names of outputs in ``--output-dir``.
+    data : callable
+        Returns a result as values of JSON.
     writes : bool
         Whether logs, or files beside them, are changed.
+    writes_objects : bool
+        Whether what is made of a log in a store goes beside it, and not into the working folder.
     shares_output : bool
         Whether all logs have one output, a folder.
     """
@@ -201,9 +214,11 @@ class LogWork(Generic[T]):
     function: Callable[..., T]
     options: Mapping[str, Any]
     show: Callable[[Location, T], None]
+    data: Callable[[T], Mapping[str, Any]]
     line: Callable[[T], str] | None = None
     suffix: str = ".mcap"
     writes: bool = True
+    writes_objects: bool = True
     shares_output: bool = False
 
 
@@ -221,6 +236,8 @@ def process(
         return [], {}
     if many.output_dir is not None and output is not None:
         raise McaptrackError("--output and --output-dir are two places for the same results; give one")
+    if many.json_lines and RUNNING.get().params.get("json"):
+        raise McaptrackError("--json prints one object, and --json-lines one for each log; give one")
     options = {**work.options} if output is None else {**work.options, "output": output}
     folder = many.output_dir
     if work.shares_output and folder is not None:
@@ -233,12 +250,15 @@ def process(
             with stdout_to_stderr():
                 result = common.with_progress(work.function, talk.progress)(path, **options)
             work.show(path, result)
+        state = "up-to-date" if getattr(result, "is_up_to_date", False) else "done"
+        talk.event(f"{path}: {state}", "log", log=str(path), state=state)
         return [result], {}
     from mcaptrack.fleet import run as run_fleet
 
     listener: _Printer[T] = _Printer(work, talk, [one.path for one in logs])
     try:
-        with LiveTable.on_terminal(talk.quiet or work.line is None) as table:
+        is_hidden = talk.quiet or work.line is None or many.json_lines or is_json()
+        with LiveTable.on_terminal(is_hidden) as table:
             done = run_fleet(
                 work.function,
                 logs,
@@ -247,8 +267,9 @@ def process(
                 output_dir=folder,
                 suffix=work.suffix,
                 writes=work.writes,
+                writes_objects=work.writes_objects,
                 on_outcome=listener.hear,
-                on_status=table.show,
+                on_status=lambda status: listener.watch(status, table),
                 on_note=talk.say,
                 **many.for_fleet(),
             )
@@ -267,6 +288,8 @@ class _Printer(Generic[T]):
 
     def __init__(self, work: LogWork[T], talk: common.Talk, logs: Sequence[Location]) -> None:
         self._work, self._talk = work, talk
+        self._has_lines = many_options().json_lines
+        self._shown = monotonic()
         self.ended = 0
         self._next = deque(logs)
         self._waiting: dict[Location, T | None] = {}
@@ -284,13 +307,40 @@ class _Printer(Generic[T]):
         elif outcome.result is None:
             for line in outcome.detail.splitlines():
                 self._talk.detail(line)
-            common.record_failure(outcome.log, outcome.error, outcome.state)
+            common.record_failure(outcome.log, outcome.error, **_about(outcome))
+        if self._has_lines:
+            self._print_line(outcome)
         if self._work.line is None:
-            self._show_in_order(outcome)
+            if not self._has_lines:
+                self._show_in_order(outcome)
         elif outcome.result is not None and self._talk.verbose:
             self._work.show(outcome.log, outcome.result)
         elif outcome.result is not None:
-            self._talk.say(f"{outcome.log}: {self._work.line(outcome.result)}")
+            words = self._work.line(outcome.result)
+            self._talk.say(f"{outcome.log}: {words}", "info", "log", **_about(outcome))
+
+    def watch(self, status: FleetStatus, table: LiveTable) -> None:
+        """Show how far the logs are: in a table, or now and then in a line for programs."""
+        table.show(status)
+        if monotonic() - self._shown < common.PROGRESS_S:
+            return
+        self._shown = monotonic()
+        ended = status.logs - status.left
+        running = [{**asdict(one), "log": str(one.log), "seconds": round(one.seconds, 1)} for one in status.running]
+        words = f"{ended} of {status.logs} logs"
+        self._talk.event(words, "progress", done=ended, total=status.logs, states=dict(status.ended), running=running)
+
+    def _print_line(self, outcome: LogOutcome[T]) -> None:
+        """Print the outcome as a line of JSON to stdout."""
+        result = None if outcome.result is None else self._work.data(outcome.result)
+        line = {
+            "schema_version": SCHEMA_VERSION,
+            **_about(outcome),
+            "error": with_flags(outcome.error) or None,
+            "warnings": [{"code": one.code, "message": with_flags(one.message)} for one in outcome.warnings],
+            "result": result,
+        }
+        print(json.dumps(line, allow_nan=False), flush=True)
 
     def _show_in_order(self, outcome: LogOutcome[T]) -> None:
         self._waiting[outcome.log] = outcome.result
@@ -299,6 +349,18 @@ class _Printer(Generic[T]):
             result = self._waiting.pop(log)
             if result is not None:
                 self._work.show(log, result)
+
+
+def _about(outcome: LogOutcome[Any]) -> dict[str, Any]:
+    """Return the outcome of a log as values of JSON, without what it made."""
+    return {
+        "log": str(outcome.log),
+        "state": outcome.state,
+        "tries": outcome.tries,
+        "seconds": outcome.seconds,
+        "cpu_seconds": outcome.cpu_seconds,
+        "peak_bytes": outcome.peak_bytes,
+    }
 
 
 def _summarise(done: FleetResult[Any], talk: common.Talk) -> None:
@@ -311,10 +373,10 @@ def _summarise(done: FleetResult[Any], talk: common.Talk) -> None:
         ran = [one for one in done.outcomes if one.tries]
         used = done.cpu_seconds / max(1, len(ran))
         line += f"; at most {done.peak_bytes / 1e6:,.0f} MB of memory, {used:.2f} s of processor time a log"
-    talk.say(line)
+    talk.say(line, "info", "summary", **done.to_json())
     if len(done.outcomes) >= _REPEATED:
         for one in done.failed:
-            say(f"  {one.state}: {one.error}")
+            say(f"  {one.state}: {one.error}", "info", "log", **_about(one))
     if done.stopped:
         left = done.counts.get("not-tried", 0)
         common.end_early(f"{done.stopped}; {left} of {len(done.outcomes)} logs are left, and the same command goes on")

@@ -44,14 +44,14 @@ def with_plugins(commands: Mapping[str, Any], words: Sequence[str]) -> dict[str,
         if not stage.option:
             continue
         try:
-            with stdout_to_stderr(), listening(lambda notice: say(f"warning: {notice.message}")):
+            with stdout_to_stderr(), listening(lambda notice: say(notice.message, "warning")):
                 plugins = dict(_of_words(stage, words)) if called in (stage.name, "run") else {}
                 plugins |= _of_settings(stage, files, commands[stage.name].settings)
             plugins = {name: cls for name, cls in plugins.items() if cls is not stage.default}
             if plugins:
                 found[stage.name] = _command(stage, plugins, commands[stage.name].rich_help_panel)
         except McaptrackError as error:
-            say(f"mcaptrack: {error}")
+            say(str(error), "error")
             raise typer.Exit(common.REFUSED) from None
     return found
 

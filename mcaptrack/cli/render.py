@@ -98,18 +98,24 @@ def render(
     def line(done: RenderResult) -> str:
         return f"{done.pictures} pictures with {', '.join(done.views) or 'nothing drawn'}"
 
+    def data(done: RenderResult) -> dict[str, object]:
+        return {"log": str(done.log), "output": str(done.video), "pictures": done.pictures, "views": list(done.views)}
+
     given: dict[str, Any] = {"topic": topic, "width": width, "max_fps": max_fps, "start_s": start_s, "end_s": end_s}
     is_named = many_options().output_dir is not None  # by a name that says what is written
     given |= {"gif": gif and not is_named, "camera": camera, "force": force}
     with common.Talk(quiet, verbose).open() as talk:
         suffix = ".gif" if gif else ".mp4"
         work = LogWork(
-            "render", mcaptrack.render, given, lambda _, one: talk.say(f"{one.video}: {line(one)}"), line, suffix
+            "render",
+            mcaptrack.render,
+            given,
+            show=lambda _, one: talk.say(f"{one.video}: {line(one)}"),
+            data=data,
+            line=line,
+            suffix=suffix,
+            writes_objects=False,
         )
         results, totals = process(find_logs(logs), work, talk, output)
     if json:
-        listed = [
-            {"log": str(one.log), "output": str(one.video), "pictures": one.pictures, "views": list(one.views)}
-            for one in results
-        ]
-        common.print_json({"results": listed, **totals})
+        common.print_json({"results": [data(one) for one in results], **totals})

@@ -34,6 +34,7 @@ def run_on_logs(given: Mapping[str, Any], name: str, function: Run, options: Map
             function,
             {**options, **where},
             show=lambda _, result: _print(result, shows_events, talk),
+            data=_as_json,
             line=lambda result: _line_of(result, shows_events),
         )
         results, totals = process(find_logs(given["logs"]), work, talk, given["output"])

@@ -140,6 +140,7 @@ _KNOWN: Final[ContextVar[tuple[Settings, dict[str, dict[str, Given]]]]] = Contex
 def declared_settings(command: str, function: Any, parameters: Iterable[Any]) -> dict[str, Setting]:
     """Return the options of a command by name. ``parameters`` are Typer's; ``function`` has their annotations."""
     hints = get_type_hints(inspect.unwrap(function), include_extras=True)
+    hints |= {name: hint for name, hint in function.__annotations__.items() if not isinstance(hint, str)}
     out = {}
     for parameter in parameters:
         if parameter.param_type_name != "option":

@@ -48,7 +48,9 @@ def info(
         if not json:
             _print(found.to_json(), verbose)
 
-    work: LogWork[LogInfo] = LogWork("info", mcaptrack.info, {"frames": frames}, show, writes=False)
+    work: LogWork[LogInfo] = LogWork(
+        "info", mcaptrack.info, {"frames": frames}, show, lambda one: one.to_json(), writes=False
+    )
     with common.Talk(quiet, verbose).open() as talk, common.printed_to(output, force):
         found, totals = process(find_logs(logs), work, talk)
         if json:
@@ -220,13 +222,22 @@ def export(
         talk.say(f"{done.folder}: {rows(done)}")
         talk.detail(f"{done.folder}: written {', '.join(done.written) or 'nothing, all tables are up to date'}")
 
+    def data(done: ExportResult) -> dict[str, object]:
+        return {"log": str(done.log), "folder": str(done.folder), "rows": done.rows, "written": list(done.written)}
+
     options: dict[str, Any] = {"form": form, "topic": topic, "blobs": blobs, "force": force}
     with common.Talk(quiet, verbose).open() as talk:
-        work = LogWork("export", mcaptrack.export, options, show, rows, ".rosbag2", shares_output=not is_bag)
+        work = LogWork(
+            "export",
+            mcaptrack.export,
+            options,
+            show,
+            data,
+            rows,
+            ".rosbag2",
+            writes_objects=False,
+            shares_output=not is_bag,
+        )
         results, totals = process(found, work, talk, output)
     if json:
-        listed = [
-            {"log": str(one.log), "folder": str(one.folder), "rows": one.rows, "written": list(one.written)}
-            for one in results
-        ]
-        common.print_json({"results": listed, **totals})
+        common.print_json({"results": [data(one) for one in results], **totals})

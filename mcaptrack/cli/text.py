@@ -1,16 +1,20 @@
 """Print text safely: names from files may contain control characters.
 
 All text that commands print for people goes through this module; only data for programs (JSON, CSV) and Typer's help
-don't.
+don't. With ``--log-format json`` each line on stderr is an object of JSON instead, with its time, its level and what it
+is about.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
-from typing import TYPE_CHECKING, Any, Final, NoReturn
+from contextvars import ContextVar
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn
 
 import typer
 
@@ -21,6 +25,11 @@ if TYPE_CHECKING:
 
 WRONG_USAGE: Final = 2
 _STDOUT, _STDERR = 1, 2
+Level = Literal["debug", "info", "warning", "error"]
+#: What precedes the text of a line.
+_BEGINNINGS: Final = {"warning": "warning: ", "error": "mcaptrack: "}
+#: Whether lines on stderr are JSON, and the name of the command then.
+_JSON: Final[ContextVar[str | None]] = ContextVar("json", default=None)
 #: Width of output that is not a terminal: lines are not broken, so that they can be searched.
 _UNBROKEN: Final = 100_000
 
@@ -41,9 +50,35 @@ def show(*lines: str) -> None:
     print("\n".join(map(printable, lines)), flush=True)
 
 
-def say(line: str) -> None:
-    """Print a line to stderr: a note, a warning or an error."""
-    print(printable(with_flags(line)), file=sys.stderr)
+def say(line: str, level: Level = "info", event: str = "", **about: Any) -> None:
+    """Print a line to stderr: a note, a warning or an error; with ``--log-format json`` as an object.
+
+    ``event`` says what kind of line it is (by default "note", or the level), and ``about`` what it is about: values of
+    JSON, which are not printed as text.
+    """
+    words = with_flags(line)
+    if _JSON.get() is None:
+        print(printable(_BEGINNINGS.get(level, "") + words), file=sys.stderr)
+        return
+    time = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    kind = event or (level if level in _BEGINNINGS else "note")
+    whole = {"time": time, "level": level, "event": kind, "command": _JSON.get(), "message": words.strip(), **about}
+    print(json.dumps(whole, allow_nan=False), file=sys.stderr, flush=True)
+
+
+def is_json() -> bool:
+    """Whether lines on stderr are objects of JSON."""
+    return _JSON.get() is not None
+
+
+@contextmanager
+def log_format(name: str, command: str) -> Iterator[None]:
+    """Print lines of this block on stderr as "text" or as "json"."""
+    token = _JSON.set(command if name == "json" else None)
+    try:
+        yield
+    finally:
+        _JSON.reset(token)
 
 
 @contextmanager
@@ -65,7 +100,7 @@ def stdout_to_stderr() -> Iterator[None]:
 
 def refuse_usage(line: str) -> NoReturn:
     """End the command with one line on stderr and exit code 2: it was called or configured wrongly."""
-    say(f"mcaptrack: {line}")
+    say(line, "error")
     raise typer.Exit(WRONG_USAGE)
 
 

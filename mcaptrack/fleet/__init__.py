@@ -20,6 +20,7 @@ from mcaptrack.fleet.limits import size_in_bytes
 from mcaptrack.fleet.processes import Processes
 from mcaptrack.fleet.results import FleetResult, FleetStatus, LogOutcome, Running, Watch
 from mcaptrack.fleet.running import Crew, Fleet, QueuedLog, location_of
+from mcaptrack.location import Location, Url
 
 T = TypeVar("T")
 
@@ -42,6 +43,7 @@ def run(
     memory_limit: str | float | None = None,
     tries: int = 2,
     writes: bool = True,
+    writes_objects: bool = True,
     on_outcome: Callable[[LogOutcome[T]], None] | None = None,
     on_status: Watch | None = None,
     on_note: Callable[[str], None] | None = None,
@@ -86,7 +88,10 @@ def run(
         How often a log is tried that kills its worker, or exceeds a limit. Other failures are not tried again.
     writes : bool, default True
         Whether the function changes logs or writes beside them; then each log is claimed by a small file there while it
-        is processed, so that another fleet leaves it alone.
+        is processed, so that another fleet leaves it alone. A log in a store is claimed by a small object beside it.
+    writes_objects : bool, default True
+        Whether what the function makes of a log in a store goes beside it. If not (as tables and videos, which go to the
+        working folder), claims on such logs are files, too.
     on_outcome, on_status, on_note : callable, optional
         Called with a ``LogOutcome`` when a log has ended, with a ``FleetStatus`` several times a second, and with a
         line of text when something is tried again or taken over.
@@ -127,9 +132,8 @@ def run(
     outputs = outputs_in(folder, found, suffix) if folder is not None else []
     for number, one in enumerate(found):
         own = {"output": outputs[number]} if outputs else {}
-        beside = one.path.parent if writes and folder is None else None
-        beside = beside if isinstance(beside, Path) and os.access(beside, os.W_OK) else claims_in
-        work.append(QueuedLog(number, one.path, location_of(one.path), own, beside))
+        place = _claimed_in(one.path, writes, writes_objects) if folder is None else None
+        work.append(QueuedLog(number, one.path, location_of(one.path), own, place or claims_in))
     for output in outputs:
         _make_folder(output.parent)
     limits = WorkerLimits(
@@ -149,6 +153,15 @@ def run(
     crew = _crew(scheduler, limits, jobs)
     fleet = Fleet(function, given, work, crew, entries, tries, keep_going, hear, watch, on_note or _ignore)
     return fleet.run()
+
+
+def _claimed_in(log: Location, writes: bool, writes_objects: bool) -> Location | None:
+    """Return where a log is claimed: beside what the function writes; None where that can't be written."""
+    if not writes:
+        return None
+    if isinstance(log, Url):
+        return log.parent if writes_objects else Path.cwd()
+    return log.parent if os.access(log.parent, os.W_OK) else None
 
 
 def _crew(scheduler: str | None, limits: WorkerLimits, jobs: int | None) -> Crew:

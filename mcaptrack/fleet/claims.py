@@ -1,4 +1,4 @@
-"""Claims: small files that keep several fleets from working on the same log."""
+"""Claims: small files, or objects in a store, that keep several fleets from working on the same log."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import monotonic, time
 from typing import Any, Final, NamedTuple
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.fleet.object_claims import ObjectClaims
+from mcaptrack.location import Location, Url
 
 #: Seconds between signs of life of a fleet, and without one after which its claims count as left behind.
 BEAT_S: Final = 10.0
@@ -34,12 +38,18 @@ class Claims:
         self._mine: dict[str, Path] = {}
         self._beaten = monotonic()
         self._me = {"host": _host(), "pid": os.getpid(), "started": _started(os.getpid())}
+        self._in_stores = ObjectClaims(self._me, _has_ended, STALE_S)
 
-    def take(self, location: str, folder: Path | None) -> Taken:
-        """Claim a log, by a file in ``folder``; without a folder, or where none can be written, there is no claim."""
+    def take(self, location: str, folder: Location | None) -> Taken:
+        """Claim a log, by a file in ``folder`` or an object below it.
+
+        Without a folder, or where nothing can be written, there is no claim.
+        """
         if folder is None:
             return Taken(is_mine=True)
-        path = claim_path(location, folder)
+        if isinstance(folder, Url):
+            return self._take_in_store(location, folder)
+        path = folder / claim_name(location)
         content = json.dumps({"location": location, **self._me, "since": round(time(), 3)}).encode()
         try:
             handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o644)
@@ -66,11 +76,18 @@ class Claims:
         except OSError:  # it was given up at this moment, or is taken over by another fleet
             return Taken(is_mine=False)
         self._mine[location] = path
-        host, pid = str(owner.get("host", "?")).partition("/")[0], owner.get("pid", "?")
-        return Taken(is_mine=True, note=f"{location}: taken over from process {pid} on {host}, which has ended")
+        return Taken(is_mine=True, note=_taken_over(location, owner))
+
+    def _take_in_store(self, location: str, prefix: Url) -> Taken:
+        try:
+            is_mine, owner = self._in_stores.take(location, prefix / claim_name(location))
+        except McaptrackError:  # a store that can't be written or reached: the command says so, if it matters
+            return Taken(is_mine=True)
+        return Taken(is_mine, "" if owner is None else _taken_over(location, owner))
 
     def beat(self) -> None:
         """Give a sign of life, if it is time."""
+        self._in_stores.beat()
         if monotonic() - self._beaten >= BEAT_S:
             self._beaten = monotonic()
             for path in self._mine.values():
@@ -79,6 +96,7 @@ class Claims:
 
     def release(self, location: str) -> None:
         """Give a claim up."""
+        self._in_stores.release(location)
         path = self._mine.pop(location, None)
         if path is None:
             return
@@ -89,18 +107,24 @@ class Claims:
 
     def release_all(self) -> None:
         """Give all claims up."""
+        self._in_stores.release_all()
         for location in list(self._mine):
             self.release(location)
 
 
-def claim_path(location: str, folder: Path) -> Path:
-    """Return the file that claims a log."""
-    return folder / f".mcaptrack-{hashlib.sha256(os.fsencode(location)).hexdigest()[:24]}.claim"
+def claim_name(location: str) -> str:
+    """Return the name of the file or object that claims a log."""
+    return f".mcaptrack-{hashlib.sha256(os.fsencode(location)).hexdigest()[:24]}.claim"
+
+
+def _taken_over(location: str, owner: Mapping[str, Any]) -> str:
+    host, pid = str(owner.get("host", "?")).partition("/")[0], owner.get("pid", "?")
+    return f"{location}: taken over from process {pid} on {host}, which has ended"
 
 
 def sweep(folder: Path, locations: set[str]) -> None:
     """Remove claims on these logs that fleets which ended have left."""
-    wanted = {claim_path(location, folder).name for location in locations}
+    wanted = {claim_name(location) for location in locations}
     try:
         left = [entry.name for entry in os.scandir(folder) if entry.name in wanted]
     except OSError:
@@ -130,9 +154,16 @@ def _owner(handle: int) -> tuple[dict[str, Any], bool]:
         host, pid, started = owner["host"], owner["pid"], owner["started"]
     except (ValueError, TypeError, KeyError):
         return {}, age > _EMPTY_S
-    if host == _host() and isinstance(pid, int):
-        return owner, _started(pid) != started if started is not None else not _is_running(pid)
-    return owner, age > STALE_S
+    ended = _has_ended({"host": host, "pid": pid, "started": started})
+    return owner, age > STALE_S if ended is None else ended
+
+
+def _has_ended(owner: Mapping[str, Any]) -> bool | None:
+    """Whether the process of a claim has ended; None if it is on another machine, or unknown."""
+    pid, started = owner.get("pid"), owner.get("started")
+    if owner.get("host") != _host() or not isinstance(pid, int):
+        return None
+    return _started(pid) != started if started is not None else not _is_running(pid)
 
 
 def _is_running(pid: int) -> bool:

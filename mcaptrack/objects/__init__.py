@@ -28,7 +28,7 @@ __all__ = [
     "find",
     "library",
     "list_objects",
-    "put_if_absent",
+    "put_if_unchanged",
     "read",
     "read_end",
     "read_ranges",
@@ -170,15 +170,27 @@ def _holds(url: Url, version: Version, file: Path) -> bool:
         return theirs == ours and not stream.read(1)
 
 
-def put_if_absent(url: Url, data: bytes) -> bool:
-    """Write a small object unless it exists; returns whether it was written. Of two processes, one succeeds."""
+def put_if_unchanged(url: Url, data: bytes, before: Version | None) -> Version | None:
+    """Write a small object if the store still has the version ``before``; None stands for no object.
+
+    Returns the version that was written; None if there is another one. Of two processes, one succeeds. ``data`` has to
+    differ between processes: if the store has it, it is taken for what was written here, because the answer to a request
+    may be lost.
+    """
     obstore = library(url)
+    mode: Any = {"e_tag": before.etag} if before else "create"
     with reporting_faults(url, "written"):
         try:
-            obstore.put(store_of(url), url.key, data, mode="create", use_multipart=False)
-        except (obstore.exceptions.AlreadyExistsError, obstore.exceptions.PreconditionError):
-            return False
-    return True
+            made = obstore.put(store_of(url), url.key, data, mode=mode, use_multipart=False)
+            return Version(len(data), made["e_tag"])
+        except (obstore.exceptions.AlreadyExistsError, obstore.exceptions.PreconditionError, FileNotFoundError) as error:
+            if isinstance(error, FileNotFoundError) and meaning_of(url, error):
+                raise
+    try:
+        there, found = read_end(url, max(len(data), 1) + 1)
+    except AbsentError:
+        return None
+    return there if found == data else None
 
 
 def delete(url: Url) -> None:
