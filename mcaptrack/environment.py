@@ -1,10 +1,12 @@
-"""The list of environment variables that are not options of a command; other names are reported as mistakes."""
+"""What the environment says: variables that are not options of a command (others are mistakes), cores and threads."""
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
@@ -12,6 +14,15 @@ from typing import Final
 from mcaptrack.errors import McaptrackError
 
 PREFIX: Final = "MCAPTRACK_"
+CONTROL_GROUPS: Final = Path("/sys/fs/cgroup")
+#: Variables that say how many threads a library uses: OpenMP (also Arrow and torch), OpenBLAS, MKL, Accelerate, OpenCV.
+THREADS: Final = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+)
 #: Names and descriptions.
 VARIABLES: Final[Mapping[str, str]] = MappingProxyType(
     {
@@ -50,8 +61,41 @@ def cache_folder() -> Path:
 
 
 def cores() -> int:
-    """The number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """The number of cores that this process may use; a part of one counts as one."""
+    return math.ceil(share_of_cores())
+
+
+def share_of_cores() -> float:
+    """How many cores this process may use: those that it may run on, or the quota of its control group."""
+    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min([float(allowed), *cpu_quotas()])
+
+
+def cpu_quotas(root: Path = CONTROL_GROUPS, own: str | None = None) -> list[float]:
+    """The limits of processor time of this process's control group and those above it, in cores."""
+    found = []
+    for folder in control_groups(root, own):
+        with suppress(OSError, ValueError):
+            quota, period = (folder / "cpu.max").read_text().split()
+            if quota != "max":
+                found.append(int(quota) / int(period))
+    with suppress(OSError, ValueError):
+        old = int((root / "cpu/cpu.cfs_quota_us").read_text()), int((root / "cpu/cpu.cfs_period_us").read_text())
+        if old[0] > 0:
+            found.append(old[0] / old[1])
+    return [quota for quota in found if quota > 0]
+
+
+def control_groups(root: Path = CONTROL_GROUPS, own: str | None = None) -> list[Path]:
+    """The folders of this process's control group and those above it. ``own`` is /proc/self/cgroup."""
+    text = own
+    if text is None:
+        text = ""
+        with suppress(OSError):
+            text = Path("/proc/self/cgroup").read_text()
+    name = next((line.removeprefix("0::/") for line in text.splitlines() if line.startswith("0::/")), "")
+    inside = root / name
+    return [inside, *(folder for folder in inside.parents if folder.is_relative_to(root))]
 
 
 def threads() -> int:

@@ -9,6 +9,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -138,3 +139,35 @@ def never_waits() -> Iterator[None]:
     signal.alarm(60)
     yield
     signal.alarm(0)
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[Any]:
+    """A server of objects at s3://bucket."""
+    from tests.stores import Store
+
+    made = Store()
+    yield made
+    made.stop()
+
+
+@pytest.fixture
+def store(server, monkeypatch, tmp_path) -> Any:
+    """The server, empty and without faults, and a working folder that is empty."""
+    from tests.stores import only_in
+
+    only_in(monkeypatch, server)
+    server.clear()
+    monkeypatch.chdir(tmp_path)
+    return server
+
+
+@pytest.fixture
+def impatient(monkeypatch) -> Iterator[None]:
+    """Failed requests to stores are sent again once only."""
+    from mcaptrack.objects import stores
+
+    monkeypatch.setattr(stores, "_RETRIES", 1)
+    stores._made_store.cache_clear()
+    yield
+    stores._made_store.cache_clear()

@@ -14,6 +14,12 @@ import pytest
 from moto.server import ThreadedMotoServer
 
 BUCKET = "bucket"
+#: Answers instead of that of the store: the status, and the code in the body.
+ANSWERS = {
+    "error": ("503 Slow Down", ""),
+    "denied": ("403 Forbidden", "AccessDenied"),
+    "expired": ("400 Bad Request", "ExpiredToken"),
+}
 
 
 class Request(NamedTuple):
@@ -29,7 +35,7 @@ class Request(NamedTuple):
 
 
 class Store:
-    """The server. ``fault`` says for a request how it fails: "error", "slow", "cut", "lost" or "" for not at all."""
+    """The server. ``fault`` says for a request how it fails: one of ``ANSWERS``, "slow", "cut", "lost"; "" for not at all."""
 
     def __init__(self) -> None:
         logging.getLogger("werkzeug").setLevel(logging.CRITICAL)
@@ -71,6 +77,11 @@ class Store:
     def names(self) -> list[str]:
         return [found["Key"] for found in self.client.list_objects_v2(Bucket=BUCKET).get("Contents", [])]
 
+    def clear(self) -> None:
+        """Remove all objects."""
+        for key in self.names():
+            self.client.delete_object(Bucket=BUCKET, Key=key)
+
     def stop(self) -> None:
         self._server.stop()
 
@@ -98,10 +109,12 @@ class Store:
             environ["REQUEST_METHOD"], key, environ["QUERY_STRING"], environ.get("HTTP_RANGE", ""), key_id, 0, 0
         )
         fault = self.fault(asked)
-        if fault == "error":
-            self.requests.append(asked._replace(status=503))
-            start_response("503 Slow Down", [("Content-Length", "0")])
-            return []
+        if fault in ANSWERS:
+            status, code = ANSWERS[fault]
+            body = f"<Error><Code>{code}</Code><Message>no</Message></Error>".encode() if code else b""
+            self.requests.append(asked._replace(status=int(status.split()[0])))
+            start_response(status, [("Content-Length", str(len(body))), ("Content-Type", "application/xml")])
+            return [body]
         if fault == "slow":
             time.sleep(0.2)
         said: list[Any] = []

@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 
@@ -15,41 +14,13 @@ import pyarrow.parquet as pq
 import pytest
 
 import mcaptrack
-from mcaptrack import log, objects
+from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import find_logs
-from mcaptrack.location import Url, parse
-from mcaptrack.objects import stores
+from mcaptrack.location import parse
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from tests.commands import call, done
-from tests.stores import BUCKET, Store, only_in
-
-
-@pytest.fixture(scope="session")
-def server() -> Iterator[Store]:
-    made = Store()
-    yield made
-    made.stop()
-
-
-@pytest.fixture
-def store(server, monkeypatch, tmp_path) -> Store:
-    """The store, empty and without faults, and a working folder that is empty."""
-    only_in(monkeypatch, server)
-    for key in server.names():
-        server.client.delete_object(Bucket=BUCKET, Key=key)
-    monkeypatch.chdir(tmp_path)
-    return server
-
-
-@pytest.fixture
-def impatient(monkeypatch) -> Iterator[None]:
-    """Failed requests are sent again once only."""
-    monkeypatch.setattr(stores, "_RETRIES", 1)
-    stores._made_store.cache_clear()
-    yield
-    stores._made_store.cache_clear()
 
 
 @pytest.fixture(scope="session")
@@ -310,14 +281,3 @@ def test_a_log_in_a_store_is_recovered_to_a_file(store, template):
     done("recover", url)
     with mcaptrack.open("a.recovered.mcap") as opened:
         assert "/camera/tracks" in opened.topics
-
-
-def test_a_claim_is_taken_by_one_process(store):
-    url = parse("s3://bucket/night/a.mcap.claim")
-    assert isinstance(url, Url)
-    assert [objects.put_if_absent(url, name) for name in (b"one", b"two")] == [True, False]
-    assert objects.read(url) == b"one"
-    assert [str(found) for found, _ in objects.list_objects(url.parent)] == [url]
-    objects.delete(url)
-    objects.delete(url)
-    assert objects.find(url) is None

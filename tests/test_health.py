@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import mcaptrack
+from mcaptrack import environment
 from mcaptrack.api import machine
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import Frame
@@ -133,7 +134,7 @@ def test_limits_are_those_of_the_control_group_and_of_those_above_it(tmp_path):
     (inner / "cpu.max").write_text("max 100000\n")
     (tmp_path / "a" / "memory.max").write_text("2000000000\n")
     (inner / "memory.max").write_text("max\n")
-    assert machine.cpu_quotas(tmp_path, "0::/a/b\n") == [1.5]
+    assert environment.cpu_quotas(tmp_path, "0::/a/b\n") == [1.5]
     assert machine.memory_limits(tmp_path, "0::/a/b\n") == [2_000_000_000]
     assert machine.memory_limits(tmp_path, "") == []
 
@@ -146,7 +147,7 @@ def test_limits_of_the_first_version_of_control_groups(tmp_path):
     ):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
-    assert machine.cpu_quotas(tmp_path, "") == [0.5]
+    assert environment.cpu_quotas(tmp_path, "") == [0.5]
     assert machine.memory_limits(tmp_path, "") == [1_000_000_000]
     (tmp_path / "memory/memory.limit_in_bytes").write_text("9223372036854771712")  # no limit
     assert machine.memory_limits(tmp_path, "") == []

@@ -12,13 +12,13 @@ from typing import Any, Final
 
 from mcaptrack import __version__
 from mcaptrack.api import machine
-from mcaptrack.environment import cache_folder
+from mcaptrack.api.store_check import StoreCheck, check_store, url_of_store
+from mcaptrack.environment import THREADS, cache_folder, share_of_cores
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import Notice, collected, warn
 
 #: Extras for people who work on mcaptrack itself, or read its examples.
 _NOT_SHOWN: Final = ("docs", "examples", "test")
-_THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 _LITTLE_BYTES: Final = 1_000_000_000
 _REQUIREMENT: Final = re.compile(r"([\w.-]+)\s*(?:\[[^]]*\])?\s*(?:[^;]*?>=\s*([\d.]+))?[^;]*(?:;(.*))?")
 
@@ -58,6 +58,8 @@ class DoctorResult:
         imported; "" where it can.
     faults : tuple of str
         What a plain run needs, and this installation lacks.
+    store : StoreCheck or None
+        What may be done with a store; None if none was named.
     warnings : tuple of mcaptrack.Notice
         What is missing or scarce, but not needed by a plain run.
 
@@ -79,6 +81,7 @@ class DoctorResult:
     cache_can_be_written: bool
     plugins: dict[str, str]
     faults: tuple[str, ...]
+    store: StoreCheck | None = None
     warnings: tuple[Notice, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
@@ -102,16 +105,27 @@ class DoctorResult:
         return found | {"temporary_folder": str(folder) if folder else None, "cache_folder": str(self.cache_folder)}
 
 
-def doctor() -> DoctorResult:
+def doctor(store: str | None = None) -> DoctorResult:
     """Find out what this installation has, and whether a plain run would work.
 
-    Pictures are encoded and decoded, and a log is written to the temporary folder and read back. The network is not
-    used.
+    Pictures are encoded and decoded, and a log is written to the temporary folder and read back. The network is used
+    for ``store`` only.
+
+    Parameters
+    ----------
+    store : str, optional
+        The URL of a bucket or prefix in a store, such as "s3://robots/night". Objects are listed there; a small hidden
+        one is written, read, replaced and removed.
 
     Returns
     -------
     DoctorResult
         Versions, codecs, cores, memory, folders, plug-ins; ``faults`` is () if nothing is missing.
+
+    Raises
+    ------
+    McaptrackError
+        If ``store`` is not the URL of a store, or if what reads stores is not installed.
 
     Examples
     --------
@@ -122,6 +136,7 @@ def doctor() -> DoctorResult:
     from mcaptrack.sources.video.self_test import codec_faults
     from mcaptrack.transforms.detect.onnx.session import providers
 
+    url = None if store is None else url_of_store(store)
     with collected() as warnings:
         packages, extras, faults = _packages()
         codecs = codec_faults()
@@ -139,6 +154,8 @@ def doctor() -> DoctorResult:
             warn(f"{folder} has only {free / 1e6:,.0f} MB free; TMPDIR may name another folder")
         cache = cache_folder()
         plugins = _plugins()
+        checked = None if url is None else check_store(url)
+        faults += checked.faults if checked else ()
         return DoctorResult(
             version=__version__,
             python=platform.python_version(),
@@ -147,7 +164,7 @@ def doctor() -> DoctorResult:
             extras=extras,
             codecs=codecs,
             onnx_providers=providers(),
-            cores=machine.cores(),
+            cores=share_of_cores(),
             memory_bytes=machine.memory_bytes(),
             threads=_threads(),
             temporary_folder=folder,
@@ -156,6 +173,7 @@ def doctor() -> DoctorResult:
             cache_can_be_written=machine.can_be_written(cache),
             plugins=plugins,
             faults=tuple(faults),
+            store=checked,
             warnings=tuple(warnings),
         )
 
@@ -214,7 +232,7 @@ def _numbers(version: str) -> tuple[int, ...]:
 def _threads() -> dict[str, str]:
     import cv2
 
-    return {"OpenCV": str(cv2.getNumThreads())} | {name: os.environ[name] for name in _THREADS if name in os.environ}
+    return {"OpenCV": str(cv2.getNumThreads())} | {name: os.environ[name] for name in THREADS if name in os.environ}
 
 
 def _plugins() -> dict[str, str]:

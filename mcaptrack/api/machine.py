@@ -1,4 +1,4 @@
-"""Limits of this process on its machine: cores, memory, folders."""
+"""Limits of this process on its machine: memory and folders."""
 
 from __future__ import annotations
 
@@ -9,32 +9,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from mcaptrack import environment, log
+from mcaptrack import log
+from mcaptrack.environment import CONTROL_GROUPS, control_groups
 from mcaptrack.errors import McaptrackError
 
-_CONTROL_GROUPS: Final = Path("/sys/fs/cgroup")
 #: Version 1 of control groups states a number beyond all memory where there is no limit.
 _NO_LIMIT: Final = 1 << 60
-
-
-def cores() -> float:
-    """Return how many cores this process may use: those that it may run on, or the quota of its control group."""
-    return min([float(environment.cores()), *cpu_quotas()])
-
-
-def cpu_quotas(root: Path = _CONTROL_GROUPS, own: str | None = None) -> list[float]:
-    """Return the limits of processor time of this process's control group and those above it, in cores."""
-    found = []
-    for folder in _groups(root, own):
-        with suppress(OSError, ValueError):
-            quota, period = (folder / "cpu.max").read_text().split()
-            if quota != "max":
-                found.append(int(quota) / int(period))
-    with suppress(OSError, ValueError):
-        old = int((root / "cpu/cpu.cfs_quota_us").read_text()), int((root / "cpu/cpu.cfs_period_us").read_text())
-        if old[0] > 0:
-            found.append(old[0] / old[1])
-    return [quota for quota in found if quota > 0]
 
 
 def memory_bytes() -> int | None:
@@ -45,27 +25,15 @@ def memory_bytes() -> int | None:
     return min(found, default=None)
 
 
-def memory_limits(root: Path = _CONTROL_GROUPS, own: str | None = None) -> list[int]:
+def memory_limits(root: Path = CONTROL_GROUPS, own: str | None = None) -> list[int]:
     """Return the limits of memory of this process's control group and those above it, in bytes."""
     found = []
-    for folder in _groups(root, own):
+    for folder in control_groups(root, own):
         with suppress(OSError, ValueError):
             found.append(int((folder / "memory.max").read_text()))  # "max" is no number
     with suppress(OSError, ValueError):
         found.append(int((root / "memory/memory.limit_in_bytes").read_text()))
     return [limit for limit in found if 0 < limit < _NO_LIMIT]
-
-
-def _groups(root: Path, own: str | None) -> list[Path]:
-    """Return the folders of this process's control group and those above it. ``own`` is /proc/self/cgroup."""
-    text = own
-    if text is None:
-        text = ""
-        with suppress(OSError):
-            text = Path("/proc/self/cgroup").read_text()
-    name = next((line.removeprefix("0::/") for line in text.splitlines() if line.startswith("0::/")), "")
-    inside = root / name
-    return [inside, *(folder for folder in inside.parents if folder.is_relative_to(root))]
 
 
 def temporary_folder() -> tuple[Path | None, str]:

@@ -58,11 +58,8 @@ _UNUSED: Final = re.compile(r"`(\w+)=` ")
 #: The warnings of the running command, and its inputs.
 _WARNED: Final[ContextVar[list[Notice]]] = ContextVar("warned")
 _BATCH: Final[ContextVar[_Batch]] = ContextVar("batch")
-#: Headings of options in the help: input and output, options of all commands, label files, and how tracks are matched
-#: with ground truth.
+#: Headings of options in the help: input and output, and options of all commands.
 FILES, COMMON = LAST_PANELS
-LABELS: Final = "Label files"
-SCORES: Final = "Scores"
 
 #: Seconds between two lines about progress, with ``--log-format json``.
 PROGRESS_S: Final = 5.0
@@ -140,55 +137,6 @@ LogFormat = Annotated[
     ),
 ]
 Camera = Annotated[str | None, option("--camera", panel=FILES, help="Which camera, if the log has several.")]
-SimilarityName = Literal["iou", "metres", "bev-iou", "3d-iou"]
-GroundPlane = Annotated[
-    Path | None,
-    option(
-        "--ground-plane",
-        panel=LABELS,
-        help="File with a 3x3 homography from pixels to metres on the ground.",
-    ),
-]
-Point = Annotated[
-    Literal["center", "foot"],
-    option("--point", panel=LABELS, tuning=True, help="Which point of a box touches the ground."),
-]
-FPS_PATTERN: Final = r"[0-9]+([.][0-9]+)?(/[0-9]+)?"
-LabelFps = Annotated[
-    str | None,
-    option(
-        "--fps",
-        panel=LABELS,
-        tuning=FPS_PATTERN,
-        help="Frames per second of label files.",
-        show_default="as seqinfo.ini beside them says",
-    ),
-]
-
-
-def similarity(shown: str) -> Any:
-    """Return the option --similarity; ``shown`` is its default in the help."""
-    words = (
-        "How ground truth and tracks are matched: by overlap of boxes in pictures (iou), distance on the ground "
-        "(metres), or overlap of 3D boxes, seen from above (bev-iou) or in space (3d-iou)."
-    )
-    return option("--similarity", panel=SCORES, tuning=True, help=words, show_default=shown)
-
-
-def gate_m(shown: str | bool = True, tuning: str | bool = True, was: str = "") -> Any:
-    """Return the option --gate-m."""
-    words = "Gate: largest distance in metres at which ground truth and a track match."
-    ends: dict[str, Any] = {} if isinstance(tuning, str) else {"least": 0.001, "most": 1e6}  # text is several numbers
-    return option("--gate-m", panel=SCORES, tuning=tuning, was=was, help=words, show_default=shown, **ends)
-
-
-def min_iou(was: str = "", was_if: tuple[str, str] | None = None) -> Any:
-    """Return the option --min-iou."""
-    words = "Least overlap (IoU) at which ground truth and a track match."
-    about: dict[str, Any] = {"was": was, "was_if": was_if, "least": 0.001, "most": 1}
-    return option("--min-iou", panel=SCORES, tuning=True, help=words, show_default="0.5", **about)
-
-
 Logs = Annotated[
     list[Path],
     typer.Argument(

@@ -1,8 +1,9 @@
-"""``mcaptrack doctor``: print what this installation has, and what it lacks."""
+"""``mcaptrack doctor``: print what this installation has and lacks, and what may be done with a store."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Annotated
 
 import typer
 
@@ -13,19 +14,29 @@ from mcaptrack.cli.text import say, show, stdout_to_stderr
 
 @common.one_line
 def doctor(
+    store: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="STORE", help="A bucket or prefix to try, such as s3://robots/night.", show_default=False
+        ),
+    ] = None,
     json: common.Json = False,
     quiet: common.Quiet = False,
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Print what this installation has: versions, codecs, memory, folders, plug-ins. The network is not used.
+    """Print what this installation has: versions, codecs, memory, folders, plug-ins, and what may be done with a store.
 
-    The exit code is 0 if all that a plain run needs is there, and 1 otherwise, with one line for each fault.
+    The network is used for a store only: objects are listed there, and a small hidden one is written, read, replaced
+    and removed. The exit code is 0 if all that a plain run needs is there, and 1 otherwise, with one line for each
+    fault.
 
     Example: mcaptrack doctor
+
+    Example: mcaptrack doctor s3://robots/night
     """
     with stdout_to_stderr():
-        found = mcaptrack.doctor()
+        found = mcaptrack.doctor(store)
     if json:
         common.print_json(found.to_json())
     elif not quiet:
@@ -61,4 +72,12 @@ def _lines(found: mcaptrack.DoctorResult, verbose: bool) -> Iterator[tuple[str, 
     yield "fetched weights", f"{found.cache_folder}{can}"
     for name, why in found.plugins.items():
         yield name, why or "can be imported"
+    if found.store is not None:
+        yield "store", found.store.url
+        yield (
+            "  server",
+            f"{found.store.server}, region {found.store.region}" if found.store.region else found.store.server,
+        )
+        yield "  credentials", found.store.credentials
+        yield from ((f"  {name}", why or "works") for name, why in found.store.access.items())
     yield "faults", f"{len(found.faults)}, see below" if found.faults else "none"

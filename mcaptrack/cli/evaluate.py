@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
-from mcaptrack.cli import common
+from mcaptrack.cli import common, labels
 from mcaptrack.cli.inputs import expand
 from mcaptrack.cli.text import console, printable, say
 from mcaptrack.errors import McaptrackError
@@ -59,19 +59,19 @@ def evaluate(
         list[Path] | None,
         common.option(
             "--truth",
-            panel=common.LABELS,
+            panel=labels.LABELS,
             help="Ground truth for files of tracks: one file for each, matched by name or in order.",
             show_default=False,
         ),
     ] = None,
     similarity: Annotated[
-        common.SimilarityName | None, common.similarity("both, as far as there are boxes and metres")
+        labels.SimilarityName | None, labels.similarity("both, as far as there are boxes and metres")
     ] = None,
-    gate_m: Annotated[str, common.gate_m(tuning=r"[0-9.eE+, -]+")] = "0.5,1,2",
-    min_iou: Annotated[float, common.min_iou()] = 0.5,
+    gate_m: Annotated[str, labels.gate_m(tuning=r"[0-9.eE+, -]+")] = "0.5,1,2",
+    min_iou: Annotated[float, labels.min_iou()] = 0.5,
     rules: Annotated[
         Literal["trackeval", "motmetrics"],
-        common.option("--rules", panel=common.SCORES, tuning=True, help="Rules for counting switches and fragments."),
+        common.option("--rules", panel=labels.SCORES, tuning=True, help="Rules for counting switches and fragments."),
     ] = "trackeval",
     smoothed: Annotated[
         bool,
@@ -86,19 +86,19 @@ def evaluate(
         list[str] | None,
         common.option(
             "--topic",
-            panel=common.SCORES,
+            panel=labels.SCORES,
             help="Score these channels.",
             show_default="tracks, samples, retracks, retracks/online; of 3D boxes retracks/full, too",
         ),
     ] = None,
     camera: common.Camera = None,
-    ground_plane: common.GroundPlane = None,
-    point: common.Point = "foot",
-    fps: common.LabelFps = None,
+    ground_plane: labels.GroundPlane = None,
+    point: labels.Point = "foot",
+    fps: labels.LabelFps = None,
     fail_under: Annotated[
         list[str] | None,
         common.option(
-            "--fail-under", panel=common.SCORES, help="Exit 4 if a score is lower, as in idf1=0.7.", show_default=False
+            "--fail-under", panel=labels.SCORES, help="Exit 4 if a score is lower, as in idf1=0.7.", show_default=False
         ),
     ] = None,
     curves: Annotated[

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from mcaptrack.cli import common
+from mcaptrack.cli import common, labels
 from mcaptrack.cli.many import takes_many
 from mcaptrack.cli.running import run_on_logs
 
@@ -23,10 +23,10 @@ def events(
         ),
     ] = None,
     similarity: Annotated[
-        common.SimilarityName | None, common.similarity("iou at the video's rate, otherwise metres")
+        labels.SimilarityName | None, labels.similarity("iou at the video's rate, otherwise metres")
     ] = None,
-    gate_m: Annotated[float | None, common.gate_m("1.0, and 2.0 for 3D boxes", was="--gate")] = None,
-    min_iou: Annotated[float | None, common.min_iou(was="--gate", was_if=("similarity", "iou"))] = None,
+    gate_m: Annotated[float | None, labels.gate_m("1.0, and 2.0 for 3D boxes", was="--gate")] = None,
+    min_iou: Annotated[float | None, labels.min_iou(was="--gate", was_if=("similarity", "iou"))] = None,
     camera: common.Camera = None,
     output: common.Output = None,
     sidecar: common.Sidecar = None,

@@ -2,30 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
-from mcaptrack.cli import common
+from mcaptrack.cli import common, labels
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.inputs import expand, only_one_output
+from mcaptrack.cli.many import LogWork, many_options, process, takes_many
+from mcaptrack.errors import McaptrackError
+from mcaptrack.location import Location
 
 if TYPE_CHECKING:
     from mcaptrack import IngestResult
+    from mcaptrack.fleet import NamedLog
 
 Inputs = Annotated[
     list[Path],
     typer.Argument(
         metavar="INPUT",
-        help="Videos, folders of images, ROS bags, MCAP files, or label files (YOLO: a folder); each becomes a log.",
+        help="Videos, folders of images, ROS bags, MCAP files, or label files (YOLO: a folder), patterns, or - for a "
+        "list of these on stdin; each becomes a log.",
         show_default=False,
     ),
 ]
 
 
 def _label_file(words: str) -> Any:
-    return common.option(panel=common.LABELS, help=f"Label file with {words}.")
+    return common.option(panel=labels.LABELS, help=f"Label file with {words}.")
 
 
 _PICTURES: Final = "Pictures"
@@ -34,6 +40,7 @@ _READING: Final = "Reading of label files"
 
 
 @common.one_line
+@takes_many()
 def ingest(
     inputs: Inputs,
     output: Annotated[Path | None, common.output("INPUT.mcap in the working folder")] = None,
@@ -45,7 +52,7 @@ def ingest(
         common.option(
             "--fps",
             panel=_PICTURES,
-            tuning=common.FPS_PATTERN,
+            tuning=labels.FPS_PATTERN,
             help="Frames per second, instead of the file's own times.",
             show_default=False,
         ),
@@ -93,8 +100,8 @@ def ingest(
             show_default="2 if copied, 1 if encoded",
         ),
     ] = None,
-    ground_plane: common.GroundPlane = None,
-    point: common.Point = "foot",
+    ground_plane: labels.GroundPlane = None,
+    point: labels.Point = "foot",
     detections: Annotated[Path | None, _label_file("detections: boxes without ids")] = None,
     tracks: Annotated[Path | None, _label_file("tracks: boxes or positions with ids")] = None,
     truth: Annotated[Path | None, _label_file("ground truth: boxes or positions with true ids")] = None,
@@ -198,7 +205,7 @@ def ingest(
     role: Annotated[
         Literal["detections", "tracks", "truth", "motion"] | None,
         common.option(
-            "--as", panel=common.LABELS, help="What INPUT holds, if it is a label file.", show_default="as its ids tell"
+            "--as", panel=labels.LABELS, help="What INPUT holds, if it is a label file.", show_default="as its ids tell"
         ),
     ] = None,
     into: Annotated[
@@ -234,6 +241,8 @@ def ingest(
 
     sources = expand(inputs, each=True)
     only_one_output(sources, output or into)
+    if into is not None and many_options().output_dir is not None:
+        raise McaptrackError("--into and --output-dir are two places for the same results; give one")
     given: dict[str, Any] = {
         "camera": camera,
         "fps": fps,
@@ -260,21 +269,46 @@ def ingest(
         "sidecar": sidecar,
         "force": force,
     }
-    results: list[IngestResult] = []
     with common.Talk(quiet, verbose).open() as talk:
-        for source in sources:
-            with talk.attempt(source, sources):
-                done = mcaptrack.ingest(source, output, progress=talk.progress, **given)
-                results.append(done)
-                for words in done.notes:
-                    talk.say(words)
-                for words in done.details:
-                    talk.detail(words)
-                talk.say(f"{done.log}: " + ", ".join(f"{topic} {count}" for topic, count in done.messages.items()))
+        work: LogWork[IngestResult] = LogWork(
+            "ingest",
+            mcaptrack.ingest,
+            given,
+            lambda _, done: _print(done, talk),
+            _as_json,
+            _line,
+            names_output=not into,
+        )
+        results, totals = process(_named(sources), work, talk, output)
     if json:
-        common.print_json({"results": [_as_json(done) for done in results]})
+        common.print_json({"results": [_as_json(done) for done in results], **totals})
     if any(done.lost for done in results):
         raise typer.Exit(common.LOST)
+
+
+def _named(sources: Sequence[Location]) -> list[NamedLog]:
+    """Return inputs, each once, with the names of their logs."""
+    from mcaptrack.api.ingesting import default_log
+    from mcaptrack.fleet import NamedLog
+
+    return [NamedLog(source, default_log(Path(source))) for source in dict.fromkeys(sources)]
+
+
+def _print(done: IngestResult, talk: common.Talk) -> None:
+    for words in done.notes:
+        talk.say(words)
+    for words in done.details:
+        talk.detail(words)
+    talk.say(f"{done.log}: {_counts(done)}")
+
+
+def _line(done: IngestResult) -> str:
+    """Return the result for one of many inputs in one line."""
+    return "; ".join([f"{done.log} {_counts(done)}", *done.notes])
+
+
+def _counts(done: IngestResult) -> str:
+    return ", ".join(f"{topic} {count}" for topic, count in done.messages.items())
 
 
 def _as_json(done: IngestResult) -> dict[str, Any]:

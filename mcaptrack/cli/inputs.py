@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -29,34 +28,10 @@ def check_paths(given: Mapping[str, Any]) -> None:
 
 
 def expand(paths: Sequence[Path], *, each: bool = False, folders: bool = False) -> list[Location]:
-    """Return paths, with patterns replaced by the files that match.
+    """Return the inputs that arguments name; see ``fleet.expansion.find_inputs``."""
+    from mcaptrack.fleet.expansion import find_inputs
 
-    With ``folders``, a folder that has logs stands for these, and "-" for a list of logs on standard input.
-    LOG.results.mcap is left out if LOG is among the paths, because it is a part of LOG; with ``each`` it is kept.
-    Raises McaptrackError for a pattern that matches no file.
-    """
-    from mcaptrack.files import place_of
-    from mcaptrack.fleet.expansion import LIST, find_logs, has_logs
-    from mcaptrack.log import results_path
-
-    out: list[Location] = []
-    for path in paths:
-        if is_remote(url := parse(path)):
-            out.append(url)
-            continue
-        refuse_url(path)
-        if folders and (str(path) == LIST or (path.is_dir() and has_logs(path))):
-            out += [one.path for one in find_logs([path])]
-            continue
-        if path.exists() or not glob.has_magic(str(path)):
-            out.append(path)
-            continue
-        found = sorted(Path(name) for name in glob.glob(str(path), recursive=True))
-        if not found:
-            raise McaptrackError(f"no file matches {path}")
-        out += found
-    results = {results_path(place_of(path)) for path in out}
-    return [path for path in out if each or place_of(path) not in results]
+    return [one.path for one in find_inputs(paths, each=each, folders=folders)]
 
 
 def only_one_output(paths: Sequence[Location], output: Path | None) -> None:

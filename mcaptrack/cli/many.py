@@ -116,7 +116,9 @@ class ManyOptions:
     json_lines: Annotated[
         bool,
         common.option(
-            "--json-lines", panel=PANEL, help="Print an object of JSON on one line for each log as soon as it has ended."
+            "--json-lines",
+            panel=PANEL,
+            help="Print a line of JSON for each log as soon as it has ended.",
         ),
     ] = False
 
@@ -208,6 +210,8 @@ class LogWork(Generic[T]):
         Whether what is made of a log in a store goes beside it, and not into the working folder.
     shares_output : bool
         Whether all logs have one output, a folder.
+    names_output : bool
+        Whether each input always has an output of its own, by default in the working folder.
     """
 
     name: str
@@ -220,6 +224,7 @@ class LogWork(Generic[T]):
     writes: bool = True
     writes_objects: bool = True
     shares_output: bool = False
+    names_output: bool = False
 
 
 def process(
@@ -239,7 +244,7 @@ def process(
     if many.json_lines and RUNNING.get().params.get("json"):
         raise McaptrackError("--json prints one object, and --json-lines one for each log; give one")
     options = {**work.options} if output is None else {**work.options, "output": output}
-    folder = many.output_dir
+    folder = many.output_dir or (Path() if work.names_output and output is None else None)
     if work.shares_output and folder is not None:
         options, folder = {**options, "output": folder}, None
     elif not work.shares_output:

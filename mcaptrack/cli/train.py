@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
-from mcaptrack.cli import common
+from mcaptrack.cli import common, labels
 from mcaptrack.cli.inputs import expand
 from mcaptrack.cli.text import console, show
 from mcaptrack.errors import command
@@ -202,9 +202,9 @@ def train(
             show_default="truth, or the best tracks",
         ),
     ] = None,
-    fps: common.LabelFps = None,
-    ground_plane: common.GroundPlane = None,
-    point: common.Point = "foot",
+    fps: labels.LabelFps = None,
+    ground_plane: labels.GroundPlane = None,
+    point: labels.Point = "foot",
     force: common.Force = False,
     json: common.Json = False,
     quiet: common.Quiet = False,

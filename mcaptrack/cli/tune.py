@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
-from mcaptrack.cli import common
+from mcaptrack.cli import common, labels
 from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.config import NAME, read_toml, write_settings
 from mcaptrack.cli.inputs import expand
@@ -35,7 +35,7 @@ def tune(
         list[Path] | None,
         common.option(
             "--truth",
-            panel=common.LABELS,
+            panel=labels.LABELS,
             help="Ground truth for files of detections: one file for each, matched by name or in order.",
             show_default=False,
         ),
@@ -47,7 +47,7 @@ def tune(
     tracker: Annotated[str, chooser("tracker", words="The {kind} to tune", panel=_SEARCH)] = "sort",
     metric: Annotated[
         Literal["IDF1", "MOTA", "HOTA", "IDP", "IDR", "DetA", "AssA"],
-        common.option("--metric", panel=common.SCORES, tuning=True, help="Score to maximise.", case_sensitive=False),
+        common.option("--metric", panel=labels.SCORES, tuning=True, help="Score to maximise.", case_sensitive=False),
     ] = "IDF1",
     trials: Annotated[
         int,
@@ -82,12 +82,12 @@ def tune(
             show_default="beside -o",
         ),
     ] = None,
-    similarity: Annotated[common.SimilarityName | None, common.similarity("iou; metres after track")] = None,
-    gate_m: Annotated[float, common.gate_m()] = 1.0,
-    min_iou: Annotated[float, common.min_iou(was="--match-iou")] = 0.5,
-    fps: common.LabelFps = None,
-    ground_plane: common.GroundPlane = None,
-    point: common.Point = "foot",
+    similarity: Annotated[labels.SimilarityName | None, labels.similarity("iou; metres after track")] = None,
+    gate_m: Annotated[float, labels.gate_m()] = 1.0,
+    min_iou: Annotated[float, labels.min_iou(was="--match-iou")] = 0.5,
+    fps: labels.LabelFps = None,
+    ground_plane: labels.GroundPlane = None,
+    point: labels.Point = "foot",
     topic: Annotated[
         str | None, common.option("--topic", panel=common.FILES, help="Read this channel instead of the default one.")
     ] = None,

@@ -90,8 +90,8 @@ def run(
         Whether the function changes logs or writes beside them; then each log is claimed by a small file there while it
         is processed, so that another fleet leaves it alone. A log in a store is claimed by a small object beside it.
     writes_objects : bool, default True
-        Whether what the function makes of a log in a store goes beside it. If not (as tables and videos, which go to the
-        working folder), claims on such logs are files, too.
+        Whether what the function makes of a log in a store goes beside it. If not (as tables and videos, which go to
+        the working folder), claims on such logs are files, too.
     on_outcome, on_status, on_note : callable, optional
         Called with a ``LogOutcome`` when a log has ended, with a ``FleetStatus`` several times a second, and with a
         line of text when something is tried again or taken over.

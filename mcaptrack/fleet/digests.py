@@ -38,6 +38,9 @@ def digest_of_log(path: Location) -> str:
         for part in dict.fromkeys((path, results)):
             if part is results and part != path and not part.exists():
                 continue
+            if part.is_dir():
+                found.update(_about_folder(part))
+                continue
             with part.open("rb") as stream:
                 about = os.fstat(stream.fileno())
                 stream.seek(max(0, about.st_size - _TAIL))
@@ -46,6 +49,14 @@ def digest_of_log(path: Location) -> str:
     except OSError:
         return ""
     return found.hexdigest()[:32]
+
+
+def _about_folder(folder: Path) -> bytes:
+    """Return the names, sizes and times of the files in a folder: of pictures, or of a bag."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    stats = [(path, path.stat()) for path in files]
+    lines = [f"{path.relative_to(folder)} {about.st_size} {about.st_mtime_ns}\n" for path, about in stats]
+    return "".join(lines).encode("utf-8", "surrogateescape")
 
 
 def _digest_in_store(url: Url) -> str:

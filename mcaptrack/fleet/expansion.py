@@ -65,17 +65,49 @@ def find_logs(
     found: list[NamedLog] = []
     for argument in arguments:
         found += _logs_of(argument, leave_out, read_list or _standard_input)
-    results = set() if each else {results_path(place_of(one.path)) for one in found}
     once: dict[object, NamedLog] = {}
-    for one in found:
-        if place_of(one.path) not in results:
-            once.setdefault(_identity(one.path), one)
+    for one in found if each else _without_results(found):
+        once.setdefault(_identity(one.path), one)
     return list(once.values())
 
 
-def has_logs(folder: Path) -> bool:
-    """Whether there is a log in a folder or below it."""
+def find_inputs(
+    arguments: Iterable[str | os.PathLike[str]], *, each: bool = False, folders: bool = False
+) -> list[NamedLog]:
+    """Return the inputs that arguments name, as they are and in order: files, folders, URLs; patterns, "-" for a list.
+
+    With ``folders``, a folder or prefix stands for the logs in it, if there are any. LOG.results.mcap is left out if
+    LOG is there, because it is a part of LOG; with ``each`` it is kept. Raises McaptrackError as ``find_logs`` does.
+    """
+    found: list[NamedLog] = []
+    for argument in arguments:
+        location = as_location(argument)
+        if str(argument) == LIST:
+            found += _listed(_standard_input(), has_folders=not folders)
+        elif folders and (isinstance(location, Url) or (location.is_dir() and _has_logs(location))):
+            found += _logs_of(argument, "", _standard_input)
+        elif isinstance(location, Url) or _is_no_pattern(location):
+            if isinstance(location, Path):
+                refuse_url(location)
+            found.append(NamedLog(location, Path(location.name)))
+        else:
+            refuse_url(location)
+            found += _matching(location, None)
+    return found if each else _without_results(found)
+
+
+def _without_results(found: Sequence[NamedLog]) -> list[NamedLog]:
+    """Leave out LOG.results.mcap where LOG is there."""
+    results = {results_path(place_of(one.path)) for one in found}
+    return [one for one in found if place_of(one.path) not in results]
+
+
+def _has_logs(folder: Path) -> bool:
     return next(_logs_in(folder, ""), None) is not None
+
+
+def _is_no_pattern(path: Path) -> bool:
+    return path.exists() or path.is_symlink() or not glob.has_magic(str(path))
 
 
 def outputs_in(folder: Path, logs: Sequence[NamedLog], suffix: str) -> list[Path]:
@@ -91,7 +123,7 @@ def outputs_in(folder: Path, logs: Sequence[NamedLog], suffix: str) -> list[Path
         if other != one.path:
             raise McaptrackError(
                 f"the results of {other} and {one.path} would both be {name}; give the folder that holds both logs, "
-                "which keeps the folders below it apart"
+                "which keeps the folders below it apart, or process them one by one"
             )
     return list(names)
 
@@ -113,7 +145,7 @@ def _logs_of(named: str | os.PathLike[str], leave_out: str, read_list: Callable[
         if not found:
             raise McaptrackError(f"the folder {argument} has no log: no file in it ends with {_SUFFIX}")
         yield from found
-    elif argument.exists() or argument.is_symlink() or not glob.has_magic(str(argument)):
+    elif _is_no_pattern(argument):
         yield NamedLog(argument, Path(argument.name))
     else:
         yield from _matching(argument, leave_out)
@@ -137,8 +169,8 @@ def _logs_in(folder: Path, leave_out: str) -> Iterator[NamedLog]:
                 yield NamedLog(path, path.relative_to(folder))
 
 
-def _matching(pattern: Path, leave_out: str) -> Iterator[NamedLog]:
-    """Yield the files that a pattern matches, and the logs in folders that it matches."""
+def _matching(pattern: Path, leave_out: str | None) -> Iterator[NamedLog]:
+    """Yield the files that a pattern matches, and the logs in folders that it matches; the folders for None."""
     names = sorted(glob.glob(str(pattern), recursive=True))
     if not names:
         raise McaptrackError(f"no file matches {pattern}")
@@ -149,7 +181,7 @@ def _matching(pattern: Path, leave_out: str) -> Iterator[NamedLog]:
         fixed /= part
     for name in names:
         path = Path(name)
-        if path.is_dir():
+        if leave_out is not None and path.is_dir():
             yield from (replace(one, below=path.relative_to(fixed) / one.below) for one in _logs_in(path, leave_out))
         else:
             yield NamedLog(path, path.relative_to(fixed))
@@ -163,7 +195,7 @@ def _standard_input() -> bytes:
     return sys.stdin.buffer.read()
 
 
-def _listed(text: bytes) -> Iterator[NamedLog]:
+def _listed(text: bytes, has_folders: bool = False) -> Iterator[NamedLog]:
     """Yield the logs of a list; their names are relative to the folder that all of them are in."""
     lines = text.split(b"\0") if b"\0" in text else text.splitlines()
     named = [as_location(os.fsdecode(line)) for line in lines if line.strip()]
@@ -172,7 +204,7 @@ def _listed(text: bytes) -> Iterator[NamedLog]:
     for path in paths:
         refuse_url(path)
         refuse_special(path)
-        if path.is_dir():
+        if path.is_dir() and not has_folders:
             raise McaptrackError(
                 f"the list of logs names {path}, which is a folder; list files, or give the folder itself"
             )

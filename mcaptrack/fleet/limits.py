@@ -11,17 +11,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from mcaptrack.environment import cores
+from mcaptrack.environment import THREADS, cores
 from mcaptrack.errors import McaptrackError
 
-#: Variables that say how many threads a library uses: OpenBLAS, OpenMP (also Arrow and torch), MKL, Accelerate, OpenCV.
-_THREADS: Final = (
-    "OPENBLAS_NUM_THREADS",
-    "OMP_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-    "OPENCV_FOR_THREADS_NUM",
-)
 _SIZE: Final = re.compile(r"([0-9]+(?:\.[0-9]+)?)\s*([kmgt]?)(i?)b?", re.IGNORECASE)
 _IS_LINUX: Final = sys.platform.startswith("linux")
 _PARENT_DIES: Final = 1  # PR_SET_PDEATHSIG of <sys/prctl.h>
@@ -30,7 +22,7 @@ _PARENT_DIES: Final = 1  # PR_SET_PDEATHSIG of <sys/prctl.h>
 def environment_of_worker(workers: int) -> dict[str, str]:
     """Return the environment of a worker: each of them gets its share of the cores, unless the user said otherwise."""
     share = str(max(1, cores() // workers))
-    return dict.fromkeys(_THREADS, share) | dict(os.environ)
+    return dict.fromkeys(THREADS, share) | dict(os.environ)
 
 
 def size_in_bytes(size: str | float | None, name: str) -> int | None:

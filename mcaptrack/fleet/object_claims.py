@@ -1,9 +1,9 @@
 """Claims on logs in a store: small objects beside them, each written by one of several fleets only.
 
-A store has no locks, and its clock is not that of any machine. A claim is therefore an object that is written if there is
-none, and replaced if it is still the version that was read; the store lets one of several such writes succeed. A sign of
-life is another version of it. Another fleet takes a claim over if it has seen the same version for a while on its own
-clock.
+A store has no locks, and its clock is not that of any machine. A claim is therefore an object that is written if there
+is none, and replaced if it is still the version that was read; the store lets one of several such writes succeed. A
+sign of life is another version of it. Another fleet takes a claim over if it has seen the same version for a while, on
+its own clock.
 """
 
 from __future__ import annotations

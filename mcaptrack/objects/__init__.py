@@ -174,8 +174,8 @@ def put_if_unchanged(url: Url, data: bytes, before: Version | None) -> Version |
     """Write a small object if the store still has the version ``before``; None stands for no object.
 
     Returns the version that was written; None if there is another one. Of two processes, one succeeds. ``data`` has to
-    differ between processes: if the store has it, it is taken for what was written here, because the answer to a request
-    may be lost.
+    differ between processes: if the store has it, it is taken for what was written here, because the answer to a
+    request may be lost.
     """
     obstore = library(url)
     mode: Any = {"e_tag": before.etag} if before else "create"
@@ -183,7 +183,11 @@ def put_if_unchanged(url: Url, data: bytes, before: Version | None) -> Version |
         try:
             made = obstore.put(store_of(url), url.key, data, mode=mode, use_multipart=False)
             return Version(len(data), made["e_tag"])
-        except (obstore.exceptions.AlreadyExistsError, obstore.exceptions.PreconditionError, FileNotFoundError) as error:
+        except (
+            obstore.exceptions.AlreadyExistsError,
+            obstore.exceptions.PreconditionError,
+            FileNotFoundError,
+        ) as error:
             if isinstance(error, FileNotFoundError) and meaning_of(url, error):
                 raise
     try:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.location import SCHEMES, Url
+from mcaptrack.location import SCHEMES, Url, hide_secrets
 
 #: A request that fails is sent again so often, and within so many seconds; one without an answer fails after a while.
 _RETRIES, _PATIENCE_S, _CONNECT_S, _READ_S, _REQUEST_S = 6, 60, 5, 20, 300
@@ -73,7 +73,7 @@ def _of_profile(given: Mapping[str, str]) -> dict[str, str]:
     Raises McaptrackError if AWS_PROFILE names a profile that has no keys.
     """
     home = Path.home() / ".aws"
-    name = given.get("AWS_PROFILE") or given.get("AWS_DEFAULT_PROFILE") or "default"
+    name = _profile(given)
     files = (
         (given.get("AWS_CONFIG_FILE") or home / "config", name if name == "default" else f"profile {name}"),
         (given.get("AWS_SHARED_CREDENTIALS_FILE") or home / "credentials", name),
@@ -100,6 +100,40 @@ def _of_profile(given: Mapping[str, str]) -> dict[str, str]:
             "session_token": found.get("aws_session_token"),
         }
     return {name: value for name, value in settings.items() if value and f"AWS_{name.upper()}" not in given}
+
+
+def described(url: Url) -> tuple[str, str, str]:
+    """The server of a store, its region ("" where there are none), and where the credentials come from.
+
+    Raises McaptrackError if the settings of AWS can't be read.
+    """
+    given, service = os.environ, SCHEMES[url.scheme]
+    if url.scheme == "gs":
+        file = given.get("GOOGLE_APPLICATION_CREDENTIALS") or given.get("GOOGLE_SERVICE_ACCOUNT")
+        return service, "", f"the file {file}" if file else "the login of gcloud, or the account of this machine"
+    if url.scheme == "az":
+        name = given.get("AZURE_STORAGE_ACCOUNT_NAME")
+        has_key = any(
+            f"AZURE_STORAGE_{kind}" in given for kind in ("ACCOUNT_KEY", "ACCESS_KEY", "SAS_KEY", "SAS_TOKEN")
+        )
+        server = f"{service}, account {name}" if name else f"{service}, no account (AZURE_STORAGE_ACCOUNT_NAME)"
+        return server, "", "the environment" if has_key else "the identity of this machine"
+    config = _of_profile(given)
+    server = endpoint() or config.get("endpoint", "")
+    named = given.get("AWS_REGION") or given.get("AWS_DEFAULT_REGION") or config.get("region")
+    if given.get("AWS_SKIP_SIGNATURE", "").lower() in ("true", "1"):
+        keys = "none (AWS_SKIP_SIGNATURE)"
+    elif "AWS_ACCESS_KEY_ID" in given:
+        keys = "the environment"
+    elif "access_key_id" in config:
+        keys = f"the profile {_profile(given)} of AWS"
+    else:
+        keys = "the role of this machine or container"
+    return hide_secrets(server) if server else service, named or "us-east-1 (assumed; AWS_REGION names another)", keys
+
+
+def _profile(given: Mapping[str, str]) -> str:
+    return given.get("AWS_PROFILE") or given.get("AWS_DEFAULT_PROFILE") or "default"
 
 
 def endpoint() -> str:

@@ -1,0 +1,135 @@
+"""What may be done with a bucket or a prefix in a store: tried with a small hidden object, which is removed again."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import islice
+from typing import Final
+from uuid import uuid4
+
+from mcaptrack import objects
+from mcaptrack.errors import McaptrackError
+from mcaptrack.location import SCHEMES, Url, hide_secrets, parse
+from mcaptrack.objects import Version
+from mcaptrack.objects.stores import described
+
+#: What is tried, and why a run needs it.
+_TRIED: Final = {
+    "list": "objects can't be listed",
+    "write": "objects can't be written",
+    "read": "objects can't be read",
+    "put-if-absent": "two commands at once may do a log twice",
+    "replace": "results of two commands at once may replace each other",
+    "delete": "objects can't be removed",
+}
+_REASON: Final = re.compile(r"^.*? can't be (?:read|written|removed): ")
+
+
+@dataclass(frozen=True)
+class StoreCheck:
+    """What may be done with a bucket or a prefix.
+
+    Attributes
+    ----------
+    url : str
+        The bucket or prefix.
+    server, region : str
+        The address of the server, or the name of the service; and its region ("" where there are none).
+    credentials : str
+        Where they come from.
+    access : dict of str to str
+        Why objects can't be "list"ed, "read", "write"n, written only if they are absent ("put-if-absent"), "replace"d if
+        they are unchanged, and "delete"d; "" where they can. What could not be tried is not there.
+
+    """
+
+    url: str
+    server: str
+    region: str
+    credentials: str
+    access: dict[str, str]
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """One line for each reason."""
+        reasons: dict[str, list[str]] = {}
+        for name, why in self.access.items():
+            if why:
+                reasons.setdefault(why, []).append(_TRIED[name])
+        return tuple(f"{self.url}: {' and '.join(words)}: {why}" for why, words in reasons.items())
+
+
+def url_of_store(store: str) -> Url:
+    """Return the URL of a bucket or prefix; that of a log stands for the prefix with it.
+
+    Raises McaptrackError for anything else, and if what reads the store is not installed.
+    """
+    url = parse(store)
+    if not isinstance(url, Url):
+        examples = ", ".join(f"{scheme}://" for scheme in SCHEMES)
+        raise McaptrackError(
+            f"{hide_secrets(store):.200} is no bucket or prefix in a store; give a URL with {examples}"
+        )
+    objects.library(url)
+    return url.parent if url.suffix.lower() == ".mcap" else url
+
+
+def check_store(url: Url) -> StoreCheck:
+    """Try what a run does with a store."""
+    server, region, credentials = described(url)
+    access = dict(_tries(url))
+    return StoreCheck(str(url), server, region, credentials, {name: access[name] for name in _TRIED if name in access})
+
+
+def _tries(url: Url) -> Iterator[tuple[str, str]]:
+    """Yield what was tried, and why it failed; "" if it didn't."""
+    listed: list[Url] = []
+    yield "list", _why(lambda: listed.extend(found for found, _ in islice(objects.list_objects(url), 1)))
+    probe = url / f".mcaptrack-doctor-{uuid4().hex}"
+    texts = [f"{number} {uuid4().hex}".encode() for number in range(4)]
+    made: list[Version | None] = []
+    why = _why(lambda: made.append(objects.put_if_unchanged(probe, texts[0], None)))
+    yield "write", why
+    if why or made[0] is None:
+        if listed:
+            yield "read", _why(lambda: objects.read_end(listed[0], 1))
+        return
+    first = made[0]
+    try:
+        yield "read", _why(lambda: _compare(probe, first, texts[0]))
+        yield "put-if-absent", _why(lambda: _refuse(objects.put_if_unchanged(probe, texts[1], None)))
+        yield "replace", _why(lambda: _replace(probe, first, texts))
+    finally:
+        why = _why(lambda: objects.delete(probe))
+    yield "delete", why
+
+
+def _why(attempt: Callable[[], object]) -> str:
+    """Return why something can't be done; "" if it was."""
+    try:
+        attempt()
+    except McaptrackError as error:
+        return _REASON.sub("", str(error))
+    return ""
+
+
+def _compare(url: Url, version: Version, text: bytes) -> None:
+    if objects.read_ranges(url, version, [(0, len(text))]) != [text]:
+        raise McaptrackError("the store gives other bytes than were written")
+
+
+def _refuse(written: Version | None) -> None:
+    if written is not None:
+        raise McaptrackError("the store overwrites an object although it was asked not to")
+
+
+def _replace(url: Url, first: Version, texts: list[bytes]) -> None:
+    with suppress(McaptrackError):  # a store that overwrote it has another version now
+        first = objects.find(url) or first
+    second = objects.put_if_unchanged(url, texts[2], first)
+    if second is None:
+        raise McaptrackError("the store does not replace an object that is unchanged")
+    _refuse(objects.put_if_unchanged(url, texts[3], first))

@@ -1,0 +1,233 @@
+"""Stores that several commands use at once: claims, what ``doctor`` says of a store, and faults during a whole run."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections import Counter
+from itertools import count
+from threading import Thread
+
+import pytest
+
+import mcaptrack
+from mcaptrack import fleet, objects
+from mcaptrack.errors import McaptrackError
+from mcaptrack.fleet import object_claims
+from mcaptrack.fleet.claims import Claims, claim_name
+from mcaptrack.location import parse
+from tests import fleet_tasks
+from tests.commands import call, done
+
+NIGHT = parse("s3://bucket/night")
+LOG = "s3://bucket/night/x.mcap"
+CLAIM = NIGHT / claim_name(LOG)
+
+
+def claims_on(host: str, stale_s: float = 60.0) -> Claims:
+    """The claims of a process on another machine."""
+    made = Claims()
+    made._in_stores._me |= {"host": host}
+    made._in_stores._stale_s = stale_s
+    return made
+
+
+def test_of_two_writers_one_succeeds(store):
+    url = NIGHT / "a"
+    first = objects.put_if_unchanged(url, b"one", None)
+    assert first == objects.find(url)
+    assert objects.put_if_unchanged(url, b"two", None) is None
+    second = objects.put_if_unchanged(url, b"three", first)
+    assert second not in (None, first)
+    assert objects.put_if_unchanged(url, b"four", first) is None
+    assert objects.read(url) == b"three"
+    objects.delete(url)
+    objects.delete(url)
+    assert objects.put_if_unchanged(url, b"five", second) is None
+    assert objects.find(url) is None
+
+
+class TestClaims:
+    def test_a_log_is_claimed_by_one_fleet_until_it_gives_it_up(self, store):
+        one, other = claims_on("one"), claims_on("other")
+        assert one.take(LOG, NIGHT) == (True, "")
+        assert [str(url) for url, _ in objects.list_objects(NIGHT)] == [CLAIM]
+        assert not other.take(LOG, NIGHT).is_mine
+        other.release(LOG)
+        assert not other.take(LOG, NIGHT).is_mine
+        one.release(LOG)
+        assert other.take(LOG, NIGHT).is_mine
+        other.release_all()
+        assert store.names() == []
+
+    def test_a_fleet_that_shows_no_life_loses_its_claim(self, store, monkeypatch):
+        monkeypatch.setattr(object_claims, "BEAT_S", 0.0)
+        one, other = claims_on("one"), claims_on("other", stale_s=0.05)
+        one.take(LOG, NIGHT)
+        assert not other.take(LOG, NIGHT).is_mine
+        for _ in range(3):  # each sign of life begins the time anew
+            time.sleep(0.06)
+            one.beat()
+            assert not other.take(LOG, NIGHT).is_mine
+        time.sleep(0.06)
+        taken = other.take(LOG, NIGHT)
+        assert taken.is_mine
+        assert taken.note.startswith(f"{LOG}: taken over from process ")
+        assert taken.note.endswith(" on one, which has ended")
+        one.beat()
+        one.release(LOG)
+        assert objects.find(CLAIM) is not None
+        other.release(LOG)
+        assert objects.find(CLAIM) is None
+
+    def test_a_process_of_this_machine_that_has_ended_loses_its_claim_at_once(self, store):
+        gone = Claims()
+        gone._in_stores._me |= {"pid": 2**22 - 1}
+        gone.take(LOG, NIGHT)
+        assert Claims().take(LOG, NIGHT).is_mine
+
+    def test_an_answer_that_is_lost_takes_no_claim_away(self, store):
+        mine = claims_on("one")
+        with store.failing(lambda request: "lost" if request.method == "PUT" and not store.names() else ""):
+            assert mine.take(LOG, NIGHT).is_mine
+        mine.release(LOG)
+        assert store.names() == []
+
+    def test_a_store_that_cant_be_written_has_no_claims(self, store):
+        with store.failing(lambda request: "denied" if request.method == "PUT" else ""):
+            assert Claims().take(LOG, NIGHT).is_mine
+
+    def test_what_is_no_claim_is_left_alone(self, store):
+        objects.put_if_unchanged(CLAIM, b"text", None)
+        assert not Claims().take(LOG, NIGHT).is_mine
+        assert objects.read(CLAIM) == b"text"
+
+
+@pytest.mark.usefixtures("never_waits")
+def test_two_fleets_over_one_bucket_do_no_log_twice(store):
+    for number in range(5):
+        store.put(f"night/{number}.mcap", b"x")
+    found = []
+
+    def work() -> None:
+        found.append(fleet.run(fleet_tasks.mark, "s3://bucket/night"))
+
+    fleets = [Thread(target=work) for _ in range(2)]
+    for each in fleets:
+        each.start()
+    while sum(name.endswith(".claim") for name in store.names()) < 2:
+        time.sleep(0.02)
+    store.put("night/go", b"go")
+    for each in fleets:
+        each.join()
+    times = Counter(name.split(".")[0] for name in store.names() if len(name.rpartition(".")[2]) == 32)
+    assert times == {f"night/{number}": 1 for number in range(5)}
+    states = [one.state for result in found for one in result.outcomes]
+    assert Counter(states) == {"done": 5, "up-to-date": 5}
+    assert not any("claim" in name for name in store.names())
+
+
+class TestDoctor:
+    def access(self, *words: str) -> tuple[int, dict[str, str], str]:
+        code, out, err = call("doctor", *words, "--json")
+        return code, json.loads(out)["store"]["access"], err
+
+    def test_a_store_that_can_be_used_has_no_faults_and_nothing_is_left_over(self, store):
+        store.put("night/a.mcap", b"x")
+        names = ("list", "write", "read", "put-if-absent", "replace", "delete")
+        assert self.access(str(NIGHT)) == (0, dict.fromkeys(names, ""), "")
+        assert store.names() == ["night/a.mcap"]
+        page = done("doctor", f"{NIGHT}/a.mcap").out
+        assert f"store              {NIGHT}\n" in page
+        assert f"{store.endpoint}, region us-east-1" in page
+        assert "  credentials      the environment" in page
+
+    def test_what_may_not_be_done_is_one_line(self, store):
+        store.put("night/a.mcap", b"x")
+        with store.failing(lambda request: "denied" if request.method == "PUT" else ""):
+            code, access, err = self.access(str(NIGHT))
+        why = "the store refuses it to these credentials (forbidden)"
+        assert (code, access) == (1, {"list": "", "write": why, "read": ""})
+        assert err == f"mcaptrack: {NIGHT}: objects can't be written: {why}\n"
+        with store.failing(lambda request: "denied" if "list-type" in request.query else ""):
+            code, access, err = self.access(str(NIGHT))
+        assert (code, err) == (1, f"mcaptrack: {NIGHT}: objects can't be listed: {why}\n")
+        assert store.names() == ["night/a.mcap"]
+
+    def test_a_store_that_ignores_conditions_is_found_out(self, store, monkeypatch):
+        real = objects.put_if_unchanged
+        monkeypatch.setattr(objects, "put_if_unchanged", lambda url, data, _: real(url, data, objects.find(url)))
+        code, access, err = self.access(str(NIGHT))
+        assert code == 1
+        assert [name for name, why in access.items() if why] == ["put-if-absent", "replace"]
+        assert "two commands at once may do a log twice" in err
+        assert store.names() == []
+
+    @pytest.mark.parametrize(
+        ("variables", "url", "words"),
+        [
+            ({}, "s3://nowhere/night", "there is no such bucket"),
+            ({"AWS_ENDPOINT_URL": "http://127.0.0.1:9"}, NIGHT, "the store can't be reached at http://127.0.0.1:9"),
+            ({"AWS_PROFILE": "none", "AWS_ACCESS_KEY_ID": None}, NIGHT, "the profile none of AWS (AWS_PROFILE) has no"),
+        ],
+    )
+    def test_a_cause_of_several_faults_is_said_once(self, store, impatient, monkeypatch, variables, url, words):
+        for name, value in variables.items():
+            monkeypatch.setenv(name, value) if value else monkeypatch.delenv(name)
+        code, _, err = call("doctor", url, "-q")
+        assert (code, err.count("\n"), err.count(words)) == (1, 1, 1), err
+
+    def test_expired_credentials_are_named(self, store):
+        with store.failing(lambda _: "expired"):
+            code, _, err = self.access(str(NIGHT))
+        words = "objects can't be listed and objects can't be written: the credentials have expired; renew them"
+        assert (code, err) == (1, f"mcaptrack: {NIGHT}: {words}\n")
+
+    @pytest.mark.parametrize("url", ["night", "https://me:secret@example.org/x"])
+    def test_what_is_no_store_is_refused(self, url):
+        with pytest.raises(McaptrackError, match=r"is no bucket or prefix in a store; give a URL with s3://, gs://, az://"):
+            mcaptrack.doctor(url)
+
+
+@pytest.fixture
+def expected(bare, tmp_path) -> bytes:
+    """The results of a whole run of a file."""
+    mcaptrack.run(shutil.copy(bare, tmp_path / "b.mcap"), sidecar=True, tables=False)
+    return (tmp_path / "b.results.mcap").read_bytes()
+
+
+@pytest.mark.parametrize("fault", ["error", "slow", "cut", "lost"])
+def test_a_whole_run_is_right_though_one_request_in_twenty_fails(store, bare, expected, fault):
+    url, number = store.put("night/b.mcap", bare), count(17)
+    with store.failing(lambda _: fault if next(number) % 20 == 19 else ""), store.counted() as requests:
+        mcaptrack.run(url)
+    assert len(requests) >= 3
+    assert store.get("night/b.results.mcap") == expected
+
+
+def test_a_whole_run_whose_credentials_expire_is_one_line_and_can_be_run_again(store, bare, expected):
+    url, number = store.put("night/b.mcap", bare), count()
+    with store.failing(lambda _: "expired" if next(number) > 1 else ""):
+        code, _, err = call("run", url, "-q")
+    lines = [line for line in err.splitlines() if not line.startswith("warning: ")]
+    assert (code, len(lines)) == (1, 1)
+    assert lines[0].endswith("the credentials have expired; renew them")
+    assert store.names() == ["night/b.mcap"]
+    mcaptrack.run(url)
+    assert store.get("night/b.results.mcap") == expected
+
+
+def test_a_log_that_is_replaced_during_a_run_is_one_line(store, bare):
+    url, number = store.put("night/b.mcap", bare), count()
+
+    def replace(_: object) -> str:
+        if next(number) == 1:
+            store.client.put_object(Bucket="bucket", Key="night/b.mcap", Body=bare.read_bytes() + b" ")
+        return ""
+
+    with store.failing(replace):
+        code, _, err = call("run", url, "-q")
+    lines = [line for line in err.splitlines() if not line.startswith("warning: ")]
+    assert (code, len(lines), store.names()) == (1, 1, ["night/b.mcap"])
+    assert "was replaced by another version while it was being read; try again" in lines[0]
