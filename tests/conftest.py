@@ -14,6 +14,9 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
+import mcaptrack
+from mcaptrack import log
+from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import demo
 from tests import bounded
 from tests.commands import done, made_log
@@ -171,3 +174,14 @@ def impatient(monkeypatch) -> Iterator[None]:
     stores._made_store.cache_clear()
     yield
     stores._made_store.cache_clear()
+
+
+@pytest.fixture(scope="session")
+def bare(template, tmp_path_factory) -> Path:
+    """A log before the first stage."""
+    path = tmp_path_factory.mktemp("bare") / "bare.mcap"
+    with log.read(template) as opened:
+        ways = {name: Provenance.from_metadata(channel.metadata) for name, channel in opened.channels.items()}
+    made = [name for name, how in ways.items() if how is not None and how.transform != "ingest"]
+    mcaptrack.drop(template, made, output=path)
+    return path

@@ -1,27 +1,48 @@
-"""A Dask cluster in a process of its own, for tests: prints the address of its scheduler, and runs until it is killed."""
+"""A Dask cluster for tests: a scheduler and two workers, each in a process of its own, on ports of their own."""
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+#: A log is set aside as soon as one worker has died with it; no process reports to others.
+_SETTINGS = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0", "DASK_DISTRIBUTED__ADMIN__LOW_LEVEL_LOG_LENGTH": "0"}
 
 
-def main() -> None:
-    """Start a scheduler with two workers."""
-    from distributed import LocalCluster
+class Running(NamedTuple):
+    """The address of a scheduler, and its process."""
 
-    options = {
-        "n_workers": 2,
-        "threads_per_worker": 1,
-        "processes": False,
-        "dashboard_address": None,
-        "protocol": "tcp",
-    }
-    with LocalCluster(host="127.0.0.1", **options) as cluster:
-        print(cluster.scheduler_address, flush=True)
-        while sys.stdin.readline():
-            time.sleep(0.1)
+    address: str
+    process: subprocess.Popen[bytes]
 
 
-if __name__ == "__main__":
-    main()
+@contextmanager
+def cluster(folder: Path) -> Iterator[Running]:
+    """A cluster, until the end of the block."""
+    file = folder / "scheduler.json"
+    scheduler = _start("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", file)
+    workers = []
+    try:
+        while not file.exists() or not file.read_text():
+            time.sleep(0.05)
+        address = json.loads(file.read_text())["address"]
+        words = ("--no-nanny", "--nthreads", "1", "--local-directory", folder)
+        workers += [_start("worker", address, *words) for _ in range(2)]
+        yield Running(address, scheduler)
+    finally:
+        for process in (scheduler, *workers):
+            process.kill()
+            process.wait()
+
+
+def _start(program: str, *words: object) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", f"distributed.cli.dask_{program}", *map(str, words), "--no-dashboard"]
+    quiet = subprocess.DEVNULL
+    return subprocess.Popen(command, env={**os.environ, **_SETTINGS}, stdout=quiet, stderr=quiet)

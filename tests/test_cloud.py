@@ -19,23 +19,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import find_logs
 from mcaptrack.location import parse
 from mcaptrack.schema import TRACKS, Frame
-from mcaptrack.schema.provenance import Provenance
 from tests.commands import call, done
-
-
-@pytest.fixture(scope="session")
-def bare(template, tmp_path_factory) -> Path:
-    """A log before the first stage."""
-    path = tmp_path_factory.mktemp("bare") / "bare.mcap"
-    with log.read(template) as opened:
-        made = [name for name, channel in opened.channels.items() if _stage(channel) not in (None, "ingest")]
-    mcaptrack.drop(template, made, output=path)
-    return path
-
-
-def _stage(channel: log.Channel) -> str | None:
-    how = Provenance.from_metadata(channel.metadata)
-    return how.transform if how else None
 
 
 def _tracks(frames: int = 150, each: int = 8) -> list[Frame]:

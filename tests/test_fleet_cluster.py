@@ -3,43 +3,40 @@
 from __future__ import annotations
 
 import builtins
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from mcaptrack import fleet
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import cluster
-from mcaptrack.fleet.worker import Request
-from tests import fleet_tasks
+from tests import fleet_cluster, fleet_tasks
 
 pytestmark = pytest.mark.usefixtures("never_waits")
 
 
 @pytest.fixture(scope="module")
-def scheduler() -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """The address of a scheduler with two workers, and its process."""
-    command = [sys.executable, "-m", "tests.fleet_cluster"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        yield process.stdout.readline().strip(), process
-        process.kill()
+def scheduler(tmp_path_factory) -> Iterator[fleet_cluster.Running]:
+    """A scheduler with two workers."""
+    with fleet_cluster.cluster(tmp_path_factory.mktemp("cluster")) as running:
+        yield running
 
 
 def test_a_cluster_does_what_processes_do_until_its_scheduler_is_lost(scheduler, tmp_path, monkeypatch):
     address, process = scheduler
     monkeypatch.chdir(tmp_path)
-    words = {"a": "a", "b": "b", "die": "die", "hang": "hang", "refuse": "refuse", "warn": "warn"}
+    words = {"a": "a", "b": "b", "die": "die", "hang": "hang", "orphan": "orphan", "refuse": "refuse", "warn": "warn"}
     for name, text in words.items():
         Path(f"{name}.mcap").write_text(text)
     given = {"scheduler": address, "ledger": "ledger.jsonl"}
     done = fleet.run(fleet_tasks.touch, ".", {"add": "+"}, timeout_s=2.0, tries=1, **given)
     states = {one.log.name: one.state for one in done.outcomes}
     good = {f"{name}.mcap": "done" for name in ("a", "b", "warn")}
-    assert states == good | {"die.mcap": "killed", "hang.mcap": "timed-out", "refuse.mcap": "failed"}
+    killed = dict.fromkeys(("die.mcap", "orphan.mcap"), "killed")
+    assert states == good | killed | {"hang.mcap": "timed-out", "refuse.mcap": "failed"}
+    by_name = {one.log.stem: one.error for one in done.outcomes}
+    assert by_name["orphan"] == "orphan.mcap: workers of the cluster died while they processed it"
     assert done.outcomes[-1].warnings[0].code == "clock"
     assert Path("a.mcap").read_text() == "a+"
     assert not list(Path().glob(".*"))
@@ -49,7 +46,7 @@ def test_a_cluster_does_what_processes_do_until_its_scheduler_is_lost(scheduler,
             process.kill()
 
     Path("hang.hangs").unlink()
-    for name in ("die", "refuse"):
+    for name in ("die", "orphan", "refuse"):
         Path(f"{name}.mcap").write_text("good")
     lost = fleet.run(fleet_tasks.touch, ".", {"add": "+"}, on_status=lose, **given)
     assert lost.stopped == f"the scheduler at {address} was lost"
@@ -79,16 +76,3 @@ def test_what_is_wrong_is_one_line(monkeypatch, tmp_path):
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(McaptrackError, match=r"pip install 'mcaptrack\[fleet\]'"):
         fleet.run(fleet_tasks.touch, tmp_path, scheduler="tcp://127.0.0.1:9")
-
-
-def test_a_log_with_which_workers_of_the_cluster_died_is_named():
-    from distributed import KilledWorker
-
-    class Task:
-        def result(self, timeout):
-            raise KilledWorker("x", SimpleNamespace(address="tcp://none"), 3)
-
-    made = object.__new__(cluster.Cluster)
-    made._futures = {}
-    reply = made._reply(Request(Path("x.mcap"), b"", {}), Task()).result()
-    assert (reply.state, reply.error) == ("killed", "x.mcap: workers of the cluster died while they processed it")

@@ -186,7 +186,9 @@ class TestDoctor:
 
     @pytest.mark.parametrize("url", ["night", "https://me:secret@example.org/x"])
     def test_what_is_no_store_is_refused(self, url):
-        with pytest.raises(McaptrackError, match=r"is no bucket or prefix in a store; give a URL with s3://, gs://, az://"):
+        with pytest.raises(
+            McaptrackError, match=r"is no bucket or prefix in a store; give a URL with s3://, gs://, az://"
+        ):
             mcaptrack.doctor(url)
 
 

@@ -20,6 +20,7 @@ import json
 import os
 import re
 import resource
+import shlex
 import subprocess
 import sys
 import tarfile
@@ -257,6 +258,29 @@ def readme(python: Python, folder: Path) -> Iterator[str]:
     yield from run(python.path, ROOT / "tools" / "readme.py", folder).splitlines()
 
 
+def image(found: Sequence[Python], built: Built, folder: Path) -> Iterator[str]:
+    """What the Dockerfile installs, in an environment that begins empty, and the health check."""
+    text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
+    wanted = re.findall(r"^FROM python:(3\.\d+)-slim", text, re.M)[0]
+    python = next((each for each in found if each.minor == wanted), None)
+    if python is None:
+        raise Skipped(f"there is no Python {wanted} on this machine")
+    run(python.path, "-m", "venv", folder / "env")
+    inside = folder / "env" / "bin"
+    with_wheels(python, inside / "python", *shlex.split(pip_line(text)), cwd=built.source)
+    (words,) = re.findall(r"^HEALTHCHECK .*CMD (\[.*\])$", text, re.M)
+    name, *more = json.loads(words)
+    run(inside / name, *more, cwd=folder)
+    size = sum(path.lstat().st_size for path in (folder / "env" / "lib").rglob("*"))
+    yield f"{size / 1e6:.0f} MB of packages; {' '.join([name, *more])} finds no fault"
+
+
+def pip_line(text: str) -> str:
+    """What a Dockerfile lets Python do to install mcaptrack."""
+    (line,) = re.findall(r"^RUN \S*/python (-m pip install .*)$", text, re.M)
+    return str(line)
+
+
 def last_line(error: Exception) -> str:
     return next((line.strip() for line in reversed(str(error).splitlines()) if line.strip()), "")
 
@@ -363,6 +387,8 @@ def works(
                     f"Python {python.minor}, newest releases, the commands of README.md",
                     partial(readme, python, place),
                 )
+            if options.only is None:
+                yield "the installation of the Dockerfile", partial(image, found, built, folder / "image")
         elif options.only in (None, name):
             install = {"newest": newest, "lowest": lowest}[name]
             yield f"Python {python.minor}, {name} releases", partial(install, python, built, place)

@@ -41,8 +41,8 @@ class StoreCheck:
     credentials : str
         Where they come from.
     access : dict of str to str
-        Why objects can't be "list"ed, "read", "write"n, written only if they are absent ("put-if-absent"), "replace"d if
-        they are unchanged, and "delete"d; "" where they can. What could not be tried is not there.
+        Why each of "list", "write", "read", "put-if-absent" (write an object only if it is absent), "replace" (only if
+        it is unchanged) and "delete" fails; "" where it works. What could not be tried is not there.
 
     """
 

@@ -1,0 +1,118 @@
+"""The Dockerfile, as far as it can be tried without Docker, and the night's job that uses its image."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from fnmatch import fnmatch
+from pathlib import Path
+
+import pytest
+from hatchling.builders.wheel import WheelBuilder
+
+ROOT = Path(__file__).parent.parent
+TEXT = (ROOT / "Dockerfile").read_text()
+#: The instructions, and what follows them.
+LINES = [tuple(line.split(None, 1)) for line in TEXT.splitlines() if line and not line.startswith("#")]
+
+
+def named(instruction: str) -> list[str]:
+    return [words for name, words in LINES if name == instruction]
+
+
+def is_sent(path: str) -> bool:
+    """Whether .dockerignore lets a file through: the last pattern that fits it or a folder above it counts."""
+    above = [path, *(str(parent) for parent in Path(path).parents if str(parent) != ".")]
+    kept = True
+    for line in (ROOT / ".dockerignore").read_text().splitlines():
+        pattern, keeps = line.removeprefix("!"), line.startswith("!")
+        anywhere = pattern.removeprefix("**/")
+        fits = any(
+            fnmatch(name, pattern) or (anywhere != pattern and fnmatch(Path(name).name, anywhere)) for name in above
+        )
+        if line and not line.startswith("#") and fits:
+            kept = keeps
+    return kept
+
+
+def test_the_last_stage_is_slim_and_not_root_and_has_a_health_check():
+    pythons = re.findall(r"Programming Language :: Python :: (3\.\d+)", (ROOT / "pyproject.toml").read_text())
+    bases = [words.split()[0] for words in named("FROM")]
+    assert len(set(bases)) == 1
+    assert bases[0] in {f"python:{version}-slim" for version in pythons}
+    last = LINES[max(number for number, (name, _) in enumerate(LINES) if name == "FROM") :]
+    (user,) = [words for name, words in last if name == "USER"]
+    assert f"useradd --uid 10001 --create-home {user}" in TEXT
+    assert [name for name, _ in last].index("USER") < [name for name, _ in last].index("ENTRYPOINT")
+    assert not any("pip" in words for name, words in last if name == "RUN")
+    (check,) = named("HEALTHCHECK")
+    assert ast.literal_eval(check.partition("CMD ")[2]) == ["mcaptrack", "doctor", "--quiet"]
+    assert [ast.literal_eval(words) for words in named("ENTRYPOINT")] == [["mcaptrack"]]
+
+
+def test_what_is_copied_is_there_and_gives_the_wheel_of_the_repository(tmp_path):
+    for words in named("COPY"):
+        if words.startswith("--from=built"):
+            assert words.split()[1:] == ["/opt/mcaptrack", "/opt/mcaptrack"]
+            continue
+        *sources, target = words.split()
+        for source in sources:
+            path = ROOT / source
+            assert path.exists(), source
+            for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+                name = file.relative_to(ROOT)
+                if file.is_file() and "__pycache__" not in name.parts and is_sent(str(name)):
+                    place = tmp_path / target / (name if len(sources) > 1 else file.relative_to(path))
+                    place.parent.mkdir(parents=True, exist_ok=True)
+                    shutil.copy(file, place)
+    assert not is_sent("tests/conftest.py")
+    assert not is_sent(".git/config")
+    made = [WheelBuilder(str(place)).build(directory=str(tmp_path / name), versions=["standard"]) for name, place in {
+        "one": ROOT, "other": tmp_path}.items()]  # fmt: skip
+    one, other = (Path(next(iter(each))).read_bytes() for each in made)
+    assert one == other
+
+
+def test_the_installation_is_one_that_the_tool_tries_and_needs_no_torch():
+    (line,) = [words for words in named("RUN") if "pip install" in words]
+    words = shlex.split(line)
+    assert words[:-1] == [
+        "/opt/mcaptrack/bin/python",
+        "-m",
+        "pip",
+        "install",
+        "--no-cache-dir",
+        "-c",
+        "constraints.txt",
+    ]
+    extras = set(re.fullmatch(r"\.\[([\w,]+)\]", words[-1])[1].split(","))
+    assert {"cloud", "fleet"} <= extras
+    assert "train" not in extras
+    tool = (ROOT / "tools" / "installs.py").read_text()
+    assert "pip_line(text)" in tool
+    assert 'partial(image, found, built, folder / "image")' in tool
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a shell")
+def test_a_nights_job_names_what_failed_and_does_the_rest_once(template, tmp_path):
+    (tmp_path / "recordings" / "deep").mkdir(parents=True)
+    shutil.copy(template, tmp_path / "recordings" / "deep" / "a.mcap")
+    (tmp_path / "recordings" / "cut.mcap").write_bytes(template.read_bytes()[:3000])
+    environment = {**os.environ, "MCAPTRACK": f"{sys.executable} -m mcaptrack", "PYTHONPATH": str(ROOT)}
+    night = ["sh", ROOT / "examples" / "nightly.sh", tmp_path]
+    assert subprocess.run(night, env=environment, check=False).returncode == 3
+    lines = [json.loads(line) for line in (tmp_path / "nightly.log").read_text().splitlines()]
+    failed = {(line["command"], line["log"]) for line in lines if line["event"] == "log" and line["level"] == "error"}
+    assert failed == {(name, "recordings/cut.mcap") for name in ("run", "export")}
+    assert len([line for line in lines if line["event"] == "summary"]) == 2
+    assert (tmp_path / "tables" / "tracks" / "recording=a").is_dir()
+    (tmp_path / "recordings" / "cut.mcap").unlink()
+    assert subprocess.run(night, env=environment, check=False).returncode == 0
+    done = [json.loads(line) for line in (tmp_path / "run.jsonl").read_text().splitlines()]
+    assert [Path(line["location"]).name for line in done if line["state"] in ("done", "up-to-date")] == ["a.mcap"]
