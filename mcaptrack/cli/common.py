@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from functools import partial, wraps
 from pathlib import Path
 from time import monotonic
-from typing import Annotated, Any, Final, Literal, NamedTuple, ParamSpec
+from typing import Annotated, Any, Final, Literal, NamedTuple, ParamSpec, get_type_hints
 
 import typer
 
@@ -309,11 +309,18 @@ def one_line(command: Callable[P, None]) -> Callable[P, None]:
         if batch.failed or batch.is_early:
             raise typer.Exit(LOST)
 
-    own = inspect.signature(command)
+    hints = hints_of(command)
+    own = [one.replace(annotation=hints[name]) for name, one in inspect.signature(command).parameters.items()]
     added = inspect.Parameter("log_format", inspect.Parameter.KEYWORD_ONLY, default="text", annotation=LogFormat)
-    guarded.__signature__ = own.replace(parameters=[*own.parameters.values(), added])  # type: ignore[attr-defined]
-    guarded.__annotations__ = {**command.__annotations__, added.name: LogFormat}
+    guarded.__signature__ = inspect.Signature([*own, added])  # type: ignore[attr-defined]
+    guarded.__annotations__ = {**hints, added.name: LogFormat}
     return guarded
+
+
+def hints_of(command: Callable[..., Any]) -> dict[str, Any]:
+    """Return the annotations of a command; those that are text become types."""
+    hints = dict(getattr(command, "__annotations__", {}))
+    return get_type_hints(command, include_extras=True) if any(isinstance(h, str) for h in hints.values()) else hints
 
 
 def tried(inputs: int) -> None:

@@ -156,9 +156,7 @@ def takes_many(*, outputs: bool = True) -> Callable[[Callable[..., None]], Calla
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         own = inspect.signature(command).parameters
-        hints = dict(getattr(command, "__annotations__", {}))
-        if any(isinstance(hint, str) for hint in hints.values()):
-            hints = get_type_hints(command, include_extras=True)
+        hints = common.hints_of(command)
         annotations = {name: hints[name] for name in own}
         added = get_type_hints(ManyOptions, include_extras=True)
         parameters = [

@@ -17,7 +17,7 @@ from typing import IO
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import can_replace, publish_stream
-from mcaptrack.location import is_remote
+from mcaptrack.location import Url, is_remote
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource, OpenFile
 from mcaptrack.log.checksums import crc_before, crc_of
@@ -35,7 +35,7 @@ from mcaptrack.log.records import (
     Record,
     walk,
 )
-from mcaptrack.log.remote import publish_object
+from mcaptrack.log.remote import publish_object, refuse_replaced
 from mcaptrack.log.writer import LogWriter, Sink, refuse_earlier_results, verify
 from mcaptrack.schema.provenance import Provenance
 
@@ -55,6 +55,7 @@ def extend(
     sidecar is extended instead. Raises McaptrackError if the log is damaged, can't be written to, or is being written
     to by another process.
     """
+    whole = log
     if log.results is not None:
         if output is not None:
             raise McaptrackError(f"{log.path} has its results in {log.results.path}; they can't also go to {output}")
@@ -68,6 +69,8 @@ def extend(
         opened = _in_place(log, change) if is_in_place else _as_copy(log, change, output)
         with opened as writer:
             yield writer
+            if whole is not log and isinstance(whole.path, Url):
+                refuse_replaced(whole.path, whole.version)
     log.is_outdated = output is None
 
 

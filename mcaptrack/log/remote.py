@@ -21,6 +21,7 @@ from mcaptrack.log.byte_source import GAP_BYTES, Signature
 from mcaptrack.log.paths import RESULTS_SUFFIX
 from mcaptrack.log.records import Damaged
 from mcaptrack.objects import AbsentError, Version
+from mcaptrack.objects.faults import replaced
 
 #: The bytes at the end of an object that are read when it is opened. The index of most logs fits in.
 _END_BYTES: Final = 128 * 2**10
@@ -159,6 +160,12 @@ class RemoteFile:
         """The end of a read that was not announced: each read that continues the last one is longer."""
         self._ahead = min(self._ahead * 2, _MAX_AHEAD) if at == self._next else _MIN_AHEAD
         return max(end, at + self._ahead)
+
+
+def refuse_replaced(url: Url, version: Version | None) -> None:
+    """Raise McaptrackError if an object is not the version that was opened: its results would be those of another log."""
+    if objects.find(url) != version:
+        raise replaced(url)
 
 
 @contextmanager

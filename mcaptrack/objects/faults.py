@@ -19,12 +19,14 @@ _MEANINGS: Final = (
         ("InvalidAccessKeyId", "SignatureDoesNotMatch", "AuthenticationFailed"),
         "the store does not know the credentials",
     ),
+    (("Account must be specified",), "no account is named; set AZURE_STORAGE_ACCOUNT_NAME"),
     (("SlowDown", "status code: 503", "status code: 429"), "the store answers that it is overloaded"),
     (
         ("PermanentRedirect", "status code: 301", "AuthorizationHeader"),
         "the bucket is in another region; set AWS_REGION",
     ),
 )
+FORBIDDEN: Final = "the store refuses it to these credentials (forbidden)"
 #: Hosts that give machines in a cloud their credentials, if nothing else does.
 _MACHINE_HOSTS: Final = ("169.254.169.254", "169.254.170.2", "metadata.google.internal")
 
@@ -56,7 +58,7 @@ def reporting_faults(url: Url, done: str = "read") -> Iterator[None]:
     except exceptions.PreconditionError:
         raise replaced(url) from None
     except exceptions.PermissionDeniedError as error:
-        why = meaning_of(url, error) or "the store refuses it to these credentials (forbidden)"
+        why = meaning_of(url, error) or FORBIDDEN
         raise McaptrackError(f"{url} can't be {done}: {why}") from None
     except exceptions.UnauthenticatedError as error:
         why = meaning_of(url, error) or "the store asks for other credentials"
@@ -89,6 +91,8 @@ def _reason(url: Url, error: Exception) -> str:
         return f"the store can't be reached{f' at {where}' if where else ''}"
     if breaks_off(error):
         return "the answer of the store breaks off"
+    if "status code: 403" in said:
+        return FORBIDDEN
     if any(words in said for words in ("timed out", "TimedOut", "timeout")):
         return "the store does not answer in time"
     status = re.search(r"status code: (\d\d\d [A-Za-z ]+)", said)
