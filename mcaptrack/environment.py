@@ -1,4 +1,4 @@
-"""What the environment says: variables that are not options of a command (others are mistakes), cores and threads."""
+"""The list of environment variables that are not options of a command (others are mistakes), and cores and threads."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def cores() -> int:
 
 
 def share_of_cores() -> float:
-    """How many cores this process may use: those that it may run on, or the quota of its control group."""
+    """The number of cores that this process may use: those that it may run on, or the quota of its control group."""
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min([float(allowed), *cpu_quotas()])
 

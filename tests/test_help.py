@@ -96,6 +96,7 @@ class TestHelp:
             ["--quiet", "-q"],
             ["--verbose", "-v"],
             ["--config"],
+            ["--log-format"],
         ]
 
     def test_options_for_many_logs_are_the_same_in_all_commands_that_take_a_log(self):
@@ -103,9 +104,9 @@ class TestHelp:
             return [(one.opts, one.help) for one in shown(command) if one.rich_help_panel == "Many logs"]
 
         known = many("run")
-        assert len(known) == 8
+        assert len(known) == 9
         printing = [one for one in known if one[0] != ["--output-dir"]]
-        each = {*STAGES, "run", "fuse", "events", "render", "export", "recover", "drop"}
+        each = {*STAGES, "run", "fuse", "events", "ingest", "render", "export", "recover", "drop"}
         for command in COMMANDS:
             assert many(command) == (known if command in each else printing if command in ("info", "check") else [])
 

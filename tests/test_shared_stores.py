@@ -67,7 +67,7 @@ class TestClaims:
         one, other = claims_on("one"), claims_on("other", stale_s=0.05)
         one.take(LOG, NIGHT)
         assert not other.take(LOG, NIGHT).is_mine
-        for _ in range(3):  # each sign of life begins the time anew
+        for _ in range(3):  # the time begins again with each sign of life
             time.sleep(0.06)
             one.beat()
             assert not other.take(LOG, NIGHT).is_mine

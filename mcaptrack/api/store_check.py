@@ -1,4 +1,4 @@
-"""What may be done with a bucket or a prefix in a store: tried with a small hidden object, which is removed again."""
+"""Try a bucket or a prefix in a store with a small hidden object, which is removed again."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mcaptrack.location import SCHEMES, Url, hide_secrets, parse
 from mcaptrack.objects import Version
 from mcaptrack.objects.stores import described
 
-#: What is tried, and why a run needs it.
+#: The operations, and the consequence of one that fails.
 _TRIED: Final = {
     "list": "objects can't be listed",
     "write": "objects can't be written",
@@ -30,7 +30,7 @@ _REASON: Final = re.compile(r"^.*? can't be (?:read|written|removed): ")
 
 @dataclass(frozen=True)
 class StoreCheck:
-    """What may be done with a bucket or a prefix.
+    """The operations that a bucket or a prefix allows.
 
     Attributes
     ----------
@@ -78,14 +78,14 @@ def url_of_store(store: str) -> Url:
 
 
 def check_store(url: Url) -> StoreCheck:
-    """Try what a run does with a store."""
+    """Try the operations of a run on a store."""
     server, region, credentials = described(url)
     access = dict(_tries(url))
     return StoreCheck(str(url), server, region, credentials, {name: access[name] for name in _TRIED if name in access})
 
 
 def _tries(url: Url) -> Iterator[tuple[str, str]]:
-    """Yield what was tried, and why it failed; "" if it didn't."""
+    """Yield each operation, and why it failed; "" if it didn't."""
     listed: list[Url] = []
     yield "list", _why(lambda: listed.extend(found for found, _ in islice(objects.list_objects(url), 1)))
     probe = url / f".mcaptrack-doctor-{uuid4().hex}"

@@ -81,10 +81,11 @@ def find_inputs(
     """
     found: list[NamedLog] = []
     for argument in arguments:
-        location = as_location(argument)
         if str(argument) == LIST:
             found += _listed(_standard_input(), has_folders=not folders)
-        elif folders and (isinstance(location, Url) or (location.is_dir() and _has_logs(location))):
+            continue
+        location = as_location(argument)
+        if folders and (isinstance(location, Url) or (location.is_dir() and _has_logs(location))):
             found += _logs_of(argument, "", _standard_input)
         elif isinstance(location, Url) or _is_no_pattern(location):
             if isinstance(location, Path):

@@ -163,7 +163,7 @@ class RemoteFile:
 
 
 def refuse_replaced(url: Url, version: Version | None) -> None:
-    """Raise McaptrackError if an object is not the version that was opened: its results would be those of another log."""
+    """Raise McaptrackError if an object is not the version that was opened: results would be those of another log."""
     if objects.find(url) != version:
         raise replaced(url)
 
