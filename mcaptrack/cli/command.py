@@ -133,7 +133,7 @@ class Command(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the command line, and move values of old names of options to the new ones."""
-        with log_format(_said(args, "--log-format"), self.name or ""):
+        with log_format(_value_of(args, "--log-format"), self.name or ""):
             return self._parse(ctx, args)
 
     def _parse(self, ctx: Any, args: list[str]) -> list[str]:
@@ -185,7 +185,7 @@ class Command(TyperCommand):
         return f"options: {', '.join(parts)}"
 
 
-def _said(words: Sequence[str], option: str) -> str:
+def _value_of(words: Sequence[str], option: str) -> str:
     """Return the value of an option on a command line that may be wrong; "" without one."""
     for number, word in enumerate(words):
         if word == option:
