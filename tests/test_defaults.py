@@ -215,4 +215,4 @@ MANY_LOGS = {"keep_going": True, "tries": 2}
 def test_defaults_of_commands(command):
     given = {one.name: one.default for one in GROUP.commands[command].params if not one.hidden}
     said = {name: value for name, value in given.items() if value is not None and value is not False}
-    assert said == COMMANDS.get(command, {}) | (MANY_LOGS if "tries" in given else {})
+    assert said == COMMANDS.get(command, {}) | (MANY_LOGS if "tries" in given else {}) | {"log_format": "text"}

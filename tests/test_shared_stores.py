@@ -215,7 +215,8 @@ def test_a_whole_run_whose_credentials_expire_is_one_line_and_can_be_run_again(s
         code, _, err = call("run", url, "-q")
     lines = [line for line in err.splitlines() if not line.startswith("warning: ")]
     assert (code, len(lines)) == (1, 1)
-    assert lines[0].endswith("the credentials have expired; renew them")
+    assert lines[0].startswith(f"mcaptrack: {url} can't be read: ")
+    assert "the credentials may have expired" in lines[0] or "the credentials have expired; renew them" in lines[0]
     assert store.names() == ["night/b.mcap"]
     mcaptrack.run(url)
     assert store.get("night/b.results.mcap") == expected

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import inspect
-import json
 import re
 import signal
+import sys
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextvars import ContextVar
@@ -19,7 +19,7 @@ from mcaptrack.cli import common
 from mcaptrack.cli.flags import RUNNING, with_flags
 from mcaptrack.cli.inputs import only_one_output
 from mcaptrack.cli.live import LiveTable
-from mcaptrack.cli.text import is_json, say, stdout_to_stderr
+from mcaptrack.cli.text import is_json, print_line_of_json, say, stdout_to_stderr
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
 
@@ -343,7 +343,7 @@ class _Printer(Generic[T]):
             "warnings": [{"code": one.code, "message": with_flags(one.message)} for one in outcome.warnings],
             "result": result,
         }
-        print(json.dumps(line, allow_nan=False), flush=True)
+        print_line_of_json(line, sys.stdout)
 
     def _show_in_order(self, outcome: LogOutcome[T]) -> None:
         self._waiting[outcome.log] = outcome.result

@@ -96,6 +96,8 @@ def _reason(url: Url, error: Exception) -> str:
     if any(words in said for words in ("timed out", "TimedOut", "timeout")):
         return "the store does not answer in time"
     status = re.search(r"status code: (\d\d\d [A-Za-z ]+)", said)
+    if status and status[1].startswith("400"):  # to a request for the head of an object, S3 can't say why
+        return f"the store answers {status[1].strip()}; the credentials may have expired"
     return f"the store answers {status[1].strip()}" if status else said[:200]
 
 
