@@ -77,7 +77,7 @@ def evaluate(
         bool,
         common.option(
             "--smoothed",
-            panel=common.SCORES,
+            panel=labels.SCORES,
             tuning=True,
             help="Of logs: score predictions from smoothed samples, too (SORT + smoothing).",
         ),
