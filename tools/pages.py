@@ -22,6 +22,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parent.parent
 #: Reasons for not running a block.
 NOT_RUN = {
+    "docker": "it needs Docker",
     "environment": "it changes the Python environment",
     "make": "make installs packages; another job runs these targets",
     "minutes": "it takes minutes",
