@@ -11,7 +11,7 @@ COPY docs docs
 COPY schemas schemas
 COPY mcaptrack mcaptrack
 RUN python -m venv /opt/mcaptrack
-RUN /opt/mcaptrack/bin/python -m pip install --no-cache-dir -c constraints.txt ".[cloud,fleet,onnx,sql]"
+RUN /opt/mcaptrack/bin/python -m pip install --no-cache-dir -c constraints.txt ".[cloud,fleet]"
 
 FROM python:3.12-slim
 COPY --from=built /opt/mcaptrack /opt/mcaptrack
