@@ -71,7 +71,7 @@ def url_of_store(store: str) -> Url:
     if not isinstance(url, Url):
         examples = ", ".join(f"{scheme}://" for scheme in SCHEMES)
         raise McaptrackError(
-            f"{hide_secrets(store):.200} is no bucket or prefix in a store; give a URL with {examples}"
+            f"{hide_secrets(store) if '://' in store else store:.200} is no bucket or prefix in a store; give a URL with {examples}"
         )
     objects.library(url)
     return url.parent if url.suffix.lower() == ".mcap" else url
