@@ -174,7 +174,7 @@ def _links(tracks: _Tracks, max_gap_s: float, min_confidence: float, across_clas
 
 
 def _births(tracks: _Tracks) -> float:
-    """How many tracks begin in a second and in a square of the height of the usual box."""
+    """The number of tracks that begin in a second and in a square of the height of the usual box."""
     boxes = tracks.boxes
     usual_px = float(np.median(boxes[:, 3]))
     far = (boxes[:, :2] + boxes[:, 2:]).max(axis=0) - boxes[:, :2].min(axis=0)
