@@ -70,9 +70,8 @@ def url_of_store(store: str) -> Url:
     url = parse(store)
     if not isinstance(url, Url):
         examples = ", ".join(f"{scheme}://" for scheme in SCHEMES)
-        raise McaptrackError(
-            f"{hide_secrets(store) if '://' in store else store:.200} is no bucket or prefix in a store; give a URL with {examples}"
-        )
+        name = hide_secrets(store) if "://" in store else store
+        raise McaptrackError(f"{name:.200} is no bucket or prefix in a store; give a URL with {examples}")
     objects.library(url)
     return url.parent if url.suffix.lower() == ".mcap" else url
 
