@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import random
 from typing import Any
 
@@ -12,7 +13,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
 from mcaptrack.foxglove import ANNOTATIONS, IMAGE, LOG, SCENE, TRANSFORM, VIDEO
+from mcaptrack.foxglove.ros_batches import Batches
 
+ros = importlib.import_module("mcaptrack.foxglove.ros")
 EVERY = pytest.mark.parametrize("name", [ANNOTATIONS, IMAGE, LOG, SCENE, TRANSFORM, VIDEO])
 
 
@@ -113,3 +116,71 @@ def test_times_that_ros_does_not_have_are_refused():
     assert len(list(foxglove.messages_in(LOG, [(1, 2, foxglove.pack_log(last, "INFO", "a", "b"))], "cdr"))) == 1
     with pytest.raises(McaptrackError, match="ROS has times from 1970 to 2038 only"):
         list(foxglove.messages_in(LOG, [(1, 2, foxglove.pack_log(last + 1, "INFO", "a", "b"))], "cdr"))
+
+
+def alike(name: str) -> list[Any]:
+    """Messages that consist of parts of the same few forms, with other numbers and letters."""
+    draw = random.Random(name)
+    made = foxglove.message_class(name)
+    forms = [made.FromString(fill(made(), random.Random(k)).SerializeToString()) for k in range(6)]
+    out = []
+    for _ in range(30):
+        message = made()
+        for form in draw.choices(forms, k=5):
+            message.MergeFrom(form)
+        for part in (*getattr(message, "entities", ()), *getattr(message, "points", ())):
+            time = next(getattr(part, field) for field in ("timestamp",) if hasattr(part, field))
+            time.seconds, time.nanos = draw.randrange(2**24, 2**28), draw.randrange(2**21, 2**28)
+            for cube in getattr(part, "cubes", ()):
+                cube.size.x, cube.pose.position.y = draw.gauss(0, 9), draw.gauss(0, 9)
+        out.append(message)
+    return out
+
+
+@pytest.mark.parametrize("name", [SCENE, ANNOTATIONS])
+def test_parts_of_one_form_are_converted_at_once_as_they_are_one_by_one(name):
+    made = foxglove.message_class(name)
+    batches = Batches(ros._field_types(made.DESCRIPTOR), ros._check_seconds)
+    messages = [one for one in alike(name) if not has_large_numbers(one)]
+    wanted = []
+    for message in messages:
+        out = bytearray()
+        ros._appender(made.DESCRIPTOR)(message, out)
+        wanted.append(bytes(out))
+    payloads = [message.SerializeToString() for message in messages]
+    assert len(messages) > 5
+    assert batches.convert(payloads) == wanted
+    assert batches.convert(payloads[::-1]) == wanted[::-1]
+    empty = bytearray()
+    ros._appender(made.DESCRIPTOR)(made(), empty)
+    assert batches.convert([b""]) == [bytes(empty)]
+
+
+def has_large_numbers(message: Any) -> bool:
+    """Whether a message has whole numbers that aren't part of a form."""
+    return any(list(large(one)) for _, parts in message.ListFields() if hasattr(parts, "add") for one in parts)
+
+
+def large(message: Any) -> Any:
+    for field, value in message.ListFields():
+        if field.message_type and not field.message_type.full_name.startswith("google."):
+            for one in value if hasattr(value, "add") else [value]:
+                yield from large(one)
+        elif field.type in (field.TYPE_UINT32, field.TYPE_INT32) and not hasattr(value, "append") and value > 127:
+            yield field.name
+
+
+def test_messages_that_are_written_in_another_way_are_converted_field_by_field():
+    scene = foxglove.message_class(SCENE)()
+    scene.entities.add(id="a").cubes.add().size.x = 2.0
+    payload = scene.SerializeToString()
+    assert payload[0] == 0x12
+    twice = payload + payload  # in order, and two fields of a message in one part: the last one counts
+    odd = payload[:1] + bytes([payload[1] + 3]) + payload[2:] + b"\x1a\x01b"  # the id of the entity again
+    store = get_typestore(Stores.EMPTY)
+    name, _, text = foxglove.record_in(SCENE, "cdr")
+    store.register(get_types_from_msg(text.decode(), name))
+    sent = [(0, 0, payload), (1, 1, twice), (2, 2, odd)]
+    found = [store.deserialize_cdr(one, name) for *_, one in foxglove.messages_in(SCENE, sent, "cdr")]
+    assert [[entity.id for entity in one.entities] for one in found] == [["a"], ["a", "a"], ["b"]]
+    assert [one.entities[0].cubes[0].size.x for one in found] == [2.0, 2.0, 2.0]

@@ -277,6 +277,17 @@ def test_a_command_that_was_killed_before_it_wrote_the_metadata_is_made_good(cop
     assert metadata(copied) == whole
 
 
+def test_metadata_behind_a_link_is_brought_up_to_date_there(copied):
+    path, whole = copied.with_name("metadata.yaml"), metadata(copied)
+    elsewhere = copied.parent.parent / "elsewhere.yaml"
+    elsewhere.write_bytes(copied.with_name("before.yaml").read_bytes())
+    path.unlink()
+    path.symlink_to(elsewhere)
+    metadata_update.update_metadata(copied)
+    assert path.is_symlink()
+    assert metadata(copied) == whole
+
+
 def test_files_of_one_recording_may_be_written_at_once(copied, monkeypatch):
     """Another process that counted before this one began may write after it."""
     whole, before = metadata(copied), copied.with_name("before.yaml").read_bytes()

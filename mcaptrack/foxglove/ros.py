@@ -2,7 +2,8 @@
 
 Viewers draw both. In the recordings of ROS 2 only the first can be read by all tools. The definitions follow from those
 in protobuf, as those that foxglove_msgs publishes do: the same fields in the same order, and the types of ROS for
-times, points and poses. A message is written in protobuf first and converted then.
+times, points and poses. A message is written in protobuf first and converted then: lists of parts many at once
+(``ros_batches``), others field by field.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache
-from itertools import chain
+from itertools import chain, islice
 from operator import attrgetter
 from typing import Any, Final
 
@@ -18,6 +19,7 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.foxglove.messages import message_class, schema_record
+from mcaptrack.foxglove.ros_batches import Batches, FieldType, UnusualMessage
 from mcaptrack.schema.encodings import CDR, ROS2MSG, Encoding
 
 #: Types of ROS for messages of protobuf, and their definitions.
@@ -56,6 +58,8 @@ _SCALARS: Final = {
 _LINE: Final = "=" * 80
 _LITTLE_ENDIAN: Final = b"\0\1\0\0"
 _LAST_S: Final = 2**31 - 1
+#: Number of messages that are converted at once.
+_BLOCK: Final = 64
 #: Appends a message, or a field of it, to the bytes of a message.
 _Append = Callable[[Any, bytearray], None]
 _U4: Final = struct.Struct("<I")
@@ -96,10 +100,33 @@ def messages_in(
         yield from messages
         return
     made, append = message_class(schema_name), _appender(message_class(schema_name).DESCRIPTOR)
-    for t_ns, number, payload in messages:
-        out = bytearray()
-        append(made.FromString(payload), out)
-        yield t_ns, number, _LITTLE_ENDIAN + out
+    fields = _field_types(made.DESCRIPTOR)
+    batches = Batches(fields, _check_seconds) if Batches.take(fields) else None
+    coming = iter(messages)
+    while block := list(islice(coming, _BLOCK if batches else 1)):
+        try:
+            converted = batches.convert([payload for *_, payload in block]) if batches else []
+        except UnusualMessage:
+            converted = []
+        for place, (t_ns, number, payload) in enumerate(block):
+            out = bytearray(converted[place] if converted else b"")
+            if not converted:
+                append(made.FromString(payload), out)
+            yield t_ns, number, _LITTLE_ENDIAN + out
+
+
+@cache
+def _field_types(descriptor: Any) -> dict[int, FieldType]:
+    """The fields of a message by number, in their order."""
+    return {
+        field.number: FieldType(
+            _kind(field),
+            _is_list(field),
+            _field_types(field.message_type) if field.message_type else {},
+            bool(field.message_type and field.message_type.full_name.startswith("google.protobuf.")),
+        )
+        for field in descriptor.fields
+    }
 
 
 def _ros_type(descriptor: Any) -> str:
@@ -254,9 +281,13 @@ def _append_list(field: Any, get: Callable[[Any], Any]) -> _Append:
     return append
 
 
+def _check_seconds(seconds: int) -> None:
+    if not 0 <= seconds <= _LAST_S:
+        raise McaptrackError(f"a view at {seconds} s can't be a ROS message: ROS has times from 1970 to 2038 only")
+
+
 def _append_time(time: Any, out: bytearray) -> None:
-    if not 0 <= time.seconds <= _LAST_S:
-        raise McaptrackError(f"a view at {time.seconds} s can't be a ROS message: ROS has times from 1970 to 2038 only")
+    _check_seconds(time.seconds)
     _align(out, _TIME.size // 2)
     out += _TIME.pack(time.seconds, time.nanos)
 

@@ -91,7 +91,7 @@ def _update(metadata: Path) -> bool:
     after = plain_yaml.dump(whole)
     if after == before:
         return False
-    publish_bytes(metadata, after.encode())
+    publish_bytes(follow_links(metadata), after.encode())
     return True
 
 
