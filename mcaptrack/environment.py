@@ -60,6 +60,15 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or usual) / "mcaptrack"
 
 
+def release_memory() -> None:
+    """Give memory that is free back to the system. Allocators keep what the largest piece of work so far took."""
+    if sys.platform == "linux":
+        import ctypes
+
+        with suppress(OSError, AttributeError):  # another C library
+            ctypes.CDLL(None).malloc_trim(0)
+
+
 def cores() -> int:
     """The number of cores that this process may use; a part of one counts as one."""
     return math.ceil(share_of_cores())

@@ -150,7 +150,8 @@ def see(template, tmp_path, monkeypatch) -> Callable[[str], Seen]:
         monkeypatch.chdir(folder)
         code, out, err = call(*shlex.split(line))
         out = re.sub(r"(?<=127\.0\.0\.1)(:|%3A)\d{5}\b", ":any", out)  # a port that was free
-        out, err = re.sub(r'"seconds": [\d.]+', "", out), re.sub(r" in [\d.]+ s\b", "", err)  # how long it took
+        out = re.sub(r'"seconds": [\d.]+|"seconds_by_part": \{[^}]*\}', "", out)  # how long it took
+        err = re.sub(r" in [\d.]+ s\b|^  time .*\n", "", err, flags=re.MULTILINE)
         left = _digests(folder)
         files = {name: left.get(name, "removed") for name in given | left if left.get(name) != given.get(name)}
         monkeypatch.chdir(tmp_path)

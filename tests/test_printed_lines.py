@@ -63,7 +63,9 @@ def result(**changed: Any) -> RunResult:
         "written_because": "",
         "seconds": 1.26,
     }
-    plain |= {"summary": None} | {name: {} for name in ("frames", "rows", "tracks", "events", "tables")}
+    plain |= {"summary": None} | {
+        name: {} for name in ("frames", "rows", "tracks", "events", "tables", "seconds_by_part")
+    }
     plain |= dict.fromkeys(("stale", "layouts", "warnings", "notes"), ())
     return RunResult(**plain | changed)
 

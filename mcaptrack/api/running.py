@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -62,6 +63,9 @@ class RunResult:
         Routine notes, such as which stages ran because their channels were missing.
     seconds : float
         How long it took.
+    seconds_by_part : dict of str to float
+        How long each stage took, and "read", "decode" (waiting for pictures, which are decoded while others are worked
+        on), "write", "tables" and "summary".
 
     """
 
@@ -80,6 +84,7 @@ class RunResult:
     warnings: tuple[Notice, ...]
     notes: tuple[str, ...]
     seconds: float
+    seconds_by_part: Mapping[str, float]
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -157,14 +162,15 @@ def change(where: Where, act: Act, progress: Progress, tables: bool | None) -> R
         layouts = write_layouts(target, report.layouts)
         for topic in report.stale:
             warn_stale(topic, target)
-        rows = _export(target, where.force, progress, boxes) if tables and isinstance(target, Path) else {}
+        with report.watch.part("tables") if tables else nullcontext():
+            rows = _export(target, where.force, progress, boxes) if tables and isinstance(target, Path) else {}
         if tables and not isinstance(target, Path):
             notes.say(
                 f"no tables are written, because {target} is in a store; {call('export', target)} writes them here"
             )
         summary = None
         if tables is not None:
-            with logs.read(target) as opened:
+            with report.watch.part("summary"), logs.read(target) as opened:
                 summary = pipeline.summarise(opened, prefix, boxes)
     return RunResult(
         log=target,
@@ -182,6 +188,7 @@ def change(where: Where, act: Act, progress: Progress, tables: bool | None) -> R
         warnings=tuple(dict.fromkeys(warnings)),
         notes=tuple(notes),
         seconds=round(monotonic() - began, 3),
+        seconds_by_part={name: round(seconds, 3) for name, seconds in report.watch.seconds.items()},
     )
 
 

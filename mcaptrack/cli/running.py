@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 Run = Callable[..., "RunResult"]
 
 _UP_TO_DATE = "nothing to do, everything is up to date"
+#: Parts of a run are listed that take at least this share of its time.
+_SLOW_SHARE = 0.05
 
 
 def run_on_logs(given: Mapping[str, Any], name: str, function: Run, options: Mapping[str, Any]) -> None:
@@ -56,7 +58,8 @@ def _as_json(result: RunResult) -> dict[str, Any]:
         data |= {"tables": result.tables, "summary": result.summary.to_json()}
     else:
         data |= {"rows": result.rows, "tracks": result.tracks}
-    return data | {"seconds": result.seconds, "next": _next(result)}
+    data |= {"seconds": result.seconds, "seconds_by_part": dict(result.seconds_by_part)}
+    return data | {"next": _next(result)}
 
 
 def _next(result: RunResult) -> list[str]:
@@ -85,12 +88,22 @@ def _print(result: RunResult, shows_events: bool, talk: common.Talk) -> None:
     did = f"{', '.join(result.stages)} in {result.seconds:.1f} s" if result.stages else _UP_TO_DATE
     talk.say(f"{result.log}: {did}")
     lines = [*_lines_of_run(result)] if result.summary is not None else [*_lines_of_stage(result)]
+    if result.stages and (slow := _slow_parts(result)):
+        lines.append(("time", slow))
     if result.written_because and result.written_to:
         lines.append(("written", f"results are in {result.written_to}: {result.written_because}"))
     lines.append(("next", "    ".join(_next(result))))
     width = max(len(name) for name, _ in lines)
     for name, words in lines:
         talk.say(f"  {name:<{width}}  {words}")
+
+
+def _slow_parts(result: RunResult) -> str:
+    """Return how long the slow parts of a run took, the slowest first; "" for a run of less than a second."""
+    if result.seconds < 1:
+        return ""
+    slow = sorted(result.seconds_by_part.items(), key=lambda part: -part[1])
+    return ", ".join(f"{name} {seconds:.1f} s" for name, seconds in slow if seconds >= _SLOW_SHARE * result.seconds)
 
 
 def _line_of(result: RunResult, shows_events: bool) -> str:

@@ -51,6 +51,8 @@ Span = tuple[int | None, int | None]
 
 #: Limit for open chunks in bytes; above it, overlapping chunks are closed and opened again later.
 OPEN_BYTES: Final = 128 * 2**20
+#: Limit for chunks that stay open for the other channels in them, in bytes.
+_KEPT_BYTES: Final = 8 * 2**20
 #: Messages outside of chunks are read one by one if their average distance in the file is larger.
 _MAX_GAP_BYTES: Final = 16 * 2**10
 #: Chunks in a store that are smaller together are read with their indexes, others after them. Indexes that are nearer
@@ -323,7 +325,7 @@ class Messages:
         if len(chunk.message_index_offsets) == 1 and isinstance(content, memoryview):
             return content  # no other channel needs it
         self._opened[chunk.offset] = content
-        while sum(map(len, self._opened.values())) > OPEN_BYTES // 4 and len(self._opened) > 1:
+        while sum(map(len, self._opened.values())) > _KEPT_BYTES and len(self._opened) > 1:
             self._opened.popitem(last=False)
         return content
 

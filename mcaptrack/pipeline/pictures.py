@@ -15,6 +15,7 @@ import numpy as np
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Image
+from mcaptrack.pipeline.ahead import Ahead
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.schema import Frame
 from mcaptrack.schema.spill import SpillFile, Stored
@@ -39,16 +40,12 @@ class KeptPictures:
     ----------
     decoded : callable
         Gives the pictures from the first one on.
-    read : callable
-        Called for each picture that is read again without being decoded.
     max_bytes : int, optional
         The room that they may take in the file; with 0 they are always decoded again.
     """
 
-    def __init__(
-        self, decoded: Callable[[], Iterator[Frame]], read: Callable[[], None], max_bytes: int = MAX_BYTES
-    ) -> None:
-        self._decoded, self._read, self._max_bytes = decoded, read, max_bytes
+    def __init__(self, decoded: Callable[[], Iterator[Frame]], max_bytes: int = MAX_BYTES) -> None:
+        self._decoded, self._max_bytes = decoded, max_bytes
         self._kept: list[_Kept] = []
         self._file = SpillFile()
         self._is_complete = False
@@ -80,28 +77,18 @@ class KeptPictures:
         for t_ns, index, shape, there in self._kept:
             difference = np.frombuffer(self._file.get(there), np.uint8).reshape(shape)
             before = before + difference if before.shape == shape else difference
-            self._read()
             yield Frame(t_ns, index, before.copy())
 
 
-def pictures_of(
-    opened: log.Log, job: Job, stamps: list[int], progress: Callable[[str, int, int], None]
-) -> tuple[Callable[[], str], Iterable[Frame]]:
+def pictures_of(opened: log.Log, job: Job, stamps: list[int]) -> tuple[Callable[[], str], Iterable[Frame]]:
     """Return the digest (once they were read) and the pictures for a job, decoded in its transform's colour format.
 
-    The capture time of each in ns is appended to ``stamps``.
+    They are decoded in a thread. The capture time of each in ns is appended to ``stamps``.
     """
     import hashlib
 
     total, channel = hashlib.sha256(), opened.channel(job.source)
     decode = decode_bgr if traits_of(job.transform).colour == "bgr" else decode_gray
-    steps = channel.messages * traits_of(job.transform).passes
-    done = 0
-
-    def count() -> None:
-        nonlocal done
-        done += 1
-        progress(job.stage, min(done, steps), steps)
 
     def encoded(is_first: bool) -> Iterator[EncodedPicture]:
         for index, (message, picture) in enumerate(foreign.pictures(opened, channel.topic)):
@@ -110,8 +97,7 @@ def pictures_of(
                 stamps.append(picture.stamp_ns)
             where = f"{opened.path}: {channel.topic} at {message.t_ns} ns: frame {index}"
             yield EncodedPicture(message.t_ns, index, picture.format, picture.data, picture.layout, where)
-            count()
 
     stamps.clear()
     max_bytes = MAX_BYTES if traits_of(job.transform).passes > 1 else 0
-    return total.hexdigest, KeptPictures(lambda: decode(encoded(is_first=not stamps)), count, max_bytes)
+    return total.hexdigest, Ahead(KeptPictures(lambda: decode(encoded(is_first=not stamps)), max_bytes))

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from mcaptrack import log
+from mcaptrack.environment import release_memory
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes, scene_planes
@@ -22,6 +24,7 @@ from mcaptrack.pipeline.motion import path_with, side_inputs
 from mcaptrack.pipeline.pictures import pictures_of
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, planes_for, read_planes, recorded_planes
 from mcaptrack.pipeline.rebuild import plugins_of
+from mcaptrack.pipeline.timing import Stopwatch
 from mcaptrack.pipeline.visible import Channels, picture_size, without_unseen
 from mcaptrack.pipeline.write import Made, digest_of, write
 from mcaptrack.predictors import weights_sha256
@@ -49,6 +52,7 @@ class Report:
 
     ``stale`` are the channels that are out of date, because this run replaced their input. ``events`` are the numbers
     of events of each kind by channel of tracks. ``warnings`` report what was assumed, left out or looks unusual.
+    ``watch`` has the seconds of each stage, and of reading, waiting for pictures ("decode") and writing.
     """
 
     stages: list[str] = field(default_factory=list)
@@ -59,6 +63,7 @@ class Report:
     stale: list[str] = field(default_factory=list)
     events: dict[str, dict[str, int]] = field(default_factory=dict)
     warnings: list[Notice] = field(default_factory=list)
+    watch: Stopwatch = field(default_factory=Stopwatch)
 
     def count(self, topic: str, made: Made) -> None:
         """Count the frames, rows and tracks of a new channel."""
@@ -103,17 +108,20 @@ def _run(
     made: dict[str, Made] = {}
     stamps: dict[str, list[int]] = {}
     report = Report()
-    planes = read_planes(opened, prefix)
+    planes, part = read_planes(opened, prefix), report.watch.part
     for job in jobs:
-        given = _input(opened, job, made, stamps, progress, boxes)
-        source = (job.source, given.digest())
-        planes, ground, frame_id = planes_for(opened, prefix, job, given.frames, source, made, planes, choice)
+        with part("read"):
+            given = _input(opened, job, made, stamps, progress, boxes, report.watch)
+            source = (job.source, given.digest())
+        with part(job.stage):
+            planes, ground, frame_id = planes_for(opened, prefix, job, given.frames, source, made, planes, choice)
         made |= ground
         given = given._replace(frame_id=given.frame_id or frame_id)
         if job.transform.reads is DETECTIONS:
             warn_memory(given.frames)
         try:
-            made |= _run_job(opened, prefix, job, given, made, planes or ())
+            with part(job.stage):
+                made |= _run_job(opened, prefix, job, given, made, planes or ())
         except McaptrackError as error:
             if not job.is_optional:
                 raise
@@ -122,15 +130,19 @@ def _run(
         for topic in (topic for topic in job.outputs() if topic in made):
             report.count(topic, made[topic])
         report.stages.append(job.stage)
+        del given
+        release_memory()
     if watch is not None:
-        events = make_events(opened, prefix, made, watch)
+        with part(EVENTS_STAGE):
+            events = make_events(opened, prefix, made, watch)
         made |= events
         report.frames |= {topic: channel.size() for topic, channel in events.items()}
         report.events = tally(events)
         report.stages += [EVENTS_STAGE] if events else []
     if made or output is not None:
-        path, _ = path_with(opened, prefix, tracks_topic(prefix), made)
-        report.layouts = write(opened, prefix, made, planes or (), stamps, output, path, boxes.in_space())
+        with part("write"):
+            path, _ = path_with(opened, prefix, tracks_topic(prefix), made)
+            report.layouts = write(opened, prefix, made, planes or (), stamps, output, path, boxes.in_space())
     provenances = {topic: channel.provenance for topic, channel in made.items()}
     warn_findings(opened, prefix, provenances, planes or (), is_all=watch is not None or not jobs)
     report.stale = outdated_by(opened, {topic: channel.provenance.digest for topic, channel in made.items()})
@@ -296,12 +308,16 @@ def _input(
     stamps: dict[str, list[int]],
     progress: Progress,
     boxes: BoxesRead,
+    watch: Stopwatch,
 ) -> _Input:
     """Return the input of a job; the capture times of pictures in ns are appended to ``stamps``, by topic."""
     if job.source not in made and job.transform.reads is VIDEO:
         seen = stamps.setdefault(job.source, [])
-        digest, pictures = pictures_of(opened, job, seen, progress)
-        return _Input(pictures, [], digest, lambda: len(seen))
+        digest, pictures = pictures_of(opened, job, seen)
+        steps = opened.channel(job.source).messages * traits_of(job.transform).passes
+        numbers = count(1)
+        each = _Repeatable(lambda: _counted(watch.each("decode", pictures), numbers, steps, job.stage, progress))
+        return _Input(each, [], digest, lambda: len(seen))
     if job.source in made:
         frames, how = made[job.source].frames, made[job.source].provenance
         of_rows, names, frame_id = how.digest, class_names(how.to_metadata()), how.frame_id
@@ -309,7 +325,7 @@ def _input(
         frames, names, frame_id = read_named_frames(opened, job.source, job.transform.reads, job.frame_id, boxes)
         of_rows = digest_of(opened, job.source)
     classes = {str(number): name for number, name in sorted(names.items())}
-    stream = _Repeatable(lambda: _counted(frames, job.stage, progress))
+    stream = _Repeatable(lambda: _counted(frames, count(1), len(frames), job.stage, progress))
     return _Input(stream, frames, lambda: of_rows, lambda: len(frames), classes, frame_id)
 
 
@@ -321,10 +337,13 @@ def _counting(frames: Iterable[Frame], taken: list[int]) -> Iterator[Frame]:
         yield frame
 
 
-def _counted(frames: Sequence[Frame], stage: str, progress: Progress) -> Iterator[Frame]:
-    for count, frame in enumerate(frames, start=1):
+def _counted(
+    frames: Iterable[Frame], numbers: Iterator[int], total: int, stage: str, progress: Progress
+) -> Iterator[Frame]:
+    """Yield the frames, and report the next of ``numbers`` after each as the progress of a stage."""
+    for frame in frames:
         yield frame
-        progress(stage, count, len(frames))
+        progress(stage, min(next(numbers), total), total)
 
 
 def input_of(

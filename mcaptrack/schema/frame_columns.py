@@ -2,7 +2,7 @@
 
 A log of hours has more rows than fit into memory, and a frame of a few rows takes more memory as objects than as
 bytes. What is read of a log, and what stages make of it, is therefore kept in blocks of about a megabyte. The first
-blocks of a channel stay in memory; the others go, compressed, into a file without a name, which disappears with the
+block of a channel stays in memory; the others go, compressed, into a file without a name, which disappears with the
 process.
 
 Letters: F frames, N rows, B blocks.
@@ -10,10 +10,13 @@ Letters: F frames, N rows, B blocks.
 
 from __future__ import annotations
 
+import weakref
 from array import array
 from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import count
+from threading import RLock
 from typing import Final, overload
 
 import numpy as np
@@ -25,11 +28,24 @@ from mcaptrack.schema.spill import SpillFile, Stored
 
 #: The size of a block in bytes of rows.
 BLOCK_BYTES: Final = 2**20
-#: Blocks of a channel that stay in memory, and blocks of the file that are kept after they were read.
-_IN_MEMORY: Final = 4
-_CACHED: Final = 2
+#: Blocks of a channel that stay in memory, and blocks of files that are kept after they were read, of all channels.
+_IN_MEMORY: Final = 1
+_CACHED: Final = 8
 #: A block ends after so many frames, even if they have few rows.
 _MOST_PARTS: Final = 4096
+
+
+#: The blocks that were read last, by the number of their FrameColumns and of the block.
+_READ: Final[OrderedDict[tuple[int, int], Rows]] = OrderedDict()
+_READING: Final = RLock()
+_NUMBERS: Final = count()
+
+
+def _forget(number: int) -> None:
+    """Let go of the blocks of FrameColumns that are gone."""
+    with _READING:
+        for key in [key for key in _READ if key[0] == number]:
+            del _READ[key]
 
 
 class FrameColumns(Sequence[Frame]):
@@ -64,7 +80,8 @@ class FrameColumns(Sequence[Frame]):
     ) -> None:
         self.schema, self.t_ns, self.numbers, self.ends = schema, t_ns, numbers, ends
         self._first, self._blocks, self._file = first, blocks, file
-        self._read: OrderedDict[int, Rows] = OrderedDict()
+        self._number = next(_NUMBERS)
+        weakref.finalize(self, _forget, self._number)
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -135,12 +152,14 @@ class FrameColumns(Sequence[Frame]):
         block = self._blocks[number]
         if not isinstance(block, Stored):
             return block
-        rows = self._read.pop(number, None)
-        if rows is None:
-            rows = np.frombuffer(self._file.get(block), self.schema.dtype)
-        self._read[number] = rows
-        if len(self._read) > _CACHED:
-            self._read.popitem(last=False)
+        key = self._number, number
+        with _READING:
+            rows = _READ.pop(key, None)
+            if rows is None:
+                rows = np.frombuffer(self._file.get(block), self.schema.dtype)
+            _READ[key] = rows
+            if len(_READ) > _CACHED:
+                _READ.popitem(last=False)
         return rows
 
 

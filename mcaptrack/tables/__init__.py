@@ -25,10 +25,10 @@ from mcaptrack.tables.fields import RECORDING, TABLE_VERSION, TABLES, Field, Tab
 from mcaptrack.tables.files import FORMATS, Format, file_metadata, verify, write
 from mcaptrack.tables.join import join
 from mcaptrack.tables.messages import messages_table
-from mcaptrack.tables.pieces import TablePieces
 from mcaptrack.tables.read import holds_tracks, read_columns, read_tracks
 from mcaptrack.tables.results import ANSWERS, cells, pieces, tidy, write_answer
 from mcaptrack.tables.rows import TrackNames, names_by_track, rows_in_pieces, rows_table, summary_table
+from mcaptrack.tables.table_pieces import TablePieces
 
 __all__ = [
     "ANSWERS",

@@ -15,10 +15,11 @@ from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
+from mcaptrack.environment import release_memory
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish
 from mcaptrack.tables.fields import TABLE_VERSION
-from mcaptrack.tables.pieces import PIECE_ROWS, pieces_of
+from mcaptrack.tables.table_pieces import PIECE_ROWS, pieces_of
 
 Format = Literal["parquet", "arrow", "csv", "jsonl"]
 FORMATS: Final[tuple[Format, ...]] = get_args(Format)
@@ -43,6 +44,8 @@ def write(
     metadata, ``order`` names the columns by which rows are sorted. A file with the same content and metadata is left as
     it is, unless ``force``. Raises McaptrackError if the file can't be written.
     """
+    import pyarrow as pa
+
     words = {"table_version": TABLE_VERSION} | dict(provenance)
     if form in _DESCRIBED and not force:
         known = file_metadata(path, form)
@@ -71,6 +74,8 @@ def write(
                 )
     except OSError as error:
         raise McaptrackError(f"{path} can't be written: {error.strerror or error}") from error
+    pa.default_memory_pool().release_unused()
+    release_memory()
     return True
 
 

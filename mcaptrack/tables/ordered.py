@@ -20,10 +20,11 @@ from mcaptrack.schema.frame_columns import FrameColumns
 from mcaptrack.schema.framing import joined_parts
 from mcaptrack.schema.spill import SpillFile, Stored
 
-#: Rows of a group, unless one track has more.
-GROUP_ROWS: Final = 2**17
+#: Rows of a group, unless one track has more; and how many groups there are at most, each of which has a buffer.
+GROUP_ROWS: Final = 2**15
+_MOST_GROUPS: Final = 256
 #: Bytes of a group that are collected before they go into the file.
-_PIECE_BYTES: Final = 2**16
+_BUFFER_BYTES: Final = 2**16
 _BITS: Final = 16
 
 
@@ -87,8 +88,8 @@ def _divided(schema: Schema, frames: FrameColumns) -> Iterator[OrderedRows]:
         members["row"] = joined.rows.view(np.uint8).reshape(len(order), -1)[order]
         found, starts = np.unique(group[order], return_index=True)
         for one, some in zip(found.tolist(), np.split(members, starts[1:]), strict=True):
-            waiting[one].append(some)
-            if sum(part.nbytes for part in waiting[one]) >= _PIECE_BYTES:
+            waiting[one].append(some.copy())  # a part of ``members`` would keep all of it
+            if sum(part.nbytes for part in waiting[one]) >= _BUFFER_BYTES:
                 put(one)
     for one in range(len(last_of_group)):
         if waiting[one]:
@@ -105,7 +106,7 @@ def _groups(schema: Schema, frames: FrameColumns) -> Ints:
         some, here = np.unique(joined.rows["track_id"].astype(np.int64), return_counts=True)
         ids, which = np.unique(np.concatenate([ids, some]), return_inverse=True)
         counts = np.bincount(which, np.concatenate([counts, here]), len(ids)).astype(np.int64)
-    group = (np.cumsum(counts) - 1) // GROUP_ROWS
+    group = (np.cumsum(counts) - 1) // max(GROUP_ROWS, int(counts.sum()) // _MOST_GROUPS)
     return np.asarray(ids[np.append(np.flatnonzero(np.diff(group)), len(ids) - 1)], np.int64)
 
 

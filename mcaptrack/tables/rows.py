@@ -20,7 +20,7 @@ from mcaptrack.schema.framing import joined_parts, unique_values
 from mcaptrack.tables.build import repeated, table_of, times
 from mcaptrack.tables.fields import CLASS, TABLES, TRACK_CLASS, Table
 from mcaptrack.tables.ordered import OrderedRows, ordered_rows
-from mcaptrack.tables.pieces import TablePieces
+from mcaptrack.tables.table_pieces import TablePieces
 
 #: The name of people where a channel names no classes.
 _PERSON: Final = "person"

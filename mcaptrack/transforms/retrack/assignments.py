@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Ints
-from mcaptrack.transforms.retrack.samples import Samples
+from mcaptrack.transforms.retrack.samples import LogSamples
 
 
 @dataclass
@@ -29,7 +29,7 @@ class Assignments:
         """Confirm assignments of ``tracks`` (C,) up to ``step``; once this was called, unconfirmed ones are dropped."""
         self._confirmed.append((step, tracks))
 
-    def of(self, samples: Samples, steps: Sequence[int]) -> tuple[Ints, Ints, Ints, Ints]:
+    def of(self, samples: LogSamples, steps: Sequence[int]) -> tuple[Ints, Ints, Ints, Ints]:
         """Steps, tracks, input ids and samples of the assignments, in the order in which they were made; (C,) each.
 
         ``samples`` are those of all ``steps``. A track has one sample a step.

@@ -28,7 +28,7 @@ from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers
 from mcaptrack.transforms.retrack.distances import metric_distances, position_distances, prediction_distances
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
 from mcaptrack.transforms.retrack.options import ConsistencyOptions
-from mcaptrack.transforms.retrack.samples import OnlineOutputs, Samples
+from mcaptrack.transforms.retrack.samples import LogSamples, OnlineOutputs
 
 #: Cost of a pair with priority: lower than any sum of other costs.
 _PRIORITY_COST: Final = -100.0
@@ -52,7 +52,7 @@ class ConsistencyPass:
         self._histories = Histories(self._length)
         self._tracks = ActiveTracks.none(self._length, horizon)
         self.assignments = Assignments()
-        self.samples = Samples()
+        self.samples = LogSamples()
         self.steps: list[int] = []
         self.noise_m = DEFAULT_NOISE_M if options.noise_m is None else options.noise_m
         self._outputs = OnlineOutputs()

@@ -17,7 +17,7 @@ from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.by_class import Movers
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
 from mcaptrack.transforms.retrack.options import RetrackOptions
-from mcaptrack.transforms.retrack.samples import OnlineOutputs, Samples
+from mcaptrack.transforms.retrack.samples import LogSamples, OnlineOutputs
 
 
 class KeptIds:
@@ -27,7 +27,7 @@ class KeptIds:
         self._options = options
         self.noise_m = (DEFAULT_NOISE_M if options.noise_m is None else options.noise_m) / movers.unit_m
         self.assignments = Assignments()
-        self.samples = Samples()
+        self.samples = LogSamples()
         self.steps: list[int] = []
         self._last_ns = 0
         self._number: dict[int, int] = {}

@@ -23,7 +23,7 @@ from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M, MotionMod
 from mcaptrack.transforms.retrack.offline_rows import move_rows
 from mcaptrack.transforms.retrack.online_tracker import Association, OnlineTracker, Step
 from mcaptrack.transforms.retrack.options import LikelihoodOptions, RetrackOptions
-from mcaptrack.transforms.retrack.samples import Samples
+from mcaptrack.transforms.retrack.samples import LogSamples
 
 #: Predictions that are made at once: more take memory, fewer take time.
 _BATCH: Final = 4096
@@ -60,7 +60,7 @@ class LikelihoodPass:
             estimate_noise=options.noise_m is None,
         )
         self.assignments = Assignments()
-        self.samples = Samples()
+        self.samples = LogSamples()
         self.steps: list[int] = []
         self._last_ns = 0
         # steps that are not written yet

@@ -18,7 +18,7 @@ from mcaptrack.transforms.retrack.kept_ids import KeptIds
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
 from mcaptrack.transforms.retrack.offline import offline_tracks
 from mcaptrack.transforms.retrack.options import ConsistencyOptions, LikelihoodOptions, RetrackOptions
-from mcaptrack.transforms.retrack.samples import Samples
+from mcaptrack.transforms.retrack.samples import LogSamples
 
 Options = TypeVar("Options", bound=RetrackOptions)
 
@@ -30,7 +30,7 @@ class OnlinePass(Protocol):
     """
 
     assignments: Assignments
-    samples: Samples
+    samples: LogSamples
     steps: list[int]
 
     @property

@@ -20,7 +20,7 @@ from mcaptrack.transforms.retrack.linking import link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
 from mcaptrack.transforms.retrack.offline_rows import Moved, TrackRows, moved_to, rows_by_step
 from mcaptrack.transforms.retrack.options import RetrackOptions
-from mcaptrack.transforms.retrack.samples import Samples
+from mcaptrack.transforms.retrack.samples import LogSamples
 
 #: Links of tracks in metres miss by at most so much, and so much more for each second of the gap.
 MAX_MISFIT: Final = (0.6, 0.2)
@@ -34,7 +34,7 @@ def offline_tracks(
     options: RetrackOptions,
     model: MotionModel,
     assignments: Assignments,
-    samples: Samples,
+    samples: LogSamples,
     steps: Sequence[int],
     times_ns: Ints,
     movers: Movers = PEOPLE,

@@ -20,7 +20,7 @@ from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_s
 from mcaptrack.schema import Rows
 from mcaptrack.schema.framing import spans_of
 from mcaptrack.schema.resampling import ANGLES, LINEAR
-from mcaptrack.transforms.retrack.samples import Samples
+from mcaptrack.transforms.retrack.samples import LogSamples
 from mcaptrack.transforms.track_classes import vote
 
 
@@ -78,7 +78,7 @@ class Moved(NamedTuple):
         return Moved(self.xy_m[which], None if self.shift_px is None else self.shift_px[which])
 
 
-def moved_to(xy_m: Floats, rows: TrackRows, samples: Samples, planes: Planes, t_ns: Ints) -> Moved:
+def moved_to(xy_m: Floats, rows: TrackRows, samples: LogSamples, planes: Planes, t_ns: Ints) -> Moved:
     """Move rows (R,) to positions (R, 2) in m, and their boxes with them if there is a ground plane at their times."""
     if not planes:
         return Moved(xy_m, None)
@@ -116,7 +116,7 @@ def _add(rows: Rows, shift_px: Floats) -> None:
     rows["y_px"] += shift_px[:, 1]
 
 
-def rows_by_step(rows: TrackRows, samples: Samples, moved: Moved | None, steps: Sequence[int]) -> Iterator[Rows]:
+def rows_by_step(rows: TrackRows, samples: LogSamples, moved: Moved | None, steps: Sequence[int]) -> Iterator[Rows]:
     """The rows of tracks at each of ``steps``, ordered by id; each track has the class of most of its rows."""
     order = np.lexsort((rows.track, rows.step))
     rows, moved = rows.take(order), moved and moved.take(order)
@@ -136,7 +136,7 @@ def rows_by_step(rows: TrackRows, samples: Samples, moved: Moved | None, steps: 
         yield from (part[start:end] for start, end in pairwise(bounds))
 
 
-def _rows(which: TrackRows, samples: Samples) -> Rows:
+def _rows(which: TrackRows, samples: LogSamples) -> Rows:
     """Rows (R,) of tracks."""
     before, is_sample = samples.take(which.before), which.is_sample
     after, rows = before.copy(), before.copy()

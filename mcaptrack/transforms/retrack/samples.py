@@ -25,7 +25,7 @@ from mcaptrack.schema.framing import joined_parts
 HELD: Final = ("track_id", "class_id", "x_m", "y_m", "score", "observed")
 
 
-class Samples:
+class LogSamples:
     """The samples of one log: ``add`` each frame, then read them."""
 
     def __init__(self) -> None:

@@ -37,7 +37,9 @@ class TablePieces:
             end = count - count % PIECE_ROWS
             for start in range(0, end, PIECE_ROWS):
                 yield whole.slice(start, PIECE_ROWS)
-            waiting, count, is_first = [whole.slice(end)], count - end, False
+            rest = whole.slice(end)  # copied, because a slice keeps what it is a part of
+            waiting, count, is_first = [rest.take(list(range(rest.num_rows)))], count - end, False
+            del whole
         if count or is_first:
             yield pa.concat_tables(waiting)
 

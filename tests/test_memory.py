@@ -1,0 +1,199 @@
+"""What commands hold in memory doesn't grow with the rows or pictures of a log; frames in a thread; times by part."""
+
+from __future__ import annotations
+
+import threading
+import time
+import tracemalloc
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from mcaptrack import notices, tables
+from mcaptrack.errors import McaptrackError
+from mcaptrack.pipeline.ahead import Ahead
+from mcaptrack.pipeline.pictures import KeptPictures
+from mcaptrack.pipeline.timing import Stopwatch
+from mcaptrack.schema import TRACKS, Frame, frame_columns, framing
+from mcaptrack.schema.frame_columns import FrameColumns, collect
+from mcaptrack.tables import ordered, table_pieces
+from mcaptrack.transforms import PROFILES, Retrack
+from mcaptrack.transforms.retrack import likelihood
+from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
+
+PEOPLE = 12
+
+
+def walks(frames: int) -> Iterator[Frame]:
+    """People who walk side by side, each at another speed, at 2.5 Hz; half of them change their ids every minute."""
+    for number in range(frames):
+        ids = np.arange(PEOPLE) + PEOPLE * (number // 150) * (np.arange(PEOPLE) % 2)
+        x_m = 0.1 * (1 + np.arange(PEOPLE)) * number
+        rows = TRACKS.rows(
+            track_id=ids,
+            x_m=x_m,
+            y_m=3.0 * np.arange(PEOPLE),
+            observed=[True] * PEOPLE,
+            source_id=[-1] * PEOPLE,
+            class_id=[1] * PEOPLE,
+        )
+        yield Frame(400_000_000 * number, number, rows)
+
+
+def held(work: Callable[[], object]) -> tuple[int, int]:
+    """Bytes that are alive at the end of a piece of work, and the most while it lasted."""
+    tracemalloc.start()
+    try:
+        kept = work()
+        alive, most = tracemalloc.get_traced_memory()
+        del kept
+        return alive, most
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.fixture
+def small_blocks(monkeypatch):
+    monkeypatch.setattr(frame_columns, "BLOCK_BYTES", 2**13)
+    monkeypatch.setattr(framing, "PART_ROWS", 256)
+    monkeypatch.setattr(ordered, "GROUP_ROWS", 256)
+    monkeypatch.setattr(ordered, "_BUFFER_BYTES", 2**10)
+    monkeypatch.setattr(table_pieces, "PIECE_ROWS", 256)
+    monkeypatch.setattr(likelihood, "_BATCH", 128)
+    monkeypatch.setattr(likelihood, "_STEPS", 16)
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_online_retracking_holds_numbers_of_each_sample_and_no_rows():
+    """A row of tracks has 153 bytes, the predictions of a sample 840; what is held were rows once, ten times as much."""
+
+    def online(frames: int) -> LikelihoodPass:
+        run = LikelihoodPass(Retrack(predictor="cv"))
+        for frame in walks(frames):
+            run.step(frame)
+        return run
+
+    online(10)  # what is imported, and made once
+    short, long = (held(lambda frames=frames: online(frames))[0] for frames in (48, 144))
+    assert (long - short) / (96 * PEOPLE) < 110
+
+
+@pytest.mark.parametrize("name", ["default", "authors"])
+@pytest.mark.usefixtures("small_blocks")
+def test_retracking_is_the_same_whatever_the_size_of_blocks(name, monkeypatch):
+    small = [[frame.rows.tolist() for frame in result] for result in PROFILES[name](walks(40))]
+    monkeypatch.setattr(frame_columns, "BLOCK_BYTES", 2**20)
+    large = [[frame.rows.tolist() for frame in result] for result in PROFILES[name](walks(40))]
+    assert repr(small) == repr(large)
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_a_table_is_made_in_pieces():
+    """All rows and their columns would take four times as much."""
+    short, long = (collect(TRACKS, walks(frames)) for frames in (100, 400))
+
+    def read(frames: FrameColumns) -> int:
+        made = tables.rows_in_pieces(TRACKS, {"/a": frames})
+        assert [piece.num_rows for piece in made][:-1] == [256] * (made.num_rows // 256)
+        return made.num_rows
+
+    read(short)
+    few, many = (held(lambda frames=frames: read(frames))[1] for frames in (short, long))
+    assert many - few < 0.6 * (300 * PEOPLE) * TRACKS.dtype.itemsize
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_rows_that_were_divided_are_ordered_by_track_and_time():
+    rng = np.random.default_rng(1)
+    frames = [
+        Frame(7 * n, n + 3, TRACKS.rows(track_id=rng.integers(-40, 9000, k) ** 3, x_m=rng.random(k), y_m=rng.random(k),
+                                        observed=[True] * k, source_id=[-1] * k))
+        for n, k in enumerate(rng.integers(0, 40, 200))
+    ]  # fmt: skip
+    columns = collect(TRACKS, frames)
+    parts = list(ordered.ordered_rows(TRACKS, columns, by_track=True))
+    assert len(parts) > 3
+    rows = columns.rows()
+    order = np.argsort(rows["track_id"], kind="stable")
+    assert np.concatenate([part.place for part in parts]).tolist() == order.tolist()
+    assert np.concatenate([part.rows["x_m"] for part in parts]).tolist() == rows["x_m"][order].tolist()
+    of_row = np.repeat(np.arange(len(frames)), [len(frame.rows) for frame in frames])
+    assert np.concatenate([part.frame for part in parts]).tolist() == of_row[order].tolist()
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_rows_are_taken_from_blocks_in_any_order():
+    columns = collect(TRACKS, walks(200))
+    places = np.random.default_rng(0).integers(0, 200 * PEOPLE, 500)
+    assert repr(columns.take(places)) == repr(columns.rows()[places])
+    assert len(columns.take(places[:0])) == 0
+
+
+def test_pictures_that_are_kept_are_not_in_memory():
+    rng = np.random.default_rng(0)
+    picture = rng.integers(0, 256, (100, 100)).astype(np.uint8)
+
+    def kept() -> KeptPictures:
+        pictures = KeptPictures(lambda: (Frame(n, n, np.roll(picture, 50 * n)) for n in range(50)))
+        assert len(list(map(np.shape, (frame.rows for frame in pictures)))) == 50
+        return pictures
+
+    assert held(kept)[0] < 5 * picture.nbytes
+
+
+# Frames that are made in a thread
+
+
+def test_frames_are_made_ahead_and_read_as_often_as_wanted():
+    made = []
+
+    class Source:
+        def __iter__(self) -> Iterator[Frame]:
+            for number in range(20):
+                made.append(number)
+                yield Frame(number, number, np.zeros(0))
+
+    frames = Ahead(Source())
+    reading = iter(frames)
+    next(reading)
+    for _ in range(200):
+        if len(made) > 2:
+            break
+        time.sleep(0.01)
+    assert 2 < len(made) < 8
+    assert [frame.index for frame in reading] == list(range(1, 20))
+    assert [frame.index for frame in frames] == list(range(20))
+
+
+def test_errors_and_warnings_of_the_thread_are_those_of_the_reader():
+    def broken() -> Iterator[Frame]:
+        notices.warn("odd")
+        yield Frame(0, 0, np.zeros(0))
+        raise McaptrackError("frame 1 can't be decoded")
+
+    with notices.collected() as warnings, pytest.raises(McaptrackError, match="frame 1"):
+        list(Ahead(broken()))
+    assert [notice.message for notice in warnings] == ["odd"]
+
+
+def test_the_thread_ends_when_no_more_frames_are_wanted():
+    def endless() -> Iterator[Frame]:
+        while True:
+            yield Frame(0, 0, np.zeros(0))
+
+    before = threading.active_count()
+    reading = iter(Ahead(endless()))
+    next(reading)
+    assert threading.active_count() == before + 1
+    reading.close()
+    assert threading.active_count() == before
+
+
+def test_time_counts_for_the_innermost_part():
+    watch = Stopwatch()
+    with watch.part("detect"):
+        for _ in watch.each("decode", (time.sleep(0.02) for _ in range(3))):
+            time.sleep(0.01)
+    assert 0.06 <= watch.seconds["decode"] < 0.5
+    assert 0.03 <= watch.seconds["detect"] < 0.5
