@@ -19,7 +19,7 @@ from mcaptrack.schema import TRACKS, Frame, frame_columns, framing
 from mcaptrack.schema.frame_columns import FrameColumns, collect
 from mcaptrack.tables import ordered, table_pieces
 from mcaptrack.transforms import PROFILES, Retrack
-from mcaptrack.transforms.retrack import likelihood
+from mcaptrack.transforms.retrack import identity_swaps, likelihood
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
 
 PEOPLE = 12
@@ -33,7 +33,7 @@ def walks(frames: int) -> Iterator[Frame]:
         rows = TRACKS.rows(
             track_id=ids,
             x_m=x_m,
-            y_m=3.0 * np.arange(PEOPLE),
+            y_m=1.5 * np.arange(PEOPLE),
             observed=[True] * PEOPLE,
             source_id=[-1] * PEOPLE,
             class_id=[1] * PEOPLE,
@@ -62,6 +62,7 @@ def small_blocks(monkeypatch):
     monkeypatch.setattr(table_pieces, "PIECE_ROWS", 256)
     monkeypatch.setattr(likelihood, "_BATCH", 128)
     monkeypatch.setattr(likelihood, "_STEPS", 16)
+    monkeypatch.setattr(identity_swaps, "_CELLS", 64)
 
 
 @pytest.mark.usefixtures("small_blocks")
@@ -84,6 +85,7 @@ def test_online_retracking_holds_numbers_of_each_sample_and_no_rows():
 def test_retracking_is_the_same_whatever_the_size_of_blocks(name, monkeypatch):
     small = [[frame.rows.tolist() for frame in result] for result in PROFILES[name](walks(40))]
     monkeypatch.setattr(frame_columns, "BLOCK_BYTES", 2**20)
+    monkeypatch.setattr(identity_swaps, "_CELLS", 2**18)
     large = [[frame.rows.tolist() for frame in result] for result in PROFILES[name](walks(40))]
     assert repr(small) == repr(large)
 

@@ -10,6 +10,7 @@ Letters: C encounters, T steps of them, N rows of trajectories.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -28,6 +29,8 @@ _MARGIN: Final = 10
 #: there (and less for each that takes over the input id of the other).
 _SWAP_COST: Final = 4.0
 _SAME_ID_COST: Final = 1.0
+#: Steps of encounters that are computed with at once.
+_CELLS: Final = 2**18
 #: The least gain in log likelihood of swaps over none.
 _MIN_GAIN: Final = 1.0
 
@@ -47,15 +50,19 @@ def resolve_swaps(
     i, j, low, high = find_encounters(trajectories)
     if len(i) == 0:
         return track, 0
-    steps = low[:, None] + np.arange(int((high - low).max()) + 1)
-    inside = steps <= high[:, None]
     begin = trajectories.first[:-1] - trajectories.step[trajectories.first[:-1]]
-    row_i = np.where(inside, steps + begin[i][:, None], 0)
-    row_j = np.where(inside, steps + begin[j][:, None], 0)
-    relative = np.where(inside[..., None], trajectories.xy_m[row_i] - trajectories.xy_m[row_j], np.nan)
-    id_i, id_j = np.where(inside, input_id[row_i], -1), np.where(inside, input_id[row_j], -1)
-    cost = _SWAP_COST + _SAME_ID_COST * _continuity(id_i, id_j)
-    swapped, gain = find_swaps(relative, cost, step_s, model.noise_m, model.speed_m_per_s)
+    swapped: dict[int, Bools] = {}
+    gain = np.zeros(len(i))
+    for part in _batches(high - low + 1):
+        steps = low[part, None] + np.arange(int((high - low)[part].max()) + 1)
+        inside = steps <= high[part, None]
+        row_i = np.where(inside, steps + begin[i[part]][:, None], 0)
+        row_j = np.where(inside, steps + begin[j[part]][:, None], 0)
+        relative = np.where(inside[..., None], trajectories.xy_m[row_i] - trajectories.xy_m[row_j], np.nan)
+        id_i, id_j = np.where(inside, input_id[row_i], -1), np.where(inside, input_id[row_j], -1)
+        cost = _SWAP_COST + _SAME_ID_COST * _continuity(id_i, id_j)
+        found, gain[part] = find_swaps(relative, cost, step_s, model.noise_m, model.speed_m_per_s)
+        swapped |= {one: found[row].copy() for row, one in enumerate(part.tolist()) if gain[one] >= _MIN_GAIN}
     owner, used, changed = track.copy(), np.zeros(count, bool), 0
     for encounter in np.argsort(-gain, kind="stable").tolist():
         if gain[encounter] < _MIN_GAIN:
@@ -65,13 +72,24 @@ def resolve_swaps(
             continue
         used[a] = used[b] = True
         changed += 1
-        is_swapped = swapped[encounter, : high[encounter] - low[encounter] + 1]
+        is_swapped = swapped[encounter][: high[encounter] - low[encounter] + 1]
         for own, other in ((a, b), (b, a)):
             rows = slice(trajectories.first[own], trajectories.first[own + 1])
             since = trajectories.step[rows] - low[encounter]
             goes = (since >= 0) & is_swapped[np.clip(since, 0, len(is_swapped) - 1)]
             owner[rows] = np.where(goes, other, own)
     return owner, changed
+
+
+def _batches(length: Ints) -> Iterator[Ints]:
+    """Encounters of similar length together, each once, as many as are computed with at once."""
+    order = np.argsort(length, kind="stable")
+    first = 0
+    while first < len(order):
+        cells = np.arange(1, len(order) - first + 1) * length[order[first:]]  # those that are shorter are padded
+        last = first + max(int(np.searchsorted(cells, _CELLS, "right")), 1)
+        yield order[first:last]
+        first = last
 
 
 def find_encounters(trajectories: Trajectories) -> tuple[Ints, Ints, Ints, Ints]:
