@@ -6,7 +6,7 @@
 
 The first table has the default without one part each, the second the way from the paper to the default, one step a row.
 `--corrupted` are true tracks with all kinds of `corruptions.py`: their scores are means over seeds, with the standard
-deviation. Without any data they are synthetic crowds. `--scenes` are folders as of `reproduce.py`, drawn once: their
+deviation. Without a folder they are synthetic crowds. `--scenes` are folders as of `reproduce.py`, drawn once: their
 spread is that of 200 choices of as many scenes with replacement. IDF1 / MOTA / identity switches within 1 m, by
 motmetrics' rules. Tables are printed, and with -o they replace those between the marks of a page.
 """
@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -71,17 +71,33 @@ STEPS: dict[str, tuple[str, Retracking]] = {
 }
 
 
-#: The default without one part each; each row's options are those of `mcaptrack retrack`.
-PARTS: dict[str, tuple[str, Retracking]] = {
-    "the default": ("", DEFAULT),
-    "no false-track removal": ("--track-confidence 0", replace(DEFAULT, track_confidence=0.0)),
-    "no offline linking": ("--link-s 0", replace(DEFAULT, link_s=0.0)),
-    "no identity swaps at encounters": ("--no-resolve-swaps", replace(DEFAULT, resolve_swaps=False)),
-    "no merged detections": ("--merge-distance-m 0", replace(DEFAULT, merge_distance_m=0.0)),
-    "no smoothing": ("--no-smooth", replace(DEFAULT, smooth=False)),
-    "noise given instead of estimated": ("--noise-m 0.2", replace(DEFAULT, noise_m=0.2)),
-    "input ids ignored": ("--same-id-bonus 0", replace(DEFAULT, same_id_bonus=0.0)),
+#: Numbers that switch a part off.
+_OFF = {"track_confidence": 0.0, "link_s": 0.0, "merge_distance_m": 0.0, "same_id_bonus": 0.0, "noise_m": 0.2}
+_NAMES = {
+    "track_confidence": "false-track removal",
+    "link_s": "offline linking",
+    "merge_distance_m": "merged detections",
+    "same_id_bonus": "input ids",
+    "noise_m": "estimated noise",
+    "resolve_swaps": "identity swaps at encounters",
+    "smooth": "smoothing",
 }
+
+
+def _parts() -> dict[str, tuple[str, Retracking]]:
+    """The default without one part each, and the options of `mcaptrack retrack` that leave it out."""
+    out: dict[str, tuple[str, Retracking]] = {"the default": ("", DEFAULT)}
+    for field in fields(DEFAULT):
+        flag = field.name.replace("_", "-")
+        name = f"no {_NAMES.get(field.name, field.name.replace('_', ' '))}"
+        if field.name in _OFF:
+            out[name] = f"--{flag} {_OFF[field.name]:g}", replace(DEFAULT, **{field.name: _OFF[field.name]})
+        elif getattr(DEFAULT, field.name) is True:
+            out[name] = f"--no-{flag}", replace(DEFAULT, **{field.name: False})
+    return out
+
+
+PARTS = _parts()
 TABLES = {"Without one part": PARTS, "From the paper to the default": STEPS}
 INPUT = "the input"
 CHOICES = 200
@@ -161,7 +177,7 @@ def main() -> None:
     retrackers: dict[str, Retracker | None] = {INPUT: None}
     retrackers |= {name: options for rows in TABLES.values() for name, (_, options) in rows.items()}
     columns: dict[str, tuple[dict[str, Scores], bool]] = {}
-    for folder in given.corrupted or ([] if given.scenes else [None]):
+    for folder in given.corrupted or [None]:
         name = f"{'synthetic crowds' if folder is None else folder}, corrupted, {given.seeds} seeds"
         columns[name] = corrupted(retrackers, folder, given.seeds, given.count, given.steps), True
     for folder in given.scenes:
