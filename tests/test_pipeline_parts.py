@@ -17,11 +17,12 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.pipeline import drawing, findings
 from mcaptrack.pipeline import write as writing
+from mcaptrack.pipeline.checks import _lacks
 from mcaptrack.pipeline.spaces import check_spaces
 from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, INGEST, VIEW, Provenance, digest
-from mcaptrack.transforms import STAGES, OcSort, Predict, Retrack, Sample, Sort, Transform
+from mcaptrack.transforms import STAGES, KnnDetector, OcSort, Predict, Retrack, Sample, Sort, Transform
 from tests.worlds import boxes_at, ns, tracks_at, walk
 
 PLANE = GroundPlane((0.1, 0, 0, 0, 0.1, 0, 0, 0, 1), 640, 480)
@@ -842,3 +843,22 @@ def test_a_frame_without_boxes_in_space_has_no_effect(tmp_path, frame_id, is_sai
         check_spaces(opened, "/camera", [], frame_id)
     wanted = "`frame=` has no effect: only recorded 3D boxes are brought to a frame"
     assert [(one.code, one.message) for one in said] == ([("option-not-used", wanted)] if is_said else [])
+
+
+@pytest.mark.parametrize(
+    ("stage", "transform", "source", "is_ingest_proposed"),
+    [
+        ("detect", KnnDetector(), "/camera/video", True),
+        ("detect", KnnDetector(), "/door/video", False),
+        ("sample", Sample(), "/camera/none", False),
+    ],
+)
+def test_a_missing_input_is_named_with_what_there_is_and_what_helps(
+    tmp_path, stage, transform, source, is_ingest_proposed
+):
+    channels = {"/camera/tracks": (TRACKS, Provenance(INGEST, {}), paced(2.5))}
+    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+        words = _lacks(opened, "/camera", pipeline.Job(stage, transform, source, "/camera/x"))
+    assert words.startswith(f"{tmp_path / 'a.mcap'} has no channel {source} for {stage}; it has /camera/tracks. ")
+    assert ("add pictures with" in words) is is_ingest_proposed
+    assert words.endswith("shows more") is not is_ingest_proposed
