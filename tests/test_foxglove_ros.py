@@ -130,7 +130,7 @@ def alike(name: str) -> list[Any]:
             message.MergeFrom(form)
         for part in (*getattr(message, "entities", ()), *getattr(message, "points", ())):
             time = next(getattr(part, field) for field in ("timestamp",) if hasattr(part, field))
-            time.seconds, time.nanos = draw.randrange(2**24, 2**28), draw.randrange(2**21, 2**28)
+            time.seconds, time.nanos = (2 ** draw.randrange(14, 28) for _ in range(2))
             for cube in getattr(part, "cubes", ()):
                 cube.size.x, cube.pose.position.y = draw.gauss(0, 9), draw.gauss(0, 9)
         out.append(message)
