@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -317,6 +318,20 @@ class TestClaims:
         path.write_text(json.dumps({"host": "other", "pid": 1, "started": None}))
         mine.release("x")
         assert path.exists()
+
+    @pytest.mark.parametrize("left", [None, b"", b'{"host"'])
+    def test_a_disk_that_is_full_has_no_claims(self, tmp_path, monkeypatch, left):
+        path = tmp_path / claim_name("x")
+        if left is not None:  # by a fleet that was killed
+            path.write_bytes(left)
+            os.utime(path, (0, 0))
+
+        def full(*_):
+            raise OSError(errno.ENOSPC, "no space left")
+
+        monkeypatch.setattr(claims.os, "write", full)
+        assert Claims().take("x", tmp_path) == (True, "")
+        assert not path.exists()
 
     def test_a_folder_that_cannot_be_written_has_no_claims(self, tmp_path):
         assert Claims().take("x", tmp_path / "missing").is_mine

@@ -58,10 +58,13 @@ class Claims:
         except OSError:  # a folder that can't be written: the command says so, if it matters
             return Taken(is_mine=True)
         try:
-            os.write(handle, content)
+            is_written = _write(handle, content)
         finally:
             os.close(handle)
-        self._mine[location] = path
+        if is_written:
+            self._mine[location] = path
+        else:
+            path.unlink(missing_ok=True)
         return Taken(is_mine=True)
 
     def _take_over(self, location: str, path: Path, content: bytes) -> Taken:
@@ -72,7 +75,9 @@ class Claims:
                 if not is_stale or os.fstat(handle).st_ino != path.stat().st_ino:
                     return Taken(is_mine=False)
                 os.ftruncate(handle, 0)
-                os.pwrite(handle, content, 0)
+                if not _write(handle, content):
+                    path.unlink()
+                    return Taken(is_mine=True)
         except OSError:  # it was given up at this moment, or is taken over by another fleet
             return Taken(is_mine=False)
         self._mine[location] = path
@@ -115,6 +120,14 @@ class Claims:
 def claim_name(location: str) -> str:
     """Return the name of the file or object that claims a log."""
     return f".mcaptrack-{hashlib.sha256(os.fsencode(location)).hexdigest()[:24]}.claim"
+
+
+def _write(handle: int, content: bytes) -> bool:
+    """Write a claim. Returns False if the disk is full: the command says so where it matters."""
+    try:
+        return os.write(handle, content) == len(content)
+    except OSError:
+        return False
 
 
 def _taken_over(location: str, owner: Mapping[str, Any]) -> str:
