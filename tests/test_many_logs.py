@@ -7,10 +7,13 @@ import json
 import os
 import shutil
 import sys
+import time
+from datetime import datetime
 from pathlib import Path
 
 import pytest
 
+from mcaptrack.cli import common
 from mcaptrack.fleet import FleetStatus, Running
 from tests.commands import call, done
 
@@ -103,6 +106,71 @@ def test_commands_that_combine_logs_take_folders_and_lists(folder, monkeypatch):
 )
 def test_what_is_wrong_is_one_line(folder, words, said):
     assert call("check", "logs", *words) == (1, "", f"mcaptrack: {said}\n")
+
+
+def test_lines_of_json_say_when_what_ended_and_how(folder, monkeypatch):
+    (folder / "logs" / "noise.mcap").write_bytes(b"noise")
+    monkeypatch.setattr(common, "PROGRESS_S", 0.0)
+    code, out, err = call("export", "logs", "--jobs", "2", "--log-format", "json", "--json-lines")
+    said, results = [[json.loads(line) for line in text.splitlines()] for text in (err, out)]
+    assert code == 3
+    assert all({"time", "level", "event", "command", "message"} <= line.keys() for line in said)
+    times = [datetime.fromisoformat(line["time"]) for line in said]
+    assert times == sorted(times)
+    assert abs(times[-1].timestamp() - time.time()) < 60
+    ended = {line["log"]: (line["level"], line["state"]) for line in said if line["event"] == "log"}
+    good = {f"logs/{name}.mcap": ("info", "done") for name in ("a", "deep/b")}
+    assert ended == good | {"logs/noise.mcap": ("error", "failed")}
+    assert {one["log"]: (one["state"], one["error"] is None) for one in results} == {
+        **dict.fromkeys(good, ("done", True)),
+        "logs/noise.mcap": ("failed", False),
+    }
+    rows = {one["log"]: one["result"] and one["result"]["rows"]["tracks"] for one in results}
+    assert rows["logs/a.mcap"] == rows["logs/deep/b.mcap"] > 0
+    assert rows["logs/noise.mcap"] is None
+    (total,) = [line for line in said if line["event"] == "summary"]
+    assert (total["logs"], total["done"], total["failed"]) == (3, 2, 1)
+    moving = [line for line in said if line["event"] == "progress"]
+    assert all(line["total"] == 3 for line in moving)
+    assert {one["log"] for line in moving for one in line["running"]} <= set(ended)
+    assert (said[-1]["level"], said[-1]["failed"]) == ("error", 1)
+
+
+def test_lines_of_json_of_one_log_and_of_a_fault_of_the_program(folder, monkeypatch):
+    monkeypatch.setattr(common, "PROGRESS_S", 0.0)
+    ran = done("track", "logs/a.mcap", "--force", "--log-format", "json")
+    said = [json.loads(line) for line in ran.err.splitlines()]
+    assert ("progress", "track") in {(line["event"], line.get("stage")) for line in said}
+    (ended,) = [line for line in said if line["event"] == "log"]
+    assert (ended["log"], ended["state"]) == ("logs/a.mcap", "done")
+    code, _, err = call("check", "logs", "--jobs", "many", "--log-format=json")
+    assert (code, json.loads(err)["level"]) == (2, "error")
+    monkeypatch.setattr("mcaptrack.info", lambda *_, **__: 1 / 0)
+    code, _, err = call("info", "logs/a.mcap", "--log-format", "json")
+    fault = json.loads(err)
+    assert (code, fault["level"]) == (1, "error")
+    assert "ZeroDivisionError: division by zero" in fault["message"]
+    assert "Traceback" in fault["traceback"]
+    assert call("check", "none.mcap").err.startswith("mcaptrack: none.mcap")
+
+
+def test_many_inputs_are_ingested_by_workers_and_once(folder, monkeypatch):
+    Path("labels").mkdir()
+    for name in ("x", "y"):
+        Path(f"labels/{name}.txt").write_text("1,1,5,5,9,9\n2,1,6,5,9,9\n")
+    words = ("--as", "truth", "--fps", "10", "--jobs", "2", "--ledger", "ingest.jsonl", "--output-dir", "made")
+    first = json.loads(done("ingest", "labels/*.txt", *words, "--json").out)
+    assert [one["log"] for one in first["results"]] == ["made/x.mcap", "made/y.mcap"]
+    assert first["fleet"]["done"] == 2
+    Path("labels/y.txt").write_text("1,1,5,5,9,9\n")
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"labels/x.txt\nlabels/y.txt\n")))
+    code, out, err = call("ingest", "-", *words, "--json")
+    totals = json.loads(out)["fleet"]
+    assert (code, totals["skipped"], totals["failed"]) == (3, 1, 1)
+    assert "made/y.mcap exists" in err
+    assert (folder / "made" / "x.mcap").exists()
+    code, _, err = call("ingest", "labels/x.txt", "labels/y.txt", "-o", "z.mcap")
+    assert (code, "can't all be written to z.mcap" in err) == (1, True)
 
 
 def test_the_table_on_a_terminal_names_the_logs_that_run(folder):
