@@ -9,6 +9,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import pytest
@@ -17,9 +18,10 @@ from hypothesis import strategies as st
 
 import mcaptrack
 from mcaptrack import McaptrackError
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import SIGHTINGS, Frame
 from mcaptrack.testing import check_transform
-from mcaptrack.transforms.fuse import FootFuser
+from mcaptrack.transforms.fuse import CameraView, FootFuser
 from mcaptrack.transforms.fuse.grouping import Places, distances, group, means
 
 PEOPLE, SECONDS = 5, 16
@@ -324,6 +326,79 @@ def test_groups_have_each_camera_once_and_can_not_be_joined_further(
         mean = total @ sum(part @ at for part, at in zip(inverse, where.xy_m[of == one], strict=True))
         assert centre.xy_m[one] == pytest.approx(mean, abs=1e-6)
         assert centre.cov[one] == pytest.approx([total[0, 0], total[0, 1], total[1, 1]], abs=1e-6)
+
+
+def camera_of(matrix: Sequence[Sequence[float]], **others: object) -> CameraView:
+    plane = GroundPlane(tuple(np.array(matrix, float).ravel()), int(WIDTH), int(HEIGHT))
+    return CameraView(name="camera", planes=((0, plane),), **others)  # type: ignore[arg-type]
+
+
+class TestOneView:
+    #: 1 px is 1 cm along the first axis; along the second the picture is sheared.
+    SHEARED: Final = ((0.01, 0.02, 1.0), (0.0, 0.03, 2.0), (0.0, 0.0, 1.0))
+
+    def test_the_covariance_of_a_foot_is_that_of_its_pixels_and_of_the_plane(self) -> None:
+        box = np.array([[80.0, 100.0, 40.0, 100.0]])  # its foot is at (100, 200) px, uncertain by 4 px
+        places = camera_of(self.SHEARED).places(box, 0, 0.04, 0.1)
+        assert places.xy_m[0] == pytest.approx([0.01 * 100 + 0.02 * 200 + 1, 0.03 * 200 + 2])
+        across, along = np.array([0.01, 0.0]) * 4, np.array([0.02, 0.03]) * 4
+        cov = np.outer(across, across) + np.outer(along, along) + 0.01 * np.eye(2)
+        assert places.cov[0] == pytest.approx([cov[0, 0], cov[0, 1], cov[1, 1]])
+
+    def test_the_heights_of_people_are_learned_in_spite_of_others(self) -> None:
+        rng = np.random.default_rng(3)
+        foot = rng.uniform((0, 100), (WIDTH, HEIGHT), (60, 2))
+        high = 0.02 * foot[:, 0] + 0.3 * foot[:, 1] + 7
+        high[:6] *= 3  # false boxes
+        boxes = np.column_stack([foot[:, 0] - 10, foot[:, 1] - high, np.full(60, 20.0), high])
+        found = camera_of(np.eye(3)).with_heights(boxes).heights
+        assert found is not None
+        assert foot[6:] @ found[:2] + found[2] == pytest.approx(high[6:], rel=0.06)
+        assert camera_of(np.eye(3)).with_heights(boxes[:19]).heights is None  # too few
+
+    def test_what_is_visible_of_people_is_in_the_picture_and_not_behind_others(self) -> None:
+        view = camera_of(np.eye(3), heights=(0.0, 0.0, 100.0))  # each is 40 px wide
+        feet = np.array([[200.0, 300.0], [220.0, 320.0], [0.0, 400.0], [500.0, HEIGHT + 50], [700.0, 200.0]])
+        # The second one hides 20 x 80 px of the first; the third is cut at the left, the fourth below.
+        assert view.visible(feet, 0) == pytest.approx([0.6, 1.0, 0.5, 0.5, 1.0])
+        assert camera_of(np.eye(3)).visible(feet[:2], 0) == pytest.approx([1.0, 1.0])  # heights that aren't known
+
+    def test_rates_are_those_of_the_share_that_is_visible(self) -> None:
+        view = camera_of(np.eye(3), detects=(0.1, 0.2, 0.3, 0.4))
+        assert view.rate(np.array([0.0, 0.1, 0.3, 0.6, 0.9, 1.0])).tolist() == [0.0, 0.1, 0.2, 0.3, 0.4, 0.4]
+
+
+class TestEvidence:
+    @staticmethod
+    def fused(cameras: Sequence[int]) -> np.void:
+        """One person at (300, 300), seen by some of three cameras that detect 80 % of people; 20 % of boxes are false."""
+        view = camera_of(np.eye(3), heights=(0.0, 0.0, 100.0), detects=(0.8,) * 4, false_share=0.2)
+        rows = sightings([(camera, 300.0, 300.0, 0.1, 0.1, 0.0) for camera in cameras])
+        ((found, _),) = FootFuser(min_score=0.0, views=(view,) * 3)([Frame(0, 0, rows)])
+        return found.rows[0]
+
+    @pytest.mark.parametrize(
+        ("cameras", "odds"),
+        [
+            # a true box for each false one (4), a camera that sees 8 times as many as by chance, one that sees nobody
+            ([0], 4 * (0.2 / 0.9) ** 2),
+            ([0, 1], 4 * 8 * (0.2 / 0.9)),
+            ([2, 1, 0], 4 * 8 * 8),
+        ],
+    )
+    def test_each_camera_counts_for_or_against(self, cameras: list[int], odds: float) -> None:
+        row = self.fused(cameras)
+        assert row["score"] == pytest.approx(odds / (1 + odds), rel=1e-5)
+        assert (row["seen_by"], row["expected_by"]) == (len(cameras), 3)
+
+    def test_what_is_less_probable_is_left_out(self) -> None:
+        rows = sightings([(0, 300.0, 300.0, 0.1, 0.1, 0.0), (0, 800.0, 300.0, 0.1, 0.1, 0.0)])
+        view = camera_of(np.eye(3), heights=(0.0, 0.0, 100.0), detects=(0.8,) * 4, false_share=0.2)
+        both = FootFuser(min_score=0.16, views=(view,) * 3)
+        assert [len(one.rows) for one in next(both([Frame(0, 0, rows)]))] == [2, 2]
+        fewer = FootFuser(min_score=0.17, views=(view,) * 3)
+        found, members = next(fewer([Frame(0, 0, rows)]))
+        assert (len(found.rows), members.rows["detection"].tolist()) == (0, [-1, -1])
 
 
 def test_distances_are_those_of_mahalanobis() -> None:
