@@ -38,8 +38,9 @@ class Cluster:
         except ImportError:
             raise McaptrackError("`scheduler=` needs Dask: `pip install 'mcaptrack[fleet]'` installs it") from None
         self._address, self._most = address, most
-        self._levels = {name: logging.getLogger(name).level for name in _LOGGERS}
-        for name in _LOGGERS:
+        known = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] in _LOGGERS]
+        self._levels = {name: logging.getLogger(name).level for name in (*_LOGGERS, *known)}
+        for name in self._levels:  # Dask sets the levels of some of them, so that those above don't count
             logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
             make: Any = Client
