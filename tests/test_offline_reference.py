@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mcaptrack.transforms.retrack import linking, offline
 from mcaptrack.transforms.retrack.false_tracks import track_log_odds
 from mcaptrack.transforms.retrack.identity_swaps import find_swaps, resolve_swaps
 from mcaptrack.transforms.retrack.linking import link_tracks
@@ -154,3 +156,38 @@ def test_decisions_at_encounters_equal_the_reference(seed):
         found = dict(zip(out.step[rows].tolist(), (names[o] for o in owner[rows].tolist()), strict=True))
         theirs = wanted.get(name, {})
         assert {step: found[step] for step in paths[name]} == {step: theirs.get(step, name) for step in paths[name]}
+
+
+@given(seed=SEEDS)
+@settings(max_examples=15)
+def test_links_are_the_same_in_batches_of_any_size(seed):
+    rng = np.random.default_rng(seed)
+    model, _ = models(rng)
+    out, _ = laid_out(scattered(rng, 12), model.noise_m)
+    forward, backward, _ = smooth(model, out, 0.4)
+    whole = linking.candidates(out, forward, backward, 0.4, 20.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(linking, "_BATCH", int(rng.integers(1, 9)))
+        parts = linking.candidates(out, forward, backward, 0.4, 20.0)
+    assert [one.tolist() for one in parts] == [one.tolist() for one in whole]
+
+
+@given(seed=SEEDS)
+@settings(max_examples=15)
+def test_encounters_of_tracks_that_did_not_change_need_no_second_look(seed):
+    """Three rounds over all encounters decide the same as rounds over those of the tracks that the last one changed."""
+    rng = np.random.default_rng(seed)
+    model, _ = models(rng)
+    steps, people = 60, 5
+    paths = [walk_of(rng, rng.uniform(-2, 2, 2), rng.normal(0, 0.3, 2), steps, model.noise_m) for _ in range(people)]
+    for _ in range(4):
+        (a, b), when = rng.choice(people, 2, replace=False), int(rng.integers(5, 55))
+        paths[a][when:], paths[b][when:] = paths[b][when:].copy(), paths[a][when:].copy()
+    step, first = np.tile(np.arange(steps), people), np.repeat(np.arange(people), steps)
+    xy = np.concatenate(paths)
+    track = first
+    for _ in range(offline._ROUNDS):
+        ids, row, out = to_trajectories(step, track, xy, model.noise_m)
+        owner, _ = resolve_swaps(model, out, row, first, 0.4)
+        track = ids[owner[row]]
+    assert offline._without_swaps(model, step, first, first, xy, 0.4).tolist() == track.tolist()

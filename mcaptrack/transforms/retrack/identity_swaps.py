@@ -36,12 +36,18 @@ _MIN_GAIN: Final = 1.0
 
 
 def resolve_swaps(
-    model: MotionModel, trajectories: Trajectories, row: Ints, source: Ints, step_s: float
+    model: MotionModel,
+    trajectories: Trajectories,
+    row: Ints,
+    source: Ints,
+    step_s: float,
+    examined: Bools | None = None,
 ) -> tuple[Ints, int]:
     """The track that each row of the trajectories belongs to (N,), and the number of encounters that were changed.
 
     ``row`` are the rows with an observation, and ``source`` the input id of each. An encounter is left for the next
-    call if one of its tracks was changed in this one.
+    call if one of its tracks was changed in this one. Only encounters of ``examined`` tracks (K,) are looked at, by
+    default all.
     """
     count = len(trajectories.first) - 1
     track = group_index(np.diff(trajectories.first))
@@ -50,6 +56,9 @@ def resolve_swaps(
     i, j, low, high = find_encounters(trajectories)
     if len(i) == 0:
         return track, 0
+    if examined is not None:
+        touched = examined[i] | examined[j]
+        i, j, low, high = i[touched], j[touched], low[touched], high[touched]
     begin = trajectories.first[:-1] - trajectories.step[trajectories.first[:-1]]
     swapped: dict[int, Bools] = {}
     gain = np.zeros(len(i))

@@ -28,6 +28,8 @@ _WEIGHTS: Final = (-0.996, -0.798, -0.205, -0.304, 0.247, 0.482, -0.324)
 _BIAS, _PRIOR = 3.702, 0.666
 #: Added to distances and speeds before taking logarithms: differences below these mean nothing.
 _NEAR_M, _SPEED_M_PER_S = 0.3, 0.15
+#: The number of pairs that are examined at once.
+_BATCH: Final = 1_000_000
 #: Links with lower log odds are not considered.
 _MIN_LOG_ODDS: Final = -2.52
 
@@ -79,12 +81,22 @@ def candidates(
     begins, ends = trajectories.step[first], trajectories.step[last]
     order = np.argsort(begins, kind="stable")
     low = np.searchsorted(begins[order], ends + 1)
-    high = np.searchsorted(begins[order], ends + round(max_gap_s / step_s), "right")
-    i = group_index(high - low)
-    j: Ints = order[ragged_range(low, high - low)]
-    gap_s = np.asarray((begins[j] - ends[i]) * step_s, np.float64)
-    near = _length(forward.mean[last[i], :2] - backward.mean[first[j], :2]) <= 1.0 + _MAX_SPEED_M_PER_S * gap_s
-    return i[near], j[near], gap_s[near]
+    count = np.searchsorted(begins[order], ends + round(max_gap_s / step_s), "right") - low
+    parts: list[tuple[Ints, Ints, Floats]] = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))]
+    for part in _batches(count):
+        i = part.start + group_index(count[part])
+        j: Ints = order[ragged_range(low[part], count[part])]
+        gap_s = np.asarray((begins[j] - ends[i]) * step_s, np.float64)
+        near = _length(forward.mean[last[i], :2] - backward.mean[first[j], :2]) <= 1.0 + _MAX_SPEED_M_PER_S * gap_s
+        parts.append((i[near], j[near], gap_s[near]))
+    i, j, gap_s = (np.concatenate(members) for members in zip(*parts, strict=True))
+    return i, j, gap_s
+
+
+def _batches(count: Ints) -> list[slice]:
+    """Groups of tracks (K,) that have about ``_BATCH`` pairs together; pairs of all tracks would take much memory."""
+    starts = np.flatnonzero(run_starts(np.cumsum(count) // _BATCH))
+    return [slice(a, b) for a, b in zip(starts.tolist(), [*starts[1:].tolist(), len(count)], strict=True)]
 
 
 def _prior_shift(log_odds: Floats) -> float:

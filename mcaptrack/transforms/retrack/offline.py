@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.ragged import group_index
 from mcaptrack.schema import Rows
 from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers
@@ -54,12 +55,7 @@ def offline_tracks(
     if options.link_s > 0 and len(track):
         track = _linked(options, model, step, track, xy, step_s, movers)
     if options.resolve_swaps and len(track) and not movers.on_ground:
-        for _ in range(_ROUNDS):
-            ids, row, trajectories = to_trajectories(step, track, xy, model.noise_m)
-            owner, changed = resolve_swaps(model, trajectories, row, source, step_s)
-            track = ids[owner[row]]
-            if not changed:
-                break
+        track = _without_swaps(model, step, track, source, xy, step_s)
     order = np.lexsort((step, track))
     step, track, sample = step[order], track[order], sample[order]
     rows = TrackRows.of(step, track, sample)
@@ -92,6 +88,21 @@ def offline_tracks(
     is_kept[is_sure] &= lengths[which] >= min_rows
     left = np.flatnonzero(is_kept)
     return rows_by_step(rows.take(left), samples, moved and moved.take(left), steps)
+
+
+def _without_swaps(model: MotionModel, step: Ints, track: Ints, source: Ints, xy: Floats, step_s: float) -> Ints:
+    """The track of each assignment (C,) after deciding again which track is which where two of them met."""
+    examined: Ints | None = None  # tracks that were changed: the encounters of all others stay as they are
+    for _ in range(_ROUNDS):
+        ids, row, trajectories = to_trajectories(step, track, xy, model.noise_m)
+        which = None if examined is None else np.isin(ids, examined)
+        owner, changed = resolve_swaps(model, trajectories, row, source, step_s, which)
+        track = ids[owner[row]]
+        if not changed:
+            break
+        own = group_index(np.diff(trajectories.first))
+        examined = ids[np.unique(own[owner != own])]
+    return track
 
 
 def _linked(
