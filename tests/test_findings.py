@@ -164,9 +164,9 @@ def test_run_warns_of_too_little_memory(path, monkeypatch):
 
 
 def test_the_memory_warning_begins_at_the_estimated_need(monkeypatch):
-    """The need is 400 MB, and 7 kB for each second that a person is seen, as measured."""
+    """The need is 400 MB, and 3 kB for each second that a person is seen, as measured."""
     frames = [Frame(n * 100_000_000, n, DETECTIONS.empty(20)) for n in range(1_000)]
-    needed = 400_000_000 + 2_000 * 7_000
+    needed = 400_000_000 + 2_000 * 3_000
     for free, is_little in ((needed, False), (needed - 1, True), (None, False)):
         monkeypatch.setattr(findings, "free_memory", lambda free=free: free)
         with notices.listening(lambda _: None), notices.collected() as said:

@@ -486,7 +486,7 @@ def test_little_memory_is_said_in_numbers(monkeypatch):
         findings.warn_memory([Frame(n * 40_000_000, n, DETECTIONS.empty(10)) for n in range(50_000)])
     assert [(one.message, one.code) for one in said] == [
         (
-            "500,000 boxes, of people who are seen for 6 hours together, take about 0.4 GB of memory, and 0.2 GB are "
+            "500,000 boxes, of people who are seen for 6 hours together, take about 0.5 GB of memory, and 0.2 GB are "
             "free: re-tracking has all samples in memory",
             "memory",
         )

@@ -66,7 +66,8 @@ def assign_by_gain(gain: Floats) -> Pairs:
     column = best[row]
     if len(np.unique(column)) == len(column):  # the best column of each row is free
         return row, column
-    rows, columns = solve(-np.maximum(gain, 0.0))
+    cost = np.maximum(gain, 0.0)
+    rows, columns = solve(np.negative(cost, out=cost))  # in place: whole logs have large tables
     kept = gain[rows, columns] > 0
     return rows[kept], columns[kept]
 

@@ -24,7 +24,7 @@ from mcaptrack.transforms import STAGES, Transform
 _IN_METRES: Final = {name for name, stage in STAGES.items() if stage.default.reads is not VIDEO}
 #: The memory that a run needs, in bytes: whatever its length, and for each second that a person is seen (re-tracking
 #: has all samples in memory).
-_BASE, _A_PERSON_SECOND = 400_000_000, 1_500
+_BASE, _A_PERSON_SECOND = 400_000_000, 3_000
 
 
 def warn_no_rows(stage: str, source: str, transform: Transform, given: Sequence[Frame], made: Sequence[Frame]) -> None:
