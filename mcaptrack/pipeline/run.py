@@ -340,10 +340,10 @@ def _counting(frames: Iterable[Frame], taken: list[int]) -> Iterator[Frame]:
 def _counted(
     frames: Iterable[Frame], numbers: Iterator[int], total: int, stage: str, progress: Progress
 ) -> Iterator[Frame]:
-    """Yield the frames, and report the next of ``numbers`` after each as the progress of a stage."""
+    """Yield the frames, and report the next of ``numbers`` for each as the progress of a stage."""
     for frame in frames:
+        progress(stage, min(next(numbers), total), total)  # before it is used: a stage may not ask whether more follow
         yield frame
-        progress(stage, min(next(numbers), total), total)
 
 
 def input_of(
