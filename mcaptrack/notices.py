@@ -44,6 +44,7 @@ Code = Literal[
     "out-of-date",
     "transforms",
     "view-lost",
+    "weak-predictor",
     "worse",
 ]
 

@@ -20,13 +20,15 @@ from mcaptrack.predictors.forecast import Forecast, Predictor
 from mcaptrack.predictors.own_clock import OnClock
 from mcaptrack.registry import BUILT_IN, Entry, find, is_installed
 
-__all__ = ["NAMES", "Forecast", "Predictor", "PredictorName", "entry_of", "make", "weights_sha256"]
+__all__ = ["NAMES", "Forecast", "Predictor", "PredictorName", "entry_of", "make", "warn_if_weak", "weights_sha256"]
 
 #: A predictor by name: built-in, of an entry point, or ``module:Class``; or a network with other weights, as in
 #: ``red:FILE``, ``lstm:FILE``, ``onnx:FILE``.
 PredictorName = str
 #: The built-in predictors that need no file.
 NAMES: Final = ("cv", "holt-cv", "kalman", "lstm", "red")
+#: Those that are less exact than ``cv`` on most recordings (docs/predictors.md).
+WEAK: Final = ("lstm",)
 
 
 def make(name: PredictorName, steps: int, step_s: float, **parameters: Any) -> Predictor:
@@ -75,6 +77,16 @@ def make(name: PredictorName, steps: int, step_s: float, **parameters: Any) -> P
             "extrapolated",
         )
     return OnClock(inner, steps, step_s)
+
+
+def warn_if_weak(name: PredictorName) -> None:
+    """Warn that a predictor that comes with mcaptrack is less exact than constant velocity."""
+    if name in WEAK:
+        warn(
+            f"{name}, the paper's network, predicts less exactly than constant velocity (cv) on most recordings; red "
+            "predicts most exactly",
+            "weak-predictor",
+        )
 
 
 def entry_of(name: PredictorName) -> tuple[Entry, Path | None]:

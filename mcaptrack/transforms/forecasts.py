@@ -11,6 +11,7 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories
 from mcaptrack.predictors import Forecast, make
+from mcaptrack.predictors.tails import Calibration
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.transforms.motion_limits import ClassNames, limits_by_class, units_m
@@ -68,6 +69,8 @@ class Forecaster:
         self._rate_hz, self._min_history = rate_hz, min_history
         self._class_names, self._class_limits = class_names, class_limits
         self._predictor = make(predictor, max(1, round(horizon_s * rate_hz)), 1 / rate_hz, **options)
+        self._calibration = Calibration.of(predictor, self._predictor)
+        self._step = 0
         self._histories = histories(max(self._predictor.past, min_history))
         self._last_ns: int | None = None
 
@@ -77,6 +80,7 @@ class Forecaster:
         if self._last_ns is not None:
             passed = max(1, round((frame.t_ns - self._last_ns) * self._rate_hz / NS_PER_S))
         self._last_ns = frame.t_ns
+        self._step += passed
         ids = frame.rows["track_id"]
         past, known = self._histories.push(ids, np.stack([frame.rows["x_m"], frame.rows["y_m"]], axis=-1), passed)
         # An interpolated position depends on later ones: a prediction from it would not be causal.
@@ -87,13 +91,18 @@ class Forecaster:
         scale = unit_m[:, None, None]
         mean, cov = self._predictor.predict(past[ready] / scale, known[ready])
         forecast = Forecast(mean * scale, cov * scale[..., None] ** 2)
-        is_measured = np.isfinite(frame.rows["vx_m_per_s"][ready]) & (unit_m != 1)
-        if is_measured.any():
+        tails = None
+        has_velocity = np.isfinite(frame.rows["vx_m_per_s"][ready])
+        is_measured = has_velocity & (unit_m != 1)
+        if self._calibration is not None and not has_velocity.any():
+            is_coasting = np.zeros(len(has_velocity), bool)
+            forecast, tails = self._calibration(self._step, ids[ready], forecast, past[ready], is_coasting)
+        elif is_measured.any():
             limits = limits_by_class(numbers, self._class_names, self._class_limits)
             noise_m = np.array([limits[one].noise_m for one in numbers])[of]
             stay = is_measured * _standing(past[ready], unit_m, self._predictor.step_s)
             forecast = _with_rest(forecast, past[ready][:, -1], stay, noise_m, unit_m, self._predictor.step_s)
-        return forecast_to_rows(ids[ready], forecast, self._predictor.step_s)
+        return forecast_to_rows(ids[ready], forecast, self._predictor.step_s, tails)
 
 
 def _standing(past: Floats, unit_m: Floats, step_s: float) -> Floats:

@@ -10,7 +10,7 @@ from typing import ClassVar
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.histories import Histories
-from mcaptrack.predictors import PredictorName, entry_of
+from mcaptrack.predictors import PredictorName, entry_of, warn_if_weak
 from mcaptrack.predictors.own_options import own_options
 from mcaptrack.registry import Entry
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
@@ -40,8 +40,8 @@ class Predict:
 
     predictor: PredictorName = option(
         "red",
-        "predictor: cv, holt-cv, kalman, lstm, red; with other weights red:FILE, lstm:FILE, onnx:FILE; one of an "
-        "installed package; or module:Class",
+        "predictor: cv, holt-cv, kalman, red, or lstm, which is less exact than cv; with other weights red:FILE, "
+        "lstm:FILE, onnx:FILE; one of an installed package; or module:Class",
         kind="predictor",
     )
     horizon_s: float = option(4.8, "how far ahead to predict, in seconds", least=0.1, most=60.0)
@@ -68,6 +68,7 @@ class Predict:
 
     def forecaster(self, histories: Callable[[int], PastPositions] = Histories) -> Forecaster:
         """The predictor with its options; ``histories`` keeps the past positions."""
+        warn_if_weak(self.predictor)
         own = {name: getattr(self, name) for name in self.own_options}
         classes = self.class_names, self.class_limits
         rates = self.predictor, self.horizon_s, self.min_history, self.rate_hz

@@ -14,6 +14,7 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.ragged import group_index
 from mcaptrack.predictors import Forecast, Predictor, make
+from mcaptrack.predictors.tails import Calibration
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.predictions import forecast_to_rows
@@ -74,7 +75,7 @@ class LikelihoodPass:
         self._coasting: list[tuple[Ints, Floats, Ints]] = []  # places of rows in _online, positions in m, times
         horizon = max(1, round(options.horizon_s * rate))
         self._predictor: Predictor = make(options.predictor, horizon, 1 / rate)
-        self._forecasts = _Forecasts(self._predictor, movers.unit_m)
+        self._forecasts = _Forecasts(options.predictor, self._predictor, movers.unit_m)
         self._written = 0
 
     @property
@@ -167,7 +168,7 @@ class LikelihoodPass:
         ends = np.searchsorted(tick[shown], np.arange(len(frames) + 1))
         numbers = [frame.index for frame in frames]
         self._online.extend(t_ns, numbers, ends, rows)
-        self._forecasts.add(t_ns, numbers, ends, rows["track_id"], past)
+        self._forecasts.add(t_ns, numbers, steps, ends, _Waiting(rows["track_id"], *past, coasts))
         self._written += len(rows)
         is_last = tick == len(frames) - 1
         self._ids, self._last_rows = ids[is_last], samples[last_sample[is_last]]
@@ -206,20 +207,49 @@ class _Positions(NamedTuple):
     xy_m: Floats
 
 
+class _Waiting(NamedTuple):
+    """Tracks without predictions yet: ids, past positions (R, L, 2) and which are known, and whether tracks coast."""
+
+    ids: Ints
+    past: Floats
+    known: Bools
+    coasts: Bools
+
+    def part(self, which: slice) -> _Waiting:
+        return _Waiting(self.ids[which], self.past[which], self.known[which], self.coasts[which])
+
+
+class _Made(NamedTuple):
+    """Predictions as the predictor made them: ids, past positions, whether tracks coast, means and covariances."""
+
+    ids: Ints
+    past: Floats
+    coasts: Bools
+    mean: Floats
+    cov: Floats
+
+    def part(self, which: slice) -> _Made:
+        return _Made(self.ids[which], self.past[which], self.coasts[which], self.mean[which], self.cov[which])
+
+
 class _Forecasts:
     """Predictions of tracks, frame by frame, made for ``_BATCH`` tracks at once."""
 
-    def __init__(self, predictor: Predictor, unit_m: float) -> None:
+    def __init__(self, name: str, predictor: Predictor, unit_m: float) -> None:
         self._predictor, self._unit_m = predictor, unit_m
+        self._calibration = Calibration.of(name, predictor)
         self._out = FrameCollector(PREDICTIONS)
-        self._waiting: list[tuple[Ints, Floats, Bools]] = []  # ids and past positions without predictions yet
-        self._made: list[Rows] = []  # predictions of frames that are not complete
-        self._frames: list[tuple[int, int, int]] = []  # time, number and tracks of these frames
+        self._waiting: list[_Waiting] = []
+        nothing = np.empty((0, predictor.steps, 2, 2))
+        self._made = [
+            _Made(np.empty(0, np.int64), np.empty((0, predictor.past, 2)), np.empty(0, bool), nothing[..., 0], nothing)
+        ]
+        self._frames: list[tuple[int, int, int, int]] = []  # time, number, step and tracks of frames in neither
 
-    def add(self, t_ns: Ints, numbers: Sequence[int], ends: Ints, ids: Ints, past: tuple[Floats, Bools]) -> None:
+    def add(self, t_ns: Ints, numbers: Sequence[int], steps: Ints, ends: Ints, tracks: _Waiting) -> None:
         """Add the tracks of frames, ``ends[f]`` to ``ends[f + 1]`` of frame f, with their past positions."""
-        self._frames += zip(t_ns.tolist(), numbers, np.diff(ends).tolist(), strict=True)
-        self._waiting.append((ids, *past))
+        self._frames += zip(t_ns.tolist(), numbers, steps.tolist(), np.diff(ends).tolist(), strict=True)
+        self._waiting.append(tracks)
         self._predict(_BATCH)
 
     def done(self) -> FrameColumns:
@@ -228,22 +258,30 @@ class _Forecasts:
         return self._out.done()
 
     def _predict(self, least: int) -> None:
-        """Predict in batches, as long as at least so many tracks wait."""
-        ids, past, known = (np.concatenate(parts) for parts in zip(*self._waiting, strict=True))
+        """Predict in batches, as long as at least so many tracks wait, and write the frames that are complete."""
+        waiting = _Waiting(*(np.concatenate(parts) for parts in zip(*self._waiting, strict=True)))
         done = 0
-        while len(ids) - done >= least:
-            part = slice(done, done + _BATCH)
-            mean, cov = self._predictor.predict(past[part] / self._unit_m, known[part])
-            forecast = Forecast(mean * self._unit_m, cov * self._unit_m**2)
-            self._made.append(forecast_to_rows(ids[part], forecast, self._predictor.step_s))
-            done += len(mean)
-        self._waiting = [(ids[done:], past[done:], known[done:])]
-        rows = PREDICTIONS.joined(self._made)
-        ends = np.cumsum([0, *(count for _, _, count in self._frames)]) * self._predictor.steps
-        complete = int(np.searchsorted(ends, len(rows), "right")) - 1
-        t_ns, numbers, _ = zip(*self._frames[:complete], strict=True) if complete else ((), (), ())
-        self._out.extend(t_ns, numbers, ends[: complete + 1], rows[: ends[complete]])
-        self._frames, self._made = self._frames[complete:], [rows[ends[complete] :]]
+        while len(waiting.ids) - done >= least:
+            ids, past, known, coasts = waiting.part(slice(done, done + _BATCH))
+            mean, cov = self._predictor.predict(past / self._unit_m, known)
+            self._made.append(_Made(ids, past, coasts, mean * self._unit_m, cov * self._unit_m**2))
+            done += len(ids)
+        self._waiting = [waiting.part(slice(done, None))]
+        made = _Made(*(np.concatenate(parts) for parts in zip(*self._made, strict=True)))
+        ends = np.cumsum([0, *(count for *_, count in self._frames)])
+        complete = int(np.searchsorted(ends, len(made.ids), "right")) - 1
+        for (t_ns, number, step, _), low, high in zip(self._frames, ends[:complete], ends[1:], strict=False):
+            rows = self._rows(step, made.part(slice(low, high)))
+            self._out.append(Frame(t_ns, number, rows))
+        self._frames = self._frames[complete:]
+        self._made = [made.part(slice(ends[complete], None))]
+
+    def _rows(self, step: int, made: _Made) -> Rows:
+        """The predictions of a step; calibrated by those of the steps before."""
+        forecast, tails = Forecast(made.mean, made.cov), None
+        if self._calibration is not None:
+            forecast, tails = self._calibration(step, made.ids, forecast, made.past, made.coasts)
+        return forecast_to_rows(made.ids, forecast, self._predictor.step_s, tails)
 
 
 def motion_model(options: RetrackOptions, noise_m: float, movers: Movers = PEOPLE) -> MotionModel:

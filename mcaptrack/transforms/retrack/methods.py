@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Protocol, TypeAlias, TypeVar
 
+from mcaptrack.predictors import warn_if_weak
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameColumns, collect
 from mcaptrack.transforms.forecasts import Forecaster
@@ -95,6 +96,7 @@ def _retrack(
     options: Options, new_pass: Callable[[Options, Movers], OnlinePass], frames: Iterable[Frame]
 ) -> Iterator[tuple[Frame, ...]]:
     """For each frame the offline tracks, the online tracks and their predictions; each class by itself."""
+    warn_if_weak(options.predictor)
     if options.leaves_unchanged:
         yield from _keep_ids(options, frames)
         return
