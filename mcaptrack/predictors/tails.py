@@ -1,9 +1,9 @@
-"""Calibrated forecasts: mixtures whose ellipses hold as many true positions as they say.
+"""Calibrated forecasts: mixtures with ellipses that hold as many true positions as they say.
 
 The covariance of a predictor is scaled, and becomes that of a mixture of a narrow and a wide normal distribution. Both
 begin as a table for each predictor, which was fitted on synthetic walks with the faults of trackers (noise, gaps, short
 and merged tracks, switched ids), before and after re-tracking: ``tools/fit_tails.py`` makes the file. While a log is
-read they follow it, because people and trackers differ: forecasts whose time has come are compared with where their
+read they follow it, because people and trackers differ: forecasts of a time that has come are compared with where their
 tracks were observed then. Nothing is known that was not known at the time of a forecast.
 
 The means of forecasts, and the covariances by which tracks are associated, are those of the predictor.
