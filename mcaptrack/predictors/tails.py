@@ -40,7 +40,7 @@ _ITERATIONS: Final = 4
 #: Limits of the weight of the wide part.
 _LEAST_WIDE, _MOST_WIDE = 0.02, 0.6
 #: The noise of measured positions is estimated from those of so many of the last steps, if they are so many.
-_NOISE_STEPS: Final = 60
+_NOISE_STEPS: Final = 40
 _LEAST_POSITIONS: Final = 10
 
 
