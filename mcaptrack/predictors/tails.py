@@ -170,7 +170,7 @@ class Calibration:
         factor = np.where((known < self._past)[:, None], self._table.short, 1.0)
         factor = np.where(is_coasting[:, None], self._table.coasting, factor)
         cov = forecast.cov * factor[:, :, None, None]
-        self._made.append(_Made(step, ids, forecast.mean, cov))
+        self._made.append(_Made(step, ids.copy(), forecast.mean.copy(), cov))  # not parts of larger arrays
         weight, narrow, wide = self._tails
         whole = (1 - weight) * narrow + weight * wide
         parts = (np.broadcast_to(part, factor.shape) for part in (weight, narrow / whole, wide / whole))

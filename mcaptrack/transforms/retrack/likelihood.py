@@ -274,7 +274,8 @@ class _Forecasts:
             rows = self._rows(step, made.part(slice(low, high)))
             self._out.append(Frame(t_ns, number, rows))
         self._frames = self._frames[complete:]
-        self._made = [made.part(slice(ends[complete], None))]
+        left = made.part(slice(ends[complete], None))  # copied, so that the larger arrays are not held
+        self._made = [_Made(left.ids.copy(), left.past.copy(), left.coasts.copy(), left.mean.copy(), left.cov.copy())]
 
     def _rows(self, step: int, made: _Made) -> Rows:
         """The predictions of a step; calibrated by those of the steps before."""
