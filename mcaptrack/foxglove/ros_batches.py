@@ -119,7 +119,7 @@ def _places(copies: Sequence[tuple[int, int, int]], width: int) -> tuple[Ints, I
 
 
 def _steps(fields: Mapping[int, FieldType], data: bytes, low: int, high: int, mask: Bytes) -> Iterator[_Step]:
-    """What the bytes of a message from ``low`` to ``high`` become; what is copied is taken out of ``mask``."""
+    """Convert the bytes of a message from ``low`` to ``high``; those that are copied are taken out of ``mask``."""
     found: dict[int, list[tuple[int, int, int]]] = {}
     for number, wire, start, end in _wire(data, low, high):
         found.setdefault(number, []).append((wire, start, end))
