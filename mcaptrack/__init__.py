@@ -7,6 +7,7 @@ SCHEMA_VERSION = 1
 _PARTS = {
     "catalogue": ["Model", "get_model", "models"],
     "contents": ["ChannelInfo", "FrameInfo", "LogInfo", "info"],
+    "delta": ["DeltaState", "DeltaTableInfo", "delta"],
     "detecting": ["detect", "motion"],
     "demonstration": ["DemoResult", "demo"],
     "fetching": ["FetchedMessage"],

@@ -5,6 +5,9 @@ from mcaptrack.api.contents import ChannelInfo as ChannelInfo
 from mcaptrack.api.contents import FrameInfo as FrameInfo
 from mcaptrack.api.contents import LogInfo as LogInfo
 from mcaptrack.api.contents import info as info
+from mcaptrack.api.delta import DeltaState as DeltaState
+from mcaptrack.api.delta import DeltaTableInfo as DeltaTableInfo
+from mcaptrack.api.delta import delta as delta
 from mcaptrack.api.demonstration import DemoResult as DemoResult
 from mcaptrack.api.demonstration import demo as demo
 from mcaptrack.api.detecting import detect as detect
@@ -57,6 +60,8 @@ from mcaptrack.notices import Notice as Notice
 __all__ = [
     "ChannelInfo",
     "ColumnInfo",
+    "DeltaState",
+    "DeltaTableInfo",
     "DemoResult",
     "DoctorResult",
     "DropResult",
@@ -82,6 +87,7 @@ __all__ = [
     "TrainResult",
     "TuneResult",
     "check",
+    "delta",
     "demo",
     "detect",
     "detections",

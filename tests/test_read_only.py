@@ -16,7 +16,7 @@ from tests.interrupted import everything, first_journal, interrupt
 from tests.logs import READING
 
 #: Those that read no log.
-OTHERS = {"demo", "docs", "doctor", "models"} | ({"train"} - READING.keys())
+OTHERS = {"delta", "demo", "docs", "doctor", "models"} | ({"train"} - READING.keys())
 pytestmark = pytest.mark.usefixtures("never_waits")
 
 

@@ -524,7 +524,7 @@ def test_templates_print_in_text_and_quoted_attributes_only(name):
         assert re.fullmatch(r"</?h\{\{ level( \+ 1)? \}\}", element)
     for link in re.findall(r'(?:href|src)="([^"]*)"', source):
         assert link in ("data:,", "#{{ id }}") or re.fullmatch(
-            r"data:image/jpeg;base64,\{\{ [\w.]+ \| base64 \}\}", link
+            r"data:image/jpeg;base64,\{\{ [\w.]+ \| base64 \}\}|\./\{\{ [\w.]+ \| address \}\}", link
         )
     styles = re.findall(r"<style>(.*?)</style>", source)
     assert not styles or re.findall(r"\{\{ (.*?) \}\}", styles[0]) == ["loop.index0", "colour"]

@@ -110,6 +110,7 @@ def on_recording(path: Path, elsewhere: Path) -> dict[str, list[object]]:
         "train": [],  # needs torch, and opens logs like all others
         "demo": [],  # takes no log
         "models": [],  # takes no log
+        "delta": [],  # takes no log
         "docs": [],
         "doctor": [],
     }

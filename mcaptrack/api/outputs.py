@@ -14,6 +14,7 @@ from mcaptrack.api.checked import checked
 from mcaptrack.api.common import (
     PathLike,
     Progress,
+    as_location,
     detail,
     locations_of,
     log_location,
@@ -23,11 +24,14 @@ from mcaptrack.api.common import (
     warn_unused,
     warnings_about,
 )
+from mcaptrack.api.delta import add_to_delta
+from mcaptrack.api.fleet_page import page_about
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, place_of, publish_bytes, refuse_overwrite
 from mcaptrack.location import Location, local_name
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.tables import Format
+from mcaptrack.tables.catalogue import is_folder_of_tables
 from mcaptrack.tables.export import default_folder, recording_name
 from mcaptrack.tables.export import export as write_tables
 from mcaptrack.tables.rosbag2 import Storage, write_bag
@@ -57,6 +61,8 @@ class ExportResult:
         The tables that were written; the others were up to date. Of a bag, its topics.
     warnings : tuple of mcaptrack.Notice
         What was left out.
+    delta : {"added", "replaced", "unchanged"} or None
+        What became of the log in the Delta tables; None if none were named.
 
     """
 
@@ -65,6 +71,7 @@ class ExportResult:
     rows: Mapping[str, int]
     written: tuple[str, ...]
     warnings: tuple[Notice, ...]
+    delta: Literal["added", "replaced", "unchanged"] | None = None
 
     @property
     def is_up_to_date(self) -> bool:
@@ -80,6 +87,7 @@ def export(
     form: Format | Literal["rosbag2", "rosbag2-sqlite3"] = "parquet",
     topic: str | Sequence[str] | None = None,
     blobs: bool = False,
+    delta: PathLike | None = None,
     force: bool = False,
     progress: Progress = no_progress,
 ) -> ExportResult:
@@ -102,6 +110,9 @@ def export(
         Also write a table of all messages of these channels.
     blobs : bool, default False
         With ``topic``: include binary fields, such as pictures and point clouds.
+    delta : path, optional
+        A folder, or its URL in a store, with Delta tables of many logs: the log is added to them, or replaced. Needs
+        deltalake.
     force : bool, default False
         Write all tables again, also over those of another log of this name; replace a bag.
     progress : callable, optional
@@ -126,7 +137,11 @@ def export(
     """
     path = log_location(log)
     if form in _BAGS:
+        if delta is not None:
+            raise McaptrackError(f"Delta tables are made of tables, and {form} writes none; leave `form=` out")
         return _export_bag(path, optional_path(output), _BAGS[form], topic, blobs, force, progress)
+    if delta is not None and form != "parquet":
+        raise McaptrackError(f"Delta tables are made of tables in Parquet, not in {form}; leave `form=` out")
     folder = optional_path(output) or default_folder(path)
     if folder.exists() and not folder.is_dir():
         raise McaptrackError(f"{folder} is a file; tables go to a folder")
@@ -137,9 +152,10 @@ def export(
             done = write_tables(
                 opened, folder, progress, form=cast("Format", form), topics=names_of(topic), blobs=blobs, force=force
             )
+        state = None if delta is None else add_to_delta(as_location(delta), path, folder, force)
         for words in done.notes:
             warn(words, "left-out")
-    return ExportResult(path, folder, done.rows, tuple(done.written), tuple(dict.fromkeys(warnings)))
+    return ExportResult(path, folder, done.rows, tuple(done.written), tuple(dict.fromkeys(warnings)), state)
 
 
 def _export_bag(
@@ -210,13 +226,15 @@ def report(
 ) -> ReportResult:
     """Write one HTML page about a log, or several: scores, predictions, tracks over the scene, identity switches.
 
+    Of a folder with the tables of many logs, the page has the totals, trends, worst logs, outliers and warnings.
+
     Parameters
     ----------
     log : path or sequence of paths
-        The log, or several.
+        The log, or several; or a folder of tables, or the URL of one with Delta tables.
     output : path, optional
         The page, by default LOG.report.html beside the log, or in the working folder if that is in a store; several
-        logs need a name.
+        logs need a name, and so do tables.
     camera : str, optional
         Name of the camera, if a log has several.
     force : bool, default False
@@ -241,7 +259,10 @@ def report(
     'page.html'
 
     """
-    paths = [log_location(path) for path in locations_of(log)]
+    places = locations_of(log)
+    if any(is_folder_of_tables(place) for place in places):
+        return _report_on_tables(places, optional_path(output), camera, force)
+    paths = [log_location(path) for path in places]
     if not paths:
         raise McaptrackError("there is no log to report on; give one, or several")
     if output is None and len(paths) != 1:
@@ -261,6 +282,20 @@ def report(
         publish_bytes(target, content)
         progress("report", len(paths), len(paths))
     return ReportResult(target, len(content), pages.data(reports), tuple(dict.fromkeys(warnings)))
+
+
+def _report_on_tables(places: Sequence[Location], output: Path | None, camera: str | None, force: bool) -> ReportResult:
+    """Write the page about all logs in a folder of tables."""
+    if len(places) != 1:
+        raise McaptrackError(f"{places[0]} and others: a page is about logs, or about one folder of tables; give one")
+    if output is None:
+        raise McaptrackError(f"the page about all logs in {places[0]} needs a name; give one with `output=`")
+    refuse_overwrite(output, force)
+    with collected() as warnings:
+        warn_unused("the page is about all cameras of all logs", camera=camera is not None)
+        content, data = page_about(places[0], output.parent)
+        publish_bytes(output, content)
+    return ReportResult(output, len(content), data, tuple(dict.fromkeys(warnings)))
 
 
 @dataclass(frozen=True)

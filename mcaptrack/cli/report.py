@@ -33,17 +33,21 @@ def report(
 
     The page needs no network and has no scripts; it contains its numbers as JSON, which --json prints. Scores are those
     of `mcaptrack evaluate`; without ground truth in the log there are none. Only reads logs; `mcaptrack run` runs
-    stages that are missing.
+    stages that are missing. Of a folder that logs were exported to, with --output-dir or --delta, the page has totals,
+    trends, the worst logs, outliers and warnings.
 
     Example: mcaptrack report log.mcap -o report.html
 
     Example: mcaptrack report 'logs/*.mcap' -o report.html
+
+    Example: mcaptrack report tables/ -o fleet.html
     """
     import mcaptrack
 
     paths = expand(logs, folders=True)
     with common.Talk(quiet, verbose).open() as talk:
         done = mcaptrack.report(paths, output, camera=camera, force=force, progress=talk.progress)
-        talk.say(f"{done.page}: {len(paths)} log{'s' if len(paths) > 1 else ''}, {done.size / 1e6:.2f} MB")
+        count = done.data["summary"]["logs"] if "summary" in done.data else len(paths)
+        talk.say(f"{done.page}: {count} log{'s' if count > 1 else ''}, {done.size / 1e6:.2f} MB")
     if json:
         common.print_json(dict(done.data))

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 #: Version of the tables' columns: the second number grows when columns are added.
-TABLE_VERSION: Final = "1.4"
+TABLE_VERSION: Final = "1.5"
 
 #: The unit of counts and ids.
 _NONE: Final = "1"
@@ -252,7 +252,8 @@ _CHANNELS: Final = Table(
 
 _RECORDINGS: Final = Table(
     "recordings",
-    "One row a log.",
+    "One row a log: when and how long it is, where it is, and how it turned out. Scores are those of metrics, within 1 "
+    "m (2 m for 3D boxes) or else by overlap; null without ground truth.",
     ("recording",),
     (),
     (
@@ -284,6 +285,26 @@ _RECORDINGS: Final = Table(
             "source", _TEXT, "what the log was made from: for each ingested channel its file, as JSON", nullable=True
         ),
         Field("mcaptrack_version", _TEXT, "version of mcaptrack that exported it"),
+        Field("location", _TEXT, "where the log was then: its path without links, or its URL", nullable=True),
+        Field("cameras", _INT, "number of cameras", nullable=True),
+        Field(
+            "tracks",
+            _INT,
+            "number of tracks of all cameras, re-tracked where they are; null where nothing was tracked",
+            nullable=True,
+        ),
+        Field("scored", _NAME, "the tracks that the scores are of: those of the camera with the lowest IDF1", "", True),
+        Field("similarity", _NAME, "what they were scored by, as in metrics", nullable=True),
+        Field("gate", _FLOAT, "least overlap, or largest distance in metres, of a match", nullable=True),
+        Field(
+            "MOTA", _FLOAT, "CLEAR: 1 less misses, false positives and switches by rows of the ground truth", "", True
+        ),
+        Field("IDF1", _FLOAT, "identity: F1 of rows under the best assignment of tracks to people", nullable=True),
+        Field("HOTA", _FLOAT, "higher order tracking accuracy, mean over thresholds", nullable=True),
+        Field("IDSW", _INT, "identity switches", nullable=True),
+        Field("warnings", _INT, "number of warnings that its channels carry", nullable=True),
+        Field("warning_texts", _TEXT, "these warnings as JSON, with code and message; null without", nullable=True),
+        Field("versions", _TEXT, "versions of mcaptrack that made its channels, with commas", nullable=True),
     ),
 )
 

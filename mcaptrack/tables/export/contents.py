@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -12,15 +13,17 @@ import numpy as np
 from mcaptrack import __version__, evaluation, log, tables
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import LAST_NS
-from mcaptrack.schema import DETECTIONS, Frame
+from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameColumns, collect
+from mcaptrack.schema.framing import joined_parts
 from mcaptrack.schema.provenance import Provenance, input_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import Camera, cameras, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead, holds_boxes, holds_boxes_3d
 from mcaptrack.sources.foreign.flatten import flattener, message_type_of
 from mcaptrack.tables import TABLES, Pointers, TablePieces, TrackNames
+from mcaptrack.tables.export import catalogue
 from mcaptrack.tables.export.names import file_name, recording_name
 
 #: Tables about the places of messages, or about the whole log.
@@ -56,7 +59,7 @@ class LogTables:
             "track_summary": lambda: tables.summary_table(
                 {topic: self._frames(topic) for topic in self.topics("tracks")}, self._class_names
             ),
-            "metrics": lambda: tables.records_table(table, sorted(self._scores(), key=_order_of_scores)),
+            "metrics": lambda: tables.records_table(table, sorted(self._scores, key=_order_of_scores)),
             "channels": lambda: tables.records_table(
                 table, [_channel(channel) for _, channel in sorted(self.opened.channels.items())]
             ),
@@ -90,7 +93,8 @@ class LogTables:
         whole = name in _OF_THE_WHOLE
         of = [self.opened.fingerprint()] if whole else [self.opened.fingerprint(topic) for topic in self.topics(name)]
         files = [file_name(part.path) for part in self.opened.parts]
-        return _digest([name, __version__, self.recording, files, of])
+        where = [catalogue.location_of(self.opened.path)] if name == "recordings" else []
+        return _digest([name, __version__, self.recording, files, of, *where])
 
     def lineage(self, name: str) -> str:
         """The provenance of the channels of a table, back to recorded channels, as JSON."""
@@ -211,7 +215,11 @@ class LogTables:
         known = [camera.truth, *(f"{camera.prefix}/{name}" for name in names)]
         return [topic for topic in known if topic in self.opened.channels]
 
-    def _scores(self) -> Iterator[dict[str, Any]]:
+    @cached_property
+    def _scores(self) -> list[dict[str, Any]]:
+        return list(self._scored_rows())
+
+    def _scored_rows(self) -> Iterator[dict[str, Any]]:
         for camera in self._labelled():
             try:
                 sequence = evaluation.sequence_of_log(self.opened, camera.prefix, ())
@@ -253,7 +261,26 @@ class LogTables:
             "ground_plane": None if not planes else planes.pop() if len(planes) == 1 else "mixed",
             "source": json.dumps(sources, sort_keys=True, separators=(",", ":")) if sources else None,
             "mcaptrack_version": __version__,
+            **self._as_a_whole(),
         }
+
+    def _as_a_whole(self) -> dict[str, Any]:
+        """What tells a log from thousands of others."""
+        there = self.topics("tracks")
+        best = [topic for one in cameras(self.opened) if (topic := catalogue.best_tracks(one, there))]
+        return {
+            "location": catalogue.location_of(self.opened.path),
+            "cameras": len(cameras(self.opened)),
+            "tracks": sum(map(self._count_tracks, best)) if best else None,
+            **catalogue.worst_score(best, self._scores),
+            **catalogue.about_channels(self.opened),
+        }
+
+    def _count_tracks(self, topic: str) -> int:
+        found: set[int] = set()
+        for _, _, joined in joined_parts(TRACKS, self._frames(topic)):
+            found.update(np.unique(joined.rows["track_id"]).tolist())
+        return len(found)
 
 
 def _origin_of_plane(row: np.void) -> str:

@@ -4,6 +4,7 @@ gather(log, camera)      read and compute everything about a log
 draw(report, 0, 1)       render its part of the page; releases its tracks and pictures
 page(reports)            the page, with all numbers inside
 data(reports)            the numbers alone: those of ``evaluate --json``, and more
+fleet_page(rows, ...)    the page about all logs of a folder of tables; its numbers are ``fleet_data(rows)``
 
 The same logs give the same bytes. The page loads nothing and runs nothing: its policy forbids both, in case a name in a
 log got past the escaping.
@@ -22,11 +23,12 @@ from mcaptrack.foxglove.palette import COUNT as COLOURS
 from mcaptrack.viewing.report import figures, lineage, sections
 from mcaptrack.viewing.report.charts import Axis, pairs_chart, round_most
 from mcaptrack.viewing.report.contents import LogReport, gather
+from mcaptrack.viewing.report.fleet_page import fleet_data, fleet_page
 from mcaptrack.viewing.report.formatting import NONE, counted, number, percent
 from mcaptrack.viewing.report.html import render
 from mcaptrack.viewing.report.summary import BeforeAfter, before_after, combined_results, summarize
 
-__all__ = ["ELEMENT", "LogReport", "data", "draw", "gather", "page"]
+__all__ = ["ELEMENT", "LogReport", "data", "draw", "fleet_data", "fleet_page", "gather", "page"]
 
 #: The id of the element that holds the numbers.
 ELEMENT: Final = "mcaptrack-report"

@@ -1,8 +1,8 @@
 """The templates of the page. They escape every value that they print.
 
-Names in logs may hold anything. Templates print them in text and in quoted attributes only: never in a link, in a style
-or as the name of an element. Ids in the page are made of numbers. Control characters and marks that change the
-direction of writing are replaced.
+Names in logs may hold anything. Templates print them in text and in quoted attributes only: never in a style or as the
+name of an element, and in a link only quoted and after "./", as the path of a file. Ids in the page are made of
+numbers. Control characters and marks that change the direction of writing are replaced.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 from functools import cache
 from typing import Any, Final
+from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -31,7 +32,7 @@ def environment() -> Environment:
         finalize=_printable,
     )
     out.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-    out.filters |= {"number": number, "percent": percent, "counted": counted, "base64": _base64}
+    out.filters |= {"number": number, "percent": percent, "counted": counted, "base64": _base64, "address": quote}
     return out
 
 

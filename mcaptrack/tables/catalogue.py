@@ -1,0 +1,124 @@
+"""One table of all logs in a folder of tables: ``recordings`` with the column ``recording``.
+
+    <folder>/recordings.parquet     the rows of <folder>/recordings/*/part-0.parquet, in one file
+
+The file is made of the others, and only saves opening thousands of them: rows of logs whose file has changed since, as
+its time and size say, are read anew.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.files import publish
+from mcaptrack.location import Location
+from mcaptrack.tables.delta import DeltaFolder, is_delta_folder
+from mcaptrack.tables.fields import RECORDING, TABLES
+from mcaptrack.tables.join import join
+
+#: The table, and its file with the rows of all logs.
+_TABLE: Final = "recordings"
+FILE: Final = "recordings.parquet"
+_MEMBERS: Final = b"mcaptrack.members"
+_PREFIX: Final = "recording="
+
+
+def is_folder_of_tables(where: Location) -> bool:
+    """Whether logs were exported to a folder, as Parquet files or as Delta tables."""
+    if isinstance(where, Path):
+        return (where / _TABLE).is_dir() and (is_delta_folder(where) or bool(_members(where)))
+    return where.suffix.lower() != ".mcap" and is_delta_folder(where)
+
+
+def read_catalogue(where: Location) -> list[dict[str, Any]]:
+    """The rows of ``recordings`` of all logs, by name. Raises McaptrackError if they can't be read."""
+    if is_delta_folder(where):
+        found = DeltaFolder(where).dataset(_TABLE)
+        table = join([], TABLES[_TABLE].arrow, [found]).to_table()
+    elif isinstance(where, Path):
+        table = _table(where, _members(where))
+    else:
+        raise McaptrackError(f"{where} has no Delta tables of logs")
+    rows: list[dict[str, Any]] = table.sort_by(RECORDING.name).to_pylist()
+    return rows
+
+
+def refresh(folder: Path) -> bool:
+    """Write the file with the rows of all logs, if it is not up to date; returns whether it was written.
+
+    Raises McaptrackError if it can't be.
+    """
+    import pyarrow.parquet as pq
+
+    members = _members(folder)
+    if not members or _known(folder)[0] == members:
+        return False
+    table = _table(folder, members)
+    table = table.sort_by(RECORDING.name).replace_schema_metadata({_MEMBERS: json.dumps(members)})
+    try:
+        with publish(folder / FILE) as part, part.open("xb") as stream:
+            pq.write_table(table, stream, compression="zstd")
+    except OSError as error:
+        raise McaptrackError(f"{folder / FILE} can't be written: {error.strerror or error}") from error
+    return True
+
+
+def _members(folder: Path) -> dict[str, list[int]]:
+    """The logs of a folder by name: when their rows were written, and how many bytes that took."""
+    found = {}
+    try:
+        with os.scandir(folder / _TABLE) as entries:
+            for entry in entries:
+                if entry.name.startswith(_PREFIX):
+                    try:
+                        about = os.stat(os.path.join(entry.path, "part-0.parquet"))
+                    except OSError:
+                        continue
+                    found[entry.name.removeprefix(_PREFIX)] = [about.st_mtime_ns, about.st_size]
+    except OSError:
+        return {}
+    return dict(sorted(found.items()))
+
+
+def _known(folder: Path) -> tuple[dict[str, list[int]], Any]:
+    """The logs that the file has, and their rows; none if there is no such file, or if it can't be read."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with (folder / FILE).open("rb") as stream:
+            table = pq.read_table(stream)
+        members = json.loads((table.schema.metadata or {})[_MEMBERS])
+    except (OSError, pa.ArrowException, KeyError, ValueError):
+        return {}, None
+    return members if isinstance(members, dict) else {}, table
+
+
+def _table(folder: Path, members: Mapping[str, list[int]]) -> Any:
+    """The rows of all logs: those of the file that still hold, and those of logs that changed."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    known, table = _known(folder)
+    kept = [name for name, state in members.items() if known.get(name) == state]
+    new = [(name, folder / _TABLE / f"{_PREFIX}{name}" / "part-0.parquet") for name in members if name not in kept]
+    parts = [join(new, TABLES[_TABLE].arrow).to_table()] if new else []
+    if kept and table is not None:
+        parts.append(table.filter(pc.is_in(table[RECORDING.name], pa.array(kept))).replace_schema_metadata(None))
+    plain = [_without_dictionaries(part) for part in parts] or [TABLES[_TABLE].arrow.empty_table()]
+    return pa.concat_tables(plain, promote_options="permissive")
+
+
+def _without_dictionaries(table: Any) -> Any:
+    import pyarrow as pa
+
+    fields = [
+        field.with_type(pa.string()) if pa.types.is_dictionary(field.type) else field
+        for field in table.schema.remove_metadata()
+    ]
+    return table.cast(pa.schema(fields))
