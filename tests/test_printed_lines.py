@@ -590,7 +590,21 @@ def asked_of(monkeypatch: pytest.MonkeyPatch, name: str) -> list[dict[str, Any]]
 
 
 #: Options that a command treats itself or gives in another form.
-OWN = {"json", "quiet", "verbose", "form", "csv", "fail_under", "search", "file", "rows", "tables", "study", "output"}
+OWN = {
+    "json",
+    "quiet",
+    "verbose",
+    "form",
+    "csv",
+    "fail_under",
+    "search",
+    "file",
+    "rows",
+    "tables",
+    "study",
+    "output",
+    "delta",
+}
 OF_FUNCTIONS = ("demo", "drop", "evaluate", "events", "export", "ingest", "recover", "render", "report", "train")
 
 

@@ -210,8 +210,7 @@ class LogWork(Generic[T]):
         Whether all logs have one output, a folder.
     names_output : bool
         Whether each input always has an output of its own, by default in the working folder.
-    then : callable
-        Called with each log that is done, now or before.
+    then : callable, called with each log that is done, now or before
     """
 
     name: str

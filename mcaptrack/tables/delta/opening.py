@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -135,7 +136,7 @@ def reporting(where: Location, done: str) -> Iterator[None]:
 
 def _first(error: Exception) -> str:
     """The reason of an error, in one line and without secrets."""
-    words = " ".join(str(error).split())
+    words = re.split(r" \d+: <unknown>", " ".join(str(error).split()))[0]
     for sign in ("Help:", "Debug source"):
         words = words.partition(sign)[0].strip()
     known = (
