@@ -148,7 +148,7 @@ def test_names_are_only_text_and_links_only_lead_to_files():
         assert not any(key.startswith("on") or key in ("src", "style") for key in attributes)
     assert not [c for c in text if not (c.isprintable() or c in "\n\u00a0\u202f")]
     assert json.loads(reader.scripts[0]) == json.loads(json.dumps(data))
-    assert len(reader.of("svg")) == 4
+    assert len(reader.of("svg")) == 5
     assert not reader.open
 
 
