@@ -55,7 +55,7 @@ def answer(command: str, path: Path) -> Any:
     copied = Path(shutil.copy(path, path.with_name("asked.mcap")))
     given = json.loads(done(command, copied, *READING[command], "--json", "-q").out)
     for result in given.get("results", []):
-        for name in ("seconds", "scores", "study"):
+        for name in ("seconds", "seconds_by_part", "scores", "study"):
             result.pop(name, None) if command in ("run", "events", *TRANSFORMS) else None
     for name in ("channels", "bytes", "messages", "digest"):
         [one.pop(name, None) for one in given.get("logs", [])]

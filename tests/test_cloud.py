@@ -81,6 +81,8 @@ def test_commands_give_the_same_of_a_store_as_of_a_file(store, template):
     assert names
     assert names == {str(file.relative_to("a.tables")) for file in Path("a.tables").rglob("*.parquet")}
     for name in names:
+        if name.startswith("recordings"):  # which says where the log is
+            continue
         assert (Path("a.tables") / name).read_bytes() == (Path("here/a.tables") / name).read_bytes()
     assert pq.read_table("a.tables/recordings")["recording"].to_pylist() == ["a"]
     done("report", url)

@@ -12,7 +12,7 @@ from mcaptrack.evaluation.metrics.calibration import ellipse_levels
 from mcaptrack.geometry.mixtures import Tails, squared_radius
 from mcaptrack.notices import Notice, listening
 from mcaptrack.predictors import NAMES, Forecast, make
-from mcaptrack.predictors.tails import TABLES, Calibration, counts_of, fit_mixture, table_of
+from mcaptrack.predictors.tails import TABLES, TailCalibration, counts_of, fit_mixture, table_of
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.predictions import tails_of
 from mcaptrack.transforms import PROFILES
@@ -78,7 +78,7 @@ class TestCalibration:
         """Errors of a known size of a predictor that says 1 m; the levels of the ellipses that hold them, by time."""
         rng = np.random.default_rng(4)
         predictor = make("kalman", 3, 0.4)
-        calibration = Calibration.of("kalman", predictor)
+        calibration = TailCalibration.of("kalman", predictor)
         ids, levels = np.arange(tracks), []
         place = np.zeros((steps + 4, tracks, 2))
         for step in range(steps):
@@ -98,7 +98,7 @@ class TestCalibration:
 
     def test_the_covariance_is_that_of_the_mixture(self):
         predictor = make("red", 12, 0.4)
-        calibration = Calibration.of("red", predictor)
+        calibration = TailCalibration.of("red", predictor)
         past = np.cumsum(np.full((2, 8, 2), 0.3), axis=1)
         plain = predictor.predict(past, np.ones((2, 8), bool))
         made, tails = calibration(0, np.array([1, 2]), plain, past, np.zeros(2, bool))
@@ -112,7 +112,7 @@ class TestCalibration:
         past = np.cumsum(np.full((3, 8, 2), 0.3), axis=1)
         past[1, :4] = np.nan
         given = Forecast(np.zeros((3, 12, 2)), np.tile(np.eye(2), (3, 12, 1, 1)))
-        made, _ = Calibration.of("kalman", predictor)(0, np.arange(3), given, past, np.array([False, False, True]))
+        made, _ = TailCalibration.of("kalman", predictor)(0, np.arange(3), given, past, np.array([False, False, True]))
         whole, short, coasting = made.cov[:, :, 0, 0]
         assert (short > whole).all()
         assert (coasting > short).all()

@@ -148,7 +148,7 @@ class DeltaBatches:
         delta_tables.prepare(self.where)
 
     def add(self, log: Location, folder: Path) -> None:
-        """Add a log whose tables stand in a folder; it may be committed later."""
+        """Add a log with its tables in a folder; it may be committed later."""
         self._waiting.append(ExportedLog(log, folder))
         if len(self._waiting) >= BATCH:
             self._start()

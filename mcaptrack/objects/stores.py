@@ -142,7 +142,7 @@ def endpoint() -> str:
 
 
 def settings_of(url: Url) -> dict[str, str]:
-    """What a program that reads AWS_..., GOOGLE_... and AZURE_... itself has to be told besides to use the same store.
+    """The further settings of a program that reads AWS_..., GOOGLE_... and AZURE_... itself, for the same store.
 
     Raises McaptrackError as for objects.
     """

@@ -65,13 +65,17 @@ class Gathered:
         self.at = min(sources, key=lambda one: len(one.frames) / max(float(np.ptp(one.t_ns)), 1.0))
         step_s = float(np.median(np.diff(self.at.t_ns))) / NS_PER_S if len(self.at.t_ns) > 1 else _MOST_WITHIN_S
         self._within_ns = round(min(_WITHIN * step_s, _MOST_WITHIN_S) * NS_PER_S)
+        #: Frames before time 0, where the clock of the slowest camera is late by more than the beginning of the log.
+        self.left_out = int(np.searchsorted(self.at.t_ns, 0))
 
     def __len__(self) -> int:
-        return len(self.at.t_ns)
+        return len(self.at.t_ns) - self.left_out
 
     def __iter__(self) -> Iterator[Frame]:
         nearest = [_nearest(one.t_ns, self.at.t_ns) for one in self._sources]
         for number, t_ns in enumerate(self.at.t_ns.tolist()):
+            if number < self.left_out:
+                continue
             parts = []
             for camera, source in enumerate(self._sources):
                 index = int(nearest[camera][number])
@@ -158,6 +162,12 @@ def fuse_cameras(
             for frame, collector in zip(made, collectors, strict=True):
                 collector.append(frame)
         _say(opened, fuser.views, offsets, offset_s, clock_offset_s)
+        if gathered.left_out:
+            warn(
+                f"{gathered.left_out} frames of {gathered.at.view.name} are left out: they are before time 0, as its "
+                "clock is late",
+                "left-out",
+            )
     parameters = {
         "max_sigma": fuser.max_sigma,
         "max_distance_m": fuser.max_distance_m,

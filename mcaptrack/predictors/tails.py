@@ -112,7 +112,7 @@ class _Made(NamedTuple):
     cov: Floats
 
 
-class Calibration:
+class TailCalibration:
     """Makes mixtures of the forecasts of one log, in the order of time.
 
     Parameters
@@ -137,7 +137,7 @@ class Calibration:
         self._fitted_at, self._is_new = 0, False
 
     @classmethod
-    def of(cls, name: str, predictor: Predictor) -> Calibration | None:
+    def of(cls, name: str, predictor: Predictor) -> TailCalibration | None:
         """The calibration of a predictor by name; None if it has no table."""
         table = table_of(name)
         return None if table is None else cls(table, predictor)

@@ -11,7 +11,7 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories
 from mcaptrack.predictors import Forecast, make
-from mcaptrack.predictors.tails import Calibration
+from mcaptrack.predictors.tails import TailCalibration
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.transforms.motion_limits import ClassNames, limits_by_class, units_m
@@ -69,7 +69,7 @@ class Forecaster:
         self._rate_hz, self._min_history = rate_hz, min_history
         self._class_names, self._class_limits = class_names, class_limits
         self._predictor = make(predictor, max(1, round(horizon_s * rate_hz)), 1 / rate_hz, **options)
-        self._calibration = Calibration.of(predictor, self._predictor)
+        self._calibration = TailCalibration.of(predictor, self._predictor)
         self._step = 0
         self._histories = histories(max(self._predictor.past, min_history))
         self._last_ns: int | None = None

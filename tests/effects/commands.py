@@ -139,6 +139,8 @@ CASES: dict[str, dict[str, Case]] = {
         gate_m="--gate-m 0.01",
         min_iou="--min-iou 0.99",
         rules=("evaluate a.mcap --json", "--rules motmetrics"),
+        curves="--curves curves.svg",
+        smoothed="--smoothed",
         topic="--topic /camera/samples",
         camera="--camera other",
         ground_plane=(SCORED, "--ground-plane plane.txt"),
@@ -234,7 +236,7 @@ CASES: dict[str, dict[str, Case]] = {
         compact=("delta scattered", "--compact"),
         keep_days="--keep-days 1",
         quiet=("delta kept --keep-days 1", "-q"),
-        verbose=("delta kept --remove fresh", "-v"),
+        verbose=("delta kept --keep-days 1", "-v"),
     ),
     "docs": common("docs", output="-o pages.txt", force=("docs -o clip.mp4", "--force")),
 }

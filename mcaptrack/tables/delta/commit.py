@@ -41,7 +41,7 @@ _KNOWN: Final = ("location", "digest", DIGESTS)
 
 @dataclass
 class Committed:
-    """What was done with logs: names of those that were added, replaced and left as they were; why others failed.
+    """The outcome for logs: names of those that were added, replaced and left as they were; why others failed.
 
     ``transactions`` are those that succeeded, ``conflicts`` those that had to be repeated.
     """

@@ -53,7 +53,7 @@ class DeltaFolder:
         return [] if table is None else sorted(table.to_table(columns=[RECORDING.name])[RECORDING.name].to_pylist())
 
     def catalogue(self, version: Any, names: Sequence[str], columns: Sequence[str]) -> dict[str, dict[str, Any]]:
-        """What a version of ``recordings`` says about logs, by name."""
+        """The entries of a version of ``recordings`` about logs, by name."""
         import pyarrow.compute as pc
 
         known = dataset_of(version, self.location(CATALOGUE))
@@ -104,7 +104,7 @@ def library() -> Any:
 
 
 def options_of(where: Location) -> dict[str, str] | None:
-    """What the library has to be told about a store; it reads the environment itself."""
+    """The settings of the library for a store; it reads the environment itself."""
     return settings_of(where) if isinstance(where, Url) else None
 
 

@@ -73,7 +73,7 @@ def _opened(where: Location) -> DeltaFolder:
 
 
 def _repeated(folder: DeltaFolder, name: str, work: Any) -> Any:
-    """What a change of the newest version returns; it is tried again if another process was quicker."""
+    """Change the newest version; tried again if another process was quicker."""
     for left in reversed(range(_TRIES)):
         table = folder.table(name)
         if table is None:

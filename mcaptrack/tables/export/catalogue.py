@@ -1,4 +1,4 @@
-"""What the table ``recordings`` says about a log as a whole, so that thousands of logs can be compared by one table."""
+"""The columns of ``recordings`` about a log as a whole, so that one table compares thousands of logs."""
 
 from __future__ import annotations
 

@@ -265,7 +265,7 @@ class LogTables:
         }
 
     def _as_a_whole(self) -> dict[str, Any]:
-        """What tells a log from thousands of others."""
+        """The columns that tell a log from thousands of others."""
         there = self.topics("tracks")
         best = [topic for one in cameras(self.opened) if (topic := catalogue.best_tracks(one, there))]
         return {

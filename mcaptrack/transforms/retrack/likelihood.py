@@ -14,7 +14,7 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.ragged import group_index
 from mcaptrack.predictors import Forecast, Predictor, make
-from mcaptrack.predictors.tails import Calibration
+from mcaptrack.predictors.tails import TailCalibration
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.predictions import forecast_to_rows
@@ -237,7 +237,7 @@ class _Forecasts:
 
     def __init__(self, name: str, predictor: Predictor, unit_m: float) -> None:
         self._predictor, self._unit_m = predictor, unit_m
-        self._calibration = Calibration.of(name, predictor)
+        self._calibration = TailCalibration.of(name, predictor)
         self._out = FrameCollector(PREDICTIONS)
         self._waiting: list[_Waiting] = []
         nothing = np.empty((0, predictor.steps, 2, 2))

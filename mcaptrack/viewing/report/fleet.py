@@ -74,7 +74,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _versions(rows: Sequence[Row]) -> dict[str, int]:
-    """How many logs have results of each version; "" for those without results."""
+    """The number of logs with results of each version; "" for those without results."""
     found: dict[str, int] = {}
     for row in rows:
         text = row.get("versions") or ""
@@ -124,7 +124,7 @@ def warnings_by_code(rows: Sequence[Row]) -> list[dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
     for row in rows:
         known: dict[str, str] = {}
-        for code, message in _said(row.get("warning_texts")):
+        for code, message in _notices_in(row.get("warning_texts")):
             known.setdefault(code, message)
         for code, message in known.items():
             one = found.setdefault(code, {"code": code, "logs": 0, "message": message, "recording": row["recording"]})
@@ -132,7 +132,7 @@ def warnings_by_code(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return sorted(found.values(), key=lambda one: (-one["logs"], one["code"]))
 
 
-def _said(text: str | None) -> Iterator[tuple[str, str]]:
+def _notices_in(text: str | None) -> Iterator[tuple[str, str]]:
     try:
         found = json.loads(text or "[]")
     except ValueError:
@@ -143,7 +143,7 @@ def _said(text: str | None) -> Iterator[tuple[str, str]]:
 
 
 def trends(rows: Sequence[Row]) -> dict[str, Any] | None:
-    """How logs changed over time, in bins of equal length; None unless there are dates of at least three bins.
+    """Changes of logs over time, in bins of equal length; None unless there are dates of at least three bins.
 
     Lists of B values: ``days`` since ``first``, logs, hours, and medians and quartiles of IDF1 and of what is counted
     by hour; None where a bin has no value.
