@@ -2,8 +2,8 @@
 
     <folder>/recordings.parquet     the rows of <folder>/recordings/*/part-0.parquet, in one file
 
-The file is made of the others, and only saves opening thousands of them: rows of logs with a file that has changed since, as
-its time and size say, are read again.
+The file is made of the others, and only saves opening thousands of them: rows of logs with a file that has
+changed since, as its time and size say, are read again.
 """
 
 from __future__ import annotations
