@@ -200,10 +200,10 @@ def lowest(python: Python, built: Built, folder: Path) -> Iterator[str]:
     yield main_job(inside, folder)
 
 
-def with_wheels(python: Python, *words: object) -> None:
+def with_wheels(python: Python, *words: object, cwd: Path | None = None) -> None:
     """Install something. Raises Skipped on Pythons that aren't promised where something has no wheels yet."""
     try:
-        run(*words)
+        run(*words, cwd=cwd)
     except Failed as error:
         if NO_WHEELS.search(str(error)) and not NO_NETWORK.search(str(error)) and python.minor not in NAMED:
             raise Skipped(f"something has no wheels for Python {python.minor} yet: {last_line(error)}") from error
