@@ -6,7 +6,7 @@ Letters: C cameras.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -26,6 +26,7 @@ from mcaptrack.pipeline.run import Report, outdated_by
 from mcaptrack.pipeline.write import Made, digest_of, write
 from mcaptrack.schema import BOX_PX, DETECTIONS, SIGHTINGS, Frame
 from mcaptrack.schema.frame_columns import FrameCollector
+from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import Provenance, frame_id_of
 from mcaptrack.sources.cameras import Camera, cameras
 from mcaptrack.transforms import STAGES
@@ -169,11 +170,7 @@ def fuse_cameras(
                 "left-out",
             )
     parameters = {
-        "max_sigma": fuser.max_sigma,
-        "max_distance_m": fuser.max_distance_m,
-        "min_score": fuser.min_score,
-        "noise": fuser.noise,
-        "noise_m": fuser.noise_m,
+        **{one.name: getattr(fuser, one.name) for one in fields(fuser) if not one.metadata.get("context")},
         "fuser": "feet",
         "cameras": [view.name for view in fuser.views],
         "clock_offset_s": [offset_s[view.name] for view in fuser.views],
@@ -269,7 +266,7 @@ def _sources(
         boxes = [columns_to_boxes(frame.rows) for frame in islice(iter(found.frames), _COMPARED)]
         joined = np.concatenate([part for part in boxes if len(part)] or [np.empty((0, len(BOX_PX)))])
         view = view.with_heights(joined[np.isfinite(joined).all(axis=1)])
-        t_ns = np.array([frame.t_ns for frame in found.frames], np.int64)
+        t_ns = frame_times(found.frames)
         offset_ns = round(clock_offset_s.get(name, 0.0) * NS_PER_S)
         sources.append(_Source(topic, found.frames, t_ns - offset_ns, view))
     if not sources:
@@ -295,7 +292,7 @@ def _compared(
         late = {
             view.name: round(offset.late_s, 3)
             for view, offset in zip(views, offsets, strict=True)
-            if offset.late_s > _LATE_S / 2 or offset.late_s < -_LATE_S / 2
+            if np.isfinite(offset.late_s)
         }
         worst = max(late, key=lambda name: abs(late[name]), default="")
         if not worst or worst in given or abs(late[worst]) < _LATE_S:

@@ -11,10 +11,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Floats
+from mcaptrack.geometry.arrays import Floats, Indices
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.schema import Frame
 from mcaptrack.transforms.fuse.fuser import FootFuser, places_of
+from mcaptrack.transforms.fuse.grouping import Places, means
 from mcaptrack.transforms.fuse.view import SHARES, CameraView
 
 #: A place that so many other cameras see is taken for true; others are false if so many should see them.
@@ -88,7 +89,6 @@ def compare(
         sure = seen.sum(axis=1) > _OTHERS
         speed = _velocities(last, frame.t_ns, centre.xy_m[sure])
         last = frame.t_ns, centre.xy_m[sure]
-        inverse, weighted = places.information()
         for number in range(count):
             others = seen.sum(axis=1) - seen[:, number]
             there = (others >= _OTHERS) & (visible[:, number] > 0)
@@ -104,19 +104,14 @@ def compare(
             if not len(mine) or not len(rest):
                 continue
             names, inner = np.unique(of[rest], return_inverse=True)
-            a, b, c = (np.bincount(inner, part) for part in inverse[rest].T)
-            u, v = (np.bincount(inner, part) for part in weighted[rest].T)
-            seen_at = np.stack([c * u - b * v, a * v - b * u], axis=-1) / (a * c - b * b)[:, None]
-            apart = places.xy_m[mine][:, None] - seen_at
-            distance = np.hypot(apart[..., 0], apart[..., 1])
-            nearest = distance.argmin(axis=1)
-            is_pair = (distance.min(axis=1) < _NEAR_M) & (distance.argmin(axis=0)[nearest] == np.arange(len(mine)))
-            difference = apart[np.arange(len(mine)), nearest][is_pair]
+            seen_at = means(Places(places.xy_m[rest], places.cov[rest]), inner, len(names)).xy_m
+            which, nearest = _pairs(places.xy_m[mine], seen_at)
+            difference = places.xy_m[mine[which]] - seen_at[nearest]
             off[number].append(difference)
-            moving = speed[np.searchsorted(np.flatnonzero(sure), names[nearest[is_pair]])]
+            moving = speed[np.searchsorted(np.flatnonzero(sure), names[nearest])]
             pace = (moving**2).sum(axis=1)
             fast = pace > _MOVES_M_PER_S**2  # False where it isn't known
-            away_s = (frame.rows["picture_ns"][mine[is_pair][fast]] - offset_ns[number] - frame.t_ns) / NS_PER_S
+            away_s = (frame.rows["picture_ns"][mine[which][fast]] - offset_ns[number] - frame.t_ns) / NS_PER_S
             late[number].append(away_s - (difference[fast] * moving[fast]).sum(axis=1) / pace[fast])
     views = tuple(
         replace(view, detects=tuple((hits[i] / tries[i]).tolist()), false_share=float(false[i] / boxes[i]))
@@ -130,12 +125,18 @@ def _velocities(last: tuple[int, Floats] | None, t_ns: int, now: Floats) -> Floa
     out = np.full(now.shape, np.nan)
     if last is None or not len(last[1]) or not len(now) or t_ns <= last[0]:
         return out
-    apart = now[:, None] - last[1]
+    which, nearest = _pairs(now, last[1])
+    out[which] = (now[which] - last[1][nearest]) / ((t_ns - last[0]) / NS_PER_S)
+    return out
+
+
+def _pairs(some: Floats, others: Floats) -> tuple[Indices, Indices]:
+    """The places in (M, 2) and (N, 2) that are nearest to each other, and near."""
+    apart = some[:, None] - others
     distance = np.hypot(apart[..., 0], apart[..., 1])
     nearest = distance.argmin(axis=1)
-    is_same = (distance.min(axis=1) < _NEAR_M) & (distance.argmin(axis=0)[nearest] == np.arange(len(now)))
-    out[is_same] = apart[np.arange(len(now)), nearest][is_same] / ((t_ns - last[0]) / NS_PER_S)
-    return out
+    is_pair = (distance.min(axis=1) < _NEAR_M) & (distance.argmin(axis=0)[nearest] == np.arange(len(some)))
+    return np.flatnonzero(is_pair), nearest[is_pair]
 
 
 def _offset(off: list[Floats], late: list[Floats]) -> Offset:
