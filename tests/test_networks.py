@@ -14,7 +14,8 @@ import pytest
 
 from mcaptrack import log, notices, pipeline
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.metrics.calibration import coverage, forecast_scores, mahalanobis_squared
+from mcaptrack.evaluation.metrics.calibration import coverage, forecast_scores
+from mcaptrack.geometry.mixtures import mahalanobis_squared
 from mcaptrack.predictors import make
 from mcaptrack.predictors.linear import LinearPredictor
 from mcaptrack.predictors.lstm import Lstm

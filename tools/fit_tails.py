@@ -25,11 +25,10 @@ from corruptions import CORRUPTIONS, STEP_S, Corruption, corrupt
 from reproduce import on_clock
 
 from mcaptrack import __version__
-from mcaptrack.evaluation.metrics.calibration import mahalanobis_squared
 from mcaptrack.evaluation.metrics.displacement import TAU_M2, Forecasts, Positions, pair_forecasts
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories
-from mcaptrack.geometry.mixtures import Tails
+from mcaptrack.geometry.mixtures import Tails, mahalanobis_squared
 from mcaptrack.predictors import NAMES, Forecast, Predictor, make
 from mcaptrack.predictors.tails import TABLES, counts_of, fit_mixture
 from mcaptrack.schema import TRACKS, Frame

@@ -51,6 +51,32 @@ def normal_tails(shape: int | tuple[int, ...]) -> Tails:
     return Tails(*(np.full(shape, np.nan) for _ in range(3)))
 
 
+def mahalanobis_squared(off_m: Floats, cov_m2: Floats) -> Floats:
+    """Squared Mahalanobis distances of errors from zero.
+
+    Parameters
+    ----------
+    off_m : array (..., 2), m
+        Errors.
+    cov_m2 : array (..., 2, 2), m^2
+        Their covariances.
+
+    Returns
+    -------
+    array (...)
+        Squared distances in units of the standard deviation.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> mahalanobis_squared(np.array([2.0, 0.0]), np.diag([4.0, 1.0])).item()
+    1.0
+    """
+    xx, xy, yy = cov_m2[..., 0, 0], cov_m2[..., 0, 1], cov_m2[..., 1, 1]
+    x, y = off_m[..., 0], off_m[..., 1]
+    return np.asarray((yy * x**2 - 2 * xy * x * y + xx * y**2) / (xx * yy - xy**2))
+
+
 def mass_within(squared: Floats, tails: Tails) -> Floats:
     """The probability of a squared Mahalanobis distance up to ``squared`` (...).
 

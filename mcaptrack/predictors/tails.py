@@ -23,7 +23,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.mixtures import Tails, mass_within
+from mcaptrack.geometry.mixtures import Tails, mahalanobis_squared, mass_within
 from mcaptrack.predictors.forecast import Forecast, Predictor
 
 TABLES: Final = Path(__file__).parent / "trained" / "tails.json"
@@ -203,8 +203,6 @@ class TailCalibration:
         """Count errors (M, 2) of steps (M,); the measured positions have noise, too, which the true ones have not."""
         weight, narrow, wide = self._tails
         noise = (self._noise_m2 / np.maximum((1 - weight) * narrow + weight * wide, 1e-3))[ahead]
-        xx, xy, yy = cov[:, 0, 0] + noise, cov[:, 0, 1], cov[:, 1, 1] + noise
-        x, y = off[:, 0], off[:, 1]
-        half = (yy * x**2 - 2 * xy * x * y + xx * y**2) / (xx * yy - xy**2) / 2
+        half = mahalanobis_squared(off, cov + noise[:, None, None] * np.eye(2)) / 2
         self._counts += counts_of(ahead, half, self._steps)
         self._is_new = self._is_new or bool(len(ahead))

@@ -14,8 +14,9 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.metrics.calibration import forecast_scores, mahalanobis_squared
+from mcaptrack.evaluation.metrics.calibration import forecast_scores
 from mcaptrack.files import publish_bytes
+from mcaptrack.geometry.mixtures import mahalanobis_squared
 from mcaptrack.predictors import make, red
 from mcaptrack.predictors.forecast import Predictor
 from mcaptrack.predictors.lstm import Lstm

@@ -10,38 +10,12 @@ from typing import Final
 import numpy as np
 
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.geometry.mixtures import Tails, log_density, mass_within, normal_tails
+from mcaptrack.geometry.mixtures import Tails, log_density, mahalanobis_squared, mass_within, normal_tails
 
 #: The probabilities of the ellipses for which reliability is reported.
 RELIABILITY_LEVELS: Final = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 #: Those of them that tables have columns for.
 LEVELS: Final = (0.5, 0.9, 0.95)
-
-
-def mahalanobis_squared(off_m: Floats, cov_m2: Floats) -> Floats:
-    """Squared Mahalanobis distances of errors from zero.
-
-    Parameters
-    ----------
-    off_m : array (..., 2), m
-        Errors.
-    cov_m2 : array (..., 2, 2), m^2
-        Their covariances.
-
-    Returns
-    -------
-    array (...)
-        Squared distances in units of the standard deviation.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> mahalanobis_squared(np.array([2.0, 0.0]), np.diag([4.0, 1.0])).item()
-    1.0
-    """
-    xx, xy, yy = cov_m2[..., 0, 0], cov_m2[..., 0, 1], cov_m2[..., 1, 1]
-    x, y = off_m[..., 0], off_m[..., 1]
-    return np.asarray((yy * x**2 - 2 * xy * x * y + xx * y**2) / (xx * yy - xy**2))
 
 
 def ellipse_levels(off_m: Floats, cov_m2: Floats, tails: Tails) -> Floats:

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.mixtures import mahalanobis_squared
 from mcaptrack.predictors import Forecast
 
 Distance = Literal["mean", "max", "first", "now"]
@@ -18,10 +19,7 @@ Covariance = Literal["paper", "predictor"]
 
 def mahalanobis(off: Floats, cov: Floats) -> Floats:
     """Eq. 1: the lengths of ``off`` (..., 2) in standard deviations of ``cov`` (..., 2, 2)."""
-    xx, xy, yy = cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 1]
-    x, y = off[..., 0], off[..., 1]
-    squared = (yy * x**2 - 2 * xy * x * y + xx * y**2) / (xx * yy - xy**2)
-    return np.asarray(np.sqrt(np.maximum(squared, 0.0)))
+    return np.asarray(np.sqrt(np.maximum(mahalanobis_squared(off, cov), 0.0)))
 
 
 def paper_covariance(first: Ints, steps: int, sigma_m: float) -> Floats:
