@@ -203,7 +203,7 @@ COMMANDS: dict[str, dict[str, Any]] = {
         "point": "foot",
         "output": Path("mcaptrack.toml"),
     },
-    "view": {"port": 0, "lichtblick": "https://lichtblick-suite.github.io/lichtblick/"},
+    "view": {"links": 8, "port": 0, "lichtblick": "https://lichtblick-suite.github.io/lichtblick/"},
 }
 
 

@@ -31,7 +31,7 @@ from tests.bags import plain
 from tests.commands import GROUP, call, done
 from tests.effects.commands import CASES
 from tests.models import DATA, stocked
-from tests.worlds import small_scene
+from tests.worlds import small_scene, write_eventful
 
 
 class Seen(NamedTuple):
@@ -95,6 +95,7 @@ def template(template, tmp_path_factory) -> Path:
     (folder / "verbose.toml").write_text("\n".join(f"[{name}]\nverbose = true" for name in GROUP.commands))
     _add_channels_of_others(folder / "a.mcap")
     plain(folder / "robot.mcap", "ros2")
+    write_eventful(folder / "eventful.mcap")
     done("export", folder / "fresh.mcap", "-o", folder / "taken")
     for path in [*(folder / "taken").glob("*/recording=fresh")]:
         path.rename(path.with_name("recording=a"))

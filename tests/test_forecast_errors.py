@@ -402,12 +402,15 @@ def test_the_layout_plots_what_is_known(tmp_path):
     watched(path)
     with log.read(path) as opened:
         panels = json.loads(opened.attachment("mcaptrack.predictions.layout.json"))["configById"]
-    assert panels["Plot!errors"]["foxglovePanelTitle"] == "Prediction errors, against ground truth"
+    assert panels["Plot!errors"]["foxglovePanelTitle"] == "Prediction errors (m), against ground truth"
     assert {curve["value"]: curve["label"] for curve in panels["Plot!errors"]["paths"]} == {
-        "/camera/predictions/scores.rows[:].ade_m": "SORT: ADE (m)",
-        "/camera/predictions/scores.rows[:].fde_m": "SORT: FDE (m)",
+        "/camera/predictions/scores.rows[:].ade_m": "ADE, SORT",
+        "/camera/predictions/scores.rows[:].fde_m": "FDE, SORT",
     }
-    assert all("{step==3}" in curve["value"] for curve in panels["Plot!spread"]["paths"])
+    assert {curve["value"]: curve["label"] for curve in panels["Plot!spread"]["paths"]} == {
+        "/camera/predictions/scores.rows[:].spread_mean_m": "mean (m)",
+        "/camera/predictions/scores.rows[:].spread_90_m": "90 % (m)",
+    }
 
 
 def test_forecasts_without_reference_do_not_fail_a_run(tmp_path):

@@ -430,6 +430,10 @@ def test_a_port_in_use_is_refused(server):
         Server({}, 99999)
 
 
+#: What is said of a log without tracks.
+OPENED = "viewers open at 0.0 s, its start: nothing is tracked in it yet"
+
+
 def extended(path: Path) -> Path:
     """A log with two layouts of its own."""
     write_log(path, SOME)
@@ -477,7 +481,7 @@ def test_view_prints_working_links_and_serves_until_ctrl_c(tmp_path):
             _, err = process.communicate(timeout=20)
             assert all(rest(connection) == b"" for connection in held)
         assert process.returncode == 0
-        assert err == "serving until Ctrl-C ...\ndone\n"
+        assert err == f"{OPENED}\nserving until Ctrl-C ...\ndone\n"
 
 
 def test_layout_files_are_served_as_they_were_edited(tmp_path):
@@ -504,6 +508,7 @@ def test_layout_files_are_served_as_they_were_edited(tmp_path):
         assert err.splitlines() == [
             f"{edited} differs from the layout in the log; the file is served",
             f"warning: {unusable}",
+            OPENED,
             "serving until Ctrl-C ...",
         ]
 
@@ -532,7 +537,7 @@ def test_links_are_printed_for_people_as_the_server_has_them(tmp_path, monkeypat
     for path, layouts in ((extended(tmp_path / "a.mcap"), [", tracking", ", comparing"]), (plain, [""])):
         code, out, err = call("view", path)
         server = served.pop()
-        assert (code, err) == (0, "serving until Ctrl-C ...\ndone\n")
+        assert (code, err) == (0, f"{OPENED}\nserving until Ctrl-C ...\ndone\n")
         names = [*(f"Lichtblick{name}" for name in layouts), "Foxglove", "log", *(f"layout{name}" for name in layouts)]
         wanted = [
             *(server.lichtblick.values() or [server.links["Lichtblick"]]),

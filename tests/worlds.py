@@ -11,9 +11,12 @@ from pathlib import Path
 import av
 import numpy as np
 
+import mcaptrack
+from mcaptrack import log
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame
+from mcaptrack.schema.provenance import Provenance, digest
 from mcaptrack.sources.synthetic import Block, Pedestrian, SyntheticScene
 
 Positions = Mapping[int, tuple[float, float]]
@@ -251,3 +254,34 @@ FORECAST = PREDICTIONS.rows(
     cov_xy_m2=[0.0, 0],
     cov_yy_m2=[1.0, 1],
 )
+
+
+def _two_walkers(name_of_first: Callable[[int], tuple[int, int]]) -> list[Frame]:
+    """Two people who walk beside each other for 24 s; ``name_of_first`` names the first by tick: track and source."""
+    frames = []
+    for tick in range(60):
+        track, source = name_of_first(tick)
+        rows = tracks_at({track: (0.4 * tick, 0.0), 90: (0.4 * tick, 8.0)})
+        rows["source_id"] = [source, 90]
+        frames.append(Frame(ns(tick / 2.5), tick, rows))
+    return frames
+
+
+def write_eventful(path: Path) -> Path:
+    """A log with events: the tracker switches at 8 and at 16 s; re-tracking joins the first two of its tracks."""
+    joined = {0: (1, 1), 1: (1, 2), 2: (3, 3)}
+    channels = {
+        "truth": _two_walkers(lambda _: (50, 50)),
+        "tracks": _two_walkers(lambda tick: (1 + tick // 20, -1)),
+        "retracks": _two_walkers(lambda tick: joined[tick // 20]),
+    }
+    with log.create(path) as writer:
+        for name, frames in channels.items():
+            messages = [(frame.t_ns, frame.index, TRACKS.codec.encode(frame.rows)) for frame in frames]
+            made = Provenance("retrack" if name == "retracks" else "ingest", {"of": name}, digest=digest(messages))
+            record = (TRACKS.name, "protobuf", TRACKS.descriptor)
+            number = writer.add_channel(f"/camera/{name}", record, "protobuf", made.to_metadata())
+            for message in messages:
+                writer.add_message(number, *message)
+    mcaptrack.events(path)
+    return path

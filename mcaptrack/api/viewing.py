@@ -5,18 +5,66 @@ from __future__ import annotations
 import json
 import threading
 import webbrowser
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Final, NamedTuple, Self
 
 from mcaptrack import log as logs
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import Notes, PathLike, log_file
+from mcaptrack.api.common import Notes, PathLike, as_path, log_file
 from mcaptrack.errors import McaptrackError, call
+from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path
+from mcaptrack.viewing import moments
 from mcaptrack.viewing.links import LICHTBLICK, viewer_links
+from mcaptrack.viewing.moments import Moment
 from mcaptrack.viewing.serving import Server
+
+#: The names of codecs of videos.
+_CODECS: Final = {"h264": "H.264", "h265": "H.265", "vp9": "VP9", "av1": "AV1"}
+
+
+class LinkedEvent(NamedTuple):
+    """An identity switch or a repair, and the address that opens it.
+
+    Attributes
+    ----------
+    event : int
+        Its number in the log, from 1, in the order of time.
+    t_ns : int
+        Log time.
+    topic : str
+        The tracks that it happened to.
+    kind : str
+        "identity switch", "joined" or "parted".
+    text : str
+        What happened, and when in seconds of the log.
+    link : str
+        The address that opens the log in Lichtblick, a second before.
+
+    """
+
+    event: int
+    t_ns: int
+    topic: str
+    kind: str
+    text: str
+    link: str
+
+
+@dataclass(frozen=True)
+class _Contents:
+    """What a log has for viewers: its files, layouts by name (name of the file, content), events, and the time at
+    which viewers open.
+    """
+
+    files: Mapping[str, Path | bytes]
+    layouts: Mapping[str, tuple[str, Path | bytes]]
+    events: Sequence[Moment]
+    start_ns: int
+    at_ns: int
 
 
 class LogServer:
@@ -34,8 +82,12 @@ class LogServer:
         Addresses that open the log in "Lichtblick", with the first layout, and in "Foxglove".
     lichtblick : dict of str to str
         Addresses that open the log in Lichtblick, by layout.
+    events : tuple of LinkedEvent
+        Every identity switch and repair, in the order of time, with the address that opens it.
+    at_s : float
+        The time at which viewers open, in seconds since the start of the log.
     notes : tuple of str
-        Which layouts were edited.
+        Where viewers open and why, which layouts were edited, and where a viewer may have trouble with the pictures.
     warnings : tuple of mcaptrack.Notice
         Which layouts could not be read.
 
@@ -49,21 +101,26 @@ class LogServer:
     """
 
     def __init__(
-        self,
-        files: Mapping[str, Path | bytes],
-        layouts: Mapping[str, tuple[str, Path | bytes]],
-        port: int,
-        lichtblick: str,
-        notes: tuple[str, ...],
-        warnings: tuple[Notice, ...],
+        self, contents: _Contents, port: int, lichtblick: str, notes: tuple[str, ...], warnings: tuple[Notice, ...]
     ) -> None:
-        self._server = Server(dict(files) | dict(layouts.values()), port)
+        self._server = Server(dict(contents.files) | dict(contents.layouts.values()), port)
         self._thread: threading.Thread | None = None
-        self.logs = tuple(self._server.address(name) for name in files)
-        self.layouts = {name: self._server.address(file) for name, (file, _) in layouts.items()}
-        links = {name: viewer_links([*self.logs], address, lichtblick) for name, address in self.layouts.items()}
-        self.lichtblick = {name: link["Lichtblick"] for name, link in links.items()}
-        self.links = next(iter(links.values())) if links else viewer_links([*self.logs], None, lichtblick)
+        self.logs = tuple(self._server.address(name) for name in contents.files)
+        self.layouts = {name: self._server.address(file) for name, (file, _) in contents.layouts.items()}
+        first = next(iter(self.layouts.values()), None)
+
+        def links_to(layout: str | None, at_ns: int) -> dict[str, str]:
+            return viewer_links(self.logs, layout, lichtblick, at_ns if at_ns > contents.start_ns else None)
+
+        self.lichtblick = {
+            name: links_to(address, contents.at_ns)["Lichtblick"] for name, address in self.layouts.items()
+        }
+        self.links = links_to(first, contents.at_ns)
+        self.events = tuple(
+            LinkedEvent(*one, links_to(first, moments.before(one.t_ns, contents.start_ns))["Lichtblick"])
+            for one in contents.events
+        )
+        self.at_s = (contents.at_ns - contents.start_ns) / NS_PER_S
         self.notes = notes
         self.warnings = warnings
 
@@ -105,30 +162,37 @@ class LogServer:
         self._server.server_close()
 
 
-@checked(port=(0, 65535))
+@checked(port=(0, 65535), at_s=(0, 1e12), event=(1, 1e12))
 def view(
     log: PathLike,
     *,
+    at_s: float | None = None,
+    event: int | None = None,
     port: int = 0,
     lichtblick: str = LICHTBLICK,
-    layout: str | None = None,
+    layout: PathLike | None = None,
     browser: bool = False,
 ) -> LogServer:
     """Serve a log and its layouts to the browser of this machine, with links that open it in Lichtblick and Foxglove.
 
-    Layout files beside the log are served as they are, also while they are edited. Only these files are served, only
-    to this machine.
+    Viewers open a second before the first identity switch or repair of the tracks that layouts show, so that there is
+    something to see; without any event, where tracks are. Layout files beside the log are served as they are, also
+    while they are edited. Only these files are served, only to this machine.
 
     Parameters
     ----------
     log : path
         The log.
+    at_s : float, optional
+        Open at this time of the log, in seconds.
+    event : int, optional
+        Open a second before this event, by its number in ``LogServer.events``.
     port : int, default 0
         Port to serve it at; 0 is any that is free.
     lichtblick : str, optional
         Address of Lichtblick, if you have installed it yourself.
-    layout : str, optional
-        Serve only this layout: "tracking", "comparing" or "predictions".
+    layout : str or path, optional
+        Serve only this layout: "tracking", "comparing" or "predictions", or the layout in this file.
     browser : bool, default False
         Open Lichtblick in the browser.
 
@@ -140,7 +204,7 @@ def view(
     Raises
     ------
     McaptrackError
-        If the log cannot be read, has no such layout, or if the port is taken.
+        If the log cannot be read, has no such layout, time or event, or if the port is taken.
 
     Examples
     --------
@@ -152,6 +216,8 @@ def view(
     """
     if not lichtblick.startswith(("http://", "https://")):
         raise McaptrackError(f"`lichtblick=` needs an address such as http://localhost:8080, not {lichtblick!r}")
+    if at_s is not None and event is not None:
+        raise McaptrackError("`at_s=` and `event=` both say where viewers open; leave one out")
     path, notes = log_file(log), Notes()
     with collected() as warnings, logs.read(path) as opened:
         if not opened.is_on_disk:
@@ -160,15 +226,79 @@ def view(
                 f"to it mends it; {call('recover', path)} saves it to another file"
             )
         files = {part.path.name: Path(part.real_path) for part in opened.parts}
-        layouts = _layouts(path, opened, notes)
-    if layout is not None and layout not in layouts:
-        raise McaptrackError(f"{path} has no layout {layout}; it has {', '.join(layouts) or 'none'}")
-    chosen = {name: (layout_path(path, name).name, content) for name, content in layouts.items()}
-    chosen = {name: file for name, file in chosen.items() if layout in (None, name)}
-    server = LogServer(files, chosen, port, lichtblick, tuple(notes), tuple(dict.fromkeys(warnings)))
+        layouts = _chosen_layouts(path, opened, layout, notes)
+        events = moments.find_moments(opened)
+        at_ns, why = _opening(opened, events, at_s, event)
+        if opened.start_ns or opened.end_ns:
+            notes.say(f"viewers open at {moments.seconds_of(opened, at_ns):.1f} s, {why}")
+        _say_trouble(opened, notes)
+        contents = _Contents(files, layouts, events, opened.start_ns, at_ns)
+    server = LogServer(contents, port, lichtblick, tuple(notes), tuple(dict.fromkeys(warnings)))
     if browser:
         webbrowser.open(server.links["Lichtblick"])
     return server
+
+
+def _opening(opened: logs.Log, events: Sequence[Moment], at_s: float | None, event: int | None) -> tuple[int, str]:
+    """Return the log time in ns at which viewers open, and why. Raises McaptrackError if the log has no such time."""
+    if at_s is not None:
+        length_s = moments.seconds_of(opened, opened.end_ns)
+        if at_s > length_s:
+            raise McaptrackError(f"{opened.path} lasts {length_s:.1f} s, so viewers can't open it at {at_s:g} s")
+        return opened.start_ns + round(at_s * NS_PER_S), "as asked"
+    if event is not None:
+        if event > len(events):
+            there = f"the events 1 to {len(events)}" if events else "no identity switches and repairs"
+            raise McaptrackError(f"{opened.path} has {there}, so viewers can't open at event {event}")
+        chosen = events[event - 1]
+        return moments.before(chosen.t_ns, opened.start_ns), f"a second before event {event} ({chosen.text})"
+    return moments.opening_moment(opened, events)
+
+
+def _say_trouble(opened: logs.Log, notes: Notes) -> None:
+    """Say where viewers may have trouble with the pictures of a log, and what helps."""
+    topics: dict[str, list[str]] = {}
+    for topic, codec in moments.video_formats(opened).items():
+        topics.setdefault(codec, []).append(topic)
+    again = call("ingest", Path("VIDEO"), image_format="jpeg")
+    for codec, those in topics.items():
+        there = f"pictures in {', '.join(those)} are {_CODECS.get(codec, codec)}"
+        if codec == "h264":
+            notes.say(
+                f"{there}: on a slow machine Lichtblick may show none while it is paused, and late ones during play. "
+                f"A log made by {again} doesn't have this, and is larger"
+            )
+        else:
+            notes.say(f"{there}, which Lichtblick doesn't play; a log made by {again} can be seen everywhere")
+
+
+def _chosen_layouts(
+    path: Path, opened: logs.Log, chosen: PathLike | None, notes: Notes
+) -> dict[str, tuple[str, Path | bytes]]:
+    """Return the layouts to serve by name: the name of each file, and its content or path."""
+    if chosen is not None and str(chosen) not in LAYOUTS and _is_file_name(chosen):
+        file = as_path(chosen)
+        try:
+            json.loads(file.read_bytes())
+        except OSError as error:
+            raise McaptrackError(f"the layout {file} can't be read: {error.strerror}") from None
+        except (ValueError, RecursionError):
+            raise McaptrackError(f"{file} is no layout: it is not JSON") from None
+        return {file.stem.removesuffix(".layout"): (f"{file.stem}.json", file)}
+    found = _layouts(path, opened, notes)
+    if chosen is not None and str(chosen) not in found:
+        there = ", ".join(found) or "none"
+        raise McaptrackError(f"{path} has no layout {chosen}; it has {there}. A file of a layout ends with .json")
+    return {
+        name: (layout_path(path, name).name, content)
+        for name, content in found.items()
+        if chosen is None or name == str(chosen)
+    }
+
+
+def _is_file_name(chosen: PathLike) -> bool:
+    """Return whether a layout is named by its file."""
+    return Path(chosen).suffix.lower() == ".json" or len(Path(chosen).parts) > 1 or Path(chosen).is_file()
 
 
 def _layouts(path: Path, opened: logs.Log, notes: Notes) -> dict[str, Path | bytes]:

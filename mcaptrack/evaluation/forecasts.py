@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation import spread
 from mcaptrack.evaluation.aligned import MAX_GAP_S, on_ground, resample_frames
 from mcaptrack.evaluation.metrics.calibration import RELIABILITY_LEVELS
 from mcaptrack.evaluation.metrics.displacement import (
@@ -29,6 +30,7 @@ from mcaptrack.evaluation.metrics.displacement import (
 )
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.geometry.mixtures import Tails
 from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_numbers, frame_times, join_frames, row_ends, spans_of, split_rows
@@ -217,6 +219,8 @@ def find_forecast_errors(
         rows["track_id"], rows["truth_id"], rows["later_id"] = arrays.forecasts.id, NO_ID, NO_ID
         of_part = scores[low:high]
         of_part["forecasts"] = np.bincount(arrays.message, minlength=high - low)
+        radii_m = _radii_m(arrays.forecasts)
+        of_part["spread_mean_m"], of_part["spread_90_m"] = spread.by_frame(radii_m, arrays.message, high - low)
         span = (int(times[low]), int(times[high - 1])) if len(parts) > 1 else None
         paths, offline = (arrays.clock.positions(some, span, arrays.forecasts) for some in (tracks, later))
         if has_truth:
@@ -233,6 +237,12 @@ def find_forecast_errors(
     return ForecastErrorFrames(
         errors.done(), split_rows(times, numbers, FORECAST_SCORES.check(scores), np.arange(1, len(frames) + 1))
     )
+
+
+def _radii_m(forecasts: Forecasts) -> Floats:
+    """The longer half axes (N,) of the 95 % ellipses at the last step."""
+    shapes = forecasts.shapes(np.arange(len(forecasts.id)))
+    return spread.radii_m(forecasts.cov_m2[:, -1], Tails(*(part[:, -1] for part in shapes)))
 
 
 def _compare(

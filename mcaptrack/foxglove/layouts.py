@@ -25,6 +25,11 @@ _CAMERA: Final = {
 }
 #: Grids have cells of 1 m, or of 10 m if there would be more cells than this.
 _MOST_CELLS: Final = 100
+#: Grids are as wide as this part of the distance of the camera; their lines are faint, so that tracks stand out.
+_GRID_SHARE: Final = 0.8
+_GRID_COLOUR: Final = "#8080a028"
+#: The width of the legend in px, beside the curves, which it would hide otherwise.
+_LEGEND_PX: Final = 130
 
 
 class Eye(NamedTuple):
@@ -66,7 +71,7 @@ def scene_panel(title: str, frame_id: str, topics: Mapping[str, bool], eye: Eye,
 
     The camera stands at ``eye`` in that frame, or moves with the frame of a robot, ``follow``.
     """
-    size = max(10, round(eye.distance_m / 10) * 10 * 2)
+    size = max(10, round(_GRID_SHARE * eye.distance_m / 10) * 10)
     grid = {
         "layerId": "foxglove.Grid",
         "instanceId": "grid",
@@ -76,7 +81,7 @@ def scene_panel(title: str, frame_id: str, topics: Mapping[str, bool], eye: Eye,
         "size": size,
         "divisions": size if size <= _MOST_CELLS else max(1, size // 10),
         "lineWidth": 1,
-        "color": "#4a4a6a80",
+        "color": _GRID_COLOUR,
         "position": [round(eye.x_m), round(eye.y_m), eye.z_m or 0],
         "rotation": [0, 0, 0],
     }
@@ -102,8 +107,11 @@ def scene_panel(title: str, frame_id: str, topics: Mapping[str, bool], eye: Eye,
     return panel(title, scene)
 
 
-def plot_panel(title: str, paths: Mapping[str, str]) -> dict[str, Any]:
-    """A plot over time: message paths with their labels."""
+def plot_panel(title: str, paths: Mapping[str, str], most: float | None = None) -> dict[str, Any]:
+    """A plot over time: message paths with their labels. Its axis ends at 0 and ``most``, if that is given.
+
+    Without limits, viewers cut lines at the border of the panel.
+    """
     curves = [
         {"value": value, "enabled": True, "timestampMethod": "receiveTime", "label": label}
         for value, label in paths.items()
@@ -111,13 +119,15 @@ def plot_panel(title: str, paths: Mapping[str, str]) -> dict[str, Any]:
     plot = {
         "paths": curves,
         "showLegend": True,
-        "legendDisplay": "floating",
+        "legendDisplay": "left",
         "showXAxisLabels": True,
         "showYAxisLabels": True,
         "isSynced": True,
         "xAxisVal": "timestamp",
-        "sidebarDimension": 240,
+        "sidebarDimension": _LEGEND_PX,
     }
+    if most is not None:
+        plot |= {"minYValue": 0, "maxYValue": most}
     return panel(title, plot)
 
 

@@ -32,6 +32,7 @@ from mcaptrack.pipeline.drawing import (
     recorded_sources,
     robot_frame,
 )
+from mcaptrack.pipeline.plots import highest_values
 from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names, classes_beside_rows, has_classes, only_class, without_class
 from mcaptrack.schema.encodings import PROTOBUF, Encoding, encoded, record_of
@@ -172,6 +173,7 @@ def write(
     follow = robot_frame(opened, sources, tree, frame_id) if tree and frame_id else ""
     by_viewers = recorded_drawings(opened, sources) if frame_id else {}
     floor_m = _floor_m(opened, prefix, shown) if frame_id else 0.0
+    highest = highest_values(prefix, lambda topic, schema: _frames(opened, shown, topic, schema))
     # Write views of unchanged channels first, so that channels made again keep their place and the log its bytes.
     first, last = ({t: c for t, c in shown.items() if (t in made) is is_made} for is_made in (False, True))
     drawn_first = [view for view in drawn.views(first, start_ns) if view.topic not in recorded]
@@ -182,7 +184,7 @@ def write(
     frame_id = frame_id or views.ground.frame_of(prefix)
     channels = layouts.CameraChannels(
         prefix, names, video, frame_id, eye._replace(z_m=floor_m), last_step, is_truth_known, follow, by_viewers,
-        tuple(cameras),
+        tuple(cameras), highest,
     )  # fmt: skip
     layout_files = layouts.make(channels)
     new = {attachment_of(name): content for name, content in layout_files.items()}

@@ -195,6 +195,9 @@ CASES: dict[str, dict[str, Case]] = {
     "info": common("info a.mcap", frames="--frames", output="-o b.txt", force=("info a.mcap -o clip.mp4", "--force")),
     "view": common(
         "view a.mcap",
+        at="--at 1",
+        event=("view eventful.mcap", "--event 2"),
+        links=("view eventful.mcap", "--links 1"),
         port="--port 1",
         lichtblick="--lichtblick http://localhost:1",
         layout="--layout tracking",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from math import atan2, degrees, hypot, isfinite
+from math import atan2, degrees, floor, hypot, isfinite, log10
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -31,6 +31,10 @@ _KINDS: Final = (
 #: The most pictures of a layout that are side by side.
 _MOST_CAMERAS: Final = 3
 _TILT_DEG: Final = 45.0
+#: The distance of the camera, in radii of the places of people: discs and labels at the border are whole.
+_DISTANCE: Final = 3.4
+#: The names of plots with known limits.
+PEOPLE, ERRORS, SPREAD = "people", "errors", "spread"
 #: The suffix of the text of events, after the topic of tracks.
 _EVENTS: Final = "/events/view/log"
 
@@ -42,6 +46,7 @@ class CameraChannels(NamedTuple):
 
     ``follow`` is the frame of the robot that recorded 3D boxes; ``recorded`` are topics that viewers draw in 3D
     themselves, and whether they are these boxes; ``seen_by`` are the topics of the pictures that boxes are drawn on.
+    ``highest`` are the largest values that plots show, by name: those that are known.
     """
 
     prefix: str
@@ -54,6 +59,7 @@ class CameraChannels(NamedTuple):
     follow: str = ""
     recorded: Mapping[str, bool] = {}
     seen_by: tuple[str, ...] = ()
+    highest: Mapping[str, float] = {}
 
     def topics(self, suffix: str, on: Collection[str]) -> dict[str, bool]:
         """The topics of all views with a suffix, and whether each is on."""
@@ -87,9 +93,8 @@ def eye_on(places_m: Floats, planes: Planes, t_ns: int) -> Eye:
         sight = plane.pixels_to_metres(np.array([[width / 2, height], [width / 2, height * 0.9]]))
         ahead_x, ahead_y = (sight[1] - sight[0]).tolist()
         bearing = degrees(atan2(ahead_x, ahead_y)) if isfinite(ahead_x) and hypot(ahead_x, ahead_y) else 0.0
-    return Eye(
-        round(float(middle[0]), 1), round(float(middle[1]), 1), round(2.4 * radius, 1), _TILT_DEG, round(bearing, 1)
-    )
+    x_m, y_m, distance_m = (round(float(value), 1) for value in (*middle, _DISTANCE * radius))
+    return Eye(x_m, y_m, distance_m, _TILT_DEG, round(bearing, 1))
 
 
 def make(camera: CameraChannels) -> dict[str, bytes]:
@@ -137,15 +142,37 @@ def _predictions(camera: CameraChannels) -> bytes:
     past = "retracks/full" if future.startswith("retracks") else "tracks"
     on = [future, past, "truth"]
     panels: dict[str, Any] = {}
-    source = f"{camera.prefix}/{future}"
-    last = f"{source}.rows[:]{{step=={camera.last_step}}}"
-    spread = {f"{last}.cov_{axis}_m2": f"variance at the end, {axis[0]} (m2)" for axis in ("xx", "yy")}
-    panels["Plot!spread"] = layouts.plot_panel("Uncertainty of forecasts", spread)
+    panels["Plot!spread"] = _spread(camera, future)
     events = "retracks" if future.startswith("retracks") else "tracks"
     left = [*_image(camera, panels, "picture", "Forecasts", on), *_errors(camera, panels)]
     right = [*_ground(camera, panels, "ground", "Forecasts on the ground", on)]
-    right.append(split(["Plot!spread", *_events(camera, panels, "Tracking", (events,))]))
+    beside = _events(camera, panels, "Tracking", (events,))
+    right.append(("row", "Plot!spread", beside[0], 60.0) if beside else "Plot!spread")
     return _file(panels, _columns(left, right, 50.0))
+
+
+def _spread(camera: CameraChannels, future: str) -> dict[str, Any]:
+    """How far forecasts spread: mean and 90th percentile of each frame, or the variances of all people."""
+    source = f"{camera.prefix}/{future}"
+    if SPREAD in camera.highest:
+        paths = {
+            f"{source}/scores.rows[:].spread_mean_m": "mean (m)",
+            f"{source}/scores.rows[:].spread_90_m": "90 % (m)",
+        }
+        return layouts.plot_panel("Radius that holds 95 %", paths, limit_of(camera.highest[SPREAD]))
+    last = f"{source}.rows[:]{{step=={camera.last_step}}}"
+    paths = {f"{last}.cov_{axis}_m2": f"{axis[0]} variance (m2)" for axis in ("xx", "yy")}
+    return layouts.plot_panel("Uncertainty of forecasts", paths)
+
+
+def limit_of(highest: float | None, is_count: bool = False) -> float | None:
+    """The round number at which an axis ends, above a value; None if that is not known."""
+    if highest is None or not isfinite(highest) or highest <= 0:
+        return None
+    unit = 10.0 ** floor(log10(highest / 10))
+    step = next(k * unit for k in (1, 2, 5, 10) if k * unit >= highest / 10 * (1 - 1e-9))
+    step = max(step, 1.0) if is_count else step
+    return float(f"{(floor(highest / step) + 1) * step:.6g}")
 
 
 def _errors(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
@@ -153,7 +180,7 @@ def _errors(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
     front = "" if camera.is_truth_known else "later_"
     labels = {"retracks/predictions": "re-tracked", "predictions": "SORT"}
     paths = {
-        f"{camera.prefix}/{name}/scores.rows[:].{front}{measure.lower()}_m": f"{label}: {measure} (m)"
+        f"{camera.prefix}/{name}/scores.rows[:].{front}{measure.lower()}_m": f"{measure}, {label}"
         for measure in ("ADE", "FDE")
         for name, label in labels.items()
         if f"{name}/scores" in camera.names
@@ -161,7 +188,8 @@ def _errors(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
     if not paths:
         return []
     words = "ground truth" if camera.is_truth_known else "later tracks"
-    panels["Plot!errors"] = layouts.plot_panel(f"Prediction errors, against {words}", paths)
+    most = limit_of(camera.highest.get(ERRORS))
+    panels["Plot!errors"] = layouts.plot_panel(f"Prediction errors (m), against {words}", paths, most)
     return ["Plot!errors"]
 
 
@@ -219,7 +247,8 @@ def _plots(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
     if not counted and not places:
         return []
     title = ("Objects" if camera.recorded else "People") if counted else "Places"
-    panels["Plot!people"] = layouts.plot_panel(title, counted or places)
+    most = limit_of(camera.highest.get(PEOPLE), is_count=True) if counted else None
+    panels["Plot!people"] = layouts.plot_panel(title, counted or places, most)
     return ["Plot!people"]
 
 
