@@ -60,6 +60,7 @@ ONLY_OPTIONS = {
     },
     "info": {"output": "the result", "force": "the result"},
     "models": {"source": "get_model"},
+    "view": {"links": "LogServer.events"},
     "query": {
         "file": "the query is text",
         "form": "Arrow writes all formats",

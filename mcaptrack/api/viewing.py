@@ -56,8 +56,8 @@ class LinkedEvent(NamedTuple):
 
 @dataclass(frozen=True)
 class _Contents:
-    """What a log has for viewers: its files, layouts by name (name of the file, content), events, and the time at
-    which viewers open.
+    """The contents of a log for viewers: its files, layouts by name (name of the file, content), events, and the time
+    at which viewers open.
     """
 
     files: Mapping[str, Path | bytes]
@@ -162,7 +162,7 @@ class LogServer:
         self._server.server_close()
 
 
-@checked(port=(0, 65535), at_s=(0, 1e12), event=(1, 1e12))
+@checked(port=(0, 65535), at_s=(0, 1e9), event=(1, 1e9))
 def view(
     log: PathLike,
     *,

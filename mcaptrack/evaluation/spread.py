@@ -1,4 +1,4 @@
-"""How far forecasts spread: one mean and one 90th percentile for each frame, which viewers can plot.
+"""The spread of forecasts: one mean and one 90th percentile for each frame, which viewers can plot.
 
 Letters: N forecasts, F frames.
 """

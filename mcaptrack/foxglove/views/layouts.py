@@ -152,7 +152,7 @@ def _predictions(camera: CameraChannels) -> bytes:
 
 
 def _spread(camera: CameraChannels, future: str) -> dict[str, Any]:
-    """How far forecasts spread: mean and 90th percentile of each frame, or the variances of all people."""
+    """The spread of forecasts: mean and 90th percentile of each frame, or the variances of all people."""
     source = f"{camera.prefix}/{future}"
     if SPREAD in camera.highest:
         paths = {
