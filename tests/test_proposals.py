@@ -160,6 +160,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "cli/view.py:_print:run": lambda s: s.untracked().says("view", "LOG"),
     "evaluation/__init__.py:sequence_of_log:run": lambda s: s.untracked().says("evaluate", "LOG"),
     "evaluation/__init__.py:ground_truth_of_log:ingest": lambda s: s.without("/camera/truth*").says("evaluate", "LOG"),
+    "api/viewing.py:_say_trouble:ingest": lambda s: s.says("view", "LOG"),
     "api/viewing.py:view:recover": lambda s: s.half_written().says("view", "LOG"),
     "tables/compared.py:pair_files:ingest": lambda s: s.without("/camera/truth*").says(
         "evaluate", "LOG", "--truth", "truth.txt"

@@ -41,7 +41,7 @@ def view(
             least=1,
             most=1e9,
             help="Open a second before this event, by its number.",
-            show_default=False,
+            show_default="none",
         ),
     ] = None,
     layout: Annotated[
