@@ -14,6 +14,7 @@ import re
 import secrets
 import shlex
 import shutil
+import stat
 import webbrowser
 from collections.abc import Callable
 from dataclasses import fields
@@ -129,39 +130,33 @@ def _add_channels_of_others(path: Path) -> None:
         writer.add_message(channel, 1, 1, b'{"a": 1}')
 
 
-#: Folders of many files, and the word in a command line that needs them there.
-FOLDERS = {"a.tables": "a.mcap", "nuscenes": "nuscenes", "taken": "taken", "yolo": "yolo"}
+class Work:
+    """A copy of a folder in which commands run: what one has changed is put back before the next."""
 
+    def __init__(self, template: Path, folder: Path) -> None:
+        self.folder, self._template = folder, template
+        shutil.copytree(template, folder, copy_function=_copy)
+        self.given = {name: _digest(folder / name) for name in _states(folder)}
+        self._clean = _states(folder)
 
-@pytest.fixture
-def see(template, tmp_path, monkeypatch) -> Callable[[str], Seen]:
-    """Run a command line in a fresh copy of the template."""
-    monkeypatch.setitem(synthetic.SCENES, "square", lambda seed: small_scene(2.0, seed=seed))
-    monkeypatch.setitem(synthetic.SCENES, "crowd", lambda seed: small_scene(1.0, seed=seed))
-    monkeypatch.setattr(Server, "serve_forever", _interrupted)
-    monkeypatch.setattr(secrets, "token_urlsafe", lambda _: "secret")
-    monkeypatch.setattr(webbrowser, "open", lambda address: print(f"opened {address}"))
+    def changed(self) -> dict[str, str]:
+        """Return digests of the files that are new or have changed; those that are gone are "removed"."""
+        now = _states(self.folder)
+        found = dict.fromkeys(self._clean.keys() - now.keys(), "removed")
+        found |= {name: _digest(self.folder / name) for name, state in now.items() if self._clean.get(name) != state}
+        return {name: digest for name, digest in found.items() if self.given.get(name) != digest}
 
-    stocked(monkeypatch, tmp_path, "http://127.0.0.1:1/network.onnx")  # which can't be reached
-    monkeypatch.setenv("MCAPTRACK_MODELS", "models")
-
-    def run(line: str) -> Seen:
-        folder = tmp_path / "work"
-        shutil.rmtree(folder, ignore_errors=True)
-        unused = [name for name, word in FOLDERS.items() if word not in line]
-        shutil.copytree(template, folder, copy_function=_copy, ignore=lambda *_: unused)
-        given = _digests(folder)
-        monkeypatch.chdir(folder)
-        code, out, err = call(*shlex.split(line))
-        out = re.sub(r"(?<=127\.0\.0\.1)(:|%3A)\d{5}\b", ":any", out)  # a port that was free
-        out = re.sub(r'"seconds": [\d.]+|"seconds_by_part": \{[^}]*\}', "", out)  # how long it took
-        err = re.sub(r" in [\d.]+ s\b|^  time .*\n", "", err, flags=re.MULTILINE)
-        left = _digests(folder)
-        files = {name: left.get(name, "removed") for name in given | left if left.get(name) != given.get(name)}
-        monkeypatch.chdir(tmp_path)
-        return Seen(code, out, err, files)
-
-    return run
+    def restore(self) -> None:
+        now = _states(self.folder)
+        if now == self._clean:
+            return
+        for name in [name for name in now if name not in self._clean]:
+            (self.folder / name).rmdir() if now[name] is None else (self.folder / name).unlink()
+        for name in sorted(name for name, state in self._clean.items() if now.get(name, ()) != state):
+            mine, original = self.folder / name, self._template / name
+            mine.unlink(missing_ok=True)
+            mine.mkdir() if original.is_dir() else _copy(str(original), str(mine))
+        self._clean = _states(self.folder)
 
 
 def _copy(source: str, target: str) -> None:
@@ -172,17 +167,57 @@ def _copy(source: str, target: str) -> None:
         shutil.copy2(source, target)
 
 
-def _digests(folder: Path) -> dict[str, str]:
-    """Digests of all files of a folder; of those with a second name that is the place on the disk."""
-    found = {}
-    for path in folder.rglob("*"):
-        if path.is_file():
-            facts = path.stat()
-            is_linked = facts.st_nlink > 1
-            found[str(path.relative_to(folder))] = (
-                str(facts.st_ino) if is_linked else hashlib.sha256(path.read_bytes()).hexdigest()
-            )
+def _states(folder: Path, inside: str = "") -> dict[str, tuple[int, ...] | None]:
+    """What changes in the file system with any change of a file, by its name, those in a folder before that folder."""
+    found: dict[str, tuple[int, ...] | None] = {}
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            name = f"{inside}{entry.name}"
+            if entry.is_dir(follow_symlinks=False):
+                found |= _states(Path(entry.path), f"{name}/")
+                found[name] = None
+            else:
+                facts = entry.stat(follow_symlinks=False)
+                found[name] = (facts.st_ino, facts.st_size, facts.st_mtime_ns, facts.st_ctime_ns)
     return found
+
+
+def _digest(path: Path) -> str:
+    """The digest of a file; of one with a second name that is the place on the disk, and folders have none."""
+    facts = path.lstat()
+    if not stat.S_ISREG(facts.st_mode):
+        return ""
+    return str(facts.st_ino) if facts.st_nlink > 1 else hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.fixture(scope="module")
+def work(template, tmp_path_factory) -> Work:
+    return Work(template, tmp_path_factory.mktemp("effects") / "work")
+
+
+@pytest.fixture
+def see(work, tmp_path, monkeypatch) -> Callable[[str], Seen]:
+    """Run a command line in a folder that is as the template."""
+    monkeypatch.setitem(synthetic.SCENES, "square", lambda seed: small_scene(2.0, seed=seed))
+    monkeypatch.setitem(synthetic.SCENES, "crowd", lambda seed: small_scene(1.0, seed=seed))
+    monkeypatch.setattr(Server, "serve_forever", _interrupted)
+    monkeypatch.setattr(secrets, "token_urlsafe", lambda _: "secret")
+    monkeypatch.setattr(webbrowser, "open", lambda address: print(f"opened {address}"))
+
+    stocked(monkeypatch, tmp_path, "http://127.0.0.1:1/network.onnx")  # which can't be reached
+    monkeypatch.setenv("MCAPTRACK_MODELS", "models")
+
+    def run(line: str) -> Seen:
+        work.restore()
+        monkeypatch.chdir(work.folder)
+        code, out, err = call(*shlex.split(line))
+        out = re.sub(r"(?<=127\.0\.0\.1)(:|%3A)\d{5}\b", ":any", out)  # a port that was free
+        out = re.sub(r'"seconds": [\d.]+|"seconds_by_part": \{[^}]*\}', "", out)  # how long it took
+        err = re.sub(r" in [\d.]+ s\b|^  time .*\n", "", err, flags=re.MULTILINE)
+        monkeypatch.chdir(tmp_path)
+        return Seen(code, out, err, work.changed())
+
+    return run
 
 
 def _interrupted(*_: object, **__: object) -> None:
