@@ -53,6 +53,7 @@ from mcaptrack.api.viewing import LogServer as LogServer
 from mcaptrack.api.viewing import view as view
 from mcaptrack.api.whole import events as events
 from mcaptrack.api.whole import run as run
+from mcaptrack.api.zoning import zones as zones
 from mcaptrack.errors import McaptrackError as McaptrackError
 from mcaptrack.notices import McaptrackWarning as McaptrackWarning
 from mcaptrack.notices import Notice as Notice
@@ -116,6 +117,7 @@ __all__ = [
     "train",
     "tune",
     "view",
+    "zones",
 ]
 __version__: str
 SCHEMA_VERSION: int

@@ -75,6 +75,23 @@ def toml_value(value: object) -> str:
     )
 
 
+#: A zone that both people of ``made_log`` walk through, and a line that one of them crosses.
+ZONES = (
+    '{"type": "FeatureCollection", "units": "metres", "features": ['
+    '{"type": "Feature", "properties": {"name": "room"}, "geometry": '
+    '{"type": "Polygon", "coordinates": [[[1, 2], [3, 2], [3, 5], [1, 5], [1, 2]]]}}, '
+    '{"type": "Feature", "properties": {"name": "door"}, "geometry": '
+    '{"type": "LineString", "coordinates": [[4, 0], [4, 9]]}}]}'
+)
+
+
+def zones_file(folder: Path) -> Path:
+    """A file of zones."""
+    path = folder / "zones.geojson"
+    path.write_text(ZONES)
+    return path
+
+
 def made_log(folder: Path, frames: int = 30) -> Path:
     """A log of two people who walk beside each other, found, tracked, predicted and re-tracked."""
     write_clip(folder / "clip.mp4", frames)
@@ -83,6 +100,7 @@ def made_log(folder: Path, frames: int = 30) -> Path:
     ]
     (folder / "truth.txt").write_text("\n".join(rows) + "\n")
     (folder / "plane.txt").write_text("0.1,0,0\n0,0.1,0\n0,0,1\n")
+    zones_file(folder)
     path = folder / "a.mcap"
     labels = ["--truth", folder / "truth.txt", "--ground-plane", folder / "plane.txt"]
     done("ingest", folder / "clip.mp4", *labels, "-o", path)

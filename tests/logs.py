@@ -14,6 +14,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mcaptrack import log
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
+from tests.commands import zones_file
 from tests.worlds import boxes_at, ns, tracks_at
 
 SCHEMA = ("test.Thing", "jsonschema", b"{}")
@@ -121,6 +122,7 @@ READING: dict[str, Callable[[Path, Path], list[object]]] = {
     "render": lambda log, out: [log, "-o", out / "rendered.gif", "--width", "64", "--end-s", "0.2"],
     "report": lambda log, out: [log, "-o", out / "report.html"],
     "tune": lambda log, out: [log, "--trials", "1", "-o", out / "tuned.json"],
+    "zones": lambda log, out: [log, "--zones", zones_file(out), "-o", out / "other.mcap"],
     "view": lambda log, out: [log, "--layout", "no such layout"],
     **{
         name: lambda log, out: [log, "-o", out / "other.mcap"]

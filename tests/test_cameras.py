@@ -16,7 +16,7 @@ from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance, digest
 from mcaptrack.sources.cameras import camera_at, cameras, find_camera, name_above, repaired_tracks
 from mcaptrack.transforms import STAGES, TRANSFORMS
-from tests.commands import GROUP, call, done
+from tests.commands import GROUP, call, done, zones_file
 from tests.robots import write_log
 from tests.worlds import tracks_at
 
@@ -38,6 +38,7 @@ READING = {
     "evaluate": (),
     "report": ("-o", "page.html", "--force"),
     "events": (),
+    "zones": ("--zones", "zones.geojson"),
     "render": ("-o", "walk.gif", "--force", "--width", "64"),
     "run": ("--no-tables",),
     "tune": ("--trials", "1", "-o", "tuned.toml"),
@@ -47,6 +48,7 @@ READING = {
 @pytest.fixture
 def path(template, tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
+    zones_file(tmp_path)
     return Path(shutil.copy(template, tmp_path / "a.mcap"))
 
 
@@ -56,7 +58,7 @@ def answer(command: str, path: Path) -> Any:
     given = json.loads(done(command, copied, *READING[command], "--json", "-q").out)
     for result in given.get("results", []):
         for name in ("seconds", "seconds_by_part", "scores", "study"):
-            result.pop(name, None) if command in ("run", "events", *TRANSFORMS) else None
+            result.pop(name, None) if command in ("run", "events", "zones", *TRANSFORMS) else None
     for name in ("channels", "bytes", "messages", "digest"):
         [one.pop(name, None) for one in given.get("logs", [])]
     return given

@@ -20,7 +20,7 @@ from mcaptrack.schema import TRACKS
 from mcaptrack.training.sources import SourceOptions, read_scenes
 from mcaptrack.viewing import serving
 from tests.bags import bag1
-from tests.commands import GROUP, call, done
+from tests.commands import GROUP, call, done, zones_file
 from tests.interrupted import interrupt
 from tests.models import stocked
 from tests.robots import write_log
@@ -184,6 +184,12 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "run", "LOG"
     ),
     "pipeline/events.py:make_events:run": lambda s: s.untracked().says("events", "LOG"),
+    "pipeline/zones.py:make_zones:run": lambda s: s.without("/camera/*tracks*", "/camera/truth*").says(
+        "zones", "LOG", "--zones", str(zones_file(Path()))
+    ),
+    "cli/running.py:_lines_of_run:zones": lambda s: s.says(
+        "run", "LOG", "--no-tables", "--zones", str(zones_file(Path()))
+    ),
     "pipeline/planes.py:plane_in_words:ingest": Scene.side_view,
     "pipeline/findings.py:warn_findings:retrack": Scene.side_view,
     "pipeline/plan.py:_warn_settings:run": Scene.of_a_later_version,

@@ -18,7 +18,7 @@ from mcaptrack import log
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.provenance import Provenance
 from tests.bags import MOT, ROS2, T0, bag1, bag2, picture, plain
-from tests.commands import GROUP, call, done
+from tests.commands import GROUP, call, done, zones_file
 
 COMMANDS = GROUP.commands
 FRAMES = 24
@@ -106,6 +106,7 @@ def on_recording(path: Path, elsewhere: Path) -> dict[str, list[object]]:
         "recover": [path, "-o", elsewhere / "recovered.mcap"],
         "tune": [path, "--trials", "1", "--output", elsewhere / "tuned.toml"],
         "drop": [path, "/robot/front/retracks*"],
+        "zones": [path, "--zones", zones_file(elsewhere)],
         "view": [],  # serves until it is interrupted, and opens the log like all others
         "train": [],  # needs torch, and opens logs like all others
         "demo": [],  # takes no log

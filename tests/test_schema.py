@@ -430,6 +430,7 @@ def test_provenance_comes_back_from_its_metadata():
         {"layout": "x"},
         [["lost", "words"]],
         "0.0.9",
+        {"1": "door"},
     )
     assert Provenance.from_metadata(whole.to_metadata()) == whole
     least = Provenance("sample", {})

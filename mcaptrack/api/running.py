@@ -16,10 +16,11 @@ from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.common import Notes, PathLike, Progress, as_location, log_output, no_progress, warnings_about
 from mcaptrack.errors import McaptrackError, call
+from mcaptrack.evaluation.zones import ZoneTotals
 from mcaptrack.files import is_same_file, publish_bytes, refuse_overwrite
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice, warn
-from mcaptrack.pipeline import AS_BEFORE, Job, PlaneChoice, Summary, Watch
+from mcaptrack.pipeline import AS_BEFORE, Job, PlaneChoice, Summary, Watch, ZoneWatch
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.sources.ingest.bags.metadata_update import update_metadata
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
@@ -45,6 +46,8 @@ class RunResult:
         Number of frames, rows and track ids by topic, of the channels that were made.
     events : dict of str to dict of str to int
         Number of events of each kind by the topic of the tracks.
+    zones : dict of str to list of ZoneTotals
+        Totals of zones and lines by the topic of the tracks, of all channels that were counted, now or before.
     stale : tuple of str
         Topics that are out of date now, because what they were made from was replaced.
     layouts : tuple of pathlib.Path
@@ -75,6 +78,7 @@ class RunResult:
     rows: Mapping[str, int]
     tracks: Mapping[str, int]
     events: Mapping[str, Mapping[str, int]]
+    zones: Mapping[str, list[ZoneTotals]]
     stale: tuple[str, ...]
     layouts: tuple[Path, ...]
     tables: Mapping[str, int]
@@ -120,14 +124,15 @@ def work(
     progress: Progress,
     tables: bool | None,
     plane: PlaneChoice = AS_BEFORE,
+    zones: ZoneWatch | None = None,
 ) -> RunResult:
     """Plan and run on one log. ``tables`` is None where a single stage runs, which neither exports nor summarises."""
 
     def act(opened: logs.Log, output: Path | None, notes: Notes, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
-        topics = watch.topics if watch else ()
+        topics = watch.topics if watch else zones.topics if zones else ()
         prefix = pipeline.find_camera(opened, where.camera, where.topic or next(iter(topics), None))
         jobs = plan(opened, prefix, notes.say)
-        return prefix, pipeline.run(opened, prefix, jobs, output, progress, watch, plane, boxes)
+        return prefix, pipeline.run(opened, prefix, jobs, output, progress, watch, plane, boxes, zones)
 
     return change(where, act, progress, tables)
 
@@ -168,6 +173,10 @@ def change(where: Where, act: Act, progress: Progress, tables: bool | None) -> R
             notes.say(
                 f"no tables are written, because {target} is in a store; {call('export', target)} writes them here"
             )
+        counted = {}
+        if report.has_zones:
+            with logs.read(target) as opened:
+                counted = {one.topic: one.totals for one in pipeline.counted_zones(opened, prefix)}
         summary = None
         if tables is not None:
             with report.watch.part("summary"), logs.read(target) as opened:
@@ -179,6 +188,7 @@ def change(where: Where, act: Act, progress: Progress, tables: bool | None) -> R
         rows=report.rows,
         tracks=report.tracks,
         events=report.events,
+        zones=counted,
         stale=tuple(report.stale),
         layouts=tuple(layouts),
         tables=rows,

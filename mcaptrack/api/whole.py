@@ -9,9 +9,11 @@ from mcaptrack import pipeline
 from mcaptrack.api.checked import checked
 from mcaptrack.api.common import PathLike, Progress, names_of, no_progress, warn_unused
 from mcaptrack.api.running import RunResult, Where, transform_of, transforms_of, work
+from mcaptrack.api.zoning import ZonesLike, zones_of
 from mcaptrack.evaluation.aligned import Similarity
 from mcaptrack.evaluation.events import EventOptions
-from mcaptrack.pipeline import Job, PlaneChoice, Watch
+from mcaptrack.evaluation.zones import ZoneOptions
+from mcaptrack.pipeline import Job, PlaneChoice, Watch, ZoneWatch
 from mcaptrack.transforms import STAGES, Transform
 from mcaptrack.transforms.sort.tracker import CameraMotionUse
 
@@ -27,6 +29,7 @@ def run(
     sidecar: bool | None = None,
     events: bool | EventOptions = True,
     tables: bool = True,
+    zones: ZonesLike | None = None,
     force: bool = False,
     detector: str | Transform | None = None,
     tracker: str | Transform | None = None,
@@ -66,6 +69,9 @@ def run(
         Write events of tracks and errors of predictions, and how tracks are matched with the ground truth for them.
     tables : bool, default True
         Write Parquet tables beside the log.
+    zones : path or mapping, optional
+        Count visits of zones and crossings of lines, of a file of GeoJSON, or of its content (see ``zones``). By
+        default those that the log was counted with before, if any.
     force : bool, default False
         Run everything again, and overwrite ``output`` if it exists.
     detector, tracker, retracker, predictor : str or Transform, optional
@@ -126,7 +132,9 @@ def run(
 
     options = events if isinstance(events, EventOptions) else EventOptions()
     watch = Watch(options, force=force) if events else None
-    return work(Where(log, camera, topic, output, sidecar, force), plan, watch, progress, tables, plane)
+    given_zones = zones_of(zones)
+    counted = ZoneWatch(given_zones, options=ZoneOptions() if given_zones else None, force=force)
+    return work(Where(log, camera, topic, output, sidecar, force), plan, watch, progress, tables, plane, counted)
 
 
 @checked(gate_m=(0.001, 1e6), min_iou=(0.001, 1))

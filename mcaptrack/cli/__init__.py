@@ -31,6 +31,7 @@ from mcaptrack.cli.text import show
 from mcaptrack.cli.train import train
 from mcaptrack.cli.tune import tune
 from mcaptrack.cli.view import view
+from mcaptrack.cli.zones import zones
 
 app = typer.Typer(
     name="mcaptrack",
@@ -78,6 +79,7 @@ register(app, _LOOK, "delta", delta)
 register(app, _LOOK, "docs", docs, reads=True)
 register(app, _MEASURE, "evaluate", evaluate, reads=True)
 register(app, _MEASURE, "events", events)
+register(app, _MEASURE, "zones", zones)
 register(app, _MEASURE, "tune", tune)
 register(app, _MEASURE, "train", train)
 register(app, _KEEP, "check", check, reads=True)

@@ -51,6 +51,11 @@ def _as_json(result: RunResult) -> dict[str, Any]:
         "stages": list(result.stages),
         "frames": result.frames,
         "events": result.events,
+        **(
+            {"zones": {topic: [one.to_json() for one in some] for topic, some in result.zones.items()}}
+            if result.zones
+            else {}
+        ),
         "written_to": str(result.written_to) if result.written_to else None,
         "written_there_because": with_flags(result.written_because) or None,
     }
@@ -124,6 +129,10 @@ def _lines_of_run(result: RunResult) -> Iterator[tuple[str, str]]:
     """Yield a line for each part of the result of ``run``: its name and its text."""
     if result.summary is not None:
         yield from _lines_of_summary(result.summary)
+    if result.zones:
+        names = {one.zone for totals in result.zones.values() for one in totals}
+        again = command("zones", result.log)
+        yield "zones", f"{len(names)} zones and lines of {len(result.zones)} channels; {again} prints them"
     codes = [notice.code for notice in result.warnings]
     if codes:
         yield "warnings", f"{len(codes)}, see above: {', '.join(dict.fromkeys(codes))}"

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field
 from functools import partial
+from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Final, Literal, get_args, get_type_hints
 
@@ -245,6 +246,16 @@ def run_all(
     tables: Annotated[
         bool, common.option("--tables/--no-tables", panel=_AFTER, help="Write Parquet tables beside the log.")
     ] = True,
+    zones: Annotated[
+        Path | None,
+        common.option(
+            "--zones",
+            panel=_AFTER,
+            metavar="FILE",
+            help="Count visits of zones and crossings of lines, as `mcaptrack zones` does.",
+            show_default="those that were counted before",
+        ),
+    ] = None,
     force: Annotated[
         bool,
         common.option("--force", panel=common.FILES, help="Run everything again, and replace the file that -o names."),
@@ -323,7 +334,7 @@ def run_all(
     /camera/retracks; then events (see `mcaptrack events`), views, and Parquet tables beside the log. --topic starts
     with the pictures, or the boxes, of that channel. Channels that are up to date are kept; those that are out of date
     are made again with the parameters they had. --force makes all again, with the parameters that environment and
-    config files set now, otherwise with those they had.
+    config files set now, otherwise with those they had. Zones of --zones are counted in later runs, too.
 
     Example: mcaptrack run log.mcap
     """
@@ -338,7 +349,7 @@ def run_all(
         settings, stages = settings_of("events"), configured(chosen)
     options: dict[str, Any] = {"topic": topic, "tables": tables, "frame": frame, "camera_motion": camera_motion}
     options |= {"fit_plane": fit_plane, "person_height_m": person_height_m, "ground_frame": ground_frame}
-    options |= {"across_classes": across_classes, "class_limits": class_limits}
+    options |= {"across_classes": across_classes, "class_limits": class_limits, "zones": zones}
     for stage in STAGES.values():
         if stage.option in chosen:
             options[stage.option] = stages.pop(stage.name)

@@ -14,12 +14,14 @@ from mcaptrack.pipeline.shown import RobotPath, Shown, find_views, robot_path
 from mcaptrack.pipeline.staleness import is_stale
 from mcaptrack.pipeline.summary import Summary, summarise
 from mcaptrack.pipeline.write import LAYOUTS, attachment_of, layout_path
+from mcaptrack.pipeline.zones import CountedZones, ZoneWatch, counted_zones
 from mcaptrack.sources.cameras import Camera, camera_at, find_camera
 
 __all__ = [
     "AS_BEFORE",
     "LAYOUTS",
     "Camera",
+    "CountedZones",
     "Job",
     "PlaneChoice",
     "Report",
@@ -27,8 +29,10 @@ __all__ = [
     "Shown",
     "Summary",
     "Watch",
+    "ZoneWatch",
     "attachment_of",
     "camera_at",
+    "counted_zones",
     "find_camera",
     "find_views",
     "fuse_cameras",

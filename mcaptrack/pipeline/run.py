@@ -27,6 +27,8 @@ from mcaptrack.pipeline.rebuild import plugins_of
 from mcaptrack.pipeline.timing import Stopwatch
 from mcaptrack.pipeline.visible import Channels, picture_size, without_unseen
 from mcaptrack.pipeline.write import Made, digest_of, write
+from mcaptrack.pipeline.zones import STAGE as ZONES_STAGE
+from mcaptrack.pipeline.zones import ZoneWatch, make_zones
 from mcaptrack.predictors import weights_sha256
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.camera_motion import to_pictures, to_scene
@@ -52,7 +54,8 @@ class Report:
 
     ``stale`` are the channels that are out of date, because this run replaced their input. ``events`` are the numbers
     of events of each kind by channel of tracks. ``warnings`` report what was assumed, left out or looks unusual.
-    ``watch`` has the seconds of each stage, and of reading, waiting for pictures ("decode") and writing.
+    ``has_zones`` says whether zones were counted, or are up to date. ``watch`` has the seconds of each stage, and of
+    reading, waiting for pictures ("decode") and writing.
     """
 
     stages: list[str] = field(default_factory=list)
@@ -63,6 +66,7 @@ class Report:
     stale: list[str] = field(default_factory=list)
     events: dict[str, dict[str, int]] = field(default_factory=dict)
     warnings: list[Notice] = field(default_factory=list)
+    has_zones: bool = False
     watch: Stopwatch = field(default_factory=Stopwatch)
 
     def count(self, topic: str, made: Made) -> None:
@@ -81,16 +85,18 @@ def run(
     watch: Watch | None = None,
     plane: PlaneChoice = AS_BEFORE,
     boxes: BoxesRead | None = None,
+    zones: ZoneWatch | None = None,
 ) -> Report:
     """Run the jobs, and write their channels and views into the log, or into a copy of it at ``output``.
 
     With ``watch`` the last stage finds events of tracks, if they are missing or out of date. ``plane`` says how to make
-    a ground plane where none is given. ``boxes`` keeps boxes of other software that are read.
+    a ground plane where none is given. ``boxes`` keeps boxes of other software that are read. With ``zones`` these are
+    counted, or those that were counted before.
 
     The log is replaced as a whole, after everything was computed.
     """
     with collected() as warnings:
-        report = _run(opened, prefix, jobs, output, progress, watch, plane, boxes or BoxesRead())
+        report = _run(opened, prefix, jobs, output, progress, watch, plane, boxes or BoxesRead(), zones)
     report.warnings = list(dict.fromkeys(warnings))
     return report
 
@@ -104,6 +110,7 @@ def _run(
     watch: Watch | None,
     choice: PlaneChoice,
     boxes: BoxesRead,
+    zones: ZoneWatch | None,
 ) -> Report:
     made: dict[str, Made] = {}
     stamps: dict[str, list[int]] = {}
@@ -139,6 +146,13 @@ def _run(
         report.frames |= {topic: channel.size() for topic, channel in events.items()}
         report.events = tally(events)
         report.stages += [EVENTS_STAGE] if events else []
+    if zones is not None:
+        with part(ZONES_STAGE):
+            counted = make_zones(opened, prefix, made, planes or (), zones)
+        made |= counted
+        report.frames |= {topic: channel.size() for topic, channel in counted.items()}
+        report.stages += [ZONES_STAGE] if counted else []
+        report.has_zones = True
     if made or output is not None:
         with part("write"):
             path, _ = path_with(opened, prefix, tracks_topic(prefix), made)
@@ -154,7 +168,7 @@ def outdated_by(opened: log.Log, digests: Mapping[str, str]) -> list[str]:
     found = []
     for topic, there in sorted(opened.channels.items()):
         known = Provenance.from_metadata(there.metadata)
-        if topic not in digests and known and known.transform in {*STAGES, EVENTS_STAGE}:
+        if topic not in digests and known and known.transform in {*STAGES, EVENTS_STAGE, ZONES_STAGE}:
             is_late = any(digests.get(name, then) != then for name, then in known.made_from().items())
             found += [topic] if is_late else []
     return found

@@ -38,6 +38,9 @@ __all__ = [
     "SIZES",
     "TRACKS",
     "VIDEO",
+    "ZONE_COUNTS",
+    "ZONE_CROSSINGS",
+    "ZONE_VISITS",
     "Column",
     "EventKind",
     "Frame",
@@ -264,6 +267,9 @@ COUNTS: Final = Schema("mcaptrack.Counts")
 SIGHTINGS: Final = Schema("mcaptrack.Sightings")
 FORECAST_ERRORS: Final = Schema("mcaptrack.ForecastErrors")
 FORECAST_SCORES: Final = Schema("mcaptrack.ForecastScores")
+ZONE_VISITS: Final = Schema("mcaptrack.ZoneVisits")
+ZONE_CROSSINGS: Final = Schema("mcaptrack.ZoneCrossings")
+ZONE_COUNTS: Final = Schema("mcaptrack.ZoneCounts")
 #: Row schemas by name.
 SCHEMAS: Final = {
     schema.name: schema
@@ -278,6 +284,9 @@ SCHEMAS: Final = {
         FORECAST_ERRORS,
         FORECAST_SCORES,
         SIGHTINGS,
+        ZONE_VISITS,
+        ZONE_CROSSINGS,
+        ZONE_COUNTS,
     )
 }
 #: Pictures instead of rows: a transform that reads this schema gets their brightness, or their colours if it asks for

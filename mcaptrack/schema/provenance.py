@@ -40,8 +40,8 @@ class Provenance:
     ``plugins`` are the classes of other packages that were used: the ``transform`` itself if it is not built in, and
     its ``predictor``. ``classes`` are the names of the classes in its rows by ``class_id``; ``class_id`` is the class
     of all rows, where these state none (see ``schema.classes``). ``frame_id`` is the frame of its metres, where the log
-    has frames. ``model`` is what its network turned out to be. ``warnings`` are the warnings when it was made,
-    with code and message.
+    has frames. ``zones`` are the names of the zones in its rows by ``zone_id``. ``model`` is what its network turned
+    out to be. ``warnings`` are the warnings when it was made, with code and message.
     """
 
     transform: str
@@ -58,6 +58,7 @@ class Provenance:
     model: Mapping[str, str] = field(default_factory=dict)
     warnings: Sequence[Sequence[str]] = ()
     version: str = __version__
+    zones: Mapping[str, str] = field(default_factory=dict)
 
     def made_from(self) -> dict[str, str]:
         """The topics that it was made from and compared with, and their digests."""
@@ -78,10 +79,11 @@ class Provenance:
             "classes": json.dumps(dict(self.classes), ensure_ascii=False),
             "class_id": self.class_id,
             "frame_id": self.frame_id,
+            "zones": json.dumps(dict(self.zones), ensure_ascii=False),
             "model": json.dumps(dict(self.model), sort_keys=True),
             "warnings": json.dumps(self.warnings, separators=(",", ":")),
         }
-        for name in ("warnings", "references", "plugins", "classes", "model"):
+        for name in ("warnings", "references", "plugins", "classes", "zones", "model"):
             if not getattr(self, name):
                 del values[name]
         return {_PREFIX + key: value for key, value in values.items() if value}
@@ -93,11 +95,12 @@ class Provenance:
         if "transform" not in values:
             return None
         parameters, references = (_read(values.pop(key, ""), dict) for key in ("parameters", "references"))
-        classes, model = (read_texts(values.pop(key, "")) for key in ("classes", "model"))
+        classes, zones, model = (read_texts(values.pop(key, "")) for key in ("classes", "zones", "model"))
         plugins = _plugins(values)
         warnings = [one for one in _read(values.pop("warnings", ""), list) if _is_warning(one)]
         known: dict[str, Any] = {key: value for key, value in values.items() if key in cls.__dataclass_fields__}
         known |= {"references": references, "warnings": warnings, "plugins": plugins, "classes": classes}
+        known["zones"] = zones
         return cls(parameters=parameters, model=model, **known)
 
 

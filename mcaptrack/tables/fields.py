@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 #: Version of the tables' columns: the second number grows when columns are added.
-TABLE_VERSION: Final = "1.5"
+TABLE_VERSION: Final = "1.6"
 
 #: The unit of counts and ids.
 _NONE: Final = "1"
@@ -76,12 +76,17 @@ class Table:
             fields += [_with_unit(field) for field in self.rows_of.arrow]
             fields += [CLASS.arrow] if has_classes(self.rows_of) else []
             fields += [TRACK_CLASS.arrow] if self.is_of_tracks() else []
+            fields += [ZONE.arrow] if self.is_of_zones() else []
         return pa.schema(fields)
 
     def is_of_tracks(self) -> bool:
         """Whether its rows name tracks by their ids, and so have the classes of these."""
         of = self.rows_of
         return of is not None and not has_classes(of) and "track_id" in {column.name for column in of.columns}
+
+    def is_of_zones(self) -> bool:
+        """Whether its rows name zones by their ids."""
+        return self.rows_of is not None and "zone_id" in {column.name for column in self.rows_of.columns}
 
 
 def _with_unit(field: Any) -> Any:
@@ -110,6 +115,9 @@ TRACK_CLASS: Final = Field(
     "name of the class of its track, or of the object that is missed; null if it has none",
     nullable=True,
 )
+
+#: The last column of each table of rows that name zones or lines.
+ZONE: Final = Field("zone", _NAME, "name of the zone or line; null if it has none", nullable=True)
 
 #: The column with the name of the log; in files it is in the name of the folder.
 RECORDING: Final = Field("recording", _NAME, "the log, by name; the same in all tables")

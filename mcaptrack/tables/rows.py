@@ -18,7 +18,7 @@ from mcaptrack.schema.classes import PERSON, majority
 from mcaptrack.schema.frame_columns import FrameColumns, collect
 from mcaptrack.schema.framing import joined_parts, unique_values
 from mcaptrack.tables.build import repeated, table_of, times
-from mcaptrack.tables.fields import CLASS, TABLES, TRACK_CLASS, Table
+from mcaptrack.tables.fields import CLASS, TABLES, TRACK_CLASS, ZONE, Table
 from mcaptrack.tables.ordered import OrderedRows, ordered_rows
 from mcaptrack.tables.table_pieces import TablePieces
 
@@ -53,15 +53,19 @@ def rows_in_pieces(
     channels: Mapping[str, FrameColumns],
     names: Mapping[str, Mapping[int, str]] = {},
     of_tracks: Mapping[str, TrackNames] = {},
+    zones: Mapping[str, Mapping[int, str]] = {},
 ) -> TablePieces:
-    """The table of ``rows_table``, piece by piece."""
+    """The table of ``rows_table``, piece by piece; ``zones`` are names of zones by number, for each channel."""
     import pyarrow as pa
 
     table, members = table_of(schema), dict(sorted(channels.items()))
-    named = {topic: _ClassNames.of(table, names.get(topic, {}), of_tracks.get(topic)) for topic in members}
+    named = {topic: _Names.of(table, names.get(topic, {}), of_tracks.get(topic)) for topic in members}
+    named_zones = {topic: _Names(ZONE.name, (("zone_id", zones.get(topic, {})),)) for topic in members}
+    columns_of = {topic: [named[topic], *([named_zones[topic]] if table.is_of_zones() else [])] for topic in members}
     words: dict[str, int] = {}
     for topic, frames in members.items():
-        named[topic].collect(schema, frames, words)
+        for one in columns_of[topic]:
+            one.collect(schema, frames, words)
     known = pa.array(list(words), pa.string())
 
     def made() -> Iterator[Any]:
@@ -69,11 +73,10 @@ def rows_in_pieces(
             for part in ordered_rows(schema, frames, "track_id" in table.order):
                 columns = _columns(schema, frames, part)
                 columns["topic"] = repeated([topic], [len(part.rows)], list(members))
-                if named[topic].column:
-                    codes = named[topic].codes(part.rows, words)
-                    columns[named[topic].column] = pa.DictionaryArray.from_arrays(
-                        pa.array(codes, mask=codes < 0), known
-                    )
+                for one in columns_of[topic]:
+                    if one.column:
+                        codes = one.codes(part.rows, words)
+                        columns[one.column] = pa.DictionaryArray.from_arrays(pa.array(codes, mask=codes < 0), known)
                 yield pa.table([columns[field.name] for field in table.arrow], schema=table.arrow)
 
     return TablePieces(table.arrow, sum(int(frames.ends[-1]) for frames in members.values()), made)
@@ -93,14 +96,14 @@ def _columns(schema: Schema, frames: FrameColumns, part: OrderedRows) -> dict[st
     return out
 
 
-class _ClassNames(NamedTuple):
-    """The names of the classes of a channel's rows: the column of the table, and names by the values of others."""
+class _Names(NamedTuple):
+    """The names in a column of a channel's rows, of classes or zones: the column, and names by the values of others."""
 
     column: str
     by: tuple[tuple[str, Mapping[int, str]], ...]
 
     @classmethod
-    def of(cls, table: Table, classes: Mapping[int, str], tracks: TrackNames | None) -> _ClassNames:
+    def of(cls, table: Table, classes: Mapping[int, str], tracks: TrackNames | None) -> _Names:
         """By the class of each row if it has one, or by its track; for rows without a track, by the ground truth."""
         if table.is_of_tracks():
             tracks = tracks or TrackNames()

@@ -53,7 +53,8 @@ class LogTables:
         if table.rows_of is not None:
             channels = {topic: self._frames(topic) for topic in self.topics(name)}
             of_tracks = {topic: self._track_names(topic) for topic in channels} if table.is_of_tracks() else {}
-            return tables.rows_in_pieces(table.rows_of, channels, self._class_names, of_tracks)
+            zones = {topic: self._zone_names(topic) for topic in channels} if table.is_of_zones() else {}
+            return tables.rows_in_pieces(table.rows_of, channels, self._class_names, of_tracks, zones)
         made: Mapping[str, Callable[[], Any]] = {
             "frames": self._places,
             "track_summary": lambda: tables.summary_table(
@@ -179,6 +180,8 @@ class LogTables:
         """The names of the classes of the tracks, and of the ground truth, that the rows of a channel are about."""
         made = provenance_of(self.opened, topic)
         base = topic.removesuffix("/events").removesuffix("/errors")
+        if made and made.zones:
+            base = made.input
         beside = base.removesuffix("/predictions")
         near = (base,) if base == beside else (f"{beside}/online", beside, input_of(self.opened.channel(base).metadata))
         there = set(self.topics("tracks"))
@@ -189,6 +192,11 @@ class LogTables:
             return tables.names_by_track(self._frames(of), self._class_names.get(of, {})) if of else {}
 
         return TrackNames(names(tracks), names(truth))
+
+    def _zone_names(self, topic: str) -> dict[int, str]:
+        """The names of the zones that the rows of a channel are about."""
+        made = provenance_of(self.opened, topic)
+        return {int(number): name for number, name in made.zones.items() if number.isdecimal()} if made else {}
 
     def _note(self, name: str, words: str) -> None:
         self.notes[name] = "; ".join([*filter(None, [self.notes.get(name)]), words])

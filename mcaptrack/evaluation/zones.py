@@ -1,0 +1,417 @@
+"""Visits of zones, crossings of lines, and counts over time: rows of ZoneVisits, ZoneCrossings and ZoneCounts.
+
+A zone in metres is compared with positions on the ground. A zone in pixels is brought to the ground by the plane of its
+camera; where there is none, or several, it is compared with the points in the picture at which boxes touch the ground.
+
+Letters: F frames, N rows, V visits, C crossings, Z zones and lines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.boxes import columns_to_boxes
+from mcaptrack.geometry.camera_path import CameraPath
+from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.geometry.plane import PERSON_HEIGHT_M, GroundPlane, Planes
+from mcaptrack.geometry.zones import Paths, Shape, Units, Visits, Zone, crossings, visits
+from mcaptrack.schema import TRACKS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS, Frame, Rows
+from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
+from mcaptrack.schema.framing import frame_numbers, frame_times, joined_parts, split_rows
+
+#: Frames of counts that are made at once.
+_FRAMES_AT_ONCE: Final = 4096
+#: Edges of a picture are curved on the ground where it has a lens: they are drawn with so many pieces.
+_PIECES: Final = 16
+_SIZES: Final = {"metres": "m", "pixels": "px"}
+
+
+@dataclass(frozen=True)
+class ZoneOptions:
+    """Options of counting: how far from an edge a track has changed sides, and the longest gap within a visit.
+
+    ``margin_m`` is in metres; in a picture without a ground plane it is in heights of people of 1.7 m.
+    """
+
+    margin_m: float = 0.25
+    max_gap_s: float = 4.0
+
+
+class PlacedZone(NamedTuple):
+    """A zone in the units that it is compared in; ``forward`` is the sign of crossings from its left to its right."""
+
+    zone: Zone
+    shape: Shape
+    units: Units
+    forward: int = 1
+
+
+class TrackPositions(NamedTuple):
+    """The rows of tracks that have a position, in order of track and time (N,).
+
+    ``at`` are positions by units, (N, 2), NaN where not known: on the ground, and in the (reference) picture.
+    ``picture_px`` are those in the picture of that time. ``frame`` is the index of the frame of each row.
+    ``height_px`` is the usual height of boxes, NaN without boxes.
+    """
+
+    at: Mapping[str, Floats]
+    picture_px: Floats
+    track: Ints
+    frame: Ints
+    t_ns: Ints
+    height_px: float
+
+
+@dataclass(frozen=True)
+class ZoneTotals:
+    """The totals of one zone or line for one channel of tracks.
+
+    ``tracks`` are the different tracks that visited or crossed it. Of a zone: ``visits``, of which ``entered`` and
+    ``left`` over its edge, the others began or ended inside; ``dwell_s`` of all visits together, their mean and
+    median; the most tracks inside at a time, and their mean over time. Of a line: crossings ``forward`` and
+    ``backward``.
+    """
+
+    zone: str
+    is_line: bool
+    tracks: int
+    visits: int = 0
+    entered: int = 0
+    left: int = 0
+    dwell_s: float = 0.0
+    mean_dwell_s: float | None = None
+    median_dwell_s: float | None = None
+    most_inside: int = 0
+    mean_inside: float | None = None
+    forward: int = 0
+    backward: int = 0
+
+    def to_json(self) -> dict[str, Any]:
+        """The totals as values of JSON; of a zone without crossings, of a line without visits."""
+        values = asdict(self)
+        lines = ("forward", "backward")
+        kept = {"zone", "is_line", "tracks", *lines} if self.is_line else values.keys() - set(lines)
+        return {name: value for name, value in values.items() if name in kept}
+
+
+class ZoneEvents(NamedTuple):
+    """Frames of visits, crossings and counts, one for each frame of the tracks; ``notes`` say what is odd."""
+
+    visits: Sequence[Frame]
+    crossings: Sequence[Frame]
+    counts: Sequence[Frame]
+    notes: list[str]
+
+
+def place_zone(zone: Zone, planes: Planes) -> PlacedZone:
+    """Bring a zone in pixels to the ground, where one plane holds for all its pictures.
+
+    Raises McaptrackError for a zone that reaches above the horizon.
+    """
+    shape = zone.shape()
+    if zone.units == "metres":
+        return PlacedZone(zone, shape, "metres")
+    if len(planes) != 1:
+        return PlacedZone(zone, shape, "pixels", -1)
+    plane = planes[0][1]
+    if plane.lens is not None:
+        shape = _in_pieces(shape)
+    parts = tuple(tuple(_on_ground(ring, plane, zone.name) for ring in part) for part in shape.parts)
+    middle = np.concatenate([ring for part in shape.parts for ring in part]).mean(axis=0)
+    corner = plane.pixels_to_metres(middle + np.array([[0.0, 0], [1, 0], [0, 1]]))
+    (a, b), (c, d) = corner[1:] - corner[0]
+    return PlacedZone(zone, Shape(parts, zone.is_line), "metres", 1 if a * d - b * c < 0 else -1)
+
+
+def _in_pieces(shape: Shape) -> Shape:
+    """The same shape with more points on each edge."""
+    share = np.arange(_PIECES)[:, None] / _PIECES
+
+    def cut(ring: Floats) -> Floats:
+        start = ring[:-1] if shape.is_line else ring
+        end = ring[1:] if shape.is_line else np.roll(ring, -1, axis=0)
+        points = (start[:, None] + share * (end - start)[:, None]).reshape(-1, 2)
+        return np.concatenate([points, ring[-1:]]) if shape.is_line else points
+
+    return Shape(tuple(tuple(cut(ring) for ring in part) for part in shape.parts), shape.is_line)
+
+
+def _on_ground(ring: Floats, plane: GroundPlane, name: str) -> Floats:
+    found = plane.pixels_to_metres(ring)
+    above = np.flatnonzero(~np.isfinite(found).all(axis=1))
+    if len(above):
+        x, y = ring[above[0]]
+        raise McaptrackError(f"zone {name} reaches above the horizon, at ({x:g}, {y:g}) px: there is no ground")
+    return found
+
+
+def positions_of(frames: Sequence[Frame], planes: Planes, path: CameraPath | None) -> TrackPositions:
+    """Find where tracks are, on the ground and in the picture.
+
+    ``planes`` are those of the reference picture where the camera moves by ``path``, otherwise those of all pictures.
+    """
+    parts: list[tuple[Ints, ...]] = []
+    places: list[tuple[Floats, ...]] = []
+    since = np.array([start for start, _ in planes[1:]], np.int64)
+    heights: list[Floats] = []
+    for first, _, joined in joined_parts(TRACKS, frames):
+        rows, t_ns = joined.rows, joined.row_ns
+        boxes = columns_to_boxes(rows)
+        in_scene = boxes if path is None else path.to_scene(boxes, t_ns)
+        which = np.searchsorted(since, t_ns, "right")
+        feet, seen = (np.stack([b[:, 0] + b[:, 2] / 2, b[:, 1] + b[:, 3]], axis=1) for b in (in_scene, boxes))
+        metres = np.stack([rows["x_m"], rows["y_m"]], axis=1)
+        for number, (_, plane) in enumerate(planes):
+            of = which == number
+            feet[of], seen[of] = plane.feet(in_scene[of]), plane.feet(boxes[of])
+            unknown = of & ~np.isfinite(metres).all(axis=1) & np.isfinite(feet).all(axis=1)
+            metres[unknown] = plane.pixels_to_metres(feet[unknown])
+        parts.append((rows["track_id"].astype(np.int64), joined.frame + first, t_ns))
+        places.append((metres, feet, seen))
+        heights.append(boxes[:, 3])
+    if not parts:
+        none, nowhere = np.zeros(0, np.int64), np.zeros((0, 2))
+        return TrackPositions({"metres": nowhere, "pixels": nowhere}, nowhere, none, none, none, np.nan)
+    track, frame, t_ns = (np.concatenate(column) for column in zip(*parts, strict=True))
+    order = np.lexsort((frame, track))
+    metres, feet, seen = (np.concatenate(column)[order] for column in zip(*places, strict=True))
+    high = np.concatenate(heights)
+    high = high[np.isfinite(high)]
+    height_px = float(np.median(high)) if len(high) else np.nan
+    return TrackPositions({"metres": metres, "pixels": feet}, seen, track[order], frame[order], t_ns[order], height_px)
+
+
+def find_zone_events(
+    frames: Sequence[Frame], found: TrackPositions, zones: Sequence[PlacedZone], options: ZoneOptions, name: str
+) -> ZoneEvents:
+    """Find visits of zones and crossings of lines, and count them.
+
+    Parameters
+    ----------
+    frames : sequence of Frame
+        Rows of Tracks.
+    found : TrackPositions
+        Of these rows.
+    zones : sequence of PlacedZone
+    options : ZoneOptions
+    name : str
+        Of the tracks, for notes.
+
+    Returns
+    -------
+    ZoneEvents
+
+    Raises
+    ------
+    McaptrackError
+        If tracks have no positions in the units of a zone.
+    """
+    notes: list[str] = []
+    stays: list[_Stays] = []
+    passes: list[_Passes] = []
+    for placed in zones:
+        paths, rows = _paths(found, placed, options, name)
+        margin = placed.shape.margin(_margin(found, placed.units, options))
+        if placed.zone.is_line:
+            row, sign = crossings(paths, placed.shape, margin)
+            passes.append(_Passes(placed.zone.number, rows[row], sign * placed.forward > 0))
+        else:
+            depth = placed.shape.depth(paths.points, margin)
+            some = visits(paths, depth, margin)
+            stays.append(_Stays.of(placed.zone.number, some, rows, found, paths))
+        notes += _far_away(placed, paths.points, name)
+    t_ns, numbers = frame_times(frames), frame_numbers(frames)
+    return ZoneEvents(
+        _visit_frames(stays, found, t_ns, numbers),
+        _crossing_frames(passes, found, t_ns, numbers),
+        _counts(zones, stays, passes, found, t_ns, numbers),
+        notes,
+    )
+
+
+def _margin(found: TrackPositions, units: Units, options: ZoneOptions) -> float:
+    """The margin in the units that a zone is compared in."""
+    return options.margin_m if units == "metres" else options.margin_m / PERSON_HEIGHT_M * found.height_px
+
+
+def _paths(found: TrackPositions, placed: PlacedZone, options: ZoneOptions, name: str) -> tuple[Paths, Ints]:
+    """The paths of tracks in the units of a zone, and the row of each of their points."""
+    points = found.at[placed.units]
+    rows = np.flatnonzero(np.isfinite(points).all(axis=1))
+    if len(points) and not len(rows):
+        where = "positions in metres" if placed.units == "metres" else "boxes in the picture"
+        raise McaptrackError(f"{name} has no {where}, which zone {placed.zone.name} in {placed.zone.units} needs")
+    gap_ns = seconds_to_ns(options.max_gap_s)
+    return Paths.of(points[rows], found.t_ns[rows], found.track[rows], gap_ns), rows
+
+
+def _far_away(placed: PlacedZone, points: Floats, name: str) -> Iterator[str]:
+    """A note about a zone that lies beyond the places of all tracks."""
+    if not len(points):
+        return
+    (low, high), least, most = placed.shape.box, points.min(axis=0), points.max(axis=0)
+    if (low > most).any() or (high < least).any():
+        unit = _SIZES[placed.units]
+        spans = (
+            f"({a[0]:.6g}, {a[1]:.6g}) to ({b[0]:.6g}, {b[1]:.6g}) {unit}" for a, b in ((low, high), (least, most))
+        )
+        kind = "line" if placed.zone.is_line else "zone"
+        yield f"{kind} {placed.zone.name}, {next(spans)}, is beyond all of {name}, {next(spans)}"
+
+
+class _Stays(NamedTuple):
+    """The visits of a zone (V,): the first and the last row of ``TrackPositions`` inside, and the frame after each."""
+
+    number: int
+    first: Ints
+    last: Ints
+    after: Ints
+    began: Bools
+    ended: Bools
+    dwell_s: Floats
+
+    @classmethod
+    def of(cls, number: int, some: Visits, rows: Ints, found: TrackPositions, paths: Paths) -> _Stays:
+        ended = some.left < 0
+        until = np.where(ended, some.last, some.left)
+        dwell = (paths.t_ns[until] - paths.t_ns[some.first]) / NS_PER_S
+        after = found.frame[rows[until]] + ended
+        return cls(number, rows[some.first], rows[some.last], after, some.began, ended, dwell)
+
+
+class _Passes(NamedTuple):
+    """The crossings of a line (C,): rows of ``TrackPositions`` after each, and whether it is forward."""
+
+    number: int
+    row: Ints
+    forward: Bools
+
+
+def _places(found: TrackPositions, rows: Ints, front: str = "") -> Iterator[tuple[str, Floats]]:
+    for unit, at in (("m", found.at["metres"]), ("px", found.picture_px)):
+        for axis, name in enumerate("xy"):
+            yield f"{front}{name}_{unit}", at[rows, axis]
+
+
+def _visit_frames(stays: Sequence[_Stays], found: TrackPositions, t_ns: Ints, numbers: Ints) -> Sequence[Frame]:
+    first, last = (np.concatenate([np.zeros(0, np.int64), *(getattr(s, n) for s in stays)]) for n in ("first", "last"))
+    rows = ZONE_VISITS.empty(len(first))
+    rows["zone_id"] = np.repeat([s.number for s in stays], [len(s.first) for s in stays])
+    rows["track_id"] = found.track[first]
+    for column, name in (("dwell_s", "dwell_s"), ("began_inside", "began"), ("ended_inside", "ended")):
+        rows[column] = np.concatenate([rows[column][:0], *(getattr(s, name) for s in stays)])
+    for column, values in (*_places(found, first), *_places(found, last, "last_")):
+        rows[column] = values
+    return _by_frame(rows, found.frame[first], t_ns, numbers)
+
+
+def _crossing_frames(passes: Sequence[_Passes], found: TrackPositions, t_ns: Ints, numbers: Ints) -> Sequence[Frame]:
+    row = np.concatenate([np.zeros(0, np.int64), *(one.row for one in passes)])
+    rows = ZONE_CROSSINGS.empty(len(row))
+    rows["zone_id"] = np.repeat([one.number for one in passes], [len(one.row) for one in passes])
+    rows["track_id"] = found.track[row]
+    rows["forward"] = np.concatenate([rows["forward"][:0], *(one.forward for one in passes)])
+    for column, values in _places(found, row):
+        rows[column] = values
+    return _by_frame(rows, found.frame[row], t_ns, numbers)
+
+
+def _by_frame(rows: Rows, frame: Ints, t_ns: Ints, numbers: Ints) -> Sequence[Frame]:
+    order = np.lexsort((rows["track_id"], rows["zone_id"], frame))
+    ends = np.searchsorted(frame[order], np.arange(len(t_ns)), "right")
+    return split_rows(t_ns.tolist(), numbers.tolist(), rows[order], ends)
+
+
+def _counts(
+    zones: Sequence[PlacedZone],
+    stays: Sequence[_Stays],
+    passes: Sequence[_Passes],
+    found: TrackPositions,
+    t_ns: Ints,
+    numbers: Ints,
+) -> FrameColumns:
+    """A row of ZoneCounts for each frame and zone."""
+    out = FrameCollector(ZONE_COUNTS)
+    steps: dict[int, dict[str, Ints]] = {}
+    for stay in stays:
+        begin, end = found.frame[stay.first], stay.after
+        new = begin[_first_of_each(found.track[stay.first], begin)]
+        steps[stay.number] = {"entered": np.sort(begin), "left": np.sort(end), "tracks": np.sort(new)}
+    for one in passes:
+        at = found.frame[one.row]
+        new = at[_first_of_each(found.track[one.row], at)]
+        sides = {"forward": np.sort(at[one.forward]), "backward": np.sort(at[~one.forward])}
+        steps[one.number] = {**sides, "tracks": np.sort(new)}
+    count = len(zones)
+    for low in range(0, len(t_ns), _FRAMES_AT_ONCE):
+        frame = np.arange(low, min(low + _FRAMES_AT_ONCE, len(t_ns)))
+        rows = ZONE_COUNTS.empty(len(frame) * count)
+        for place, placed in enumerate(zones):
+            of = rows[place::count]
+            of["zone_id"] = placed.zone.number
+            for name, at in steps[placed.zone.number].items():
+                of[name] = np.searchsorted(at, frame, "right")
+            of["inside"] = of["entered"] - of["left"]
+        out.extend(t_ns[frame], numbers[frame], np.arange(len(frame) + 1) * count, rows)
+    return out.done()
+
+
+def _first_of_each(track: Ints, frame: Ints) -> Ints:
+    """The index of the first event of each track."""
+    order = np.lexsort((frame, track))
+    return np.asarray(order[np.unique(track[order], return_index=True)[1]])
+
+
+def zone_totals(
+    zones: Sequence[Zone], visited: Sequence[Frame], crossed: Sequence[Frame], counts: Sequence[Frame]
+) -> list[ZoneTotals]:
+    """The totals of zones, from their rows."""
+    some, passes = _joined(ZONE_VISITS, visited), _joined(ZONE_CROSSINGS, crossed)
+    inside = _insides(zones, counts)
+    out = []
+    for zone in zones:
+        rows, ways = some[some["zone_id"] == zone.number], passes[passes["zone_id"] == zone.number]
+        if zone.is_line:
+            forward = int(ways["forward"].sum())
+            tracks = len(np.unique(ways["track_id"]))
+            out.append(ZoneTotals(zone.name, True, tracks, forward=forward, backward=len(ways) - forward))
+            continue
+        dwell, (most, mean) = rows["dwell_s"], inside[zone.number]
+        out.append(
+            ZoneTotals(
+                zone.name,
+                False,
+                len(np.unique(rows["track_id"])),
+                len(rows),
+                int((~rows["began_inside"]).sum()),
+                int((~rows["ended_inside"]).sum()),
+                float(dwell.sum()),
+                float(dwell.mean()) if len(rows) else None,
+                float(np.median(dwell)) if len(rows) else None,
+                most,
+                mean,
+            )
+        )
+    return out
+
+
+def _joined(schema: Any, frames: Sequence[Frame]) -> Rows:
+    parts = [joined.rows for _, _, joined in joined_parts(schema, frames)]
+    return np.concatenate([schema.empty(), *parts])
+
+
+def _insides(zones: Sequence[Zone], counts: Sequence[Frame]) -> dict[int, tuple[int, float | None]]:
+    """The most tracks in each zone at a time, and their mean over frames."""
+    most, total = dict.fromkeys((zone.number for zone in zones), 0), dict.fromkeys((z.number for z in zones), 0)
+    for _, _, joined in joined_parts(ZONE_COUNTS, counts):
+        for number in most:
+            inside = joined.rows["inside"][joined.rows["zone_id"] == number]
+            most[number] = max(most[number], int(inside.max(initial=0)))
+            total[number] += int(inside.sum())
+    return {number: (most[number], total[number] / len(counts) if len(counts) else None) for number in most}

@@ -1,0 +1,271 @@
+"""Count visits of zones and crossings of lines, and write them beside the tracks.
+
+<tracks>/zones/visits       visits: rows of ZoneVisits
+<tracks>/zones/crossings    crossings: rows of ZoneCrossings
+<tracks>/zones/counts       who is inside, and the counts so far, in each frame: rows of ZoneCounts
+<tracks>/zones/view/log     enters, leaves and crossings as text, for a viewer
+
+The zones themselves are in the provenance of these channels, so that later runs count again where tracks have changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, Final, NamedTuple
+
+from mcaptrack import foxglove, log
+from mcaptrack.errors import McaptrackError, call
+from mcaptrack.evaluation.event_text import SUFFIX
+from mcaptrack.evaluation.zone_text import zone_messages
+from mcaptrack.evaluation.zones import (
+    PlacedZone,
+    ZoneOptions,
+    ZoneTotals,
+    find_zone_events,
+    place_zone,
+    positions_of,
+    zone_totals,
+)
+from mcaptrack.geometry.plane import Planes, scene_planes
+from mcaptrack.geometry.zones import Zone
+from mcaptrack.notices import warn
+from mcaptrack.pipeline.checks import describe_origin, may_replace
+from mcaptrack.pipeline.motion import ground_truth_with, path_with
+from mcaptrack.pipeline.planes import planes_to_json
+from mcaptrack.pipeline.staleness import is_stale
+from mcaptrack.pipeline.write import Made, digest_of
+from mcaptrack.schema import TRACKS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS, Frame, Schema
+from mcaptrack.schema.provenance import VIEW, Provenance, frame_id_of
+from mcaptrack.sources.cameras import camera_at, provenance_of
+from mcaptrack.sources.zones import zones_from_json, zones_to_json
+from mcaptrack.transforms import FULL
+
+#: The name of the stage, in reports and in the provenance.
+STAGE: Final = "zones"
+_BELOW: Final = "/zones"
+_SCHEMAS: Final = {"/visits": ZONE_VISITS, "/crossings": ZONE_CROSSINGS, "/counts": ZONE_COUNTS}
+
+
+@dataclass(frozen=True)
+class ZoneWatch:
+    """The zones to count, and the channels of tracks to count them for.
+
+    Without ``zones`` they are those that the log was counted with before; if there are none, nothing is counted.
+    Without ``topics`` channels are the tracks, the re-tracked tracks at the rate of the video, the ground truth, and
+    those with counts already. ``options`` None: those of before, or the default ones. With ``force`` all is counted
+    again.
+    """
+
+    zones: tuple[Zone, ...] = ()
+    topics: tuple[str, ...] = ()
+    options: ZoneOptions | None = None
+    force: bool = False
+
+
+class CountedZones(NamedTuple):
+    """The zones that a channel of tracks was counted with, and their totals."""
+
+    topic: str
+    zones: tuple[Zone, ...]
+    totals: list[ZoneTotals]
+
+
+def outputs(topic: str) -> tuple[str, ...]:
+    """Return the topics for the zones of a channel of tracks."""
+    return *(topic + _BELOW + name for name in _SCHEMAS), topic + _BELOW + SUFFIX
+
+
+def make_zones(
+    opened: log.Log, prefix: str, made: Mapping[str, Made], planes: Planes, watch: ZoneWatch
+) -> dict[str, Made]:
+    """Count the zones of channels of tracks that are not counted yet, or that have changed since.
+
+    ``made`` are the channels of this run, by topic. Returns the new channels by topic. Raises McaptrackError for given
+    topics that hold no tracks, and for zones that none of the tracks can be compared with.
+    """
+    before = _before(opened, prefix)
+    zones = watch.zones or before.zones
+    if not zones:
+        return {}
+    options = watch.options or (before.options if before.options else ZoneOptions())
+    zones = _of_camera(opened, prefix, zones, is_given=bool(watch.zones))
+    topics = watch.topics or _default_topics(opened, prefix, made, before)
+    if not topics:
+        if not watch.zones:
+            return {}
+        raise McaptrackError(f"{opened.path} has no tracks of {prefix}; {call('run', opened.path)} makes them")
+    out: dict[str, Made] = {}
+    faults: list[McaptrackError] = []
+    for topic in topics:
+        if not _has_tracks(opened, topic, made):
+            there = opened.channel(topic).schema_name  # raises if there is no such channel
+            raise McaptrackError(f"{opened.path}: {topic} holds {there or 'no schema'}, not tracks")
+        wanted = _parameters(zones, options, planes)
+        if not watch.force and not _is_due(opened, topic, made, wanted):
+            continue
+        taken = [one for one in outputs(topic) if not may_replace(opened, one, VIEW if SUFFIX in one else STAGE)]
+        if taken:
+            words = f"no zones of {topic}: they would replace {taken[0]}, which {describe_origin(opened, taken[0])}"
+            if watch.topics:
+                raise McaptrackError(f"{opened.path}: {words}")
+            warn(words, "left-out")
+            continue
+        try:
+            out |= _counted(opened, prefix, topic, made, planes, zones, options, wanted)
+        except McaptrackError as error:
+            faults.append(error)
+    if faults and (not out or watch.topics) and watch.zones:
+        raise McaptrackError(f"{opened.path}: {faults[0]}")
+    for fault in faults:
+        warn(str(fault), "not-compared")
+    return out
+
+
+def _counted(
+    opened: log.Log,
+    prefix: str,
+    topic: str,
+    made: Mapping[str, Made],
+    planes: Planes,
+    zones: Sequence[Zone],
+    options: ZoneOptions,
+    parameters: Mapping[str, Any],
+) -> dict[str, Made]:
+    """The channels of one channel of tracks."""
+    source = made[topic].provenance.digest if topic in made else digest_of(opened, topic)
+    frames: Sequence[Frame]
+    if topic == camera_at(opened, prefix).truth:
+        frames = ground_truth_with(opened, prefix, made)
+    else:
+        frames = made[topic].frames if topic in made else opened.frame_columns(topic, TRACKS)
+    path, motion = path_with(opened, prefix, topic, made)
+    still = scene_planes(planes, path)
+    placed: list[PlacedZone] = [place_zone(zone, still) for zone in zones]
+    found = find_zone_events(frames, positions_of(frames, still, path), placed, options, topic)
+    for note in found.notes:
+        warn(note, "not-compared")
+    names = {str(zone.number): zone.name for zone in zones}
+    provenance = Provenance(
+        STAGE, parameters, topic, source, references=motion, zones=names, frame_id=_frame_id(opened, topic, made)
+    )
+    rows = (found.visits, found.crossings, found.counts)
+    out = {
+        topic + _BELOW + name: Made.of(schema, some, provenance)
+        for (name, schema), some in zip(_SCHEMAS.items(), rows, strict=True)
+    }
+    visited, crossed = (topic + _BELOW + name for name in list(_SCHEMAS)[:2])
+    text = list(zone_messages(found.visits, found.crossings, zones, topic, opened.start_ns))
+    crossings = {crossed: out[crossed].provenance.digest}
+    view = Provenance(VIEW, {}, visited, out[visited].provenance.digest, references=crossings)
+    out[topic + _BELOW + SUFFIX] = Made(ZONE_VISITS, [], view, text, foxglove.LOG)
+    return out
+
+
+def counted_zones(opened: log.Log, prefix: str) -> list[CountedZones]:
+    """Return the totals of all channels of a camera's tracks that zones were counted of, in order of their topics."""
+    out = []
+    for topic in _with_counts(opened, prefix):
+        names = [topic + _BELOW + name for name in _SCHEMAS]
+        schemas = _SCHEMAS.values()
+        if not all(_holds(opened, name, schema) for name, schema in zip(names, schemas, strict=True)):
+            continue
+        known = provenance_of(opened, names[0])
+        zones = zones_from_json(known.parameters.get("zones")) if known else ()
+        rows = [opened.frame_columns(name, schema) for name, schema in zip(names, schemas, strict=True)]
+        out.append(CountedZones(topic, zones, zone_totals(zones, *rows)))
+    return out
+
+
+class _Before(NamedTuple):
+    """The earlier counts of a camera: channels of tracks, zones and options."""
+
+    topics: tuple[str, ...] = ()
+    zones: tuple[Zone, ...] = ()
+    options: ZoneOptions | None = None
+
+
+def _before(opened: log.Log, prefix: str) -> _Before:
+    topics = tuple(_with_counts(opened, prefix))
+    for topic in topics:
+        known = provenance_of(opened, topic + _BELOW + next(iter(_SCHEMAS)))
+        zones = zones_from_json(known.parameters.get("zones")) if known else ()
+        if known and zones:
+            values = {one.name: known.parameters.get(one.name) for one in fields(ZoneOptions)}
+            numbers = {
+                name: float(value)
+                for name, value in values.items()
+                if isinstance(value, int | float) and not isinstance(value, bool) and value >= 0
+            }
+            return _Before(topics, zones, ZoneOptions(**numbers))
+    return _Before(topics)
+
+
+def _with_counts(opened: log.Log, prefix: str) -> list[str]:
+    """The channels of a camera's tracks with visits that this stage counted."""
+    ending = _BELOW + next(iter(_SCHEMAS))
+    found = (topic for topic in sorted(camera_at(opened, prefix).topics) if topic.endswith(ending))
+    made = ((topic, provenance_of(opened, topic)) for topic in found)
+    return [topic.removesuffix(ending) for topic, known in made if known and known.transform == STAGE]
+
+
+def _of_camera(opened: log.Log, prefix: str, zones: tuple[Zone, ...], is_given: bool) -> tuple[Zone, ...]:
+    """Return the zones of this camera. Raises McaptrackError if all are of others."""
+    camera = camera_at(opened, prefix)
+    names = {name.strip("/") for name in (prefix, *camera.names, *camera.topics)}
+    kept = tuple(zone for zone in zones if not zone.camera or zone.camera in names)
+    others = sorted({zone.camera for zone in zones} - {zone.camera for zone in kept})
+    kept = tuple(replace(zone, number=number) for number, zone in enumerate(kept, start=1))
+    if not kept:
+        raise McaptrackError(f"all zones are of {', '.join(others)}, not of {prefix.strip('/')}; `camera=` chooses")
+    if others and is_given:
+        left = len(zones) - len(kept)
+        warn(f"{left} zones of {', '.join(others)} are left out: these are tracks of {prefix.strip('/')}", "left-out")
+    return kept
+
+
+def _default_topics(opened: log.Log, prefix: str, made: Mapping[str, Made], before: _Before) -> tuple[str, ...]:
+    full = f"{prefix}/retracks{FULL}"
+    retracked = full if _has_tracks(opened, full, made) else f"{prefix}/retracks"
+    usual = (f"{prefix}/tracks", retracked, camera_at(opened, prefix).truth)
+    return tuple(topic for topic in dict.fromkeys((*usual, *before.topics)) if _has_tracks(opened, topic, made))
+
+
+def _parameters(zones: Sequence[Zone], options: ZoneOptions, planes: Planes) -> dict[str, Any]:
+    """The parameters of counting, as values of JSON."""
+    values: dict[str, Any] = {"zones": zones_to_json(zones), **asdict(options)}
+    return values | ({"ground_planes": planes_to_json(planes)} if planes else {})
+
+
+def _is_due(opened: log.Log, topic: str, made: Mapping[str, Made], wanted: Mapping[str, Any]) -> bool:
+    """Whether the zones of a channel were never counted, in another way, or of what has changed since."""
+    names = outputs(topic)
+    if not all(name in opened.channels for name in names) or is_stale(opened, names[0]):
+        return True
+    known = provenance_of(opened, names[0])
+    if known is None or not _is_same(known.parameters, wanted):
+        return True
+    return any(name in made and made[name].provenance.digest != then for name, then in known.made_from().items())
+
+
+def _is_same(before: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
+    """Whether parameters are the same, as JSON has them."""
+    known = zones_from_json(before.get("zones"))
+    rest = [{key: value for key, value in one.items() if key != "zones"} for one in (before, wanted)]
+    return zones_to_json(known) == wanted["zones"] and rest[0] == rest[1]
+
+
+def _frame_id(opened: log.Log, topic: str, made: Mapping[str, Made]) -> str:
+    """The frame of the metres of tracks."""
+    if topic in made:
+        return made[topic].provenance.frame_id
+    return frame_id_of(opened.channel(topic).metadata)
+
+
+def _has_tracks(opened: log.Log, topic: str, made: Mapping[str, Made]) -> bool:
+    return made[topic].schema is TRACKS if topic in made else _holds(opened, topic, TRACKS)
+
+
+def _holds(opened: log.Log, topic: str, schema: Schema) -> bool:
+    channel = opened.channels.get(topic)
+    return channel is not None and channel.holds(schema)

@@ -1,0 +1,501 @@
+"""Zones and lines: counts against a slow implementation that walks along each person, and laws."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import mcaptrack
+from mcaptrack import log, notices
+from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation.zones import ZoneOptions, find_zone_events, place_zone, positions_of, zone_totals
+from mcaptrack.geometry.plane import GroundPlane
+from mcaptrack.geometry.zones import Paths, Shape, crossings, visits
+from mcaptrack.schema import TRACKS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS, Frame
+from mcaptrack.schema.framing import join_frames
+from mcaptrack.sources.zones import parse_zones, read_zones, to_geojson
+from tests.commands import call, done
+from tests.worlds import ns, tracks_at, walk
+
+SQUARE = [[-2.0, 9.0], [2.0, 9.0], [2.0, 13.0], [-2.0, 13.0], [-2.0, 9.0]]
+LINE = [[0.0, 5.0], [0.0, 20.0]]
+HOLED = [[[-4, 8], [4, 8], [4, 15], [-4, 15], [-4, 8]], [[-1, 10], [1, 10], [1, 12], [-1, 12], [-1, 10]]]
+
+
+def feature(name: str | None, kind: str, coordinates: object, **own: object) -> dict:
+    properties = ({"name": name} if name is not None else {}) | own
+    return {"type": "Feature", "properties": properties, "geometry": {"type": kind, "coordinates": coordinates}}
+
+
+def collection(*features: dict, **top: object) -> dict:
+    return {"type": "FeatureCollection", "units": "metres", "features": list(features)} | top
+
+
+ZONES = collection(
+    feature("square", "Polygon", [SQUARE]), feature("ring", "Polygon", HOLED), feature("gate", "LineString", LINE)
+)
+
+
+# A slow implementation, one person at a time
+
+
+def is_inside(rings: list, x: float, y: float) -> bool:
+    """By the angles that the edges are seen under."""
+    turns = 0
+    for ring in rings:
+        total = 0.0
+        for (ax, ay), (bx, by) in zip(ring, [*ring[1:], ring[0]], strict=True):
+            one, two = np.arctan2(ay - y, ax - x), np.arctan2(by - y, bx - x)
+            total += (two - one + np.pi) % (2 * np.pi) - np.pi
+        turns += abs(round(total / (2 * np.pi)))
+    return turns % 2 == 1
+
+
+def distance(points: list, x: float, y: float, is_closed: bool) -> float:
+    best = np.inf
+    ends, p = np.array([*points, *(points[:1] if is_closed else [])], float), np.array([x, y])
+    for a, b in pairwise(ends):
+        share = 0.0 if (a == b).all() else np.clip((p - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+        best = min(best, float(np.linalg.norm(p - a - share * (b - a))))
+    return best
+
+
+def slow_visits(rings: list, path: list[tuple[int, float, float]], margin: float, gap_ns: int) -> list[tuple]:
+    """Visits of one person as (first time, time until, began inside, ended inside); ``path`` has time, x and y."""
+    rings = [ring[:-1] for ring in rings]
+    pieces, out = [[path[0]]], []
+    for one in path[1:]:
+        pieces.append([one]) if one[0] - pieces[-1][-1][0] > gap_ns else pieces[-1].append(one)
+    for piece in pieces:
+        sides = [is_inside(rings, x, y) for _, x, y in piece]
+        deep = [min(distance(ring, x, y, True) for ring in rings) for _, x, y in piece]
+        state, crossed = sides[0], 0
+        entered = (0, True) if state else None
+        for number in range(1, len(piece)):
+            if sides[number] != sides[number - 1]:
+                crossed = number
+            is_sure = deep[number] > margin or number == len(piece) - 1
+            if is_sure and sides[number] != state:
+                state = sides[number]
+                if state:
+                    entered = (crossed, False)
+                else:
+                    out.append((piece[entered[0]][0], piece[crossed][0], entered[1], False))
+                    entered = None
+        if entered:
+            out.append((piece[entered[0]][0], piece[-1][0], entered[1], True))
+    return out
+
+
+def slow_crossings(points: list, path: list[tuple[int, float, float]], margin: float, gap_ns: int) -> list[tuple]:
+    """Crossings of one person as (time, forward)."""
+
+    def side(a, b, x, y):
+        return (b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])
+
+    out, pending = [], []
+    for before, now in pairwise(path):
+        if now[0] - before[0] > gap_ns:
+            out += settle(pending)
+            pending = []
+            continue
+        for a, b in pairwise(points):
+            was, is_left = side(a, b, *before[1:]) > 0, side(a, b, *now[1:]) > 0
+            apart = side(before[1:], now[1:], *a) > 0, side(before[1:], now[1:], *b) > 0
+            if was != is_left and apart[0] != apart[1]:
+                pending.append((now[0], was))
+        if distance(points, *now[1:], False) > margin:
+            out += settle(pending)
+            pending = []
+    return out + settle(pending)
+
+
+def settle(pending: list[tuple]) -> list[tuple]:
+    net = sum(1 if forward else -1 for _, forward in pending)
+    return [[one for one in pending if one[1] == (net > 0)][-1]] if net else []
+
+
+def paths_of(frames: list[Frame]) -> dict[int, list[tuple[int, float, float]]]:
+    out: dict[int, list[tuple[int, float, float]]] = {}
+    for frame in frames:
+        for row in frame.rows:
+            if np.isfinite(row["x_m"]):
+                out.setdefault(int(row["track_id"]), []).append((frame.t_ns, float(row["x_m"]), float(row["y_m"])))
+    return out
+
+
+def expected(frames: list[Frame], features: list[dict], margin_m: float, gap_s: float = 4.0) -> tuple[set, set]:
+    """All visits and crossings, by number of the zone and track."""
+    visited, crossed = set(), set()
+    for number, one in enumerate(features, start=1):
+        rings = one["geometry"]["coordinates"]
+        for track, path in paths_of(frames).items():
+            if one["geometry"]["type"] == "Polygon":
+                edges = [np.hypot(*(np.diff(np.array(ring, float), axis=0)).T).sum() for ring in rings]
+                areas = [abs(cv2.contourArea(np.array(ring[:-1], np.float32))) for ring in rings]
+                margin = min(margin_m, (areas[0] - sum(areas[1:])) / sum(edges) / 2)
+                visited |= {(number, track, *some) for some in slow_visits(rings, path, margin, ns(gap_s))}
+            else:
+                crossed |= {(number, track, *some) for some in slow_crossings(rings, path, margin_m, ns(gap_s))}
+    return visited, crossed
+
+
+def told(visited: list[Frame], crossed: list[Frame]) -> tuple[set, set]:
+    """The same, of rows."""
+    return (
+        {
+            (int(row["zone_id"]), int(row["track_id"]), frame.t_ns, frame.t_ns + round(float(row["dwell_s"]) * 1e9),
+             bool(row["began_inside"]), bool(row["ended_inside"]))
+            for frame in visited for row in frame.rows
+        },
+        {
+            (int(row["zone_id"]), int(row["track_id"]), frame.t_ns, bool(row["forward"]))
+            for frame in crossed for row in frame.rows
+        },
+    )  # fmt: skip
+
+
+def count(frames: list[Frame], content: dict, margin_m: float = 0.25, gap_s: float = 4.0):
+    """Zones of rows in metres, with the totals."""
+    zones = parse_zones(content)
+    placed = [place_zone(zone, ()) for zone in zones]
+    found = find_zone_events(frames, positions_of(frames, (), None), placed, ZoneOptions(margin_m, gap_s), "tracks")
+    return found, zone_totals(zones, found.visits, found.crossings, found.counts)
+
+
+def wandering(seed: int, people: int = 6, ticks: int = 120, jitter: float = 0.3) -> list[Frame]:
+    """Random walks about the zones, with jitter and gaps."""
+    chance = np.random.default_rng(seed)
+    at = np.cumsum(chance.normal(0, 0.4, (ticks, people, 2)), axis=0) + chance.uniform(-3, 3, (people, 2)) + [0, 11]
+    at += chance.normal(0, jitter, at.shape)
+    seen = chance.random((ticks, people)) < 0.9
+    return walk(lambda t: {p + 1: tuple(at[t, p]) for p in range(people) if seen[t, p]}, ticks, 5)
+
+
+class TestAgainstASlowImplementation:
+    @pytest.mark.parametrize("margin", [0.0, 0.25])
+    def test_random_walks(self, margin):
+        frames = wandering(1)
+        found, _ = count(frames, ZONES, margin, gap_s=0.5)
+        wanted = expected(frames, ZONES["features"], margin, 0.5)
+        assert told(found.visits, found.crossings) == wanted
+        assert min(map(len, wanted)) > 3
+
+    def test_the_command_equals_it_on_the_ground_truth_and_on_tracks_of_a_log(self, finished, tmp_path):
+        path = tmp_path / "zones.geojson"
+        path.write_text(json.dumps(ZONES))
+        result = mcaptrack.zones(finished, zones=path, output=tmp_path / "out.mcap")
+        topics = ["/camera/retracks/full", "/camera/tracks", "/camera/truth"]
+        assert list(result.zones) == topics
+        with log.read(tmp_path / "out.mcap") as opened:
+            for topic in topics:
+                frames = opened.frames(topic, TRACKS)
+                if topic == "/camera/tracks":  # which has boxes alone: the plane gives their places
+                    continue
+                wanted = expected(frames, ZONES["features"], 0.25)
+                rows = [
+                    opened.frames(f"{topic}/zones/{name}", schema)
+                    for name, schema in (
+                        ("visits", ZONE_VISITS),
+                        ("crossings", ZONE_CROSSINGS),
+                        ("counts", ZONE_COUNTS),
+                    )
+                ]
+                assert told(*rows[:2]) == wanted
+                square, ring, gate = result.zones[topic]
+                assert (square.visits, ring.visits) == tuple(sum(v[0] == n for v in wanted[0]) for n in (1, 2))
+                assert (gate.forward, gate.backward) == tuple(sum(c[3] == w for c in wanted[1]) for w in (True, False))
+                inside = {
+                    frame.t_ns: sum(v[0] == 1 and v[2] <= frame.t_ns and (frame.t_ns < v[3] or (v[5] and frame.t_ns == v[3]))
+                                    for v in wanted[0])
+                    for frame in rows[2]
+                }  # fmt: skip
+                assert {f.t_ns: int(f.rows["inside"][0]) for f in rows[2]} == inside
+        assert result.zones["/camera/truth"][2].tracks >= 2
+
+
+class TestGeometry:
+    def test_depth_is_the_distance_that_opencv_has(self):
+        chance = np.random.default_rng(2)
+        for corners in (3, 5, 12):
+            angle = np.sort(chance.uniform(0, 2 * np.pi, corners))
+            ring = (np.stack([np.cos(angle), np.sin(angle)], 1) * chance.uniform(1, 9, (corners, 1))).astype(np.float32)
+            points = chance.uniform(-10, 10, (200, 2)).astype(np.float32)
+            wanted = [cv2.pointPolygonTest(ring, tuple(map(float, one)), measureDist=True) for one in points]
+            found = Shape(((ring.astype(float),),)).depth(points.astype(float))
+            np.testing.assert_allclose(found, wanted, atol=1e-4)
+
+    @settings(max_examples=8, deadline=None)
+    @given(st.integers(0, 10**6), st.sampled_from([0.0, 0.2]))
+    def test_laws(self, seed, margin):
+        frames = wandering(seed, people=3, ticks=60)
+        found, totals = count(frames, ZONES, margin, 0.5)
+        counts = join_frames(ZONE_COUNTS, found.counts).rows.reshape(-1, 3)
+        assert (counts["entered"].astype(int) - counts["left"] == counts["inside"]).all()
+        assert (np.diff(counts["entered"].astype(int), axis=0) >= 0).all()
+        assert counts["inside"].max(axis=0)[:2].tolist() == [one.most_inside for one in totals[:2]]
+        assert [one.visits for one in totals[:2]] == counts["entered"][-1][:2].tolist()
+        # a line that runs the other way
+        other = collection(feature("gate", "LineString", LINE[::-1]))
+        (turned,) = count(frames, other, margin, 0.5)[1]
+        assert (turned.forward, turned.backward) == (totals[2].backward, totals[2].forward)
+        # in other units of length
+        bigger = [frame._replace(rows=frame.rows.copy()) for frame in frames]
+        for frame in bigger:
+            frame.rows["x_m"] *= 3
+            frame.rows["y_m"] *= 3
+        scaled = json.loads(json.dumps(ZONES))
+        for one in scaled["features"]:
+            one["geometry"]["coordinates"] = (np.array(one["geometry"]["coordinates"], float) * 3).tolist()
+        again = count(bigger, scaled, 3 * margin, 0.5)
+        assert told(again[0].visits, again[0].crossings) == told(found.visits, found.crossings)
+        # backwards in time: who enters leaves
+        last = frames[-1].t_ns
+        back = [Frame(last - frame.t_ns, n, frame.rows) for n, frame in enumerate(frames[::-1])]
+        mirrored = count(back, ZONES, margin, 0.5)[1]
+        for one, two in zip(totals, mirrored, strict=True):
+            assert (one.visits, one.entered, one.left, one.tracks) == (two.visits, two.left, two.entered, two.tracks)
+        assert (mirrored[2].forward, mirrored[2].backward) == (totals[2].backward, totals[2].forward)
+
+    @settings(max_examples=6, deadline=None)
+    @given(st.integers(0, 10**6))
+    def test_the_halves_of_a_zone_hold_together_what_it_holds(self, seed):
+        frames = wandering(seed, people=3, ticks=60)
+        halves = [[[-2, 9], [0.5, 9], [0.5, 13], [-2, 13], [-2, 9]], [[0.5, 9], [2, 9], [2, 13], [0.5, 13], [0.5, 9]]]
+        content = collection(*(feature(str(n), "Polygon", [ring]) for n, ring in enumerate((SQUARE, *halves))))
+        inside = join_frames(ZONE_COUNTS, count(frames, content, 0.0)[0].counts).rows["inside"].reshape(-1, 3)
+        assert (inside[:, 0] == inside[:, 1] + inside[:, 2]).all()
+
+    def test_noise_at_an_edge_counts_once(self):
+        at = [-1.0, -0.1, 0.1, -0.1, 0.1, -0.1, 0.1, 0.15, 1.0, 1.1, 0.1, -0.1, 0.1, 1.0, 0.1, -0.1, 0.1, -0.05, -1.0]
+        frames = walk(lambda tick: {7: (at[tick], 1.0)}, len(at), 1)
+        zone = collection(
+            feature("room", "Polygon", [[[0, -5], [9, -5], [9, 5], [0, 5], [0, -5]]]),
+            feature("door", "LineString", [[0, -5], [0, 5]]),
+        )
+        found, (room, door) = count(frames, zone)
+        assert told(found.visits, found.crossings) == ({(1, 7, ns(6), ns(17), False, False)}, {
+            (2, 7, ns(6), True), (2, 7, ns(17), False)
+        })  # fmt: skip
+        assert (room.visits, room.tracks, room.dwell_s, door.forward, door.backward) == (1, 1, 11.0, 1, 1)
+        noisy = count(frames, zone, 0.0)[1]
+        assert (noisy[0].visits, noisy[1].forward) == (5, 5)
+
+    def test_a_track_that_is_lost_and_found_again_is_one_visit_unless_the_gap_is_long(self):
+        seen = [0, 1, 2, 5, 6, 12, 13]
+        frames = [Frame(ns(t), t, tracks_at({1: (0.0, 11.0)} if t in seen else {})) for t in range(14)]
+        found, (square, *_) = count(frames, ZONES, gap_s=4.0)
+        assert (square.visits, square.tracks, square.entered, square.dwell_s) == (2, 1, 0, 7.0)
+        inside = [int(frame.rows["inside"][0]) for frame in found.counts]
+        assert inside == [1] * 7 + [0] * 5 + [1] * 2
+
+    def test_paths_through_the_corners_of_a_line_count_once(self):
+        line = Shape(((np.array([[0.0, 0], [1, 0], [2, 0], [2, 2]]),),), is_line=True)
+        for x in (0.5, 1.0, 1.5):
+            points = np.array([[x, -1.0], [x, 0.0], [x, 1.0]])
+            paths = Paths.of(points, np.arange(3), np.zeros(3, np.int64), 10)
+            assert [part.tolist() for part in crossings(paths, line, 0.0)] == [[1], [-1]]
+
+    def test_nothing_in_gives_nothing_out(self):
+        empty = [Frame(0, 0, TRACKS.empty())]
+        found, totals = count(empty, ZONES)
+        assert [one.tracks for one in totals] == [0, 0, 0]
+        assert found.counts[0].rows["inside"].tolist() == [0, 0, 0]
+        assert totals[0].mean_dwell_s is None
+        paths = Paths.of(np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0, np.int64), 1)
+        assert [len(one) for one in visits(paths, np.zeros(0), 0.1)] == [0, 0, 0, 0]
+
+
+class TestPixels:
+    PLANE = GroundPlane((0.05, 0.0, -8.0, 0.0, -0.05, 10.0, 0.0, 0.0, 1.0), 320, 200)
+    BOX = [[100, 50], [200, 50], [200, 150], [100, 150]]
+
+    def test_the_same_zone_in_pixels_and_in_metres_counts_the_same(self):
+        frames = wandering(5)
+        corners = self.PLANE.pixels_to_metres(np.array(self.BOX, float)).tolist()
+        gate = [[150, 0], [150, 200]]
+        both = [
+            collection(feature("a", "Polygon", [self.BOX]), feature("b", "LineString", gate), units="pixels"),
+            collection(
+                feature("a", "Polygon", [corners]),
+                feature("b", "LineString", self.PLANE.pixels_to_metres(np.array(gate, float)).tolist()),
+            ),
+        ]
+        found = []
+        for content in both:
+            placed = [place_zone(zone, [(0, self.PLANE)]) for zone in parse_zones(content)]
+            some = find_zone_events(frames, positions_of(frames, (), None), placed, ZoneOptions(), "tracks")
+            found.append(told(some.visits, some.crossings))
+        assert found[0] == found[1]
+        assert min(map(len, found[0])) > 0
+
+    def test_forward_is_what_a_person_sees_in_the_picture_and_on_the_ground(self):
+        feet = [[140.0, 100.0], [160.0, 100.0]]  # to the right of a line upwards in the picture, seen from its start
+        line = collection(feature("up", "LineString", [[150, 200], [150, 0]]), units="pixels")
+        ways = []
+        mirrored = GroundPlane((0.05, 0.0, -8.0, 0.0, 0.05, 1.0, 0.0, 0.0, 1.0), 320, 200)
+        for planes in ((), [(0, self.PLANE)], [(0, mirrored)]):
+            rows = [
+                TRACKS.rows(track_id=[1], x_px=[x - 5], y_px=[y - 30], w_px=[10], h_px=[30], observed=[True],
+                            source_id=[-1])
+                for x, y in feet
+            ]  # fmt: skip
+            frames = [Frame(ns(n), n, row) for n, row in enumerate(rows)]
+            placed = [place_zone(zone, planes) for zone in parse_zones(line)]
+            found = find_zone_events(frames, positions_of(frames, planes, None), placed, ZoneOptions(0.0), "tracks")
+            ways.append([bool(way) for frame in found.crossings for way in frame.rows["forward"]])
+        assert ways == [[True]] * 3
+
+    def test_a_zone_above_the_horizon_is_refused(self):
+        plane = GroundPlane((0.05, 0.0, -8.0, 0.0, -0.05, 10.0, 0.0, 0.01, -0.9), 320, 200)
+        (zone,) = parse_zones(collection(feature("sky", "Polygon", [self.BOX]), units="px"))
+        with pytest.raises(McaptrackError, match=r"^zone sky reaches above the horizon, at \(100, 50\) px"):
+            place_zone(zone, [(0, plane)])
+
+
+BOWTIE = [[0, 0], [2, 2], [2, 0], [0, 2], [0, 0]]
+WRONG = {
+    "crosses or touches itself at \\(1, 1\\)": collection(feature("a", "Polygon", [BOWTIE])),
+    "touches itself": collection(feature("a", "Polygon", [[[0, 0], [4, 0], [4, 4], [2, 0], [0, 4], [0, 0]]])),
+    'add "units": "metres"': collection(feature("a", "Polygon", [SQUARE]), units=None) | {"units": "degrees"},
+    "has no units": {k: v for k, v in ZONES.items() if k != "units"},
+    "are these degrees": collection(feature("a", "Polygon", [[[13.4, 52.5], [13.40001, 52.5], [13.4, 52.50001]]])),
+    "the coordinate nan": collection(feature("a", "Polygon", [[[0, 0], [1, float("nan")], [2, 0]]])),
+    "the coordinate inf": collection(feature("a", "LineString", [[0, 0], [1, float("inf")]])),
+    "the coordinate 'x'": collection(feature("a", "LineString", [[0, "x"], [1, 1]])),
+    "no zones": collection(),
+    "zones 1 and 2 are both called a": collection(feature("a", "Polygon", [SQUARE]), feature("a", "LineString", LINE)),
+    "has 2 different points": collection(feature("a", "Polygon", [[[0, 0], [1, 1], [0, 0]]])),
+    "not nested as its type needs": collection(feature("a", "Polygon", SQUARE[0][0])),
+    "where a point of two numbers is needed": collection(feature("a", "Polygon", SQUARE)),
+    "not GeoJSON": {"zones": []},
+    "a list without a type": [1, 2],
+    "is a 'Circle'": collection(feature("a", "Circle", [0, 0])),
+    "feature 1 is a number": collection() | {"features": [5]},
+    "needs a list of features": {"type": "FeatureCollection", "features": 3},
+    "more than 2000 points": collection(feature("a", "LineString", [[n, n % 2] for n in range(2001)])),
+    "1 to 100 printable characters": collection(feature("a\nb", "Polygon", [SQUARE])),
+    "not valid JSON": "{",
+    "is not a text file": b"\xff\xfe\x00",
+    "zones take at most": b" " * (8 * 2**20 + 1),
+}
+
+
+class TestFiles:
+    @pytest.mark.parametrize("words", WRONG)
+    def test_a_file_that_cannot_be_read_is_one_line(self, tmp_path, words):
+        path, content = tmp_path / "zones.json", WRONG[words]
+        if isinstance(content, bytes):
+            path.write_bytes(content)
+        else:
+            path.write_text(content if isinstance(content, str) else json.dumps(content))
+        words = "has units 'degrees'" if words.startswith("add") else words
+        with pytest.raises(McaptrackError, match=words) as error:
+            read_zones(path)
+        assert str(error.value).startswith(str(path))
+        assert len(str(error.value).splitlines()) == 1
+        assert len(str(error.value)) < 300 + len(str(path))
+
+    def test_what_is_written_is_read_back(self):
+        content = collection(
+            feature("square", "Polygon", [SQUARE]), feature("ring", "Polygon", HOLED), feature("gate", "LineString", LINE),
+            feature("two", "MultiPolygon", [[SQUARE], [[[20, 20], [21, 20], [21, 21], [20, 20]]]], units="px", camera="/a"),
+        )  # fmt: skip
+        zones = parse_zones(content)
+        assert parse_zones(to_geojson(zones)) == zones
+        assert [(zone.units, zone.camera, len(zone.parts)) for zone in zones[2:]] == [
+            ("metres", "", 1),
+            ("pixels", "a", 2),
+        ]
+
+    def test_points_are_left_out_with_a_warning_and_names_are_made(self):
+        content = collection(feature("tree", "Point", [1, 1]), feature(None, "Polygon", [SQUARE]))
+        with notices.collected() as said:
+            (zone,) = parse_zones(content)
+        assert zone.name == "zone 1"
+        assert [one.message for one in said] == ["zone tree is left out: it is a Point, not a Polygon or LineString"]
+
+
+class TestRun:
+    @pytest.fixture
+    def place(self, finished, tmp_path) -> Path:
+        (tmp_path / "zones.geojson").write_text(json.dumps(ZONES))
+        mcaptrack.zones(finished, zones=ZONES, output=tmp_path / "a.mcap")
+        return tmp_path
+
+    def test_later_runs_count_again_what_has_changed(self, place):
+        path = place / "a.mcap"
+        assert mcaptrack.run(path, tables=False).stages == ()
+        mcaptrack.drop(path, "/camera/tracks/zones/visits")
+        assert mcaptrack.run(path, tables=False).stages == ("zones",)
+        before = mcaptrack.zones(path)
+        assert before.stages == ()
+        made = mcaptrack.sample(path, rate_hz=5.0)
+        assert not any("/tracks/zones" in topic for topic in made.stale)
+        result = mcaptrack.run(path, tables=False)
+        assert result.stages[-1] == "zones"
+        assert all("/retracks/full/zones/" in topic for topic in result.channels if "/zones/" in topic)
+        assert result.zones["/camera/truth"] == before.zones["/camera/truth"]
+        assert mcaptrack.run(path, tables=False).is_up_to_date
+
+    def test_other_zones_replace_those_of_before(self, place):
+        path = place / "a.mcap"
+        one = mcaptrack.zones(path, zones={"type": "LineString", "coordinates": LINE, "units": "m"})
+        assert [[total.zone for total in some] for some in one.zones.values()] == [["line 1"]] * 3
+        assert mcaptrack.zones(path, margin_m=0.5).stages == ("zones",)
+        with log.read(path) as opened:
+            metadata = opened.channel("/camera/truth/zones/visits").metadata
+        assert json.loads(metadata["mcaptrack.zones"]) == {"1": "line 1"}
+        assert json.loads(metadata["mcaptrack.parameters"])["margin_m"] == 0.5
+
+    def test_tables_and_json_have_the_names(self, place):
+        said = json.loads(done("zones", place / "a.mcap", "--json").out)["results"][0]
+        square = said["zones"]["/camera/truth"][0]
+        assert (square["zone"], square["visits"]) == ("square", square["entered"] + 0 * square["left"])
+        with mcaptrack.open(place / "a.mcap") as opened:
+            rows = opened.table("zone_visits").to_pylist()
+            assert {row["zone"] for row in rows} == {"square", "ring"}
+            assert {row["class"] for row in rows} == {"person"}
+            assert {row["zone"] for row in opened.table("zone_counts").to_pylist()} == {"square", "ring", "gate"}
+            assert {row["zone"] for row in opened.table("zone_crossings").to_pylist()} == {"gate"}
+
+    def test_the_log_view_tells_them_in_order(self, place):
+        from foxglove_schemas_protobuf.Log_pb2 import Log
+
+        with log.read(place / "a.mcap") as opened:
+            said = [Log.FromString(one.payload).message for one in opened.messages("/camera/truth/zones/view/log")]
+            times = opened.times("/camera/truth/zones/view/log")
+        assert (np.diff(times) >= 0).all()
+        assert any(" enters square, (" in words for words in said)
+        assert any(" crosses gate forward, (" in words for words in said)
+        assert sum(" leaves " in words or " ends in " in words for words in said) == sum(
+            " enters " in words or " begins in " in words for words in said
+        )
+
+    def test_mistakes_are_one_line(self, finished, tmp_path):
+        (tmp_path / "other.json").write_text(json.dumps(collection(feature("a", "Polygon", [SQUARE], camera="front"))))
+        for words, why in (
+            (("zones", finished), "was not counted yet; give a file of GeoJSON with --zones"),
+            (("zones", finished, "--zones", tmp_path / "no.json"), "can't be read: No such file"),
+            (
+                ("zones", finished, "--zones", tmp_path / "other.json"),
+                "all zones are of front, not of camera; --camera",
+            ),
+        ):
+            outcome = call(*words, "-o", tmp_path / "b.mcap")
+            assert (outcome.code, outcome.out) == (1, "")
+            assert why in outcome.err
+            assert len(outcome.err.splitlines()) == 1
+
+    def test_a_zone_that_nobody_could_reach_is_named(self, finished, tmp_path):
+        content = collection(feature("moon", "Polygon", [[[900, 900], [901, 900], [901, 901]]]))
+        result = mcaptrack.zones(finished, zones=content, output=tmp_path / "b.mcap")
+        assert {one.code for one in result.warnings} == {"not-compared"}
+        assert "zone moon, (900, 900) to (901, 901) m, is beyond all of /camera/tracks" in result.warnings[0].message
