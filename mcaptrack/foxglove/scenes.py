@@ -9,7 +9,7 @@ Letters: F instants, N people, P points of each.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import Any, Final, NamedTuple
 
@@ -163,6 +163,18 @@ class SceneMessages:
         xy = _short(xy_m)[None]
         self._add(np.array([frame]), template, points__x=xy[..., 0], points__y=xy[..., 1])
 
+    def zone(
+        self, frame: Ints, name: str, rings: Sequence[Floats], is_closed: bool, label_m: Floats, labels: Sequence[str],
+        rgba: tuple[float, float, float, float],
+    ) -> None:  # fmt: skip
+        """Draw the rings (P, 2) of a zone, or a line, at each of N instants, with labels (N,) at a point (2,)."""
+        points = tuple(tuple(map(tuple, _short(ring).tolist())) for ring in rings)
+        for length, chosen, words in by_length(np.array(labels, object)):
+            template = _zone(self._frame_id, self._lifetime_ns, name, points, is_closed, length, rgba)
+            at = {f"text_{axis}": np.full(len(chosen), _short(label_m)[place]) for place, axis in enumerate("xy")}
+            shades = _shades("text_", np.broadcast_to(rgba[:3], (len(chosen), 3)))
+            self._add(frame[chosen], template, label=words, **at, **shades)
+
     def messages(self) -> Iterator[bytes]:
         """The message of each instant, in order."""
         for frame in range(self._count):
@@ -297,6 +309,30 @@ def _forecast(
     }
     lines, discs = _lines(points, thickness_px, is_high=is_high), [disc] if has_ellipse else []
     return _entity(frame_id, lifetime_ns, TextSlot("entity_id", length), cylinders=discs, lines=lines)
+
+
+@cache
+def _zone(
+    frame_id: str,
+    lifetime_ns: int,
+    name: str,
+    rings: tuple[tuple[tuple[float, float], ...], ...],
+    is_closed: bool,
+    length: int,
+    rgba: tuple[float, float, float, float],
+) -> Template:
+    lines = [
+        {
+            "type": _LINE_LOOP if is_closed else _LINE_STRIP,
+            "pose": {"position": {}, "orientation": _UPRIGHT},
+            "thickness": 3.0,
+            "scale_invariant": True,
+            "points": [{"x": x, "y": y} for x, y in ring],
+            "color": dict(zip("rgba", rgba, strict=True)),
+        }
+        for ring in rings
+    ]
+    return _entity(frame_id, lifetime_ns, name, lines=lines, texts=[_label(length, _DISC_M)])
 
 
 @cache

@@ -148,7 +148,7 @@ def _run(
         report.stages += [EVENTS_STAGE] if events else []
     if zones is not None:
         with part(ZONES_STAGE):
-            counted = make_zones(opened, prefix, made, planes or (), zones)
+            counted = make_zones(opened, prefix, made, planes or (), zones, stamps)
         made |= counted
         report.frames |= {topic: channel.size() for topic, channel in counted.items()}
         report.stages += [ZONES_STAGE] if counted else []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -62,7 +62,7 @@ class Made(NamedTuple):
     schema: Schema
     frames: Sequence[Frame]
     provenance: Provenance
-    encoded: list[tuple[int, int, bytes]] | None = None
+    encoded: Collection[tuple[int, int, bytes]] | None = None
     drawn: str = ""
 
     @classmethod
@@ -105,6 +105,40 @@ class Made(NamedTuple):
         return len(self.frames if self.encoded is None else self.encoded)
 
 
+class DrawnMessages(Collection[tuple[int, int, bytes]]):
+    """Messages for viewers that are made each time they are read: all of them take much memory."""
+
+    def __init__(self, count: int, draw: Callable[[], Iterator[tuple[int, int, bytes]]]) -> None:
+        self._count, self._draw = count, draw
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Iterator[tuple[int, int, bytes]]:
+        return self._draw()
+
+    def __contains__(self, message: object) -> bool:
+        return any(message == one for one in self)
+
+
+class PictureClock(NamedTuple):
+    """The topic of a camera's pictures, None without any; their times, rising, and their stamps (M,) in ns."""
+
+    topic: str | None
+    t_ns: Ints
+    stamp_ns: Ints
+
+
+def picture_clock(opened: log.Log, prefix: str, stamps: Mapping[str, Sequence[int]]) -> PictureClock:
+    """Return the times of a camera's pictures; ``stamps`` as for ``write``."""
+    usual = f"{prefix}/{VIDEO}"
+    video = usual if usual in opened.channels else next(iter(stamps), None) or camera_at(opened, prefix).pictures
+    picture_ns = opened.times(video) if video else np.empty(0, np.int64)
+    video = video if len(picture_ns) else None
+    stamp_ns = _stamps(opened, video, stamps.get(video, ())) if video else picture_ns
+    return PictureClock(video, picture_ns, stamp_ns)
+
+
 def digest_of(opened: log.Log, topic: str) -> str:
     """Return the digest of a channel's messages: from its provenance if possible, else computed."""
     known = Provenance.from_metadata(opened.channel(topic).metadata)
@@ -142,11 +176,7 @@ def write(
     ``made`` are the channels by topic; ``stamps`` the capture times in ns of pictures that stages have read, by topic.
     """
     camera = camera_at(opened, prefix)
-    usual = f"{prefix}/{VIDEO}"
-    video = usual if usual in opened.channels else next(iter(stamps), None) or camera.pictures
-    picture_ns = opened.times(video) if video else np.empty(0, np.int64)
-    video = video if len(picture_ns) else None
-    stamp_ns = _stamps(opened, video, stamps.get(video, ())) if video else picture_ns
+    video, picture_ns, stamp_ns = picture_clock(opened, prefix, stamps)
     shown = _channels_to_draw(opened, camera, made) | _boxes_to_draw(opened, boxes)
     outdated = {topic + suffix for topic in shown for suffix in views.SUFFIXES}
     planes = moved_planes(planes, path)

@@ -4,6 +4,8 @@
 <tracks>/zones/crossings    crossings: rows of ZoneCrossings
 <tracks>/zones/counts       who is inside, and the counts so far, in each frame: rows of ZoneCounts
 <tracks>/zones/view/log     enters, leaves and crossings as text, for a viewer
+<tracks>/zones/view/image   zones and lines on the pictures, with their counts so far
+<tracks>/zones/view/scene   the same on the ground
 
 The zones themselves are in the provenance of these channels, so that later runs count again where tracks have changed.
 """
@@ -27,14 +29,17 @@ from mcaptrack.evaluation.zones import (
     positions_of,
     zone_totals,
 )
-from mcaptrack.geometry.plane import Planes, scene_planes
+from mcaptrack.foxglove import views
+from mcaptrack.foxglove.views import zones as drawn_zones
+from mcaptrack.foxglove.views.image import PictureTimes
+from mcaptrack.geometry.plane import Planes, moved_planes, scene_planes
 from mcaptrack.geometry.zones import Zone
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import describe_origin, may_replace
 from mcaptrack.pipeline.motion import ground_truth_with, path_with
 from mcaptrack.pipeline.planes import planes_to_json
 from mcaptrack.pipeline.staleness import is_stale
-from mcaptrack.pipeline.write import Made, digest_of
+from mcaptrack.pipeline.write import DrawnMessages, Made, PictureClock, digest_of, picture_clock
 from mcaptrack.schema import TRACKS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS, Frame, Schema
 from mcaptrack.schema.provenance import VIEW, Provenance, frame_id_of
 from mcaptrack.sources.cameras import camera_at, provenance_of
@@ -44,6 +49,9 @@ from mcaptrack.transforms import FULL
 #: The name of the stage, in reports and in the provenance.
 STAGE: Final = "zones"
 _BELOW: Final = "/zones"
+_VIEWS: Final = (SUFFIX, views.SUFFIX, views.SCENE_SUFFIX)
+#: The height of pictures where no plane says it.
+_HEIGHT_PX: Final = 480.0
 _SCHEMAS: Final = {"/visits": ZONE_VISITS, "/crossings": ZONE_CROSSINGS, "/counts": ZONE_COUNTS}
 
 
@@ -72,17 +80,23 @@ class CountedZones(NamedTuple):
 
 
 def outputs(topic: str) -> tuple[str, ...]:
-    """Return the topics for the zones of a channel of tracks."""
-    return *(topic + _BELOW + name for name in _SCHEMAS), topic + _BELOW + SUFFIX
+    """Return the topics for the zones of a channel of tracks; those of views on pictures and scenes may be missing."""
+    return *(topic + _BELOW + name for name in _SCHEMAS), *(topic + _BELOW + suffix for suffix in _VIEWS)
 
 
 def make_zones(
-    opened: log.Log, prefix: str, made: Mapping[str, Made], planes: Planes, watch: ZoneWatch
+    opened: log.Log,
+    prefix: str,
+    made: Mapping[str, Made],
+    planes: Planes,
+    watch: ZoneWatch,
+    stamps: Mapping[str, Sequence[int]] = {},
 ) -> dict[str, Made]:
     """Count the zones of channels of tracks that are not counted yet, or that have changed since.
 
-    ``made`` are the channels of this run, by topic. Returns the new channels by topic. Raises McaptrackError for given
-    topics that hold no tracks, and for zones that none of the tracks can be compared with.
+    ``made`` are the channels of this run, by topic, ``stamps`` the capture times of pictures, as for ``write``. Returns
+    the new channels by topic. Raises McaptrackError for given topics that hold no tracks, and for zones that none of
+    the tracks can be compared with.
     """
     before = _before(opened, prefix)
     zones = watch.zones or before.zones
@@ -104,7 +118,7 @@ def make_zones(
         wanted = _parameters(zones, options, planes)
         if not watch.force and not _is_due(opened, topic, made, wanted):
             continue
-        taken = [one for one in outputs(topic) if not may_replace(opened, one, VIEW if SUFFIX in one else STAGE)]
+        taken = [one for one in outputs(topic) if not may_replace(opened, one, VIEW if "/view/" in one else STAGE)]
         if taken:
             words = f"no zones of {topic}: they would replace {taken[0]}, which {describe_origin(opened, taken[0])}"
             if watch.topics:
@@ -112,7 +126,8 @@ def make_zones(
             warn(words, "left-out")
             continue
         try:
-            out |= _counted(opened, prefix, topic, made, planes, zones, options, wanted)
+            pictures = picture_clock(opened, prefix, stamps)
+            out |= _counted(opened, prefix, topic, made, planes, zones, options, wanted, pictures)
         except McaptrackError as error:
             faults.append(error)
     if faults and (not out or watch.topics) and watch.zones:
@@ -131,6 +146,7 @@ def _counted(
     zones: Sequence[Zone],
     options: ZoneOptions,
     parameters: Mapping[str, Any],
+    pictures: PictureClock,
 ) -> dict[str, Made]:
     """The channels of one channel of tracks."""
     source = made[topic].provenance.digest if topic in made else digest_of(opened, topic)
@@ -159,6 +175,26 @@ def _counted(
     crossings = {crossed: out[crossed].provenance.digest}
     view = Provenance(VIEW, {}, visited, out[visited].provenance.digest, references=crossings)
     out[topic + _BELOW + SUFFIX] = Made(ZONE_VISITS, [], view, text, foxglove.LOG)
+    shapes = [
+        drawn_zones.ZoneShape(one.zone, one.zone.shape(), one.shape if one.units == "metres" else None, one.forward)
+        for one in placed
+    ]
+    view = replace(view, input=(counts := topic + _BELOW + "/counts"), input_digest=out[counts].provenance.digest)
+    view = replace(view, references={})
+    captions = drawn_zones.ZoneCaptions.of(zones, found.counts)
+    moving, frame_id = moved_planes(planes, path), provenance.frame_id or views.ground.frame_of(prefix)
+    if len(pictures.t_ns):
+        clock = PictureTimes(pictures.t_ns, pictures.stamp_ns)
+        height_px = float(planes[0][1].height_px) if planes else _HEIGHT_PX
+        out[topic + _BELOW + views.SUFFIX] = Made(
+            ZONE_COUNTS, [], view,
+            DrawnMessages(len(pictures.t_ns), lambda: drawn_zones.on_pictures(
+                shapes, captions, clock, moving, path, height_px)),
+            foxglove.ANNOTATIONS,
+        )  # fmt: skip
+    if any(one.ground for one in shapes):
+        scenes = DrawnMessages(len(captions.t_ns), lambda: drawn_zones.on_ground(shapes, captions, frame_id))
+        out[topic + _BELOW + views.SCENE_SUFFIX] = Made(ZONE_COUNTS, [], view, scenes, foxglove.SCENE)
     return out
 
 
@@ -239,7 +275,7 @@ def _parameters(zones: Sequence[Zone], options: ZoneOptions, planes: Planes) -> 
 
 def _is_due(opened: log.Log, topic: str, made: Mapping[str, Made], wanted: Mapping[str, Any]) -> bool:
     """Whether the zones of a channel were never counted, in another way, or of what has changed since."""
-    names = outputs(topic)
+    names = outputs(topic)[: len(_SCHEMAS) + 1]
     if not all(name in opened.channels for name in names) or is_stale(opened, names[0]):
         return True
     known = provenance_of(opened, names[0])

@@ -37,6 +37,8 @@ _DISTANCE: Final = 3.4
 PEOPLE, ERRORS, SPREAD = "people", "errors", "spread"
 #: The suffix of the text of events, after the topic of tracks.
 _EVENTS: Final = "/events/view/log"
+#: The suffix of zones, after the topic of tracks.
+_ZONES: Final = "/zones"
 
 
 class CameraChannels(NamedTuple):
@@ -79,7 +81,13 @@ def best_channels(names: Collection[str]) -> list[str]:
     """The channels to switch on, of those below the prefix: the best tracks, and their forecasts."""
     found = [name for name in _BEST if name in names][:1]
     of_these = "retracks/predictions"
-    return found + [of_these for name in found if name.startswith("retracks") and of_these in names]
+    forecasts = [of_these for name in found if name.startswith("retracks") and of_these in names]
+    return found + forecasts + zones_of(found, names)
+
+
+def zones_of(chosen: Collection[str], names: Collection[str]) -> list[str]:
+    """The zones of chosen channels of tracks, of those below the prefix."""
+    return [f"{name}{_ZONES}" for name in chosen if f"{name}{_ZONES}" in names]
 
 
 def eye_on(places_m: Floats, planes: Planes, t_ns: int) -> Eye:
@@ -126,6 +134,7 @@ def _comparing(camera: CameraChannels) -> bytes:
     shown = []
     for number, (title, names) in enumerate(_KINDS):
         found = [name for name in names if camera.has_view(name)][:1]
+        found += [f"{name}{_ZONES}" for name in found if camera.has_view(f"{name}{_ZONES}")]
         if found:
             shown += found
             upper += _image(camera, panels, f"picture{number}", title, found) or _ground(

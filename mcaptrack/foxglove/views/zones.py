@@ -1,0 +1,182 @@
+"""Zones and lines drawn on pictures and on the ground, with the counts so far.
+
+Letters: F frames, P points of a ring.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.foxglove import SceneMessages
+from mcaptrack.foxglove.annotations import Annotations
+from mcaptrack.foxglove.views.ground import lifetime_ns
+from mcaptrack.foxglove.views.image import BATCH, PictureTimes, View
+from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.camera_path import CameraPath
+from mcaptrack.geometry.plane import Planes
+from mcaptrack.geometry.zones import Shape, Zone
+from mcaptrack.schema import ZONE_COUNTS, Frame
+from mcaptrack.schema.framing import frame_times, joined_parts
+
+#: Zones are amber, lines are blue; tracks have other colours.
+_ZONE, _LINE = (1.0, 0.75, 0.125), (0.375, 0.75, 1.0)
+_ALPHA, _FILL = 0.875, 0.125
+_TEXT_PX: Final = 12.0
+#: The length of the arrow that points forward, as a share of the height of the picture, or of the line.
+_ARROW: Final = 0.04
+#: Zones with a point farther than this from the picture are not drawn.
+_FAR_PX: Final = 1e4
+
+
+class ZoneCaptions(NamedTuple):
+    """The texts of zones over time: times of frames (F,) in ns, and a text for each zone and frame."""
+
+    t_ns: Ints
+    texts: Sequence[Sequence[str]]
+
+    @classmethod
+    def of(cls, zones: Sequence[Zone], counts: Sequence[Frame]) -> ZoneCaptions:
+        """The texts for frames of ZoneCounts."""
+        texts: list[list[str]] = [[] for _ in zones]
+        for _, _, joined in joined_parts(ZONE_COUNTS, counts):
+            for zone, kept in zip(zones, texts, strict=True):
+                rows = joined.rows[joined.rows["zone_id"] == zone.number]
+                names = ("forward", "backward") if zone.is_line else ("inside", "tracks")
+                pairs = zip(*(rows[name].tolist() for name in names), strict=True)
+                known: dict[tuple[int, int], str] = {}
+                form = "{}: {} forward, {} back" if zone.is_line else "{}: {} inside, {} so far"
+                kept.extend(known.setdefault(pair, form.format(zone.name, *pair)) for pair in pairs)
+        return cls(frame_times(counts), texts)
+
+    def at(self, zone: int, t_ns: Ints) -> list[str]:
+        """The texts of a zone at times."""
+        if not len(self.t_ns):
+            return [""] * len(t_ns)
+        place = np.maximum(np.searchsorted(self.t_ns, t_ns, "right") - 1, 0)
+        return [self.texts[zone][one] for one in place.tolist()]
+
+
+class ZoneShape(NamedTuple):
+    """A zone to draw: its shape, and the same on the ground, None if it is not known there.
+
+    ``forward`` is 1 if forward is to the right of a line on the ground, with the second axis upwards, otherwise -1.
+    """
+
+    zone: Zone
+    shape: Shape
+    ground: Shape | None
+    forward: int
+
+    def rings_px(self, height_px: float) -> list[Floats]:
+        """The rings in a picture of this height, of a zone in pixels; of a line the line and its arrow."""
+        rings = [ring for part in self.shape.parts for ring in part]
+        # In pictures the second axis points down: what is to the right as one sees it is to the left here.
+        return [*rings, *_arrow(rings[0], -1, _ARROW * height_px)] if self.zone.is_line else rings
+
+    def rings_m(self) -> list[Floats]:
+        """The rings on the ground; of a line the line and its arrow; none if it is not known there."""
+        if self.ground is None:
+            return []
+        rings = [ring for part in self.ground.parts for ring in part]
+        return [*rings, *_arrow(rings[0], self.forward, _ARROW * self.ground.length)] if self.zone.is_line else rings
+
+
+def on_ground(zones: Sequence[ZoneShape], captions: ZoneCaptions, frame_id: str) -> View:
+    """Scene messages (time, number, payload) in metres, one for each frame."""
+    t_ns = captions.t_ns
+    life_ns = lifetime_ns(t_ns)
+    for start in range(0, len(t_ns), BATCH):
+        span = slice(start, min(start + BATCH, len(t_ns)))
+        scene = SceneMessages(t_ns[span], frame_id, life_ns)
+        frame = np.arange(len(t_ns[span]))
+        for place, one in enumerate(zones):
+            rings = one.rings_m()
+            if not rings:
+                continue
+            rgb = _LINE if one.zone.is_line else _ZONE
+            label = rings[0].mean(axis=0)
+            texts = captions.texts[place][span]
+            scene.zone(frame, one.zone.name, rings, not one.zone.is_line, label, texts, (*rgb, _ALPHA))
+        yield from zip(t_ns[span].tolist(), range(span.start, span.stop), scene.messages(), strict=True)
+
+
+def on_pictures(
+    zones: Sequence[ZoneShape],
+    captions: ZoneCaptions,
+    pictures: PictureTimes,
+    planes: Planes,
+    path: CameraPath | None,
+    height_px: float,
+) -> View:
+    """Annotation messages (time, number, payload), one for each picture.
+
+    ``planes`` are those of the pictures, ``path`` is how the camera moves; zones in pixels are those of its reference
+    picture. ``height_px`` is the height of a picture.
+    """
+    since = np.array([start for start, _ in planes[1:]], np.int64)
+    for span, drawn in pictures.batches():
+        t_ns = pictures.t_ns[span]
+        which = np.searchsorted(since, t_ns, "right")
+        for place, one in enumerate(zones):
+            texts = np.array(captions.at(place, t_ns), object)
+            for frame, rings in _seen(one, t_ns, which, planes, path, height_px):
+                _draw(drawn, frame, rings, one, texts, height_px)
+        yield from pictures.numbered(span, drawn)
+
+
+def _seen(
+    one: ZoneShape, t_ns: Ints, which: Ints, planes: Planes, path: CameraPath | None, height_px: float
+) -> Iterator[tuple[Ints, list[Floats]]]:
+    """The rings of a zone in pictures: groups of pictures in which they are at the same place."""
+    if one.zone.units == "metres":
+        for number in np.unique(which).tolist() if planes else ():
+            yield np.flatnonzero(which == number), [planes[number][1].metres_to_pixels(ring) for ring in one.rings_m()]
+        return
+    rings = one.rings_px(height_px)
+    if path is None:
+        yield np.arange(len(t_ns)), rings
+        return
+    for frame, at in enumerate(t_ns):
+        points = (np.column_stack([ring, np.zeros_like(ring)]) for ring in rings)
+        yield np.array([frame]), [path.to_pictures(some, np.repeat(at, len(some)))[:, :2] for some in points]
+
+
+def _draw(
+    drawn: Annotations, frame: Ints, rings: Sequence[Floats], one: ZoneShape, texts: NDArray[Any], height_px: float
+) -> None:
+    """Draw a zone in some pictures; not where a part of it is behind the camera or far away."""
+    points = np.concatenate(rings)
+    if not np.isfinite(points).all() or (np.abs(points) > _FAR_PX).any():
+        return
+    count = len(frame)
+    rgb = np.broadcast_to(_LINE if one.zone.is_line else _ZONE, (count, 3))
+    thickness = max(1.5, height_px / 240)
+    alpha = np.full(count, _ALPHA)
+    if one.zone.is_line:
+        pairs = np.concatenate([np.repeat(line, 2, axis=0)[1:-1] for line in rings])
+        drawn.pairs(
+            frame, np.broadcast_to(pairs, (count, *pairs.shape)), rgb, np.full(len(pairs) // 2, _ALPHA), thickness
+        )
+    fill = _FILL if len(rings) == 1 else 0.0
+    for ring in () if one.zone.is_line else rings:
+        drawn.loops(frame, np.broadcast_to(ring, (count, *ring.shape)), rgb, alpha, thickness, fill)
+    size = _TEXT_PX * max(1.0, height_px / 480)
+    corner = np.maximum(rings[0][np.argmin(rings[0].sum(axis=1))], [2.0, size + 2.0])
+    drawn.labels(frame, np.broadcast_to(corner, (count, 2)), texts[frame], rgb, size)
+
+
+def _arrow(line: Floats, forward: int, size: float) -> list[Floats]:
+    """An arrow from the middle of a line (P, 2) to its right, or to its left if ``forward`` is -1."""
+    steps = np.diff(line, axis=0)
+    lengths = np.hypot(*steps.T)
+    edge = int(np.searchsorted(np.cumsum(lengths), lengths.sum() / 2))
+    along = steps[edge] / lengths[edge]
+    middle = line[edge] + along * (lengths.sum() / 2 - lengths[:edge].sum())
+    ahead = forward * np.array([along[1], -along[0]])
+    tip = middle + size * ahead
+    wings = [tip - size / 3 * (ahead + side * along) for side in (1, -1)]
+    return [np.array([middle, tip]), np.array([wings[0], tip, wings[1]])]
