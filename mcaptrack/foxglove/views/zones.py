@@ -165,7 +165,8 @@ def _draw(
     for ring in () if one.zone.is_line else rings:
         drawn.loops(frame, np.broadcast_to(ring, (count, *ring.shape)), rgb, alpha, thickness, fill)
     size = _TEXT_PX * max(1.0, height_px / 480)
-    corner = np.maximum(rings[0][np.argmin(rings[0].sum(axis=1))], [2.0, size + 2.0])
+    within = np.clip(rings[0], 0.0, [2 * height_px, height_px])
+    corner = np.maximum(within.mean(axis=0) - [2.5 * size, 0.0], [2.0, size + 2.0])
     drawn.labels(frame, np.broadcast_to(corner, (count, 2)), texts[frame], rgb, size)
 
 

@@ -65,6 +65,7 @@ def draw(report: LogReport, at: int, total: int) -> None:
         events=figures.identity_events(report),
         forecasts=sections.forecasts(report),
         motion=sections.motion(report),
+        zones=report.zones,
         lineage=lineage.provenance(report),
         notes=report.notes,
         people=report.has_only_people,

@@ -35,6 +35,7 @@ from mcaptrack.viewing.report.identity_events import (
     summarize_events,
 )
 from mcaptrack.viewing.report.scene_map import SceneBackground, background_picture
+from mcaptrack.viewing.report.zones import zone_section
 
 #: The channels of a camera in a report, and the role of each, which gives its colour.
 ROLES: Final = {
@@ -83,6 +84,7 @@ class LogReport:
     missing: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     html: str = ""
+    zones: dict[str, Any] = field(default_factory=dict)
     has_only_people: bool = True
 
     @property
@@ -120,6 +122,7 @@ def gather(opened: log.Log, camera: str | None, progress: Callable[[str], None] 
     _find_events(opened, out)
     progress(f"{opened.path}: pictures")
     _read_pictures(opened, out)
+    out.zones = zone_section(opened, prefix, {role: one.name for role, one in out.track_sets.items()})
     out.data = plain(
         _recording(opened) | {"name": out.name, "camera": prefix} | _statistics(out) | {"notes": out.notes}
     )
@@ -274,7 +277,7 @@ def _statistics(out: LogReport) -> dict[str, Any]:
             {topic: statistics.durations_s(frames) for topic, frames in resampled.items()}
         ),
         "ground_plane": origin_of(out.planes) if out.planes else None,
-    }
+    } | ({"zones": out.zones["data"]} if out.zones["data"] else {})
 
 
 def _recording(opened: log.Log) -> dict[str, Any]:
