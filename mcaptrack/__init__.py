@@ -26,7 +26,7 @@ _PARTS = {
     "upkeep": ["DropResult", "LogCheck", "LogRecovery", "check", "drop", "recover"],
     "viewing": ["LogServer", "view"],
     "whole": ["events", "run"],
-    "zoning": ["zones"],
+    "zoning": ["draw_zones", "zones"],
 }
 #: Where the names of the package are defined; each is imported when it is first used.
 _MODULES = {name: f"mcaptrack.api.{module}" for module, names in _PARTS.items() for name in names} | {

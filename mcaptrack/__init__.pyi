@@ -53,6 +53,7 @@ from mcaptrack.api.viewing import LogServer as LogServer
 from mcaptrack.api.viewing import view as view
 from mcaptrack.api.whole import events as events
 from mcaptrack.api.whole import run as run
+from mcaptrack.api.zoning import draw_zones as draw_zones
 from mcaptrack.api.zoning import zones as zones
 from mcaptrack.errors import McaptrackError as McaptrackError
 from mcaptrack.notices import McaptrackWarning as McaptrackWarning
@@ -93,6 +94,7 @@ __all__ = [
     "detect",
     "detections",
     "doctor",
+    "draw_zones",
     "drop",
     "evaluate",
     "events",

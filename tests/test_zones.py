@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from itertools import pairwise
 from pathlib import Path
 
@@ -499,3 +500,47 @@ class TestRun:
         result = mcaptrack.zones(finished, zones=content, output=tmp_path / "b.mcap")
         assert {one.code for one in result.warnings} == {"not-compared"}
         assert "zone moon, (900, 900) to (901, 901) m, is beyond all of /camera/tracks" in result.warnings[0].message
+
+
+class TestDrawing:
+    """The page itself was looked at in a browser; here are the numbers that it begins with."""
+
+    @staticmethod
+    def data_of(page: Path) -> dict:
+        text = page.read_text()
+        assert "Content-Security-Policy" in text
+        assert not re.search(r"(src|href)=\"(?!data:)", text)
+        return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)[1])
+
+    def test_a_page_in_pixels_begins_with_the_zones_of_the_log(self, finished, tmp_path):
+        box = [[10, 100], [60, 100], [60, 160], [10, 100]]
+        content = collection(
+            feature("</script>", "Polygon", [box]), feature("b", "LineString", [[5, 105], [9, 159]]), units="px"
+        )
+        mcaptrack.zones(finished, zones=content, output=tmp_path / "a.mcap")
+        said = done("zones", "draw", tmp_path / "a.mcap").err
+        assert said.startswith(f"{tmp_path / 'a.zones.html'}: open it in a browser")
+        data = self.data_of(tmp_path / "a.zones.html")
+        assert (data["units"], data["scale"], data["x0"], data["y0"], data["up"]) == ("pixels", 1.0, 0.0, 0.0, 1)
+        assert [(one["name"], one["line"], one["points"]) for one in data["zones"]] == [
+            ("</script>", False, [[10, 100], [60, 100], [60, 160]]), ("b", True, [[5, 105], [9, 159]])
+        ]  # fmt: skip
+        again = call("zones", "draw", tmp_path / "a.mcap")
+        assert (again.code, len(again.err.splitlines())) == (1, 1)
+        done("zones", "draw", tmp_path / "a.mcap", "--force", "-q")
+
+    def test_without_pictures_it_is_the_ground_in_metres_with_the_second_axis_upwards(self, finished, tmp_path):
+        mcaptrack.drop(finished, "/camera/video", output=tmp_path / "a.mcap")
+        data = self.data_of(mcaptrack.draw_zones(tmp_path / "a.mcap", output=tmp_path / "b.html"))
+        seen = np.array(data["seen"])
+        assert (data["units"], data["up"], len(seen) > 10) == ("metres", -1, True)
+        across = (seen[:, 0] - data["x0"]) * data["scale"]
+        down = (seen[:, 1] - data["y0"]) * data["scale"] * data["up"]
+        assert 0 < across.min() < across.max() < 800
+        assert down.min() > 0
+
+    def test_what_drawing_does_not_take_is_refused_in_one_line(self, finished):
+        for words in (("--margin-m", "1"), (finished,)):
+            outcome = call("zones", "draw", finished, *words)
+            assert (outcome.code, len(outcome.err.splitlines())) == (1, 1)
+            assert "takes one log" in outcome.err

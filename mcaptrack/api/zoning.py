@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import PathLike, Progress, as_path, names_of, no_progress
+from mcaptrack.api.common import PathLike, Progress, as_path, log_location, names_of, no_progress, optional_path
 from mcaptrack.api.running import RunResult, Where, work
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.zones import ZoneOptions
+from mcaptrack.files import publish_bytes, refuse_overwrite
 from mcaptrack.geometry.zones import Zone
+from mcaptrack.location import Url
 from mcaptrack.pipeline import Job, ZoneWatch
 from mcaptrack.sources.zones import parse_zones, read_zones
+from mcaptrack.viewing.zones_page import zones_page
+
+_PAGE: Final = ".zones.html"
 
 #: Zones and lines: a file of GeoJSON, or its content.
 ZonesLike = PathLike | Mapping[str, Any]
@@ -110,3 +116,58 @@ def zones(
 
     watch = ZoneWatch(found, names_of(topic), options, force)
     return work(Where(log, camera, None, output, sidecar, force), plan, None, progress, None, zones=watch)
+
+
+@checked()
+def draw_zones(
+    log: PathLike,
+    *,
+    camera: str | None = None,
+    output: PathLike | None = None,
+    force: bool = False,
+) -> Path:
+    """Write a page on which zones and lines are drawn in a browser, over a picture of the scene.
+
+    The page needs no other file and no network. It downloads the zones as GeoJSON, in pixels of the picture; or in
+    metres where the log has no pictures, over the places of its tracks.
+
+    Parameters
+    ----------
+    log : path
+        The log.
+    camera : str, optional
+        Name of the camera, if the log has several.
+    output : path, optional
+        Write to this file; by default LOG.zones.html beside the log.
+    force : bool, default False
+        Overwrite the page if it exists.
+
+    Returns
+    -------
+    pathlib.Path
+        The page.
+
+    Raises
+    ------
+    McaptrackError
+        If the log cannot be read, or has neither pictures nor tracks.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> mcaptrack.draw_zones("log.mcap").name
+    'log.zones.html'
+
+    """
+    path = log_location(log)
+    page = optional_path(output) or Path(
+        f"{path.stem}.zones.html" if isinstance(path, Url) else path.with_suffix(_PAGE)
+    )
+    if page.suffix.lower() not in (".html", ".htm"):
+        raise McaptrackError(f"{page} is not a name for a page; give one that ends with .html")
+    refuse_overwrite(page, force)
+    with logs.read(path) as opened:
+        prefix = pipeline.find_camera(opened, camera)
+        content = zones_page(opened, prefix, f"{path.stem}.geojson")
+    publish_bytes(page, content.encode())
+    return page

@@ -7,12 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from mcaptrack.cli import common
 from mcaptrack.cli.many import LogWork, process, takes_many
-from mcaptrack.cli.text import console
+from mcaptrack.cli.text import console, say
+from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
     from mcaptrack import RunResult
 
 _COUNT = "Counting"
+#: The word before a log that is drawn on.
+_DRAW = "draw"
 
 
 @common.one_line
@@ -75,10 +78,27 @@ def zones(
     for each frame in .../zones/counts. `mcaptrack run --zones FILE` does this, too, and later runs count again where
     tracks have changed. `mcaptrack docs zones` says what the file holds.
 
+    With `draw` before the log, a page is written on which zones are drawn over a picture of the scene, in a browser.
+
     Example: mcaptrack zones log.mcap --zones zones.geojson
+
+    Example: mcaptrack zones draw log.mcap
     """
     import mcaptrack
     from mcaptrack.fleet import find_logs
+
+    if str(logs[0]) == _DRAW and len(logs) > 1:
+        given = {"--zones": zones, "--topic": topic, "--margin-m": margin_m, "--max-gap-s": max_gap_s}
+        given |= {"--sidecar": sidecar}
+        if len(logs) > 2 or any(one is not None for one in given.values()):
+            unused = next((name for name, one in given.items() if one is not None), f"another log ({logs[-1]})")
+            raise McaptrackError(f"`zones draw` takes one log, --camera, --output and --force, not {unused}")
+        page = mcaptrack.draw_zones(logs[1], camera=camera, output=output, force=force)
+        if json:
+            common.print_json({"log": str(logs[1]), "page": str(page)})
+        elif not quiet:
+            say(f"{page}: open it in a browser, draw, and download the file for --zones")
+        return
 
     options: dict[str, Any] = {"zones": zones, "topic": topic, "margin_m": margin_m, "max_gap_s": max_gap_s}
     options |= {"camera": camera, "sidecar": sidecar, "force": force}
@@ -114,7 +134,8 @@ def _as_json(result: RunResult) -> dict[str, Any]:
 def _print(result: RunResult, talk: common.Talk, is_json: bool) -> None:
     if not is_json:
         print_zones(result)
-    where = f"written to {result.written_to}" if result.written_to else "everything was up to date"
+    where = f"results are in {result.written_to}" if result.written_to else "everything was up to date"
+    where += f": {result.written_because}" if result.written_to and result.written_because else ""
     talk.say(f"{result.log}: {where}")
 
 
