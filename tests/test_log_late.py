@@ -13,6 +13,7 @@ import pytest
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import parse_ns
+from mcaptrack.log.chunk_list import ChunkList
 from mcaptrack.log.chunks import LOG_MAX_NS, MAX_NS
 from mcaptrack.schema import Frame
 from mcaptrack.schema.resampling import resample
@@ -172,7 +173,7 @@ def test_messages_may_share_a_time(early, tmp_path, monkeypatch, shared):
 
 def test_pictures_outside_of_the_times_that_their_chunk_names_are_refused(early):
     with log.read(early) as opened:
-        opened.index.chunks[:] = [chunk._replace(start_ns=0, end_ns=0) for chunk in opened.index.chunks]
+        opened.index.chunks = ChunkList(chunk._replace(start_ns=0, end_ns=0) for chunk in opened.index.chunks)
         with pytest.raises(McaptrackError, match="lie outside of the times that their chunk names"):
             list(Pictures(opened, "/camera/video").frames([3]))
 

@@ -7,6 +7,8 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Final, Literal, NamedTuple
 
+import numpy as np
+
 from mcaptrack.log.index import DATA_END_SIZE, FOOTER_SIZE, Index, add_summary_record, read_footer
 from mcaptrack.log.records import FOOTER_BODY, MAGIC, Bytes, Damaged, Opcode, Reader, walk
 
@@ -154,25 +156,29 @@ class _Checker:
                 self._find(f"no-{name}-index", where, f"the summary does not list {len(there)} {name}", "warning")
 
     def _compare_chunks(self, summary: Index, where: int) -> None:
-        ours = {chunk.offset: chunk for chunk in self._found.chunks}
-        if ours and not summary.chunks:
+        ours = self._found.chunks
+        if len(ours) and not len(summary.chunks):
             words = "the summary lists no chunks: finding a message takes a scan"
             self._find("no-chunk-index", where, words, "warning")
             return
+        missing = np.ones(len(ours), bool)
         for chunk in summary.chunks:
-            known = ours.pop(chunk.offset, None)
-            if known is None:
+            row = ours.row_at(chunk.offset)
+            if row is None or not missing[row]:
                 self._find(
                     "chunk-index",
                     where,
                     f"the summary lists a chunk at byte {chunk.offset}, where there is no intact one",
                 )
-            elif chunk != known:
-                names = [n for n, a, b in zip(chunk._fields, chunk, known, strict=True) if a != b]
+                continue
+            missing[row] = False
+            names = [name for name, one, two in zip(chunk._fields, chunk, ours[row], strict=True) if one != two]
+            if names:
                 words = f"the chunk index differs from the chunk at byte {chunk.offset}: {', '.join(names)}"
                 self._find("chunk-index", where, words)
-        if ours:
-            self._find("chunk-not-listed", min(ours), "a chunk that the summary does not list", times=len(ours))
+        if missing.any():
+            words = "a chunk that the summary does not list"
+            self._find("chunk-not-listed", int(ours.offsets[missing].min()), words, times=int(missing.sum()))
 
     def _compare_statistics(self, reader: Reader, summary: Index, where: int) -> None:
         found = self._found

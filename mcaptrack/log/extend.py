@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import IO
 
@@ -174,7 +175,7 @@ class _Rewrite:
             change.open_all = True
             return change
         places = [index.data_end]
-        places += [chunk.offset for chunk in index.chunks if not dropped.isdisjoint(chunk.message_index_offsets)]
+        places += [chunk.offset for chunk in islice(index.chunks.with_channels(dropped), 1)]  # the first in the file
         places += [listed.offset for listed in index.metadata if listed.name in metadata]
         places += [listed.offset for listed in index.attachments if listed.name in attachments]
         undescribed = {channel for channel in dropped if not change._first_chunk_describes(channel)}
@@ -190,9 +191,8 @@ class _Rewrite:
 
     def _first_chunk_describes(self, channel_id: int) -> bool:
         """Whether the first chunk with messages of a channel describes it: then no record outside of chunks does."""
-        for chunk in self.index.chunks:
-            if channel_id in chunk.message_index_offsets:
-                return channel_id in _described_in(open_chunk(self.source, chunk_record(self.source, chunk)))[0]
+        for chunk in self.index.chunks.with_channels([channel_id]):
+            return channel_id in _described_in(open_chunk(self.source, chunk_record(self.source, chunk)))[0]
         return False
 
     def is_better_in_place(self, path: Path) -> bool:
@@ -231,7 +231,7 @@ class _Rewrite:
             schemas=schemas,
             channels=channels,
             counts={number: count for number, count in counts.items() if number in channels and count},
-            chunks=[chunk for chunk in index.chunks if chunk.offset < self.cut],
+            chunks=index.chunks.before(self.cut),
             attachments=[listed for listed in index.attachments if listed.offset < self.cut],
             metadata=[listed for listed in index.metadata if listed.offset < self.cut],
         )
@@ -244,12 +244,11 @@ class _Rewrite:
             raise error.moved(base) from None
 
     def _copy_kept(self, writer: LogWriter, buffer: Bytes, base: int) -> None:
-        chunks = {chunk.offset: chunk for chunk in self.index.chunks if chunk.offset >= self.cut}
-        described = {channel for chunk in writer.chunks for channel in chunk.message_index_offsets}
+        described = writer.chunks.channels
         undescribed_channels: dict[int, None] = {}  # kept channels that a dropped chunk described
         for record in walk(buffer, self.cut - base, len(buffer)):
             if record.opcode == Opcode.CHUNK:
-                known = chunks.get(base + record.start)
+                known = self.index.chunks.at(base + record.start)
                 if known is None:
                     raise Damaged("a chunk is missing in the index", record.start)
                 self._copy_kept_chunk(writer, buffer, base, record, known, undescribed_channels, described)

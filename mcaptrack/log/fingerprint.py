@@ -30,13 +30,12 @@ def fingerprint(
         described = (schema.name, schema.encoding, hashlib.sha256(schema.data).hexdigest()) if schema else ()
         kept = sorted(channel.metadata.items())
         say(channel.topic, channel.message_encoding, kept, described, index.counts.get(number, 0))
-    for chunk in index.chunks:
-        if channel_id is None or channel_id in chunk.message_index_offsets:
-            # Offsets of chunks matter for the whole log, because they locate its messages, but not for one channel.
-            place = (chunk.offset, *sorted(chunk.message_index_offsets)) if channel_id is None else ()
-            if chunk.offset not in checksums:
-                checksums[chunk.offset] = _checksum(buffer, chunk)
-            say(place, chunk.start_ns, chunk.end_ns, chunk.uncompressed_size, checksums[chunk.offset])
+    for chunk in index.chunks if channel_id is None else index.chunks.with_channels([channel_id]):
+        # Offsets of chunks matter for the whole log, because they locate its messages, but not for one channel.
+        place = (chunk.offset, *sorted(chunk.message_index_offsets)) if channel_id is None else ()
+        if chunk.offset not in checksums:
+            checksums[chunk.offset] = _checksum(buffer, chunk)
+        say(place, chunk.start_ns, chunk.end_ns, chunk.uncompressed_size, checksums[chunk.offset])
     for number in sorted(index.loose) if channel_id is None else [channel_id]:
         for offset in index.loose[number][:, 1].tolist() if number in index.loose else []:
             record = record_at(buffer, offset)

@@ -13,6 +13,7 @@ import numpy as np
 
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource, RunningChecksum
+from mcaptrack.log.chunk_list import ChunkList
 from mcaptrack.log.chunks import Entries, message_head, open_chunk, scan_entries
 from mcaptrack.log.records import (
     MAGIC,
@@ -52,7 +53,7 @@ class Index:
     regular: bool = False
     schemas: dict[int, SchemaRecord] = field(default_factory=dict)
     channels: dict[int, ChannelRecord] = field(default_factory=dict)
-    chunks: list[ChunkIndexRecord] = field(default_factory=list)
+    chunks: ChunkList = field(default_factory=ChunkList)
     entries: dict[int, dict[int, Entries]] = field(
         default_factory=dict
     )  # by offset of the chunk and channel, for scanned chunks
@@ -73,11 +74,17 @@ class Index:
         channel = self.channels.get(channel_id)
         if channel and self.schemas.get(channel.schema_id) != other.schemas.get(channel.schema_id):
             return False
-        ours, theirs = ([c for c in index.chunks if channel_id in c.message_index_offsets] for index in (self, other))
-        return ours == theirs and all(
-            _equal(self.entries[chunk.offset][channel_id], other.entries[chunk.offset][channel_id])
-            for chunk in ours
-            if chunk.offset in self.entries
+        rows = (index.chunks.rows_with([channel_id]) for index in (self, other))
+        if len({len(those) for those in rows}) > 1:
+            return False
+        both = zip(*(index.chunks.with_channels([channel_id]) for index in (self, other)), strict=True)
+        return all(
+            chunk == theirs
+            and (
+                chunk.offset not in self.entries
+                or _equal(self.entries[chunk.offset][channel_id], other.entries[chunk.offset][channel_id])
+            )
+            for chunk, theirs in both
         )
 
     def equals(self, other: Index) -> bool:
@@ -147,7 +154,7 @@ def read_summary(buffer: Bytes) -> Index | None:
             add_summary_record(index, summary, record)
     except Damaged as error:
         raise error.moved(summary_start) from None
-    index.chunks.sort(key=lambda chunk: chunk.offset)
+    index.chunks.sort_by_offset()
     index.regular = statistics is not None and _is_consistent(index, Reader(summary, statistics.body, statistics.end))
     return index if index.regular else None
 
@@ -171,6 +178,7 @@ def read_intact_summary(buffer: Bytes, start: int) -> Index | None:
     with suppress(Damaged):
         for record in walk(summary, 0, at - start):
             add_summary_record(index, summary, record)
+        index.chunks.sort_by_offset()
         return index
     return None
 
@@ -180,16 +188,13 @@ def _is_consistent(index: Index, statistics: Reader) -> bool:
     statistics.skip(8)
     declared = [statistics.number(size) for size in (2, 4, 4, 4, 4)]
     found = [len(part) for part in (index.schemas, index.channels, index.attachments, index.metadata, index.chunks)]
-    known = {channel for chunk in index.chunks for channel in chunk.message_index_offsets}
     schemas = {0, *index.schemas}
-    described = known <= set(index.channels) and all(c.schema_id in schemas for c in index.channels.values())
+    described = index.chunks.channels <= set(index.channels)
+    described = described and all(c.schema_id in schemas for c in index.channels.values())
     # The number of index entries follows from the length of the message indexes. If it is less than the number of
     # messages, some are outside of chunks or were never indexed.
-    listed = sum(c.message_index_length - 15 * len(c.message_index_offsets) for c in index.chunks)
-    indexed = all(chunk.message_index_offsets for chunk in index.chunks) and listed == 16 * sum(index.counts.values())
-    ends = [len(MAGIC), *(chunk.offset + chunk.length for chunk in index.chunks)]
-    starts = [*(chunk.offset for chunk in index.chunks), index.data_end]
-    apart = all(end <= start for end, start in zip(ends, starts, strict=True))
+    indexed = index.chunks.are_all_indexed and index.chunks.listed == 16 * sum(index.counts.values())
+    apart = index.chunks.are_apart(len(MAGIC), index.data_end)
     return declared == found and described and indexed and apart
 
 

@@ -127,7 +127,7 @@ class _Recovery:
     def __init__(self, buffer: ByteSource, writer: LogWriter, report: RecoverResult, progress: Progress) -> None:
         self._buffer, self._writer, self._report, self._progress = buffer, writer, report, progress
         self._summary_index = read_intact_summary(buffer, summary_start(buffer)) or Index()
-        places = {chunk.offset for chunk in self._summary_index.chunks} | {self._summary_index.data_end}
+        places = {*self._summary_index.chunks.offsets.tolist(), self._summary_index.data_end}
         places |= {listed.offset for listed in (*self._summary_index.attachments, *self._summary_index.metadata)}
         self._known_offsets = sorted(places - {0})  # offsets of records by the summary; empty without one
         self._schemas: dict[int, SchemaRecord] = dict(self._summary_index.schemas)
@@ -136,7 +136,7 @@ class _Recovery:
         self._seen_chunks: set[tuple[int, int]] = set()  # size and checksum of copied chunks
         self._saved: Counter[int] = Counter()  # copied messages by channel
         self._pending: Record | None = None  # a message outside of chunks, until a valid record follows it
-        self._is_chunked = bool(self._summary_index.chunks)
+        self._is_chunked = len(self._summary_index.chunks) > 0
         self._checksum = RunningChecksum(buffer)
         self._is_done = False
 
@@ -365,7 +365,7 @@ class _Recovery:
 
     def _words(self, at: int, why: str) -> str:
         """Why something is lost, and what it held, if the summary lists a chunk there."""
-        known = next((chunk for chunk in self._summary_index.chunks if chunk.offset == at), None)
+        known = self._summary_index.chunks.at(at)
         if known is None or not self._known_offsets:
             return why
         topics = [

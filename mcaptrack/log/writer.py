@@ -25,6 +25,7 @@ from mcaptrack.files import publish_stream
 from mcaptrack.log import journal, records
 from mcaptrack.log.byte_source import ByteSource, OpenFile
 from mcaptrack.log.checksums import crc_of
+from mcaptrack.log.chunk_list import ChunkList
 from mcaptrack.log.chunks import LOG_MAX_NS
 from mcaptrack.log.index import Index, SummaryEntry, attachment_entry, metadata_entry, read_index
 from mcaptrack.log.paths import RESULTS_SUFFIX, results_path
@@ -74,11 +75,10 @@ class LogWriter:
         self.schemas: dict[int, SchemaRecord] = index.schemas
         self.channels: dict[int, ChannelRecord] = index.channels
         self.counts: dict[int, int] = index.counts
-        self.chunks: list[ChunkIndexRecord] = index.chunks
+        self.chunks: ChunkList = index.chunks
         self._attachments: list[SummaryEntry] = index.attachments
         self._metadata: list[SummaryEntry] = index.metadata
-        full = [chunk for chunk in index.chunks if chunk.message_index_offsets]
-        self._times = (min(c.start_ns for c in full), max(c.end_ns for c in full)) if full else None
+        self._times = index.chunks.times()
         self._groups: dict[int, tuple[ChunkKind, str]] = {}
         self._open: dict[tuple[ChunkKind, str], _OpenChunk] = {}
         self._topics = {channel.topic for channel in self.channels.values()}
@@ -233,25 +233,29 @@ class LogWriter:
         return sum(self.counts.values())
 
     def _summary(self, start: int) -> bytes:
-        groups = {
-            Opcode.SCHEMA: [records.pack_schema(schema) for schema in self.schemas.values()],
-            Opcode.CHANNEL: [records.pack_channel(channel) for channel in self.channels.values()],
+        groups: dict[Opcode, Iterable[bytes]] = {
+            Opcode.SCHEMA: map(records.pack_schema, self.schemas.values()),
+            Opcode.CHANNEL: map(records.pack_channel, self.channels.values()),
             Opcode.STATISTICS: [self._statistics()],
-            Opcode.CHUNK_INDEX: [records.pack_chunk_index(chunk) for chunk in self.chunks],
-            Opcode.ATTACHMENT_INDEX: [listed.entry for listed in self._attachments],
-            Opcode.METADATA_INDEX: [listed.entry for listed in self._metadata],
+            Opcode.CHUNK_INDEX: map(records.pack_chunk_index, self.chunks),
+            Opcode.ATTACHMENT_INDEX: (listed.entry for listed in self._attachments),
+            Opcode.METADATA_INDEX: (listed.entry for listed in self._metadata),
         }
-        summary, offsets = bytearray(), bytearray()
+        body, offsets = bytearray(), bytearray()
         for opcode, parts in groups.items():
-            if parts:  # no offset for an empty group: some readers report it as damage
-                group = b"".join(parts)
-                where = records.number(start + len(summary), 8) + records.number(len(group), 8)
+            low = len(body)
+            for part in parts:
+                body += part
+            if len(body) > low:  # no offset for an empty group: some readers report it as damage
+                where = records.number(start + low, 8) + records.number(len(body) - low, 8)
                 offsets += records.pack(Opcode.SUMMARY_OFFSET, records.number(opcode, 1), where)
-                summary += group
-        body = bytes(summary + offsets)
+        offsets_start = start + len(body)
+        body += offsets
         footer = records.number(Opcode.FOOTER, 1) + records.number(records.FOOTER_BODY.size, 8)
-        footer += records.number(start, 8) + records.number(start + len(summary), 8)
-        return body + footer + records.number(zlib.crc32(footer, zlib.crc32(body)), 4) + MAGIC
+        footer += records.number(start, 8) + records.number(offsets_start, 8)
+        body += footer
+        body += records.number(zlib.crc32(body), 4) + MAGIC
+        return bytes(body)
 
     def _statistics(self) -> bytes:
         first, last = self._times or (0, 0)
