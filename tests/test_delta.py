@@ -18,6 +18,7 @@ import pytest
 import mcaptrack
 from mcaptrack import log, tables
 from mcaptrack.errors import McaptrackError
+from mcaptrack.location import parse
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.tables.delta import DeltaFolder, ExportedLog, columns, commit, remove
 from mcaptrack.tables.delta.commit import Batch, predicate
@@ -407,3 +408,36 @@ def test_a_ledger_that_says_done_does_not_keep_a_log_out_of_the_tables(some, pla
     done("export", "a.mcap", "b.mcap", "--ledger", "ledger.jsonl")
     outcome = done("export", "a.mcap", "b.mcap", "--ledger", "ledger.jsonl", "--delta", "lake")
     assert counts(place / "lake", "tracks") == {"a": 12, "b": 12}, outcome.err
+
+
+def test_writers_in_one_store_lose_nothing_and_its_faults_are_one_plain_line(store):
+    """The library colours its messages, and repeats them; what a store answers is said as for logs."""
+    lake, failed = parse("s3://bucket/lake"), []
+    logs = [exported(Path(f"{name}.mcap"), Path("tables")) for name in "abc"]
+
+    def add(*those: ExportedLog) -> None:
+        failed.extend(commit(lake, [ExportedLog(one.log, one.folder)]).failed for one in those)
+
+    threads = [threading.Thread(target=add, args=(logs[n], logs[2])) for n in range(2)]
+    for one in threads:
+        one.start()
+    for one in threads:
+        one.join()
+    assert failed == [{}] * 4
+    found = mcaptrack.query(lake, "select recording, count(*) as n from detections group by all order by all")
+    assert found.to_pylist() == [{"recording": name, "n": 3} for name in "abc"]
+    assert mcaptrack.query(lake, "select count(*) as n from recordings").to_pylist() == [{"n": 3}]
+    forbidden, expired = (
+        "the store refuses it to these credentials (forbidden)",
+        "the credentials have expired; renew them",
+    )
+    for kind, words in (("denied", forbidden), ("expired", expired)):
+        with store.failing(lambda request, kind=kind: kind if request.method == "PUT" else ""):
+            with pytest.raises(McaptrackError) as error:
+                commit(lake, logs[:1], force=True)
+            assert str(error.value) == f"the Delta table {lake}/frames can't be written: {words}"
+        with store.failing(lambda request, kind=kind: kind if ".parquet" in request.key else ""):
+            with pytest.raises(McaptrackError) as error:
+                mcaptrack.query(lake, "select max(x_px) from detections")
+            assert str(error.value) == f"the Delta tables {lake} can't be read: {words}"
+    assert commit(lake, logs).unchanged == ["a", "b", "c"]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-import tracemalloc
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -21,6 +20,7 @@ from mcaptrack.tables import ordered, table_pieces
 from mcaptrack.transforms import PROFILES, Retrack
 from mcaptrack.transforms.retrack import identity_swaps, likelihood
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
+from tests.memory import held
 
 PEOPLE = 12
 
@@ -39,18 +39,6 @@ def walks(frames: int) -> Iterator[Frame]:
             class_id=[1] * PEOPLE,
         )
         yield Frame(400_000_000 * number, number, rows)
-
-
-def held(work: Callable[[], object]) -> tuple[int, int]:
-    """Bytes that are alive at the end of a piece of work, and the most while it lasted."""
-    tracemalloc.start()
-    try:
-        kept = work()
-        alive, most = tracemalloc.get_traced_memory()
-        del kept
-        return alive, most
-    finally:
-        tracemalloc.stop()
 
 
 @pytest.fixture

@@ -82,6 +82,16 @@ class TestClaims:
         other.release(LOG)
         assert objects.find(CLAIM) is None
 
+    def test_a_claim_that_was_taken_over_is_not_given_up_by_its_former_fleet(self, store):
+        """It doesn't know yet that it has lost it."""
+        one, other = claims_on("one"), claims_on("other", stale_s=0.0)
+        one.take(LOG, NIGHT)
+        assert [other.take(LOG, NIGHT).is_mine for _ in range(2)] == [False, True]
+        one.release(LOG)
+        assert store.names() == [CLAIM.key]
+        other.release(LOG)
+        assert store.names() == []
+
     def test_a_process_of_this_machine_that_has_ended_loses_its_claim_at_once(self, store):
         gone = Claims()
         gone._in_stores._me |= {"pid": 2**22 - 1}

@@ -27,6 +27,8 @@ _MEANINGS: Final = (
     ),
 )
 FORBIDDEN: Final = "the store refuses it to these credentials (forbidden)"
+_ARROW: Final = re.compile(r"\s*\x1b\[[0-9;]*m↳\x1b\[[0-9;]*m")
+_COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")
 #: Hosts that give machines in a cloud their credentials, if nothing else does.
 _MACHINE_HOSTS: Final = ("169.254.169.254", "169.254.170.2", "metadata.google.internal")
 
@@ -64,7 +66,17 @@ def reporting_faults(url: Url, done: str = "read") -> Iterator[None]:
         why = meaning_of(url, error) or "the store asks for other credentials"
         raise McaptrackError(f"{url} can't be {done}: {why}{_credentials_hint(url)}") from None
     except (exceptions.BaseError, ValueError, OSError) as error:
-        raise McaptrackError(f"{url} can't be {done}: {_reason(url, error)}") from None
+        raise McaptrackError(f"{url} can't be {done}: {reason(url, error)}") from None
+
+
+def plain(words: str) -> str:
+    """A message of a library without the colours and arrows that some print even where no terminal is."""
+    return _COLOUR.sub("", _ARROW.sub(":", words))
+
+
+def is_of_store(words: str) -> bool:
+    """Whether a message of another library is about a request to a store."""
+    return any(sign in words for sign in ("Error performing", "error sending request", "NoSuchBucket"))
 
 
 def meaning_of(url: Url, error: Exception) -> str:
@@ -75,11 +87,11 @@ def meaning_of(url: Url, error: Exception) -> str:
 
 def _text_of(url: Url, error: Exception) -> str:
     """An error of the library in one line, without the name of the object and the settings that it was asked with."""
-    said = " ".join(str(error).partition("Debug source")[0].split())
+    said = " ".join(plain(str(error)).partition("Debug source")[0].split()).replace("retry_timeout", "")  # a setting
     return said.replace(url.key, "") if url.key else said
 
 
-def _reason(url: Url, error: Exception) -> str:
+def reason(url: Url, error: Exception) -> str:
     """The reason of an error of a store, in a few words."""
     said = _text_of(url, error)
     if any(host in said for host in _MACHINE_HOSTS):

@@ -25,7 +25,7 @@ from mcaptrack.files import place_of
 from mcaptrack.location import Location, Url
 from mcaptrack.log.paths import results_path
 from mcaptrack.tables import TABLES
-from mcaptrack.tables.delta import DeltaFolder, is_delta_folder
+from mcaptrack.tables.delta import DeltaFolder, is_delta_folder, reason_of_store
 from mcaptrack.tables.export import TOPICS, LogTables, current_file, default_folder, topic_folder
 
 __all__ = ["Database"]
@@ -322,6 +322,9 @@ class Database:
 
     def _error_text(self, error: str, query: str) -> str:
         """A message of DuckDB in one line, with the tables that exist."""
+        for where in (one.folder.where for one in self._of_many):
+            if reason := reason_of_store(where, error):
+                return f"the Delta tables {where} can't be read: {reason}"
         if missing := _MISSING.search(error):
             name = missing.group(1)
             known = [*TABLES, *sorted(self._loaded - set(TABLES))]

@@ -16,7 +16,7 @@ DeltaFolder(where)              the tables, to read them
 
 from mcaptrack.tables.delta.commit import Committed, commit, prepare
 from mcaptrack.tables.delta.exported import ExportedLog
-from mcaptrack.tables.delta.opening import DeltaFolder, is_delta_folder
+from mcaptrack.tables.delta.opening import DeltaFolder, is_delta_folder, reason_of_store
 from mcaptrack.tables.delta.removal import remove
 from mcaptrack.tables.delta.upkeep import TableState, compact, describe, vacuum
 
@@ -30,6 +30,7 @@ __all__ = [
     "describe",
     "is_delta_folder",
     "prepare",
+    "reason_of_store",
     "remove",
     "vacuum",
 ]

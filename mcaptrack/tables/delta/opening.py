@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location, Url, hide_secrets, join
+from mcaptrack.objects.faults import is_of_store, plain, reason
 from mcaptrack.objects.stores import settings_of
 from mcaptrack.tables.fields import RECORDING, TABLES
 
@@ -123,29 +124,35 @@ def reporting(where: Location, done: str) -> Iterator[None]:
     except exceptions.DeltaProtocolError as error:
         raise McaptrackError(
             f"the Delta table {where} can't be {done}: it uses features that this version of deltalake doesn't know "
-            f"({_first(error)})"
+            f"({_first(where, error)})"
         ) from None
     except (exceptions.DeltaError, OSError, ValueError) as error:
-        raise McaptrackError(f"the Delta table {where} can't be {done}: {_first(error)}") from None
+        raise McaptrackError(f"the Delta table {where} can't be {done}: {_first(where, error)}") from None
     except Exception as error:
         if type(error) is not Exception and not type(error).__module__.startswith("pyarrow"):
             raise
         # Errors of its parts come as plain exceptions.
-        raise McaptrackError(f"the Delta table {where} can't be {done}: {_first(error)}") from None
+        raise McaptrackError(f"the Delta table {where} can't be {done}: {_first(where, error)}") from None
 
 
-def _first(error: Exception) -> str:
+def reason_of_store(where: Location, words: str) -> str:
+    """Why a request to the store of a folder failed, by a message of a library; "" if the message isn't about that."""
+    if not isinstance(where, Url) or not is_of_store(words):
+        return ""
+    return reason(where, OSError(words))
+
+
+def _first(where: Location, error: Exception) -> str:
     """The reason of an error, in one line and without secrets."""
-    words = re.split(r" \d+: <unknown>", " ".join(str(error).split()))[0]
+    if reason := reason_of_store(where, str(error)):
+        return reason
+    words = re.split(r" \d+: <unknown>", " ".join(plain(str(error)).split()))[0]
     for sign in ("Help:", "Debug source"):
         words = words.partition(sign)[0].strip()
     known = (
         ("Permission denied", "it may not be written here (permission denied)"),
         ("No space left", "the disk is full"),
         ("Read-only file system", "the file system is read-only"),
-        ("NoSuchBucket", "there is no such bucket"),
-        ("status code: 403", "the store refuses it to these credentials (forbidden)"),
-        ("error sending request", "the store can't be reached"),
     )
     meaning = next((meaning for sign, meaning in known if sign in words), "")
     return meaning or (hide_secrets(words) if words.startswith("http") else words)[:300] or type(error).__name__
