@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaptrack.geometry.assignment import assign_by_gain
+from mcaptrack.geometry.assignment import assign_by_gain, assign_pairs_by_gain
 from mcaptrack.transforms import PROFILES
 from mcaptrack.transforms.retrack.identity_swaps import _continuity, find_swaps
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
@@ -114,6 +114,11 @@ def test_the_assignment_is_optimal(seed):
     best = max(sum(wide[k, c] for k, c in enumerate(order)) for order in permutations(range(wide.shape[1]), len(wide)))
     assert gain[rows, columns].sum() == pytest.approx(best)
     assert (gain[rows, columns] > 0).all()
+    candidates = np.nonzero(gain > 0)
+    pairs, gained = assign_pairs_by_gain(candidates, gain[candidates], gain.shape)
+    assert gained.sum() == pytest.approx(best)
+    assert gained.tolist() == pytest.approx(gain[pairs].tolist())
+    assert (gained > 0).all()
 
 
 class TestLinks:

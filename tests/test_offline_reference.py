@@ -12,6 +12,7 @@ from mcaptrack.transforms.retrack.false_tracks import track_log_odds
 from mcaptrack.transforms.retrack.identity_swaps import find_swaps, resolve_swaps
 from mcaptrack.transforms.retrack.linking import link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
+from tests.memory import held
 from tests.references.offline import DRIFTS, Motion, course_of, exchanged, links, person_log_odds
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -87,6 +88,30 @@ def test_links_equal_the_reference(seed):
     found = link_tracks(model, out, forward, backward, 0.4, most_s, least)
     names = sorted(paths)
     assert {names[i]: names[j] for i, j in enumerate(found.tolist()) if j >= 0} == links(motion, paths, most_s, least)
+
+
+@given(seed=SEEDS)
+@settings(max_examples=25)
+def test_links_are_the_same_without_a_table_of_all_pairs(seed):
+    rng = np.random.default_rng(seed)
+    model, _ = models(rng)
+    out, _ = laid_out(scattered(rng, 14), model.noise_m)
+    forward, backward, _ = smooth(model, out, 0.4)
+    whole = link_tracks(model, out, forward, backward, 0.4, 20.0, 0.1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(linking, "_TABLE_CELLS", 1)
+        assert link_tracks(model, out, forward, backward, 0.4, 20.0, 0.1).tolist() == whole.tolist()
+
+
+def test_links_of_thousands_of_broken_tracks_take_memory_for_the_candidates_alone():
+    """A chain of tracks that hang together: a table of all has 9 million cells, of which 9000 are candidates."""
+    count = 3000
+    rows = np.repeat(np.arange(count), 3)
+    pairs = rows, np.minimum(rows + np.tile([0, 1, 2], count), count - 1)
+    gain = np.random.default_rng(0).uniform(0.1, 5, len(rows))
+    linking._assigned(pairs, gain, (count, count))
+    _, most = held(lambda: linking._assigned(pairs, gain, (count, count)))
+    assert most < 2_000_000
 
 
 @given(seed=SEEDS)

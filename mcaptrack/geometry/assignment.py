@@ -72,6 +72,28 @@ def assign_by_gain(gain: Floats) -> Pairs:
     return rows[kept], columns[kept]
 
 
+def assign_pairs_by_gain(pairs: Pairs, gain: Floats, shape: tuple[int, int]) -> tuple[Pairs, Floats]:
+    """The assignment with the largest total gain, of pairs (P,) with positive gains (P,) and no table of them.
+
+    For large and sparse problems: memory grows with P + M, where that of ``assign_by_gain`` grows with M N. ``shape``
+    is (M, N). Returns the pairs that were chosen and their gains.
+    """
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import min_weight_full_bipartite_matching
+
+    count, width = shape
+    alone = np.arange(count)
+    # Each row may also take a column of its own, which gains nothing. The solver wants all rows assigned, and takes 0
+    # for no pair; so all gains are one higher.
+    rows, columns = np.concatenate([pairs[0], alone]), np.concatenate([pairs[1], width + alone])
+    graph = csr_array((np.append(gain, np.zeros(count)) + 1, (rows, columns)), shape=(count, width + count))
+    row, column = min_weight_full_bipartite_matching(graph, maximize=True)
+    row, column = row[column < width], column[column < width]
+    place = pairs[0] * width + pairs[1]
+    order = np.argsort(place, kind="stable")
+    return (row, column), gain[order[np.searchsorted(place[order], row * width + column)]]
+
+
 def one_to_one(rows: NDArray[np.intp], columns: NDArray[np.intp]) -> bool:
     """Whether no row and no column is in more than one pair."""
     return len(set(rows.tolist())) == len(rows) == len(set(columns.tolist()))

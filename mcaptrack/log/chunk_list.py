@@ -76,11 +76,10 @@ class ChunkList:
 
     def _entry(self, row: int) -> ChunkIndexRecord:
         low, high = self._ends[row - 1] if row else 0, self._ends[row]
-        numbers = self._numbers[row * _WIDTH : (row + 1) * _WIDTH]
+        first, last, offset, length, index_length, stored, opened = self._numbers[row * _WIDTH : (row + 1) * _WIDTH]
         indexes = dict(zip(self._channels[low:high], self._indexes[low:high], strict=True))
-        return ChunkIndexRecord(
-            *numbers[:_INDEX_LENGTH], indexes, numbers[_INDEX_LENGTH], self._names[self._compression[row]], *numbers[5:]
-        )
+        compression = self._names[self._compression[row]]
+        return ChunkIndexRecord(first, last, offset, length, indexes, index_length, compression, stored, opened)
 
     def __eq__(self, other: object) -> bool:
         """Whether the same entries follow in the same order."""

@@ -322,9 +322,9 @@ class Database:
 
     def _error_text(self, error: str, query: str) -> str:
         """A message of DuckDB in one line, with the tables that exist."""
-        for where in (one.folder.where for one in self._of_many):
-            if reason := reason_of_store(where, error):
-                return f"the Delta tables {where} can't be read: {reason}"
+        for place in (one.folder.where for one in self._of_many):
+            if reason := reason_of_store(place, error):
+                return f"the Delta tables {place} can't be read: {reason}"
         if missing := _MISSING.search(error):
             name = missing.group(1)
             known = [*TABLES, *sorted(self._loaded - set(TABLES))]

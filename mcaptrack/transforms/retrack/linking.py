@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from mcaptrack.geometry.arrays import Floats, Ints
-from mcaptrack.geometry.assignment import assign_by_gain
+from mcaptrack.geometry.assignment import Pairs, assign_by_gain, assign_pairs_by_gain
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
 
@@ -30,6 +30,8 @@ _BIAS, _PRIOR = 3.702, 0.666
 _NEAR_M, _SPEED_M_PER_S = 0.3, 0.15
 #: The number of pairs that are examined at once.
 _BATCH: Final = 1_000_000
+#: The largest table of ends and beginnings that is made: 16 MB.
+_TABLE_CELLS: Final = 2_000_000
 #: Links with lower log odds are not considered.
 _MIN_LOG_ODDS: Final = -2.52
 
@@ -65,10 +67,9 @@ def link_tracks(
     log_odds = np.full(len(first), -np.inf)
     for edges in _components(i, j, len(first)):
         ends, beginnings = np.unique(i[edges]), np.unique(j[edges])
-        table = np.full((len(ends), len(beginnings)), -1.0)
-        table[np.searchsorted(ends, i[edges]), np.searchsorted(beginnings, j[edges])] = np.round(gain[edges], 6)
-        row, column = assign_by_gain(table)
-        continued_by[ends[row]], log_odds[ends[row]] = beginnings[column], table[row, column] + _MIN_LOG_ODDS
+        pairs = np.searchsorted(ends, i[edges]), np.searchsorted(beginnings, j[edges])
+        (row, column), gained = _assigned(pairs, np.round(gain[edges], 6), (len(ends), len(beginnings)))
+        continued_by[ends[row]], log_odds[ends[row]] = beginnings[column], gained + _MIN_LOG_ODDS
     shift = _prior_shift(log_odds[continued_by >= 0])
     return np.where(log_odds + shift > np.log(min_confidence / (1 - min_confidence)), continued_by, -1)
 
@@ -97,6 +98,19 @@ def _batches(count: Ints) -> list[slice]:
     """Groups of tracks (K,) that have about ``_BATCH`` pairs together; pairs of all tracks would take much memory."""
     starts = np.flatnonzero(run_starts(np.cumsum(count) // _BATCH))
     return [slice(a, b) for a, b in zip(starts.tolist(), [*starts[1:].tolist(), len(count)], strict=True)]
+
+
+def _assigned(pairs: Pairs, gain: Floats, shape: tuple[int, int]) -> tuple[Pairs, Floats]:
+    """The best set of links among candidates (E,) of ends and beginnings, and their gains.
+
+    Thousands of broken tracks that hang together would have a table of gigabytes, nearly all of it empty.
+    """
+    if shape[0] * shape[1] > _TABLE_CELLS:
+        return assign_pairs_by_gain(pairs, gain, shape)
+    table = np.full(shape, -1.0)
+    table[pairs] = gain
+    row, column = assign_by_gain(table)
+    return (row, column), table[row, column]
 
 
 def _prior_shift(log_odds: Floats) -> float:
