@@ -12,6 +12,10 @@ COPY schemas schemas
 COPY mcaptrack mcaptrack
 RUN python -m venv /opt/mcaptrack
 RUN /opt/mcaptrack/bin/python -m pip install --no-cache-dir -c constraints.txt ".[cloud,fleet]"
+# Nothing here runs the tests of packages, Arrow Flight or pip: a sixth of the whole.
+RUN find /opt/mcaptrack -type d -name tests -prune -exec rm -r {} +
+RUN cd /opt/mcaptrack/lib/python3.*/site-packages/pyarrow && rm -r include libarrow_flight* _flight*
+RUN /opt/mcaptrack/bin/python -m pip uninstall --yes pip
 
 FROM python:3.12-slim
 COPY --from=built /opt/mcaptrack /opt/mcaptrack

@@ -80,6 +80,25 @@ def test_a_decoder_that_gives_another_picture_is_named(monkeypatch):
     assert "vp9: pictures can't be decoded (the picture looks different (by 128 of 255 on average))" in fault()
 
 
+@pytest.mark.parametrize(
+    ("name", "function", "words"),
+    [
+        ("pyarrow", "pyarrow.parquet.write_table", "no table can be written as Parquet and read back"),
+        ("scipy", "scipy.optimize.linear_sum_assignment", "nothing can be assigned"),
+        ("opencv-python-headless", "cv2.resize", "no picture can be worked on"),
+    ],
+)
+def test_a_package_whose_libraries_are_missing_is_named(name, function, words, monkeypatch):
+    """It is installed, by what pip says."""
+
+    def broken(*given, **more):
+        raise ImportError("libarrow_substrait.so: cannot open shared object file\nmore")
+
+    monkeypatch.setattr(function, broken)
+    why = "libarrow_substrait.so: cannot open shared object file"
+    assert fault() == f"{name}: {words} ({why}); `pip install --force-reinstall {name}` installs it anew"
+
+
 def test_a_temporary_folder_that_is_missing_is_named(place, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(place / "none"))
     assert fault().startswith(f"{place / 'none'}: a log can't be written there and read back (No such file")

@@ -6,6 +6,7 @@ import ast
 import json
 import os
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -97,6 +98,25 @@ def test_the_installation_is_one_that_the_tool_tries_and_needs_no_torch():
     tool = (ROOT / "tools" / "installs.py").read_text()
     assert "pip_line(text)" in tool
     assert 'partial(image, found, built, folder / "image")' in tool
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a shell")
+def test_what_is_left_out_is_what_nothing_needs(tmp_path):
+    """In a folder with the files of the packages; `doctor`, the health check, finds what lacks a library."""
+    packages = tmp_path / "lib" / "python3.12" / "site-packages"
+    kept = ["pyarrow/libarrow.so.2600", "pyarrow/libarrow_substrait.so.2600", "scipy/a.py", "numpy/testing/a.py"]
+    left = ["pyarrow/libarrow_flight.so.2600", "pyarrow/_flight.so", "pyarrow/include/a.h", "scipy/b/tests/a.py"]
+    for name in (*kept, *left):
+        (packages / name).parent.mkdir(parents=True, exist_ok=True)
+        (packages / name).touch()
+    python = tmp_path / "bin" / "python"
+    python.parent.mkdir()
+    python.write_text('#!/bin/sh\necho "$@" > "$0.said"\n')
+    python.chmod(0o755)
+    for line in runpy.run_path(str(ROOT / "tools" / "installs.py"))["slimming"](TEXT):
+        subprocess.run(["sh", "-c", line.replace("/opt/mcaptrack", str(tmp_path))], check=True)
+    assert {str(path.relative_to(packages)) for path in packages.rglob("*") if path.is_file()} == set(kept)
+    assert (tmp_path / "bin" / "python.said").read_text() == "-m pip uninstall --yes pip\n"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a shell")

@@ -268,6 +268,8 @@ def image(found: Sequence[Python], built: Built, folder: Path) -> Iterator[str]:
     run(python.path, "-m", "venv", folder / "env")
     inside = folder / "env" / "bin"
     with_wheels(python, inside / "python", *shlex.split(pip_line(text)), cwd=built.source)
+    for line in slimming(text):
+        run("sh", "-c", line.replace("/opt/mcaptrack", shlex.quote(str(folder / "env"))))
     (words,) = re.findall(r"^HEALTHCHECK .*CMD (\[.*\])$", text, re.M)
     name, *more = json.loads(words)
     run(inside / name, *more, cwd=folder)
@@ -279,6 +281,12 @@ def pip_line(text: str) -> str:
     """What a Dockerfile lets Python do to install mcaptrack."""
     (line,) = re.findall(r"^RUN \S*/python (-m pip install .*)$", text, re.M)
     return str(line)
+
+
+def slimming(text: str) -> list[str]:
+    """What a Dockerfile removes of the installation again."""
+    after = text.partition(" -m pip install ")[2]
+    return re.findall(r"^RUN (.*/opt/mcaptrack.*)$", after, re.M)
 
 
 def last_line(error: Exception) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import re
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
@@ -108,8 +109,8 @@ class DoctorResult:
 def doctor(store: str | None = None) -> DoctorResult:
     """Find out what this installation has, and whether a plain run would work.
 
-    Pictures are encoded and decoded, and a log is written to the temporary folder and read back. The network is used
-    for ``store`` only.
+    Pictures are encoded and decoded, a table is written, and a log is written to the temporary folder and read back.
+    The network is used for ``store`` only.
 
     Parameters
     ----------
@@ -139,6 +140,12 @@ def doctor(store: str | None = None) -> DoctorResult:
     url = None if store is None else url_of_store(store)
     with collected() as warnings:
         packages, extras, faults = _packages()
+        broken = machine.broken_packages()
+        faults += [
+            f"{name}: {words}; `pip install --force-reinstall {name}` installs it anew"
+            for name, words in broken.items()
+            if packages.get(name, "?")  # that it is not installed is said already
+        ]
         codecs = codec_faults()
         faults += [
             f"{name}: {_codec_words(name)} ({why}); `pip install av` brings it" for name, why in codecs.items() if why
@@ -166,7 +173,7 @@ def doctor(store: str | None = None) -> DoctorResult:
             onnx_providers=providers(),
             cores=share_of_cores(),
             memory_bytes=machine.memory_bytes(),
-            threads=_threads(),
+            threads=_threads(broken),
             temporary_folder=folder,
             temporary_bytes_free=free,
             cache_folder=cache,
@@ -229,10 +236,13 @@ def _numbers(version: str) -> tuple[int, ...]:
     return tuple(numbers)
 
 
-def _threads() -> dict[str, str]:
+def _threads(broken: Collection[str]) -> dict[str, str]:
+    found = {name: os.environ[name] for name in THREADS if name in os.environ}
+    if "opencv-python-headless" in broken:
+        return found
     import cv2
 
-    return {"OpenCV": str(cv2.getNumThreads())} | {name: os.environ[name] for name in THREADS if name in os.environ}
+    return {"OpenCV": str(cv2.getNumThreads())} | found
 
 
 def _plugins() -> dict[str, str]:

@@ -1,10 +1,11 @@
-"""Limits of this process on its machine: memory and folders."""
+"""Limits of this process on its machine: memory and folders; and packages that lack something."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import tempfile
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -53,6 +54,54 @@ def temporary_folder() -> tuple[Path | None, str]:
         return folder, str(error)
     except OSError as error:
         return folder, error.strerror or str(error)
+
+
+def broken_packages() -> dict[str, str]:
+    """Return what can't be done because files of an installed package are missing, and why, by package."""
+    out = {}
+    for name, (what, work) in _TRIED.items():
+        try:
+            work()
+        except Exception as error:
+            out[name] = f"{what} ({_first_line(error)})"
+    return out
+
+
+def _write_table() -> None:
+    import pyarrow as pa
+    import pyarrow.dataset  # queries and tables of many logs
+    import pyarrow.parquet as pq
+
+    stream = pa.BufferOutputStream()
+    table = pa.table({"recording": ["doctor"], "t_ns": [1]})
+    pq.write_table(table, stream, compression="zstd")
+    if pq.read_table(pa.BufferReader(stream.getvalue())) != table:
+        raise ValueError("it is read back as another one")
+
+
+def _assign() -> None:
+    from scipy.optimize import linear_sum_assignment
+
+    linear_sum_assignment([[1.0, 0.0], [0.0, 1.0]])
+
+
+def _resize() -> None:
+    import cv2
+    import numpy as np
+
+    cv2.resize(np.zeros((4, 4), np.uint8), (2, 2))
+
+
+def _first_line(error: Exception) -> str:
+    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
+
+
+#: What is tried of packages of which parts are often left out or not found: their names, what else can't be done, how.
+_TRIED: Final[Mapping[str, tuple[str, Callable[[], None]]]] = {
+    "pyarrow": ("no table can be written as Parquet and read back", _write_table),
+    "scipy": ("nothing can be assigned", _assign),
+    "opencv-python-headless": ("no picture can be worked on", _resize),
+}
 
 
 def free_bytes(folder: Path) -> int | None:
