@@ -139,7 +139,7 @@ class ChunkList:
 
     @property
     def listed(self) -> int:
-        """How many messages the message indexes list, by their length in bytes, times 16."""
+        """The number of messages in message indexes by the length of these, times 16."""
         return sum(self._numbers[_INDEX_LENGTH::_WIDTH]) - 15 * len(self._channels)
 
     def are_apart(self, start: int, end: int) -> bool:

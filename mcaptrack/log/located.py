@@ -34,7 +34,7 @@ class TimeOutOfRange(Exception):
         self.count, self.t_ns = count, t_ns
 
 
-class Batch(NamedTuple):
+class MessageBatch(NamedTuple):
     """Messages of one channel that are read together, in time order, (M,) each: of one chunk, or near each other.
 
     ``is_direct``: the messages are read from the file itself, because they are outside of chunks or in an uncompressed
@@ -55,7 +55,7 @@ class Batch(NamedTuple):
         return int(self.offset.max() - self.offset.min()) if len(self.offset) else 0
 
 
-class Batches:
+class MessageBatches:
     """The batches of channels that have messages in a span of times, in the order of channels, chunks and the file.
 
     Raises Damaged if the message indexes contradict the index of the log.
@@ -122,12 +122,12 @@ class Batches:
     def __len__(self) -> int:
         return len(self._chunk)
 
-    def __getitem__(self, number: int) -> Batch:
+    def __getitem__(self, number: int) -> MessageBatch:
         low, high = self.edges[number], self.edges[number + 1]
         row = self._chunk[number]
         chunk = None if row == _OUTSIDE else self._index.chunks[row]
         part = slice(low, high)
-        return Batch(
+        return MessageBatch(
             self._channel[number],
             chunk,
             bool(self._direct[number]),
@@ -135,7 +135,7 @@ class Batches:
             self._offset[part].astype(np.int64),
         )
 
-    def __iter__(self) -> Iterator[Batch]:
+    def __iter__(self) -> Iterator[MessageBatch]:
         return map(self.__getitem__, range(len(self)))
 
     @property
@@ -160,8 +160,8 @@ class Batches:
         offsets = np.append(self._index.chunks.offsets.astype(np.int64), -1)  # the last one is that of _OUTSIDE
         return np.repeat(offsets[rows], np.diff(self.edges))
 
-    def in_order(self) -> Iterator[list[Batch]]:
-        """Batches in groups that follow one another in time; batches of one group overlap, and keep their order."""
+    def in_order(self) -> Iterator[list[MessageBatch]]:
+        """MessageBatches in groups that follow one another in time; batches of one group overlap, and keep their order."""
         numbers = np.flatnonzero(np.diff(self.edges))
         first_ns, last_ns = self.t_ns[self.edges[numbers]], self.t_ns[self.edges[numbers + 1] - 1]
         order = np.argsort(first_ns, kind="stable")

@@ -28,7 +28,7 @@ from mcaptrack.log.chunks import (
 )
 from mcaptrack.log.fingerprint import fingerprint
 from mcaptrack.log.index import Index
-from mcaptrack.log.located import Batch, Batches, Span, to_int64
+from mcaptrack.log.located import MessageBatch, MessageBatches, Span, to_int64
 from mcaptrack.log.records import (
     CHUNK_HEAD_BYTES,
     MESSAGE_HEAD,
@@ -226,12 +226,12 @@ class Messages:
             if crc >= 0
         )
 
-    def _located(self, channels: Sequence[int], span: Span, *, are_read: bool = True) -> Batches:
+    def _located(self, channels: Sequence[int], span: Span, *, are_read: bool = True) -> MessageBatches:
         """The batches of channels. A store learns what will be read of them: their indexes, and if they ``are_read``
         their chunks.
         """
         if not self.source.is_remote:
-            return Batches(self.source, self.index, channels, span)
+            return MessageBatches(self.source, self.index, channels, span)
         first, last = span
         indexes, wholes = [], []
         for chunk in self.index.chunks.with_channels(channels):
@@ -244,7 +244,7 @@ class Messages:
             wholes.append((end if is_direct else chunk.offset, end + chunk.message_index_length))
         is_one = are_read and sum(end - start for start, end in wholes) <= _READ_AT_ONCE_BYTES
         self.source.expect(wholes if is_one else indexes, GAP_BYTES if is_one or not are_read else _MIN_GAP_BYTES)
-        batches = Batches(self.source, self.index, channels, span)
+        batches = MessageBatches(self.source, self.index, channels, span)
         if are_read and not is_one:
             self.source.expect(wholes)
         return batches
@@ -265,7 +265,7 @@ class Messages:
             self._opened_bytes -= len(self._opened.popitem(last=False)[1])
         return content
 
-    def _open(self, batch: Batch) -> tuple[memoryview, Ints]:
+    def _open(self, batch: MessageBatch) -> tuple[memoryview, Ints]:
         """The bytes that contain a batch, and the offsets of its messages in them."""
         base = 0
         if batch.chunk is not None:
@@ -303,7 +303,7 @@ class Messages:
         """Remember the checksum of bytes that were read outside of chunks."""
         self._pieces[start] = (start + len(data), zlib.crc32(data))
 
-    def _read(self, batch: Batch, skip: int) -> Iterator[Message]:
+    def _read(self, batch: MessageBatch, skip: int) -> Iterator[Message]:
         """The messages of a batch except the first ``skip``."""
         content, offset = self._open(batch)
         found = message_heads_at(content, batch.channel, batch.t_ns[skip:], offset[skip:])
