@@ -142,7 +142,7 @@ def doctor(store: str | None = None) -> DoctorResult:
         packages, extras, faults = _packages()
         broken = machine.broken_packages()
         faults += [
-            f"{name}: {words}; `pip install --force-reinstall {name}` installs it anew"
+            f"{name}: {words}; `pip install --force-reinstall {name}` repairs it"
             for name, words in broken.items()
             if packages.get(name, "?")  # that it is not installed is said already
         ]

@@ -161,7 +161,7 @@ class MessageBatches:
         return np.repeat(offsets[rows], np.diff(self.edges))
 
     def in_order(self) -> Iterator[list[MessageBatch]]:
-        """MessageBatches in groups that follow one another in time; batches of one group overlap, and keep their order."""
+        """Batches in groups that follow one another in time; batches of one group overlap, and keep their order."""
         numbers = np.flatnonzero(np.diff(self.edges))
         first_ns, last_ns = self.t_ns[self.edges[numbers]], self.t_ns[self.edges[numbers + 1] - 1]
         order = np.argsort(first_ns, kind="stable")
