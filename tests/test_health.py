@@ -96,7 +96,7 @@ def test_a_package_whose_libraries_are_missing_is_named(name, function, words, m
 
     monkeypatch.setattr(function, broken)
     why = "libarrow_substrait.so: cannot open shared object file"
-    assert fault() == f"{name}: {words} ({why}); `pip install --force-reinstall {name}` repairs it"
+    assert fault() == f"{name}: {words} ({why}); install {name} again"
 
 
 def test_a_temporary_folder_that_is_missing_is_named(place, monkeypatch):

@@ -142,7 +142,7 @@ def doctor(store: str | None = None) -> DoctorResult:
         packages, extras, faults = _packages()
         broken = machine.broken_packages()
         faults += [
-            f"{name}: {words}; `pip install --force-reinstall {name}` repairs it"
+            f"{name}: {words}; install {name} again"
             for name, words in broken.items()
             if packages.get(name, "?")  # that it is not installed is said already
         ]

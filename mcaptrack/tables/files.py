@@ -27,6 +27,8 @@ FORMATS: Final[tuple[Format, ...]] = get_args(Format)
 _DESCRIBED: Final = ("parquet", "arrow")
 
 _ZSTD_LEVEL: Final = 1  # higher levels hardly make floats that are split by byte smaller
+#: Rows that are read back at once.
+_ROWS_READ: Final = 16 * 1024
 _PREFIX: Final = "mcaptrack."
 
 
@@ -44,8 +46,6 @@ def write(
     metadata, ``order`` names the columns by which rows are sorted. A file with the same content and metadata is left as
     it is, unless ``force``. Raises McaptrackError if the file can't be written.
     """
-    import pyarrow as pa
-
     words = {"table_version": TABLE_VERSION} | dict(provenance)
     if form in _DESCRIBED and not force:
         known = file_metadata(path, form)
@@ -63,6 +63,7 @@ def write(
                 from mcaptrack.tables import text
 
                 text.write(part, pieces_of(table), form)
+            _release()
             try:
                 found = verify(part, form) if form in _DESCRIBED else table.num_rows
             except McaptrackError:
@@ -74,9 +75,16 @@ def write(
                 )
     except OSError as error:
         raise McaptrackError(f"{path} can't be written: {error.strerror or error}") from error
+    _release()
+    return True
+
+
+def _release() -> None:
+    """Give memory that is not used back to the system."""
+    import pyarrow as pa
+
     pa.default_memory_pool().release_unused()
     release_memory()
-    return True
 
 
 def _describes(known: Mapping[str, str], words: Mapping[str, str]) -> bool:
@@ -110,6 +118,7 @@ def _write_parquet(part: Path, table: Any, words: Mapping[str, str], order: Sequ
                     added = worker.submit(content.add, piece)
                     writer.write_table(piece, row_group_size=PIECE_ROWS)
                     added.result()
+                    del piece  # else it would stay while the next one is made
             writer.add_key_value_metadata({_PREFIX + "digest": content.hexdigest()})
             writer.close()
         except BaseException:
@@ -180,8 +189,8 @@ def verify(path: Path, form: Format = "parquet") -> int:
     try:
         if form == "parquet":
             with path.open("rb") as stream, pq.ParquetFile(stream, page_checksum_verification=True) as file:
-                groups = (file.read_row_group(number) for number in range(file.num_row_groups))
-                found = digest(file.schema_arrow, counted(groups))
+                batches = (pa.Table.from_batches([batch]) for batch in file.iter_batches(_ROWS_READ))
+                found = digest(file.schema_arrow, counted(batches))
         else:
             with path.open("rb") as stream:
                 reader = pa.ipc.open_file(stream)
