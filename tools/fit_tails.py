@@ -29,7 +29,7 @@ from mcaptrack.evaluation.metrics.displacement import TAU_M2, Forecasts, Positio
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories
 from mcaptrack.geometry.mixtures import Tails, mahalanobis_squared
-from mcaptrack.predictors import NAMES, Forecast, Predictor, make
+from mcaptrack.predictors import NAMES, Forecast, PeopleSeen, Predictor, make, predict_among
 from mcaptrack.predictors.tails import TABLES, counts_of, fit_mixture
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.framing import join_frames
@@ -122,7 +122,8 @@ def distances(true: Positions, samples: list[Frame]) -> Iterator[tuple[str, np.n
             predictor = make(name, STEPS, STEP_S)
             seen = past[:, -predictor.past :]
             known = np.isfinite(seen[..., 0])
-            mean, cov = predictor.predict(seen, known)
+            people = PeopleSeen(seen, known, step, np.arange(len(step)))
+            mean, cov = predict_among(predictor, seen, known, people)
             found = pair_forecasts(true, tracks, Forecasts(step, ids, mean, cov))
             good = np.isfinite(found.offset_m).all(axis=(1, 2)) & (found.d_obs_m2 < TAU_M2)
             which = found.forecast[good]

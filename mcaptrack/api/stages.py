@@ -191,8 +191,8 @@ def predict(
     log : path
         The log.
     predictor : str or Transform, optional
-        "red" (the default), "kalman", "holt-cv", "cv", "lstm" (less exact than "cv"), "red:FILE", "onnx:FILE", the name
-        of an installed predictor, or "module:Class"; or a transform.
+        "red" (the default), "social" (looks at other people), "kalman", "holt-cv", "cv", "lstm" (less exact than "cv"),
+        "red:FILE", "onnx:FILE", the name of an installed predictor, or "module:Class"; or a transform.
     topic : str, optional
         Read this channel instead of the usual one, /camera/samples.
     to : str, optional

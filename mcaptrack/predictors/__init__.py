@@ -16,17 +16,30 @@ from typing import Any, Final
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.predictors.checked import CheckedPredictor
-from mcaptrack.predictors.forecast import Forecast, Predictor
+from mcaptrack.predictors.forecast import Forecast, PeopleSeen, Predictor, predict_among, predict_together, uses_people
 from mcaptrack.predictors.own_clock import OnClock
 from mcaptrack.registry import BUILT_IN, Entry, find, is_installed
 
-__all__ = ["NAMES", "Forecast", "Predictor", "PredictorName", "entry_of", "make", "warn_if_weak", "weights_sha256"]
+__all__ = [
+    "NAMES",
+    "Forecast",
+    "PeopleSeen",
+    "Predictor",
+    "PredictorName",
+    "entry_of",
+    "make",
+    "predict_among",
+    "predict_together",
+    "uses_people",
+    "warn_if_weak",
+    "weights_sha256",
+]
 
 #: A predictor by name: built-in, of an entry point, or ``module:Class``; or a network with other weights, as in
 #: ``red:FILE``, ``lstm:FILE``, ``onnx:FILE``.
 PredictorName = str
 #: The built-in predictors that need no file.
-NAMES: Final = ("cv", "holt-cv", "kalman", "lstm", "red")
+NAMES: Final = ("cv", "holt-cv", "kalman", "lstm", "red", "social")
 #: Those that are less exact than ``cv`` on most recordings (docs/predictors.md).
 WEAK: Final = ("lstm",)
 

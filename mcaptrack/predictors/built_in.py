@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from mcaptrack.predictors.lstm import Lstm
     from mcaptrack.predictors.onnx import Onnx
     from mcaptrack.predictors.red import Red
+    from mcaptrack.predictors.social import Social
 
 
 def cv(steps: int, step_s: float) -> LinearPredictor:
@@ -37,6 +38,14 @@ def red(steps: int, step_s: float, file: Path | None = None) -> Red:
     from mcaptrack.predictors.weights import SHIPPED, load
 
     return Red.of(load(file or SHIPPED / "red.safetensors"))
+
+
+def social(steps: int, step_s: float, file: Path | None = None) -> Social:
+    """``red`` corrected by what other people do, with the weights of a file or those that come with mcaptrack."""
+    from mcaptrack.predictors.social import Social
+    from mcaptrack.predictors.weights import SHIPPED, load
+
+    return Social.of(load(file or SHIPPED / "social.safetensors"))
 
 
 def lstm(steps: int, step_s: float, file: Path | None = None) -> Lstm:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.predictors.forecast import Forecast
+from mcaptrack.predictors.forecast import Forecast, PeopleSeen, uses_people
 from mcaptrack.predictors.onnx import are_covariances
 from mcaptrack.registry import Entry, blamed, failure
 
@@ -63,13 +63,19 @@ class CheckedPredictor:
             found = getattr(self.inner, "weights_sha256", None)
             return None if found is None else str(found)
 
-    def predict(self, xy_m: Floats, valid: NDArray[np.bool_]) -> Forecast:
+    @property
+    def uses_people(self) -> bool:
+        with blamed(self.entry, "could not say whether it uses_people"):
+            return uses_people(self.inner)
+
+    def predict(self, xy_m: Floats, valid: NDArray[np.bool_], people: PeopleSeen | None = None) -> Forecast:
         """Positions (B, L', 2) of which ``valid`` (B, L') are known, the last one always -> forecasts."""
         batch = len(valid)
         if batch == 0:
             return Forecast(np.empty((0, self.steps, 2)), np.empty((0, self.steps, 2, 2)))
         with blamed(self.entry, f"failed on {batch} {'track' if batch == 1 else 'tracks'}"):
-            given = self.inner.predict(xy_m.copy(), valid.copy())
+            among = {} if people is None else {"people": people.copied()}
+            given = self.inner.predict(xy_m.copy(), valid.copy(), **among)
         if not isinstance(given, tuple | list) or len(given) != 2:
             raise McaptrackError(
                 f"{self.entry} gave a {type(given).__name__}; predict has to return mean and covariance"

@@ -1,13 +1,16 @@
-"""The interface of predictors: what they are given and what they return. Letters: B batch, L past, T future steps."""
+"""The interface of predictors: what they are given and what they return.
+
+Letters: B batch, L past, T future steps, M people.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.geometry.arrays import Floats
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 
 
 class Forecast(NamedTuple):
@@ -25,8 +28,54 @@ class Forecast(NamedTuple):
     cov: Floats
 
 
+class PeopleSeen(NamedTuple):
+    """All people who are seen at the times of a batch, the tracks of the batch among them.
+
+    Nothing in it is later than the last position of the past. The order of people has no meaning.
+
+    Attributes
+    ----------
+    xy_m : (M, L, 2) of float, in m
+        Past positions, the current one last, at the same times as those of the batch. Unknown ones may be NaN.
+    valid : (M, L) of bool
+        Mask of the known positions; the last one is always known.
+    moment : (M,) of int
+        People with the same number are seen at the same time in the same scene.
+    row : (B,) of int
+        The row of each track of the batch in the arrays above.
+    """
+
+    xy_m: Floats
+    valid: Bools
+    moment: Ints
+    row: Ints
+
+    @classmethod
+    def together(cls, xy_m: Floats, valid: Bools) -> PeopleSeen:
+        """The tracks of a batch, all seen at the same time."""
+        return cls(xy_m, valid, np.zeros(len(valid), np.int64), np.arange(len(valid)))
+
+    @classmethod
+    def alone(cls, xy_m: Floats, valid: Bools) -> PeopleSeen:
+        """The tracks of a batch, each of them alone."""
+        each = np.arange(len(valid))
+        return cls(xy_m, valid, each, each)
+
+    def copied(self) -> PeopleSeen:
+        """The same in arrays of their own."""
+        return PeopleSeen(self.xy_m.copy(), self.valid.copy(), self.moment.copy(), self.row.copy())
+
+
+def uses_people(predictor: Any) -> bool:
+    """Whether a predictor's ``predict`` takes ``people``: its attribute ``uses_people``, which is optional."""
+    return bool(getattr(predictor, "uses_people", False))
+
+
 class Predictor(Protocol):
     """A predictor on a regular clock.
+
+    A predictor that looks at other people has the attribute ``uses_people = True``. Its ``predict`` has a third
+    parameter, ``people: PeopleSeen | None = None``, without which every track is alone. Others never get it.
 
     Attributes
     ----------
@@ -66,6 +115,19 @@ class Predictor(Protocol):
         Returns
         -------
         Forecast
-            Of ``steps`` steps for each of the B tracks, which don't depend on the others of the batch.
+            Of ``steps`` steps for each of the B tracks, which don't depend on the others of the batch (but on
+            ``people``, if the predictor uses them).
         """
         ...
+
+
+def predict_among(predictor: Predictor, xy_m: Floats, valid: Bools, people: PeopleSeen | None) -> Forecast:
+    """The forecasts of a batch; a predictor that uses other people gets them."""
+    if people is not None and uses_people(predictor):
+        return predictor.predict(xy_m, valid, people=people)  # type: ignore[call-arg]
+    return predictor.predict(xy_m, valid)
+
+
+def predict_together(predictor: Predictor, xy_m: Floats, valid: Bools) -> Forecast:
+    """The forecasts of tracks that are all seen at the same time, without other people."""
+    return predict_among(predictor, xy_m, valid, PeopleSeen.together(xy_m, valid))

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats
-from mcaptrack.predictors.forecast import Forecast, Predictor
+from mcaptrack.predictors.forecast import Forecast, PeopleSeen, Predictor, predict_among, uses_people
 
 
 @dataclass(frozen=True)
@@ -34,15 +34,22 @@ class OnClock:
     def weights_sha256(self) -> str | None:
         return self.inner.weights_sha256
 
+    @property
+    def uses_people(self) -> bool:
+        return uses_people(self.inner)
+
     @cached_property
     def past(self) -> int:
         return int(np.ceil((self.inner.past - 1) * self.inner.step_s / self.step_s - 1e-6)) + 1
 
-    def predict(self, xy_m: Floats, valid: Bools) -> Forecast:
+    def predict(self, xy_m: Floats, valid: Bools, people: PeopleSeen | None = None) -> Forecast:
         """Positions (B, L', 2), of which ``valid`` (B, L') are known, the last one always -> forecasts."""
         if abs(self.step_s / self.inner.step_s - 1) > 1e-6:
             xy_m, valid = self._past(xy_m, valid)
-        return self._future(self.inner.predict(xy_m, valid), xy_m[:, -1])
+            if people is not None:
+                past, known = self._past(people.xy_m, people.valid)
+                people = people._replace(xy_m=past, valid=known)
+        return self._future(predict_among(self.inner, xy_m, valid, people), xy_m[:, -1])
 
     def _past(self, xy_m: Floats, valid: Bools) -> tuple[Floats, Bools]:
         """Past positions and which are known, at the times of the inner clock."""

@@ -8,7 +8,7 @@ from dataclasses import MISSING, Field, fields, is_dataclass
 from typing import Any, Final, NamedTuple, get_type_hints
 
 #: Parameters that a predictor gets from the caller, and attributes of ``forecast.Predictor``: they are no options.
-_INTERFACE: Final = frozenset({"steps", "step_s", "file", "past", "name", "weights_sha256"})
+_INTERFACE: Final = frozenset({"steps", "step_s", "file", "past", "name", "weights_sha256", "uses_people"})
 _NAMED: Final = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
 
 

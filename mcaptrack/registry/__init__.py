@@ -73,6 +73,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
         },
         "predictor": {
             "red": "mcaptrack.predictors.built_in:red",
+            "social": "mcaptrack.predictors.built_in:social",
             "cv": "mcaptrack.predictors.built_in:cv",
             "holt-cv": "mcaptrack.predictors.built_in:holt_cv",
             "kalman": "mcaptrack.predictors.built_in:kalman",

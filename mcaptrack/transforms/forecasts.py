@@ -10,7 +10,7 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories
-from mcaptrack.predictors import Forecast, make
+from mcaptrack.predictors import Forecast, PeopleSeen, make, predict_among, uses_people
 from mcaptrack.predictors.tails import TailCalibration
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.schema.predictions import forecast_to_rows
@@ -89,7 +89,8 @@ class Forecaster:
         numbers = classes.tolist()
         unit_m = np.array(units_m(numbers, self._class_names, self._class_limits))[of]
         scale = unit_m[:, None, None]
-        mean, cov = self._predictor.predict(past[ready] / scale, known[ready])
+        people = self._people(frame.rows, past, known, ready) if uses_people(self._predictor) else None
+        mean, cov = predict_among(self._predictor, past[ready] / scale, known[ready], people)
         forecast = Forecast(mean * scale, cov * scale[..., None] ** 2)
         tails = None
         has_velocity = np.isfinite(frame.rows["vx_m_per_s"][ready])
@@ -103,6 +104,18 @@ class Forecaster:
             stay = is_measured * _standing(past[ready], unit_m, self._predictor.step_s)
             forecast = _with_rest(forecast, past[ready][:, -1], stay, noise_m, unit_m, self._predictor.step_s)
         return forecast_to_rows(ids[ready], forecast, self._predictor.step_s, tails)
+
+    def _people(self, rows: Rows, past: Floats, known: Bools, ready: Bools) -> PeopleSeen:
+        """The people who are observed in a frame, for the tracks of it that are ``ready`` (N,).
+
+        Positions are in the unit of the class, and only objects with the same unit are seen together.
+        """
+        there = np.flatnonzero(rows["observed"] & known[:, -1])  # interpolated positions depend on later ones
+        classes, of = np.unique(rows["class_id"][there], return_inverse=True)
+        unit_m = np.array(units_m(classes.tolist(), self._class_names, self._class_limits))[of]
+        _, moment = np.unique(unit_m, return_inverse=True)
+        row = np.searchsorted(there, np.flatnonzero(ready))
+        return PeopleSeen(past[there] / unit_m[:, None, None], known[there], moment, row)
 
 
 def _standing(past: Floats, unit_m: Floats, step_s: float) -> Floats:

@@ -40,8 +40,9 @@ class Predict:
 
     predictor: PredictorName = option(
         "red",
-        "predictor: cv, holt-cv, kalman, red, or lstm, which is less exact than cv; with other weights red:FILE, "
-        "lstm:FILE, onnx:FILE; one of an installed package; or module:Class",
+        "predictor: cv, holt-cv, kalman, red, social, which looks at other people, or lstm, which is less exact than "
+        "cv; with other weights red:FILE, social:FILE, lstm:FILE, onnx:FILE; one of an installed package; or "
+        "module:Class",
         kind="predictor",
     )
     horizon_s: float = option(4.8, "how far ahead to predict, in seconds", least=0.1, most=60.0)

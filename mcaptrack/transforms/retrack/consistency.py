@@ -19,7 +19,7 @@ from mcaptrack.geometry.arrays import Bools, Floats, Indices, Ints
 from mcaptrack.geometry.assignment import assign
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories, Holt
-from mcaptrack.predictors import Forecast, Predictor, make
+from mcaptrack.predictors import Forecast, Predictor, make, predict_together
 from mcaptrack.schema import Frame
 from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.transforms.retrack.active_tracks import ActiveTracks, SmoothedHistory
@@ -77,7 +77,7 @@ class ConsistencyPass:
         row_at = np.flatnonzero(usable)
         past, valid = past[usable], valid[usable]
         valid = np.minimum.accumulate(valid[:, ::-1], axis=1)[:, ::-1]  # the unbroken run up to now
-        predictions = self._predictor.predict(past, valid)
+        predictions = predict_together(self._predictor, past, valid)
 
         track, observation = self._match(step, past[:, -1], predictions, sources[row_at])
         self._update(step, track, past[observation, -1], sources[row_at[observation]])
@@ -120,7 +120,7 @@ class ConsistencyPass:
         tracks = self._tracks
         history = tracks[track].history
         history.append(self._holt, xy_m, step - tracks.last_step[track])
-        prediction = self._predictor.predict(*history.positions())
+        prediction = predict_together(self._predictor, *history.positions())
         for name, value in vars(history).items():
             getattr(tracks.history, name)[track] = value
         tracks.prediction.mean[track], tracks.prediction.cov[track] = prediction
@@ -135,7 +135,7 @@ class ConsistencyPass:
         ids = np.arange(self._next_id, self._next_id + count)
         self._next_id += count
         history = SmoothedHistory.of_observations(self._holt, past, valid)
-        prediction = raw if self._options.birth == "raw" else self._predictor.predict(*history.positions())
+        prediction = raw if self._options.birth == "raw" else predict_together(self._predictor, *history.positions())
         hits = np.zeros(count, np.int64)
         self._tracks = self._tracks + ActiveTracks(ids, np.full(count, step), hits, sources.copy(), history, prediction)
         self.assignments.add(step, ids, sources)

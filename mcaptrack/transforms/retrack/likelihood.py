@@ -13,7 +13,7 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.ragged import group_index
-from mcaptrack.predictors import Forecast, Predictor, make
+from mcaptrack.predictors import Forecast, PeopleSeen, Predictor, make, predict_among, uses_people
 from mcaptrack.predictors.tails import TailCalibration
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
@@ -168,7 +168,7 @@ class LikelihoodPass:
         ends = np.searchsorted(tick[shown], np.arange(len(frames) + 1))
         numbers = [frame.index for frame in frames]
         self._online.extend(t_ns, numbers, ends, rows)
-        self._forecasts.add(t_ns, numbers, steps, ends, _Waiting(rows["track_id"], *past, coasts))
+        self._forecasts.add(t_ns, numbers, steps, ends, _Waiting(rows["track_id"], *past, coasts, steps[tick[shown]]))
         self._written += len(rows)
         is_last = tick == len(frames) - 1
         self._ids, self._last_rows = ids[is_last], samples[last_sample[is_last]]
@@ -208,15 +208,17 @@ class _Positions(NamedTuple):
 
 
 class _Waiting(NamedTuple):
-    """Tracks without predictions yet: ids, past positions (R, L, 2) and which are known, and whether tracks coast."""
+    """Tracks without predictions yet: ids, past positions (R, L, 2), which are known, whether tracks coast, steps."""
 
     ids: Ints
     past: Floats
     known: Bools
     coasts: Bools
+    step: Ints
 
     def part(self, which: slice) -> _Waiting:
-        return _Waiting(self.ids[which], self.past[which], self.known[which], self.coasts[which])
+        ids, past, known, coasts, step = self
+        return _Waiting(ids[which], past[which], known[which], coasts[which], step[which])
 
 
 class _Made(NamedTuple):
@@ -262,8 +264,13 @@ class _Forecasts:
         waiting = _Waiting(*(np.concatenate(parts) for parts in zip(*self._waiting, strict=True)))
         done = 0
         while len(waiting.ids) - done >= least:
-            ids, past, known, coasts = waiting.part(slice(done, done + _BATCH))
-            mean, cov = self._predictor.predict(past / self._unit_m, known)
+            end = done + _BATCH
+            if uses_people(self._predictor):  # whole steps, because their tracks are predicted together
+                end = int(np.searchsorted(waiting.step, waiting.step[min(end, len(waiting.ids)) - 1], "right"))
+            ids, past, known, coasts, steps = waiting.part(slice(done, end))
+            units = past / self._unit_m
+            people = PeopleSeen(units, known, steps, np.arange(len(ids)))
+            mean, cov = predict_among(self._predictor, units, known, people)
             self._made.append(_Made(ids, past, coasts, mean * self._unit_m, cov * self._unit_m**2))
             done += len(ids)
         self._waiting = [waiting.part(slice(done, None))]

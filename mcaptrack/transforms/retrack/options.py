@@ -32,8 +32,8 @@ class RetrackOptions:
 
     predictor: PredictorName = option(
         "kalman",
-        "predictor: cv, holt-cv, kalman, red, or lstm, which is less exact than cv; red:FILE, lstm:FILE, onnx:FILE; "
-        "one of an installed package, or module:Class",
+        "predictor: cv, holt-cv, kalman, red, social, which looks at other people, or lstm, which is less exact than "
+        "cv; red:FILE, social:FILE, lstm:FILE, onnx:FILE; one of an installed package, or module:Class",
         kind="predictor",
         theme=_PREDICTIONS,
     )

@@ -1,8 +1,4 @@
-"""Test a transform against the laws that hold for every transform.
-
-    from mcaptrack.testing import check_transform
-
-    check_transform(MyTracker())
+"""The laws that hold for every transform.
 
 Letters: N rows, H and W pixels.
 """
@@ -21,16 +17,11 @@ from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.registry import Entry
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, TRACKS, VIDEO, Frame, Schema
+from mcaptrack.testing.error import LawError
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.protocol import Colour, Transform, check_options, traits_of
 
-__all__ = ["LAWS", "LawError", "check_transform", "sample_frames"]
-
 Result = list[tuple[Frame, ...]]
-
-
-class LawError(AssertionError):
-    """A transform breaks a law; the message says which one, and where."""
 
 
 def check_transform(transform: Transform, frames: Sequence[Frame] | None = None, *, seed: int = 0) -> None:

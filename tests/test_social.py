@@ -1,0 +1,278 @@
+"""Predictors that look at other people: what they are given, the laws that they obey, and `social`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.predictors import NAMES, Forecast, PeopleSeen, make, predict_together, social
+from mcaptrack.predictors.weights import SHIPPED, Weights, load
+from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.testing import LawError, check_predictor, check_transform
+from mcaptrack.transforms import PROFILES, Predict
+from mcaptrack.transforms.retrack import likelihood
+from tests.worlds import ns
+
+STEPS = 12
+SOCIAL = make("social", STEPS, 0.4)
+RED = make("red", STEPS, 0.4)
+SEEN: list[Any] = []
+
+
+@dataclass(frozen=True)
+class Watching:
+    """Keeps what it is given; people stay where they are."""
+
+    steps: int
+    step_s: float
+    past: int = 3
+    uses_people: ClassVar[bool] = True
+
+    def predict(self, xy_m, valid, people=None):
+        SEEN.append((xy_m, people))
+        return np.repeat(xy_m[:, -1:], self.steps, axis=1), np.tile(np.eye(2), (len(xy_m), self.steps, 1, 1))
+
+
+class Blind(Watching):
+    uses_people: ClassVar[bool] = False
+
+    def predict(self, xy_m, valid):
+        return super().predict(xy_m, valid)
+
+
+@pytest.fixture(autouse=True)
+def nothing_seen() -> None:
+    SEEN.clear()
+
+
+def frame(tick: int, rows: dict[int, tuple[float, float]], unseen: tuple[int, ...] = (), cars: tuple[int, ...] = ()):
+    ids = np.array(list(rows))
+    places = np.array(list(rows.values()), float)
+    kind = np.where(np.isin(ids, cars), 3, 1)
+    content = TRACKS.rows(
+        track_id=ids,
+        x_m=places[:, 0],
+        y_m=places[:, 1],
+        observed=~np.isin(ids, unseen),
+        source_id=np.full(len(ids), -1),
+        class_id=kind,
+    )
+    return Frame(ns(0.4 * tick), tick, content)
+
+
+def crowd(seed: int, count: int, length: int = 8) -> tuple[np.ndarray, np.ndarray]:
+    """Pasts (M, L, 2) of walks that are near each other, with gaps, and which positions are known."""
+    rng = np.random.default_rng(seed)
+    speed = rng.normal(0, 0.4, (count, 1, 2))
+    xy_m = rng.uniform(-4, 4, (count, 1, 2)) + speed * np.arange(1 - length, 1)[:, None]
+    valid = rng.random((count, length)) < 0.8
+    valid[:, -1] = True
+    return np.where(valid[..., None], xy_m + rng.normal(0, 0.1, xy_m.shape), np.nan), valid
+
+
+class TestWhatPredictorsAreGiven:
+    def test_those_who_are_observed_now_are_people_though_too_short_to_be_predicted(self):
+        frames = [frame(n, {1: (n, 0), 2: (n, 1)}) for n in range(3)]
+        frames.append(frame(3, {9: (0, 5), 2: (3, 1), 1: (3, 0), 4: (7, 7)}, unseen=(4,)))
+        list(Predict(predictor="tests.test_social:Watching")(frames))
+        xy_m, people = SEEN[-1]
+        assert xy_m[:, -1].tolist() == [[3, 1], [3, 0]]  # tracks 2 and 1, which have four positions
+        assert people.xy_m[:, -1].tolist() == [[0, 5], [3, 1], [3, 0]]
+        assert people.row.tolist() == [1, 2]
+        np.testing.assert_array_equal(people.xy_m[people.row], xy_m)
+        assert people.moment.tolist() == [0, 0, 0]
+        assert people.valid.sum(axis=1).tolist() == [1, 4, 4]
+
+    def test_vehicles_and_people_are_not_seen_together_because_their_units_differ(self):
+        frames = [frame(n, {1: (n, 0), 2: (9 * n, 1)}, cars=(2,)) for n in range(4)]
+        list(Predict(predictor="tests.test_social:Watching", class_names=((1, "pedestrian"), (3, "car")))(frames))
+        xy_m, people = SEEN[-1]
+        assert len(set(people.moment.tolist())) == 2
+        np.testing.assert_array_equal(people.xy_m[people.row], xy_m)
+        assert 0 < people.xy_m[1, -1, 0] < 27
+
+    def test_a_predictor_that_does_not_ask_gets_positions_alone(self):
+        frames = [frame(n, {1: (n, 0), 2: (n, 1)}) for n in range(5)]
+        list(Predict(predictor="tests.test_social:Blind")(frames))
+        assert [people for _, people in SEEN] == [None] * len(SEEN) != []
+
+    def test_other_steps_are_those_of_people_too(self):
+        """At 5 Hz a network with steps of 0.4 s gets every other position, of everybody."""
+        xy_m = np.arange(40.0).reshape(2, 10, 2)
+        slow = make("social", 24, 0.2)
+        given = PeopleSeen(xy_m, np.ones((2, 10), bool), np.zeros(2, int), np.array([0, 1]))
+        every = xy_m[:, 1::2]
+        wanted = predict_together(SOCIAL, every, np.ones((2, 5), bool))
+        found = slow.predict(xy_m, np.ones((2, 10), bool), given)
+        np.testing.assert_allclose(found.mean[:, 1::2], wanted.mean, atol=1e-9)
+
+    @pytest.mark.parametrize("batch", [4, 4096])
+    def test_retracking_gives_all_tracks_of_a_step(self, monkeypatch, batch):
+        rng = np.random.default_rng(1)
+        frames = [frame(n, {k: (0.4 * n, 2 * k + rng.normal(0, 0.05)) for k in range(5)}) for n in range(12)]
+        options = [PROFILES["default"], PROFILES["paper"]]
+        for profile in options:
+            run = type(profile)(**{**vars(profile), "predictor": "tests.test_social:Watching"})
+            monkeypatch.setattr(likelihood, "_BATCH", batch)
+            predictions = [one for *_, one in run(frames)]
+            assert any(len(one.rows) for one in predictions)
+        moments = [np.bincount(people.moment).max() for _, people in SEEN if people is not None and len(people.row)]
+        assert max(moments) == 5
+        for xy_m, people in SEEN:
+            np.testing.assert_array_equal(people.xy_m[people.row], xy_m)
+
+
+class Breaks:
+    """Constant positions, but for one law."""
+
+    steps, step_s, past, uses_people = 3, 0.4, 4, True
+
+    def __init__(self, law: str) -> None:
+        self.law, self.calls = law, 0
+
+    def predict(self, xy_m, valid, people=None):
+        self.calls += 1
+        mean = np.repeat(xy_m[:, -1:], self.steps, axis=1)
+        cov = np.tile(np.eye(2), (len(mean), self.steps, 1, 1))
+        others = people.xy_m[:, -1]
+        mean = mean + {
+            "pure": self.calls,
+            "unknown": np.nan_to_num(xy_m[:, :1]).clip(0, 9),
+            "order-blind": others[0] - others[-1],
+            "batch": float(len(mean)),
+            "moment": others.sum() - 8 * xy_m[0, -1].sum(),
+            "moves": -mean / 2,
+            "rotates": [1.0, 0.0],
+        }.get(self.law, 0.0)
+        if self.law == "covariances":
+            cov[0, 0] = [[1.0, 2.0], [2.0, 1.0]]
+        if self.law == "shapes":
+            mean = mean[:, :1]
+        if self.law == "input":
+            people.xy_m[0, -1] = 0.0
+        return mean, cov
+
+
+class TestLaws:
+    @pytest.mark.parametrize("name", NAMES)
+    @pytest.mark.parametrize("step_s", [0.4, 0.25])
+    def test_the_built_in_predictors_obey_them(self, name, step_s):
+        for seed in range(3):
+            check_predictor(make(name, STEPS, step_s), rotates=name != "lstm", seed=seed)
+
+    def test_one_that_obeys_passes(self):
+        check_predictor(Breaks(""), rotates=True)
+        check_predictor(Breaks("rotates"))
+
+    @pytest.mark.parametrize(
+        ("law", "said"),
+        [
+            *((one, f"{one}: ") for one in ("pure", "unknown", "order-blind", "batch", "moment", "moves", "rotates")),
+            ("covariances", "forecasts: means that are not finite, or covariances"),
+            ("shapes", r"forecasts: shapes are \(5, 1, 2\)"),
+            ("input", "pure: it changes its input"),
+        ],
+    )
+    def test_one_that_breaks_a_law_is_told_which(self, law, said):
+        with pytest.raises(LawError, match=said):
+            check_predictor(Breaks(law), rotates=True)
+
+    def test_predictions_of_a_log_are_causal(self):
+        check_transform(Predict(predictor="social"))
+
+
+class TestSocial:
+    @settings(max_examples=25)
+    @given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 40))
+    def test_pairs_are_the_nearest_people_of_the_same_moment(self, seed, count):
+        rng = np.random.default_rng(seed)
+        now = rng.uniform(-9, 9, (count, 2))
+        moment, row = rng.integers(0, 2, count), rng.permutation(count)[: rng.integers(1, count + 1)]
+        found = social.pairs_of(PeopleSeen(now[:, None], np.ones((count, 1), bool), moment, row), now)
+        wanted = []
+        for track, me in enumerate(row.tolist()):
+            away = {
+                j: float(np.hypot(*(now[j] - now[me]))) for j in range(count) if j != me and moment[j] == moment[me]
+            }
+            near = sorted((j for j in away if away[j] < 12), key=away.__getitem__)[:16]
+            wanted += [(track, j) for j in near]
+        assert list(zip(*(part.tolist() for part in found), strict=True)) == wanted
+
+    def test_people_at_the_same_distance_as_the_sixteenth_are_all_taken(self):
+        angle = np.linspace(0, 2 * np.pi, 20, endpoint=False)
+        now = np.concatenate([[[0.0, 0.0]], np.round(np.stack([np.cos(angle), np.sin(angle)], -1), 0) * 2])
+        people = PeopleSeen(now[:, None], np.ones((21, 1), bool), np.zeros(21, int), np.array([0]))
+        distance = np.hypot(*now[1:].T)
+        assert len(social.pairs_of(people, now)[1]) == (distance <= np.sort(distance)[15]).sum() > 0
+
+    @settings(max_examples=20)
+    @given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 20), angle=st.floats(0, 7))
+    def test_order_and_rotation(self, seed, count, angle):
+        xy_m, valid = crowd(seed, count)
+        forecast = predict_together(SOCIAL, xy_m, valid)
+        assert (np.linalg.eigvalsh(forecast.cov) > 0).all()
+        order = np.random.default_rng(seed).permutation(count)
+        mixed = predict_together(SOCIAL, xy_m[order], valid[order])
+        np.testing.assert_allclose(mixed.mean, forecast.mean[order], atol=1e-9)
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        turned = predict_together(SOCIAL, xy_m @ turn.T, valid)
+        np.testing.assert_allclose(turned.mean, forecast.mean @ turn.T, atol=1e-6)
+        np.testing.assert_allclose(turned.cov, turn @ forecast.cov @ turn.T, atol=1e-6)
+
+    def test_those_who_stand_still_have_forecasts_that_rotate_too(self):
+        """They have no direction, so that nothing may depend on it."""
+        xy_m = np.tile(np.array([[0.0, 0.0], [1.0, 0.0]])[:, None], (1, 8, 1))
+        east, north = (predict_together(SOCIAL, xy_m[:, :, axes], np.ones((2, 8), bool)) for axes in ([0, 1], [1, 0]))
+        np.testing.assert_allclose(north.mean, east.mean[..., ::-1], atol=1e-9)
+        np.testing.assert_allclose(north.cov, east.cov[..., ::-1, ::-1], atol=1e-9)
+
+    def test_people_beyond_twelve_metres_have_no_influence(self):
+        xy_m, valid = crowd(3, 2)
+        alone = SOCIAL.predict(xy_m[:1], valid[:1])
+        for away, is_seen in ((25.0, False), (3.0, True)):
+            other = xy_m[1:] - xy_m[1:, -1:] + xy_m[:1, -1:] + [away, 0.0]
+            people = PeopleSeen(np.concatenate([xy_m[:1], other]), valid, np.zeros(2, int), np.array([0]))
+            found = SOCIAL.predict(xy_m[:1], valid[:1], people)
+            assert (np.abs(found.mean - alone.mean).max() > 1e-3) == is_seen
+
+    def test_two_who_walk_together_are_predicted_from_both(self):
+        """One of them is seen with much noise; on average that of the other does not count less."""
+        rng = np.random.default_rng(5)
+        true = np.stack([0.5 * np.arange(20), np.zeros(20)], -1)
+        errors = []
+        for _ in range(60):
+            past = np.stack([true[:8], true[:8] + [0.0, 0.8]]) + rng.normal(0, 0.2, (2, 8, 2))
+            known = np.ones((2, 8), bool)
+            wanted = np.stack([true[8:], true[8:] + [0.0, 0.8]])
+            made = [RED.predict(past, known), SOCIAL.predict(past, known), predict_together(SOCIAL, past, known)]
+            errors.append([np.hypot(*(one.mean - wanted).transpose(2, 0, 1)).mean() for one in made])
+        red, alone, together = np.mean(errors, axis=0)
+        assert together < 0.85 * red
+        assert together < 0.9 * alone
+
+    def test_its_file_says_what_it_was_trained_on_and_holds_red_as_it_is(self):
+        found, red = load(SHIPPED / "social.safetensors"), load(SHIPPED / "red.safetensors")
+        assert "synthetic" in found.card["data"]
+        assert (found.card["licence"], found.card["red_sha256"]) == ("Apache-2.0", red.sha256)
+        for name, part in red.tensors.items():
+            np.testing.assert_array_equal(found.tensors[f"red.{name}"], part)
+
+    def test_a_file_of_another_network_is_refused(self):
+        with pytest.raises(McaptrackError, match=r"red\.safetensors holds red, not social"):
+            make(f"social:{SHIPPED / 'red.safetensors'}", STEPS, 0.4)
+        whole = load(SHIPPED / "social.safetensors")
+        for name in whole.tensors:
+            rest = {key: part for key, part in whole.tensors.items() if key != name}
+            with pytest.raises(McaptrackError, match=r"has no |has to be 0x"):
+                social.Social.of(Weights(whole.path, rest, whole.card, ""))
+
+    def test_no_tracks_have_no_forecasts(self):
+        empty = SOCIAL.predict(np.empty((0, 8, 2)), np.empty((0, 8), bool))
+        assert isinstance(empty, Forecast)
+        assert empty.mean.shape == (0, STEPS, 2)
