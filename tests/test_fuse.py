@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 import mcaptrack
 from mcaptrack import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
+from mcaptrack.notices import collected
 from mcaptrack.schema import SIGHTINGS, Frame
 from mcaptrack.testing import check_transform
 from mcaptrack.transforms.fuse import CameraView, FootFuser
@@ -275,6 +276,38 @@ class TestInput:
             mcaptrack.fuse(path, **options)  # type: ignore[arg-type]
         assert path.read_bytes() == before
 
+    def test_a_run_tracks_the_scene_by_what_suits_it(self, tmp_path: Path) -> None:
+        path = write_log(tmp_path / "scene.mcap", CAMERAS[:3])
+        mcaptrack.fuse(path)
+        (note,) = (one for one in mcaptrack.run(path, camera="world", tables=False).notes if "suits" in one)
+        assert note.startswith("track by ground (birth_score 0.8, ")
+        assert note.endswith("which suits the fuser feet; `tracker=` chooses")
+
+    def test_a_run_makes_a_scene_again_that_is_out_of_date(self, tmp_path: Path) -> None:
+        path = write_log(tmp_path / "scene.mcap", CAMERAS[:3], late_s={"east": 0.2})
+        mcaptrack.fuse(path, min_score=0.4, clock_offset_s={"east": 0.2})
+        mcaptrack.run(path, camera="world", tables=False)
+        assert mcaptrack.run(path, camera="world", tables=False).is_up_to_date
+        with mcaptrack.open(path) as log, collected() as warnings:
+            rows = log.array("detections", "/north/detections")
+            frames = []
+            for t_ns in np.unique(rows["t_ns"]):
+                part = rows[rows["t_ns"] == t_ns][1:]
+                boxes = np.stack([part[name] for name in ("x_px", "y_px", "w_px", "h_px")], axis=-1)
+                scores, classes = [0.9] * len(part), [1] * len(part)
+                frames.append(mcaptrack.detections(boxes, scores, classes, int(t_ns), box_format="xywh"))
+            log.write("/north/detections", frames, replace=True)
+        (line,) = (one.message for one in warnings if one.message.startswith("/world/detections is out"))
+        assert "camera='world'" in line
+        again = mcaptrack.run(path, camera="world", tables=False)
+        assert again.stages[:2] == ("fuse", "track")
+        assert again.rows["/world/detections/sightings"] == 2 * SECONDS * (3 * PEOPLE - 1)
+        how = {one.topic: one.parameters for one in mcaptrack.info(path).channels}["/world/detections"]
+        assert (how["min_score"], how["clock_offsets_given"]) == (0.4, ["east"])
+        assert mcaptrack.fuse(path, min_score=0.4, clock_offset_s={"east": 0.2}).rows == {
+            topic: count for topic, count in again.rows.items() if "detections" in topic
+        }
+
     def test_cameras_are_fused_again_after_one_of_them_changed(self, tmp_path: Path) -> None:
         path = write_log(tmp_path / "scene.mcap", CAMERAS[:2])
         first, second = mcaptrack.fuse(path), mcaptrack.fuse(path)
@@ -326,6 +359,14 @@ def test_groups_have_each_camera_once_and_can_not_be_joined_further(
         mean = total @ sum(part @ at for part, at in zip(inverse, where.xy_m[of == one], strict=True))
         assert centre.xy_m[one] == pytest.approx(mean, abs=1e-6)
         assert centre.cov[one] == pytest.approx([total[0, 0], total[0, 1], total[1, 1]], abs=1e-6)
+
+
+def test_a_person_made_of_boxes_of_two_others_is_dissolved() -> None:
+    """Cameras 0 and 1 see two people 0.8 m apart. Cameras 2 and 3 see both, too, and place one of them between."""
+    drawn = [(0, 0.0), (1, 0.02), (2, 0.04), (0, 0.8), (1, 0.78), (3, 0.76), (2, 0.42), (3, 0.38)]
+    rows = sightings([(camera, x, 0.0, 0.25, 0.25, 0.0) for camera, x in drawn])
+    where = Places(np.stack([rows["x_m"], rows["y_m"]], axis=-1), np.tile([0.0625, 0.0, 0.0625], (len(rows), 1)))
+    assert group(rows["camera"].astype(np.int64), where, 9.0, 1.2).tolist() == [0, 0, 0, 1, 1, 1, 1, 0]
 
 
 def camera_of(matrix: Sequence[Sequence[float]], **others: object) -> CameraView:

@@ -16,7 +16,7 @@ from mcaptrack.transforms import GroundTracker, Predict, Retrack, Sample
 from mcaptrack.transforms.ground.state import VX, VY, GroundTracks, X, Y
 from mcaptrack.transforms.motion_limits import LIMITS, limits_of, limits_row, read_limits
 from mcaptrack.transforms.to_video_rate import to_video_rate
-from tests.references.ground import Axis
+from tests.references.ground import Axis, transition
 from tools.traffic import CLASSES, Faults, draw_traffic
 
 NAMES = tuple(CLASSES.items())
@@ -66,6 +66,14 @@ def test_the_laws_of_transforms_hold(options: dict[str, object]):
     check_transform(GroundTracker(class_names=NAMES, **options), frames)
 
 
+def test_the_laws_hold_with_covariances_of_some_detections():
+    _, frames = scene(3, seconds=2.0, density=0.5)
+    for number, frame in enumerate(frames):
+        frame.rows["cov_xx_m2"], frame.rows["cov_xy_m2"], frame.rows["cov_yy_m2"] = 0.3, 0.1, 0.2
+        frame.rows["cov_xx_m2"][frame.rows["x_m"] > 0 if number > 3 else slice(None)] = np.nan
+    check_transform(GroundTracker(class_names=NAMES), frames)
+
+
 def test_points_without_size_are_tracked_too():
     points = frames_of(drive(12))
     (rows,) = (tracked(points)[-1].rows,)
@@ -94,6 +102,76 @@ def test_the_filter_is_that_of_the_textbook(row: str, class_id: int):
             own.correct(float(found[X, 0]))
         assert tracks.table[[X, VX, 12], 0] == pytest.approx(own.mean)
         assert tracks.table[14:20, 0] == pytest.approx(own.cov[np.triu_indices(3)])
+
+
+def test_with_covariances_the_filter_is_that_of_matrices():
+    """One filter over both axes, from the textbook, with a noise of its own for each detection."""
+    limits, rng = LIMITS["person"], np.random.default_rng(5)
+    tracks, noise = GroundTracks(), limits.noise_m**2 * np.eye(2)
+    tracks.expect_covariances()
+    place = np.array([[1.0, 0, 0, 0, 0, 0], [0, 0, 0, 1.0, 0, 0]])  # position, velocity, acceleration along each axis
+    found, mean, cov = np.full((15, 1), np.nan), np.zeros(6), np.diag([0.0, limits.speed_m_per_s**2, 0.0] * 2)
+    for frame in range(10):
+        seconds, one = float(rng.uniform(0.1, 0.6)), rng.normal(0, 0.4, (2, 2))
+        own = one @ one.T + 0.01 * np.eye(2)
+        at = np.array([0.5 * frame, -0.2 * frame]) + rng.normal(0, 0.2, 2)
+        found[[X, Y], 0], found[9:12, 0], found[12:, 0] = at, (0.9, PEDESTRIAN, -1), own[[0, 0, 1], [0, 1, 1]]
+        if not frame:
+            tracks.initiate(1, found, {PEDESTRIAN: limits}, 0)
+            mean, cov = place.T @ at, cov + place.T @ (own + noise) @ place
+            continue
+        move, drift = np.kron(np.eye(2), transition(seconds)), np.zeros((3, 3))
+        drift[:2, :2] = [[seconds**3 / 3, seconds**2 / 2], [seconds**2 / 2, seconds]]
+        mean, cov = move @ mean, move @ cov @ move.T + np.kron(np.eye(2), limits.drift_m_per_s**2 * drift)
+        gain = cov @ place.T @ np.linalg.inv(place @ cov @ place.T + own + noise)
+        mean, cov = mean + gain @ (at - place @ mean), cov - gain @ place @ cov
+        tracks.predict(seconds)
+        tracks.update(np.array([0]), found, np.array([True]), frame)
+        assert tracks.table[[X, VX, Y, VY], 0] == pytest.approx(mean[[0, 1, 3, 4]])
+        assert tracks.covariances is not None
+        assert tracks.covariances.values[0] == pytest.approx(cov)
+
+
+def seen(places: list[tuple[float, float, float]], cov: tuple[float, float, float] | None) -> Frame:
+    """People (x_m, y_m, score), all with the same covariance, half a second after others."""
+    x, y, score = zip(*places, strict=True)
+    given = dict(zip(("cov_xx_m2", "cov_xy_m2", "cov_yy_m2"), np.tile(cov, (len(x), 1)).T, strict=True)) if cov else {}
+    return Frame(
+        500_000_000,
+        1,
+        DETECTIONS.rows(x_m=x, y_m=y, score=score, class_id=[1] * len(x), source_id=range(len(x)), **given),
+    )
+
+
+def kept_by(first: list[tuple[float, float, float]], then: Frame) -> list[int]:
+    """The tracks of people in the first frame, 1 and so on, to which the detections of the next frame belong."""
+    begun = seen(first, (0.01, 0.0, 0.01))._replace(t_ns=0, index=0)
+    table = GroundTracker(confirm_score=0.0, birth_score=0.0, link_s=0.0)([begun, then])
+    (frame,) = list(table)[-1]
+    ids = dict(zip(frame.rows["source_id"].tolist(), frame.rows["track_id"].tolist(), strict=True))
+    return [ids[number] for number in range(len(then.rows))]
+
+
+def test_what_is_uncertain_along_a_line_of_sight_belongs_to_the_track_on_it():
+    first = [(0.0, 0.0, 0.9), (0.75, 0.6, 0.9)]
+    assert kept_by(first, seen([(0.7, 0.0, 0.9)], (4.0, 0.0, 0.001))) == [1]
+    assert kept_by(first, seen([(0.7, 0.0, 0.9)], (0.01, 0.0, 0.01))) == [2]  # the nearer one
+
+
+def test_of_two_detections_the_more_probable_one_continues_a_track():
+    near, probable = (0.15, 0.0), (0.3, 0.1)
+    assert kept_by([(0.0, 0.0, 0.9)], seen([(*near, 0.9), (*probable, 0.9)], (0.01, 0.0, 0.01)))[0] == 1
+    assert kept_by([(0.0, 0.0, 0.9)], seen([(*near, 0.1), (*probable, 0.98)], (0.01, 0.0, 0.01)))[1] == 1
+
+
+@pytest.mark.parametrize("cov", [(-1.0, 0.0, 1.0), (1.0, 2.0, 1.0), (0.0, 0.0, 0.0), (np.inf, 0.0, 1.0)])
+def test_covariances_that_are_none_count_as_missing(cov: tuple[float, float, float]):
+    first = [(0.0, 0.0, 0.9), (0.75, 0.6, 0.9)]
+    frames = [seen(first, None)._replace(t_ns=0, index=0), seen([(0.7, 0.1, 0.9)], None)]
+    odd = [frames[0], seen([(0.7, 0.1, 0.9)], cov)]
+    options = {"confirm_score": 0.0, "link_s": 0.0}
+    for (one,), (other,) in zip(GroundTracker(**options)(odd), GroundTracker(**options)(frames), strict=True):
+        assert one.rows.tobytes() == other.rows.tobytes()
 
 
 def turning(count: int, missing: tuple[int, ...] = ()) -> tuple[dict[int, dict[str, float]], np.ndarray]:
@@ -311,6 +389,23 @@ def test_drawn_traffic_is_tracked_and_repaired():
         (one, kind) for one, kind in {*zip(rows["track_id"].tolist(), rows["class_id"].tolist(), strict=True)}
     )
     assert len(per_track) == len(set(rows["track_id"].tolist()))  # one class each
+
+
+@pytest.mark.parametrize(("pictures", "is_repaired"), [(1, True), (4, False)])
+def test_people_that_were_detected_as_seldom_as_samples_are_associated_again(pictures: int, is_repaired: bool):
+    """Two people cross at a right angle and swap ids; a tracker that saw more than the samples is believed."""
+    frames = []
+    for t in range(40):
+        way = 0.4 * (t - 20)
+        ids = [1, 2] if t < 21 else [2, 1]
+        rows = TRACKS.rows(track_id=ids, x_m=[way, 0.1], y_m=[0.0, way + 0.3], observed=[True] * 2, class_id=[1] * 2,
+                           score=[0.9] * 2, source_id=ids, vx_m_per_s=[1.0, 0.0], vy_m_per_s=[0.0, 1.0])  # fmt: skip
+        frames.append(Frame(t * 400_000_000, t * pictures, rows))
+    ends = [offline.rows for offline, _, _ in Retrack(class_names=NAMES)(frames)]
+    first, last = (
+        dict(zip(np.rint(rows["x_m"]).tolist(), rows["track_id"].tolist(), strict=True)) for rows in (ends[5], ends[35])
+    )
+    assert (first[0.0] == last[0.0]) == is_repaired
 
 
 def test_headings_are_interpolated_around_the_circle():

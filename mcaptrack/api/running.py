@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
@@ -101,8 +101,9 @@ class RunResult:
         return not self.stages
 
 
-#: Plans the jobs for a log; takes the open log, the prefix of its camera, and a function that takes notes.
-Plan = Callable[[logs.Log, str, Callable[[str], None]], list[Job]]
+#: Plans the jobs for a log; takes the open log, the prefix of its camera, a function that takes notes, and the topics
+#: that were made again already.
+Plan = Callable[[logs.Log, str, Callable[[str], None], Collection[str]], list[Job]]
 
 
 @dataclass(frozen=True)
@@ -125,14 +126,19 @@ def work(
     tables: bool | None,
     plane: PlaneChoice = AS_BEFORE,
     zones: ZoneWatch | None = None,
+    fuses: bool = False,
 ) -> RunResult:
-    """Plan and run on one log. ``tables`` is None where a single stage runs, which neither exports nor summarises."""
+    """Plan and run on one log. ``tables`` is None where a single stage runs, which neither exports nor summarises.
+
+    With ``fuses`` a scene of several cameras is made again first, if it is out of date.
+    """
 
     def act(opened: logs.Log, output: Path | None, notes: Notes, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
         topics = watch.topics if watch else zones.topics if zones else ()
         prefix = pipeline.find_camera(opened, where.camera, where.topic or next(iter(topics), None))
-        jobs = plan(opened, prefix, notes.say)
-        return prefix, pipeline.run(opened, prefix, jobs, output, progress, watch, plane, boxes, zones)
+        fused = pipeline.fuse_again(opened, prefix, where.force, notes.say, progress) if fuses else {}
+        jobs = plan(opened, prefix, notes.say, fused)
+        return prefix, pipeline.run(opened, prefix, jobs, output, progress, watch, plane, boxes, zones, fused)
 
     return change(where, act, progress, tables)
 
@@ -161,12 +167,13 @@ def change(where: Where, act: Act, progress: Progress, tables: bool | None) -> R
             if output is None:
                 opened.lock()  # a second process is refused before it computes anything
             prefix, report = act(opened, output, notes, boxes)
+            named = {topic: pipeline.camera_to_name(opened, topic) for topic in report.stale}
             written_to = output or opened.parts[-1].path
         if written_to == path and isinstance(path, Path):
             update_metadata(path)
         layouts = write_layouts(target, report.layouts)
         for topic in report.stale:
-            warn_stale(topic, target)
+            warn_stale(topic, target, named)
         with report.watch.part("tables") if tables else nullcontext():
             rows = _export(target, where.force, progress, boxes) if tables and isinstance(target, Path) else {}
         if tables and not isinstance(target, Path):
@@ -212,9 +219,9 @@ def write_layouts(log: Location, layouts: Mapping[str, bytes]) -> list[Path]:
     return paths
 
 
-def warn_stale(topic: str, log: Location) -> None:
-    """Warn of a channel that is out of date now."""
-    again = call("run", log)
+def warn_stale(topic: str, log: Location, cameras: Mapping[str, str] = {}) -> None:
+    """Warn of a channel that is out of date now; ``cameras`` are those to name, by topic."""
+    again = call("run", log, camera=cameras[topic]) if cameras.get(topic) else call("run", log)
     warn(f"{topic} is out of date, because its input was replaced; {again} brings it up to date", "out-of-date")
 
 
@@ -293,7 +300,7 @@ def run_stage(
     keep = modes[mode or "both"] if modes else None
     before = transforms_of(stages)
 
-    def plan(opened: logs.Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
+    def plan(opened: logs.Log, prefix: str, say: Callable[[str], None], _: Collection[str]) -> list[Job]:
         return pipeline.plan_stage(opened, prefix, stage, transform, topic, to, keep, say, before, frame or "", make)
 
     where = Where(log, camera, topic, output, sidecar, force)

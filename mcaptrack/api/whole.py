@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
@@ -127,14 +127,17 @@ def run(
     given = {"camera_motion": camera_motion, "across_classes": across_classes, "class_limits": class_limits}
     shared = {name: value for name, value in given.items() if value is not None}
 
-    def plan(opened: logs.Log, prefix: str, say: Callable[[str], None]) -> list[Job]:
-        return pipeline.plan_all(opened, prefix, say, topic, transforms, force, chosen, shared, plane, frame or "")
+    def plan(opened: logs.Log, prefix: str, say: Callable[[str], None], changed: Collection[str]) -> list[Job]:
+        return pipeline.plan_all(
+            opened, prefix, say, topic, transforms, force, chosen, shared, plane, frame or "", changed
+        )
 
     options = events if isinstance(events, EventOptions) else EventOptions()
     watch = Watch(options, force=force) if events else None
     given_zones = zones_of(zones)
     counted = ZoneWatch(given_zones, options=ZoneOptions() if given_zones else None, force=force)
-    return work(Where(log, camera, topic, output, sidecar, force), plan, watch, progress, tables, plane, counted)
+    where = Where(log, camera, topic, output, sidecar, force)
+    return work(where, plan, watch, progress, tables, plane, counted, fuses=True)
 
 
 @checked(gate_m=(0.001, 1e6), min_iou=(0.001, 1))

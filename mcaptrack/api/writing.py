@@ -68,7 +68,7 @@ def write_rows(
         stale = pipeline.outdated_by(opened, {name: made.provenance.digest})
         write_layouts(path, layouts)
         for topic_of_stage in stale:
-            warn_stale(topic_of_stage, path)
+            warn_stale(topic_of_stage, path, {topic_of_stage: pipeline.camera_to_name(opened, topic_of_stage)})
         if opened.results is None and isinstance(path, Path):
             update_metadata(path)
     return len(frames)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -109,7 +109,7 @@ def zones(
     elif zones is not None:
         options = usual
 
-    def plan(opened: logs.Log, prefix: str, _: Callable[[str], None]) -> list[Job]:
+    def plan(opened: logs.Log, prefix: str, *_: object) -> list[Job]:
         if not found and not pipeline.counted_zones(opened, prefix):
             raise McaptrackError(f"{opened.path} was not counted yet; give a file of GeoJSON with `zones=`")
         return []

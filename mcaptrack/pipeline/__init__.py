@@ -6,7 +6,7 @@ transform and its parameters.
 
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.pipeline.events import Watch
-from mcaptrack.pipeline.fusing import fuse_cameras
+from mcaptrack.pipeline.fusing import fuse_again, fuse_cameras
 from mcaptrack.pipeline.plan import plan_all, plan_stage
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, read_planes
 from mcaptrack.pipeline.run import Report, input_of, outdated_by, run
@@ -15,7 +15,7 @@ from mcaptrack.pipeline.staleness import is_stale
 from mcaptrack.pipeline.summary import Summary, summarise
 from mcaptrack.pipeline.write import LAYOUTS, attachment_of, layout_path
 from mcaptrack.pipeline.zones import CountedZones, ZoneWatch, counted_zones
-from mcaptrack.sources.cameras import Camera, camera_at, find_camera
+from mcaptrack.sources.cameras import Camera, camera_at, camera_to_name, find_camera
 
 __all__ = [
     "AS_BEFORE",
@@ -32,9 +32,11 @@ __all__ = [
     "ZoneWatch",
     "attachment_of",
     "camera_at",
+    "camera_to_name",
     "counted_zones",
     "find_camera",
     "find_views",
+    "fuse_again",
     "fuse_cameras",
     "input_of",
     "is_stale",

@@ -23,17 +23,16 @@ from mcaptrack.notices import collected, warn
 from mcaptrack.pipeline.checks import describe_origin, may_replace, read_named_frames
 from mcaptrack.pipeline.planes import read_planes
 from mcaptrack.pipeline.run import Report, outdated_by
+from mcaptrack.pipeline.staleness import is_stale
 from mcaptrack.pipeline.write import Made, digest_of, write
-from mcaptrack.schema import BOX_PX, DETECTIONS, SIGHTINGS, Frame
+from mcaptrack.schema import BOX_PX, DETECTIONS, SIGHTINGS, Frame, Schema
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_times
-from mcaptrack.schema.provenance import Provenance, frame_id_of
-from mcaptrack.sources.cameras import Camera, cameras
+from mcaptrack.schema.provenance import FUSE, Provenance, frame_id_of
+from mcaptrack.sources.cameras import Camera, cameras, provenance_of
 from mcaptrack.transforms import STAGES
 from mcaptrack.transforms.fuse import CameraView, FootFuser, Offset, compare
 
-#: The name of what fuses, in the provenance; and the default name of the scene.
-STAGE, SCENE = "fuse", "world"
 #: The frame of the metres, if the ground planes name none.
 _FRAME: Final = "map"
 #: Pictures of other cameras count up to this share of the time between those of the slowest camera away from it.
@@ -146,20 +145,64 @@ def fuse_cameras(
         If there is nothing to fuse, or if a channel that others recorded would be replaced.
     """
     prefix = "/" + scene.strip("/")
-    target = f"{prefix}/{STAGES['detect'].output_topic}"
-    topics = {target: DETECTIONS, f"{target}/sightings": SIGHTINGS}
-    for topic in topics:
-        if not may_replace(opened, topic, STAGE):
+    for topic in _topics(prefix):
+        if not may_replace(opened, topic, FUSE):
             raise McaptrackError(
                 f"{opened.path}: {topic} {describe_origin(opened, topic)}; give the scene another name with `to=`"
             )
+    with collected() as warnings:
+        out = _fuse(opened, names, prefix, fuser, clock_offset_s, progress)
+    report = Report(stages=[FUSE], layouts=write(opened, prefix, out, (), {}, output), warnings=list(warnings))
+    for topic, channel in out.items():
+        report.count(topic, channel)
+    report.stale = outdated_by(opened, {topic: channel.provenance.digest for topic, channel in out.items()})
+    return prefix, report
+
+
+def fuse_again(
+    opened: log.Log, prefix: str, force: bool, say: Callable[[str], None], progress: Callable[[str, int, int], None]
+) -> dict[str, Made]:
+    """Make the scene below ``prefix`` again if it is out of date, or with ``force``; {} if there is none to make.
+
+    The cameras and parameters are those that it was made with; so are offsets of clocks that were given. Raises
+    McaptrackError as ``fuse_cameras`` does.
+    """
+    target = next(iter(_topics(prefix)))
+    made = provenance_of(opened, target)
+    if made is None or made.transform != FUSE or not (force or is_stale(opened, target)):
+        return {}
+    names = [str(name) for name in made.parameters["cameras"]]
+    offset_s = dict(zip(names, made.parameters["clock_offset_s"], strict=True))
+    given = {name: float(offset_s[name]) for name in made.parameters.get("clock_offsets_given", ())}
+    options = {one.name: made.parameters[one.name] for one in fields(FootFuser) if one.name in made.parameters}
+    say(f"{target} was made from earlier detections or ground planes: fusing {', '.join(names)} again, as before")
+    return _fuse(opened, names, prefix, FootFuser(**options), given, progress)
+
+
+def _topics(prefix: str) -> dict[str, Schema]:
+    """The schemas of the channels of a scene, the main one first."""
+    target = f"{prefix}/{STAGES['detect'].output_topic}"
+    return {target: DETECTIONS, f"{target}/sightings": SIGHTINGS}
+
+
+def _fuse(
+    opened: log.Log,
+    names: Sequence[str],
+    prefix: str,
+    fuser: FootFuser,
+    clock_offset_s: Mapping[str, float],
+    progress: Callable[[str, int, int], None],
+) -> dict[str, Made]:
+    """Fuse cameras as ``fuse_cameras`` does, and return the channels by topic."""
+    topics = _topics(prefix)
+    target = next(iter(topics))
     with collected() as warnings:
         chosen = _chosen(opened, names, prefix)
         sources, references, classes, frame_id = _sources(opened, chosen, clock_offset_s)
         gathered, fuser, offsets, offset_s = _compared(sources, fuser, clock_offset_s)
         collectors = [FrameCollector(schema) for schema in topics.values()]
         for count, made in enumerate(fuser(gathered), start=1):
-            progress(STAGE, count, len(gathered))
+            progress(FUSE, count, len(gathered))
             for frame, collector in zip(made, collectors, strict=True):
                 collector.append(frame)
         _say(opened, fuser.views, offsets, offset_s, clock_offset_s)
@@ -169,16 +212,19 @@ def fuse_cameras(
                 "clock is late",
                 "left-out",
             )
+    for notice in warnings:
+        warn(notice.message, notice.code)
     parameters = {
         **{one.name: getattr(fuser, one.name) for one in fields(fuser) if not one.metadata.get("context")},
         "fuser": "feet",
         "cameras": [view.name for view in fuser.views],
         "clock_offset_s": [offset_s[view.name] for view in fuser.views],
+        "clock_offsets_given": sorted(clock_offset_s),
         "detects": [[round(rate, 4) for rate in view.detects] for view in fuser.views],
         "false_share": [round(view.false_share, 4) for view in fuser.views],
     }
     how = Provenance(
-        STAGE,
+        FUSE,
         parameters,
         references=references,
         classes=classes,
@@ -190,11 +236,7 @@ def fuse_cameras(
         if first := out.get(target):  # the second one belongs to the scene, too, and not to a camera of its own
             how = replace(how, input=target, input_digest=first.provenance.digest)
         out[topic] = Made.of(schema, collector.done(), how)
-    report = Report(stages=[STAGE], layouts=write(opened, prefix, out, (), {}, output), warnings=list(warnings))
-    for topic, channel in out.items():
-        report.count(topic, channel)
-    report.stale = outdated_by(opened, {topic: channel.provenance.digest for topic, channel in out.items()})
-    return prefix, report
+    return out
 
 
 def _chosen(opened: log.Log, names: Sequence[str], scene: str) -> list[Camera]:

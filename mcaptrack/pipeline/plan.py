@@ -7,8 +7,8 @@ transform with the same parameters, or left as it is, with a warning, if that is
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import fields, replace
-from typing import Any, Final
+from dataclasses import replace
+from typing import Any
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
@@ -17,21 +17,19 @@ from mcaptrack.notices import warn
 from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, fits
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, read_planes, warn_unused
-from mcaptrack.pipeline.rebuild import MissingPluginError, rebuild
+from mcaptrack.pipeline.rebuild import MissingPluginError, differing, rebuild
 from mcaptrack.pipeline.spaces import check_spaces, suited_tracker
 from mcaptrack.pipeline.staleness import is_stale
 from mcaptrack.schema import DETECTIONS, VIDEO
-from mcaptrack.schema.provenance import Provenance
+from mcaptrack.schema.provenance import FUSE, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.camera_motion import motion_topic
 from mcaptrack.sources.cameras import USUAL, camera_at, provenance_of
 from mcaptrack.transforms import STAGES, Stage, Transform
+from mcaptrack.transforms.fuse import FootFuser
 from mcaptrack.transforms.protocol import traits_of
 
 Say = Callable[[str], None]
-
-#: The maximum number of differing parameters in a message.
-_NAMED: Final = 3
 
 
 def plan_stage(
@@ -78,6 +76,7 @@ def plan_all(
     shared: Mapping[str, object] = {},
     plane: PlaneChoice = AS_BEFORE,
     frame_id: str = "",
+    changed: Collection[str] = (),
 ) -> list[Job]:
     """Plan the jobs that bring all results of a camera up to date; empty if they are.
 
@@ -86,11 +85,13 @@ def plan_all(
     ``shared`` are options of several stages that the user gave ("camera_motion"), where they differ from before.
     ``plane`` says how to make a ground plane where none is given; where it was made otherwise, it is made again.
     ``chosen`` are options that the user gave for ``defaults`` ("tracker"): a channel that was made with another choice
-    is made again; so are tracks of 3D boxes in another frame than ``frame_id``. Raises McaptrackError as ``plan_stage``
-    does, and if the class that made a channel is not installed.
+    is made again; so are tracks of 3D boxes in another frame than ``frame_id``. ``changed`` are topics that were made
+    again already, and are not written yet. Raises McaptrackError as ``plan_stage`` does, and if the class that made a
+    channel is not installed.
     """
     sources = {_stage_from(opened, source): source} if source else {}
     planner = _Planner(opened, prefix, sources, defaults, force, chosen, shared, plane, frame_id)
+    planner.take_as_changed(changed)
     warn_unused(opened, prefix, plane)
     read = {stage.input_topic for stage in STAGES.values()}
     for stage in STAGES.values():
@@ -141,6 +142,10 @@ class _Planner:
         self._notes: list[str] = []
         self._unnamed: dict[str, MissingPluginError] = {}
         self._differing: set[str] = set()
+
+    def take_as_changed(self, topics: Collection[str]) -> None:
+        """Plan all that is made from these topics."""
+        self._changes |= dict.fromkeys(topics, True)
 
     def checked(self, say: Say) -> list[Job]:
         """Check the jobs and return them; only after that report which run and why."""
@@ -215,26 +220,25 @@ class _Planner:
 
     def _suited(self, stage: str, source: str) -> Transform | None:
         """Create the transform that the maker of a stage's input recommends for the stage; None if it names none."""
-        if name := self.suited_tracker(stage, source):
-            return STAGES[stage].make(name)
         option, maker = STAGES[stage].option, self._maker_of(source)
         found = traits_of(maker).suited(option)
         if maker is None or found is None:
-            return None
+            name = self.suited_tracker(stage, source)
+            return STAGES[stage].make(name) if name else None
         made_by = next(one for one in STAGES.values() if f"{self._prefix}/{one.output_topic}" == source)
+        is_fused = isinstance(maker, FootFuser)
+        named = "fuser feet" if is_fused else f"{made_by.option} {made_by.choice(maker)}"
         parameters, planes = dict(found.parameters), read_planes(self._opened, self._prefix)
         if planes and not is_assumed(planes):
             parameters |= found.on_ground
         try:
             transform = STAGES[stage].make(found.name, **parameters)
         except McaptrackError as error:
-            entry = made_by.entry(type(maker))
+            entry = named if is_fused else made_by.entry(type(maker))
             raise McaptrackError(f"{entry} suits {found.name}, but {error}; `{option}=` chooses another") from None
         values = ", ".join(f"{key} {value}" for key, value in parameters.items())
         by = found.name + (f" ({values})" if values else "")
-        self._notes.append(
-            f"{stage} by {by}, which suits the {made_by.option} {made_by.choice(maker)}; `{option}=` chooses"
-        )
+        self._notes.append(f"{stage} by {by}, which suits the {named}; `{option}=` chooses")
         return transform
 
     def _maker_of(self, topic: str) -> Transform | None:
@@ -243,6 +247,8 @@ class _Planner:
             if topic in job.outputs():
                 return job.transform
         made = provenance_of(self._opened, topic)
+        if made and made.transform == FUSE:
+            return FootFuser()
         return self._before(made.transform, made)[0] if made and made.transform in STAGES else None
 
     def _is_made_by_another(self, topic: str) -> bool:
@@ -273,7 +279,7 @@ class _Planner:
         is_projected = is_usual and STAGES[stage].needs_scale and self._is_plane_due(source)
         is_due = is_due or is_projected
         if wanted and not is_replaced and not self._force:
-            self._warn_settings(main, _differing(before, wanted) if before else str(why_not))
+            self._warn_settings(main, differing(before, wanted) if before else str(why_not))
         if not is_due and not self._force and not is_replaced:
             return False
         transform = wanted if self._force or is_replaced else before
@@ -376,16 +382,6 @@ class _Planner:
             f"{self._opened.path}: {topic} is there and {describe_origin(self._opened, topic)}; leave `topic=` out to "
             f"go on from it, or run {other}"
         )
-
-
-def _differing(before: Transform, wanted: Transform) -> str:
-    """Return the differing parameters of two transforms as text; "" if there are none."""
-    if type(before) is not type(wanted):
-        return f"{type(wanted).__name__}, not {type(before).__name__}"
-    names = [f.name for f in fields(before) if not f.metadata.get("context")]
-    pairs = [(name, getattr(before, name), getattr(wanted, name)) for name in names]
-    words = [f"{name} {now}, not {then}" for name, then, now in pairs if then != now]
-    return "; ".join(words[:_NAMED]) + (f"; and {len(words) - _NAMED} more" if len(words) > _NAMED else "")
 
 
 def _main(opened: log.Log, stage: str, topic: str) -> str:

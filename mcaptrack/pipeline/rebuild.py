@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields
-from typing import Any, get_type_hints
+from typing import Any, Final, get_type_hints
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
@@ -18,6 +18,9 @@ from mcaptrack.registry import Entry, find, is_installed
 from mcaptrack.schema.provenance import Plugin, Provenance
 from mcaptrack.transforms import Stage, Transform
 from mcaptrack.transforms.protocol import member_type
+
+#: The maximum number of differing parameters in a message.
+_NAMED: Final = 3
 
 
 class MissingPluginError(McaptrackError):
@@ -164,3 +167,13 @@ def _name_with_package(kind: str, plugin: Plugin) -> str:
 
 def _plugin(entry: Entry) -> Plugin:
     return Plugin(entry.name, entry.implementation, entry.distribution, entry.version)
+
+
+def differing(before: Transform, wanted: Transform) -> str:
+    """Return the differing parameters of two transforms as text; "" if there are none."""
+    if type(before) is not type(wanted):
+        return f"{type(wanted).__name__}, not {type(before).__name__}"
+    names = [f.name for f in fields(before) if not f.metadata.get("context")]
+    pairs = [(name, getattr(before, name), getattr(wanted, name)) for name in names]
+    words = [f"{name} {now}, not {then}" for name, then, now in pairs if then != now]
+    return "; ".join(words[:_NAMED]) + (f"; and {len(words) - _NAMED} more" if len(words) > _NAMED else "")

@@ -35,7 +35,7 @@ from mcaptrack.schema.camera_motion import to_pictures, to_scene
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import row_ends, unique_values
-from mcaptrack.schema.provenance import Provenance
+from mcaptrack.schema.provenance import FUSE, Provenance
 from mcaptrack.sources.camera_motion import tracks_topic
 from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead
@@ -86,17 +86,19 @@ def run(
     plane: PlaneChoice = AS_BEFORE,
     boxes: BoxesRead | None = None,
     zones: ZoneWatch | None = None,
+    fused: Mapping[str, Made] = {},
 ) -> Report:
     """Run the jobs, and write their channels and views into the log, or into a copy of it at ``output``.
 
     With ``watch`` the last stage finds events of tracks, if they are missing or out of date. ``plane`` says how to make
     a ground plane where none is given. ``boxes`` keeps boxes of other software that are read. With ``zones`` these are
-    counted, or those that were counted before.
+    counted, or those that were counted before. ``fused`` are channels that were made again from those of several
+    cameras, to begin with.
 
     The log is replaced as a whole, after everything was computed.
     """
     with collected() as warnings:
-        report = _run(opened, prefix, jobs, output, progress, watch, plane, boxes or BoxesRead(), zones)
+        report = _run(opened, prefix, jobs, output, progress, watch, plane, boxes or BoxesRead(), zones, fused)
     report.warnings = list(dict.fromkeys(warnings))
     return report
 
@@ -111,10 +113,13 @@ def _run(
     choice: PlaneChoice,
     boxes: BoxesRead,
     zones: ZoneWatch | None,
+    fused: Mapping[str, Made],
 ) -> Report:
-    made: dict[str, Made] = {}
+    made: dict[str, Made] = dict(fused)
     stamps: dict[str, list[int]] = {}
-    report = Report()
+    report = Report(stages=[FUSE] if fused else [])
+    for topic, channel in fused.items():
+        report.count(topic, channel)
     planes, part = read_planes(opened, prefix), report.watch.part
     for job in jobs:
         with part("read"):
@@ -168,7 +173,7 @@ def outdated_by(opened: log.Log, digests: Mapping[str, str]) -> list[str]:
     found = []
     for topic, there in sorted(opened.channels.items()):
         known = Provenance.from_metadata(there.metadata)
-        if topic not in digests and known and known.transform in {*STAGES, EVENTS_STAGE, ZONES_STAGE}:
+        if topic not in digests and known and known.transform in {*STAGES, EVENTS_STAGE, ZONES_STAGE, FUSE}:
             is_late = any(digests.get(name, then) != then for name, then in known.made_from().items())
             found += [topic] if is_late else []
     return found

@@ -16,7 +16,7 @@ from mcaptrack import __version__
 T = TypeVar("T", dict[str, Any], list[Any])
 _PREFIX: Final = "mcaptrack."
 #: ``transform`` of channels that were ingested, and of views.
-INGEST, VIEW = "ingest", "view"
+INGEST, VIEW, FUSE = "ingest", "view", "fuse"
 #: The metadata record with the start time of a log's cameras, ``start_ns``.
 CLOCK: Final = "mcaptrack.clock"
 

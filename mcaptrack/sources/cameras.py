@@ -96,6 +96,11 @@ def find_camera(opened: log.Log, name: str | None = None, topic: str | None = No
     return usual[0]
 
 
+def camera_to_name(opened: log.Log, topic: str) -> str:
+    """Return the name of the camera of a topic, as a command has to name it; "" if the log has no other."""
+    return _prefix_of_topic(opened, topic)[1:] if len(cameras(opened)) > 1 else ""
+
+
 def _with_pictures_first(opened: log.Log, known: list[Camera]) -> list[Camera]:
     """Return the cameras without those that are boxes in space alone, if there are others; or else all."""
     return [camera for camera in known if not camera.in_space or _has_own_channels(opened, camera)] or known

@@ -13,11 +13,14 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.schema import DETECTIONS, SIGHTINGS, Frame, Rows, Schema
 from mcaptrack.transforms.fuse.grouping import Places, group, means
 from mcaptrack.transforms.fuse.view import Views
-from mcaptrack.transforms.protocol import check_options, context, option
+from mcaptrack.transforms.protocol import Suited, check_options, context, option
 
 #: How often a box of another object, or a false one, fits a group by chance.
 _CHANCE: Final = 0.1
 _LEAST, _MOST = 0.02, 0.98
+#: Limits of people's motion for a tracker of the result (see ``motion_limits``).
+_WALKS: Final = "person=:0.4::1.2"
+_TRACKED: Final = MappingProxyType({"birth_score": 0.8, "confirm_score": 2.0, "max_age_s": 1.0, "class_limits": _WALKS})
 _COV: Final = ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2")
 
 
@@ -63,6 +66,10 @@ class FootFuser:
 
     reads: ClassVar[Schema] = SIGHTINGS
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": DETECTIONS, "sightings": SIGHTINGS})
+
+    #: Scores are probabilities, so that few tracks need begin by mistake; people who stand are seen all the time; and
+    #: positions are exact enough to expect steady walks.
+    suits: ClassVar[Mapping[str, Suited]] = MappingProxyType({"tracker": Suited("ground", _TRACKED)})
 
     def __post_init__(self) -> None:
         check_options(self)

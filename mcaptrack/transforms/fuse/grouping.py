@@ -31,10 +31,11 @@ def distances(x: Floats, y: Floats, xx: Floats, xy: Floats, yy: Floats) -> Float
 
 
 def group(camera: Ints, places: Places, gate: float, farthest_m: float) -> Ints:
-    """Join boxes until no two groups fit together; returns the group of each box (N,).
+    """Join boxes that fit together, until as few groups are left as there can be; returns the group of each box (N,).
 
     Pairs are joined in order of their distance, if the groups that they are in by then still fit: no camera is twice in
-    a group, and the means of the two are within the gate. A box that fits no other is a group of its own.
+    a group, and the means of the two are within the gate. A box that fits no other is a group of its own. Then a
+    group is dissolved if all its boxes fit others (``_dissolved``).
 
     Parameters
     ----------
@@ -68,8 +69,74 @@ def group(camera: Ints, places: Places, gate: float, farthest_m: float) -> Ints:
         seen[low] |= seen[high]
         inverse[low] = [a + b for a, b in zip(inverse[low], inverse[high], strict=True)]
         weighted[low] = [a + b for a, b in zip(weighted[low], weighted[high], strict=True)]
-    roots = np.array([_root(owner, one) for one in range(count)], np.int64)
-    return np.unique(roots, return_inverse=True)[1].astype(np.int64)
+    of = np.unique([_root(owner, one) for one in range(count)], return_inverse=True)[1].astype(np.int64)
+    return _dissolved(camera, places, of, gate, farthest_m)
+
+
+def _dissolved(camera: Ints, places: Places, of: Ints, gate: float, farthest_m: float) -> Ints:
+    """Give the boxes of a group to others near it, where all of them fit there; returns the group of each box (N,).
+
+    Where people stand close together, boxes of two of them may have been joined to a third person. Then the two lack
+    these boxes. The group with the fewest boxes goes first. A box takes a place in another group if this has none of
+    its camera, or if the one that it has fits another group.
+    """
+    count = int(of.max(initial=-1)) + 1
+    centre = means(places, of, count)
+    x, y = (centre.xy_m[:, None] - centre.xy_m).transpose(2, 0, 1)
+    near = x * x + y * y <= (2 * farthest_m) ** 2
+    np.fill_diagonal(near, False)
+    size = np.bincount(of, minlength=count)
+    tried = np.flatnonzero(near.any(axis=1))
+    if not len(tried):
+        return of
+    box, to = np.nonzero(near[of])
+    apart = places.xy_m[box] - centre.xy_m[to]
+    away = distances(*apart.T, *(places.cov[box] + centre.cov[to]).T)
+    fits = (away <= gate) & ((apart**2).sum(axis=1) <= farthest_m**2)
+    choices: dict[int, list[tuple[float, int]]] = {}
+    for one, group_, value in zip(box[fits].tolist(), to[fits].tolist(), away[fits].tolist(), strict=True):
+        choices.setdefault(one, []).append((value, group_))
+    for options in choices.values():
+        options.sort()
+    owner, cameras = of.tolist(), camera.tolist()
+    slots = [dict[int, int]() for _ in range(count)]
+    for one, (group_, of_camera) in enumerate(zip(owner, cameras, strict=True)):
+        slots[group_][of_camera] = one
+    for group_ in tried[np.argsort(size[tried], kind="stable")].tolist():
+        moves = _moves(group_, slots, cameras, choices)
+        if moves is None:
+            continue
+        for one, _ in moves:
+            slots[owner[one]].pop(cameras[one])
+        for one, new in moves:
+            slots[new][cameras[one]] = one
+            owner[one] = new
+    return np.unique(owner, return_inverse=True)[1].astype(np.int64)
+
+
+def _moves(
+    group_: int, slots: list[dict[int, int]], cameras: list[int], choices: dict[int, list[tuple[float, int]]]
+) -> list[tuple[int, int]] | None:
+    """The boxes that move if a group is dissolved, each with its new group; None if one has no place."""
+    moves: list[tuple[int, int]] = []
+    for of_camera, one in slots[group_].items():
+        best: tuple[float, list[tuple[int, int]]] | None = None
+        for away, to in choices.get(one, ()):
+            if not slots[to] or (best and away >= best[0]):
+                continue
+            other = slots[to].get(of_camera)
+            if other is None:
+                best = away, [(one, to)]
+                continue
+            for further, next_ in choices.get(other, ()):
+                if next_ != group_ and slots[next_] and of_camera not in slots[next_]:
+                    if not best or away + further < best[0]:
+                        best = away + further, [(one, to), (other, next_)]
+                    break
+        if best is None:
+            return None
+        moves += best[1]
+    return moves
 
 
 def _root(owner: list[int], one: int) -> int:

@@ -15,7 +15,8 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats, Indices
 from mcaptrack.geometry.assignment import max_weight_matching
 from mcaptrack.geometry.oriented_boxes import bev_iou_of_pairs
-from mcaptrack.transforms.ground.state import BOX, CLASS, GATE_M, HITS, MISSED_S, NOISE, X, Y, variance
+from mcaptrack.transforms.ground.covariances import Covariances
+from mcaptrack.transforms.ground.state import BOX, CLASS, GATE_M, HITS, MISSED_S, NOISE, SCORE, X, Y, measured, variance
 
 Cost = Literal["metres", "iou"]
 
@@ -26,26 +27,34 @@ _OTHER_GATE: Final = 9.0
 _OTHER_SHARE: Final = 0.4
 #: The gain of a pair without any distance.
 _GAIN: Final = 30.0
+#: Scores count as probabilities from this one to 1 minus it.
+_LEAST_SCORE: Final = 0.02
 #: Detections that a track of another class needs before.
 _OTHER_HITS: Final = 2
 
 
 def associate(
-    table: Floats, found: Floats, cost: Cost, min_iou: float, across_classes: bool
+    table: Floats,
+    found: Floats,
+    cost: Cost,
+    min_iou: float,
+    across_classes: bool,
+    covariances: Covariances | None = None,
 ) -> tuple[Indices, Indices, Bools]:
-    """Tracks and detections that belong together, (P,) each, and whether they have the same class."""
+    """Tracks and detections that belong together, (P,) each, and whether they have the same class.
+
+    With the ``covariances`` of the tracks, these and those of the detections count instead of usual ones.
+    """
     if not table.shape[1] or not found.shape[1]:
         nothing = np.empty(0, np.intp)
         return nothing, nothing, np.empty(0, bool)
-    x, y = found[X] - table[X, :, None], found[Y] - table[Y, :, None]
-    squared = x * x + y * y
-    spread = variance(table)
+    apart = _Apart(table, found, covariances)
     reach = table[GATE_M] * (1 + table[MISSED_S])
     same = table[CLASS, :, None] == found[CLASS]
-    near = squared <= np.minimum(_GATE * spread, reach * reach)[:, None]
+    near = apart.within(_GATE, reach)
     if across_classes:
         same = np.ones_like(same)
-    track, row = _assigned(table, found, squared, spread, near & same, cost, min_iou)
+    track, row = _assigned(table, found, apart, near & same, cost, min_iou)
     is_same = np.ones(len(track), bool)
     if across_classes or same.all():
         return track, row, is_same
@@ -55,14 +64,49 @@ def associate(
     other = near & lost[:, None] & free
     if not other.any():
         return track, row, is_same
-    limit = np.minimum(_OTHER_GATE * spread, np.maximum(_OTHER_SHARE * reach, 3 * table[NOISE]) ** 2)
-    more = _assigned(table, found, squared, spread, other & (squared <= limit[:, None]), cost, min_iou)
+    nearer = apart.within(_OTHER_GATE, np.maximum(_OTHER_SHARE * reach, 3 * table[NOISE]))
+    more = _assigned(table, found, apart, other & nearer, cost, min_iou)
     is_same = np.concatenate([is_same, np.zeros(len(more[0]), bool)])
     return np.concatenate([track, more[0]]), np.concatenate([row, more[1]]), is_same
 
 
+class _Apart:
+    """Distances of detections (rows, N) from the predicted positions of tracks (rows, K)."""
+
+    def __init__(self, table: Floats, found: Floats, covariances: Covariances | None) -> None:
+        x, y = found[X] - table[X, :, None], found[Y] - table[Y, :, None]
+        self._squared = x * x + y * y
+        self._spread = variance(table)
+        self._deviations: Floats | None = None
+        if covariances is not None:
+            count = found.shape[1]
+            noise = np.stack([measured(np.full(count, one), found) for one in table[NOISE].tolist()])
+            xx, xy, yy = covariances.places()[:, :, None] + np.moveaxis(noise, 2, 0)
+            #: Twice the log-odds that detections are true; their scores are probabilities.
+            share = np.clip(np.where(np.isnan(found[SCORE]), 0.5, found[SCORE]), _LEAST_SCORE, 1 - _LEAST_SCORE)
+            self._odds = 2 * np.log(share / (1 - share))
+            self._area = xx * yy - xy * xy
+            self._deviations = (yy * x * x - 2 * xy * x * y + xx * y * y) / self._area
+
+    def within(self, gate: float, reach_m: Floats) -> Bools:
+        """Whether pairs (K, N) are within ``gate`` squared standard deviations, and ``reach_m`` of their track (K,)."""
+        if self._deviations is None:
+            return np.asarray(self._squared <= np.minimum(gate * self._spread, reach_m * reach_m)[:, None])
+        return np.asarray((self._deviations <= gate) & (self._squared <= (reach_m * reach_m)[:, None]))
+
+    def gain(self, track: Indices, row: Indices) -> Floats:
+        """The gain of pairs (P,): twice the logarithm of their likelihood, but for a constant.
+
+        Where detections have covariances it is twice that of a ratio: to the detection being false.
+        """
+        if self._deviations is None:
+            s = self._spread[track]
+            return np.asarray(_GAIN - self._squared[track, row] / s - 2 * np.log(s))
+        return np.asarray(_GAIN - self._deviations[track, row] - np.log(self._area[track, row]) + self._odds[row])
+
+
 def _assigned(
-    table: Floats, found: Floats, squared: Floats, spread: Floats, allowed: Bools, cost: Cost, min_iou: float
+    table: Floats, found: Floats, apart: _Apart, allowed: Bools, cost: Cost, min_iou: float
 ) -> tuple[Indices, Indices]:
     """The best assignment of the allowed pairs (K, N)."""
     track, row = allowed.nonzero()
@@ -73,8 +117,7 @@ def _assigned(
         good = gain >= max(min_iou, 1e-6)
         track, row, gain = track[good], row[good], gain[good]
     else:
-        s = spread[track]
-        gain = _GAIN - squared[track, row] / s - 2 * np.log(s)
+        gain = apart.gain(track, row)
     if not len(track):
         return track, row
     (track, row), _ = max_weight_matching((track, row), np.round(gain, 6), allowed.shape)

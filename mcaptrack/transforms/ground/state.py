@@ -17,11 +17,14 @@ import numpy as np
 
 from mcaptrack.geometry.angles import wrapped
 from mcaptrack.geometry.arrays import Bools, Floats, Indices
+from mcaptrack.transforms.ground.covariances import Covariances, along_axes
 from mcaptrack.transforms.motion_limits import MotionLimits
 
 # Rows of detections.
 X, Y, Z, LENGTH, WIDTH, HEIGHT, HEADING, VX, VY, SCORE, CLASS, SOURCE = range(12)
 DETECTION_ROWS: Final = 12
+#: Detections that have covariances have three rows more: xx, xy, yy.
+COVARIANCE: Final = slice(DETECTION_ROWS, DETECTION_ROWS + 3)
 PLACE: Final = slice(X, Y + 1)
 #: Position, size and heading.
 BOX: Final = slice(X, HEADING + 1)
@@ -68,10 +71,14 @@ def no_tracks() -> Floats:
 
 
 class GroundTracks:
-    """The tracks that are alive: ``table`` (rows, K), and the scores of the classes that each had, ``votes`` (C, K)."""
+    """The tracks that are alive: ``table`` (rows, K), and the scores of the classes that each had, ``votes`` (C, K).
+
+    From the first detection with a covariance on, ``covariances`` are those of the tracks.
+    """
 
     def __init__(self) -> None:
         self.table: Floats = no_tracks()
+        self.covariances: Covariances | None = None
         self.votes: Floats = np.zeros((0, 0))
         self._classes: dict[int, int] = {}
 
@@ -81,13 +88,24 @@ class GroundTracks:
     def keep(self, which: Bools) -> None:
         """Keep some of the tracks."""
         self.table, self.votes = self.table.compress(which, axis=1), self.votes.compress(which, axis=1)
+        if self.covariances:
+            self.covariances.values = self.covariances.values.compress(which, axis=0)
+
+    def expect_covariances(self) -> None:
+        """Begin to keep a covariance over both axes for each track."""
+        if self.covariances is None:
+            self.covariances = Covariances(self.table[_COVARIANCE])
 
     def predict(self, dt: float) -> None:
         """Predict all tracks by ``dt`` seconds."""
         t = self.table
         if dt <= 0 or not len(self):
             return
-        _predict_covariance(t[_COVARIANCE], t[_DRIFT], t[_TURNS], dt)
+        if self.covariances:
+            self.covariances.predict(*_transition(t[_DRIFT], t[_TURNS], dt))
+            t[_COVARIANCE] = self.covariances.means()
+        else:
+            _predict_covariance(t[_COVARIANCE], t[_DRIFT], t[_TURNS], dt)
         fade = np.exp(-dt / _FADES_S)
         g, f = _FADES_S * (1 - fade), _FADES_S * (dt - _FADES_S * (1 - fade))
         vx, vy, ax, ay = t[VX], t[VY], t[_AX], t[_AY]
@@ -123,7 +141,12 @@ class GroundTracks:
     def update(self, track: Indices, found: Floats, is_same_class: Bools, frame: int) -> None:
         """Correct tracks (N,) with one detection each, (rows, N), at a frame."""
         t = self.table[:, track]
-        _correct(t, found)
+        if self.covariances:
+            gain = self.covariances.correct(track, measured(t[NOISE], found))
+            _move(t, *along_axes(gain, found[PLACE] - t[PLACE]))
+            t[_COVARIANCE] = self.covariances.means()[:, track]
+        else:
+            _correct(t, found)
         self._vote(track, found)
         weight = is_same_class.astype(float)
         _follow_box(t, found, weight)
@@ -141,7 +164,7 @@ class GroundTracks:
         """Start a track at each of these detections, (rows, N)."""
         count = found.shape[1]
         t = np.zeros((_ROWS, count))
-        t[:DETECTION_ROWS] = found
+        t[:DETECTION_ROWS] = found[:DETECTION_ROWS]
         rows = [limits[int(one)] for one in found[CLASS].tolist()]
         t[NOISE] = [row.noise_m for row in rows]
         t[GATE_M] = [row.gate_m for row in rows]
@@ -164,6 +187,8 @@ class GroundTracks:
         t[HITS] = 1
         t[LAST_FRAME] = frame
         t[LAST], t[LAST_VELOCITY], t[LAST_SPREAD], t[FIRST] = t[BOX], t[_VELOCITY], t[_VV], t[PLACE]
+        if self.covariances:
+            self.covariances.add(t[_COVARIANCE], measured(t[NOISE], found))
         self.table = np.concatenate([self.table, t], axis=1)
         self.votes = np.concatenate([self.votes, np.zeros((len(self.votes), count))], axis=1)
         self._vote(np.arange(len(self) - count, len(self)), found)
@@ -191,6 +216,17 @@ class GroundTracks:
         return np.asarray(classes[self.votes[:, track].argmax(axis=0)], float)
 
 
+def measured(noise_m: Floats, found: Floats) -> Floats:
+    """The covariances (N, 3) of detections (rows, N) of tracks with this noise (N,).
+
+    Their own covariance says how well the cameras place them; people and boxes sway by the noise of their class, too.
+    """
+    out = np.stack([noise_m**2, np.zeros_like(noise_m), noise_m**2], axis=-1)
+    if found.shape[0] > DETECTION_ROWS:
+        out += np.nan_to_num(found[COVARIANCE].T)
+    return out
+
+
 def variance(table: Floats) -> Floats:
     """The variance of the predicted measurement of each track, per axis, (K,)."""
     return np.asarray(table[_PP] + table[NOISE] ** 2)
@@ -211,16 +247,32 @@ def _predict_covariance(cov: Floats, drift: Floats, turns: Floats, dt: float) ->
     cov[5] = fade**2 * aa + (1 - fade**2) * lasting**2
 
 
+def _transition(drift: Floats, turns: Floats, dt: float) -> tuple[Floats, Floats]:
+    """The transition (3, 3) of one axis by ``dt`` seconds, and the covariance (K, 3, 3) that is added to each track."""
+    fade = np.exp(-dt / _FADES_S)
+    g, f = _FADES_S * (1 - fade), _FADES_S * (dt - _FADES_S * (1 - fade))
+    added = np.zeros((6, len(drift)))
+    _predict_covariance(added, drift, turns, dt)
+    pp, pv, pa, vv, va, aa = added
+    out = np.stack([pp, pv, pa, pv, vv, va, pa, va, aa], axis=-1).reshape(-1, 3, 3)
+    return np.array([[1.0, dt, f], [0.0, 1.0, g], [0.0, 0.0, fade]]), out
+
+
 def _correct(t: Floats, found: Floats) -> None:
     """Correct the motion of tracks (rows, N) with the positions of detections, in place."""
     off = found[PLACE] - t[PLACE]
     pp, pv, pa, vv, va, aa = t[_COVARIANCE].copy()
     s = pp + t[NOISE] ** 2
     kp, kv, ka = pp / s, pv / s, pa / s
-    t[PLACE] += kp * off
-    t[_VELOCITY] += kv * off
-    t[_ACCELERATION] += ka * off
+    _move(t, kp * off, kv * off, ka * off)
     t[_COVARIANCE] = pp - kp * pp, pv - kp * pv, pa - kp * pa, vv - kv * pv, va - kv * pa, aa - ka * pa
+
+
+def _move(t: Floats, place: Floats, velocity: Floats, acceleration: Floats) -> None:
+    """Correct positions, velocities and accelerations of tracks (rows, N), in place, by (2, N) each."""
+    t[PLACE] += place
+    t[_VELOCITY] += velocity
+    t[_ACCELERATION] += acceleration
     speed = np.hypot(t[VX], t[VY])
     t[_VELOCITY] *= np.minimum(1.0, t[_MAX_SPEED] / np.maximum(speed, 1e-9))
 

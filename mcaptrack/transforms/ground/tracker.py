@@ -22,6 +22,7 @@ from mcaptrack.transforms.ground.lost_tracks import LostTracks, continuations
 from mcaptrack.transforms.ground.output import Waiting, rows_to_frames
 from mcaptrack.transforms.ground.state import (
     CLASS,
+    DETECTION_ROWS,
     ID,
     IS_CONFIRMED,
     LAST_FRAME,
@@ -64,6 +65,8 @@ _COLUMNS: Final = (
     "class_id",
     "source_id",
 )
+#: The same of covariances, where there are any.
+_COVARIANCES: Final = ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +76,9 @@ class GroundTracker:
     Reads detections with positions in metres, writes tracks with positions, sizes, headings and velocities. Detections
     are assigned on the ground plane, a class at a time, to the positions that Kalman filters predict: at constant
     velocity, and on arcs for vehicles. Limits of their motion come from a table by class.
+
+    Detections of several cameras have covariances, by which they are gated, compared and weighted, and scores that are
+    probabilities; from the first such detection on each track has a covariance over both axes.
 
     Rows are written ``delay_s`` late: a track is written from its first detection on if it is confirmed in that time,
     and gaps that end in it are interpolated.
@@ -201,9 +207,13 @@ class _Run:
         dt = 0.0 if self._last_ns is None else (frame.t_ns - self._last_ns) / NS_PER_S
         self._last_ns = frame.t_ns
         found = self._detections(frame)
+        if len(found) > DETECTION_ROWS:
+            tracks.expect_covariances()
         tracks.predict(dt)
         self._lost.wait(dt)
-        track, row, is_same = associate(tracks.table, found, options.cost, options.min_iou, options.across_classes)
+        track, row, is_same = associate(
+            tracks.table, found, options.cost, options.min_iou, options.across_classes, tracks.covariances
+        )
         before = tracks.table[:, track]
         if len(track):
             tracks.update(track, found[:, row], is_same, self._frame)
@@ -265,6 +275,10 @@ class _Run:
         """The detections of a frame that are used, in an order of their own: (rows, N)."""
         rows, options = frame.rows, self._options
         found = np.stack([rows[name] for name in _COLUMNS]).astype(float)
+        xx, xy, yy = given = np.stack([rows[name] for name in _COVARIANCES])
+        is_given = (xx > 0) & (yy > 0) & (xy * xy < xx * yy) & np.isfinite(given).all(axis=0)
+        if is_given.any():
+            found = np.concatenate([found, np.where(is_given, given, np.nan)])
         used = np.isfinite(found[X]) & np.isfinite(found[Y])
         self._left_out += len(rows) - int(used.sum())
         if options.min_score is not None:

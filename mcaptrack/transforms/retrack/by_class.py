@@ -24,7 +24,8 @@ class Movers(NamedTuple):
     All of re-tracking is made for people. Other classes are re-tracked in a unit of length in which they move as people
     do: ``unit_m`` metres. ``on_ground`` says that a tracker made their tracks in metres, with velocities, and not
     from boxes in pictures: detections don't merge where objects occlude one another, and the tracker has confirmed each
-    track by the scores of its detections. ``usual_score`` is the median score of the log,
+    track by the scores of its detections. It knows more than samples say, unless people were detected at no higher rate
+    than that of the samples; those are re-tracked like others. ``usual_score`` is the median score of the log,
     ``drift_m_per_s`` how much velocities change within a second, None for what the options say.
     """
 
@@ -51,12 +52,19 @@ def movers_of(frames: Sequence[Frame], class_names: ClassNames, usual_score: flo
     first = next((frame for frame in frames if len(frame.rows)), None)
     if first is None:
         return PEOPLE
-    on_ground = not has_any(TRACKS, frames, lambda rows: ~np.isfinite(rows["vx_m_per_s"]))
     number = int(first.rows["class_id"][0])
     limits = limits_by_class([number], class_names, class_limits)[number]
+    has_velocities = not has_any(TRACKS, frames, lambda rows: ~np.isfinite(rows["vx_m_per_s"]))
+    on_ground = has_velocities and not (limits.name == "person" and _is_slow(frames))
     drift_m_per_s = limits.drift_m_per_s if on_ground else None
     (unit_m,) = units_m([number], class_names, class_limits)
     return Movers(unit_m, on_ground, usual_score, drift_m_per_s)
+
+
+def _is_slow(frames: Sequence[Frame]) -> bool:
+    """Whether tracks are at no higher rate than their samples: pictures are counted by the frames' ``index``."""
+    passed = np.diff(frame_numbers(frames))
+    return bool(len(passed)) and float(np.median(passed)) <= 1
 
 
 def split_classes(frames: FrameColumns) -> list[FrameColumns]:
