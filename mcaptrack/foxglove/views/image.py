@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.foxglove import Annotations, colours
+from mcaptrack.foxglove.views import label_places
 from mcaptrack.foxglove.views.people import (
     ForecastPaths,
+    People,
     PeopleInParts,
     by_count,
     by_plane,
@@ -108,6 +110,8 @@ def tracks(
         longest = lines.row.shape[1] - 1
         rgb = np.broadcast_to(_WHITE, (len(people.number), 3)) if style.is_white else colours(people.number)
         alpha = np.where(people.observed, OBSERVED, INTERPOLATED)
+        named = np.flatnonzero(has_box | has_place)
+        corner = _label_corners(people, named, has_box[named], unit, style, pictures.t_ns)
         for span, drawn in pictures.batches(first, last):
             rows = np.arange(*np.searchsorted(people.frame, [span.start, span.stop]))
             boxed, marked = rows[has_box[rows]], rows[~has_box[rows] & has_place[rows]]
@@ -128,17 +132,30 @@ def tracks(
                     drawn.pairs(
                         of, segments(walked, style.dash), shade, fade(points - 1, longest), style.thickness * unit
                     )
-            named = np.concatenate([boxed, marked])
-            named.sort()
-            corner = np.where(has_box[named, None], people.box_px[named, :2], people.foot_px[named])
-            size = np.where(has_box[named, None], people.box_px[named, 2:], 0.0)
-            words_px = _WORDS_PX * unit
-            if style.name_at == "below":
-                corner = corner + size * [0, 1] + [0, words_px + style.thickness * unit]
-            elif style.name_at == "beside":
-                corner = corner + size * [1, 0] + [style.thickness * unit, words_px]
-            drawn.labels(frame[named], corner, people.label[named], rgb[named], words_px)
+            these = slice(*np.searchsorted(named, rows[[0, -1]] + [0, 1])) if len(rows) else slice(0)
+            of = named[these]
+            drawn.labels(frame[of], corner[these], people.label[of], rgb[of], _WORDS_PX * unit)
             yield from pictures.numbered(span, drawn)
+
+
+def _label_corners(
+    people: People, named: Ints, has_box: NDArray[np.bool_], unit: float, style: TrackStyle, at_ns: Ints
+) -> Floats:
+    """The lower left corners of the labels of some people (N, 2): at their boxes, and away from each other."""
+    corner = np.where(has_box[:, None], people.box_px[named, :2], people.foot_px[named])
+    size = np.where(has_box[:, None], people.box_px[named, 2:], 0.0)
+    words_px = _WORDS_PX * unit
+    if style.name_at == "below":
+        corner = corner + size * [0, 1] + [0, words_px + style.thickness * unit]
+    elif style.name_at == "beside":
+        corner = corner + size * [1, 0] + [style.thickness * unit, words_px]
+    else:
+        corner = np.maximum(corner, [-np.inf, words_px])  # not above the picture
+    extent = label_places.extents(people.label[named], words_px)
+    is_down = style.name_at != "above"
+    number, frame = people.number[named], people.frame[named]
+    corner[:, 1] += label_places.shifts(at_ns, frame, number, corner, extent, is_down)
+    return corner
 
 
 def _moved(points: Floats, then_ns: Ints, now_ns: Ints, path: CameraPath | None) -> Floats:
