@@ -10,6 +10,7 @@ from typing import Any, Literal
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.common import PathLike, as_location, warnings_about
+from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.transform_series import TransformSeries
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice, warn
@@ -35,6 +36,8 @@ class ChannelInfo:
         Name of its schema, and encoding of its messages.
     messages : int
         Number of messages.
+    rate_hz : float or None
+        Messages per second of the log; None for less than two messages, and for a log without length.
     transform, input, version : str or None
         What made it, from which channel, and with which version of mcaptrack; None if it was recorded by others.
     plugins : dict or None
@@ -58,6 +61,7 @@ class ChannelInfo:
     schema: str
     encoding: str
     messages: int
+    rate_hz: float | None
     transform: str | None
     input: str | None
     version: str | None
@@ -229,6 +233,7 @@ def _channel(opened: logs.Log, part: logs.Log, channel: logs.Channel) -> Channel
         schema=channel.schema_name,
         encoding=channel.message_encoding,
         messages=channel.messages,
+        rate_hz=_rate(opened, channel.messages),
         transform=made.transform if made else None,
         input=made.input or None if made else None,
         version=made.version if made else None,
@@ -238,6 +243,12 @@ def _channel(opened: logs.Log, part: logs.Log, channel: logs.Channel) -> Channel
         frame=frame_id_of(channel.metadata) or None,
         stale=not replaced and pipeline.is_stale(opened, channel.topic),
     )
+
+
+def _rate(opened: logs.Log, messages: int) -> float | None:
+    """Return the messages per second of a log, rounded: the summary holds no times of a single channel."""
+    span_ns = opened.end_ns - opened.start_ns
+    return round((messages - 1) / (span_ns / NS_PER_S), 3) if messages > 1 and span_ns > 0 else None
 
 
 def _frames(opened: logs.Log) -> tuple[FrameInfo, ...]:

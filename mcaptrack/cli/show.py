@@ -67,14 +67,17 @@ def _print(data: dict[str, Any], verbose: bool) -> None:
     seconds = (data["end_ns"] - data["start_ns"]) / 1e9
     name = Text(printable(data["log"]), "bold")
     out.print(name, f" {data['bytes']:,} bytes, {data['messages']:,} messages, {seconds:.3f} s")
+    out.print(f"starts at {_when(data['start_ns'])}" if data["messages"] else "no messages")
     if data["results"]:
         out.print(f"with results in {data['results']}")
     table = Table(box=None, pad_edge=False)
-    for column in ("topic", "schema", "messages"):
-        table.add_column(column, justify="right" if column == "messages" else "left", overflow="fold")
+    for column in ("topic", "schema", "messages", "per second"):
+        is_number = column in ("messages", "per second")
+        table.add_column(column, justify="right" if is_number else "left", overflow="fold")
     for channel in data["channels"]:
         topic = channel["topic"] + ("  (replaced by the results)" if channel["replaced"] else "")
-        table.add_row(topic, channel["schema"], f"{channel['messages']:,}")
+        rate = "" if channel["rate_hz"] is None else f"{channel['rate_hz']:.1f}"
+        table.add_row(topic, channel["schema"], f"{channel['messages']:,}", rate)
     out.print(table)
     shown = {channel["topic"]: channel for channel in reversed(data["channels"]) if not channel["replaced"]}
     out.print(_lineage([*reversed(shown.values())], verbose))
@@ -82,6 +85,17 @@ def _print(data: dict[str, Any], verbose: bool) -> None:
         out.print(_frames(data["frames"], data["start_ns"]) if data["frames"] else "no transforms")
 
 
+def _when(t_ns: int) -> str:
+    """A time of a log: date and time if it is one, otherwise seconds."""
+    from datetime import UTC, datetime
+
+    if t_ns < _FIRST_DATE_NS:
+        return f"{t_ns / 1e9:.3f} s"
+    return f"{datetime.fromtimestamp(t_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S}.{t_ns % 10**9 // 10**6:03d} UTC"
+
+
+#: Earlier times are not dates but seconds since something began: the year 1980.
+_FIRST_DATE_NS: Final = 315_532_800 * 10**9
 #: Deepest level of drawn trees. Channels and frames below it are drawn at this level, beside their input or parent.
 _DEEPEST: Final = 30
 #: The most gaps, or jumps, of a frame that are shown one by one.
