@@ -19,10 +19,8 @@ from mcaptrack.api.health import doctor as doctor
 from mcaptrack.api.ingesting import IngestResult as IngestResult
 from mcaptrack.api.ingesting import ingest as ingest
 from mcaptrack.api.outputs import ExportResult as ExportResult
-from mcaptrack.api.outputs import RenderResult as RenderResult
 from mcaptrack.api.outputs import ReportResult as ReportResult
 from mcaptrack.api.outputs import export as export
-from mcaptrack.api.outputs import render as render
 from mcaptrack.api.outputs import report as report
 from mcaptrack.api.querying import ColumnInfo as ColumnInfo
 from mcaptrack.api.querying import TableInfo as TableInfo
@@ -31,6 +29,8 @@ from mcaptrack.api.querying import list_tables as list_tables
 from mcaptrack.api.querying import query as query
 from mcaptrack.api.recording import Recording as Recording
 from mcaptrack.api.recording import open as open  # noqa: A004
+from mcaptrack.api.rendering import RenderResult as RenderResult
+from mcaptrack.api.rendering import render as render
 from mcaptrack.api.rows import detections as detections
 from mcaptrack.api.running import RunResult as RunResult
 from mcaptrack.api.scoring import Scores as Scores

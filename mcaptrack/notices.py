@@ -35,6 +35,7 @@ Code = Literal[
     "left-out",
     "lost",
     "memory",
+    "not-blurred",
     "not-compared",
     "nothing-found",
     "option-not-used",

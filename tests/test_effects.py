@@ -213,6 +213,7 @@ def see(work, tmp_path, monkeypatch) -> Callable[[str], Seen]:
         code, out, err = call(*shlex.split(line))
         out = re.sub(r"(?<=127\.0\.0\.1)(:|%3A)\d{5}\b", ":any", out)  # a port that was free
         out = re.sub(r'"seconds": [\d.]+|"seconds_by_part": \{[^}]*\}', "", out)  # how long it took
+        out = re.sub(r"[\d.]+ GB free", "", out)  # others write there, too
         err = re.sub(r" in [\d.]+ s\b|^  time .*\n", "", err, flags=re.MULTILINE)
         monkeypatch.chdir(tmp_path)
         return Seen(code, out, err, work.changed())
@@ -255,7 +256,12 @@ ALSO = {
         "tune a.mcap --trials 1",
         "tune tall.txt --truth truth.txt --trials 1 --fps 10",
     ],
-    "render": ["render a.mcap -o b.mp4"],
+    "render": [
+        "render a.mcap -o b.mp4",
+        "render a.mcap --blur people -o c.mcap",
+        "render a.mcap --compare --end-s 0.2",
+        "render a.mcap --heatmap",
+    ],
     "ingest": [
         "ingest truth.txt --fps 10 --as truth",
         "ingest truth.txt --fps 10 --as truth --ground-plane plane.txt",

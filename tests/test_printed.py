@@ -293,6 +293,7 @@ class TestRun:
         for topic, rows in one["rows"].items():
             tracks = f"{one['tracks'][topic]:,} tracks, " if topic in one["tracks"] else ""
             assert stated.pop(topic) == f"{tracks}{rows:,} rows in {one['frames'][topic]:,} frames"
+        stated.pop("time", None)  # of a slow machine
         assert list(stated) == ["next"]
         assert one["tracks"].keys() == {"/camera/tracks"}
         with log.read(fresh) as opened:

@@ -196,6 +196,11 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "pipeline/plan.py:_refusal:run": Scene.by_own_tracker,
     "pipeline/plan.py:_not_made:*": Scene.elsewhere,
     "pipeline/shown.py:find_views:run": lambda s: s.untracked().says("render", "LOG"),
+    "viewing/blur/recording.py:blurrable:run": lambda s: s.ingested("clip.mp4").says(
+        "render", "LOG", "--blur", "people", "-o", "c.mcap"
+    ),
+    "viewing/comparing.py:find_panels:run": lambda s: s.untracked().says("render", "LOG", "--compare"),
+    "viewing/heat_map.py:_channel:run": lambda s: s.ingested("clip.mp4").says("render", "LOG", "--heatmap"),
     "viewing/report/contents.py:_score:ingest": lambda s: s.without("/camera/truth*").page(),
     "viewing/report/summary.py:_without_ground_truth:run": lambda s: s.ingested("clip.mp4").page(),
     "viewing/report/sections.py:scores:run": lambda s: s.ingested("clip.mp4").page(),

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast
 
 from mcaptrack import log as logs
-from mcaptrack import pipeline
 from mcaptrack.api.checked import checked
 from mcaptrack.api.common import (
     PathLike,
@@ -37,9 +35,6 @@ from mcaptrack.tables.export import export as write_tables
 from mcaptrack.tables.rosbag2 import Storage, write_bag
 from mcaptrack.tables.rosbag2 import default_folder as default_bag
 from mcaptrack.viewing import report as pages
-from mcaptrack.viewing.rendering import RenderOptions
-from mcaptrack.viewing.rendering import render as draw_video
-from mcaptrack.viewing.rendering import render_from_above as draw_from_above
 
 #: ROS 2 bags by the format of ``export``.
 _BAGS: Mapping[str, Storage] = {"rosbag2": "mcap", "rosbag2-sqlite3": "sqlite3"}
@@ -296,105 +291,3 @@ def _report_on_tables(places: Sequence[Location], output: Path | None, camera: s
         content, data = page_about(places[0], output.parent)
         publish_bytes(output, content)
     return ReportResult(output, len(content), data, tuple(dict.fromkeys(warnings)))
-
-
-@dataclass(frozen=True)
-class RenderResult:
-    """A video with what was drawn on it.
-
-    Attributes
-    ----------
-    log : pathlib.Path or str
-        The log; the URL of one in a store.
-    video : pathlib.Path
-        The video or GIF.
-    pictures : int
-        Number of pictures.
-    views : tuple of str
-        Topics of the views that were drawn.
-    warnings : tuple of mcaptrack.Notice
-        What looks odd.
-
-    """
-
-    log: Location
-    video: Path
-    pictures: int
-    views: tuple[str, ...]
-    warnings: tuple[Notice, ...]
-
-
-@checked(width=(16, 16384), max_fps=(0.01, 1000), start_s=(0, 1e9), end_s=(0, 1e9))
-def render(
-    log: PathLike,
-    output: PathLike | None = None,
-    *,
-    topic: str | Sequence[str] | None = None,
-    width: int | None = None,
-    max_fps: float | None = None,
-    start_s: float = 0.0,
-    end_s: float | None = None,
-    gif: bool = False,
-    camera: str | None = None,
-    force: bool = False,
-    progress: Progress = no_progress,
-) -> RenderResult:
-    """Draw boxes, trails and predictions on the video of a log, or from above if it has none.
-
-    Tracks of 3D boxes are drawn on the pictures of a calibrated camera; without one, they are seen from above in their
-    frame of reference, around the robot.
-
-    Parameters
-    ----------
-    log : path
-        The log.
-    output : path, optional
-        The video, .mp4 or .gif; by default LOG.mp4 beside the log.
-    topic : str or sequence of str, optional
-        Draw these views; by default those that the layout shows.
-    width : int, optional
-        Width in pixels; by default that of the video, or 960 from above.
-    max_fps : float, optional
-        Largest number of pictures per second; by default all, in a GIF 10.
-    start_s, end_s : float, optional
-        Begin and end at these times of the log, in seconds.
-    gif : bool, default False
-        Write LOG.gif if ``output`` names no file.
-    camera : str, optional
-        Name of the camera, if the log has several.
-    force : bool, default False
-        Overwrite the video if it exists.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
-
-    Returns
-    -------
-    RenderResult
-        The video, and what was drawn.
-
-    Raises
-    ------
-    McaptrackError
-        If the log has no pictures and no scenes, or if the video exists.
-
-    Examples
-    --------
-    >>> import mcaptrack
-    >>> mcaptrack.render("log.mcap", "walk.gif", width=160, end_s=1.0).pictures > 1
-    True
-
-    """
-    path = log_location(log)
-    target = optional_path(output) or local_name(path, ".gif" if gif else ".mp4")
-    refuse_overwrite(target, force)
-    options = RenderOptions(width_px=width, max_fps=max_fps, start_s=start_s, end_s=end_s)
-    with warnings_about(path) as warnings, logs.read(path) as opened:
-        warn_unused("the name of the output says what is written", gif=gif and output is not None)
-        prefix = pipeline.find_camera(opened, camera)
-        shown = pipeline.find_views(opened, prefix, names_of(topic))
-        if shown.pictures:
-            count = draw_video(opened, shown.pictures, shown.views, target, options, progress)
-        else:
-            follow = partial(pipeline.robot_path, opened, prefix, shown.views[0])
-            count = draw_from_above(opened, shown.views, target, options, follow, progress)
-    return RenderResult(path, target, count, tuple(shown.views), tuple(dict.fromkeys(warnings)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from mcaptrack.cli import common
 from mcaptrack.cli.many import LogWork, many_options, process, takes_many
@@ -25,6 +25,29 @@ def render(
             panel=_PICTURE,
             help="Draw these views.",
             show_default="as in the layout",
+        ),
+    ] = None,
+    compare: Annotated[
+        bool,
+        common.option(
+            "--compare",
+            panel=_PICTURE,
+            help="Draw SORT, re-tracked and ground truth side by side, with counters of identity switches.",
+        ),
+    ] = False,
+    heatmap: Annotated[
+        bool,
+        common.option(
+            "--heatmap", panel=_PICTURE, help="Draw one picture of where people spend their time: LOG.heatmap.png."
+        ),
+    ] = False,
+    blur: Annotated[
+        Literal["people"] | None,
+        common.option(
+            "--blur",
+            panel=_PICTURE,
+            help="Hide people: in a video, or with -o OUT.mcap in a copy of the log.",
+            show_default="off",
         ),
     ] = None,
     width: Annotated[
@@ -90,22 +113,41 @@ def render(
     Draws the views that Foxglove and Lichtblick show, in the same colours. Tracks of 3D boxes are drawn on the pictures
     of a calibrated camera; without one, they are seen from above, as with --topic /lidar/retracks/full/view/scene.
 
+    With --compare SORT's tracks, re-tracked ones and the ground truth stand side by side. With --heatmap this is a
+    picture (.png, .jpg) of where people spend their time.
+
+    With --blur people all people in the log's detections, tracks and labels are hidden, and nothing is drawn unless
+    --topic names it. What may still show people is listed: other cameras, point clouds, attachments.
+
     Example: mcaptrack render log.mcap -o walk.gif --width 480 --start-s 2 --end-s 8
     """
     import mcaptrack
+    from mcaptrack.api.rendering import default_suffix
     from mcaptrack.fleet import find_logs
 
     def line(done: RenderResult) -> str:
-        return f"{done.pictures} pictures with {', '.join(done.views) or 'nothing drawn'}"
+        if heatmap:
+            return f"where people of {', '.join(done.views)} spend their time"
+        hidden = f", people hidden in {', '.join(done.blurred)}" if done.blurred else ""
+        return f"{done.pictures} pictures with {', '.join(done.views) or 'nothing drawn'}{hidden}"
 
     def data(done: RenderResult) -> dict[str, object]:
-        return {"log": str(done.log), "output": str(done.video), "pictures": done.pictures, "views": list(done.views)}
+        written = {"log": str(done.log), "output": str(done.video), "pictures": done.pictures}
+        return written | {"views": list(done.views), "blurred": list(done.blurred)}
 
-    given: dict[str, Any] = {"topic": topic, "width": width, "max_fps": max_fps, "start_s": start_s, "end_s": end_s}
+    given: dict[str, Any] = {
+        "topic": topic,
+        "compare": compare,
+        "heatmap": heatmap,
+        "blur": blur,
+        "width": width,
+        "max_fps": max_fps,
+    }
+    given |= {"start_s": start_s, "end_s": end_s}
     is_named = many_options().output_dir is not None  # by a name that says what is written
     given |= {"gif": gif and not is_named, "camera": camera, "force": force}
     with common.Talk(quiet, verbose).open() as talk:
-        suffix = ".gif" if gif else ".mp4"
+        suffix = default_suffix(compare=compare, heatmap=heatmap, blur=blur, gif=gif)
         work = LogWork(
             "render",
             mcaptrack.render,

@@ -25,6 +25,8 @@ from mcaptrack.sources.foreign.flatten import message_decoder
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import write_clip
 from mcaptrack.viewing import from_above
+from mcaptrack.viewing.blur.mosaic import hide
+from mcaptrack.viewing.blur.people import HiddenPeople
 from mcaptrack.viewing.from_above import Sight
 
 _LINE_LOOP, _LINE_STRIP, _LINE_LIST = 2, 3, 4
@@ -60,6 +62,7 @@ def render(
     output: Path,
     options: RenderOptions,
     progress: Callable[[str, int, int], None] = lambda *_: None,
+    hidden: HiddenPeople | None = None,
 ) -> int:
     """Draw views on the pictures of a channel and write a video, .mp4 or .gif by the suffix of ``output``.
 
@@ -73,6 +76,8 @@ def render(
     options : RenderOptions
     progress : callable
         Called with "render", the number of finished pictures and their total.
+    hidden : HiddenPeople, optional
+        The people of these pictures, to hide.
 
     Returns
     -------
@@ -84,18 +89,21 @@ def render(
     McaptrackError
         If there are no pictures in the period, or if they can't be decoded.
     """
-    _check_suffix(output)
+    check_suffix(output)
     pictures = Pictures(opened, picture_topic)
     if not len(pictures.t_ns):
         raise McaptrackError(f"{opened.path}: {picture_topic} has no pictures")
-    numbers = _chosen(opened, pictures.t_ns, "pictures", output, options)
+    numbers = chosen_pictures(opened, pictures.t_ns, "pictures", output, options)
     chosen = pictures.t_ns[numbers]
 
     def drawn() -> Iterator[tuple[int, Image]]:
         span = int(chosen[0]), int(chosen[-1]) + 1
-        views = [(_at_times(opened.messages(topic, *span)), message_decoder(opened, topic)) for topic in view_topics]
+        views = [(at_times(opened.messages(topic, *span)), message_decoder(opened, topic)) for topic in view_topics]
         for done, frame in enumerate(pictures.frames(numbers.tolist()), 1):
-            image = _scaled(np.asarray(frame.rows, np.uint8), options.width_px)
+            whole = np.asarray(frame.rows, np.uint8)
+            if hidden is not None:
+                whole, _ = hide(whole, hidden.at(frame.index))
+            image = scaled(whole, options.width_px)
             scale = image.shape[1] / frame.rows.shape[1]
             for view, read in views:
                 payload = view(frame.t_ns)
@@ -104,7 +112,7 @@ def render(
             yield frame.t_ns, image
             progress("render", done, len(chosen))
 
-    return write_clip(output, drawn(), _rate_of(chosen))
+    return write_clip(output, drawn(), rate_of(chosen))
 
 
 def render_from_above(
@@ -139,18 +147,18 @@ def render_from_above(
     McaptrackError
         If there is no scene in the period.
     """
-    _check_suffix(output)
+    check_suffix(output)
     times = opened.times(view_topics[0])
     if not len(times):
         raise McaptrackError(f"{opened.path}: {view_topics[0]} has no scenes")
-    chosen = times[_chosen(opened, times, "scenes", output, options)]
+    chosen = times[chosen_pictures(opened, times, "scenes", output, options)]
     span = int(chosen[0]), int(chosen[-1]) + 1
     path = path_of_robot(chosen)
-    sights = _sights(opened, view_topics, span, options.width_px or _WIDTH_PX, path, len(chosen))
+    seen = sights(opened, view_topics, span, options.width_px or _WIDTH_PX, path, len(chosen))
 
     def drawn() -> Iterator[tuple[int, Image]]:
-        views = [(_at_times(opened.messages(topic, *span)), message_decoder(opened, topic)) for topic in view_topics]
-        for done, (t_ns, sight) in enumerate(zip(chosen.tolist(), sights, strict=True), 1):
+        views = [(at_times(opened.messages(topic, *span)), message_decoder(opened, topic)) for topic in view_topics]
+        for done, (t_ns, sight) in enumerate(zip(chosen.tolist(), seen, strict=True), 1):
             image = draw(from_above.ground(sight), from_above.grid(sight))
             if path is not None:
                 image = draw(image, from_above.robot(sight, path.at_m[done - 1], float(path.heading_rad[done - 1])))
@@ -161,10 +169,10 @@ def render_from_above(
             yield t_ns, image
             progress("render", done, len(chosen))
 
-    return write_clip(output, drawn(), _rate_of(chosen))
+    return write_clip(output, drawn(), rate_of(chosen))
 
 
-def _sights(
+def sights(
     opened: log.Log, topics: Sequence[str], span: tuple[int, int], width_px: int, path: RobotPath | None, count: int
 ) -> list[Sight]:
     """The part of the ground in each picture: the surroundings of the robot, or all boxes and people."""
@@ -188,12 +196,13 @@ def _sights(
     return [Sight(x, y, float(scale), *size)] * count
 
 
-def _check_suffix(output: Path) -> None:
+def check_suffix(output: Path) -> None:
+    """Raise McaptrackError for a name that is not that of a video."""
     if output.suffix.lower() not in (".mp4", ".gif"):
         raise McaptrackError(f"{output}: a video is rendered to .mp4 or .gif, not to {output.suffix or 'no suffix'}")
 
 
-def _chosen(opened: log.Log, times: Ints, what: str, output: Path, options: RenderOptions) -> Ints:
+def chosen_pictures(opened: log.Log, times: Ints, what: str, output: Path, options: RenderOptions) -> Ints:
     """The numbers of the pictures, or scenes, of a video. Raises McaptrackError if there is none in the period."""
     first = int(times[0]) + seconds_to_ns(options.start_s)
     last = int(times[-1]) if options.end_s is None else int(times[0]) + seconds_to_ns(options.end_s)
@@ -213,13 +222,13 @@ def _chosen(opened: log.Log, times: Ints, what: str, output: Path, options: Rend
     return numbers
 
 
-def _rate_of(t_ns: Ints) -> Fraction:
+def rate_of(t_ns: Ints) -> Fraction:
     """The frame rate of a video with pictures at these times."""
     rest = np.diff(t_ns)
     return Fraction(NS_PER_S, int(np.median(rest))).limit_denominator(1001) if len(rest) else Fraction(1)
 
 
-def _at_times(messages: Iterator[log.Message]) -> Callable[[int], bytes | None]:
+def at_times(messages: Iterator[log.Message]) -> Callable[[int], bytes | None]:
     """A function that returns the message at a time, for rising times; None if there is none at exactly that time."""
     waiting: log.Message | None = next(messages, None)
 
@@ -232,7 +241,7 @@ def _at_times(messages: Iterator[log.Message]) -> Callable[[int], bytes | None]:
     return at
 
 
-def _scaled(image: Image, width_px: int | None) -> Image:
+def scaled(image: Image, width_px: int | None) -> Image:
     """The picture in the given width, and of even size, as video needs it."""
     import cv2
 

@@ -218,6 +218,9 @@ CASES: dict[str, dict[str, Case]] = {
     "render": common(
         "render a.mcap",
         topic="--topic /camera/detections/view/image",
+        compare="--compare",
+        heatmap="--heatmap",
+        blur="--blur people",
         width="--width 32",
         max_fps="--max-fps 5",
         start_s="--start-s 1",

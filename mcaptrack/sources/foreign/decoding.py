@@ -80,15 +80,8 @@ def unpacker(kind: MessageType) -> Unpack:
 
 
 def _ros_unpacker(kind: MessageType) -> Unpack:
-    from rosbags.typesys import Stores
-
-    found = _ROS_NAME.fullmatch(kind.name)
-    if not found:
-        raise McaptrackError(f"{kind.name!r} is not the name of a ROS message; those are like sensor_msgs/Image")
-    name = "{}/msg/{}".format(*found.groups())
-    is_ros1 = kind.encoding == "ros1"
-    store = _typestore(name, kind, Stores.ROS1_NOETIC if is_ros1 else Stores.LATEST)
-    read = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+    store, name = ros_types(kind)
+    read = store.deserialize_ros1 if kind.encoding == "ros1" else store.deserialize_cdr
 
     def unpack(payload: bytes) -> Any:
         # A sequence can't have more members than the message has bytes; one of an empty type could be endless.
@@ -96,6 +89,17 @@ def _ros_unpacker(kind: MessageType) -> Unpack:
         return read(payload, name)
 
     return unpack
+
+
+def ros_types(kind: MessageType) -> tuple[Any, str]:
+    """The types of a ROS message (a store of rosbags), and its name in it. Raises McaptrackError as ``unpacker``."""
+    from rosbags.typesys import Stores
+
+    found = _ROS_NAME.fullmatch(kind.name)
+    if not found:
+        raise McaptrackError(f"{kind.name!r} is not the name of a ROS message; those are like sensor_msgs/Image")
+    name = "{}/msg/{}".format(*found.groups())
+    return _typestore(name, kind, Stores.ROS1_NOETIC if kind.encoding == "ros1" else Stores.LATEST), name
 
 
 def _typestore(name: str, kind: MessageType, known: Any) -> Any:

@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.arrays import Bytes
+from mcaptrack.geometry.arrays import Bools, Bytes
 
 
 class PixelLayout(NamedTuple):
@@ -108,3 +108,64 @@ def _rows(data: bytes, layout: PixelLayout, size: int) -> Bytes:
             f"{len(data)} bytes don't hold {width} x {height} pixels of {size} bytes with {layout.step} bytes a row"
         )
     return np.ascontiguousarray(np.ndarray((height, row), np.uint8, data, 0, (step, 1)))
+
+
+def raw_with(encoding: str, data: bytes, layout: PixelLayout, image: Bytes, mask: Bools) -> bytes:
+    """An uncompressed picture with other pixels where ``mask`` (H, W) says so: those of ``image`` (H, W, 3), BGR.
+
+    All other bytes stay as they are; where neighbours share a colour (packed YUV, NV12), it changes for both. Raises
+    McaptrackError as ``raw_bgr`` does.
+    """
+    import cv2
+
+    out = np.frombuffer(data, np.uint8).copy()
+    height, width = layout.height_px, layout.width_px
+    gray = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+    if encoding in _COLOURS:
+        size, conversion = _COLOURS[encoding]
+        pixels = _places(out, layout, size).reshape(height, width, size)
+        if "Bayer" in conversion:
+            # The name has the colours of the first two rows; BGR has them in the opposite order.
+            channel = np.array(["bgr".index(letter) for letter in encoding[6:10]]).reshape(2, 2)
+            of = np.tile(channel, (-(-height // 2), -(-width // 2)))[:height, :width]
+            pixels[mask, 0] = np.take_along_axis(image, of[..., None], axis=2)[mask][:, 0]
+        elif size == 1:
+            pixels[mask, 0] = gray[mask]
+        else:
+            pixels[mask, :3] = image[mask][:, ::-1] if encoding.startswith("rgb") else image[mask]
+        return out.tobytes()
+    if encoding in _WIDE:
+        kind = np.dtype(_WIDE[encoding]).newbyteorder(">" if layout.is_bigendian else "<")
+        pixels = _places(out, layout, kind.itemsize)
+        values = gray.astype(kind) * (257 if kind.kind == "u" else 1 / 255)
+        flat = values.astype(kind).view(np.uint8).reshape(height, width, kind.itemsize)
+        pixels.reshape(height, width, kind.itemsize)[mask] = flat[mask]
+        return out.tobytes()
+    if encoding not in (*_LUMA_AT, *_PLANAR):
+        raise McaptrackError(f"pixels of the encoding {encoding[:40]!r} are not read; {', '.join(RAW_ENCODINGS)} are")
+    colour = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2YCrCb), np.uint8)
+    luma = np.asarray(np.rint(16 + colour[..., 0] * (219 / 255)), np.uint8)
+    # Neighbours share their colours: all of them get other pixels if one does.
+    across, down = np.arange(width) // 2 * 2, np.arange(height) // 2 * 2
+    shared = mask | mask[:, np.minimum(across + 1, width - 1)] | mask[:, across]
+    if encoding in _LUMA_AT:
+        at = _LUMA_AT[encoding]
+        pixels = _places(out, layout, 2).reshape(height, width, 2)
+        pixels[..., at][shared] = luma[shared]
+        pixels[..., 1 - at][shared] = np.where(np.arange(width) % 2 == 0, colour[..., 2], colour[..., 1])[shared]
+        return out.tobytes()
+    shared = shared | shared[np.minimum(down + 1, height - 1)] | shared[down]
+    planes = _places(out, layout._replace(height_px=height + (height + 1) // 2), 1)
+    planes[:height][shared] = luma[shared]
+    rest, block = planes[height:], shared[::2, ::2]
+    for place, number in enumerate((2, 1) if encoding == "nv12" else (1, 2)):
+        chroma = rest[:, place::2]
+        both = block[:, : chroma.shape[1]]
+        chroma[both] = colour[::2, ::2, number][:, : chroma.shape[1]][both]
+    return out.tobytes()
+
+
+def _places(data: Bytes, layout: PixelLayout, size: int) -> Bytes:
+    """The bytes of the pixels in ``data``, (H, W * B), to write to."""
+    row = layout.width_px * size
+    return np.ndarray((layout.height_px, row), np.uint8, data, 0, (layout.step or row, 1))

@@ -1,0 +1,212 @@
+"""Draw videos of logs, and hide people in their pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+from mcaptrack import log as logs
+from mcaptrack import pipeline
+from mcaptrack.api.checked import checked
+from mcaptrack.api.common import (
+    PathLike,
+    Progress,
+    log_location,
+    names_of,
+    no_progress,
+    optional_path,
+    warn_unused,
+    warnings_about,
+)
+from mcaptrack.errors import McaptrackError
+from mcaptrack.files import is_same_file, refuse_overwrite
+from mcaptrack.location import Location, local_name
+from mcaptrack.notices import Notice
+from mcaptrack.sources.cameras import camera_at
+from mcaptrack.viewing.blur.recording import blurrable, write_blurred_log
+from mcaptrack.viewing.comparing import compare as draw_comparison
+from mcaptrack.viewing.comparing import find_panels
+from mcaptrack.viewing.heat_map import draw_heat_map
+from mcaptrack.viewing.rendering import RenderOptions
+from mcaptrack.viewing.rendering import render as draw_video
+from mcaptrack.viewing.rendering import render_from_above as draw_from_above
+
+
+@dataclass(frozen=True)
+class RenderResult:
+    """A video with what was drawn on it, or a log or video in which people are hidden.
+
+    Attributes
+    ----------
+    log : pathlib.Path or str
+        The log; the URL of one in a store.
+    video : pathlib.Path
+        The video, GIF or log that was written.
+    pictures : int
+        Number of pictures.
+    views : tuple of str
+        Topics of the views that were drawn.
+    warnings : tuple of mcaptrack.Notice
+        What looks odd.
+    blurred : tuple of str
+        Topics of the pictures in which people are hidden.
+
+    """
+
+    log: Location
+    video: Path
+    pictures: int
+    views: tuple[str, ...]
+    warnings: tuple[Notice, ...]
+    blurred: tuple[str, ...] = ()
+
+
+@checked(width=(16, 16384), max_fps=(0.01, 1000), start_s=(0, 1e9), end_s=(0, 1e9))
+def render(
+    log: PathLike,
+    output: PathLike | None = None,
+    *,
+    topic: str | Sequence[str] | None = None,
+    compare: bool = False,
+    heatmap: bool = False,
+    blur: Literal["people"] | None = None,
+    width: int | None = None,
+    max_fps: float | None = None,
+    start_s: float = 0.0,
+    end_s: float | None = None,
+    gif: bool = False,
+    camera: str | None = None,
+    force: bool = False,
+    progress: Progress = no_progress,
+) -> RenderResult:
+    """Draw boxes, trails and predictions on the video of a log, or from above if it has none.
+
+    Tracks of 3D boxes are drawn on the pictures of a calibrated camera; without one, they are seen from above in their
+    frame of reference, around the robot.
+
+    With ``compare`` SORT's tracks, re-tracked ones and the ground truth stand side by side. With ``heatmap`` it is a
+    picture of where people spend their time.
+
+    With ``blur="people"`` all people that any channel of the log has boxes of are hidden, also while they are missed
+    for a few pictures. To a name that ends with .mcap this writes a copy of the log with such pictures, in which
+    everything else is as before.
+
+    Parameters
+    ----------
+    log : path
+        The log.
+    output : path, optional
+        The video, .mp4 or .gif; by default LOG.mp4 beside the log, LOG.compared.mp4 with ``compare``, LOG.blurred.mp4
+        with ``blur``. With ``blur`` it may be a log, .mcap. With ``heatmap`` it is a picture, .png or .jpg, by default
+        LOG.heatmap.png.
+    topic : str or sequence of str, optional
+        Draw these views; by default those that the layout shows, or none with ``blur``. With ``heatmap``, count these
+        tracks.
+    compare : bool, default False
+        Draw SORT's tracks, re-tracked ones and the ground truth side by side, with counters, a clock, events and the
+        ground.
+    heatmap : bool, default False
+        Draw a picture of where people spend their time.
+    blur : str, optional
+        "people" hides people.
+    width : int, optional
+        Width in pixels; by default that of the video, or 960 from above.
+    max_fps : float, optional
+        Largest number of pictures per second; by default all, in a GIF 10.
+    start_s, end_s : float, optional
+        Begin and end at these times of the log, in seconds.
+    gif : bool, default False
+        Write LOG.gif if ``output`` names no file.
+    camera : str, optional
+        Name of the camera, if the log has several. A log is written with the people hidden in the pictures of all
+        cameras.
+    force : bool, default False
+        Overwrite the output if it exists.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    RenderResult
+        The video, and what was drawn.
+
+    Raises
+    ------
+    McaptrackError
+        If the log has no pictures and no scenes, no boxes to hide people in, or if the output exists.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> mcaptrack.render("log.mcap", "walk.gif", width=160, end_s=1.0).pictures > 1
+    True
+    >>> mcaptrack.render("log.mcap", "anonymous.mcap", blur="people").blurred
+    ('/camera/video',)
+
+    """
+    path = log_location(log)
+    refuse_both(compare=compare, heatmap=heatmap, blur=blur is not None)
+    suffix = default_suffix(compare=compare, heatmap=heatmap, blur=blur, gif=gif)
+    target = optional_path(output) or local_name(path, suffix)
+    is_log = target.suffix.lower() == ".mcap"
+    if is_log and is_same_file(target, path):
+        raise McaptrackError(f"{target} is the log itself; give another name, so that the pictures aren't lost")
+    if is_log and blur is None:
+        raise McaptrackError(f"{target}: a log is written only with `blur=`; a video is rendered to .mp4 or .gif")
+    refuse_overwrite(target, force)
+    options = RenderOptions(width_px=width, max_fps=max_fps, start_s=start_s, end_s=end_s)
+    with warnings_about(path) as warnings, logs.read(path) as opened:
+        warn_unused("the name of the output says what is written", gif=gif and output is not None)
+        if is_log:
+            of_video = {"topic": topic, "width": width, "max_fps": max_fps, "start_s": start_s, "end_s": end_s}
+            warn_unused("the whole log is written", **{name: bool(value) for name, value in of_video.items()})
+            only = None if camera is None else pipeline.find_camera(opened, camera)
+            done = write_blurred_log(opened, blurrable(opened, only), target, progress)
+            found = tuple(dict.fromkeys(warnings))
+            return RenderResult(path, target, sum(done.pictures.values()), (), found, tuple(done.pictures))
+        prefix = pipeline.find_camera(opened, camera)
+        if blur is not None:
+            hidden = blurrable(opened, prefix)
+            views = list(pipeline.find_views(opened, prefix, names_of(topic)).views) if topic else []
+            pictures = next(iter(hidden))
+            count = draw_video(opened, pictures, views, target, options, progress, hidden[pictures])
+            found = tuple(dict.fromkeys(warnings))
+            return RenderResult(path, target, count, tuple(views), found, (pictures,))
+        if heatmap:
+            warn_unused("a heat map is one picture", max_fps=max_fps is not None, gif=gif and output is None)
+            pictures_of = camera_at(opened, prefix).pictures
+            heat = draw_heat_map(opened, prefix, names_of(topic), pictures_of, target, options)
+            return RenderResult(path, target, 1, (heat.topic,), tuple(dict.fromkeys(warnings)))
+        if compare:
+            warn_unused("SORT's tracks, re-tracked ones and ground truth are drawn", topic=bool(topic))
+            panels = find_panels(opened, prefix)
+            pictures_of = camera_at(opened, prefix).pictures
+            if pictures_of is None:
+                raise McaptrackError(f"{opened.path} has no pictures of {prefix} to compare tracks on")
+            count = draw_comparison(opened, pictures_of, panels, target, options, progress)
+            drawn = tuple(panel.view for panel in panels)
+            return RenderResult(path, target, count, drawn, tuple(dict.fromkeys(warnings)))
+        shown = pipeline.find_views(opened, prefix, names_of(topic))
+        if shown.pictures:
+            count = draw_video(opened, shown.pictures, shown.views, target, options, progress)
+        else:
+            follow = partial(pipeline.robot_path, opened, prefix, shown.views[0])
+            count = draw_from_above(opened, shown.views, target, options, follow, progress)
+    return RenderResult(path, target, count, tuple(shown.views), tuple(dict.fromkeys(warnings)))
+
+
+def refuse_both(**given: bool) -> None:
+    """Raise McaptrackError if more than one of some parameters is given."""
+    chosen = [f"`{name}=`" for name, is_given in given.items() if is_given]
+    if len(chosen) > 1:
+        raise McaptrackError(f"{' and '.join(chosen)} make different files; give one of them")
+
+
+def default_suffix(*, compare: bool, heatmap: bool, blur: str | None, gif: bool) -> str:
+    """Return the end of the name of an output that is not named, after that of the log."""
+    if heatmap:
+        return ".heatmap.png"
+    return (".compared" if compare else "" if blur is None else ".blurred") + (".gif" if gif else ".mp4")

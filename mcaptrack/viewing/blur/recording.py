@@ -1,0 +1,221 @@
+"""A log with people hidden in its pictures, and a video of such pictures.
+
+All other records of the log stay as they are: the messages of other channels, their order and times, metadata and
+attachments. The pictures keep their times and all fields but the picture itself.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack import __version__, log
+from mcaptrack.errors import McaptrackError, call
+from mcaptrack.geometry.arrays import Bools, Image, Ints
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.notices import warn
+from mcaptrack.pipeline import LAYOUTS, attachment_of
+from mcaptrack.sources import foreign
+from mcaptrack.sources.cameras import Camera, cameras
+from mcaptrack.sources.foreign.flatten import message_type_of
+from mcaptrack.sources.foreign.replaced_pictures import picture_replacer
+from mcaptrack.sources.video import EncodedPicture, H264Encoder, decode_bgr, encode_image
+from mcaptrack.sources.video.raw_pixels import raw_with
+from mcaptrack.viewing.blur.mosaic import hide
+from mcaptrack.viewing.blur.people import HiddenPeople
+
+#: The key of the metadata of a channel with replaced pictures.
+BLURRED: Final = "mcaptrack.blurred"
+#: Words in the names of schemas of messages that may show people and are not pictures that are read.
+_MAY_SHOW: Final = ("image", "video", "pointcloud", "disparity", "laserscan")
+_JPEG: Final = ("jpeg", "jpg")
+
+Progress = Callable[[str, int, int], None]
+
+
+class Blurred(NamedTuple):
+    """The number of pictures of each topic that were replaced, the number of hidden boxes, and the topics of boxes."""
+
+    pictures: dict[str, int]
+    boxes: int
+    sources: tuple[str, ...]
+
+
+def blurrable(opened: log.Log, only: str | None = None) -> dict[str, HiddenPeople]:
+    """The channels of pictures in which people can be hidden, each with what to hide.
+
+    ``only`` is the prefix of one camera. Raises McaptrackError if there are none; warns of cameras without boxes and
+    of pictures that no detector saw.
+    """
+    out: dict[str, HiddenPeople] = {}
+    there: list[Camera] = [one for one in cameras(opened) if one.pictures and (only is None or one.prefix == only)]
+    for camera in there:
+        assert camera.pictures is not None
+        people = HiddenPeople(opened, camera, opened.times(camera.pictures))
+        if people.topics:
+            out[camera.pictures] = people
+            if unseen := people.unseen():
+                total = len(opened.times(camera.pictures))
+                warn(
+                    f"{opened.path}: no detector saw {unseen} of the {total} pictures of {camera.pictures}; "
+                    "people in them may be recognisable",
+                    "not-blurred",
+                )
+    if not out:
+        found = ", ".join(str(camera.pictures) for camera in there) or "no pictures"
+        raise McaptrackError(
+            f"{opened.path} has {found} and no boxes of people in them to hide; {call('run', opened.path)} finds people"
+        )
+    return out
+
+
+def warn_of_rest(opened: log.Log, blurred: Sequence[str]) -> None:
+    """Warn of channels and attachments that may show people and are copied as they are."""
+    rest = [
+        topic
+        for topic, channel in sorted(opened.channels.items())
+        if topic not in blurred
+        and (foreign.holds_pictures(channel) or any(word in channel.schema_name.lower() for word in _MAY_SHOW))
+        and not channel.schema_name.endswith("ImageAnnotations")
+    ]
+    if rest:
+        warn(f"{opened.path}: {', '.join(rest)} are kept as recorded and may show people", "not-blurred")
+    ours = {attachment_of(name) for name in LAYOUTS}
+    kept = sorted({one.name for part in opened.parts for one in part.index.attachments} - ours)
+    if kept:
+        warn(f"{opened.path}: the attachments {', '.join(kept)} are kept as they are", "not-blurred")
+
+
+def blurred_pictures(
+    opened: log.Log, topic: str, people: HiddenPeople
+) -> Iterator[tuple[log.Message, foreign.Picture, Image, Bools, int]]:
+    """Each message of a channel of pictures with its picture, the same with people hidden, the mask, and the boxes.
+
+    Messages with pictures that can't be decoded, as before the first key picture of a video, are left out.
+    """
+    read = foreign.picture_reader(opened, topic)
+    waiting: dict[int, tuple[log.Message, foreign.Picture]] = {}
+
+    def encoded() -> Iterator[EncodedPicture]:
+        for number, message in enumerate(opened.messages(topic)):
+            picture = read(message)
+            waiting[number] = message, picture
+            where = f"{opened.path}: {topic} at {message.t_ns} ns"
+            yield EncodedPicture(message.t_ns, number, picture.format, picture.data, picture.layout, where)
+
+    left_out = 0
+    for frame in decode_bgr(encoded()):
+        message, picture = waiting.pop(frame.index)
+        for number in [number for number in waiting if number < frame.index]:
+            del waiting[number]
+            left_out += 1
+        own = people.at(frame.index)
+        image, mask = hide(np.asarray(frame.rows, np.uint8), own)
+        yield message, picture, image, mask, len(own)
+    left_out += len(waiting)
+    if left_out:
+        what = f"{left_out} messages of {topic} without a picture that can be decoded"
+        warn(f"{opened.path}: {what} are left out", "left-out")
+
+
+def write_blurred_log(
+    opened: log.Log, blurrable: dict[str, HiddenPeople], output: Path, progress: Progress = lambda *_: None
+) -> Blurred:
+    """Write a copy of a log in which people are hidden in the pictures of these topics.
+
+    Raises McaptrackError for pictures that can't be decoded or encoded.
+    """
+    total = sum(len(opened.times(topic)) for topic in blurrable)
+    done, boxes, pictures = 0, 0, dict[str, int]()
+    recorded = opened if opened.results is None else log.read(opened.path, sidecar=False)
+    try:
+        with log.extend(recorded, output, drop=tuple(blurrable)) as writer:
+            if opened.results is not None:
+                _copy_results(opened.results, writer, blurrable)
+            for topic, people in blurrable.items():
+                channel = opened.channel(topic)
+                kind = message_type_of(opened, topic)
+                note = {
+                    "hidden": "people",
+                    "boxes": list(people.topics),
+                    "version": __version__,
+                }
+                metadata = channel.metadata | {BLURRED: json.dumps(note, sort_keys=True, separators=(",", ":"))}
+                schema = (kind.name, kind.schema_encoding, kind.schema)
+                number = writer.add_channel(topic, schema, kind.encoding, metadata, "media", topic)
+                replace, encode = picture_replacer(kind), _Encoder(opened, topic)
+                for message, picture, image, mask, count in blurred_pictures(opened, topic, people):
+                    data, word = encode(message.t_ns, picture, image, mask)
+                    payload = replace(message.payload, data, word)
+                    writer.add_message(number, message.t_ns, message.sequence, payload, message.publish_ns)
+                    done, boxes = done + 1, boxes + count
+                    pictures[topic] = pictures.get(topic, 0) + 1
+                    progress("blur", done, total)
+    finally:
+        if recorded is not opened:
+            recorded.__exit__()
+    warn_of_rest(opened, tuple(blurrable))
+    sources = tuple(dict.fromkeys(name for people in blurrable.values() for name in people.topics))
+    return Blurred(pictures, boxes, sources)
+
+
+def _copy_results(results: log.Log, writer: log.LogWriter, blurrable: dict[str, HiddenPeople]) -> None:
+    """Copy the channels of a sidecar, its metadata and attachments."""
+    numbers = {}
+    for channel in results.recorded:
+        if channel.topic in blurrable:
+            continue
+        kind = message_type_of(results, channel.topic)
+        schema = (kind.name, kind.schema_encoding, kind.schema)
+        numbers[channel.id] = writer.add_channel(
+            channel.topic, schema, channel.message_encoding, channel.metadata, "rows", "", another=True
+        )
+    for channel_id, message in log.stream(results):
+        if channel_id in numbers:
+            writer.add_message(numbers[channel_id], message.t_ns, message.sequence, message.payload, message.publish_ns)
+    log.copy_attachments_and_metadata(results, writer)
+
+
+class _Encoder:
+    """Encodes the pictures of a channel as they were: the same format where it can be written, else PNG or H.264."""
+
+    def __init__(self, opened: log.Log, topic: str) -> None:
+        self._name = f"{opened.path}: {topic}"
+        self._fps = rate_of(opened.times(topic))
+        self._codec: H264Encoder | None = None
+        self._size, self._has_warned = (0, 0), False
+
+    def __call__(self, t_ns: int, picture: foreign.Picture, image: Image, mask: Bools) -> tuple[bytes, str]:
+        """The data of a picture, and its new format, "" for the same one."""
+        if picture.layout is not None:
+            return raw_with(picture.format, picture.data, picture.layout, image, mask), ""
+        if picture.format in _JPEG:
+            return encode_image(image, "jpeg"), ""
+        if picture.format in ("h264", "h265", "vp9", "av1"):
+            if picture.format != "h264":
+                self._warn_of_format(picture.format, "h264")
+            even = image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2]
+            if self._codec is None or even.shape[:2] != self._size:
+                self._size = even.shape[:2]
+                self._codec = H264Encoder(even.shape[1], even.shape[0], self._fps)
+            return self._codec.encode(even, t_ns), "" if picture.format == "h264" else "h264"
+        if picture.format != "png":
+            self._warn_of_format(picture.format, "png")
+        return encode_image(image, "png"), "" if picture.format == "png" else "png"
+
+    def _warn_of_format(self, before: str, after: str) -> None:
+        if not self._has_warned:
+            warn(f"{self._name}: pictures in {before} become {after}", "other")
+        self._has_warned = True
+
+
+def rate_of(t_ns: Ints) -> Fraction:
+    """The frame rate of pictures at these times."""
+    rest = np.diff(t_ns)
+    rest = rest[rest > 0]
+    return Fraction(NS_PER_S, int(np.median(rest))).limit_denominator(1001) if len(rest) else Fraction(1)

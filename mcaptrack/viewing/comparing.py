@@ -1,0 +1,265 @@
+"""A video that compares tracks: the same pictures side by side, with SORT's tracks, re-tracked ones and ground truth.
+
+Above each picture stands a counter: identity switches so far where the log has ground truth, otherwise tracks and
+repairs. Below are the clock, what happened in the last seconds, and the re-tracked people on the ground.
+
+Letters: R events.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError, call
+from mcaptrack.evaluation.event_text import describe
+from mcaptrack.foxglove import views
+from mcaptrack.geometry.arrays import Image, Ints
+from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.schema import EVENTS, TRACKS, EventKind
+from mcaptrack.schema.framing import frame_times, joined_parts
+from mcaptrack.schema.resampling import interval_ns
+from mcaptrack.sources.foreign.flatten import message_decoder
+from mcaptrack.sources.pictures import Pictures
+from mcaptrack.sources.video import write_clip
+from mcaptrack.transforms import FULL
+from mcaptrack.viewing import from_above
+from mcaptrack.viewing.rendering import (
+    RenderOptions,
+    at_times,
+    check_suffix,
+    chosen_pictures,
+    draw,
+    rate_of,
+    scaled,
+    sights,
+)
+
+#: The largest width of a comparison in pixels, unless one is given.
+_WIDTH_PX: Final = 1920
+_BACKGROUND, _INK, _FAINT = (32, 28, 26), (235, 230, 225), (150, 145, 140)
+#: Events stand below the pictures for this time, the newest ones of all panels.
+_SHOWN_S: Final = 4.0
+_REPAIRS: Final = (EventKind.JOINED, EventKind.PARTED)
+#: The share of the width that the ground takes, and the height of a line of text in shares of a panel's width.
+_GROUND: Final = 0.25
+_LINE: Final = 0.055
+
+
+class Panel(NamedTuple):
+    """A channel of tracks in a comparison: its title, its topic, its view, and that of its events, "" for none."""
+
+    title: str
+    topic: str
+    view: str
+    events: str
+
+
+class _Happened(NamedTuple):
+    """Events (R,) that a panel counts and tells, by rising times; the births of its tracks; whether it has switches."""
+
+    t_ns: Ints
+    words: list[str]
+    is_switch: list[bool]
+    born_ns: Ints
+    is_compared: bool
+
+
+def find_panels(opened: log.Log, prefix: str) -> list[Panel]:
+    """Return what can be compared: SORT's tracks, re-tracked ones, and ground truth if there is any.
+
+    Raises McaptrackError if the log lacks the views of one of the first two.
+    """
+    names = (("SORT", "tracks", ""), ("re-tracked", "retracks", FULL), ("ground truth", "truth", ""))
+    out = []
+    for title, name, rest in names:
+        topic = f"{prefix}/{name}"
+        found = (topic + rest, topic)
+        view = next((one + views.SUFFIX for one in found if one + views.SUFFIX in opened.channels), "")
+        if view:
+            shown = view.removesuffix(views.SUFFIX)
+            events = topic + "/events" if topic + "/events" in opened.channels else ""
+            out.append(Panel(title, shown, view, events))
+        elif name != "truth":
+            raise McaptrackError(
+                f"{opened.path} has no view {topic}{views.SUFFIX} to compare; {call('run', opened.path)} makes it"
+            )
+    return out
+
+
+def compare(
+    opened: log.Log,
+    picture_topic: str,
+    panels: Sequence[Panel],
+    output: Path,
+    options: RenderOptions,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+) -> int:
+    """Draw panels side by side on the pictures of a channel and write a video, .mp4 or .gif by the suffix.
+
+    Parameters
+    ----------
+    opened : Log
+    picture_topic : str
+    panels : sequence of Panel
+    output : Path
+    options : RenderOptions
+        The width is that of all panels together.
+    progress : callable
+        Called with "render", the number of finished pictures and their total.
+
+    Returns
+    -------
+    int
+        The number of pictures in the video.
+
+    Raises
+    ------
+    McaptrackError
+        If there are no pictures in the period, or if they can't be decoded.
+    """
+    check_suffix(output)
+    pictures = Pictures(opened, picture_topic)
+    if not len(pictures.t_ns):
+        raise McaptrackError(f"{opened.path}: {picture_topic} has no pictures")
+    numbers = chosen_pictures(opened, pictures.t_ns, "pictures", output, options)
+    chosen = pictures.t_ns[numbers]
+    span = int(chosen[0]), int(chosen[-1]) + 1
+    happened = [_happened(opened, panel, int(pictures.t_ns[0])) for panel in panels]
+    scene = panels[1].topic + views.SCENE_SUFFIX
+    start_ns = int(pictures.t_ns[0])
+
+    def composed() -> Iterator[tuple[int, Image]]:
+        drawn = [
+            (at_times(opened.messages(panel.view, *span)), message_decoder(opened, panel.view)) for panel in panels
+        ]
+        width, ground, sight = 0, None, None
+        for done, frame in enumerate(pictures.frames(numbers.tolist()), 1):
+            whole = np.asarray(frame.rows, np.uint8)
+            if not width:
+                total = options.width_px or min(_WIDTH_PX, whole.shape[1] * len(panels))
+                width = max(2, total // len(panels) // 2 * 2)
+                if scene in opened.channels:
+                    ground = at_times(opened.messages(scene, *span)), message_decoder(opened, scene)
+                    inset = max(16, round(width * len(panels) * _GROUND))
+                    sight = sights(opened, [scene], span, inset, None, 1)[0]
+            plain = scaled(whole, width)
+            parts = []
+            for view, read in drawn:
+                payload, image = view(frame.t_ns), plain.copy()
+                parts.append(image if payload is None else draw(image, read(payload), width / whole.shape[1]))
+            inset_image = None
+            if ground is not None and sight is not None:
+                inset_image = draw(from_above.ground(sight), from_above.grid(sight))
+                payload = ground[0](frame.t_ns)
+                if payload is not None:
+                    inset_image = draw(inset_image, from_above.drawing(ground[1](payload), sight))
+            counters = [_counter(panel, one, frame.t_ns) for panel, one in zip(panels, happened, strict=True)]
+            captions = _captions(panels, happened, frame.t_ns)
+            clock = _clock((frame.t_ns - start_ns) / NS_PER_S)
+            titles = [panel.title for panel in panels]
+            yield frame.t_ns, _composed(parts, titles, counters, clock, captions, inset_image)
+            progress("render", done, len(chosen))
+
+    return write_clip(output, composed(), rate_of(chosen))
+
+
+def _happened(opened: log.Log, panel: Panel, start_ns: int) -> _Happened:
+    """The switches of a panel, or its repairs if it was not compared with ground truth."""
+    frames = opened.frame_columns(panel.topic, TRACKS)
+    interval_s = interval_ns(frame_times(frames)) / NS_PER_S
+    first: dict[int, int] = {}
+    for _, _, joined in joined_parts(TRACKS, frames):
+        ids, where = np.unique(joined.rows["track_id"], return_index=True)
+        for one, at in zip(ids.tolist(), joined.row_ns[where].tolist(), strict=True):
+            first.setdefault(one, at)
+    born_ns = np.sort(np.fromiter(first.values(), np.int64, len(first)))
+    rows = []
+    if panel.events:
+        for frame in opened.frame_columns(panel.events, EVENTS):
+            rows += [(frame.t_ns, row, EventKind(int(row["kind"]))) for row in frame.rows]
+    is_compared = any(kind in (EventKind.MISS, EventKind.FALSE_TRACK, EventKind.SWITCH) for _, _, kind in rows)
+    wanted = [one for one in rows if one[2] is EventKind.SWITCH or one[2] in _REPAIRS]
+    words = [describe(row, f"at {(at - start_ns) / NS_PER_S:.1f} s", interval_s) for at, row, _ in wanted]
+    t_ns = np.array([at for at, _, _ in wanted], np.int64)
+    return _Happened(t_ns, words, [kind is EventKind.SWITCH for _, _, kind in wanted], born_ns, is_compared)
+
+
+def _counter(panel: Panel, happened: _Happened, now_ns: int) -> str:
+    """The text of a counter at a time."""
+    until = int(np.searchsorted(happened.t_ns, now_ns, "right"))
+    tracks = int(np.searchsorted(happened.born_ns, now_ns, "right"))
+    if not panel.events:
+        return f"{tracks} {'person' if tracks == 1 else 'people'} so far"
+    switches = sum(happened.is_switch[:until])
+    repairs = until - switches
+    parts = [f"{switches} identity switch{'' if switches == 1 else 'es'}"] if happened.is_compared else []
+    parts += [f"{tracks} track{'' if tracks == 1 else 's'}"]
+    parts += [f"{repairs} repair{'' if repairs == 1 else 's'}"] if repairs else []
+    return ", ".join(parts)
+
+
+def _captions(panels: Sequence[Panel], happened: Sequence[_Happened], now_ns: int) -> list[str]:
+    """The events of the last seconds as texts, the newest first."""
+    found = []
+    for panel, one in zip(panels, happened, strict=True):
+        low = int(np.searchsorted(one.t_ns, now_ns - seconds_to_ns(_SHOWN_S), "right"))
+        high = int(np.searchsorted(one.t_ns, now_ns, "right"))
+        found += [(int(one.t_ns[n]), f"{panel.title}: {one.words[n]}") for n in range(low, high)]
+    return [words for _, words in sorted(found, key=lambda pair: -pair[0])]
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(seconds + 0.05, 60)
+    return f"{int(minutes)}:{int(rest):02d}.{int(rest % 1 * 10)}"
+
+
+def _composed(
+    parts: Sequence[Image],
+    titles: Sequence[str],
+    counters: Sequence[str],
+    clock: str,
+    captions: Sequence[str],
+    inset: Image | None,
+) -> Image:
+    """The whole picture: panels below their titles, and a strip with the clock, captions and the ground."""
+    height, width = parts[0].shape[:2]
+    line = max(8, round(width * _LINE))
+    header = round(line * 1.5)
+    below = max(line * 4, 0 if inset is None else inset.shape[0])
+    total = (header + height + below + 1) // 2 * 2
+    out = np.full((total, width * len(parts), 3), _BACKGROUND, np.uint8)
+    for number, part in enumerate(parts):
+        left = number * width
+        out[header : header + height, left : left + width] = part
+        end = _write(out, titles[number], (left + line // 3, line), line, _INK, width - line)
+        _write(out, counters[number], (end + line // 2, line), line, _FAINT, left + width - end - line)
+        if number:
+            out[: header + height, left - 1 : left + 1] = 0
+    space = out.shape[1] - line
+    if inset is not None:
+        left = out.shape[1] - inset.shape[1]
+        out[header + height : header + height + inset.shape[0], left:] = inset
+        space = left - line
+    top = header + height
+    _write(out, clock, (line // 3, top + round(line * 1.6)), round(line * 1.7), _INK, space)
+    lines = int((total - top - line * 2.2) // (line * 1.25))
+    for number, words in enumerate(captions[: max(lines, 0)]):
+        at = (line // 3, top + round(line * (3.2 + 1.25 * number)))
+        _write(out, words, at, line, _INK if number == 0 else _FAINT, space)
+    return out
+
+
+def _write(image: Image, words: str, at: tuple[int, int], line_px: int, bgr: Any, most_px: int) -> int:
+    """Write a line of text from its lower left corner on, smaller if it is too long; returns where it ends."""
+    import cv2
+
+    font, size = cv2.FONT_HERSHEY_SIMPLEX, line_px / 34
+    wide = cv2.getTextSize(words, font, size, 1)[0][0]
+    size *= min(1.0, max(most_px, 1) / max(wide, 1))
+    cv2.putText(image, words, at, font, size, bgr, 1, cv2.LINE_AA)
+    return at[0] + int(cv2.getTextSize(words, font, size, 1)[0][0])

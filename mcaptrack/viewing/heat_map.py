@@ -1,0 +1,235 @@
+"""A picture of where people spend their time: over the scene where its ground plane is known, or seen from above.
+
+Letters: H rows, W columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError, call
+from mcaptrack.evaluation.occupancy import Occupancy, occupancy
+from mcaptrack.files import publish_bytes
+from mcaptrack.geometry.arrays import Floats, Image
+from mcaptrack.geometry.clocks import seconds_to_ns
+from mcaptrack.geometry.plane import GroundPlane
+from mcaptrack.notices import warn
+from mcaptrack.pipeline import read_planes
+from mcaptrack.schema import TRACKS
+from mcaptrack.schema.classes import UNKNOWN, class_name, class_names, is_person
+from mcaptrack.schema.framing import joined_parts
+from mcaptrack.sources.pictures import Pictures
+from mcaptrack.sources.video import encode_image
+from mcaptrack.transforms import FULL
+from mcaptrack.viewing import from_above
+from mcaptrack.viewing.from_above import Sight
+from mcaptrack.viewing.rendering import RenderOptions, draw, scaled
+
+#: The formats of a heat map by the suffix of its file.
+SUFFIXES: Final = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
+#: Channels below the prefix of a camera, the best one first.
+_BEST: Final = ("retracks" + FULL, "retracks", "tracks", "truth")
+#: The scene without people is the median of this many pictures.
+_PICTURES: Final = 15
+#: Seen from above: the width in pixels, and the height as a share of it.
+_WIDTH_PX: Final = 960
+_HEIGHT: Final = 0.75
+#: The heat is drawn over the picture with this opacity at most, and is faded below this share of the highest.
+_OPACITY: Final = 0.8
+_FADED: Final = 0.04
+#: Pixels that are this many times as large on the ground as at the lower edge are near the horizon.
+_FARTHEST: Final = 20.0
+_INK: Final = (235, 230, 225)
+
+
+class HeatMap(NamedTuple):
+    """A heat map: the topic of its tracks, the person-seconds of all cells, and the highest density in s/m2."""
+
+    topic: str
+    person_s: float
+    most_s_per_m2: float
+
+
+def draw_heat_map(
+    opened: log.Log, prefix: str, topics: Sequence[str], pictures: str | None, output: Path, options: RenderOptions
+) -> HeatMap:
+    """Draw where people spend their time, and write a picture, .png or .jpg by the suffix of ``output``.
+
+    Parameters
+    ----------
+    opened : Log
+    prefix : str
+        Of the camera.
+    topics : sequence of str
+        One channel of tracks; by default the best one of the camera.
+    pictures : str, optional
+        The topic of its pictures.
+    output : Path
+    options : RenderOptions
+        Width and period. Seconds count from the first picture, or from the first row without pictures.
+
+    Returns
+    -------
+    HeatMap
+
+    Raises
+    ------
+    McaptrackError
+        If there are no tracks of people in metres in the period.
+    """
+    if output.suffix.lower() not in SUFFIXES:
+        raise McaptrackError(f"{output}: a heat map is a picture, .png or .jpg, not {output.suffix or 'no suffix'}")
+    topic = _channel(opened, prefix, topics)
+    heat = _heat(opened, topic, pictures, options)
+    planes = read_planes(opened, prefix) or []
+    if pictures is not None and len(planes) == 1:
+        image = _over_picture(_scene(Pictures(opened, pictures), options.width_px), heat, planes[0][1])
+    else:
+        if pictures is not None:
+            why = "the ground plane changes" if planes else "there is no ground plane"
+            warn(f"{opened.path}: the heat map is drawn from above, because {why}", "other")
+        image = _from_above(heat, options.width_px or _WIDTH_PX)
+    most = float(heat.person_s.max()) / heat.cell_m**2
+    image = _with_legend(image, most, float(heat.person_s.sum()), topic)
+    data = encode_image(image, "jpeg" if SUFFIXES[output.suffix.lower()] == "jpeg" else "png")
+    publish_bytes(output, data)
+    return HeatMap(topic, float(heat.person_s.sum()), most)
+
+
+def _channel(opened: log.Log, prefix: str, topics: Sequence[str]) -> str:
+    """The channel of tracks to count."""
+    if len(topics) > 1:
+        raise McaptrackError(f"a heat map is of one channel of tracks, not of {', '.join(topics)}")
+    if topics:
+        channel = opened.channel(topics[0])
+        if not channel.holds(TRACKS):
+            raise McaptrackError(f"{opened.path}: {topics[0]} holds {channel.schema_name}, not tracks to count")
+        return channel.topic
+    for name in _BEST:
+        found = opened.channels.get(f"{prefix}/{name}")
+        if found is not None and found.holds(TRACKS):
+            return found.topic
+    raise McaptrackError(f"{opened.path} has no tracks of {prefix} yet; {call('run', opened.path)} makes them")
+
+
+def _heat(opened: log.Log, topic: str, pictures: str | None, options: RenderOptions) -> Occupancy:
+    """The person-seconds of a channel in the period."""
+    frames = opened.frame_columns(topic, TRACKS)
+    names = class_names(opened.channels[topic].metadata)
+    times = opened.times(pictures or topic)
+    start_ns = int(times[0]) if len(times) else 0
+    first = start_ns + seconds_to_ns(options.start_s)
+    last = None if options.end_s is None else start_ns + seconds_to_ns(options.end_s)
+    parts = []
+    for _, _, joined in joined_parts(TRACKS, frames):
+        rows, t_ns = joined.rows, joined.row_ns
+        classes = rows["class_id"].astype(np.int64)
+        wanted = [one for one in np.unique(classes).tolist() if one == UNKNOWN or is_person(class_name(one, names))]
+        kept = np.isin(classes, wanted) & (t_ns >= first) & (t_ns <= (t_ns if last is None else last))
+        parts.append((t_ns[kept], rows["track_id"][kept].astype(np.int64), rows["x_m"][kept], rows["y_m"][kept]))
+    if not parts or not sum(len(part[0]) for part in parts):
+        raise McaptrackError(f"{opened.path}: {topic} has no rows of people in that time to count")
+    t_ns, ids, x_m, y_m = (np.concatenate([part[n] for part in parts]) for n in range(4))
+    heat = occupancy(t_ns, ids, np.stack([x_m, y_m], axis=-1).astype(np.float64))
+    if not heat.person_s.size or not heat.person_s.max():
+        raise McaptrackError(f"{opened.path}: {topic} has no track with two positions in metres in that time")
+    if heat.outside_s > 0.02 * heat.person_s.sum():
+        warn(f"{opened.path}: {heat.outside_s:.0f} person-seconds are outside of the heat map", "left-out")
+    return heat
+
+
+def _scene(pictures: Pictures, width_px: int | None) -> Image:
+    """The scene without people who move."""
+    count = len(pictures.t_ns)
+    numbers = np.unique(np.linspace(0, count - 1, min(count, _PICTURES)).round().astype(int)).tolist()
+    seen = [np.asarray(frame.rows, np.uint8) for frame in pictures.frames(numbers)]
+    alike = [image for image in seen if image.shape == seen[0].shape]
+    return scaled(np.median(np.stack(alike), axis=0).astype(np.uint8), width_px)
+
+
+def _smooth(heat: Occupancy) -> Floats:
+    """The density (H, W) in shares of the highest, smoothed by about a cell, with a margin of two cells around."""
+    import cv2
+
+    padded = np.pad(heat.person_s, 2)
+    found = np.asarray(cv2.GaussianBlur(padded, (0, 0), 0.8), np.float64)
+    return found / max(float(found.max()), 1e-12)
+
+
+def _over_picture(scene: Image, heat: Occupancy, plane: GroundPlane) -> Image:
+    import cv2
+
+    height, width = scene.shape[:2]
+    across = (np.arange(width) + 0.5) * plane.width_px / width
+    x, y = np.meshgrid(across, (np.arange(height) + 0.5) * plane.height_px / height)
+    at = np.stack([x.ravel(), y.ravel()], axis=-1)
+    with np.errstate(all="ignore"):
+        metres = plane.pixels_to_metres(at)
+        depth = np.append(at, np.ones((len(at), 1)), axis=1) @ plane.matrix[2]
+        near = float(plane.matrix[2] @ [plane.width_px / 2, plane.height_px, 1.0])
+        is_ground = np.isfinite(metres).all(axis=1) & (depth / near > 1 / _FARTHEST)
+        cells = (metres - np.array(heat.low_m)) / heat.cell_m + 1.5  # of the padded grid, from the middle of a cell
+    cells[~is_ground] = -10
+    grid = _smooth(heat)
+    place = cells.astype(np.float32).reshape(height, width, 2)
+    found = cv2.remap(grid.astype(np.float32), place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderValue=0)
+    return _painted((scene * 0.75).astype(np.uint8), np.asarray(found, np.float64))
+
+
+def _from_above(heat: Occupancy, width_px: int) -> Image:
+    import cv2
+
+    size = width_px // 2 * 2, max(2, round(width_px * _HEIGHT) // 2 * 2)
+    low, high = np.array(heat.low_m), np.array(heat.high_m)
+    extent = np.maximum(high - low, 1.0) * 1.15
+    middle = (low + high) / 2
+    scale = float(min(size[0] / extent[0], size[1] / extent[1]))
+    sight = Sight(float(middle[0]), float(middle[1]), scale, *size)
+    x = (np.arange(size[0]) + 0.5 - size[0] / 2) / scale + middle[0]
+    y = -(np.arange(size[1]) + 0.5 - size[1] / 2) / scale + middle[1]
+    across, up = (x - low[0]) / heat.cell_m + 1.5, (y - low[1]) / heat.cell_m + 1.5
+    column, row = np.meshgrid(across.astype(np.float32), up.astype(np.float32))
+    found = cv2.remap(_smooth(heat).astype(np.float32), column, row, cv2.INTER_LINEAR, borderValue=0)
+    return draw(_painted(from_above.ground(sight), np.asarray(found, np.float64)), from_above.grid(sight))
+
+
+def _painted(image: Image, share: Floats) -> Image:
+    """Paint shares (H, W) from 0 to 1 over a picture; the square root of a share gives its colour."""
+    import cv2
+
+    level = np.sqrt(share.clip(0, 1))
+    colours = np.asarray(
+        cv2.applyColorMap(np.rint(55 + 200 * level).astype(np.uint8), cv2.COLORMAP_INFERNO), np.float64
+    )
+    opacity = (_OPACITY * np.clip(share / _FADED, 0, 1))[..., None]
+    return np.rint(image * (1 - opacity) + colours * opacity).astype(np.uint8)
+
+
+def _with_legend(image: Image, most: float, total_s: float, topic: str) -> Image:
+    """The picture above a strip with the colours, their values and what was counted."""
+    import cv2
+
+    width = image.shape[1]
+    line = max(10, round(min(width, 900) / 45))
+    strip = np.full((line * 4, width, 3), (32, 28, 26), np.uint8)
+    long = width // 3
+    level = np.linspace(0, 1, long)
+    colours = cv2.applyColorMap(np.rint(55 + 200 * level).astype(np.uint8)[None], cv2.COLORMAP_INFERNO)
+    strip[line // 2 : line // 2 + line, line : line + long] = colours
+    font, size = cv2.FONT_HERSHEY_SIMPLEX, line / 34
+    for share in (0.0, 0.5, 1.0):
+        words = f"{most * share**2:.2g}" + (" s/m2" if share == 1 else "")
+        cv2.putText(
+            strip, words, (line + round(long * share * 0.96), round(line * 2.6)), font, size, _INK, 1, cv2.LINE_AA
+        )
+    amount = f"{total_s:.0f} person-seconds" if total_s < 600 else f"{total_s / 60:.0f} person-minutes"
+    words = f"{amount} of {topic}"
+    wide = cv2.getTextSize(words, font, size, 1)[0][0]
+    size *= min(1.0, (width - long - 4.5 * line) / max(wide, 1))
+    cv2.putText(strip, words, (round(long + 3.5 * line), round(line * 1.4)), font, size, _INK, 1, cv2.LINE_AA)
+    return np.concatenate([image, strip])

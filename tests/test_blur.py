@@ -1,0 +1,278 @@
+"""People hidden in pictures: all of them, also while they are missed, and nothing else is changed."""
+
+from __future__ import annotations
+
+import base64
+import json
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+import mcaptrack
+from mcaptrack import foxglove, log
+from mcaptrack.schema import DETECTIONS, TRACKS, Frame
+from mcaptrack.sources.foreign import MessageType, picture_decoder
+from mcaptrack.sources.foreign.replaced_pictures import picture_replacer
+from mcaptrack.sources.video.raw_pixels import RAW_ENCODINGS, PixelLayout, raw_bgr, raw_with
+from mcaptrack.viewing.blur.mosaic import hide
+from tests.commands import call, printed
+from tests.logs import add_rows
+from tests.robots import write_log
+from tests.ros_messages import pixels, ros_writer
+from tests.worlds import ns
+
+SIZE = (160, 120)
+
+
+def noise(seed: int = 0, width: int = SIZE[0], height: int = SIZE[1]) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), np.uint8)
+
+
+boxes = st.lists(
+    st.tuples(st.floats(-60, 170), st.floats(-60, 130), st.floats(0, 200), st.floats(0, 200)), min_size=0, max_size=5
+)
+
+
+@given(boxes)
+@settings(max_examples=25, deadline=None)
+def test_all_pixels_of_boxes_are_hidden_and_no_other_and_cells_are_large(given_boxes):
+    image, found = noise(), np.array(given_boxes, float).reshape(-1, 4)
+    out, mask = hide(image, found)
+    wanted = np.zeros(mask.shape, bool)
+    for x, y, w, h in found.tolist():
+        left, right = (int(np.clip(v, 0, SIZE[0])) for v in (np.floor(x), np.ceil(x + w)))
+        top, bottom = (int(np.clip(v, 0, SIZE[1])) for v in (np.floor(y), np.ceil(y + h)))
+        wanted[top:bottom, left:right] = True
+    assert (mask == wanted).all()
+    assert (out[~mask] == image[~mask]).all()
+    assert (out[mask] % 32 == 16).all()
+    least = min((max(8, max(w, h) / 4) for _, _, w, h in given_boxes), default=8)
+    assert len(np.unique(out[mask], axis=0)) <= (SIZE[0] / least + 1) * (SIZE[1] / least + 1) * (len(found) + 1)
+
+
+def test_a_person_is_a_handful_of_colours():
+    """A person of 120 px is at most 4 x 2 cells of 32 px or so, and each is the mean of its pixels, rounded."""
+    image = noise(3, 320, 256)
+    out, _ = hide(image, np.array([[64.0, 64.0, 60.0, 120.0]]))
+    inside = out[64:184, 64:124]
+    for row in range(0, 120, 32):
+        for column in range(0, 60, 32):
+            cell = inside[row : row + 32, column : column + 32].reshape(-1, 3)
+            assert (cell == cell[0]).all()
+    mean = image[64:96, 64:96].reshape(-1, 3).mean(axis=0)
+    assert abs(inside[0, 0] - mean).max() <= 17
+    assert (
+        abs(cv2.resize(out[64:160, 64:124], (4, 4)).astype(int) - cv2.resize(image[64:160, 64:124], (4, 4))).max() > 20
+    )
+
+
+def walk_log(path: Path) -> dict[int, tuple[float, float, float, float]]:
+    """A log of 5 s: somebody tracked with a hole of 2 s, found 1 s late and lost 1 s early, a car and a detection.
+
+    Returns the true box of the person in each picture.
+    """
+    true = {n: (10.0 + 2 * n, 40.0, 12.0, 30.0) for n in range(50)}
+    tracked = [n for n in range(10, 40) if not 15 <= n < 35]
+    kind = foxglove.schema_record("foxglove.RawImage")
+    with log.create(path) as writer:
+        video = writer.add_channel("/camera/video", kind, "protobuf", {"mine": "kept"}, "media")
+        imu = writer.add_channel("/imu", ("robot/Imu", "jsonschema", b"{}"), "json", {})
+        depth = writer.add_channel("/lidar/points", ("foxglove.PointCloud", "", b""), "json", {})
+        for n in range(50):
+            message = RawImage(
+                frame_id="eye", width=160, height=120, encoding="rgb8", step=480, data=noise(n).tobytes()
+            )
+            message.timestamp.FromNanoseconds(ns(n / 10))
+            writer.add_message(video, ns(n / 10), 7 * n, message.SerializeToString(), ns(n / 10) + 5)
+            writer.add_message(imu, ns(n / 10) + 3, n, b'{"n":1}')
+            writer.add_message(depth, ns(n / 10) + 4, n, b"{}")
+        writer.add_attachment("notes.txt", "text/plain", b"secret")
+
+        def frame(n: int, *rows: tuple[int, int, tuple[float, ...]]) -> Frame:
+            names = ("x_px", "y_px", "w_px", "h_px")
+            place = dict(zip(names, np.array([box for _, _, box in rows]).reshape(-1, 4).T, strict=True))
+            which = {"track_id": [one for one, _, _ in rows], "class_id": np.array([c for _, c, _ in rows], np.uint32)}
+            return Frame(
+                ns(n / 10),
+                n,
+                TRACKS.rows(**which, **place, observed=np.ones(len(rows), bool), source_id=[-1] * len(rows)),
+            )
+
+        car = (5, 3, (100.0, 5.0, 40.0, 20.0))
+        frames = [frame(n, *([(1, 1, true[n])] if n in tracked else []), car) for n in range(50)]
+        add_rows(writer, "/camera/tracks", TRACKS, frames, "track", "/camera/video")
+        found = DETECTIONS.rows(x_px=[30.0], y_px=[80.0], w_px=[10.0], h_px=[20.0], score=[0.5], class_id=[1])
+        seen = [Frame(ns(n / 10), n, found if n == 20 else found[:0]) for n in range(50)]
+        add_rows(writer, "/camera/detections", DETECTIONS, seen, "detect", "/camera/video")
+    return true
+
+
+def messages(path: Path) -> dict[str, list[tuple]]:
+    out: dict[str, list[tuple]] = {}
+    with path.open("rb") as stream:
+        for _, channel, m in make_reader(stream).iter_messages(log_time_order=True):
+            out.setdefault(channel.topic, []).append((m.log_time, m.publish_time, m.sequence, m.data))
+    return out
+
+
+def test_a_person_stays_hidden_in_gaps_and_around_the_track_and_all_else_is_kept(tmp_path):
+    true = walk_log(tmp_path / "a.mcap")
+    done = mcaptrack.render(tmp_path / "a.mcap", tmp_path / "b.mcap", blur="people")
+    assert (done.pictures, done.blurred) == (50, ("/camera/video",))
+    said = [str(one) for one in done.warnings if one.code == "not-blurred"]
+    assert len(said) == 2
+    assert "/lidar/points" in said[0]
+    assert "notes.txt" in said[1]
+    before, after = messages(tmp_path / "a.mcap"), messages(tmp_path / "b.mcap")
+    assert before.keys() == after.keys()
+    pictures = zip(before.pop("/camera/video"), after.pop("/camera/video"), strict=True)
+    assert before == after
+    hidden = []
+    for n, (old, new) in enumerate(pictures):
+        assert old[:3] == new[:3]
+        shown, was = RawImage.FromString(new[3]), RawImage.FromString(old[3])
+        image = np.frombuffer(shown.data, np.uint8).reshape(120, 160, 3)
+        mask = (image != noise(n)).any(axis=2)
+        x, y, w, h = map(round, true[n])
+        hidden.append(mask[y : y + h, x : x + w].mean())
+        assert not mask[5:25, 110:140].any()  # the car
+        assert mask[85:95, 32:38].any() == (18 <= n <= 22)  # detected once, and hidden just before and after
+        was.data = shown.data
+        assert was == shown
+    assert min(hidden) > 0.98
+    with log.read(tmp_path / "b.mcap") as opened:
+        how = opened.channel("/camera/video").metadata
+        assert how["mine"] == "kept"
+        assert json.loads(how["mcaptrack.blurred"])["boxes"] == ["/camera/detections", "/camera/tracks"]
+        assert opened.attachment("notes.txt") == b"secret"
+
+
+def test_pictures_of_a_robot_keep_their_messages_and_cameras_without_boxes_are_named(tmp_path):
+    path = tmp_path / "robot.mcap"
+    shots = write_log(path, "/front/image", "/rear/image", boxes="/front/boxes")
+    code, out, err = call("render", path, "--blur", "people", "-o", tmp_path / "out.mcap", "--json")
+    assert code == 0, err
+    assert json.loads(out)["results"][0]["blurred"] == ["/front/image"]
+    assert "/rear/image are kept as recorded and may show people" in err
+    before, after = messages(path), messages(tmp_path / "out.mcap")
+    for topic in ("/rear/image", "/front/boxes"):
+        assert before[topic] == after[topic]
+    with (tmp_path / "out.mcap").open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        found = [m for _, _, _, m in reader.iter_decoded_messages(topics=["/front/image"])]
+    assert len(found) == len(shots)
+    for message, shot in zip(found, shots, strict=True):
+        assert (message.header.frame_id, message.format) == ("eye", "jpeg")
+        image = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR)
+        for x, y, w, h in shot.boxes.round().astype(int).tolist():
+            part = np.s_[max(y, 0) : y + h, max(x, 0) : x + w]
+            if image[part].size:
+                assert (
+                    np.abs(np.diff(image[part].astype(int), axis=0)).mean()
+                    < 0.8 * np.abs(np.diff(shot.image[part].astype(int), axis=0)).mean() + 2
+                )
+
+
+def test_a_video_is_written_too_and_results_stay_up_to_date(finished, tmp_path):
+    printed("render", finished, "--blur", "people", "-o", tmp_path / "a.mp4", "--end-s", 1)
+    printed("render", finished, "--blur", "people", "-o", tmp_path / "a.mcap")
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        clip = [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
+    with log.read(finished) as one, log.read(tmp_path / "a.mcap") as other:
+        from mcaptrack.pipeline.staleness import is_stale
+        from mcaptrack.sources.pictures import Pictures
+
+        original = [frame.rows for frame in Pictures(one, "/camera/video").frames(range(len(clip)))]
+        stored = [frame.rows for frame in Pictures(other, "/camera/video").frames(range(len(clip)))]
+        truth = one.frames("/camera/truth", TRACKS)
+        assert not any(is_stale(other, topic) for topic in other.channels)
+        assert one.times("/camera/video").tolist() == other.times("/camera/video").tolist()
+    seen = 0
+    for n, (old, new, kept) in enumerate(zip(original, clip, stored, strict=True)):
+        for row in truth[n].rows:
+            x, y, w, h = (round(float(row[name])) for name in ("x_px", "y_px", "w_px", "h_px"))
+            part = np.s_[max(y, 0) : y + h, max(x, 0) : x + w]
+            if old[part].size:
+                # Each row of a person's pixels differs from the next; in a mosaic only few do.
+                detail = [np.abs(np.diff(one[part].astype(int), axis=0)).mean() for one in (old, new, kept)]
+                assert max(detail[1:]) < 0.6 * detail[0] + 1
+                seen += 1
+    assert seen > 5
+
+
+LAYOUTS = [PixelLayout(18, 10), PixelLayout(18, 10, 100)]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS, ids=["dense", "padded"])
+@pytest.mark.parametrize("encoding", RAW_ENCODINGS)
+def test_uncompressed_pictures_get_the_hidden_pixels_and_keep_all_other_bytes(encoding, layout):
+    size = {"rgb8": 3, "bgr8": 3, "8uc3": 3, "rgba8": 4, "bgra8": 4, "8uc4": 4, "mono16": 2, "16uc1": 2, "32fc1": 4}
+    each = size.get(encoding, 2 if encoding in ("uyvy", "yuv422", "yuyv", "yuv422_yuy2") else 1)
+    rows = 15 if encoding in ("nv12", "nv21") else 10
+    step = layout.step or 18 * each
+    rng = np.random.default_rng(1)
+    data = rng.integers(30, 220, rows * step).astype(np.uint8).tobytes()
+    if encoding == "32fc1":
+        data = rng.random((10, step // 4)).astype("<f4").tobytes()
+    colour = np.full((10, 18, 3), (180, 90, 60), np.uint8)
+    mask = np.zeros((10, 18), bool)
+    mask[2:8, 4:12] = True
+    out = raw_with(encoding, data, layout, colour, mask)
+    assert len(out) == len(data)
+    before, after = (raw_bgr(encoding, one, layout).astype(int) for one in (data, out))
+    is_grey = (each == 1 and "bayer" not in encoding) or encoding in ("mono16", "16uc1", "32fc1") or each == 2
+    wanted = cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY)[0, 0] if is_grey else (180, 90, 60)
+    if encoding in ("nv12", "nv21") or (each == 2 and encoding not in ("mono16", "16uc1")):
+        wanted = np.rint(16 + int(cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY)[0, 0]) * 219 / 255)
+    assert abs(after[3:7, 5:11] - wanted).max() <= 2
+    apart = np.s_[:, :2] if "bayer" in encoding else np.s_[:, :4]
+    assert (after[apart] == before[apart]).all()
+    assert (np.frombuffer(out, np.uint8) != np.frombuffer(data, np.uint8)).any()
+    assert raw_with(encoding, data, layout, colour, np.zeros_like(mask)) == data
+
+
+def test_only_the_picture_of_a_message_changes_in_every_encoding():
+    cases = []
+    for ros1 in (True, False):
+        ros = ros_writer("sensor_msgs/CompressedImage", "", ros1)
+        cases.append(
+            (ros.kind, ros.pack(ros.new("sensor_msgs/CompressedImage", ros.header(), "rgb8; jpeg", pixels(b"ab"))))
+        )
+    fields = {"timestamp": {"sec": 5, "nsec": 6}, "frame_id": "eye", "format": "jpeg", "more": [1, None]}
+    kind = MessageType("foxglove.CompressedImage", "jsonschema", b"{}", "json")
+    cases.append((kind, json.dumps(fields | {"data": base64.b64encode(b"ab").decode()}).encode()))
+    cases.append((kind, json.dumps(fields | {"data": [97, 98]}).encode()))
+    name = "foxglove.CompressedImage"
+    packed = foxglove.pack_picture(name, 5, "eye", "jpeg", b"ab") + b"\xa2\x06\x03abc"  # a field of a later version
+    cases.append((MessageType(name, "protobuf", foxglove.schema_record(name)[2], "protobuf"), packed))
+    for kind, payload in cases:
+        decode, replace = picture_decoder(kind), picture_replacer(kind)
+        once = replace(payload, b"other bytes", "")
+        assert decode(once) == decode(payload)._replace(data=b"other bytes")
+        assert decode(replace(payload, b"x", "png")) == decode(payload)._replace(data=b"x", format="png")
+        again = replace(once, b"ab", "")
+        assert again == payload or json.loads(again) == json.loads(payload)
+
+
+def test_mistakes_are_said_in_a_line(finished, footage, tmp_path):
+    printed("ingest", footage.video, "-o", tmp_path / "bare.mcap")
+    for words, said in {
+        (tmp_path / "bare.mcap", "--blur", "people", "-o", "b.mcap"): "and no boxes of people in them to hide",
+        (finished, "-o", "b.mcap"): "a log is written only with --blur",
+        (finished, "--blur", "people", "-o", finished, "--force"): "is the log itself",
+        (finished, "--blur", "people", "-o", "b.avi"): "a video is rendered to .mp4 or .gif",
+    }.items():
+        code, _, err = call("render", *words, folder=tmp_path)
+        assert (code, said in err) == (1, True), err
+        assert err.count("\n") == 1
+    assert [one.name for one in tmp_path.iterdir()] == ["bare.mcap"]
+    _, err = printed("render", finished, "--blur", "people", "-o", tmp_path / "b.mcap", "--width", "64")
+    assert "--width changes nothing here: the whole log is written" in err

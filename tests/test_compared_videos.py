@@ -1,0 +1,123 @@
+"""Videos that compare tracks, and heat maps."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+import mcaptrack
+from mcaptrack import log
+from mcaptrack.evaluation.occupancy import Occupancy
+from mcaptrack.geometry.plane import GroundPlane
+from mcaptrack.schema import EVENTS, TRACKS
+from mcaptrack.viewing import comparing, heat_map
+from tests.commands import call, printed
+
+
+def clip(path: Path) -> list[np.ndarray]:
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
+
+
+def test_three_panels_show_the_views_of_their_channels(finished, tmp_path):
+    done = mcaptrack.render(finished, tmp_path / "a.mp4", compare=True, width=480, end_s=0.5)
+    names = ("tracks", "retracks/full", "truth")
+    assert done.views == tuple(f"/camera/{name}/view/image" for name in names)
+    frames = clip(tmp_path / "a.mp4")
+    assert len(frames) == done.pictures
+    for number, view in enumerate(done.views):
+        mcaptrack.render(finished, tmp_path / "one.mp4", topic=view, width=160, end_s=0.5, force=True)
+        (single, *_) = clip(tmp_path / "one.mp4")
+        high = single.shape[0]
+        part = frames[0][:, 160 * number + 2 : 160 * (number + 1) - 2].astype(int)
+        # Somewhere below the title stands the same picture.
+        apart = [abs(part[top : top + high] - single[:, 2:158]).mean() for top in range(4, 40)]
+        assert min(apart) < 4
+
+
+def test_counters_are_those_of_the_events_and_captions_tell_the_last_ones(finished):
+    with log.read(finished) as opened:
+        panels = comparing.find_panels(opened, "/camera")
+        start = int(opened.times("/camera/video")[0])
+        last = int(opened.times("/camera/video")[-1])
+        happened = [comparing._happened(opened, panel, start) for panel in panels]
+        for panel, one in zip(panels[:2], happened, strict=False):
+            rows = [(f.t_ns, int(r["kind"])) for f in opened.frames(panel.events, EVENTS) for r in f.rows]
+            ids = {int(i) for f in opened.frames(panel.topic, TRACKS) for i in f.rows["track_id"]}
+            switches = sum(kind == 4 for _, kind in rows)
+            said = comparing._counter(panel, one, last)
+            assert said.startswith(f"{switches} identity switch")
+            assert f" {len(ids)} track" in said
+        assert comparing._counter(panels[2], happened[2], last) == "3 people so far"
+    made = comparing._Happened(np.array([1, 2, 9]) * 10**9, ["a", "b", "c"], [True, False, True], np.array([0]), True)
+    panel = comparing.Panel("SORT", "/t", "/v", "/e")
+    assert comparing._counter(panel, made, 2 * 10**9) == "1 identity switch, 1 track, 1 repair"
+    assert comparing._counter(panel, made, 9 * 10**9) == "2 identity switches, 1 track, 1 repair"
+    assert comparing._counter(panel, made._replace(is_compared=False), 0) == "1 track"
+    assert comparing._captions([panel], [made], 3 * 10**9) == ["SORT: b", "SORT: a"]
+    assert comparing._captions([panel], [made], 8 * 10**9) == []
+    assert [comparing._clock(seconds) for seconds in (0.0, 59.97, 61.24)] == ["0:00.0", "1:00.0", "1:01.2"]
+
+
+def test_heat_stands_where_people_stood_in_the_picture_and_nowhere_beyond_the_horizon():
+    """A camera that looks along the ground: 10 x 10 s in one cell, seen at its place by the plane."""
+    plane = GroundPlane((0.01, 0.0, -3.2, 0.0, 0.0, 6.0, 0.0, 0.005, -0.2), 640, 480)
+    at = np.array([0.25, 7.75])
+    heat = Occupancy(np.zeros((20, 20)), (-5.0, 0.0), 0.5, 0.0)
+    column, row = ((at - (-5.0, 0.0)) // 0.5).astype(int)
+    heat.person_s[row, column] = 100.0
+    image = heat_map._over_picture(np.full((480, 640, 3), 80, np.uint8), heat, plane)
+    bright = np.unravel_index(image.astype(int).sum(axis=2).argmax(), (480, 640))
+    wanted = plane.metres_to_pixels(at[None])[0]
+    assert abs(np.array(bright[::-1]) - wanted).max() < 8
+    assert (image[:40] == 60).all()  # above the horizon, y = 40
+    above = heat_map._from_above(heat, 320)
+    y, x = np.unravel_index(above.astype(int).sum(axis=2)[:200].argmax(), (200, 320))
+    scale = min(320 / 11.5, 240 / 11.5)
+    assert abs(x - (160 + (at[0] - 0.0) * scale)) < 8
+    assert abs(y - (120 - (at[1] - 5.0) * scale)) < 8
+
+
+def test_a_heat_map_says_how_much_it_counts(finished, tmp_path):
+    done = mcaptrack.render(finished, tmp_path / "a.png", heatmap=True)
+    assert done.views == ("/camera/retracks/full",)
+    with log.read(finished) as opened:
+        frames = opened.frames("/camera/retracks/full", TRACKS)
+        times: dict[int, list[int]] = {}
+        for frame in frames:
+            for row in frame.rows:
+                times.setdefault(int(row["track_id"]), []).append(frame.t_ns)
+        wanted = sum(t[-1] - t[0] for t in times.values()) / 1e9
+        options = heat_map.RenderOptions()
+        found = heat_map.draw_heat_map(opened, "/camera", (), "/camera/video", tmp_path / "b.jpg", options)
+    assert found.person_s == pytest.approx(wanted, rel=0.02)
+    assert cv2.imread(str(tmp_path / "a.png")).shape[1] == cv2.imread(str(tmp_path / "b.jpg")).shape[1] == 320
+    printed("render", finished, "--heatmap", "--topic", "/camera/truth", "-o", tmp_path / "c.png", "--width", 200)
+    assert cv2.imread(str(tmp_path / "c.png")).shape[1] == 200
+
+
+def test_mistakes_are_said_in_a_line(finished, footage, tmp_path):
+    printed("ingest", footage.video, "-o", tmp_path / "bare.mcap")
+    bare = tmp_path / "bare.mcap"
+    for words, said in {
+        (bare, "--compare"): "has no view /camera/tracks/view/image to compare; `mcaptrack run",
+        (bare, "--heatmap"): "has no tracks of /camera yet; `mcaptrack run",
+        (finished, "--heatmap", "-o", "a.mp4"): "a heat map is a picture, .png or .jpg, not .mp4",
+        (finished, "--heatmap", "--topic", "/camera/detections"): "/camera/detections holds mcaptrack.Detections, not",
+        (finished, "--heatmap", "--start-s", "900"): "no rows of people in that time",
+        (finished, "--heatmap", "--compare"): "--compare and --heatmap make different files",
+        (finished, "--compare", "-o", "a.png"): "a video is rendered to .mp4 or .gif",
+    }.items():
+        out = ("-o", "out.png" if "--heatmap" in words else "out.mp4") if "-o" not in words else ()
+        code, _, err = call("render", *words, *out, folder=tmp_path)
+        assert (code, said in err) == (1, True), err
+        assert err.count("\n") == 1
+    assert [one.name for one in tmp_path.iterdir()] == ["bare.mcap"]
+    shutil.copyfile(finished, tmp_path / "walk.mcap")
+    printed("render", tmp_path / "walk.mcap", "--heatmap")
+    assert (tmp_path / "walk.heatmap.png").exists()
