@@ -181,6 +181,25 @@ def test_the_last_of_two_that_write_one_log_at_once_writes_all_its_tables(place,
     assert (row["messages"], row["location"]) == (2, str(place / "x" / "a.mcap"))
 
 
+def test_a_transaction_that_came_too_late_is_repeated(place, monkeypatch):
+    """The library refuses each first one, as where another process was quicker with the same log."""
+    one, refused = exported(place / "a.mcap", place / "tables"), []
+
+    def replace(self, table, name, *given):
+        if name not in refused:
+            refused.append(name)
+            raise deltalake.exceptions.CommitFailedError(name)
+        return inner(self, table, name, *given)
+
+    inner = Batch._replace
+    monkeypatch.setattr(Batch, "_replace", replace)
+    found = commit(place / "lake", [one])
+    assert (found.added, found.conflicts) == (["a"], len(refused))
+    assert {"detections", "frames", "recordings"} <= set(refused)
+    for name, rows in (("detections", 3), ("frames", 3), ("recordings", 1)):
+        assert counts(place / "lake", name) == {"a": rows}, name
+
+
 @pytest.mark.parametrize("after", range(5))
 def test_what_was_killed_between_two_transactions_is_completed_by_the_next_call(place, monkeypatch, after):
     """A kill after so many tables; rows without a row in recordings are replaced, and none stands there twice."""

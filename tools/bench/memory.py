@@ -2,8 +2,8 @@
 
     .venv/bin/python tools/bench/memory.py [--full] [--only NAME ...]
 
-Each command runs in a process of its own, whose peak of resident memory is printed, with seconds in all and a minute of
-the log:
+Each command runs in a process of its own, whose peak of resident memory is printed, with seconds of the processor,
+in all and a minute of the log (those of the clock grow with other work on the machine):
 
 - `video`: 7 people, 25 pictures a second; `ingest`, `run` and `export`;
 - `boxes`: rows of 50 people at 10 Hz, from a label file; `ingest`, `run`, `export`, `check` and `recover`;
@@ -21,7 +21,6 @@ import struct
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -128,11 +127,10 @@ KINDS = {"video": video, "boxes": boxes, "chunks": chunks, "channels": channels}
 
 
 def measured(line: str, folder: Path) -> tuple[int, float, float]:
-    """Exit code, seconds and peak of resident memory in MB of a command."""
+    """Exit code, seconds of the processor and peak of resident memory in MB of a command."""
     import shlex
 
     environment = {name: value for name, value in os.environ.items() if not name.startswith("MCAPTRACK_")}
-    began = time.monotonic()
     with (folder / "said.txt").open("wb") as said:
         process = subprocess.Popen(
             [sys.executable, "-m", "mcaptrack", *shlex.split(line)],
@@ -143,7 +141,11 @@ def measured(line: str, folder: Path) -> tuple[int, float, float]:
         )
         _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
-    return process.returncode, time.monotonic() - began, usage.ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
+    return (
+        process.returncode,
+        usage.ru_utime + usage.ru_stime,
+        usage.ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3),
+    )
 
 
 def measurements(sizes: Sizes, wanted: list[str]) -> Iterator[str]:
