@@ -12,15 +12,15 @@ from mcaptrack.api.demonstration import DemoResult as DemoResult
 from mcaptrack.api.demonstration import demo as demo
 from mcaptrack.api.detecting import detect as detect
 from mcaptrack.api.detecting import motion as motion
+from mcaptrack.api.exporting import ExportResult as ExportResult
+from mcaptrack.api.exporting import export as export
 from mcaptrack.api.fetching import FetchedMessage as FetchedMessage
 from mcaptrack.api.fusing import fuse as fuse
 from mcaptrack.api.health import DoctorResult as DoctorResult
 from mcaptrack.api.health import doctor as doctor
 from mcaptrack.api.ingesting import IngestResult as IngestResult
 from mcaptrack.api.ingesting import ingest as ingest
-from mcaptrack.api.outputs import ExportResult as ExportResult
 from mcaptrack.api.outputs import ReportResult as ReportResult
-from mcaptrack.api.outputs import export as export
 from mcaptrack.api.outputs import report as report
 from mcaptrack.api.querying import ColumnInfo as ColumnInfo
 from mcaptrack.api.querying import TableInfo as TableInfo

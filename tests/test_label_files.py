@@ -276,7 +276,7 @@ def test_a_format_is_told_by_the_first_row(row, name, tmp_path):
         assert read_labels(path, role="detections").format == name
         return
     count = len(row.replace(",", " ").split())
-    formats = "mot, kitti, sdd, trajnet, obsmat, coco, yolo, supervision, csv"
+    formats = "mot, kitti, sdd, trajnet, obsmat, coco, cvat, yolo, supervision, csv"
     with pytest.raises(McaptrackError) as error:
         read_labels(path)
     assert str(error.value) == f"{path}:3: a row of {count} columns fits no label format ({formats}): {row[:60]}"
@@ -298,7 +298,7 @@ REFUSED = {
     "ids": ("trajnet", "tracks", "4 1 1 1\n2 7 1 1\n2 8 1 1\n2 7 1 1\n", ": id 7 appears twice in frame 2"),
     "json": ("auto", "tracks", ' \n{"a": 1}', " is JSON (an object with a), but neither annotations (images, annotations, categories) nor results (image_id, category_id, bbox, score) of COCO, nor rows of supervision (x_min, y_min, x_max, y_max, ...)"),
     "coco": ("auto", "tracks", '[{"image_id": 1}]', " is JSON (a list of image_id), but neither annotations (images, annotations, categories) nor results (image_id, category_id, bbox, score) of COCO, nor rows of supervision (x_min, y_min, x_max, y_max, ...)"),
-    "xml": ("auto", "tracks", '\ufeff<a "images">', " is XML, which isn't read; the formats of labels are mot, kitti, sdd, trajnet, obsmat, coco, yolo, supervision, csv"),
+    "xml": ("auto", "tracks", '\ufeff<a "images">', ":1: not valid XML: not well-formed (invalid token)"),
     "a long line": ("mot", "tracks", "1,1,1,1,1,1\n" + "1," * 2048 + "1", ":2: a line of more than 4096 characters is no row"),
 }  # fmt: skip
 

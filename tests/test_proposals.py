@@ -153,6 +153,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "cli/running.py:_next:run": lambda s: s.says("fuse", "LOG"),
     "pipeline/fusing.py:_lack:detect": lambda s: s.without("/camera/[!vg]*").says("fuse", "LOG"),
     "api/running.py:warn_stale:run": lambda s: s.says("detect", "LOG", "--detector", "mog2"),
+    "api/ingesting.py:_changes:run": lambda s: s.says("ingest", "truth.txt", "--as", "corrections", "--into", "LOG"),
     "api/running.py:change:export": lambda s: s.says("run", "s3://bucket/a.mcap"),
     "cli/train.py:_print:predict": lambda s: s.says(
         "train", "synthetic", "--walks", "1000", "--epochs", "1", "-o", "my net"

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from mcaptrack import log as logs
 from mcaptrack.api.checked import checked
@@ -21,12 +21,14 @@ from mcaptrack.api.common import (
     warn_unused,
     warnings_about,
 )
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, call
+from mcaptrack.evaluation.corrections import changes_in
 from mcaptrack.files import is_same_file, refuse_overwrite
 from mcaptrack.geometry import clocks
 from mcaptrack.geometry.plane import Point
 from mcaptrack.notices import Notice, warn
-from mcaptrack.sources.ingest import Format, ImageFormat, IngestOptions, InputRole
+from mcaptrack.sources.corrections import CORRECTED
+from mcaptrack.sources.ingest import Format, ImageFormat, IngestOptions, IngestReport, InputRole
 from mcaptrack.sources.ingest import ingest as make_log
 from mcaptrack.sources.ingest.bags.metadata_update import update_metadata
 from mcaptrack.sources.ingest.labels.columns import check_keys, parse_columns
@@ -56,6 +58,9 @@ class IngestResult:
         Whether there were label files.
     uses_camera : bool
         Whether anything was written below the name of the camera.
+    changes : dict or None
+        What corrections changed: numbers of boxes that are the same, moved, added and removed, and ids of tracks that
+        were joined, split, added and removed; None if there were none.
 
     """
 
@@ -67,6 +72,7 @@ class IngestResult:
     warnings: tuple[Notice, ...]
     has_labels: bool
     uses_camera: bool
+    changes: Mapping[str, Any] | None = None
 
 
 @checked(quality=(1, 100), keyframe_interval_s=(0.01, 60), first_frame=(0, 10**12), frames=(1, 10_000_000))
@@ -129,9 +135,9 @@ def ingest(
     motion : path, optional
         File with the motion of the camera: a row per frame, of its number (from 0) and the 2x3 transform from pixels of
         the frame before.
-    label_format : {"auto", "mot", "kitti", "sdd", "trajnet", "obsmat", "coco", "yolo", "supervision", "csv", ...}
-        Format of the label files, by default "auto": as their content tells. Those of 3D boxes are "csv", "kitti-3d",
-        "nuscenes" and "argoverse".
+    label_format : {"auto", "mot", "kitti", "sdd", "trajnet", "obsmat", "coco", "cvat", "yolo", "supervision", ...}
+        Format of the label files, by default "auto": as their content tells. "csv" is any table with a header. Those of
+        3D boxes are "csv", "kitti-3d", "nuscenes" and "argoverse".
     first_frame : int, optional
         Number of the first picture in label files.
     frames : int, optional
@@ -150,9 +156,9 @@ def ingest(
         Frame of reference of 3D boxes; by default that of the format, or else the root of the log's transforms.
     scene : str, optional
         Name of the scene, if the labels are of nuScenes.
-    role : {"detections", "tracks", "truth", "motion"}, optional
-        What ``source`` holds, if it is a label file; by default as its ids tell. The motion of a camera goes ``into`` a
-        log.
+    role : {"detections", "tracks", "truth", "corrections", "motion"}, optional
+        What ``source`` holds, if it is a label file; by default as its ids tell. The motion of a camera and corrections
+        of its tracks go ``into`` a log; ``run`` then takes corrected tracks in place of those that it found.
     into : path, optional
         Add to this log instead of making a new one.
     sidecar : bool, optional
@@ -206,6 +212,7 @@ def ingest(
         frame_id=frame,
         scene=scene,
     )
+    changes = None
     with warnings_about(path) as warnings:
         if into is None:
             target = default_log(path) if output is None else log_output(output, path)
@@ -217,6 +224,7 @@ def ingest(
                 opened.lock()
                 report = make_log(path, target, options, into=opened, force=force, progress=progress)
                 written_to = opened.parts[-1].path
+            changes = _changes(target, report) if role == "corrections" else None
             if place.why:
                 report.remarks.append(place.words(written_to))
             if written_to == target:
@@ -243,7 +251,20 @@ def ingest(
         warnings=tuple(dict.fromkeys(warnings)),
         has_labels=report.has_labels,
         uses_camera=report.uses_camera,
+        changes=changes,
     )
+
+
+def _changes(path: Path, report: IngestReport) -> dict[str, Any] | None:
+    """Compare corrections that were written with their tracks, and say in a line of the report what they changed."""
+    (topic,) = (topic for topic in report.messages if topic.endswith(f"/{CORRECTED}"))
+    with logs.read(path) as opened:
+        found = changes_in(opened, topic)
+    if found is None:
+        report.remarks.append(f"{path} has no tracks to compare {topic} with")
+        return None
+    report.remarks.append(f"{topic}: {found.words}; {call('run', path)} takes it over")
+    return found.to_json()
 
 
 def default_log(source: Path) -> Path:

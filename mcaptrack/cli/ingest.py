@@ -122,6 +122,7 @@ def ingest(
             "trajnet",
             "obsmat",
             "coco",
+            "cvat",
             "yolo",
             "supervision",
             "csv",
@@ -203,9 +204,13 @@ def ingest(
         ),
     ] = None,
     role: Annotated[
-        Literal["detections", "tracks", "truth", "motion"] | None,
+        Literal["detections", "tracks", "truth", "corrections", "motion"] | None,
         common.option(
-            "--as", panel=labels.LABELS, help="What INPUT holds, if it is a label file.", show_default="as its ids tell"
+            "--as",
+            panel=labels.LABELS,
+            help="What INPUT holds, if it is a label file. corrections: tracks of the log that a person has "
+            "corrected; run then takes them over.",
+            show_default="as its ids tell",
         ),
     ] = None,
     into: Annotated[
@@ -318,4 +323,5 @@ def _as_json(done: IngestResult) -> dict[str, Any]:
         "messages": done.messages,
         "notes": [with_flags(words) for words in (*done.notes, *done.details)],
         "lost": [with_flags(words) for words in done.lost],
+        **({"changes": done.changes} if done.changes is not None else {}),
     }

@@ -175,20 +175,38 @@ def export(
             "--output",
             "-o",
             panel=common.FILES,
-            help="Folder for the tables, or for the bag.",
-            show_default="LOG.tables or LOG.rosbag2 beside the log",
+            help="Folder for the tables or the bag, or the file.",
+            show_default="LOG.tables, LOG.rosbag2, LOG.cvat.xml, ... beside the log",
         ),
     ] = None,
     form: Annotated[
-        Literal["parquet", "arrow", "csv", "jsonl", "rosbag2", "rosbag2-sqlite3"],
-        common.option("--format", panel=common.FILES, help="Format of the files: of tables, or of a ROS 2 bag."),
+        Literal[
+            "parquet",
+            "arrow",
+            "csv",
+            "jsonl",
+            "rosbag2",
+            "rosbag2-sqlite3",
+            "mot",
+            "kitti",
+            "coco",
+            "cvat",
+            "boxes-csv",
+            "rerun",
+        ],
+        common.option(
+            "--format",
+            panel=common.FILES,
+            help="Tables (parquet, arrow, csv, jsonl), a ROS 2 bag, or a file with the boxes of one channel: "
+            "MOTChallenge, KITTI tracking, COCO with tracks, CVAT for video, a table, or a recording of Rerun.",
+        ),
     ] = "parquet",
     topic: Annotated[
         list[str] | None,
         common.option(
             "--topic",
             panel=common.FILES,
-            help="Also write a table of all messages of this channel.",
+            help="Also write a table of all messages of this channel; the channel with the boxes for a file.",
             show_default=False,
         ),
     ] = None,
@@ -215,7 +233,7 @@ def export(
         common.option(
             "--force",
             panel=common.FILES,
-            help="Write all tables again, also over those of another log of this name; replace a bag.",
+            help="Write all tables again, also over those of another log of this name; replace a bag or a file.",
         ),
     ] = False,
     json: common.Json = False,
@@ -223,26 +241,31 @@ def export(
     verbose: common.Verbose = False,
     config: common.Config = None,
 ) -> None:
-    """Write a log as tables (Parquet), one row per object and frame, or as a ROS 2 bag.
+    """Write a log as tables (Parquet), one row per object and frame, as a ROS 2 bag, or for other programs.
 
     One folder a table (frames, detections, tracks, track_summary, predictions, events, metrics, channels, recordings
     and others), one file a log in it; several logs can share a folder. Exporting again replaces what has changed.
     `mcaptrack docs tables` lists all columns. A bag (rosbag2) holds results as ROS messages, for RViz and `ros2 bag`.
+    A file (mot, kitti, coco, cvat, boxes-csv) has the boxes of one channel; `mcaptrack ingest` reads it again.
 
     Example: mcaptrack export log.mcap -o tables/
+
+    Example: mcaptrack export log.mcap --format cvat -o boxes.xml
 
     Example: mcaptrack export robot.mcap --topic /imu --format csv
 
     Example: mcaptrack export log.mcap --delta lake/
     """
     import mcaptrack
-    from mcaptrack.api.outputs import refuse_same_tables
+    from mcaptrack.api.exporting import refuse_same_tables
     from mcaptrack.fleet import find_logs
+    from mcaptrack.tables import FORMATS as TABLES
     from mcaptrack.tables.catalogue import refresh
+    from mcaptrack.tables.exchange import ends_with
 
-    found, is_bag = find_logs(logs), form.startswith("rosbag2")
+    found, is_table = find_logs(logs), form in TABLES
     folder = output or many_options().output_dir
-    if not is_bag:
+    if is_table:
         refuse_same_tables([one.path for one in found], folder)
     if delta is not None and form != "parquet":
         raise McaptrackError(f"--delta takes tables in Parquet, not --format {form}; leave one of them out")
@@ -267,13 +290,13 @@ def export(
             show,
             data,
             rows,
-            ".rosbag2",
+            ".rosbag2" if form.startswith("rosbag2") else ends_with(form),
             writes_objects=False,
-            shares_output=not is_bag,
+            shares_output=is_table,
             then=batches.add if batches else lambda _: None,
         )
         results, totals = process(found, work, talk, output)
-        if folder is not None and not is_bag and form == "parquet" and len(found) > 1:
+        if folder is not None and form == "parquet" and len(found) > 1:
             refresh(folder)
         if batches:
             totals |= {"delta": batches.finish(len(found) == 1)}

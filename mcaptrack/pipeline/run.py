@@ -17,6 +17,7 @@ from mcaptrack.geometry.plane import Planes, scene_planes
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline.checks import Job, check_inputs, read_named_frames
 from mcaptrack.pipeline.context import in_context
+from mcaptrack.pipeline.corrections import corrected_input, corrected_tracks, fixed_in
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.findings import warn_findings, warn_memory, warn_no_rows
@@ -201,6 +202,11 @@ class _Input(NamedTuple):
     classes: Mapping[str, str] = {}
     frame_id: str = ""
 
+    def corrected(self, opened: log.Log, prefix: str, job: Job) -> tuple[_Input, Mapping[str, str]]:
+        """Return tracks with the corrections of people, and the digests of these by topic."""
+        frames, references = corrected_input(opened, prefix, job, self.frames)
+        return (self._replace(stream=frames, frames=frames) if references else self), references
+
     def in_scene(self, path: CameraPath) -> _Input:
         """Return the same tracks with boxes in pixels of the reference picture."""
         moved = to_scene(self.frames, path)
@@ -212,11 +218,13 @@ def _run_job(
 ) -> dict[str, Made]:
     """Run a job, and return its channels by topic. ``made`` are the channels of earlier jobs."""
     known = side_inputs(opened, prefix, job, made)
+    given, corrections = given.corrected(opened, prefix, job)
     path, motion = path_with(opened, prefix, job.source, made) if job.transform.reads is TRACKS else (None, {})
     if path is not None:  # boxes of pictures that the camera moved between can't be joined as they are
         given, planes = given.in_scene(path), scene_planes(planes, path)
     context = in_context(opened, prefix, job, given.frames, planes, given.classes)
-    transform = replace(context, **known.values)
+    fixed = fixed_in(opened, prefix, job.source, made) if hasattr(context, "fixed_ids") else ()
+    transform = replace(context, **known.values, **({"fixed_ids": fixed} if fixed else {}))
     collectors = [FrameCollector(schema) for schema in transform.writes.values()]
     taken = [0]
     try:
@@ -243,14 +251,14 @@ def _run_job(
             "picture that has its parameter sets",
             "left-out",
         )
-    provenance = _provenance_of(job, transform, given, warnings, {**known.references, **motion})
+    provenance = _provenance_of(job, transform, given, warnings, {**known.references, **motion, **corrections})
     channels: dict[str, tuple[Schema, Sequence[Frame]]] = {
         topic: (schema, to_pictures(channel, path) if schema is TRACKS else channel)
         for (topic, schema), channel in zip(job.outputs().items(), outputs, strict=True)
     }
     if job.target + FULL in job.kept():
         carry = linked_tracks if traits_of(transform).leaves_unchanged else to_video_rate
-        frames = _at_video_rate(opened, job, made, outputs[0], planes, path, carry)
+        frames = _at_video_rate(opened, prefix, job, made, outputs[0], planes, path, carry)
         channels |= {job.target + FULL: (TRACKS, frames)} if frames else {}
     seen: Channels = channels
     if not traits_of(transform).keeps_unseen:
@@ -298,6 +306,7 @@ def _provenance_of(
 
 def _at_video_rate(
     opened: log.Log,
+    prefix: str,
     job: Job,
     made: Mapping[str, Made],
     retracked: Sequence[Frame],
@@ -317,6 +326,7 @@ def _at_video_rate(
     else:
         there = source in opened.channels and opened.channels[source].schema_name == TRACKS.name
         tracks = opened.frame_columns(source, TRACKS) if there else ()
+    tracks = corrected_tracks(opened, prefix, source, tracks) if len(tracks) else tracks
     return to_pictures(carry(to_scene(tracks, path), retracked, planes), path)
 
 

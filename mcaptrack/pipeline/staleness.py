@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mcaptrack import log
-from mcaptrack.pipeline import motion
+from mcaptrack.pipeline import corrections, motion
 from mcaptrack.pipeline.planes import planes_to_json, read_planes
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.cameras import chain_of, name_above, provenance_of
@@ -19,7 +19,7 @@ def is_stale(opened: log.Log, topic: str) -> bool:
         planes = read_planes(opened, prefix)
         if planes_to_json(planes or ()) != made.parameters["ground_planes"]:
             return True
-    if motion.is_motion_new(opened, prefix, made):
+    if motion.is_motion_new(opened, prefix, made) or corrections.are_new(opened, prefix, made):
         return True
     if any((name in opened.channels) != bool(then) for name, then in made.references.items()):
         return True

@@ -29,10 +29,11 @@ from mcaptrack.schema.framing import split_rows
 from mcaptrack.sources import ingest
 from mcaptrack.sources.ingest.bags.opening import is_mcap
 from mcaptrack.sources.ingest.boxes_3d_job import FRAME, Boxes3DJob
-from mcaptrack.sources.ingest.job import IngestOptions, label_rows
+from mcaptrack.sources.ingest.job import IngestOptions
 from mcaptrack.sources.ingest.label_job import LabelJob
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
 from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX, IgnoredBoxes, Labels, Role
+from mcaptrack.sources.ingest.labels.label_rows import label_rows
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 
 #: Formats that give the frame number of each row.

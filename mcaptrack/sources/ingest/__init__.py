@@ -17,6 +17,7 @@ from mcaptrack.sources.ingest.job import MOTION, IngestJob, IngestOptions, Inges
 from mcaptrack.sources.ingest.label_job import LabelJob, label_frames
 from mcaptrack.sources.ingest.labels.box_rows import OTHERS
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
+from mcaptrack.sources.ingest.labels.cvat import is_cvat
 from mcaptrack.sources.ingest.labels.formats import Format, Role
 from mcaptrack.sources.ingest.labels.yolo import is_label_folder
 from mcaptrack.sources.ingest.motion_job import MotionJob
@@ -115,7 +116,8 @@ def _job(source: Path, options: IngestOptions, progress: Progress, into: log.Log
         return Boxes3DJob([(role, source)], options, into)
     if source.is_dir() and role != MOTION and (role or is_label_folder(source)):
         return LabelJob([(role, source)], options, into)
-    is_video = source.is_dir() or source.suffix.lower() in VIDEO_SUFFIXES or _is_binary(source)
+    is_zip = role != MOTION and source.suffix.lower() == ".zip" and is_cvat(source)
+    is_video = source.is_dir() or source.suffix.lower() in VIDEO_SUFFIXES or (not is_zip and _is_binary(source))
     if is_video:
         return VideoJob(source, options, progress, into)
     if role == MOTION:

@@ -48,6 +48,8 @@ class Boxes3DJob(IngestJob):
         self._refuse_options(options)
         self.boxes: dict[Role, BoxRows3D] = {}
         for given, path in (*inputs, *options.labels.items()):
+            if given == "corrections":
+                raise McaptrackError(f"{path} holds 3D boxes; corrections are boxes in pictures")
             rows = read_boxes_3d(path, given or "detections", options.label_format, options.columns, options.scene)
             role = given or ("tracks" if rows.has_ids else "detections")
             if role != "detections":

@@ -18,14 +18,16 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.plane import GroundPlane, Point
 from mcaptrack.notices import Notice, warn
-from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, TRACKS, Frame, Rows, Schema
+from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import classes_beside_rows, only_class, without_class
 from mcaptrack.schema.encodings import PROTOBUF, Encoding, encoded, record_of
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance, digest
+from mcaptrack.sources.corrections import CORRECTED
 from mcaptrack.sources.ingest.labels.box_rows import OTHERS, fitted
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
 from mcaptrack.sources.ingest.labels.formats import Format, Labels, Role
+from mcaptrack.sources.ingest.labels.label_rows import label_rows
 from mcaptrack.sources.ingest.labels.motions import motion_frames, read_motions
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline
@@ -38,7 +40,14 @@ Progress = Callable[[str, int, int], None]
 Frames = Callable[[], Iterator[Frame]]
 
 #: The schema of each role.
-SCHEMA_OF: Final[Mapping[Role, Schema]] = {"detections": DETECTIONS, "tracks": TRACKS, "truth": TRACKS}
+SCHEMA_OF: Final[Mapping[Role, Schema]] = {
+    "detections": DETECTIONS,
+    "tracks": TRACKS,
+    "truth": TRACKS,
+    "corrections": TRACKS,
+}
+#: The last part of the topic of each role, if it isn't its name.
+TOPIC_OF: Final[Mapping[Role, str]] = {"corrections": CORRECTED}
 #: The role of a file with the motion of the camera, and the last part of its topic.
 MOTION: Final = "motion"
 #: What an input that is a text file can hold.
@@ -150,7 +159,7 @@ class IngestJob:
     def read(self, path: Path, role: Role) -> Labels:
         """Read a label file with the format options."""
         options = self.options
-        wanted = options.classes or ONLY_PEOPLE
+        wanted = options.classes or (WantedClasses("all") if role == "corrections" else ONLY_PEOPLE)
         if is_3d(path, options.label_format, options.columns):
             raise McaptrackError(
                 f"{path} holds 3D boxes, and {self.source} does not; add them with "
@@ -271,7 +280,7 @@ class IngestJob:
 
     def topics(self) -> Iterator[str]:
         """The topics that will be written."""
-        yield from (f"{self.prefix}/{role}" for role in self.labels)
+        yield from (f"{self.prefix}/{TOPIC_OF.get(role, role)}" for role in self.labels)
         if self.homography:
             yield f"{self.prefix}/ground_plane"
         if self.motions is not None:
@@ -297,11 +306,13 @@ class IngestJob:
         """Write the labels, each frame at the time of its picture."""
         for role, (path, labels) in self.labels.items():
             placed = timeline.place(path, labels, self.report.lost)
+            if role == "corrections":  # frames beyond those that were looked at stay as they are
+                placed = placed.between(int(labels.labelled[0]), int(labels.labelled[-1]))
             parameters: dict[str, Any] = {"file": path.name, "format": labels.format} | self.label_parameters(
                 role, labels
             )
             frames = self.frames(role, plane, placed)
-            self.write_rows(writer, role, SCHEMA_OF[role], frames, parameters, labels.classes)
+            self.write_rows(writer, TOPIC_OF.get(role, role), SCHEMA_OF[role], frames, parameters, labels.classes)
 
     def write_motion(self, writer: log.LogWriter, timeline: Timeline, size: tuple[int, int]) -> None:
         """Write the motion of the camera, if it was given; pictures have this width and height."""
@@ -373,28 +384,3 @@ class IngestJob:
             writer.add_message(channel, *message)
             count += 1
         self.report.messages[topic] = count
-
-
-def label_rows(labels: Labels, role: Role, plane: GroundPlane | None) -> Rows:
-    """Convert the N rows of labels to rows of detections or tracks, with positions in metres if a plane is given."""
-    if role == "detections" and labels.boxes_px is not None:
-        x, y, w, h = labels.boxes_px.T
-        return DETECTIONS.rows(x_px=x, y_px=y, w_px=w, h_px=h, score=labels.score, class_id=labels.class_id)
-    nowhere = np.full((len(labels.frame), 4), np.nan)
-    boxes = nowhere if labels.boxes_px is None else labels.boxes_px
-    xy_m = labels.xy_m
-    if xy_m is None:
-        xy_m = plane.boxes_to_metres(boxes) if plane else nowhere[:, :2]
-    return TRACKS.rows(
-        track_id=labels.id,
-        x_px=boxes[:, 0],
-        y_px=boxes[:, 1],
-        w_px=boxes[:, 2],
-        h_px=boxes[:, 3],
-        x_m=xy_m[:, 0],
-        y_m=xy_m[:, 1],
-        score=labels.score,
-        observed=np.ones(len(labels.frame), bool),
-        source_id=np.full(len(labels.frame), -1),
-        class_id=labels.class_id,
-    )

@@ -78,6 +78,8 @@ class LabelJob(IngestJob):
             raise McaptrackError(f"{self.source} is a label file; {options.for_videos()} is for videos")
         if options.frames is not None and not 0 < options.frames <= MAX_FRAMES:
             raise McaptrackError(f"`frames=` is a number from 1 to {MAX_FRAMES}, not {options.frames}")
+        if "corrections" in self.labels and into is None:
+            raise McaptrackError(f"{self.source}: corrections are of tracks in a log; name it with `into=`")
         self._fps: Fraction | None = None
         self._clock = ("", False)  # remark on times that don't come from pictures, and whether they are assumed
         self._other_rates: list[str] = []

@@ -11,7 +11,7 @@ Letters: K tracks, N rows of samples, E candidate links.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -41,20 +41,31 @@ _RETURNS: Final = 0.5
 
 
 def link_in_picture(
-    frames: FrameColumns, max_gap_s: float, min_confidence: float, across_classes: bool
+    frames: FrameColumns,
+    max_gap_s: float,
+    min_confidence: float,
+    across_classes: bool,
+    fixed: Collection[int] = (),
 ) -> Iterator[Rows]:
     """The rows of each frame, with tracks linked over gaps of up to ``max_gap_s``, and the gaps interpolated.
 
     A link is made if it is right with a probability of at least ``min_confidence``. A track that continues another has
-    the id of that one. Where nothing is linked, rows are those of the input.
+    the id of that one. No link joins two of the tracks ``fixed``. Where nothing is linked, rows are those of the input.
     """
     if not len(frames):
         return
     tracks = _tracks(frames)
     before, after = _links(tracks, min(max_gap_s, MAX_GAP_S), min_confidence, across_classes)
     root = np.arange(len(tracks.ids))
+    holds = np.isin(tracks.ids, np.array(sorted(fixed), np.int64))
+    made = np.ones(len(before), bool)
     for link in np.argsort(tracks.t_s[tracks.first[after]], kind="stable").tolist():  # a continuation begins later
-        root[after[link]] = root[before[link]]
+        first = root[before[link]]
+        made[link] = not (holds[first] and holds[after[link]])
+        if made[link]:
+            root[after[link]] = first
+            holds[first] |= holds[after[link]]
+    before, after = before[made], after[made]
     name = dict(zip(tracks.ids.tolist(), tracks.ids[root].tolist(), strict=True))
     last = tracks.first[1:] - 1
     ends = {int(tracks.ids[i]): int(tracks.ids[j]) for i, j in zip(before, after, strict=True)}

@@ -113,7 +113,9 @@ def _keep_ids(options: RetrackOptions, frames: Iterable[Frame]) -> Iterator[tupl
     linked: Iterator[Rows] | None = None
     if options.links_in_picture:
         frames = collect(TRACKS, frames)
-        linked = link_in_picture(frames, options.link_s, options.link_confidence, options.across_classes)
+        linked = link_in_picture(
+            frames, options.link_s, options.link_confidence, options.across_classes, options.fixed_ids
+        )
     for frame in frames:
         online = frame._replace(rows=frame.rows[frame.rows["observed"]])
         offline = frame if linked is None else frame._replace(rows=next(linked))

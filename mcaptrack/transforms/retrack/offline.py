@@ -16,6 +16,7 @@ from mcaptrack.schema import Rows
 from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers
 from mcaptrack.transforms.retrack.false_tracks import scored_confidence, track_confidence
+from mcaptrack.transforms.retrack.fixed_tracks import fix_tracks
 from mcaptrack.transforms.retrack.identity_swaps import resolve_swaps
 from mcaptrack.transforms.retrack.linking import link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
@@ -56,6 +57,8 @@ def offline_tracks(
         track = _linked(options, model, step, track, xy, step_s, movers)
     if options.resolve_swaps and len(track) and not movers.on_ground:
         track = _without_swaps(model, step, track, source, xy, step_s)
+    track = fix_tracks(step, track, source, options.fixed_ids)
+    kept_tracks = np.unique(track[np.isin(source, np.array(options.fixed_ids, np.int64))])
     order = np.lexsort((step, track))
     step, track, sample = step[order], track[order], sample[order]
     rows = TrackRows.of(step, track, sample)
@@ -81,11 +84,13 @@ def offline_tracks(
         is_sure = (confidence >= options.track_confidence)[np.searchsorted(ids, rows.track)]
     else:
         is_sure = np.ones(len(rows.track), bool)
+    is_fixed = np.isin(rows.track, kept_tracks)
+    is_sure |= is_fixed
     min_track_s = options.min_track_s * (_CONFIRMED_SHARE if movers.on_ground else 1.0)
     min_rows = round(min_track_s * options.rate_hz) + 1
     _, which, lengths = np.unique(rows.track[is_sure], return_inverse=True, return_counts=True)
     is_kept &= is_sure
-    is_kept[is_sure] &= lengths[which] >= min_rows
+    is_kept[is_sure] &= (lengths[which] >= min_rows) | is_fixed[is_sure]
     left = np.flatnonzero(is_kept)
     return rows_by_step(rows.take(left), samples, moved and moved.take(left), steps)
 

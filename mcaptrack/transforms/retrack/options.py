@@ -136,6 +136,7 @@ class RetrackOptions:
     ground_planes: Planes = context(tuple)
     class_names: ClassNames = context(tuple, is_recorded=False)
     poor_scale: bool = context(lambda: False)
+    fixed_ids: tuple[int, ...] = context(tuple, is_recorded=False)
 
     reads: ClassVar[Schema] = TRACKS
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType(

@@ -33,7 +33,7 @@ from mcaptrack.sources.ingest.labels.number_table import EXACT
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
 #: Formats of other detectors and annotation tools.
-OTHERS: Final[tuple[Format, ...]] = ("coco", "yolo", "supervision", "csv")
+OTHERS: Final[tuple[Format, ...]] = ("coco", "cvat", "yolo", "supervision", "csv")
 #: A class that a row doesn't state.
 NO_CLASS: Final = -1
 _MAX_CLASS: Final = 2**31 - 1
@@ -53,7 +53,7 @@ class BoxRows:
     ``names`` are the class names by number, None if the file has none. ``at`` names the place of a row in messages.
     ``crowd`` (N,) marks regions of people that have no boxes of their own. ``labelled`` (F,) are frames that the file
     describes, with or without boxes. ``times_s`` (F,): the times of frames, which are then numbered from 0.
-    ``is_normalised``: boxes are in shares of the picture's size.
+    ``is_normalised``: boxes are in shares of the picture's size. ``observed`` (N,): see ``Labels``.
     """
 
     path: Path
@@ -70,6 +70,7 @@ class BoxRows:
     first_frame: int | None = None
     times_s: Floats | None = None
     is_normalised: bool = False
+    observed: Bools | None = None
     remarks: list[str] = field(default_factory=list)
     doubts: list[tuple[str, Code]] = field(default_factory=list)
 
@@ -118,6 +119,7 @@ class BoxRows:
             tuple(self.doubts),
             self.is_normalised,
             self.times_s,
+            None if self.observed is None else self.observed[kept],
         )
 
     def take_shares(self) -> None:
@@ -259,6 +261,8 @@ def class_ids(rows: BoxRows) -> tuple[ClassIds, dict[int, str]]:
     for one, name in sorted(rows.names.items()):
         if is_person(name):
             place = PERSON
+        elif one == UNKNOWN and name.casefold() == "unknown":
+            place = UNKNOWN
         elif one > PERSON:
             place = one
         else:

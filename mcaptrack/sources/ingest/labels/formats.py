@@ -41,6 +41,7 @@ Format = Literal[
     "trajnet",
     "obsmat",
     "coco",
+    "cvat",
     "yolo",
     "supervision",
     "csv",
@@ -50,7 +51,7 @@ Format = Literal[
 ]
 #: Formats that hold 3D boxes alone; tables ("csv") may hold either.
 FORMATS_3D: Final[tuple[str, ...]] = ("kitti-3d", "nuscenes", "argoverse")
-Role = Literal["detections", "tracks", "truth"]
+Role = Literal["detections", "tracks", "truth", "corrections"]
 ClassIds = NDArray[np.uint32]
 
 NO_ID: Final = -1
@@ -68,7 +69,7 @@ _MOT_NAMES: Final = (
     "pedestrian,person on vehicle,car,bicycle,motorbike,non motorized vehicle,static person,distractor,occluder,"
     "occluder on the ground,occluder full,reflection,crowd"
 )
-_MOT_CLASSES: Final = dict(enumerate(_MOT_NAMES.split(","), start=1))
+MOT_CLASSES: Final = dict(enumerate(_MOT_NAMES.split(","), start=1))
 #: Distractor classes of MOT16, 17 and 20: person on a vehicle, static person, distractor, reflection.
 _DISTRACTORS: Final = (2, 7, 8, 12)
 #: People in KITTI that are occluded more than this, or truncated, are not scored; boxes up to this height are not
@@ -109,7 +110,8 @@ class Labels:
     ``class_id`` (N,) is as in the schema of detections; ``classes`` are names by class id. ``left_out`` describes the
     rows that were left out; those of ground truth are in ``ignored``. ``remarks`` and ``doubts`` (warnings and their
     codes) say how the file was understood. ``is_normalised``: boxes are in shares of the picture's size. ``times_s``
-    (F,): the times of frames by the file itself; its frames are then numbered from 0.
+    (F,): the times of frames by the file itself; its frames are then numbered from 0. ``observed`` (N,): which boxes
+    were seen, and not filled in or occluded, if the file says so.
     """
 
     format: Format
@@ -128,6 +130,7 @@ class Labels:
     doubts: tuple[tuple[str, Code], ...] = ()
     is_normalised: bool = False
     times_s: Floats | None = None
+    observed: Bools | None = None
 
     @property
     def step(self) -> int:
@@ -227,7 +230,7 @@ def read_mot(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Lab
     has_others = role != "detections" and not wanted.is_people
     stated = np.where(named & (kind >= 0) & (kind < 2**31), kind, PERSON).astype(np.int64)
     if has_others:
-        kept = wanted.mask(path, stated, _MOT_CLASSES) & ((stated != PERSON) | (score != 0) | (role != "truth"))
+        kept = wanted.mask(path, stated, MOT_CLASSES) & ((stated != PERSON) | (score != 0) | (role != "truth"))
     elif role == "truth":
         if (kind == 0).all():
             raise McaptrackError(
@@ -263,7 +266,7 @@ def read_mot(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Lab
         score[kept] if role != "truth" else np.full(int(kept.sum()), np.nan),
         np.unique(frame),
         class_id[kept],
-        {one: _MOT_CLASSES[one] for one in np.unique(class_id[kept]).tolist() if has_others and one in _MOT_CLASSES},
+        {one: MOT_CLASSES[one] for one in np.unique(class_id[kept]).tolist() if has_others and one in MOT_CLASSES},
         left_out=others,
         ignored=ignored if (kind > 0).any() else None,
     )

@@ -31,8 +31,8 @@ _TRACK_IDS: Final = ("track_id", "instance_id", "tracker_id")
 _FRAMES: Final = ("frame_id", "frame_index", "mot_frame_id")
 _VIDEOS: Final = ("video_id", "vid_id")
 _BY_LIST: Final = "the list `images`"
-#: Numbers of a row: frame, left, top, width, height, score, category, id, whether it is a crowd.
-_COLUMNS: Final = 9
+#: Numbers of a row: frame, left, top, width, height, score, category, id, whether it is a crowd, and was filled in.
+_COLUMNS: Final = 10
 
 
 def is_json(path: Path) -> bool:
@@ -125,6 +125,7 @@ class _Rows:
                 NO_CLASS if category is None else _float(category),
                 NO_ID if track_id is None else _float(track_id),
                 bool(crowd),
+                isinstance(inner, dict) and inner.get("observed") is False,
             )
         )
 
@@ -137,9 +138,10 @@ class _Rows:
     def done(self, names: Mapping[int, str] | None) -> BoxRows:
         """All rows."""
         values: Floats = np.frombuffer(self._values, np.float64).reshape(-1, _COLUMNS)
-        frame, score, number, track_id, crowd = (values[:, at] for at in (0, 5, 6, 7, 8))
+        frame, score, number, track_id, crowd, unseen = (values[:, at] for at in (0, 5, 6, 7, 8, 9))
         boxes, is_crowd = values[:, 1:5], crowd != 0
         rows = BoxRows(self._path, "coco", self.at, frame, boxes, track_id, score, number, names, is_crowd)
+        rows.observed = unseen == 0
         rows.take_shares()
         return rows
 

@@ -12,6 +12,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
 from mcaptrack.sources.ingest.labels.columns import choose_columns
+from mcaptrack.sources.ingest.labels.cvat import is_cvat, read_cvat
 from mcaptrack.sources.ingest.labels.delimited import MAX_LINE, SUPERVISION, comment_header, header_of, read_csv
 from mcaptrack.sources.ingest.labels.formats import FORMATS_3D, READERS, Format, Labels, Role
 from mcaptrack.sources.ingest.labels.json_boxes import is_json, read_json
@@ -72,6 +73,7 @@ def read_labels(
         xy_m=None if xy is None else xy[order],
         score=labels.score[order],
         class_id=labels.class_id[order],
+        observed=None if labels.observed is None else labels.observed[order],
         doubts=tuple(doubt for doubt in labels.doubts if first_frame is None or doubt[1] != "clock"),
     )
 
@@ -84,6 +86,10 @@ def _read(path: Path, label_format: Format, role: Role, columns: Mapping[str, st
         label_format = "yolo"
     elif label_format in ("auto", "supervision", "coco") and is_json(path):
         return read_json(path, label_format, role, columns, wanted)
+    elif label_format in ("auto", "cvat") and is_cvat(path):
+        if columns:
+            raise McaptrackError(f"{path}: `columns=` is for tables with a header, not for CVAT")
+        return read_cvat(path, role, wanted)
     if label_format == "auto":
         found = next(lines_of(path, MAX_LINE), None)
         if found is None:
@@ -91,6 +97,8 @@ def _read(path: Path, label_format: Format, role: Role, columns: Mapping[str, st
         label_format = "csv" if columns else _guess(path, *found)
     if columns and label_format not in ("csv", "supervision"):
         raise McaptrackError(f"{path}: `columns=` is for tables with a header, not for {label_format}")
+    if label_format == "cvat":
+        raise McaptrackError(f"{path} is neither XML nor a zip file with annotations.xml, as CVAT writes them")
     if label_format == "coco":
         raise McaptrackError(f"{path} is not JSON, as COCO is")
     if label_format == "yolo":
@@ -101,8 +109,6 @@ def _read(path: Path, label_format: Format, role: Role, columns: Mapping[str, st
 
 
 def _guess(path: Path, number: int, line: str) -> Format:
-    if line.lstrip().startswith("<"):
-        raise McaptrackError(f"{path} is XML, which isn't read; the formats of labels are {', '.join(FORMATS)}")
     header = header_of(path, line)
     if header:
         return "supervision" if set(SUPERVISION) <= set(header) else "csv"
@@ -113,7 +119,7 @@ def _guess(path: Path, number: int, line: str) -> Format:
         return "mot"
     if len(columns) == 10 and columns[-1].startswith('"'):
         return "sdd"
-    if len(columns) in (17, 18) and columns[2].replace("_", "").isalpha():
+    if len(columns) in (17, 18) and columns[2][:1].isalpha() and columns[2].replace("_", "").isalnum():
         return "kitti"
     if len(columns) == 4:
         return "trajnet"

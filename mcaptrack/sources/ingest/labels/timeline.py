@@ -40,6 +40,11 @@ class Placed(NamedTuple):
     index: Ints  # type: ignore[assignment]  # hides tuple.index, which is not needed here
     t_ns: Ints
 
+    def between(self, first: int, last: int) -> Placed:
+        """The frames with numbers from ``first`` to ``last`` in the file."""
+        inside = (self.number >= first) & (self.number <= last)
+        return Placed(self.number[inside], self.index[inside], self.t_ns[inside])
+
 
 @dataclass(frozen=True)
 class Timeline:

@@ -1,0 +1,216 @@
+"""Write logs as tables, as ROS 2 bags, or as files of other programs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, cast
+
+from mcaptrack import log as logs
+from mcaptrack.api.checked import checked
+from mcaptrack.api.common import (
+    PathLike,
+    Progress,
+    as_location,
+    log_location,
+    names_of,
+    no_progress,
+    optional_path,
+    warn_unused,
+    warnings_about,
+)
+from mcaptrack.api.delta import add_to_delta
+from mcaptrack.errors import McaptrackError
+from mcaptrack.files import is_same_file, place_of
+from mcaptrack.location import Location
+from mcaptrack.notices import Notice, warn
+from mcaptrack.tables import Format
+from mcaptrack.tables.exchange import FORMATS as EXCHANGE_FORMATS
+from mcaptrack.tables.exchange import ExchangeFormat, default_file, write_boxes
+from mcaptrack.tables.export import default_folder, recording_name
+from mcaptrack.tables.export import export as write_tables
+from mcaptrack.tables.rosbag2 import Storage, write_bag
+from mcaptrack.tables.rosbag2 import default_folder as default_bag
+
+#: ROS 2 bags by the format of ``export``.
+_BAGS: Mapping[str, Storage] = {"rosbag2": "mcap", "rosbag2-sqlite3": "sqlite3"}
+
+
+@dataclass(frozen=True)
+class ExportResult:
+    """The tables of a log in a folder, its bag, or the file of another program.
+
+    Attributes
+    ----------
+    log : pathlib.Path or str
+        The log; the URL of one in a store.
+    folder : pathlib.Path
+        The folder with its tables, the bag, or the file.
+    rows : dict of str to int
+        Number of rows of each table; of a bag, the number of messages of each topic; of a file, the
+        number of boxes of its channel.
+    written : tuple of str
+        The tables that were written; the others were up to date. Of a bag, its topics; of a
+        file, its channel.
+    warnings : tuple of mcaptrack.Notice
+        What was left out.
+    delta : {"added", "replaced", "unchanged"} or None
+        What became of the log in the Delta tables; None if none were named.
+
+    """
+
+    log: Location
+    folder: Path
+    rows: Mapping[str, int]
+    written: tuple[str, ...]
+    warnings: tuple[Notice, ...]
+    delta: Literal["added", "replaced", "unchanged"] | None = None
+
+    @property
+    def is_up_to_date(self) -> bool:
+        """Whether there was nothing to write."""
+        return not self.written
+
+
+@checked()
+def export(
+    log: PathLike,
+    output: PathLike | None = None,
+    *,
+    form: Format | Literal["rosbag2", "rosbag2-sqlite3"] | ExchangeFormat = "parquet",
+    topic: str | Sequence[str] | None = None,
+    blobs: bool = False,
+    delta: PathLike | None = None,
+    force: bool = False,
+    progress: Progress = no_progress,
+) -> ExportResult:
+    """Write a log as tables, one row per object and frame, as a ROS 2 bag, or as a file of another program.
+
+    A bag has detections and tracks as ``vision_msgs/Detection3DArray`` or ``Detection2DArray``, predictions as
+    ``nav_msgs/Path``, drawings of tracks and predictions as ``visualization_msgs/MarkerArray``, and the transforms of
+    the log.
+
+    A file of another program has the boxes of one channel: the re-tracked boxes of the only camera at the rate of the
+    video, or else its tracks or detections, or those of ``topic``. What its format can't hold is a warning.
+
+    Parameters
+    ----------
+    log : path
+        The log.
+    output : path, optional
+        Folder for the tables, by default LOG.tables beside the log, or for the bag, by default LOG.rosbag2, or the
+        file, such as LOG.cvat.xml; of a log in a store, in the working folder.
+    form : {"parquet", "arrow", "csv", "jsonl", "rosbag2", "rosbag2-sqlite3", "mot", "kitti", "coco", "cvat", ...}
+        Format of the files. "rosbag2" is a ROS 2 bag in MCAP, "rosbag2-sqlite3" one in a database. "mot"
+        (MOTChallenge), "kitti" (KITTI tracking), "coco" (with tracks), "cvat" (CVAT for video 1.1) and "boxes-csv"
+        are files with the boxes of one channel; "rerun" is a recording with pictures and forecasts, too.
+    topic : str or sequence of str, optional
+        Also write a table of all messages of these channels; the channel with the boxes for a file.
+    blobs : bool, default False
+        With ``topic``: include binary fields, such as pictures and point clouds.
+    delta : path, optional
+        A folder, or its URL in a store, with Delta tables of many logs: the log is added to them, or replaced. Needs
+        deltalake.
+    force : bool, default False
+        Write all tables again, also over those of another log of this name; replace a bag or a file.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    ExportResult
+        The folder, and the number of rows of each table.
+
+    Raises
+    ------
+    McaptrackError
+        If the log cannot be read, or if the folder holds the tables of another log.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> mcaptrack.export("log.mcap", "tables").rows["tracks"] > 0
+    True
+
+    """
+    path = log_location(log)
+    if form in EXCHANGE_FORMATS:
+        if delta is not None:
+            raise McaptrackError(f"Delta tables are made of tables, and {form} writes none; leave `form=` out")
+        return _export_file(path, optional_path(output), form, names_of(topic), blobs, force, progress)
+    if form in _BAGS:
+        if delta is not None:
+            raise McaptrackError(f"Delta tables are made of tables, and {form} writes none; leave `form=` out")
+        return _export_bag(path, optional_path(output), _BAGS[form], topic, blobs, force, progress)
+    if delta is not None and form != "parquet":
+        raise McaptrackError(f"Delta tables are made of tables in Parquet, not in {form}; leave `form=` out")
+    folder = optional_path(output) or default_folder(path)
+    if folder.exists() and not folder.is_dir():
+        raise McaptrackError(f"{folder} is a file; tables go to a folder")
+    if blobs and not topic:
+        raise McaptrackError("`blobs=True` needs a channel to write; name it with `topic=`")
+    with warnings_about(path) as warnings:
+        with logs.read(path) as opened:
+            done = write_tables(
+                opened, folder, progress, form=cast("Format", form), topics=names_of(topic), blobs=blobs, force=force
+            )
+        state = None if delta is None else add_to_delta(as_location(delta), path, folder, force)
+        for words in done.notes:
+            warn(words, "left-out")
+    return ExportResult(path, folder, done.rows, tuple(done.written), tuple(dict.fromkeys(warnings)), state)
+
+
+def _export_bag(
+    path: Location,
+    output: Path | None,
+    storage: Storage,
+    topic: str | Sequence[str] | None,
+    blobs: bool,
+    force: bool,
+    progress: Progress,
+) -> ExportResult:
+    """Write a log as a ROS 2 bag."""
+    with warnings_about(path) as warnings:
+        warn_unused("a bag has no tables", topic=bool(topic), blobs=blobs)
+        folder = output or default_bag(path)
+        with logs.read(path) as opened:
+            done = write_bag(opened, folder, progress, storage=storage, force=force)
+        for words in done.notes:
+            warn(words, "left-out")
+    return ExportResult(path, folder, done.messages, tuple(done.messages), tuple(dict.fromkeys(warnings)))
+
+
+def _export_file(
+    path: Location,
+    output: Path | None,
+    form: ExchangeFormat,
+    topics: Sequence[str],
+    blobs: bool,
+    force: bool,
+    progress: Progress,
+) -> ExportResult:
+    """Write one channel of a log as a file of another program."""
+    if len(topics) > 1:
+        raise McaptrackError(f"a file of {form} has the boxes of one channel, not of {', '.join(topics)}; give one")
+    target = output or default_file(path, form)
+    with warnings_about(path) as warnings:
+        warn_unused("a file of boxes has no tables", blobs=blobs)
+        with logs.read(path) as opened:
+            if any(is_same_file(part.path, target) for part in opened.parts):
+                raise McaptrackError(f"{target} is a log; give the file another name with `output=`")
+            done = write_boxes(opened, target, form, topics[0] if topics else None, progress, force=force)
+        for words in done.notes:
+            warn(words, "left-out")
+    return ExportResult(path, target, {done.topic: done.rows}, (done.topic,), tuple(dict.fromkeys(warnings)))
+
+
+def refuse_same_tables(logs_to_export: Sequence[Location], output: Path | None) -> None:
+    """Raise McaptrackError if two different logs would have the same name in the tables of one folder."""
+    folders: dict[tuple[Path, str], Location] = {}
+    for path in logs_to_export:
+        other = folders.setdefault((output or default_folder(path), recording_name(path)), path)
+        if place_of(other) != place_of(path):
+            raise McaptrackError(
+                f"{other} and {path} would both be {recording_name(path)} in the tables; export them to two folders"
+            )

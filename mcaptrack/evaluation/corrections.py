@@ -1,0 +1,147 @@
+"""Compare tracks that people have corrected with the channel that was corrected.
+
+Letters: N rows of one side, P pairs.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from mcaptrack import log
+from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.assignment import assign_by_gain
+from mcaptrack.geometry.boxes import columns_to_boxes, iou
+from mcaptrack.schema import TRACKS, Frame, Rows
+from mcaptrack.sources.corrections import CORRECTED
+
+#: Boxes are the same object from this overlap on.
+_SAME_IOU: Final = 0.3
+#: Boxes were moved if a corner is farther away than this: annotation tools interpolate between keyframes.
+MOVED_PX: Final = 2.0
+#: A track is joined or split if each part has at least so many boxes; fewer may be boxes that were matched by chance.
+_LEAST_BOXES: Final = 2
+#: The channels that people may have corrected, the likeliest first.
+_CORRECTED_FROM: Final = ("retracks/full", "tracks")
+_SHOWN: Final = 5
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Corrections compared with the channel ``of``, in the ``frames`` that both have.
+
+    ``same``, ``moved``, ``added`` and ``removed`` are numbers of boxes. ``joined`` are corrected ids with the ids that
+    they are of, ``split`` ids with the corrected ids that they became; ``new_tracks`` and ``removed_tracks`` are ids.
+    """
+
+    of: str
+    frames: int
+    same: int
+    moved: int
+    added: int
+    removed: int
+    joined: dict[int, list[int]]
+    split: dict[int, list[int]]
+    new_tracks: list[int]
+    removed_tracks: list[int]
+
+    @property
+    def words(self) -> str:
+        """All in one line."""
+        parts = [f"{self.same} boxes as they were"]
+        parts += [f"{n} {what}" for n, what in ((self.moved, "moved"), (self.added, "added")) if n]
+        parts += [f"{self.removed} removed"] if self.removed else []
+        parts += [f"tracks {_listed(ids)} joined to {one}" for one, ids in list(self.joined.items())[:_SHOWN]]
+        parts += [f"track {one} split into {_listed(ids)}" for one, ids in list(self.split.items())[:_SHOWN]]
+        more = max(len(self.joined) - _SHOWN, 0) + max(len(self.split) - _SHOWN, 0)
+        parts += [f"{more} more joined or split"] if more else []
+        parts += [f"new tracks {_listed(self.new_tracks)}"] if self.new_tracks else []
+        parts += [f"tracks {_listed(self.removed_tracks)} removed"] if self.removed_tracks else []
+        return f"of {self.of}, in {self.frames} frames: {', '.join(parts)}"
+
+    def to_json(self) -> dict[str, Any]:
+        """All values, as JSON has them."""
+        return asdict(self)
+
+
+def _listed(ids: Sequence[int]) -> str:
+    return ", ".join(map(str, ids[:_SHOWN])) + (f" and {len(ids) - _SHOWN} more" if len(ids) > _SHOWN else "")
+
+
+def changes_in(opened: log.Log, topic: str) -> Changes | None:
+    """Compare the corrections at ``topic`` with their tracks; None if the log has no tracks that they could be of.
+
+    They are of the re-tracked boxes of their camera, or of its tracks if the ids fit those better.
+    """
+    prefix = topic.removesuffix(f"/{CORRECTED}")
+    names = [f"{prefix}/{name}" for name in _CORRECTED_FROM]
+    there = [name for name in names if name in opened.channels and opened.channels[name].holds(TRACKS)]
+    corrected = opened.frame_columns(topic, TRACKS)
+    found = [compare(name, opened.frame_columns(name, TRACKS), corrected) for name in there]
+    return max(found, key=lambda one: one[1])[0] if found else None
+
+
+def compare(of: str, before: Sequence[Frame], after: Sequence[Frame]) -> tuple[Changes, int]:
+    """Compare tracks with their corrections, frame by frame; also return the number of boxes with the id they had."""
+    counts = np.zeros(4, np.int64)  # same, moved, added, removed
+    kept, frames = 0, 0
+    parts: dict[tuple[int, int], int] = defaultdict(int)
+    ids: tuple[set[int], set[int]] = set(), set()
+    for old, new in _pairs(before, after):
+        frames += 1
+        i, j = _matched(old, new)
+        corners = [columns_to_boxes(rows) for rows in (old[i], new[j])]
+        for boxes in corners:
+            boxes[:, 2:] += boxes[:, :2]
+        is_moved = (np.abs(corners[0] - corners[1]) > MOVED_PX).any(axis=1)
+        counts += (int((~is_moved).sum()), int(is_moved.sum()), len(new) - len(j), len(old) - len(i))
+        for pair in zip(old["track_id"][i].tolist(), new["track_id"][j].tolist(), strict=True):
+            parts[pair] += 1
+        kept += int((old["track_id"][i] == new["track_id"][j]).sum())
+        ids[0].update(old["track_id"].tolist())
+        ids[1].update(new["track_id"].tolist())
+    became: dict[int, list[int]] = defaultdict(list)
+    made_of: dict[int, list[int]] = defaultdict(list)
+    for (one, other), count in sorted(parts.items()):
+        if count >= _LEAST_BOXES:
+            became[one].append(other)
+            made_of[other].append(one)
+    same, moved, added, removed = counts.tolist()
+    changes = Changes(
+        of, frames, same, moved, added, removed,
+        {one: parts_of for one, parts_of in sorted(made_of.items()) if len(parts_of) > 1},
+        {one: parts_of for one, parts_of in sorted(became.items()) if len(parts_of) > 1},
+        sorted(ids[1] - {other for _, other in parts}), sorted(ids[0] - {one for one, _ in parts}),
+    )  # fmt: skip
+    return changes, kept
+
+
+def _pairs(before: Sequence[Frame], after: Sequence[Frame]) -> Iterator[tuple[Rows, Rows]]:
+    """The rows with boxes of each frame that both have, by time."""
+    rest = iter(after)
+    new = next(rest, None)
+    for old in before:
+        while new is not None and new.t_ns < old.t_ns:
+            new = next(rest, None)
+        if new is not None and new.t_ns == old.t_ns:
+            yield _with_boxes(old.rows), _with_boxes(new.rows)
+
+
+def _with_boxes(rows: Rows) -> Rows:
+    out: Rows = rows[np.isfinite(columns_to_boxes(rows)).all(axis=1)]
+    return out
+
+
+def _matched(old: Rows, new: Rows) -> tuple[Ints, Ints]:
+    """The rows (P,) of both sides that are the same object: by overlap, with some preference for the same id."""
+    if not len(old) or not len(new):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    overlap = iou(columns_to_boxes(old), columns_to_boxes(new))
+    gain = np.where(overlap >= _SAME_IOU, overlap + 0.1 * (old["track_id"][:, None] == new["track_id"][None]), -1.0)
+    i, j = assign_by_gain(gain)
+    good = gain[i, j] > 0
+    return i[good], j[good]

@@ -1,0 +1,352 @@
+"""Read annotations of CVAT: "CVAT for video 1.1" (and 1.0), and "CVAT for images 1.1", as XML or in CVAT's zip files.
+
+A track of a video is a list of boxes. Between two of them that are not next to each other the box is interpolated
+linearly, as CVAT shows it; after a box that is ``outside`` there is none until the next one. CVAT gives tracks new
+numbers whenever it writes them, so an attribute ``track_id`` of a box, if there is one, names the track instead.
+
+XML may be hostile: document types and entities are refused, depth and sizes are limited. Letters: N rows, F frames.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from array import array
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any, Final, NoReturn
+from xml.parsers import expat
+
+import numpy as np
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.files import refuse_special
+from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.schema.classes import PERSON, is_person
+from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows
+from mcaptrack.sources.ingest.labels.formats import NO_ID, Labels, Role
+from mcaptrack.sources.ingest.labels.wanted import WantedClasses
+
+_MAX_BYTES: Final = 512 * 2**20
+_MAX_ROWS: Final = 10_000_000
+#: Frames in one file, also those that are interpolated.
+_MAX_FRAMES: Final = 10_000_000
+#: Files of CVAT have a depth of 8.
+_MAX_DEPTH: Final = 32
+_MAX_TEXT: Final = 65536
+_MAX_CLASSES: Final = 65536
+_BLOCK: Final = 2**16
+_ZIP: Final = b"PK\x03\x04"
+_MEMBER: Final = "annotations.xml"
+#: The element of a track.
+_TRACK: Final = "track"
+#: Shapes of CVAT that are no boxes.
+_OTHER_SHAPES: Final = ("polygon", "polyline", "points", "point", "cuboid", "ellipse", "mask", "skeleton", "tag")
+#: Numbers of a row: frame, left, top, width, height, track, label, whether it is occluded, line.
+_COLUMNS: Final = 9
+
+
+def is_cvat(path: Path) -> bool:
+    """Whether a file is XML, or a zip file with CVAT's annotations."""
+    refuse_special(path)
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(4096)
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+    if head.startswith(_ZIP):
+        return _has_member(path)
+    return head.removeprefix(b"\xef\xbb\xbf").lstrip()[:1] == b"<"
+
+
+def _has_member(path: Path) -> bool:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return _MEMBER in archive.namelist()
+    except (zipfile.BadZipFile, OSError, ValueError):
+        return False
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[IO[bytes]]:
+    """The XML of a file or of a zip file. Raises McaptrackError if it can't be read, or is too large."""
+    try:
+        with path.open("rb") as stream:
+            if stream.read(4) != _ZIP:
+                stream.seek(0)
+                yield stream
+                return
+        with zipfile.ZipFile(path) as archive, archive.open(_MEMBER) as member:
+            yield member
+    except (zipfile.BadZipFile, zlib.error, KeyError, NotImplementedError, RuntimeError, EOFError) as error:
+        raise McaptrackError(f"{path} is a zip file with an {_MEMBER} that can't be read: {error}") from None
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror or error}") from None
+
+
+@dataclass
+class _Track:
+    """A track while it is read: its number, its label, and the last box (frame, left, top, right, bottom)."""
+
+    number: int
+    label: int
+    line: int
+    last: tuple[float, ...] | None = None
+    is_outside: bool = False
+    is_occluded: bool = False
+    stated: str = ""
+
+
+@dataclass
+class _Parser:
+    """The content of a file, as far as it was read. ``meta`` are the texts of the description of the task, by name."""
+
+    path: Path
+    values: array[float] = field(default_factory=lambda: array("d"))
+    labels: dict[str, int] = field(default_factory=dict)
+    meta: dict[str, str] = field(default_factory=dict)
+    others: Counter[str] = field(default_factory=Counter)
+    tracks: list[_Track] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
+    images: list[int] = field(default_factory=list)
+    rotated: int = 0
+    interpolated: int = 0
+
+    def __post_init__(self) -> None:
+        self._track: _Track | None = None
+        self._image: int | None = None
+        self._text: list[str] | None = None
+        self._attribute = ""
+        self._size = 0
+        self._reader = expat.ParserCreate()
+        self._reader.buffer_text = True
+        self._reader.StartDoctypeDeclHandler = self._refuse_doctype
+        self._reader.StartElementHandler = self._start
+        self._reader.EndElementHandler = self._end
+        self._reader.CharacterDataHandler = self._character
+
+    def read(self) -> None:
+        """Read the whole file. Raises McaptrackError, with the line, if it isn't what CVAT writes."""
+        try:
+            with _opened(self.path) as stream:
+                while block := stream.read(_BLOCK):
+                    self._size += len(block)
+                    if self._size > _MAX_BYTES:
+                        self._fail(f"there are more than {_MAX_BYTES} bytes of XML; give it in parts")
+                    self._reader.Parse(block, False)
+                self._reader.Parse(b"", True)
+        except expat.ExpatError as error:
+            why = expat.ErrorString(error.code)
+            raise McaptrackError(f"{self.path}:{error.lineno}: not valid XML: {why}") from None
+
+    def _fail(self, words: str) -> NoReturn:
+        raise McaptrackError(f"{self.path}:{self._reader.CurrentLineNumber}: {words}")
+
+    def _refuse_doctype(self, *_: object) -> NoReturn:
+        self._fail("a document type, which CVAT doesn't write; it may hold entities, and isn't read")
+
+    def _start(self, name: str, given: dict[str, str]) -> None:
+        self.names.append(name)
+        if len(self.names) > _MAX_DEPTH:
+            self._fail("nested deeper than annotations of CVAT are")
+        if len(self.names) == 1 and name != "annotations":
+            self._fail(f"XML that begins with <{name[:40]}>; of XML, <annotations> of CVAT are read")
+        if "meta" in self.names[:2]:
+            self._text = []
+        elif name == _TRACK and len(self.names) == 2:
+            line = self._reader.CurrentLineNumber
+            number = len(self.tracks) if "id" not in given else self._whole(given["id"], "the id of a track")
+            self._track = _Track(number, self._label(given), line)
+        elif name == "image" and len(self.names) == 2:
+            self._image = self._whole(given.get("id", ""), "the id of an image")
+            self.images.append(self._image)
+        elif name == "box" and self._track is not None:
+            self._add_to_track(self._track, given)
+        elif name == "box" and self._image is not None:
+            self._add(self._image, self._corners(given), NO_ID, self._label(given), given.get("occluded") == "1")
+        elif name in _OTHER_SHAPES:
+            self.others[name] += 1
+        elif name == "attribute":
+            self._attribute, self._text = given.get("name", ""), []
+
+    def _end(self, name: str) -> None:
+        text = "".join(self._text or ()).strip()
+        if "meta" in self.names[:2] and text and len(self.names) <= 4:
+            self.meta.setdefault(name, text)
+        elif name == "attribute" and self._track is not None and self._attribute == "track_id":
+            self._track.stated = self._track.stated or text[:40]
+        elif name == _TRACK and self._track is not None:
+            self.tracks.append(self._track)
+            if len(self.tracks) > _MAX_ROWS:
+                self._fail(f"more than {_MAX_ROWS} tracks; give it in parts")
+            self._track = None
+        elif name == "image":
+            self._image = None
+        self._text = None
+        self.names.pop()
+
+    def _character(self, text: str) -> None:
+        if self._text is not None:
+            self._text.append(text[:_MAX_TEXT])
+            if len(self._text) > _MAX_TEXT:
+                self._fail("a text is longer than those of CVAT are")
+
+    def _label(self, given: dict[str, str]) -> int:
+        name = " ".join(given.get("label", "").split())[:256]
+        if name not in self.labels and len(self.labels) >= _MAX_CLASSES:
+            self._fail(f"more than {_MAX_CLASSES} labels")
+        return self.labels.setdefault(name, len(self.labels))
+
+    def _whole(self, text: str, what: str) -> int:
+        if not (text.isascii() and text.isdecimal() and len(text) < 16):
+            self._fail(f"{what} is a whole number from 0 on, not {text[:40]!r}")
+        return int(text)
+
+    def _corners(self, given: dict[str, str]) -> tuple[float, ...]:
+        try:
+            corners = tuple(float(given[name]) for name in ("xtl", "ytl", "xbr", "ybr"))
+        except KeyError as error:
+            self._fail(f"a box without {error}")
+        except ValueError:
+            self._fail(f"a box with corners that aren't numbers: {str(given)[:80]}")
+        self.rotated += given.get("rotation", "0.0").strip("0.") != ""
+        return corners
+
+    def _add(self, frame: int, corners: tuple[float, ...], track: int, label: int, is_occluded: bool) -> None:
+        left, top, right, bottom = corners
+        line = self._reader.CurrentLineNumber
+        self.values.extend((frame, left, top, right - left, bottom - top, track, label, is_occluded, line))
+        if len(self.values) > _MAX_ROWS * _COLUMNS:
+            self._fail(f"more than {_MAX_ROWS} boxes, interpolated ones among them; give it in parts")
+
+    def _add_to_track(self, track: _Track, given: dict[str, str]) -> None:
+        """Add a box, and those between it and the one before."""
+        frame, corners = self._whole(given.get("frame", ""), "the frame of a box"), self._corners(given)
+        own = len(self.tracks)
+        if track.last is not None:
+            before, *start = track.last
+            if frame <= before:
+                self._fail(f"the frame of a box is {frame}, and that of the box before is {before:.0f}")
+            if not track.is_outside and frame - before > _MAX_FRAMES:
+                self._fail(f"{frame - before - 1:.0f} boxes would be interpolated; at most {_MAX_FRAMES} are")
+            for between in range(int(before) + 1, frame) if not track.is_outside else ():
+                share = (between - before) / (frame - before)
+                box = tuple(a + share * (b - a) for a, b in zip(start, corners, strict=True))
+                self._add(between, box, own, track.label, track.is_occluded)
+                self.interpolated += 1
+        track.last = (frame, *corners)
+        track.is_outside, track.is_occluded = given.get("outside") == "1", given.get("occluded") == "1"
+        if not track.is_outside:
+            self._add(frame, corners, own, track.label, track.is_occluded)
+
+
+def read_cvat(path: Path, role: Role, wanted: WantedClasses) -> Labels:
+    """Read annotations of CVAT. Raises McaptrackError, with the line, if they are damaged or hold no boxes."""
+    parser = _Parser(path)
+    parser.read()
+    if parser.tracks and parser.images:
+        raise McaptrackError(f"{path} holds both tracks and images; CVAT writes one of them")
+    if not parser.values:
+        others = _counted(parser.others)
+        raise McaptrackError(f"{path} holds no boxes{f', only {others}' if others else ''}")
+    values: Floats = np.frombuffer(parser.values, np.float64).reshape(-1, _COLUMNS)
+    number, names = _classes(parser.labels)
+    rows = BoxRows(
+        path,
+        "cvat",
+        lambda row: f"{path}:{values[row, 8]:.0f}",
+        values[:, 0],
+        values[:, 1:5],
+        np.where(values[:, 5] < 0, NO_ID, 0.0),
+        np.full(len(values), np.nan),
+        number[values[:, 6].astype(int)],
+        names,
+        labelled=_frames(parser, values[:, 0]),
+        first_frame=0,
+        observed=values[:, 7] == 0,
+    )
+    if parser.tracks:
+        own = values[:, 5].astype(int)
+        ids, words = _ids(path, parser.tracks, np.bincount(own, minlength=len(parser.tracks)))
+        rows.id = ids[own].astype(float)
+        rows.remarks += words
+    if parser.interpolated:
+        rows.remarks.append(f"{path}: {parser.interpolated} boxes are interpolated between others of their tracks")
+    if parser.rotated:
+        rows.doubts.append((f"{path}: {parser.rotated} boxes are rotated, and taken without their rotation", "other"))
+    left = _counted(parser.others)
+    if left:
+        rows.doubts.append((f"{path} also holds {left}; they are left out, because they are no boxes", "left-out"))
+    return rows.labels(role, wanted)
+
+
+def _counted(others: Counter[str]) -> str:
+    return ", ".join(f"{count} of <{name}>" for name, count in others.most_common())
+
+
+def _classes(labels: dict[str, int]) -> tuple[Floats, dict[int, str]]:
+    """The class number of each label, and names by number; those that aren't people follow in alphabetical order."""
+    others = sorted({name for name in labels if name and not is_person(name) and name.casefold() != "unknown"})
+    places = {name: place for place, name in enumerate(others, start=PERSON + 1)}
+    numbers = [PERSON if is_person(name) else places.get(name, NO_CLASS) for name in labels]
+    names = {number: name for name, number in zip(labels, numbers, strict=True) if number != NO_CLASS}
+    return np.array(numbers, float), names or {PERSON: "person"}
+
+
+def _frames(parser: _Parser, frame: Floats) -> Ints:
+    """The frames (F,) that were annotated: those of the task or of its images, or else up to the last box."""
+    if parser.images:
+        return np.unique(np.array(parser.images, np.int64))
+    meta = {name: int(text) for name, text in parser.meta.items() if _is_count(text)}
+    last = meta.get("stop_frame", meta.get("size", 0) - 1)
+    first = meta.get("start_frame", 0)
+    key, _, step = parser.meta.get("frame_filter", "").partition("=")
+    every = int(step) if key.strip() == "step" and _is_count(step.strip()) and int(step) else 1
+    if not first <= last < first + _MAX_FRAMES or frame.max() > last or frame.min() < first:
+        first, last, every = int(frame.min()), int(min(frame.max(), frame.min() + _MAX_FRAMES)), 1
+    return np.arange(first, last + 1, every)
+
+
+def _is_count(text: str) -> bool:
+    return text.isascii() and text.isdecimal() and len(text) < 10
+
+
+def _ids(path: Path, tracks: list[_Track], counts: Any) -> tuple[Ints, list[str]]:
+    """The id of each track, and remarks: the one that its attribute states, or else its number in the file.
+
+    Of several tracks that state one id, as after a track was split, the one with most boxes keeps it. The others, and
+    tracks that were drawn by hand beside those that state an id, get new ids.
+    """
+    stated = [int(t.stated) if _is_id(t.stated) else None for t in tracks]
+    ids = np.full(len(tracks), -1, np.int64)
+    if not any(one is not None for one in stated):
+        numbers = np.array([track.number for track in tracks], np.int64)
+        if len(np.unique(numbers)) == len(numbers):
+            return numbers, []
+        return np.arange(len(tracks)), [f"{path}: ids of tracks occur twice; its tracks are counted from 0"]
+    taken: set[int] = set()
+    split: Counter[int] = Counter()
+    for at in np.argsort(-counts, kind="stable").tolist():
+        one = stated[at]
+        if one is None or one in taken:
+            split.update([one] if one is not None else [])
+            continue
+        taken.add(one)
+        ids[at] = one
+    new = np.flatnonzero(ids < 0)
+    ids[new] = max(taken) + 1 + np.arange(len(new))
+    remarks = []
+    if split:
+        shown = ", ".join(map(str, sorted(split)[:8])) + (", ..." if len(split) > 8 else "")
+        remarks.append(f"{path}: several tracks state one track_id ({shown}): {split.total()} of them get new ids")
+    drawn = sum(one is None for one in stated)
+    if drawn:
+        remarks.append(f"{path}: {drawn} tracks state no track_id and get new ids, from {int(ids[new].min())} on")
+    return ids, remarks
+
+
+def _is_id(text: str) -> bool:
+    return text.isascii() and text.isdecimal() and len(text) < 16

@@ -1,0 +1,121 @@
+"""One channel of boxes as a file of another program: MOTChallenge, KITTI, COCO, CVAT, Rerun, or a plain table.
+
+Each format is a module that takes ``BoxTable`` and yields the bytes of the file. What a format can't hold is said once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal, get_args
+
+from mcaptrack import log
+from mcaptrack.files import publish_stream, refuse_overwrite
+from mcaptrack.location import Location, local_name
+from mcaptrack.tables.exchange import coco, cvat, text
+from mcaptrack.tables.exchange.boxes import BoxTable, read_boxes
+from mcaptrack.tables.exchange.chosen import boxes_topic
+from mcaptrack.tables.exchange.rerun_file import write_recording
+
+__all__ = ["FORMATS", "ExchangeFormat", "WrittenBoxes", "default_file", "ends_with", "write_boxes"]
+
+ExchangeFormat = Literal["mot", "kitti", "coco", "cvat", "boxes-csv", "rerun"]
+FORMATS: Final[tuple[ExchangeFormat, ...]] = get_args(ExchangeFormat)
+Progress = Callable[[str, int, int], None]
+
+#: How each format is written, what it can hold beside frames, boxes and ids, and the end of its file's name.
+_WRITERS: Final[Mapping[ExchangeFormat, Callable[[BoxTable], Iterator[bytes]]]] = {
+    "mot": text.mot,
+    "kitti": text.kitti,
+    "coco": coco.coco,
+    "cvat": cvat.cvat,
+    "boxes-csv": text.boxes_csv,
+}
+_HOLDS: Final[Mapping[ExchangeFormat, frozenset[str]]] = {
+    "mot": frozenset({"scores"}),
+    "kitti": frozenset({"scores", "names"}),
+    "coco": frozenset({"scores", "names", "observed"}),
+    "cvat": frozenset({"names", "observed"}),
+    "boxes-csv": frozenset({"scores", "names", "observed", "metres"}),
+}
+_ENDS: Final[Mapping[ExchangeFormat, str]] = {
+    "mot": ".mot.txt",
+    "kitti": ".kitti.txt",
+    "coco": ".coco.json",
+    "cvat": ".cvat.xml",
+    "boxes-csv": ".boxes.csv",
+    "rerun": ".rrd",
+}
+
+
+@dataclass(frozen=True)
+class WrittenBoxes:
+    """The channel that was written, its number of rows, and what was left out or assumed."""
+
+    topic: str
+    rows: int
+    notes: tuple[str, ...]
+
+
+def default_file(path: Location, form: ExchangeFormat) -> Path:
+    """The default file for the boxes of a log: log.mcap -> log.cvat.xml beside it."""
+    return local_name(path, _ENDS[form])
+
+
+def ends_with(form: str) -> str:
+    """The end of the name of a file of this format; "" for others."""
+    return next((end for name, end in _ENDS.items() if name == form), "")
+
+
+def write_boxes(
+    opened: log.Log,
+    output: Path,
+    form: ExchangeFormat,
+    topic: str | None = None,
+    progress: Progress = lambda *_: None,
+    *,
+    force: bool = False,
+) -> WrittenBoxes:
+    """Write one channel of boxes as a file.
+
+    Parameters
+    ----------
+    opened : Log
+    output : Path
+        The file. It appears when it is complete.
+    form : str
+        The format.
+    topic : str, optional
+        The channel; by default the best tracks of the only camera, or its detections.
+    progress : callable
+        Called with a text, the number of finished rows and their total.
+    force : bool
+        Whether to replace a file that is there.
+
+    Returns
+    -------
+    WrittenBoxes
+
+    Raises
+    ------
+    McaptrackError
+        If there is no such channel, if it has no boxes in pixels, if the file exists, or if Rerun is not installed.
+    """
+    refuse_overwrite(output, force)
+    chosen = boxes_topic(opened, topic)
+    if form == "rerun":
+        rows, notes = write_recording(opened, output, chosen, progress)
+        return WrittenBoxes(chosen, rows, tuple(notes))
+    boxes = read_boxes(opened, chosen)
+    done = 0
+    with publish_stream(output) as stream:
+        progress("export", 0, len(boxes.frame))
+        for part in _WRITERS[form](boxes):
+            stream.write(part)
+            done = min(done + 1, len(boxes.frame))
+            progress("export", done, len(boxes.frame))
+        progress("export", len(boxes.frame), len(boxes.frame))
+    lost = [boxes.left_out(form, _HOLDS[form])]
+    lost += [text.describe_mot_numbers(boxes.classes)] if form == "mot" else []
+    return WrittenBoxes(chosen, len(boxes.frame), (*boxes.notes, *(f"{output}: {one}" for one in lost if one)))

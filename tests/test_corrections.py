@@ -1,0 +1,189 @@
+"""Tracks that people have corrected: they come into the log, it is said what they changed, and re-tracking keeps them."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import mcaptrack
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation.corrections import compare
+from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema.framing import join_frames
+from mcaptrack.sources.corrections import fixed_ids, with_corrections
+from mcaptrack.transforms import Retrack
+from mcaptrack.transforms.retrack.fixed_tracks import fix_tracks
+from tests.commands import done
+
+STEP_NS = 400_000_000
+
+
+def frame(number: int, boxes: dict[int, tuple[float, float]]) -> Frame:
+    """A frame of tracks: boxes of 10 x 20 px at these places by id, which are metres, too."""
+    places = np.array(list(boxes.values()), float).reshape(-1, 2)
+    rows = TRACKS.rows(
+        track_id=list(boxes),
+        x_px=places[:, 0] * 10,
+        y_px=places[:, 1] * 10,
+        w_px=np.full(len(boxes), 10.0),
+        h_px=np.full(len(boxes), 20.0),
+        x_m=places[:, 0],
+        y_m=places[:, 1],
+        observed=np.ones(len(boxes), bool),
+        source_id=np.full(len(boxes), -1),
+    )
+    return Frame(number * STEP_NS, number, rows)
+
+
+def ids(frames) -> list[list[int]]:
+    return [one.rows["track_id"].tolist() for one in frames]
+
+
+class TestFixTracks:
+    def test_a_track_that_was_cut_is_one_again_with_what_came_before_and_after(self):
+        step = np.arange(8)
+        source = np.array([1, 1, 9, 9, 9, 9, 2, 2])
+        track = np.array([5, 5, 5, 5, 6, 6, 6, 6])
+        assert fix_tracks(step, track, source, [9]).tolist() == [5] * 8
+
+    def test_two_that_were_joined_are_two(self):
+        step, source = np.arange(6), np.array([8, 8, 8, 9, 9, 9])
+        found = fix_tracks(step, np.full(6, 5), source, [8, 9])
+        assert len(set(found[:3].tolist())) == len(set(found[3:].tolist())) == 1
+        assert found[0] != found[5]
+
+    def test_all_else_stays_as_it_is(self):
+        step, source = np.array([0, 0, 1, 1]), np.array([1, 2, 1, 2])
+        track = np.array([5, 6, 5, 6])
+        assert fix_tracks(step, track, source, []) is track
+        assert fix_tracks(step, track, source, [7]) is track
+
+    @settings(max_examples=40, deadline=None)
+    @given(st.data())
+    def test_whatever_was_assigned_a_fixed_id_has_one_track_and_shares_it_with_no_other(self, data):
+        pairs = data.draw(st.sets(st.tuples(st.integers(0, 7), st.integers(0, 4)), min_size=1))
+        step, source = (np.array(one) for one in zip(*sorted(pairs), strict=True))
+        # a track has one sample a step
+        track = np.array([(s * 3 + data.draw(st.integers(0, 2))) % 7 for s in source])
+        _, first = np.unique(np.stack([step, track]), axis=1, return_index=True)
+        step, source, track = step[first], source[first], track[first]
+        fixed = data.draw(st.sets(st.integers(0, 4)))
+        found = fix_tracks(step, track, source, fixed)
+        owners = {one: set(found[source == one].tolist()) for one in fixed if (source == one).any()}
+        assert all(len(tracks) == 1 for tracks in owners.values())
+        assert len({next(iter(tracks)) for tracks in owners.values()}) == len(owners)
+        assert len(np.unique(np.stack([step, found]), axis=1).T) == len(step)  # still one sample a step
+
+
+class TestWithCorrections:
+    def test_corrections_take_the_place_of_tracks_in_the_times_that_they_cover(self):
+        tracks = [frame(k, {3: (k, 0), 4: (k, 9)}) for k in range(6)]
+        corrected = [frame(2, {4: (2, 1)}), frame(3, {}), frame(4, {4: (4, 1), 7: (4, 5)})]
+        assert fixed_ids(tracks, corrected) == (5, 6)
+        both = with_corrections(tracks, corrected)
+        assert ids(both) == [[3, 4], [3, 4], [5], [], [5, 6], [3, 4]]
+        assert both[2].rows["y_px"].tolist() == [10]
+
+    @settings(max_examples=25, deadline=None)
+    @given(st.sets(st.integers(0, 8)), st.sets(st.integers(0, 8)))
+    def test_every_time_is_there_once_in_order(self, those, others):
+        tracks = [frame(k, {1: (k, 0)}) for k in sorted(those)]
+        corrected = [frame(k, {1: (k, 5)}) for k in sorted(others)]
+        found = with_corrections(tracks, corrected)
+        assert [one.index for one in found] == sorted(those | others)
+        ours = [one.index for one in found if one.rows["y_px"].tolist() == [50]]
+        assert ours == sorted(others)
+
+
+class TestRetrack:
+    def test_ids_that_a_person_gave_are_neither_cut_nor_joined(self):
+        """One walks on under one id, which plain re-tracking cuts where she jumps; two others are one, if it decides."""
+        walk = {k: (k * 0.5 + (30 if k >= 12 else 0), 0.0) for k in range(24)}
+        follow = {k: (20 + k * 0.5, 20.0) for k in range(24)}
+        frames = [frame(k, {1: walk[k], (2 if k < 12 else 3): follow[k]}) for k in range(24)]
+        plain = [rows.rows for rows, *_ in Retrack()(frames)]
+        fixed = [rows.rows for rows, *_ in Retrack(fixed_ids=(1, 2, 3))(frames)]
+
+        def tracks_of(found, source):
+            return {int(one["track_id"]) for rows in found for one in rows if one["source_id"] == source}
+
+        assert len(tracks_of(plain, 1)) == 2
+        assert tracks_of(plain, 2) == tracks_of(plain, 3)
+        assert [len(tracks_of(fixed, source)) for source in (1, 2, 3)] == [1, 1, 1]
+        assert len(set.union(*(tracks_of(fixed, source) for source in (1, 2, 3)))) == 3
+
+    def test_a_short_track_of_a_person_is_no_false_one(self):
+        frames = [frame(k, {1: (k * 0.5, 0.0), **({2: (5.0, 40.0)} if 8 <= k < 11 else {})}) for k in range(20)]
+        sources = {int(one) for rows, *_ in Retrack(fixed_ids=(2,))(frames) for one in rows.rows["source_id"]}
+        assert 2 in sources
+
+
+class TestCompare:
+    def test_what_was_changed_is_counted(self):
+        before = [frame(k, {1: (k, 0), 2: (k, 9), 3: (k, 30)}) for k in range(6)]
+        # 1 and, from frame 3 on, 2 are one; 2 is moved in one frame; 3 is removed; 9 is new
+        after = [
+            frame(k, {1: (k, 0) if k < 3 else (k, 9), **({2: (k + 0.3 * (k == 1), 9)} if k < 3 else {}), 9: (k, 60)})
+            for k in range(5)
+        ]
+        found, _ = compare("/camera/tracks", before, after)
+        assert (found.frames, found.same, found.moved, found.added, found.removed) == (5, 7, 1, 5, 7)
+        assert (found.joined, found.split) == ({1: [1, 2]}, {2: [1, 2]})
+        assert (found.new_tracks, found.removed_tracks) == ([9], [3])
+        assert "tracks 1, 2 joined to 1, track 2 split into 1, 2, new tracks 9, tracks 3 removed" in found.words
+
+
+def test_corrections_made_in_cvat_come_back_and_run_keeps_them(template, tmp_path):
+    path = Path(shutil.copy(template, tmp_path / "a.mcap"))
+    boxes = mcaptrack.export(path, tmp_path / "a.xml", form="cvat").folder
+    text = boxes.read_text()
+    unchanged = mcaptrack.ingest(boxes, role="corrections", into=path)
+    assert list(unchanged.messages) == ["/camera/corrected"]
+    assert unchanged.changes["of"] == "/camera/retracks/full"
+    assert [unchanged.changes[name] for name in ("moved", "added", "removed")] == [0, 0, 0]
+    # A person draws another one, who stands in the first 20 pictures, and nobody found.
+    corner = 'xtl="50" ytl="2" xbr="58" ybr="12" occluded="0"'
+    drawn = f'<track id="9" label="person"><box frame="0" keyframe="1" outside="0" {corner}/>'
+    drawn += f'<box frame="20" keyframe="1" outside="1" {corner}/></track>'
+    boxes.write_text(text.replace("</annotations>", drawn + "</annotations>"))
+    out = done("ingest", boxes, "--as", "corrections", "--into", path, "--force")
+    assert "20 added, new tracks" in " ".join((out.out + out.err).split())
+    (new,) = mcaptrack.ingest(boxes, role="corrections", into=path, force=True).changes["new_tracks"]
+    assert mcaptrack.info(path).to_json()["channels"]
+    with log.read(path) as opened:
+        before = len(np.unique(opened.rows("/camera/retracks", TRACKS).rows["track_id"]))
+    assert set(mcaptrack.run(path).stages) >= {"sample", "predict", "retrack"}
+    with log.read(path) as opened:
+        topics = "/camera/corrected", "/camera/retracks/full"
+        corrected, full = (join_frames(TRACKS, opened.frame_columns(topic, TRACKS)) for topic in topics)
+        after = len(np.unique(opened.rows("/camera/retracks", TRACKS).rows["track_id"]))
+    assert after == before + 1
+    owner: dict[int, set[int]] = {}
+    for row, t_ns in zip(corrected.rows, corrected.row_ns, strict=True):
+        same = (full.row_ns == t_ns) & (np.abs(full.rows["x_px"] - row["x_px"]) < 1e-6)
+        owner.setdefault(int(row["track_id"]), set()).update(full.rows["track_id"][same].tolist())
+    assert len(owner[new]) == 1
+    assert sorted(len(one) for one in owner.values()) == [1] * len(owner)
+    assert mcaptrack.run(path).stages == ()
+    mcaptrack.drop(path, ["/camera/corrected"])
+    mcaptrack.run(path)
+    with log.read(path) as opened, log.read(template) as first:
+        assert opened.rows("/camera/retracks", TRACKS).rows.tobytes() == (
+            first.rows("/camera/retracks", TRACKS).rows.tobytes()
+        )
+
+
+def test_corrections_need_a_log_and_ids(template, tmp_path):
+    (tmp_path / "a.txt").write_text("1,1,2,3,4,5,1,1,1\n")
+    (tmp_path / "b.txt").write_text("1,-1,2,3,4,5,1,1,1\n")
+    path = shutil.copy(template, tmp_path / "a.mcap")
+    with pytest.raises(McaptrackError, match=r"corrections are of tracks in a log; name it with `into=`"):
+        mcaptrack.ingest(tmp_path / "a.txt", tmp_path / "b.mcap", role="corrections")
+    with pytest.raises(McaptrackError, match="corrections need ids"):
+        mcaptrack.ingest(tmp_path / "b.txt", role="corrections", into=path)

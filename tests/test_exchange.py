@@ -1,0 +1,358 @@
+"""Boxes as files of other programs: what is written is read again, and what they write is read; expected by hand."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import mcaptrack
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.schema import TRACKS
+from mcaptrack.sources.ingest.labels.reading import read_labels
+from mcaptrack.sources.ingest.labels.wanted import WantedClasses
+from mcaptrack.tables.exchange import _HOLDS, _WRITERS
+from mcaptrack.tables.exchange.boxes import BoxTable
+from mcaptrack.tables.exchange.cvat import KEYFRAME_PX
+
+ALL = WantedClasses("all")
+NAMES = {1: "person", 2: "bicycle", 3: "traffic light", 7: 'a "b" <c> & d'}
+#: The example of CVAT's documentation of its XML format, for videos, without what says nothing about boxes.
+CVAT_EXAMPLE = """<?xml version="1.0" encoding="utf-8"?>
+<annotations>
+  <version>1.0</version>
+  <meta>
+    <task>
+      <id>1062</id>
+      <name>My interpolation task</name>
+      <size>30084</size>
+      <mode>interpolation</mode>
+      <overlap>20</overlap>
+      <bugtracker></bugtracker>
+      <labels><label><name>car</name><attributes><attribute>@select=model:1,2,3,4</attribute></attributes></label></labels>
+      <segments><segment><id>3085</id><start>0</start><stop>30083</stop></segment></segments>
+      <owner><username>admin</username><email></email></owner>
+    </task>
+    <dumped>2018-06-06 15:52:11.138470+03:00</dumped>
+  </meta>
+  <track id="0" label="car">
+    <box frame="110" xtl="634.12" ytl="37.68" xbr="661.50" ybr="71.37" outside="0" occluded="1" keyframe="1">
+      <attribute name="model">1</attribute>
+    </box>
+    <box frame="111" xtl="634.21" ytl="38.50" xbr="661.59" ybr="72.19" outside="0" occluded="1" keyframe="0">
+      <attribute name="model">1</attribute>
+    </box>
+    <box frame="112" xtl="634.30" ytl="39.32" xbr="661.67" ybr="73.01" outside="1" occluded="1" keyframe="1">
+      <attribute name="model">1</attribute>
+    </box>
+  </track>
+  <track id="1" label="car">
+    <box frame="0" xtl="626.81" ytl="30.96" xbr="656.05" ybr="58.88" outside="0" occluded="0" keyframe="1">
+      <attribute name="model">3</attribute>
+    </box>
+    <box frame="1" xtl="626.63" ytl="31.56" xbr="655.87" ybr="59.48" outside="0" occluded="0" keyframe="0">
+      <attribute name="model">3</attribute>
+    </box>
+    <box frame="2" xtl="626.09" ytl="33.38" xbr="655.33" ybr="61.29" outside="1" occluded="0" keyframe="1">
+      <attribute name="model">3</attribute>
+    </box>
+  </track>
+</annotations>
+"""
+
+
+def box(frame: int, left: float, outside: int = 0, more: str = "", inner: str = "") -> str:
+    corners = f'xtl="{left}" ytl="10" xbr="{left + 10}" ybr="30"'
+    return f'<box frame="{frame}" {corners} outside="{outside}" keyframe="1" {more}>{inner}</box>'
+
+
+def track(number: int, *boxes: str) -> str:
+    return f'<track id="{number}" label="person">{"".join(boxes)}</track>'
+
+
+ONE = f"<annotations>{track(0, box(0, 1))}</annotations>"
+
+
+def read(tmp_path: Path, text: str | bytes, name: str = "a.xml", role: str = "tracks", wanted=ALL):
+    path = tmp_path / name
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return read_labels(path, "auto", role, wanted=wanted)
+
+
+@st.composite
+def tables(draw, has_ids: bool = True) -> BoxTable:
+    """Rows of tracks: each id once a frame, and one class a track."""
+    last = draw(st.integers(0, 12))
+    frames = np.arange(last + 1)
+    ids = draw(st.lists(st.integers(0, 2**40), min_size=1, max_size=4, unique=True))
+    class_of = {one: draw(st.sampled_from([1, 1, 2, 3, 7])) for one in ids}
+    pairs = [(frame, one) for frame in range(last + 1) for one in sorted(ids)]
+    kept = sorted(draw(st.sets(st.sampled_from(pairs), min_size=1)))
+    places = st.floats(-500, 5000, allow_nan=False, width=64)
+    sizes = st.floats(0, 800, allow_nan=False, width=64)
+    boxes = np.array([[draw(places), draw(places), draw(sizes), draw(sizes)] for _ in kept]) + 3.25
+    boxes[:, 2:] = np.abs(boxes[:, 2:])
+    scores = [draw(st.floats(0, 1, width=32)) for _ in kept]
+    return BoxTable(
+        "/camera/tracks",
+        frames,
+        frames * 40_000_000,
+        np.array([frame for frame, _ in kept]),
+        np.array([one if has_ids else -1 for _, one in kept]),
+        boxes,
+        np.full((len(kept), 2), np.nan),
+        np.array(scores, np.float32),
+        np.array([class_of[one] for _, one in kept]),
+        np.array([draw(st.booleans()) for _ in kept]),
+        NAMES,
+        has_ids,
+        False,
+        (1920, 1080),
+        (),
+    )
+
+
+@pytest.mark.parametrize("form", _WRITERS)
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(table=tables())
+def test_what_is_written_is_read_again(form, table, tmp_path):
+    labels = read(tmp_path, b"".join(_WRITERS[form](table)), f"a.{form}")
+    first = labels.first_frame if form != "mot" else 1
+    order = np.lexsort((table.id, table.frame))
+    assert (labels.frame - first).tolist() == table.frame[order].tolist()
+    assert labels.id.tolist() == table.id[order].tolist()
+    np.testing.assert_allclose(labels.boxes_px, table.boxes[order], rtol=0, atol=1e-9)
+    if "scores" in _HOLDS[form]:
+        assert labels.score.astype(np.float32).tolist() == table.score[order].tolist()
+    if "names" in _HOLDS[form]:
+        names = [labels.classes[one] for one in labels.class_id.tolist()]
+        in_kitti = {1: "Pedestrian", 2: "bicycle", 3: "traffic_light", 7: "a_b_c_d"}
+        assert names == [(in_kitti if form == "kitti" else NAMES)[one] for one in table.class_id[order].tolist()]
+    if form in ("coco", "cvat"):
+        assert labels.observed.tolist() == table.observed[order].tolist()
+
+
+@pytest.mark.parametrize("form", _WRITERS)
+@settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(table=tables(has_ids=False))
+def test_detections_are_read_again_without_ids(form, table, tmp_path):
+    if form == "cvat":  # whose boxes of videos are tracks, of one frame each
+        labels = read(tmp_path, b"".join(_WRITERS[form](table)), "a.xml")
+        assert len(np.unique(labels.id)) == len(table.frame)
+        return
+    labels = read(tmp_path, b"".join(_WRITERS[form](table)), f"a.{form}", "detections")
+    assert not labels.has_ids
+    assert sorted(map(tuple, labels.boxes_px.round(6))) == sorted(map(tuple, table.boxes.round(6)))
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(table=tables())
+def test_cvat_interpolates_what_is_no_keyframe(table, tmp_path):
+    """CVAT keeps keyframes alone, and interpolates: no corner is farther than ``KEYFRAME_PX`` from where it was."""
+    lines = b"".join(_WRITERS["cvat"](table)).decode().splitlines()
+    sparse = "\n".join(line for line in lines if 'keyframe="0"' not in line)
+    labels = read(tmp_path, sparse)
+    order = np.lexsort((table.id, table.frame))
+    assert labels.id.tolist() == table.id[order].tolist()
+    corners = [np.hstack([b[:, :2], b[:, :2] + b[:, 2:]]) for b in (labels.boxes_px, table.boxes[order])]
+    np.testing.assert_allclose(*corners, rtol=0, atol=KEYFRAME_PX + 1e-9)
+
+
+def test_a_straight_walk_needs_two_keyframes():
+    count = 50
+    frames = np.arange(count)
+    boxes = np.stack([frames * 3.0, frames * 0.5, np.full(count, 20.0), np.full(count, 50.0)], axis=-1)
+    table = BoxTable(
+        "/t", frames, frames, frames, np.full(count, 4), boxes, boxes[:, :2], np.full(count, np.nan, np.float32),
+        np.ones(count, int), np.ones(count, bool), {}, True, False, None, (),
+    )  # fmt: skip
+    text = b"".join(_WRITERS["cvat"](table)).decode()
+    assert text.count('keyframe="1"') == 2
+    assert text.count("<box ") == count
+
+
+class TestCvat:
+    def test_the_example_of_its_documentation(self, tmp_path):
+        labels = read(tmp_path, CVAT_EXAMPLE)
+        assert (labels.format, labels.frame.tolist(), labels.id.tolist()) == ("cvat", [0, 1, 110, 111], [1, 1, 0, 0])
+        np.testing.assert_allclose(labels.boxes_px[2], [634.12, 37.68, 27.38, 33.69])
+        assert labels.classes == {2: "car"}
+        assert labels.observed.tolist() == [True, True, False, False]
+        assert (labels.labelled[0], labels.labelled[-1]) == (0, 30083)
+
+    def test_boxes_between_keyframes_are_interpolated_and_none_after_the_object_left(self, tmp_path):
+        boxes = [box(2, 100), box(6, 140), box(8, 180, outside=1), box(12, 50)]
+        labels = read(tmp_path, f"<annotations>{track(3, *boxes)}</annotations>")
+        assert labels.frame.tolist() == [2, 3, 4, 5, 6, 7, 12]
+        assert labels.boxes_px[:, 0].tolist() == [100, 110, 120, 130, 140, 160, 50]
+        assert labels.id.tolist() == [3] * 7
+        assert any("4 boxes are interpolated" in words for words in labels.remarks)
+
+    def test_ids_are_those_of_the_attribute_and_a_track_that_was_split_gets_a_new_one(self, tmp_path):
+        def own(n):
+            return f'<attribute name="track_id">{n}</attribute>'
+
+        tracks = [
+            track(0, box(0, 1, inner=own(40))),
+            track(1, *(box(frame, 1, inner=own(40)) for frame in (1, 2))),
+            track(2, box(0, 50, inner=own(7))),
+            track(3, box(1, 90)),
+        ]
+        labels = read(tmp_path, f"<annotations>{''.join(tracks)}</annotations>")
+        rows = list(zip(labels.frame.tolist(), labels.id.tolist(), strict=True))
+        assert rows == [(0, 7), (0, 41), (1, 40), (1, 42), (2, 40)]
+        assert any("several tracks state one track_id (40)" in words for words in labels.remarks)
+        assert any("1 tracks state no track_id" in words for words in labels.remarks)
+
+    def test_a_zip_file_of_cvat(self, tmp_path):
+        with zipfile.ZipFile(tmp_path / "task.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("images/frame_000000.png", b"\0")
+            archive.writestr("annotations.xml", CVAT_EXAMPLE.replace("30084", "200"))
+        result = mcaptrack.ingest(tmp_path / "task.zip", tmp_path / "b.mcap", fps=10, classes="car")
+        assert result.messages == {"/camera/tracks": 200}
+
+    def test_annotations_of_images_are_detections(self, tmp_path):
+        text = (
+            '<annotations><version>1.1</version><image id="0" name="a.jpg" width="600" height="400"/>'
+            '<image id="2" name="c.jpg" width="600" height="400"><box label="person" occluded="0" xtl="1" ytl="2" '
+            'xbr="4" ybr="8"></box><polygon label="car" points="1,2;3,4"/><tag label="good"/></image></annotations>'
+        )
+        labels = read(tmp_path, text, role="detections")
+        assert (labels.frame.tolist(), labels.boxes_px.tolist(), labels.has_ids) == ([2], [[1, 2, 3, 6]], False)
+        assert labels.labelled.tolist() == [0, 2]
+        assert [code for _, code in labels.doubts if "1 of <polygon>, 1 of <tag>" in _] == ["left-out"]
+
+    def test_a_rotated_box_is_said(self, tmp_path):
+        turned = box(0, 1, more='rotation="30.5"')
+        labels = read(tmp_path, f"<annotations>{track(0, turned)}</annotations>")
+        assert any("1 boxes are rotated" in words for words, _ in labels.doubts)
+
+    BOMB = '<!DOCTYPE a [<!ENTITY b "bbbb"><!ENTITY c "&b;&b;">]><annotations>&c;</annotations>'
+    OUTER = '<!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/passwd">]><annotations>&x;</annotations>'
+
+    @pytest.mark.parametrize(
+        ("text", "words"),
+        [
+            (BOMB, ":1: a document type, which CVAT doesn't write"),
+            (OUTER, ":1: a document type"),
+            ("<annotations>" + "<a>" * 40, ":1: nested deeper"),
+            ("<annotation><object/></annotation>", ":1: XML that begins with <annotation>"),
+            ("<annotations>\n<track>", ":2: not valid XML: no element found"),
+            ("<annotations></annotations>", " holds no boxes"),
+            ('<annotations><image id="0"><points label="a" points="1,2"/></image></annotations>', "only 1 of <points>"),
+            (f"<annotations>{track(0, box(3, 1), box(3, 2))}</annotations>", "the frame of a box is 3"),
+            (f"<annotations>{track(0, box(0, 1), box(2**40, 2))}</annotations>", "boxes would be interpolated"),
+            ('<annotations><track id="x"></track></annotations>', "the id of a track is a whole number"),
+            ('<annotations><track><box frame="1" xtl="1"/></track></annotations>', "a box without 'ytl'"),
+            (ONE.replace('"30"', '"z"'), "corners that aren't numbers"),
+            (ONE.replace('"30"', '"nan"'), "not finite"),
+            (ONE.replace('"30"', '"3"'), "can't be 10 wide and -7 high"),
+        ],
+    )  # fmt: skip
+    def test_what_it_would_not_write_is_refused_in_one_line(self, text, words, tmp_path):
+        with pytest.raises(McaptrackError) as error:
+            read(tmp_path, text)
+        assert words in str(error.value)
+        assert "\n" not in str(error.value)
+
+    def test_a_zip_file_that_is_damaged_is_refused(self, tmp_path):
+        path = tmp_path / "a.zip"
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("annotations.xml", CVAT_EXAMPLE * 3)
+        data = bytearray(path.read_bytes())
+        data[60:80] = bytes(20)
+        path.write_bytes(data)
+        with pytest.raises(McaptrackError, match=r"zip file with an annotations.xml that can't be read"):
+            read_labels(path, "cvat", "tracks")
+
+
+class TestCommand:
+    @pytest.mark.parametrize("form", _WRITERS)
+    def test_a_channel_goes_out_and_comes_back_into_the_log(self, form, template, tmp_path):
+        path = Path(shutil.copy(template, tmp_path / "a.mcap"))
+        result = mcaptrack.export(path, tmp_path / f"a.{form}", form=form)
+        assert result.folder == tmp_path / f"a.{form}"
+        assert list(result.rows) == ["/camera/retracks/full"]
+        mcaptrack.ingest(result.folder, role="tracks", into=path, camera="camera/again")
+        with log.read(path) as opened:
+            before, after = (opened.rows(t, TRACKS) for t in ("/camera/retracks/full", "/camera/again/tracks"))
+        assert after.t_ns.tolist() == before.t_ns.tolist()
+        assert len(before.rows) > 0
+        for name in ("track_id", "class_id"):
+            assert after.rows[name].tolist() == before.rows[name].tolist()
+        for name in ("x_px", "y_px", "w_px", "h_px"):
+            np.testing.assert_allclose(after.rows[name], before.rows[name], rtol=0, atol=1e-9)
+
+    def test_a_recording_of_rerun_needs_its_library(self, template, tmp_path, monkeypatch):
+        monkeypatch.setitem(sys.modules, "rerun", None)
+        with pytest.raises(McaptrackError, match=r"pip install \"mcaptrack\[rerun\]\""):
+            mcaptrack.export(template, tmp_path / "a.rrd", form="rerun")
+        assert not list(tmp_path.iterdir())
+
+    def test_a_recording_of_rerun_has_pictures_boxes_and_forecasts(self, template, tmp_path):
+        pytest.importorskip("rerun", reason="the extra rerun is not installed")
+        result = mcaptrack.export(template, tmp_path / "a.rrd", form="rerun")
+        command = [sys.executable, "-m", "rerun_cli", "rrd", "print", tmp_path / "a.rrd"]
+        said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        assert list(result.rows) == ["/camera/retracks/full"]
+        assert all(f"/{name}" in said for name in ("camera", "camera/boxes", "ground/trails", "ground/forecasts"))
+
+    def test_frames_and_sizes_of_coco_are_those_of_the_pictures(self, template, tmp_path):
+        mcaptrack.export(template, tmp_path / "a.json", form="coco", topic="/camera/truth")
+        content = json.loads((tmp_path / "a.json").read_text())
+        assert [image["frame_id"] for image in content["images"]] == list(range(30))
+        assert {(image["width"], image["height"]) for image in content["images"]} == {(64, 48)}
+        assert all(b["timestamp_ns"] > a["timestamp_ns"] for a, b in pairwise(content["images"]))
+        assert {one["track_id"] for one in content["annotations"]} == {1, 2}
+        assert [one["name"] for one in content["categories"]] == ["person"]
+
+    @pytest.mark.parametrize(
+        ("given", "words"),
+        [
+            ({"topic": "/camera/video"}, "/camera/video has no detections and no tracks"),
+            ({"topic": "/nothing"}, "/nothing"),
+            ({"topic": ["/camera/tracks", "/camera/truth"]}, "of one channel, not of"),
+            ({"delta": "lake"}, "Delta tables are made of tables"),
+            ({"output": "there"}, "is a folder"),
+        ],
+    )
+    def test_mistakes_are_refused(self, given, words, template, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "there").mkdir()
+        with pytest.raises(McaptrackError, match=words):
+            mcaptrack.export(template, **{"output": "x.txt", "form": "mot", **given})
+        assert [path.name for path in tmp_path.iterdir()] == ["there"]
+
+    def test_a_file_is_replaced_only_when_told(self, template, tmp_path):
+        mcaptrack.export(template, tmp_path / "a.txt", form="mot")
+        with pytest.raises(McaptrackError, match="exists; give another name"):
+            mcaptrack.export(template, tmp_path / "a.txt", form="mot")
+        first = (tmp_path / "a.txt").read_bytes()
+        mcaptrack.export(template, tmp_path / "a.txt", form="mot", force=True)
+        assert (tmp_path / "a.txt").read_bytes() == first
+
+    def test_what_a_format_has_no_place_for_is_said_once(self, template, tmp_path):
+        said = [one.message for one in mcaptrack.export(template, tmp_path / "a.xml", form="cvat").warnings]
+        assert len(said) == 1
+        assert "CVAT has no place for positions in metres" in said[0]
+        assert not mcaptrack.export(template, tmp_path / "a.csv", form="boxes-csv").warnings
+
+
+def test_mot15_is_read_as_it_is(data):
+    path = data / "mot15" / "ETH-Sunnyday" / "gt" / "gt.txt"
+    labels = read_labels(path, "mot", "truth")
+    lines = [line.split(",") for line in path.read_text().splitlines()]
+    assert len(labels.frame) == sum(float(line[6]) != 0 for line in lines)
+    boxes = np.array([[float(one) for one in line[2:6]] for line in lines if float(line[6])])
+    rows = sorted(map(tuple, boxes)), sorted(map(tuple, labels.boxes_px))
+    assert rows[0] == rows[1]
