@@ -297,6 +297,14 @@ class TestGeometry:
         inside = [int(frame.rows["inside"][0]) for frame in found.counts]
         assert inside == [1] * 7 + [0] * 5 + [1] * 2
 
+    def test_in_a_narrow_zone_the_margin_is_half_the_area_by_the_circumference(self):
+        # 0.4 m wide and 3.6 m long: 1.44 / 8 / 2 = 0.09, so that 0.1 m inside is a visit and 0.05 m is none
+        content = collection(feature("strip", "Polygon", [[[0, 0], [0.4, 0], [0.4, 3.6], [0, 3.6], [0, 0]]]))
+        for inside, wanted in ((0.1, 1), (0.05, 0)):
+            at = [-1.0, inside, -1.0]
+            (strip,) = count(walk(lambda tick, at=at: {1: (at[tick], 2.0)}, 3, 1), content)[1]
+            assert strip.visits == wanted
+
     def test_paths_through_the_corners_of_a_line_count_once(self):
         line = Shape(((np.array([[0.0, 0], [1, 0], [2, 0], [2, 2]]),),), is_line=True)
         for x in (0.5, 1.0, 1.5):
