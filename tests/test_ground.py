@@ -156,6 +156,9 @@ def test_what_is_uncertain_along_a_line_of_sight_belongs_to_the_track_on_it():
     first = [(0.0, 0.0, 0.9), (0.75, 0.6, 0.9)]
     assert kept_by(first, seen([(0.7, 0.0, 0.9)], (4.0, 0.0, 0.001))) == [1]
     assert kept_by(first, seen([(0.7, 0.0, 0.9)], (0.01, 0.0, 0.01))) == [2]  # the nearer one
+    first = [(0.0, 0.0, 0.9), (0.9, 0.0, 0.9)]
+    assert kept_by(first, seen([(0.5, 0.5, 0.9)], (2.0, 1.99, 2.0))) == [1]  # a line between the axes
+    assert kept_by(first, seen([(0.5, 0.5, 0.9)], (2.0, -1.99, 2.0))) == [2]
 
 
 def test_of_two_detections_the_more_probable_one_continues_a_track():
