@@ -7,6 +7,7 @@ shows the option instead, and a command instead of a call.
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,18 @@ def call(function: str, *values: str | Path, **parameters: Any) -> str:
     words = [_literal(value) for value in values]
     words += [f"{name}={_literal(value)}" for name, value in parameters.items()]
     return f"`mcaptrack.{function}({', '.join(words)})`"
+
+
+def list_names(names: Sequence[str], most: int = 30) -> str:
+    """Names for a message: all, or the first and the number of the rest.
+
+    Examples
+    --------
+    >>> list_names(["a", "b", "c", "d"], most=2), list_names([])
+    ('a, b and 2 more', 'none')
+    """
+    more = f" and {len(names) - most:,} more" if len(names) > most else ""
+    return (", ".join(names[:most]) or "none") + more
 
 
 def _literal(value: Any) -> str:

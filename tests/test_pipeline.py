@@ -11,6 +11,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+import mcaptrack
 from mcaptrack import log, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions, evaluate, sequence_of_log
@@ -339,3 +340,14 @@ def test_new_detections_give_a_new_estimate_of_the_scale(footage, tmp_path):
         heights = np.concatenate([f.rows["h_px"] for f in opened.frames("/camera/detections", DETECTIONS)])
         assert rows_to_plane(frame.rows).homography[0] == pytest.approx(1.7 / np.median(heights))
         assert [topic for topic in opened.channels if pipeline.is_stale(opened, topic)] == []
+
+
+def test_a_log_of_many_channels_is_refused_in_few_words(tmp_path):
+    path = tmp_path / "a.mcap"
+    with log.create(path) as writer:
+        for number in range(1000):
+            writer.add_channel(f"/sensor/{number:04}", ("", "", b""), "raw", {})
+    for stage in (mcaptrack.run, mcaptrack.track):
+        with pytest.raises(McaptrackError, match="/sensor/0029 and 970 more") as error:
+            stage(path)
+        assert len(str(error.value)) < 1000

@@ -12,7 +12,7 @@ from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 
-from mcaptrack.errors import McaptrackError, call
+from mcaptrack.errors import McaptrackError, call, list_names
 from mcaptrack.files import place_of
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.location import Location, is_remote
@@ -177,9 +177,7 @@ class Log:
         if topic not in self.channels:
             there = [name for name in sorted(self.channels) if "/view/" not in name]
             more = call("info", self.path)
-            raise McaptrackError(
-                f"{self.path} has no channel {topic}; it has {', '.join(there) or 'none'}. {more} shows more"
-            )
+            raise McaptrackError(f"{self.path} has no channel {topic}; it has {list_names(there)}. {more} shows more")
         return self.channels[topic]
 
     def _channel(self, record: ChannelRecord) -> Channel:

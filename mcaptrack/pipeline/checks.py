@@ -10,7 +10,7 @@ from dataclasses import is_dataclass
 from typing import NamedTuple
 
 from mcaptrack import log
-from mcaptrack.errors import McaptrackError, call
+from mcaptrack.errors import McaptrackError, call, list_names
 from mcaptrack.foxglove import views
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.schema.classes import class_names
@@ -108,11 +108,11 @@ def read_named_frames(
 def _lacks(opened: log.Log, prefix: str, job: Job) -> str:
     """Return the message for a missing input: what is missing, what the log has, and what to do."""
     there = [topic for topic in sorted(opened.channels) if "/view/" not in topic]
-    has, hint = f"it has {', '.join(there) or 'none'}", f"{call('info', opened.path)} shows more"
+    has, hint = f"it has {list_names(there)}", f"{call('info', opened.path)} shows more"
     if job.transform.reads is VIDEO and job.source == f"{prefix}/{STAGES[job.stage].input_topic}":
         pictures = [topic for topic in there if foreign.holds_pictures(opened.channels[topic])]
         if pictures:
-            has, hint = f"it has pictures in {', '.join(pictures)}", "choose one with `topic=`"
+            has, hint = f"it has pictures in {list_names(pictures)}", "choose one with `topic=`"
         else:
             add = call("ingest", "VIDEO", into=opened.path)
             hint = f"add pictures with {add}, or name what to begin with by `topic=`"
