@@ -143,11 +143,14 @@ class TestInfo:
     def test_every_channel_has_a_line_with_its_schema_and_messages(self, twice):
         for path in twice:
             (one,) = data("info", path)
-            first, head, *rest = done("info", path).out.splitlines()
+            first, begin, head, *rest = done("info", path).out.splitlines()
             seconds = (one["end_ns"] - one["start_ns"]) / 1e9
             assert first == f"{path}  {one['bytes']:,} bytes, {one['messages']:,} messages, {seconds:.3f} s"
-            assert head.split() == ["topic", "schema", "messages"]
+            assert begin == f"starts at {one['start_ns'] / 1e9:.3f} s"
+            assert head.split() == ["topic", "schema", "messages", "per", "second"]
             channels = [[c["topic"], c["schema"], f"{c['messages']:,}"] for c in one["channels"]]
+            for row, channel in zip(channels, one["channels"], strict=True):
+                row += [] if channel["rate_hz"] is None else [f"{channel['rate_hz']:.1f}"]
             assert [line.split() for line in rest[: len(channels)]] == channels
             assert rest[len(channels)] == "lineage"
             assert len({len(line) for line in [head, *rest[: len(channels)]]}) == 1  # numbers end below each other

@@ -63,7 +63,7 @@ def result(**changed: Any) -> RunResult:
         "written_because": "",
         "seconds": 1.26,
     }
-    plain |= {"summary": None} | {
+    plain |= {"summary": None, "zones": None} | {
         name: {} for name in ("frames", "rows", "tracks", "events", "tables", "seconds_by_part")
     }
     plain |= dict.fromkeys(("stale", "layouts", "warnings", "notes"), ())
@@ -822,7 +822,7 @@ class TestQuery:
 
 def test_a_channel_that_results_replace_is_said_and_drawn_once():
     described = {"schema": "S", "messages": 1234, "replaced": False, "transform": None, "input": None, "plugins": None}
-    described |= {"stale": False, "parameters": {"b": 1, "a": 2}, "frame": None}
+    described |= {"stale": False, "parameters": {"b": 1, "a": 2}, "frame": None, "rate_hz": 12.34}
     data = {
         "log": "a\x1b.mcap",
         "bytes": 12345,
@@ -843,9 +843,10 @@ def test_a_channel_that_results_replace_is_said_and_drawn_once():
         more = [["│   └── a=2, b=1"], ["    └── a=2, b=1"]] if verbose else [[], []]
         assert [line.rstrip() for line in out.getvalue().splitlines()] == [
             r"a\x1b.mcap  12,345 bytes, 6,789 messages, 1000000000.000 s",
+            "starts at 0.000 s",
             "with results in a.results.mcap",
-            f"{'topic':<31}schema  messages",
-            *(f"{topic:<31}S          1,234" for topic in ("/a  (replaced by the results)", "/a", "/b")),
+            f"{'topic':<31}schema  messages  per second",
+            *(f"{topic:<31}S          1,234        12.3" for topic in ("/a  (replaced by the results)", "/a", "/b")),
             "lineage",
             "├── /a",
             *more[0],

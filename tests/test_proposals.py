@@ -202,6 +202,9 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     ),
     "viewing/comparing.py:find_panels:run": lambda s: s.untracked().says("render", "LOG", "--compare"),
     "viewing/heat_map.py:_channel:run": lambda s: s.ingested("clip.mp4").says("render", "LOG", "--heatmap"),
+    "viewing/zones_page.py:zones_page:run": lambda s: s.ingested("truth.txt", "--as", "detections", "--fps", "10").says(
+        "zones", "draw", "LOG"
+    ),
     "viewing/report/contents.py:_score:ingest": lambda s: s.without("/camera/truth*").page(),
     "viewing/report/summary.py:_without_ground_truth:run": lambda s: s.ingested("clip.mp4").page(),
     "viewing/report/sections.py:scores:run": lambda s: s.ingested("clip.mp4").page(),
