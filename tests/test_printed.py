@@ -150,7 +150,7 @@ class TestInfo:
             assert head.split() == ["topic", "schema", "messages", "per", "second"]
             channels = [[c["topic"], c["schema"], f"{c['messages']:,}"] for c in one["channels"]]
             for row, channel in zip(channels, one["channels"], strict=True):
-                row += [] if channel["rate_hz"] is None else [f"{channel['rate_hz']:.1f}"]
+                row.extend([] if channel["rate_hz"] is None else [f"{channel['rate_hz']:.1f}"])
             assert [line.split() for line in rest[: len(channels)]] == channels
             assert rest[len(channels)] == "lineage"
             assert len({len(line) for line in [head, *rest[: len(channels)]]}) == 1  # numbers end below each other
