@@ -7,6 +7,7 @@ import threading
 import webbrowser
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple, Self
 
@@ -18,6 +19,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path
 from mcaptrack.viewing import moments
+from mcaptrack.viewing.linked_report import is_about, with_links
 from mcaptrack.viewing.links import LICHTBLICK, viewer_links
 from mcaptrack.viewing.moments import Moment
 from mcaptrack.viewing.serving import Server
@@ -63,6 +65,7 @@ class _Contents:
     files: Mapping[str, Path | bytes]
     layouts: Mapping[str, tuple[str, Path | bytes]]
     events: Sequence[Moment]
+    report: tuple[str, bytes] | None
     start_ns: int
     at_ns: int
 
@@ -84,6 +87,8 @@ class LogServer:
         Addresses that open the log in Lichtblick, by layout.
     events : tuple of LinkedEvent
         Every identity switch and repair, in the order of time, with the address that opens it.
+    report : str or None
+        Address of the report on the log, if there is one beside it: its times are links that open the log there.
     at_s : float
         The time at which viewers open, in seconds since the start of the log.
     notes : tuple of str
@@ -120,6 +125,12 @@ class LogServer:
             LinkedEvent(*one, links_to(first, moments.before(one.t_ns, contents.start_ns))["Lichtblick"])
             for one in contents.events
         )
+        self.report = None
+        if contents.report is not None:
+            name, page = contents.report
+            lead = partial(moments.before, start_ns=contents.start_ns)
+            page = with_links(page, lambda t_ns: links_to(first, lead(t_ns))["Lichtblick"])
+            self.report = self._server.add(name, page)
         self.at_s = (contents.at_ns - contents.start_ns) / NS_PER_S
         self.notes = notes
         self.warnings = warnings
@@ -232,7 +243,7 @@ def view(
         if opened.start_ns or opened.end_ns:
             notes.say(f"viewers open at {moments.seconds_of(opened, at_ns):.1f} s, {why}")
         _say_trouble(opened, notes)
-        contents = _Contents(files, layouts, events, opened.start_ns, at_ns)
+        contents = _Contents(files, layouts, events, _report(path, opened, notes), opened.start_ns, at_ns)
     server = LogServer(contents, port, lichtblick, tuple(notes), tuple(dict.fromkeys(warnings)))
     if browser:
         webbrowser.open(server.links["Lichtblick"])
@@ -253,6 +264,22 @@ def _opening(opened: logs.Log, events: Sequence[Moment], at_s: float | None, eve
         chosen = events[event - 1]
         return moments.before(chosen.t_ns, opened.start_ns), f"a second before event {event} ({chosen.text})"
     return moments.opening_moment(opened, events)
+
+
+def _report(path: Path, opened: logs.Log, notes: Notes) -> tuple[str, bytes] | None:
+    """Return name and content of the report beside a log, if it is about the log as it is now."""
+    file = path.with_suffix(".report.html")
+    try:
+        page = file.read_bytes() if file.is_file() else None
+    except OSError as error:
+        warn(f"{file} can't be served: {error.strerror}", "left-out")
+        return None
+    if page is None:
+        return None
+    if not is_about(page, opened.fingerprint()):
+        notes.say(f"{file} is not served: it is not about the log as it is now; {call('report', path, force=True)} is")
+        return None
+    return file.name, page
 
 
 def _say_trouble(opened: logs.Log, notes: Notes) -> None:

@@ -82,8 +82,8 @@ def view(
 
     Links open the log where something happens, and there is a link for each identity switch and repair. Also serves
     its layouts (tracking, comparing, predictions): the links open Lichtblick with one; in Foxglove import the file
-    (Layouts, Import from file). Layout files beside the log are served as they are, also while they are edited. Only
-    these files are served, only to this machine, until Ctrl-C.
+    (Layouts, Import from file). Layout files beside the log are served as they are, also while they are edited, and
+    its report with a link at each time. Only these files are served, only to this machine, until Ctrl-C.
 
     Example: mcaptrack view log.mcap
 
@@ -116,6 +116,7 @@ def _as_json(server: LogServer) -> dict[str, Any]:
         "layouts": server.layouts,
         "links": server.links,
         "lichtblick": server.lichtblick,
+        "report": server.report,
         "at_s": server.at_s,
         "events": [one._asdict() for one in server.events],
         "notes": list(server.notes),
@@ -126,6 +127,7 @@ def _print(server: LogServer, path: Path, most: int) -> None:
     lines = [(f"Lichtblick, {name}", link) for name, link in server.lichtblick.items()]
     lines = [*(lines or [("Lichtblick", server.links["Lichtblick"])]), ("Foxglove", server.links["Foxglove"])]
     lines += [("log", "  ".join(server.logs))]
+    lines += [("report", server.report)] if server.report else []
     lines += [(f"layout, {name}", address) for name, address in server.layouts.items()]
     lines += [] if server.layouts else [("layout", f"none yet: {command('run', path)} makes one")]
     width = max(len(name) for name, _ in lines) + 2

@@ -37,6 +37,7 @@ _AUTHORITY: Final = re.compile(r"([0-9A-Za-z._~!$&'()*+,;=%-]+|\[[0-9A-Fa-f:.]+\
 _ABSOLUTE: Final = re.compile(r"http://([^/?#]*)(/[^#]*)?", re.IGNORECASE)
 _RANGES: Final = re.compile(r"bytes=(.*)", re.IGNORECASE)
 _RANGE: Final = re.compile(r"([0-9]*)-([0-9]*)")
+_POLICY: Final = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 #: More digits than the size of any file has.
 _MANY_DIGITS: Final = 20
 
@@ -82,6 +83,11 @@ class Server(ThreadingHTTPServer):
         """The address of a file."""
         return f"http://{LOOPBACK}:{self.server_port}/{self._word}/{quote(os.fsencode(name))}"
 
+    def add(self, name: str, content: bytes) -> str:
+        """Serve one more file; returns its address."""
+        self.served[f"/{self._word}/".encode() + os.fsencode(name)] = content
+        return self.address(name)
+
     def process_request(self, request: Any, client_address: Any) -> None:
         """Answer in a thread, unless all connections are in use."""
         with self._lock:
@@ -124,6 +130,13 @@ class Server(ThreadingHTTPServer):
         with self._lock:
             for connection in self._idle_since:
                 _end(connection)
+
+
+def _kind_of(name: str) -> dict[str, str]:
+    """The fields that say what a file is. Pages may load and run nothing, whoever made them."""
+    if name.endswith(".html"):
+        return {"Content-Type": "text/html; charset=utf-8", "Content-Security-Policy": _POLICY}
+    return {"Content-Type": "application/json" if name.endswith(".json") else "application/octet-stream"}
 
 
 def _end(connection: socket.socket) -> None:
@@ -243,7 +256,8 @@ class _Handler(BaseHTTPRequestHandler):
         if content is None:
             self._head(HTTPStatus.NOT_FOUND, {"Content-Length": "0"})
         elif isinstance(content, bytes):
-            self._head(HTTPStatus.OK, {"Content-Type": "application/json", "Content-Length": str(len(content))})
+            name = self.path.partition("?")[0]
+            self._head(HTTPStatus.OK, {**_kind_of(name), "Content-Length": str(len(content))})
             self.wfile.write(content if with_body else b"")
         else:
             try:
@@ -263,7 +277,7 @@ class _Handler(BaseHTTPRequestHandler):
         if with_body and self.headers.get("If-Range", tag).strip(" \t") == tag:  # only GET has ranges
             span, status = requested_range(self.headers.get_all("Range", []), there.st_size)
         headers = {
-            "Content-Type": "application/json" if path.suffix == ".json" else "application/octet-stream",
+            **_kind_of(path.name if path.suffix == ".json" else ""),
             "Content-Length": str(len(span)),
             "ETag": tag,
             "Last-Modified": formatdate(there.st_mtime, usegmt=True),

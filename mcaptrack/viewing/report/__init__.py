@@ -19,14 +19,24 @@ import numpy as np
 
 from mcaptrack import SCHEMA_VERSION, __version__, foxglove
 from mcaptrack.evaluation import EvaluationRow, metrics
+from mcaptrack.evaluation.people import Intervals
 from mcaptrack.foxglove.palette import COUNT as COLOURS
 from mcaptrack.viewing.report import figures, lineage, sections
-from mcaptrack.viewing.report.charts import Axis, pairs_chart, round_most
+from mcaptrack.viewing.report.charts import Axis, pairs_chart, ranges_chart, round_most
 from mcaptrack.viewing.report.contents import LogReport, gather
 from mcaptrack.viewing.report.fleet_page import fleet_data, fleet_page
 from mcaptrack.viewing.report.formatting import NONE, counted, number, percent
+from mcaptrack.viewing.report.headline import BeforeAfter
 from mcaptrack.viewing.report.html import render
-from mcaptrack.viewing.report.summary import BeforeAfter, before_after, combined_results, summarize
+from mcaptrack.viewing.report.identity_timeline import identity_timeline, people_over_time
+from mcaptrack.viewing.report.summary import (
+    before_after,
+    change_text,
+    combined_results,
+    intervals_of,
+    summarize,
+    verdict,
+)
 
 __all__ = ["ELEMENT", "LogReport", "data", "draw", "fleet_data", "fleet_page", "gather", "page"]
 
@@ -60,8 +70,11 @@ def draw(report: LogReport, at: int, total: int) -> None:
         "log.html",
         number=at,
         level=2 if total == 1 else 3,
+        identities=identity_timeline(report),
+        over_time=people_over_time(report),
         scores=sections.scores(report),
         scene=figures.scene_map(report),
+        heat=figures.heat(report),
         events=figures.identity_events(report),
         forecasts=sections.forecasts(report),
         motion=sections.motion(report),
@@ -70,7 +83,7 @@ def draw(report: LogReport, at: int, total: int) -> None:
         notes=report.notes,
         people=report.has_only_people,
     )
-    report.background, report.sequence, report.highlights = None, None, []
+    report.background, report.sequence, report.highlights, report.doubts = None, None, [], []
     for one in report.track_sets.values():
         one.frames = []
 
@@ -108,13 +121,13 @@ def _in_short(report: LogReport) -> str:
 def _comparison(reports: Sequence[LogReport]) -> dict[str, Any]:
     """Scores by log, and of all logs together."""
     pairs = [(report, before_after(report, report.results) if report.results else None) for report in reports]
-    rows = [_comparison_row(report.file, found) for report, found in pairs]
+    sure = [intervals_of([report]) for report in reports]
+    rows = [_comparison_row(report.file, found, one) for (report, found), one in zip(pairs, sure, strict=True)]
     together = combined_results(reports)
     if together:
-        rows.append(_comparison_row("", before_after(next(one for one in reports if one.results), together)))
-    columns = ["log", "within"]
-    for key in _COMPARED:
-        columns += [f"{key} tracked", "re-tracked"]
+        whole = before_after(next(one for one in reports if one.results), together)
+        rows.append(_comparison_row("", whole, intervals_of(reports)))
+    columns = ["log", "within", "change of IDF1 (95 %)", "re-tracking is", *_COMPARED]
     charts = []
     for key, label, is_share in (("IDSW", "identity switches", False), ("IDF1", "identities kept (IDF1), %", True)):
         values = [
@@ -126,20 +139,28 @@ def _comparison(reports: Sequence[LogReport]) -> dict[str, Any]:
             axis = Axis(label, 1.0 if is_share else round_most([np.array([v[1:] for v in values]).ravel()]), is_share)
             chart = pairs_chart(f"{label} by log", values, axis, ("tracked", "re-tracked"))  # type: ignore[arg-type]
             charts.append({"chart": chart, "title": label, "caption": ""})
+    known = [(report.name, one.idf1) for report, one in zip(reports, sure, strict=True) if one and one.idf1[1].is_known]
+    if known:
+        title = "IDF1 with 95 % intervals, by log"
+        chart = ranges_chart(
+            title, known, Axis("identities kept (IDF1), %", 1.0, percent=True), ("tracked", "re-tracked")
+        )
+        caption = "Logs with bars that overlap may only have other people in them. Bars: bootstrap over people."
+        charts.append({"chart": chart, "title": "Intervals.", "caption": caption})
     return {"columns": columns, "rows": rows, "figures": charts}
 
 
-def _comparison_row(file: str, found: BeforeAfter | None) -> dict[str, Any]:
+def _comparison_row(file: str, found: BeforeAfter | None, sure: Intervals | None) -> dict[str, Any]:
     if found is None:
-        return {"file": file, "rule": "no ground truth", "cells": [NONE] * (2 * len(_COMPARED))}
+        return {"file": file, "rule": "no ground truth", "cells": [NONE] * (len(_COMPARED) + 2)}
     sides = [metrics.summary(side.score) if side else None for side in (found.tracked, found.retracked)]
     similarity, gate = found.rule
     return {
         "file": file,
         "rule": f"{gate:g} m" if similarity == "metres" else f"IoU {gate:g}",
-        "cells": [
-            (percent if is_share else number)(side[key] if side else None)
+        "cells": [change_text(sure), verdict(sure)]
+        + [
+            " → ".join((percent if is_share else number)(side[key] if side else None) for side in sides)
             for key, is_share in _COMPARED.items()
-            for side in sides
         ],
     }

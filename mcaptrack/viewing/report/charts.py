@@ -194,6 +194,23 @@ def pairs_chart(title: str, rows: Sequence[tuple[str, float, float]], axis: Axis
     }  # fmt: skip
 
 
+def ranges_chart(
+    title: str,
+    rows: Sequence[tuple[str, tuple[tuple[float, float, float], tuple[float, float, float]]]],
+    axis: Axis,
+    names: tuple[str, str],
+) -> Chart:
+    """For each of several names two values with their intervals (value, low, high), a row each; ``names`` name them."""
+    chart = pairs_chart(title, [(name, before[0], after[0]) for name, (before, after) in rows], axis, names)
+    left, width = chart["left"], WIDTH - _LEFT + 2
+    for row, (_, sides) in zip(chart["rows"], rows, strict=True):
+        row["bars"] = [
+            (*(_fixed(left + min(max(end / axis.most, 0), 1) * width) for end in side[1:]), role, row["y"] + shift)
+            for side, role, shift in zip(sides, ("tracks", "offline"), (-3, 3), strict=True)
+        ]
+    return chart | {"kind": "ranges"}
+
+
 def _fixed(value: float) -> str:
     return f"{value:.1f}"
 

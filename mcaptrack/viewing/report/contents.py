@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, get_args
@@ -15,6 +15,7 @@ from mcaptrack.evaluation import EvaluateOptions, EvaluationInput, EvaluationRow
 from mcaptrack.evaluation.aligned import Similarity, has_positions, resample_frames
 from mcaptrack.evaluation.event_text import PEOPLE, nouns_of
 from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events
+from mcaptrack.evaluation.people import PersonScores, person_scores
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes, is_estimated, origin_of, plane_at
 from mcaptrack.schema import DETECTIONS, EVENTS, TRACKS, Frame
@@ -26,7 +27,9 @@ from mcaptrack.sources.cameras import provenance_of, repaired_tracks
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.transforms import STAGES
 from mcaptrack.viewing.report import statistics
+from mcaptrack.viewing.report.doubts import Doubt, find_doubts
 from mcaptrack.viewing.report.formatting import plain
+from mcaptrack.viewing.report.headline import AFTER, BEFORE, BeforeAfter, compared
 from mcaptrack.viewing.report.identity_events import (
     ChannelEvents,
     IdentityEvent,
@@ -48,8 +51,8 @@ ROLES: Final = {
 #: How trackers are called; channels of earlier versions that name none were made by the first.
 _TRACKERS: Final = {"sort": "SORT", "bytetrack": "ByteTrack", "ocsort": "OC-SORT"}
 _FIRST_TRACKER: Final = next(iter(_TRACKERS))
-#: The roles for which events are shown.
-_WITH_EVENTS: Final = ("tracks", "offline")
+#: What is added to the name of tracks at the video rate, beside those at the prediction rate that are compared.
+EVERY_PICTURE: Final = ", every picture"
 #: The number of events with thumbnails.
 _THUMBNAILS: Final = 12
 
@@ -78,9 +81,12 @@ class LogReport:
     results: list[EvaluationRow] = field(default_factory=list)
     channel_events: list[ChannelEvents] = field(default_factory=list)
     highlights: list[list[IdentityEvent]] = field(default_factory=list)
+    repairs: ChannelEvents | None = None
     planes: Planes = ()
     background: SceneBackground | None = None
     data: dict[str, Any] = field(default_factory=dict)
+    people: dict[str, PersonScores] = field(default_factory=dict)
+    doubts: list[Doubt] = field(default_factory=list)
     missing: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     html: str = ""
@@ -97,6 +103,20 @@ class LogReport:
         """The tracks at the prediction rate; without any, those of the tracker."""
         there = {role: one for role, one in self.track_sets.items() if role in ("samples", "offline")}
         return there or {role: one for role, one in self.track_sets.items() if role == "tracks"}
+
+    @property
+    def headline(self) -> BeforeAfter | None:
+        """The scores before and after re-tracking that the whole page counts by; None without scores."""
+        return compared({role: one.topic for role, one in self.track_sets.items()}, self.results)
+
+    @property
+    def compared_roles(self) -> tuple[str, str]:
+        """The roles of tracks before and after re-tracking; "" for those that are missing."""
+        found = self.headline
+        if found is not None:
+            return found.roles
+        before, after = (next((role for role in roles if role in self.track_sets), "") for roles in (BEFORE, AFTER))
+        return before, after
 
     @property
     def metres_note(self) -> str:
@@ -119,7 +139,11 @@ def gather(opened: log.Log, camera: str | None, progress: Callable[[str], None] 
     progress(f"{opened.path}: scores")
     _score(opened, out)
     progress(f"{opened.path}: events")
+    _compare_people(opened, out)
     _find_events(opened, out)
+    if out.repairs is not None:
+        after = out.compared_roles[1]
+        out.doubts = find_doubts(out.repairs, out.track_sets[after].frames, out.people.get(after))
     progress(f"{opened.path}: pictures")
     _read_pictures(opened, out)
     out.zones = zone_section(opened, prefix, {role: one.name for role, one in out.track_sets.items()})
@@ -143,8 +167,8 @@ def _read(opened: log.Log, out: LogReport) -> None:
     if made and stage and stage.default.reads is DETECTIONS:
         tracker = _TRACKERS.get(str(made.parameters.get(stage.option, _FIRST_TRACKER)), "tracker")
     names = {
-        "tracks": tracker,
-        "samples": f"{tracker}, sampled",
+        "tracks": f"{tracker}{EVERY_PICTURE}" if f"{out.prefix}/samples" in opened.channels else tracker,
+        "samples": tracker,
         "online": "re-tracked online",
         "offline": "re-tracked",
         "truth": "ground truth",
@@ -197,26 +221,50 @@ def _score(opened: log.Log, out: LogReport) -> None:
     out.notes += outcome.notes
 
 
+def _classes(opened: log.Log, out: LogReport, topic: str) -> tuple[dict[int, str], dict[int, str]]:
+    """The names of the classes of the ground truth, and of tracks."""
+    truth = out.track_sets["truth"].topic if "truth" in out.track_sets else topic
+    return class_names(opened.channel(truth).metadata), class_names(opened.channel(topic).metadata)
+
+
+def _compare_people(opened: log.Log, out: LogReport) -> None:
+    """Compare tracks before and after re-tracking with each true person, by the rule of the headline."""
+    found = out.headline
+    if found is None:
+        return
+    for role in filter(None, found.roles):
+        one = out.track_sets[role]
+        rule = MatchRule(*found.rule)  # type: ignore[arg-type]  # a similarity
+        classes = _classes(opened, out, one.topic)
+        scores = person_scores(out.track_sets["truth"].frames, one.frames, rule, (out.name, one.topic), classes)
+        if scores is not None:
+            out.people[role] = scores
+
+
 def _find_events(opened: log.Log, out: LogReport) -> None:
-    """Read or compute the events of the channels in ``_WITH_EVENTS``."""
+    """Read or compute the events of tracks before and after re-tracking, counted by the rule of the headline."""
     ground_truth = out.track_sets["truth"].frames if "truth" in out.track_sets else None
-    for role in _WITH_EVENTS:
-        tracks = out.track_sets.get(role)
-        if tracks is None or not any(len(frame.rows) for frame in tracks.frames):
+    headline = out.headline
+    options = EventOptions()
+    if headline is not None:
+        similarity, gate = headline.rule
+        options = EventOptions(similarity, **{"gate_m" if similarity == "metres" else "min_iou": gate})  # type: ignore[arg-type]
+    for role in filter(None, out.compared_roles):
+        tracks = out.track_sets[role]
+        if not any(len(frame.rows) for frame in tracks.frames):
             continue
         known = _recorded(opened, tracks.topic + "/events")
-        truth = out.track_sets["truth"].topic if ground_truth is not None else tracks.topic
-        classes = (class_names(opened.channel(truth).metadata), class_names(opened.channel(tracks.topic).metadata))
-        if known is None:
+        classes = _classes(opened, out, tracks.topic)
+        if known is None or (headline is not None and known[1] != headline.rule):
             frames = repaired_tracks(tracks.frames, provenance_of(opened, tracks.topic))
-            found = find_events(frames, ground_truth, EventOptions(), out.name, tracks.topic, classes)
+            found = find_events(frames, ground_truth, options, out.name, tracks.topic, classes)
             known = found.events, found.rule
         events, rule = known
-        out.channel_events.append(
-            summarize_events(
-                tracks.topic, events, rule, tracks.frames, ground_truth, (out.start_ns, out.end_ns), classes
-            )
-        )
+        span_ns = (out.start_ns, out.end_ns)
+        args = (tracks.frames, ground_truth, span_ns, classes)
+        out.channel_events.append(summarize_events(tracks.topic, events, rule, *args))
+        if role in AFTER:
+            out.repairs = summarize_events(tracks.topic, events, None, *args)
     out.highlights = most_important(out.channel_events, _THUMBNAILS)
 
 
@@ -243,8 +291,10 @@ def _read_pictures(opened: log.Log, out: LogReport) -> None:
         pictures = Pictures(opened, topic)
         out.background = background_picture(pictures)
         for channel, events in zip(out.channel_events, out.highlights, strict=True):
-            tracks = next(one for one in out.track_sets.values() if one.topic == channel.topic)
-            add_thumbnails(events, tracks.frames, pictures, out.start_ns)
+            add_thumbnails(events, _with_boxes(out, channel.topic), pictures, out.start_ns)
+        if out.doubts and out.repairs is not None:
+            tracks = _with_boxes(out, out.repairs.topic)
+            add_thumbnails([one.event for one in out.doubts], tracks, pictures, out.start_ns)
     except DamagedError:
         raise
     except McaptrackError as error:
@@ -252,6 +302,12 @@ def _read_pictures(opened: log.Log, out: LogReport) -> None:
         return
     if out.background is None:
         out.missing["pictures"] = f"{topic} holds no pictures"
+
+
+def _with_boxes(out: LogReport, topic: str) -> list[Frame]:
+    """The rows of tracks with boxes in pictures: of the tracker instead of its samples, with the same ids."""
+    role = next(one.role for one in out.track_sets.values() if one.topic == topic)
+    return out.track_sets["tracks" if role == "samples" and "tracks" in out.track_sets else role].frames
 
 
 def _statistics(out: LogReport) -> dict[str, Any]:
@@ -314,8 +370,3 @@ def _channel(opened: log.Log, channel: log.Channel) -> dict[str, Any]:
 def plane_of(report: LogReport) -> Any:
     """The first ground plane of the log, if there is one."""
     return plane_at(report.planes, report.start_ns)
-
-
-def result_of(results: Sequence[EvaluationRow], topic: str, similarity: str, gate: float) -> EvaluationRow | None:
-    """The scores of a channel for one similarity and gate."""
-    return next((r for r in results if (r.tracks, r.similarity, r.gate) == (topic, similarity, gate)), None)

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+from mcaptrack.errors import command
 from mcaptrack.foxglove.palette import COUNT as COLOURS
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.viewing.report.charts import time_ticks
 from mcaptrack.viewing.report.contents import LogReport, TrackSet, plane_of
-from mcaptrack.viewing.report.formatting import clock, counted, number
+from mcaptrack.viewing.report.formatting import clock, counted, number, short
+from mcaptrack.viewing.report.headline import rule_text
 from mcaptrack.viewing.report.identity_events import BARS, SIDE_PX, ChannelEvents, IdentityEvent, Thumbnail
 from mcaptrack.viewing.report.scene_map import (
     TrackPath,
     ground_map,
     ground_paths,
     ground_span,
+    heat_map,
     picture_map,
     pixel_paths,
 )
-from mcaptrack.viewing.report.summary import rule_text
 
 _NO_GROUND = (
     "Tracks can't be drawn: there is no picture, and without a ground plane positions on the ground are not known."
@@ -31,22 +34,40 @@ def scene_map(report: LogReport) -> dict[str, Any]:
     sets = [report.track_sets[role] for role in ("tracks", "offline", "truth") if role in report.track_sets]
     sets = [one for one in sets if any(len(frame.rows) for frame in one.frames)]
     if not sets:
-        return {"missing": "There are no tracks to draw.", "maps": []}
+        return {"missing": "There are no tracks to draw.", "maps": [], "plans": []}
     if report.background is not None:
         plane = plane_of(report)
         drawn = _with_paths(sets, [pixel_paths(one.frames, plane) for one in sets])
         if drawn:
             maps = [_map(one, paths, picture_map(paths, report.background, report.start_s)) for one, paths in drawn]
-            return {"missing": "", "maps": maps, "jpeg": report.background.jpeg}
+            return {"missing": "", "maps": maps, "jpeg": report.background.jpeg, "plans": _plans(sets)}
         why = "No track has a place in the picture"
     else:
         why = report.missing.get("pictures", "There are no pictures")
     drawn = _with_paths(sets, [ground_paths(one.frames) for one in sets])
     if not drawn:
-        return {"missing": _NO_GROUND, "maps": []}
+        return {"missing": _NO_GROUND, "maps": [], "plans": []}
     span = ground_span([path.points for _, paths in drawn for path in paths])
     maps = [_map(one, paths, ground_map(paths, span, report.start_s)) for one, paths in drawn]
-    return {"missing": f"{why}; here is the ground instead.", "maps": maps, "jpeg": b""}
+    return {"missing": f"{why}; here is the ground instead.", "maps": maps, "jpeg": b"", "plans": []}
+
+
+def _plans(sets: Sequence[TrackSet]) -> list[dict[str, Any]]:
+    """Plans of the ground in metres: of re-tracked people, or of tracks, and of the ground truth."""
+    chosen = {"truth" if one.role == "truth" else "tracks": one for one in sets}
+    drawn = _with_paths([*chosen.values()], [ground_paths(one.frames) for one in chosen.values()])
+    span = ground_span([path.points for _, paths in drawn for path in paths])
+    return [_map(one, paths, ground_map(paths, span, 0.0)) for one, paths in drawn]
+
+
+def heat(report: LogReport) -> dict[str, Any] | None:
+    """The map of where people spent their time: re-tracked people, or tracks; None without positions in metres."""
+    for role in ("offline", "online", "samples", "tracks"):
+        one = report.track_sets.get(role)
+        found = heat_map(one.frames) if one is not None and any(len(frame.rows) for frame in one.frames) else None
+        if one is not None and found is not None:
+            return found | {"name": short(one.name), "role": one.role, "note": report.metres_note}
+    return None
 
 
 def _with_paths(sets: Sequence[TrackSet], paths: Sequence[list[TrackPath]]) -> list[tuple[TrackSet, list[TrackPath]]]:
@@ -54,19 +75,36 @@ def _with_paths(sets: Sequence[TrackSet], paths: Sequence[list[TrackPath]]) -> l
 
 
 def _map(one: TrackSet, paths: Sequence[TrackPath], values: dict[str, Any]) -> dict[str, Any]:
-    return values | {"name": one.name, "role": one.role, "count": counted(len(paths), "track")}
+    return values | {"name": short(one.name), "role": one.role, "count": counted(len(paths), "track")}
 
 
 def identity_events(report: LogReport) -> dict[str, Any]:
-    """Timelines of identity switches or repairs, and thumbnails of the most important ones."""
+    """Timelines of identity switches or repairs, the most important ones, and the least certain repairs."""
     has_rule = any(channel.rule for channel in report.channel_events)
     pairs = list(zip(report.channel_events, report.highlights, strict=True))
     return {
         "has_channels": bool(pairs),
         "has_ground_truth": has_rule,
-        "has_samples": has_rule and "samples" in report.track_sets,
         "timelines": [_timeline(channel, shown, report) for channel, shown in pairs],
         "highlights": [_highlights(channel, shown, report) for channel, shown in pairs if channel.events],
+        "doubts": [
+            _event(one.event, one.text(), report) | {"is_wrong": one.is_right is False} for one in report.doubts
+        ],
+        "view": command("view", Path(report.file)),
+    }
+
+
+def _event(event: IdentityEvent, text: str, report: LogReport) -> dict[str, Any]:
+    """An event with its time for a viewer: in ns since 1970, and in seconds of the log."""
+    seconds = (event.t_ns - report.start_ns) / NS_PER_S
+    return {
+        "text": text,
+        "is_wrong": False,
+        "t_ns": event.t_ns,
+        "clock": clock(seconds),
+        "thumbnails": [
+            _thumbnail(one, when) for one, when in ((event.before, "before"), (event.after, "after")) if one
+        ],
     }
 
 
@@ -87,7 +125,7 @@ def _timeline(channel: ChannelEvents, shown: Sequence[IdentityEvent], report: Lo
     chosen = {id(event) for event in shown}
     bars = enumerate(zip(channel.births, channel.ends, strict=True))
     return {
-        "title": _title(channel, one.name),
+        "title": _title(channel, short(one.name)),
         "role": one.role,
         "rule": rule_text(*channel.rule) if channel.rule else "",
         "span": clock(span),
@@ -110,17 +148,9 @@ def _highlights(channel: ChannelEvents, shown: Sequence[IdentityEvent], report: 
     has_pictures = any(event.before or event.after for event in shown)
     why = report.missing.get("pictures", "The events have no place in the picture")
     return {
-        "title": f"{_set_of(report, channel).name}: {most}" + (f", and {number(rest)} more" if rest else ""),
+        "title": f"{short(_set_of(report, channel).name)}: {most}" + (f", and {number(rest)} more" if rest else ""),
         "missing": "" if has_pictures else f"{why}; they are listed without.",
-        "events": [
-            {
-                "text": f"{event.text[:1].upper()}{event.text[1:]}.",
-                "thumbnails": [
-                    _thumbnail(one, when) for one, when in ((event.before, "before"), (event.after, "after")) if one
-                ],
-            }
-            for event in shown
-        ],
+        "events": [_event(event, f"{event.text[:1].upper()}{event.text[1:]}.", report) for event in shown],
     }
 
 

@@ -39,7 +39,7 @@ def counted(count: int, one: str, many: str = "") -> str:
 
 def short(name: str) -> str:
     """The name of tracks where there is little room."""
-    return name.removesuffix(", sampled")
+    return name.removesuffix(", every picture")
 
 
 def clock(seconds: float, span_s: float = 0.0) -> str:

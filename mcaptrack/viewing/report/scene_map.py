@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from mcaptrack.evaluation.occupancy import occupancy
 from mcaptrack.foxglove.palette import COUNT as COLOURS
 from mcaptrack.geometry.arrays import Floats, Image, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
@@ -32,8 +33,11 @@ _MAX_POINTS: Final = 6000
 _MARGIN: Final = 14
 #: Above this number of tracks, lines are joined by colour and do not name their track.
 _MAX_NAMED: Final = 600
-#: The largest width and height of a map of the ground.
+#: The largest width and height of a map of the ground, and the room for the labels of its axes.
 _GROUND: Final = (460, 520)
+_AXIS_PX: Final = 34
+#: The colour of a heat map, red, green and blue.
+_HEAT: Final = (224, 84, 0)
 
 
 class SceneBackground(NamedTuple):
@@ -141,6 +145,41 @@ def ground_map(paths: Sequence[TrackPath], span: tuple[Floats, Floats], start_s:
         "width": width, "height": height, "view_width": _GROUND[0], "left": _MARGIN,
         "bar_end": f"{_MARGIN + bar_m * scale:.1f}", "bar_label_x": f"{_MARGIN + bar_m * scale + 6:.1f}",
         "bar_label": f"{bar_m:g} m", **_lines(paths, simplified(points, 0.5), start_s),
+    }  # fmt: skip
+
+
+def heat_map(frames: Sequence[Frame]) -> dict[str, Any] | None:
+    """The values of a map of the time that people spent in each cell of the ground; None without positions in metres.
+
+    The picture has one pixel for each cell and is the more opaque, the longer; the square root shows short stays, too.
+    """
+    import cv2
+
+    rows, t_ns = rows_by_track(frames)
+    found = occupancy(t_ns, rows["track_id"], np.stack([rows["x_m"], rows["y_m"]], axis=-1))
+    most = float(found.person_s.max(initial=0.0))
+    if most <= 0:
+        return None
+    high, wide = found.person_s.shape
+    picture = np.empty((high, wide, 4), np.uint8)
+    picture[..., :3] = _HEAT[::-1]
+    picture[..., 3] = np.rint(255 * np.sqrt(found.person_s[::-1] / most)).astype(np.uint8)
+    low_m, size_m = np.array(found.low_m), np.array([wide, high]) * found.cell_m
+    room = np.array([_GROUND[0] - _AXIS_PX, _GROUND[1] - _AXIS_PX])
+    scale = float((room / size_m).min())
+    width, height = (size_m * scale).round(1).tolist()
+    step = round_step(float(size_m.max()) / 6)
+    ticks = [
+        np.arange(np.ceil(low / step), np.floor((low + size) / step) + 1) * step
+        for low, size in zip(low_m, size_m, strict=True)
+    ]
+    return {
+        "png": cv2.imencode(".png", picture)[1].tobytes(),
+        "left": _AXIS_PX, "width": width, "height": height, "view_width": _GROUND[0], "view_height": round(height + 34),
+        "x_ticks": [(f"{_AXIS_PX + (at - low_m[0]) * scale:.1f}", f"{at:g}") for at in ticks[0].tolist()],
+        "y_ticks": [(f"{height - (at - low_m[1]) * scale:.1f}", f"{at:g}") for at in ticks[1].tolist()],
+        "most": number(most, 0 if most >= 10 else 1, "s"), "cell": number(found.cell_m, 2, "m"),
+        "total": number(float(found.person_s.sum()) / 60, 1, "min"),
     }  # fmt: skip
 
 

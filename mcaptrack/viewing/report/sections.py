@@ -15,7 +15,8 @@ from mcaptrack.evaluation.metrics.calibration import LEVELS
 from mcaptrack.viewing.report.charts import Axis, Bars, Line, histogram_chart, line_chart, round_most
 from mcaptrack.viewing.report.contents import LogReport
 from mcaptrack.viewing.report.formatting import counted, number, percent, short
-from mcaptrack.viewing.report.summary import before_after, rule_text
+from mcaptrack.viewing.report.headline import rule_text
+from mcaptrack.viewing.report.summary import before_after
 
 #: The columns of the table of scores: whether a column is a share, and whether its lowest value is the best.
 _SCORES: Final = {"IDF1": True, "MOTA": True, "HOTA": True, "IDSW": False, "Frag": False, "FP": False, "FN": False}
@@ -31,7 +32,11 @@ def scores(report: LogReport) -> dict[str, Any]:
     """All scores by rule, and statistics of tracks that need no ground truth."""
     found = before_after(report, report.results) if report.results else None
     of_all = [row for row in report.results if row.of_class is None]
-    first = [row for row in of_all if found is None or (row.similarity, row.gate) == found.rule]
+    # The tracker's tracks at the prediction rate are compared with the re-tracked ones: one number for one thing.
+    beside = report.track_sets["tracks"].topic if {"tracks", "samples"} <= set(report.track_sets) else ""
+    first = [
+        row for row in of_all if (found is None or (row.similarity, row.gate) == found.rule) and row.tracks != beside
+    ]
     of_classes = [row for row in report.results if row.of_class is not None]
     of_classes = [row for row in of_classes if found is None or (row.similarity, row.gate) == found.rule]
     rest = [row for row in of_all if row not in first]
@@ -43,6 +48,7 @@ def scores(report: LogReport) -> dict[str, Any]:
         "other_groups": _score_groups(rest, report),
         "has_averages": any(row.averages for row in report.results),
         "other_rules": "; ".join(rule_text(*rule) for rule in rules),
+        "is_at_prediction_rate": bool(beside),
         "missing": report.missing.get("scores", ""),
         "tracks": _track_rows(report),
         "no_tracks": f"There are no tracks here; {command('run', Path(report.file))} makes them.",

@@ -4,54 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any
 
 from mcaptrack.errors import command
 from mcaptrack.evaluation import EvaluationRow, combined, set_means
-from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M
-from mcaptrack.evaluation.metrics import summary
-from mcaptrack.viewing.report.contents import LogReport, result_of
-from mcaptrack.viewing.report.formatting import counted, number, percent, times
-
-#: The rules of the summary; the first by which tracks can be scored.
-_RULES: Final = (("metres", GATE_M), ("iou", 0.5))
-_RULES_3D: Final = (("metres", GATE_3D_M), *_RULES)
-
-
-class BeforeAfter(NamedTuple):
-    """Tracking and re-tracking, scored by one rule; either may be missing."""
-
-    rule: tuple[str, float]
-    tracked: EvaluationRow | None
-    retracked: EvaluationRow | None
-
-    def values(self, name: str) -> list[float]:
-        """A score of those that exist."""
-        return [summary(row.score)[name] for row in (self.tracked, self.retracked) if row is not None]
-
-
-def rule_text(similarity: str, gate: float) -> str:
-    """A rule in words."""
-    if similarity == "metres":
-        return f"within {gate:g} m on the ground"
-    seen = {"bev-iou": ", seen from above,", "3d-iou": " in space"}.get(similarity, "")
-    return f"by overlap of boxes{seen} of at least {gate:g}"
+from mcaptrack.evaluation.people import Intervals, intervals
+from mcaptrack.viewing.report.contents import LogReport
+from mcaptrack.viewing.report.formatting import NONE, counted, number, percent, short, times
+from mcaptrack.viewing.report.headline import BeforeAfter, compared, rule_text
 
 
 def before_after(report: LogReport, results: Sequence[EvaluationRow]) -> BeforeAfter | None:
     """The scores that the summary compares: before and after re-tracking, at the prediction rate if possible."""
-    is_3d = bool(results) and all(row.is_3d for row in results)
-    for similarity, gate in _RULES_3D if is_3d else _RULES:
-        found = {
-            role: result_of(results, one.topic, similarity, gate)
-            for role, one in report.track_sets.items()
-            if role in ("samples", "tracks", "offline", "online")
-        }
-        tracked = found.get("samples") or found.get("tracks")
-        retracked = found.get("offline") or found.get("online")
-        if tracked or retracked:
-            return BeforeAfter((similarity, gate), tracked, retracked)
-    return None
+    return compared({role: one.topic for role, one in report.track_sets.items()}, results)
 
 
 def combined_results(reports: Sequence[LogReport]) -> list[EvaluationRow]:
@@ -62,17 +27,52 @@ def combined_results(reports: Sequence[LogReport]) -> list[EvaluationRow]:
     return out
 
 
+def intervals_of(reports: Sequence[LogReport]) -> Intervals | None:
+    """Intervals of scores before and after re-tracking; None where these were not compared with ground truth."""
+    pairs = [[report.people.get(role) for role in report.compared_roles] for report in reports if report.results]
+    if not pairs or any(one is None for pair in pairs for one in pair):
+        return None
+    before, after = zip(*pairs, strict=True)
+    return intervals(before, after)
+
+
+def change_text(found: Intervals | None) -> str:
+    """The change of IDF1 in points with its interval; a dash if it is not known."""
+    if found is None:
+        return NONE
+    change = found.idf1_change
+    value = f"{100 * change.value:+.1f}"
+    return f"{value} ({100 * change.low:+.1f} to {100 * change.high:+.1f})" if change.is_known else value
+
+
+def verdict(found: Intervals | None) -> str:
+    """A change of IDF1 in a word: only better or worse if the whole interval says so."""
+    if found is None:
+        return NONE
+    if not found.idf1_change.is_known:
+        return f"unknown: {counted(found.people, 'person', 'people')}"
+    return {1: "better", -1: "worse", 0: "not sure"}[found.idf1_change.sign]
+
+
 def summarize(reports: Sequence[LogReport]) -> dict[str, Any]:
     """The text and the tiles of the summary."""
     scored = [report for report in reports if report.results]
     found = before_after(scored[0], combined_results(reports) or scored[0].results) if scored else None
     if found is None:
         return {"text": _without_ground_truth(reports), "tiles": []}
-    return {"text": _with_ground_truth(reports, scored, found), "tiles": _tiles(found)}
+    text = _with_ground_truth(reports, scored, found)
+    sure = intervals_of(reports)
+    if sure is not None and sure.idf1_change.is_known:
+        change = sure.idf1_change
+        text += (
+            f" IDF1 changes by {100 * change.value:+.1f} points (95 % interval {100 * change.low:+.1f} to "
+            f"{100 * change.high:+.1f}, by resampling these {number(sure.people)} people)."
+        )
+    return {"text": text, "tiles": _tiles(found)}
 
 
 def _with_ground_truth(reports: Sequence[LogReport], scored: Sequence[LogReport], found: BeforeAfter) -> str:
-    names = {one.track_sets["tracks"].name for one in scored if "tracks" in one.track_sets}
+    names = {short(one.track_sets["tracks"].name) for one in scored if "tracks" in one.track_sets}
     name = names.pop() if len(names) == 1 and "tracks" in scored[0].track_sets else "the tracker"
     name = "the tracks as given" if name == "tracks as given" else name
     switches = [times(int(value)) for value in found.values("IDSW")]

@@ -1,0 +1,55 @@
+"""The rule by which a page counts: one for its summary, its timelines and its events, so that numbers agree."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
+
+from mcaptrack.evaluation import EvaluationRow
+from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M
+from mcaptrack.evaluation.metrics import summary
+
+#: The rules of the summary; the first by which tracks can be scored.
+_RULES: Final = (("metres", GATE_M), ("iou", 0.5))
+_RULES_3D: Final = (("metres", GATE_3D_M), *_RULES)
+#: The roles of tracks before and after re-tracking, the first that there is: at the prediction rate if possible.
+BEFORE: Final = ("samples", "tracks")
+AFTER: Final = ("offline", "online")
+
+
+class BeforeAfter(NamedTuple):
+    """Tracking and re-tracking, scored by one rule; either may be missing. ``roles`` are those that are scored."""
+
+    rule: tuple[str, float]
+    tracked: EvaluationRow | None
+    retracked: EvaluationRow | None
+    roles: tuple[str, str] = ("", "")
+
+    def values(self, name: str) -> list[float]:
+        """A score of those that exist."""
+        return [summary(row.score)[name] for row in (self.tracked, self.retracked) if row is not None]
+
+
+def rule_text(similarity: str, gate: float) -> str:
+    """A rule in words."""
+    if similarity == "metres":
+        return f"within {gate:g} m on the ground"
+    seen = {"bev-iou": ", seen from above,", "3d-iou": " in space"}.get(similarity, "")
+    return f"by overlap of boxes{seen} of at least {gate:g}"
+
+
+def result_of(results: Sequence[EvaluationRow], topic: str, similarity: str, gate: float) -> EvaluationRow | None:
+    """The scores of a channel for one similarity and gate."""
+    return next((r for r in results if (r.tracks, r.similarity, r.gate) == (topic, similarity, gate)), None)
+
+
+def compared(topics: Mapping[str, str], results: Sequence[EvaluationRow]) -> BeforeAfter | None:
+    """The scores that a page compares, of the topics of tracks by role; None if nothing was scored."""
+    is_3d = bool(results) and all(row.is_3d for row in results)
+    for similarity, gate in _RULES_3D if is_3d else _RULES:
+        found = {role: result_of(results, topic, similarity, gate) for role, topic in topics.items()}
+        before = next((role for role in BEFORE if found.get(role)), "")
+        after = next((role for role in AFTER if found.get(role)), "")
+        if before or after:
+            return BeforeAfter((similarity, gate), found.get(before), found.get(after), (before, after))
+    return None

@@ -1,0 +1,334 @@
+"""The report about people: identities over time, numbers that agree, doubts, intervals, and links to viewers."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
+from urllib.request import urlopen
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import linear_sum_assignment
+
+import mcaptrack
+from mcaptrack import log
+from mcaptrack.evaluation.events import MatchRule
+from mcaptrack.evaluation.people import LEAST_PEOPLE, PersonScores, intervals, person_scores
+from mcaptrack.schema import Frame
+from mcaptrack.viewing.linked_report import is_about, with_links
+from mcaptrack.viewing.report import LogReport, gather, page
+from mcaptrack.viewing.report.contents import TrackSet
+from mcaptrack.viewing.report.doubts import find_doubts
+from mcaptrack.viewing.report.identity_events import summarize_events
+from mcaptrack.viewing.report.identity_timeline import counts_over_time, identity_timeline, pieces
+from mcaptrack.viewing.report.scene_map import heat_map
+from tests.worlds import crossing_tracks, ns, tracks_at, walk, write_eventful
+
+
+@pytest.fixture(scope="module")
+def eventful(tmp_path_factory) -> Path:
+    return write_eventful(tmp_path_factory.mktemp("eventful") / "walk.mcap")
+
+
+@pytest.fixture(scope="module")
+def told(eventful) -> LogReport:
+    with log.read(eventful) as opened:
+        return gather(opened, None)
+
+
+@pytest.fixture(scope="module")
+def text(told) -> str:
+    return page([told])
+
+
+# Scores of people
+
+
+def swapped(rng: np.random.Generator) -> tuple[list[Frame], list[Frame]]:
+    """Ground truth of random walkers, and tracks of it with noise, misses, false rows and new ids."""
+    truth = crossing_tracks(rng, ticks=30)
+    tracks = []
+    offset = 0
+    for frame in truth:
+        offset += int(rng.random() < 0.1)
+        kept = rng.random(len(frame.rows)) < 0.9
+        people = {
+            int(row["track_id"]) + 10 * offset: (row["x_m"] + rng.normal(0, 0.3), row["y_m"] + rng.normal(0, 0.3))
+            for row in frame.rows[kept]
+        }
+        if rng.random() < 0.2:
+            people[999] = (50.0, 50.0)
+        tracks.append(Frame(frame.t_ns, frame.index, tracks_at(people)))
+    return truth, tracks
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sums_over_people_are_the_scores(seed):
+    truth, tracks = swapped(np.random.default_rng(seed))
+    found = person_scores(truth, tracks, MatchRule("metres", 1.0))
+    (scored,) = mcaptrack.evaluation.evaluate(
+        [mcaptrack.evaluation.EvaluationInput("a", truth, [mcaptrack.evaluation.Candidate("tracks", None, tracks)])],
+        mcaptrack.evaluation.EvaluateOptions(similarities=("metres",), gates_m=(1.0,)),
+    ).results
+    counts = scored.score.counts
+    assert found.switches.sum() == counts["IDSW"] > 0
+    assert found.hits.sum() == counts["IDTP"]
+    assert found.matched.sum() == counts["TP"]
+    assert (found.rows.sum(), found.false_rows) == (counts["TP"] + counts["FN"], counts["FP"])
+    assert found.idf1() == pytest.approx(2 * counts["IDTP"] / (2 * counts["IDTP"] + counts["IDFP"] + counts["IDFN"]))
+
+
+def people(rows, matched, hits, switches, false_rows=0) -> PersonScores:
+    none = np.empty(0, np.int64)
+    columns = (np.array(column) for column in (rows, matched, hits, switches))
+    return PersonScores(np.arange(len(rows)), *columns, false_rows, none, none, none, none)
+
+
+def test_intervals_hold_the_value_and_shrink_with_more_people():
+    rng = np.random.default_rng(0)
+
+    def sample(count: int) -> PersonScores:
+        rows = rng.integers(50, 150, count)
+        hits = (rows * rng.uniform(0.4, 0.9, count)).astype(int)
+        return people(rows, rows - 2, hits, rng.integers(0, 4, count), 20)
+
+    few, many = sample(12), sample(400)
+    widths = []
+    for one in (few, many):
+        found = intervals([one], [one]).idf1[0]
+        assert found.value == pytest.approx(one.idf1())
+        assert found.low < found.value < found.high
+        widths.append(found.high - found.low)
+    assert widths[1] < 0.4 * widths[0]  # about 1 / sqrt(400 / 12) = 0.17
+
+
+def test_a_change_of_all_people_is_sure_and_that_of_one_is_not():
+    rows = [100] * 12
+    before = people(rows, rows, [60] * 12, [2] * 12)
+    all_better = people(rows, rows, [80] * 12, [1] * 12)
+    one_better = people(rows, rows, [100, *[60] * 11], [0, *[2] * 11])
+    assert (intervals([before], [all_better]).idf1_change.sign, intervals([all_better], [before]).idf1_change.sign) == (
+        1,
+        -1,
+    )
+    assert intervals([before], [all_better]).idf1_change.low == pytest.approx(0.2)
+    assert intervals([before], [one_better]).idf1_change.sign == 0
+    assert intervals([before], [all_better]).switches_change == pytest.approx((-1, -1, -1))
+
+
+def test_too_few_people_and_other_people_give_no_interval():
+    few = people([9] * (LEAST_PEOPLE - 1), *[[9] * (LEAST_PEOPLE - 1)] * 2, [0] * (LEAST_PEOPLE - 1))
+    found = intervals([few], [few])
+    assert (found.idf1_change.is_known, found.idf1_change.sign, found.idf1[0].value) == (False, 0, 1.0)
+    assert intervals([few], [few, few]) is None
+    assert intervals([few], [few._replace(ids=few.ids + 1)]) is None
+
+
+# One number for one thing
+
+
+def test_the_page_has_one_number_of_switches_for_each_kind_of_tracks(told, text):
+    (before,) = {int(number) for number in re.findall(r"tracks as given: (\d+) identity switch", text)}
+    (after,) = {int(number) for number in re.findall(r"re-tracked: (\d+) identity switch", text)}
+    assert (before, after) == (2, 1)
+    values = told.headline.values("IDSW")
+    assert values == [before, after]
+    assert [int(one.switches.sum()) for one in told.people.values()] == values
+    assert f"<dd>{before}\N{NO-BREAK SPACE}→ {after}" in text
+    assert all(len(one.events) == count for one, count in zip(told.channel_events, values, strict=True))
+
+
+def test_with_samples_the_headline_and_the_events_are_at_the_prediction_rate(finished):
+    with log.read(finished) as opened:
+        report = gather(opened, None)
+    assert report.compared_roles == ("samples", "offline")
+    assert [one.topic for one in report.channel_events] == ["/camera/samples", "/camera/retracks"]
+    assert [len(one.events) for one in report.channel_events] == report.headline.values("IDSW")
+    shown = page([report])
+    first_table = shown.partition("<h2>Scores</h2>")[2].partition("</table>")[0]
+    assert "/camera/samples" in first_table
+    assert "/camera/tracks<" not in first_table
+
+
+# Identities over time
+
+
+def bars(values) -> dict[str, list[list[tuple[str, float, float]]]]:
+    """Ids with their seconds of each lane, by the name of the row."""
+    found = {}
+    for row in values["rows"]:
+        lanes = []
+        for lane in row["lanes"]:
+            titles = [piece["title"].replace("\N{NO-BREAK SPACE}s", "") for piece in lane["pieces"]]
+            lanes.append([re.fullmatch(r"(\d+): ([\d.]+) to ([\d.]+)", title).groups() for title in titles])
+        found[row["name"]] = lanes
+    return found
+
+
+def test_each_person_has_a_lane_for_the_tracker_above_one_for_the_re_tracked(told):
+    found = bars(identity_timeline(told))
+    assert list(found) == ["50", "90"]
+    assert found["50"] == [
+        [("0", "0.0", "24.0")],
+        [("1", "0.0", "8.0"), ("2", "8.0", "16.0"), ("3", "16.0", "24.0")],
+        [("1", "0.0", "16.0"), ("3", "16.0", "24.0")],
+    ]
+    assert found["90"][1:] == [[("90", "0.0", "24.0")]] * 2
+
+
+def test_without_ground_truth_bars_are_re_tracked_tracks_with_the_ids_of_the_tracker(told):
+    report = LogReport("a.mcap", "a", "/camera", told.start_ns, told.end_ns)
+    tracks = told.track_sets["offline"]
+    report.track_sets["offline"] = TrackSet(tracks.topic, "offline", "re-tracked", tracks.frames)
+    found = bars(identity_timeline(report))
+    assert found["1"] == [[("1", "0.0", "8.0"), ("2", "8.0", "16.0")]]
+    assert found["3"] == [[("3", "16.0", "24.0")]]
+
+
+@given(
+    st.lists(st.integers(0, 2), max_size=40),
+    st.lists(st.integers(1, 4), min_size=40, max_size=40),
+)
+def test_pieces_cover_their_rows_and_nothing_twice(identity, steps):
+    t_ns = np.cumsum(np.array(steps[: len(identity)], np.int64)) * 10**9
+    found = pieces(np.array(identity, np.int64), t_ns, 0, 1e9)
+    seconds = (t_ns / 1e9).tolist()
+    for at, one in zip(seconds, identity, strict=True):
+        assert [piece.identity for piece in found if piece.first_s <= at < piece.last_s] == [one]
+    assert all(a.last_s <= b.first_s for a, b in itertools.pairwise(found))
+    assert sum(piece.last_s - piece.first_s for piece in found) <= len(identity) + 1e-9
+
+
+@given(st.lists(st.integers(0, 5), min_size=1, max_size=400))
+def test_people_over_time_keep_their_mean(counts):
+    frames = [Frame(ns(t), t, tracks_at(dict.fromkeys(range(count), (0.0, 0.0)))) for t, count in enumerate(counts)]
+    at_s, found = counts_over_time(frames, 0, max(len(counts) - 1, 1))
+    assert (np.diff(at_s) > 0).all()
+    assert 0 <= found.min() <= found.max() <= max(counts)
+    if len(counts) <= 160:
+        assert found.tolist() == counts
+
+
+# Maps and doubts
+
+
+def test_a_heat_map_is_darkest_where_people_stay(told):
+    frames = walk(lambda tick: {1: (0.25, 0.25) if tick < 20 else (0.25 + tick - 20, 0.25)}, 26)
+    found = heat_map(frames)
+    import cv2
+
+    picture = cv2.imdecode(np.frombuffer(found["png"], np.uint8), cv2.IMREAD_UNCHANGED)
+    opacity = picture[..., 3]
+    assert opacity.shape[0] == 1
+    assert (opacity.max(), int(opacity.argmax())) == (255, 0)
+    assert found["total"] == "0.2\N{NO-BREAK SPACE}min"  # 25 steps of 0.4 s
+    assert heat_map([]) is None
+
+
+def joined(jump_m: float, other: bool) -> tuple[list[Frame], list[Frame]]:
+    """Tracks that join the tracker's 1 and 2 over a gap of 2 s, a ``jump_m`` away; and the ground truth, another
+    person after the gap if ``other``.
+    """
+    tracks, truth = [], []
+    for tick in range(40):
+        x_m = 0.4 * tick + (jump_m if tick >= 20 else 0.0)
+        if not 15 <= tick < 20:
+            rows = tracks_at({7: (x_m, 0.0)})
+            rows["source_id"] = 1 if tick < 15 else 2
+        else:
+            rows = tracks_at({})
+        tracks.append(Frame(ns(tick / 2.5), tick, rows))
+        truth.append(Frame(ns(tick / 2.5), tick, tracks_at({4 if other and tick >= 18 else 3: (x_m, 0.0)})))
+    return tracks, truth
+
+
+@pytest.mark.parametrize(
+    ("other", "verdict"), [(False, "agrees: both are person 3"), (True, "person 3 before, person 4")]
+)
+def test_doubts_say_how_far_a_repair_is_from_the_expected_place(other, verdict):
+    tracks, truth = joined(2.5, other)
+    found = mcaptrack.evaluation.events.find_events(tracks, truth)
+    told = summarize_events("/a", found.events, None, tracks, truth, (0, ns(16)))
+    scores = person_scores(truth, tracks, MatchRule("metres", 1.0))
+    (doubt,) = find_doubts(told, tracks, scores)
+    assert doubt.away_m == pytest.approx(2.5)
+    assert (doubt.is_right, verdict in doubt.text(), "2.5\N{NO-BREAK SPACE}m from" in doubt.text()) == (
+        not other,
+        True,
+        True,
+    )
+    (alone,) = find_doubts(told, tracks, None)
+    assert (alone.is_right, alone.verdict) == (None, "")
+    nothing, _ = joined(0.0, False)
+    assert find_doubts(told, nothing, None) == []
+
+
+# Links
+
+
+def test_the_served_report_opens_viewers_at_its_times(eventful, tmp_path):
+    path = tmp_path / "walk.mcap"
+    path.write_bytes(eventful.read_bytes())
+    mcaptrack.report(path)
+    written = (tmp_path / "walk.report.html").read_text()
+    times = [int(t_ns) for t_ns in re.findall(r'<span class="at" data-ns="(\d+)">', written)]
+    assert {ns(8), ns(16)} <= set(times)
+    with mcaptrack.view(path) as server, urlopen(server.report) as answer:  # our own server
+        assert answer.headers["Content-Type"] == "text/html; charset=utf-8"
+        assert answer.headers["Content-Security-Policy"].startswith("default-src 'none'")
+        served = answer.read().decode()
+        links = re.findall(r'<a class="at" href="([^"]+)">', served)
+    assert len(links) == len(times)
+    wanted = {one.t_ns: one.link for one in server.events}
+    for t_ns, link in zip(times, links, strict=True):
+        assert link.replace("&amp;", "&") == wanted[t_ns]
+        assert parse_qs(urlsplit(link.replace("&amp;", "&")).query)["ds"] == ["remote-file"]
+    assert "data-ns" not in served
+
+
+def test_a_report_on_another_state_of_the_log_is_not_served_and_that_is_said(eventful, tmp_path):
+    path = tmp_path / "walk.mcap"
+    path.write_bytes(eventful.read_bytes())
+    page_path = Path(mcaptrack.report(path).page)
+    for content in (page_path.read_bytes().replace(b'"digest":"', b'"digest":"0'), b"<html>", b""):
+        page_path.write_bytes(content)
+        with mcaptrack.view(path) as server:
+            assert server.report is None
+            assert any("walk.report.html is not served" in note for note in server.notes)
+
+
+@given(st.binary(max_size=80), st.text(max_size=20))
+def test_only_times_become_links_and_addresses_are_escaped(content, address):
+    assert with_links(content, lambda _: address) == content
+    found = with_links(b'<span class="at" data-ns="12">1 s</span>' + content, lambda t_ns: f"{t_ns}{address}").decode(
+        "utf-8", "surrogateescape"
+    )
+    assert found.count("<a ") == 1
+    inside = found.partition('href="')[2].partition('"')[0]
+    assert "<" not in inside
+
+
+@pytest.mark.parametrize(
+    "data", [b"[]", b"{", b'{"logs": 1}', b'{"logs": [{}]}', b"[" * 100_000, b'{"logs": [{"digest": 1}]}']
+)
+def test_pages_with_other_numbers_are_not_about_the_log(data):
+    assert not is_about(b'<script type="application/json" id="mcaptrack-report">' + data + b"</script>", "a")
+    assert json.loads("1") == 1
+
+
+def test_the_best_assignment_is_that_of_scipy():
+    truth, tracks = swapped(np.random.default_rng(7))
+    found = person_scores(truth, tracks, MatchRule("metres", 1.0))
+    near = np.zeros((200, 1200), int)
+    for a, b in zip(truth, tracks, strict=True):
+        for row in a.rows:
+            for other in b.rows:
+                away = np.hypot(row["x_m"] - other["x_m"], row["y_m"] - other["y_m"])
+                near[int(row["track_id"]), int(other["track_id"])] += away <= 1.0
+    rows, columns = linear_sum_assignment(-near)
+    assert found.hits.sum() == near[rows, columns].sum()
