@@ -139,6 +139,10 @@ class Scene:
             read_scenes([self.path], SourceOptions(), 0.4)
         return with_flags(str(refused.value))
 
+    def with_an_old_report(self) -> Scene:
+        self.path.with_suffix(".report.html").write_text("of another log")
+        return self
+
     def untracked(self) -> Scene:
         return self.ingested("clip.mp4", "--truth", "truth.txt", "--ground-plane", "plane.txt")
 
@@ -161,6 +165,8 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "cli/view.py:_print:run": lambda s: s.untracked().says("view", "LOG"),
     "evaluation/__init__.py:sequence_of_log:run": lambda s: s.untracked().says("evaluate", "LOG"),
     "evaluation/__init__.py:ground_truth_of_log:ingest": lambda s: s.without("/camera/truth*").says("evaluate", "LOG"),
+    "api/viewing.py:_report:report": lambda s: s.with_an_old_report().says("view", "LOG"),
+    "viewing/report/figures.py:identity_events:view": Scene.page,
     "api/viewing.py:_say_trouble:ingest": lambda s: s.says("view", "LOG"),
     "api/viewing.py:view:recover": lambda s: s.half_written().says("view", "LOG"),
     "tables/compared.py:pair_files:ingest": lambda s: s.without("/camera/truth*").says(

@@ -444,7 +444,7 @@ def holds(reader: Reader) -> None:
             assert not key.startswith("on")
             assert key not in ("src", "srcset", "style", "action", "formaction", "xlink:href")
             if key == "href":
-                assert re.fullmatch(r"data:(image/jpeg;base64,[\w+/=]+|,)|#scene-\d+", value), element
+                assert re.fullmatch(r"data:(image/(jpeg|png);base64,[\w+/=]+|,)|#scene-\d+", value), element
             if key == "id":
                 assert re.fullmatch(rf"scene-\d+|{ELEMENT}", value)
             if key == "class":
@@ -524,10 +524,10 @@ def test_templates_print_in_text_and_quoted_attributes_only(name):
         assert re.fullmatch(r"</?h\{\{ level( \+ 1)? \}\}", element)
     for link in re.findall(r'(?:href|src)="([^"]*)"', source):
         assert link in ("data:,", "#{{ id }}") or re.fullmatch(
-            r"data:image/jpeg;base64,\{\{ [\w.]+ \| base64 \}\}|\./\{\{ [\w.]+ \| address \}\}", link
+            r"data:image/(?:jpeg|png);base64,\{\{ [\w.]+ \| base64 \}\}|\./\{\{ [\w.]+ \| address \}\}", link
         )
     styles = re.findall(r"<style>(.*?)</style>", source)
-    assert not styles or re.findall(r"\{\{ (.*?) \}\}", styles[0]) == ["loop.index0", "colour"]
+    assert not styles or re.findall(r"\{\{ (.*?) \}\}", styles[0]) == ["loop.index0", "colour"] * 2
 
 
 # Files

@@ -42,8 +42,9 @@ def told(eventful) -> LogReport:
 
 
 @pytest.fixture(scope="module")
-def text(told) -> str:
-    return page([told])
+def text(eventful) -> str:
+    with log.read(eventful) as opened:
+        return page([gather(opened, None)])
 
 
 # Scores of people

@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack.evaluation.people import PersonScores
-from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.geometry.clocks import seconds_to_ns
 from mcaptrack.schema import EventKind, Frame
 from mcaptrack.viewing.report.formatting import number
 from mcaptrack.viewing.report.identity_events import ChannelEvents, IdentityEvent
@@ -34,7 +34,7 @@ class Doubt(NamedTuple):
     is_right: bool | None
 
     def text(self) -> str:
-        """What happened."""
+        """The repair in words."""
         start = f"{self.event.text[:1].upper()}{self.event.text[1:]}"
         where = f"{start}. It appears {number(self.away_m, 1, 'm')} from where it was expected"
         return f"{where}. {self.verdict}" if self.verdict else f"{where}."
@@ -81,7 +81,7 @@ def _away_m(rows: Any, t_ns: Any, event: IdentityEvent) -> float | None:
 
 
 def _verdict(people: PersonScores, event: IdentityEvent) -> tuple[str, bool | None]:
-    """What the ground truth says about a repair, and whether it is right; None if that is not known."""
+    """Compare a repair with the ground truth: words, and whether it is right; None if that is not known."""
     own = people.track == int(event.row["track_id"])
     when, who = people.t_ns[own], people.person[own]
     order = np.argsort(when, kind="stable")
@@ -97,8 +97,3 @@ def _verdict(people: PersonScores, event: IdentityEvent) -> tuple[str, bool | No
     if before == after:
         return f"The ground truth agrees: both are person {before}.", True
     return f"The ground truth disagrees: person {before} before, person {after} after.", False
-
-
-def seconds_into(event: IdentityEvent, start_ns: int) -> float:
-    """When an event happened, in seconds since the start of the log."""
-    return (event.t_ns - start_ns) / NS_PER_S

@@ -124,7 +124,7 @@ def _row(identity: int, lanes: list[tuple[str, list[Piece]]]) -> dict[str, Any]:
 def _groups(ids: Any) -> Iterator[tuple[int, int, int]]:
     """Each id of sorted rows, and its first row and the row after its last."""
     known, first = np.unique(ids, return_index=True)
-    yield from zip(known.tolist(), first.tolist(), [*first[1:].tolist(), len(ids)], strict=True)
+    yield from zip(known.tolist(), first.tolist(), np.append(first, len(ids))[1:].tolist(), strict=True)
 
 
 def _interval_ns(t_ns: Ints) -> float:
