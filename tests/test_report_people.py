@@ -189,6 +189,24 @@ def test_without_ground_truth_bars_are_re_tracked_tracks_with_the_ids_of_the_tra
     found = bars(identity_timeline(report))
     assert found["1"] == [[("1", "0.0", "8.0"), ("2", "8.0", "16.0")]]
     assert found["3"] == [[("3", "16.0", "24.0")]]
+    # interpolated rows have no id of the tracker, which is no change of identity
+    report.track_sets["offline"].frames = without_sources(tracks.frames, {0, 1, 7, 8, 9})
+    found = bars(identity_timeline(report))
+    assert [[(one, last) for one, _, last in lane] for lane in found["1"]] == [[("1", "8.8"), ("2", "16.0")]]
+    assert found["3"] == [[("3", "16.0", "24.0")]]
+    report.track_sets["offline"].frames = without_sources(tracks.frames, set(range(20)))
+    assert bars(identity_timeline(report))["1"] == [[("1", "0.0", "16.0")]]
+
+
+def without_sources(frames: list[Frame], ticks: set[int]) -> list[Frame]:
+    """Frames without ids of the tracker at these ticks of every twenty."""
+    out = []
+    for frame in frames:
+        rows = frame.rows.copy()
+        if frame.index % 20 in ticks:
+            rows["source_id"] = -1
+        out.append(Frame(frame.t_ns, frame.index, rows))
+    return out
 
 
 @given(

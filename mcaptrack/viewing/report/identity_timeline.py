@@ -33,7 +33,7 @@ _LEAST, _WIDE = 0.15, 4.5
 _MINUTES: Final = 600.0
 
 
-class Piece(NamedTuple):
+class IdentitySpan(NamedTuple):
     """A time in which a person has one id: seconds since the start of the log."""
 
     identity: int
@@ -41,7 +41,7 @@ class Piece(NamedTuple):
     last_s: float
 
 
-def pieces(identity: Ints, t_ns: Ints, start_ns: int, interval_ns: float) -> list[Piece]:
+def pieces(identity: Ints, t_ns: Ints, start_ns: int, interval_ns: float) -> list[IdentitySpan]:
     """The times with one id (P,), of rows at rising times (P,) that are usually ``interval_ns`` apart.
 
     A piece lasts until the next row is due, so that a single row is as long as an interval.
@@ -53,7 +53,7 @@ def pieces(identity: Ints, t_ns: Ints, start_ns: int, interval_ns: float) -> lis
     begin = (t_ns[first] - start_ns) / NS_PER_S
     due = np.append(t_ns[1:], np.iinfo(np.int64).max)[last]
     end = (np.minimum(t_ns[last] + round(interval_ns), due) - start_ns) / NS_PER_S
-    return [Piece(*one) for one in zip(identity[first].tolist(), begin.tolist(), end.tolist(), strict=True)]
+    return [IdentitySpan(*one) for one in zip(identity[first].tolist(), begin.tolist(), end.tolist(), strict=True)]
 
 
 def identity_timeline(report: LogReport) -> dict[str, Any]:
@@ -108,14 +108,25 @@ def _of_tracks(report: LogReport) -> list[dict[str, Any]]:
         return []
     rows, t_ns = rows_by_track(report.track_sets[role].frames)
     interval_ns = _interval_ns(frame_times(report.track_sets[role].frames))
-    sources = np.where(rows["source_id"] >= 0, rows["source_id"], rows["track_id"]).astype(np.int64)
+    sources = rows["source_id"].astype(np.int64)
     return [
-        _row(track, [("ids", pieces(sources[low:high], t_ns[low:high], report.start_ns, interval_ns))])
+        _row(track, [("ids", pieces(_known(sources[low:high], track), t_ns[low:high], report.start_ns, interval_ns))])
         for track, low, high in _groups(rows["track_id"])
     ]
 
 
-def _row(identity: int, lanes: list[tuple[str, list[Piece]]]) -> dict[str, Any]:
+def _known(source: Ints, track: int) -> Ints:
+    """The ids of the tracker (P,): rows without one, which are interpolated, have that of the row before, or the first.
+
+    A track without any has its own id.
+    """
+    there = np.flatnonzero(source >= 0)
+    if not len(there):
+        return np.full(len(source), track)
+    return source[there[np.maximum(np.searchsorted(there, np.arange(len(source)), "right") - 1, 0)]]
+
+
+def _row(identity: int, lanes: list[tuple[str, list[IdentitySpan]]]) -> dict[str, Any]:
     whole = lanes[0][1]
     seconds = sum(piece.last_s - piece.first_s for piece in whole)
     return {"name": str(identity), "seconds": seconds, "begins": whole[0].first_s if whole else 0.0, "lanes": lanes}
@@ -132,7 +143,7 @@ def _interval_ns(t_ns: Ints) -> float:
     return float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else NS_PER_S / 10
 
 
-def _lane(lane: tuple[str, list[Piece]], span_s: float) -> dict[str, Any]:
+def _lane(lane: tuple[str, list[IdentitySpan]], span_s: float) -> dict[str, Any]:
     """A lane as coordinates in percent; pieces that are too short to be seen are drawn a little longer."""
     kind, found = lane
     out = []
