@@ -47,6 +47,11 @@ def test_the_label_of_the_higher_id_moves_by_a_line_and_the_lower_one_stays(topi
     assert apart["8"] == drawn(topic, {8: standing(160, 104)})[0]["8"]
 
 
+def test_labels_at_one_place_stand_in_the_order_of_their_ids():
+    found = drawn(FULL, {one: standing(100, 200) for one in (2, 4, 6)})[0]
+    assert [found[name][1] for name in ("2", "4", "6")] == [200.0, 182.0, 164.0]
+
+
 def test_labels_of_a_crowd_do_not_overlap_but_where_they_would_be_far_from_their_boxes():
     rng = np.random.default_rng(5)
     paths = {n + 1: standing(*rng.uniform((100, 100), (500, 260)), 1) for n in range(30)}

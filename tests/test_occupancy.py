@@ -19,6 +19,8 @@ def test_times_by_hand():
     xy = np.array([[0.5, 0.5], [0.5, 0.5], [0.5, 1.5], [2.5, 1.5], [1.5, 1.5], [1.5, 1.5]])
     heat = occupancy(t_ns, ids, xy, cell_m=1.0, span_m=(0.0, 3.0, 0.0, 2.0))
     np.testing.assert_allclose(heat.person_s, [[2.0, 0.0, 0.0], [0.25, 1.5, 0.25]])
+    back = occupancy(t_ns[2:4], ids[2:4], np.array([[2.0, 0.5], [0.0, 0.5]]), cell_m=1.0, span_m=(0.0, 3.0, 0.0, 1.0))
+    np.testing.assert_allclose(back.person_s, [[0.5, 0.5, 0.0]])
     assert (heat.low_m, heat.high_m, heat.cell_m, heat.outside_s) == ((0.0, 0.0), (3.0, 2.0), 1.0, 0.0)
 
 
