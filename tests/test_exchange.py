@@ -168,17 +168,25 @@ def test_cvat_interpolates_what_is_no_keyframe(table, tmp_path):
     np.testing.assert_allclose(*corners, rtol=0, atol=KEYFRAME_PX + 1e-9)
 
 
-def test_a_straight_walk_needs_two_keyframes():
+def test_a_straight_walk_needs_few_keyframes(tmp_path):
+    """A walk on a line, 2 px off in one picture, and hidden in five."""
     count = 50
     frames = np.arange(count)
     boxes = np.stack([frames * 3.0, frames * 0.5, np.full(count, 20.0), np.full(count, 50.0)], axis=-1)
+    boxes[20, 0] += 2
+    observed = (frames < 30) | (frames >= 35)
     table = BoxTable(
         "/t", frames, frames, frames, np.full(count, 4), boxes, boxes[:, :2], np.full(count, np.nan, np.float32),
-        np.ones(count, int), np.ones(count, bool), {}, True, False, None, (),
+        np.ones(count, int), observed, {}, True, False, None, (),
     )  # fmt: skip
     text = b"".join(_WRITERS["cvat"](table)).decode()
-    assert text.count('keyframe="1"') == 2
     assert text.count("<box ") == count
+    lines = text.splitlines()
+    keys = [line.split('"')[1] for line in lines if 'keyframe="1"' in line]
+    assert keys == ["0", "19", "20", "21", "30", "35", "49"]
+    labels = read(tmp_path, "\n".join(line for line in lines if 'keyframe="0"' not in line))
+    assert labels.observed.tolist() == observed.tolist()
+    np.testing.assert_allclose(labels.boxes_px, boxes, atol=KEYFRAME_PX)
 
 
 class TestCvat:
