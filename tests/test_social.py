@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import expit, softmax
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.predictors import NAMES, Forecast, PeopleSeen, make, predict_together, social
+from mcaptrack.predictors import NAMES, Forecast, PeopleSeen, make, predict_among, predict_together, social
 from mcaptrack.predictors.weights import SHIPPED, Weights, load
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.testing import LawError, check_predictor, check_transform
@@ -104,28 +105,28 @@ class TestWhatPredictorsAreGiven:
 
     def test_other_steps_are_those_of_people_too(self):
         """At 5 Hz a network with steps of 0.4 s gets every other position, of everybody."""
-        xy_m = np.arange(40.0).reshape(2, 10, 2)
+        xy_m = np.random.default_rng(2).normal(0, 1, (2, 10, 2))
         slow = make("social", 24, 0.2)
         given = PeopleSeen(xy_m, np.ones((2, 10), bool), np.zeros(2, int), np.array([0, 1]))
         every = xy_m[:, 1::2]
         wanted = predict_together(SOCIAL, every, np.ones((2, 5), bool))
-        found = slow.predict(xy_m, np.ones((2, 10), bool), given)
+        found = predict_among(slow, xy_m, np.ones((2, 10), bool), given)
         np.testing.assert_allclose(found.mean[:, 1::2], wanted.mean, atol=1e-9)
+        assert np.abs(SOCIAL.predict(every, np.ones((2, 5), bool)).mean - wanted.mean).max() > 0.01
 
-    @pytest.mark.parametrize("batch", [4, 4096])
-    def test_retracking_gives_all_tracks_of_a_step(self, monkeypatch, batch):
+    @pytest.mark.parametrize("profile", ["default", "paper"])
+    def test_retracking_gives_all_tracks_of_a_step_at_once(self, monkeypatch, profile):
+        """However many tracks are predicted at once."""
         rng = np.random.default_rng(1)
         frames = [frame(n, {k: (0.4 * n, 2 * k + rng.normal(0, 0.05)) for k in range(5)}) for n in range(12)]
-        options = [PROFILES["default"], PROFILES["paper"]]
-        for profile in options:
-            run = type(profile)(**{**vars(profile), "predictor": "tests.test_social:Watching"})
-            monkeypatch.setattr(likelihood, "_BATCH", batch)
-            predictions = [one for *_, one in run(frames)]
-            assert any(len(one.rows) for one in predictions)
-        moments = [np.bincount(people.moment).max() for _, people in SEEN if people is not None and len(people.row)]
-        assert max(moments) == 5
-        for xy_m, people in SEEN:
+        monkeypatch.setattr(likelihood, "_BATCH", 4)
+        list(replace(PROFILES[profile], predictor="tests.test_social:Watching")(frames))
+        calls = [(xy_m, people) for xy_m, people in SEEN if len(xy_m)]
+        for xy_m, people in calls:
             np.testing.assert_array_equal(people.xy_m[people.row], xy_m)
+        sizes = [size for _, people in calls for size in np.bincount(people.moment).tolist() if size]
+        assert set(sizes) == {5}
+        assert len(calls) > 5
 
 
 class Breaks:
@@ -255,6 +256,41 @@ class TestSocial:
         red, alone, together = np.mean(errors, axis=0)
         assert together < 0.85 * red
         assert together < 0.9 * alone
+
+    def test_the_formulas_are_those_of_attention(self):
+        """Against loops over tracks, people and steps, on the same features."""
+        xy_m, valid = crowd(11, 6)
+        found = predict_together(SOCIAL, xy_m, valid)
+        seen, get = SOCIAL.see(xy_m, valid), SOCIAL.weights.tensors
+
+        def layer(name: str, x: np.ndarray) -> np.ndarray:
+            return get[f"{name}.weight"] @ x + get[f"{name}.bias"]
+
+        ahead = seen.mean - xy_m[:, -1:]
+        features = np.concatenate([social.own_features(seen), seen.state], axis=1)
+        for i in range(6):
+            own = np.tanh(layer("own", features[i]))
+            others = [j for j in range(6) if j != i]
+            views, scores = [], [layer("alone", own)]
+            for j in others:
+                one, two = seen.chosen(np.array([i])), seen.chosen(np.array([j]))
+                pair = np.tanh(layer("pair", social.pair_features(one, two, 0.4)[0]))
+                views.append(np.tanh(layer("both", pair) + get["both.own"] @ own))
+                scores.append(layer("attention", views[-1]))
+            share = softmax(np.array(scores), axis=0)[1:]
+            pool = sum(part[0] * view for part, view in zip(share, views, strict=True))
+            total = sum(expit(score[0]) * view for score, view in zip(scores[1:], views, strict=True))
+            out = layer("head", np.tanh(layer("dense", np.concatenate([own, pool, total])))).reshape(STEPS, 4)
+            for t in range(STEPS):
+                late = t / (STEPS - 1)
+                mean = seen.mean[i, t].copy()
+                for part, j in zip(share, others, strict=True):
+                    mean += ((1 - late) * part[1] + late * part[2]) * (ahead[j, t] - ahead[i, t])
+                mean += seen.turn[i].T @ out[t, :2] * seen.gate[i] * seen.spread[i, t]
+                np.testing.assert_allclose(found.mean[i, t], mean, atol=1e-9)
+                wide = np.exp([out[t, 2] + seen.gate[i] * out[t, 3], out[t, 2] - seen.gate[i] * out[t, 3]])
+                matrix = seen.turn[i].T @ np.diag(wide) @ seen.turn[i]
+                np.testing.assert_allclose(found.cov[i, t], matrix @ seen.cov[i, t] @ matrix.T, atol=1e-9)
 
     def test_its_file_says_what_it_was_trained_on_and_holds_red_as_it_is(self):
         found, red = load(SHIPPED / "social.safetensors"), load(SHIPPED / "red.safetensors")
