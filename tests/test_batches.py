@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import GROUP, call, made_log
+from tests.commands import GROUP, call, made_log, zones_file
 
 #: Commands that make one thing of all their inputs: without one of them it would be another thing, so they refuse.
 COMBINING = {"report", "query", "evaluate", "tune", "train"}
@@ -52,7 +52,8 @@ def inputs(command: str, *names: str) -> list[str]:
 def test_a_broken_input_does_not_stop_the_others(command, folder):
     bad = ["missing.mcap"] if command == "check" else ["broken.mcap", "missing.mcap"]  # check tells what is broken
     *bad, good = inputs(command, *bad, "a.mcap")
-    outcome = call(command, *bad, good, "--json")
+    words = ["--zones", zones_file(folder)] if command == "zones" else []
+    outcome = call(command, *bad, good, *words, "--json")
     assert outcome.code == 3, outcome.err
     data = json.loads(outcome.out)
     assert [Path(one["log"]).name for one in data["results"]] == ["a.mcap"]

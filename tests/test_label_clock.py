@@ -43,7 +43,8 @@ from tests.bags import camera_bag
 from tests.robots import FPS, PICTURES, ROBOT_NS, lines, robot_log
 from tests.worlds import ns, write_clip
 
-ROLES: tuple[Role, ...] = get_args(Role)
+#: Corrections belong to tracks of a log: see test_corrections.
+ROLES: tuple[Role, ...] = tuple(role for role in get_args(Role) if role != "corrections")
 FORMATS = tuple(name for name in get_args(Format) if name not in ("auto", *OTHERS, *FORMATS_3D))
 #: By hand: the pictures that are labelled, and by which files. The first ones and the last ones are empty.
 SEEN = {k: [1, 2] if k % 2 else [1] for k in (3, 4, 5, 7, 15)}

@@ -331,6 +331,9 @@ def test_files_and_logs_give_the_same_tables(known, tmp_path):
             "forecast_errors",
             "forecast_scores",
             "sightings",
+            "zone_visits",
+            "zone_crossings",
+            "zone_counts",
         ), name
 
 

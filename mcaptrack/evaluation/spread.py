@@ -65,11 +65,13 @@ def by_frame(values: Floats, frame: Ints, frames: int) -> tuple[Floats, Floats]:
     if not len(values):
         return np.full(frames, np.nan), np.full(frames, np.nan)
     ordered = values[np.lexsort((values, frame))]
-    place = (np.cumsum(count) - count) + PERCENTILE / 100 * (count - 1)
-    place = np.clip(place, 0, len(ordered) - 1)
+    # Places within a frame, so that the rounding of a frame doesn't depend on those before it.
+    place = np.maximum(PERCENTILE / 100 * (count - 1), 0.0)
     low = np.floor(place).astype(np.int64)
-    high = np.minimum(low + 1, len(ordered) - 1)
-    most = ordered[low] + (place - low) * (ordered[high] - ordered[low])
+    share = place - low
+    first = np.minimum(np.cumsum(count) - count + low, len(ordered) - 1)
+    second = np.minimum(first + 1, len(ordered) - 1)
+    most = ordered[first] + share * (ordered[second] - ordered[first])
     total = np.bincount(frame, values, minlength=frames)
     some = count > 0
     return np.where(some, total / np.maximum(count, 1), np.nan), np.where(some, most, np.nan)
