@@ -23,7 +23,9 @@ from tests.commands import done, made_log
 from tests.worlds import small_scene
 
 # The same examples each time, so that a failure comes from a change; `--hypothesis-profile search` tries many new ones.
-settings.register_profile("same", deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+settings.register_profile(
+    "same", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
+)
 settings.register_profile("search", settings.get_profile("same"), derandomize=False, print_blob=True, max_examples=3000)
 settings.load_profile("same")
 

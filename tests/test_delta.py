@@ -283,7 +283,7 @@ def test_one_log_that_cannot_be_added_does_not_stop_the_others(some, place):
     assert counts(place / "lake", "tracks") == {"a": 12}
 
 
-@pytest.mark.parametrize("name", ["it's", 'a"b', "日本語 é", "a b;c", "-x", "%2Fetc", "0001", "a\udcff"])
+@pytest.mark.parametrize("name", ["it's", '-a"b; %2Fetc', "日本語 é", "0001", "a\udcff"])
 def test_names_with_signs_that_mean_something_elsewhere(some, place, name):
     path = place / f"{name}.mcap"
     try:

@@ -337,7 +337,7 @@ def sightings(drawn: Sequence[tuple[int, float, float, float, float, float]]) ->
     )  # fmt: skip
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(places)
 def test_groups_have_each_camera_once_and_can_not_be_joined_further(
     drawn: list[tuple[int, float, float, float, float, float]],

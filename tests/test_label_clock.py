@@ -60,7 +60,8 @@ WRITERS: dict[str, Callable[[int, int, bool], str]] = {
     "obsmat": lambda k, who, _: f"{k} {who} {who}.5 0 2.5 0 0 0",
 }
 POSITIONS = ("trajnet", "obsmat")
-KINDS = [(f, r) for f, r in itertools.product(FORMATS, ROLES) if r != "detections" or f not in POSITIONS]
+#: What labels hold makes no difference to their clock, so one format is enough for kinds other than ground truth.
+KINDS = [(f, r) for f, r in itertools.product(FORMATS, ROLES) if r == "truth" or f == "mot"]
 NAMES = ["-".join(kind) for kind in KINDS]
 
 

@@ -101,7 +101,7 @@ def test_a_change_before_any_read_gives_the_old_content_the_new_one_or_an_error(
         return read
 
     outcomes = set()
-    for at in range(1, 500):
+    for at in range(1 + len(kind) % 2, 500, 2):  # every second read, and not the same ones of each kind
         path.write_bytes(old)
         seen.clear()
         with monkeypatch.context() as patch:

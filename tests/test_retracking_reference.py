@@ -121,7 +121,7 @@ CHOICES = {
 
 
 @given(seed=SEEDS, chosen=st.fixed_dictionaries({name: st.sampled_from(v) for name, v in (NUMBERS | CHOICES).items()}))
-@settings(max_examples=45, phases=QUICK)
+@settings(max_examples=25, phases=QUICK)
 def test_algorithm_1_with_random_options_equals_the_reference(seed, chosen):
     transform = RetrackByConsistency(**PLAIN, **chosen)
     frames = noisy_tracks(np.random.default_rng(seed), rate_hz=transform.rate_hz)
@@ -149,7 +149,7 @@ LIKELIHOOD = {
 
 
 @given(seed=SEEDS, chosen=st.fixed_dictionaries({name: st.sampled_from(v) for name, v in LIKELIHOOD.items()}))
-@settings(max_examples=45, phases=QUICK)
+@settings(max_examples=25, phases=QUICK)
 def test_the_likelihood_method_equals_the_reference(seed, chosen):
     transform = Retrack(**PLAIN, **chosen)
     predict, past = black_box(
@@ -180,7 +180,7 @@ OFFLINE = {
 
 
 @given(seed=SEEDS, chosen=st.fixed_dictionaries({name: st.sampled_from(v) for name, v in OFFLINE.items()}))
-@settings(max_examples=22, phases=QUICK)
+@settings(max_examples=14, phases=QUICK)
 def test_the_offline_steps_equal_the_reference(seed, chosen):
     kind = chosen.pop("kind")
     transform = kind(predictor="cv", horizon_s=2.0, **chosen)

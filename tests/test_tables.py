@@ -53,7 +53,7 @@ def some_tracks(people):
 
 
 @given(st.data())
-@settings(max_examples=60)
+@settings(max_examples=30)
 def test_rows_and_empty_frames_survive_files_to_the_bit(tmp_path_factory, data):
     folder, schema = tmp_path_factory.mktemp("tables"), data.draw(ALL)
     form = data.draw(st.sampled_from(["parquet", "arrow"]))
@@ -236,7 +236,7 @@ WORDS = st.text(st.characters(codec="utf-8"), max_size=12) | st.sampled_from(
 
 
 @given(st.lists(st.tuples(WORDS, st.none() | DOUBLES, TIMES), max_size=6))
-@settings(max_examples=60)
+@settings(max_examples=30)
 def test_text_is_read_back_by_others_as_it_was(tmp_path_factory, rows):
     folder = tmp_path_factory.mktemp("text")
     words, numbers, times = zip(*rows, strict=True) if rows else ((), (), ())
@@ -473,7 +473,7 @@ def test_a_file_that_could_not_be_written_is_not_written_to_later(tmp_path, monk
 
 
 @given(st.data())
-@settings(max_examples=60)
+@settings(max_examples=30)
 def test_a_byte_that_changed_on_the_disk_is_noticed(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("t") / "t.parquet"
     table = some_tracks([{k: (k / 3, n / 7) for k in range(30)} for n in range(30)])
