@@ -537,6 +537,17 @@ class TestDrawing:
         assert (again.code, len(again.err.splitlines())) == (1, 1)
         done("zones", "draw", tmp_path / "a.mcap", "--force", "-q")
 
+    def test_zones_that_the_page_cannot_change_are_named_and_not_in_its_file(self, finished, tmp_path):
+        outline, hole = [[0, 0], [9, 0], [9, 9], [0, 9]], [[4, 4], [5, 4], [5, 5]]
+        content = collection(feature("ring", "Polygon", [outline, hole]), feature("b", "LineString", [[0, 0], [9, 9]]))
+        content["features"].append(feature("seen", "LineString", [[5, 105], [9, 159]], units="px"))
+        mcaptrack.zones(finished, zones=content, output=tmp_path / "a.mcap")
+        outcome = call("zones", "draw", tmp_path / "a.mcap")
+        assert outcome.err.splitlines()[0].endswith("they are not in the file that it downloads: ring, b")
+        page = tmp_path / "a.zones.html"
+        assert [one["name"] for one in self.data_of(page)["zones"]] == ["seen"]
+        assert "not in the file: ring, b</p>" in page.read_text()
+
     def test_without_pictures_it_is_the_ground_in_metres_with_the_second_axis_upwards(self, finished, tmp_path):
         mcaptrack.drop(finished, "/camera/video", output=tmp_path / "a.mcap")
         data = self.data_of(mcaptrack.draw_zones(tmp_path / "a.mcap", output=tmp_path / "b.html"))

@@ -13,6 +13,7 @@ from mcaptrack import log, pipeline
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.zones import Units, Zone
+from mcaptrack.notices import warn
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.framing import join_frames, thinned
 from mcaptrack.sources.pictures import Pictures
@@ -55,7 +56,15 @@ def zones_page(opened: log.Log, prefix: str, file: str) -> str:
         middle = (least + most) / 2
         low = (float(middle[0] - extent[0] / 2), float(middle[1] + extent[1] / 2))
     counted = pipeline.counted_zones(opened, prefix)
-    zones = [zone for zone in (counted[0].zones if counted else ()) if zone.units == units]
+    counted_zones = counted[0].zones if counted else ()
+    zones = [zone for zone in counted_zones if zone.units == units and _is_simple(zone)]
+    left_out = [zone.name for zone in counted_zones if zone not in zones]
+    if left_out:
+        names = ", ".join(left_out)
+        warn(
+            f"{opened.path}: the page can't change zones that have holes or several parts, or that are not in {units}; "
+            f"they are not in the file that it downloads: {names}"
+        )
     data = {
         "units": units, "unit": "px" if units == "pixels" else "m", "scale": scale, "x0": low[0], "y0": low[1],
         "up": up, "digits": 1 if units == "pixels" else 2, "camera": prefix.strip("/"), "file": file,
@@ -70,14 +79,18 @@ def zones_page(opened: log.Log, prefix: str, file: str) -> str:
         height=height,
         jpeg=background.jpeg if background else b"",
         data=data,
+        left_out=left_out,
         nonce=b64encode(sha256(opened.path.name.encode()).digest()[:12]).decode(),
     )
 
 
+def _is_simple(zone: Zone) -> bool:
+    """Whether the page can change a zone: it has one outline."""
+    return len(zone.parts) == 1 and len(zone.parts[0]) == 1
+
+
 def _drawn(zones: Sequence[Zone]) -> list[dict[str, Any]]:
-    """The zones that the page can change: those of one outline."""
-    simple = [zone for zone in zones if len(zone.parts) == 1 and len(zone.parts[0]) == 1]
-    return [{"name": zone.name, "line": zone.is_line, "points": zone.parts[0][0]} for zone in simple]
+    return [{"name": zone.name, "line": zone.is_line, "points": zone.parts[0][0]} for zone in zones]
 
 
 def _places(opened: log.Log, prefix: str) -> Floats:
