@@ -24,16 +24,14 @@ from mcaptrack.schema import EVENTS, TRACKS, EventKind
 from mcaptrack.schema.framing import frame_times, joined_parts
 from mcaptrack.schema.resampling import interval_ns
 from mcaptrack.sources.foreign.flatten import message_decoder
-from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import write_clip
 from mcaptrack.transforms import FULL
 from mcaptrack.viewing import from_above
 from mcaptrack.viewing.rendering import (
     RenderOptions,
     at_times,
-    check_suffix,
-    chosen_pictures,
     draw,
+    pictures_of_video,
     rate_of,
     scaled,
     sights,
@@ -122,16 +120,12 @@ def compare(
     McaptrackError
         If there are no pictures in the period, or if they can't be decoded.
     """
-    check_suffix(output)
-    pictures = Pictures(opened, picture_topic)
-    if not len(pictures.t_ns):
-        raise McaptrackError(f"{opened.path}: {picture_topic} has no pictures")
-    numbers = chosen_pictures(opened, pictures.t_ns, "pictures", output, options)
+    pictures, numbers = pictures_of_video(opened, picture_topic, output, options)
     chosen = pictures.t_ns[numbers]
     span = int(chosen[0]), int(chosen[-1]) + 1
-    happened = [_happened(opened, panel, int(pictures.t_ns[0])) for panel in panels]
-    scene = panels[1].topic + views.SCENE_SUFFIX
     start_ns = int(pictures.t_ns[0])
+    happened = [_happened(opened, panel, start_ns) for panel in panels]
+    scene = panels[1].topic + views.SCENE_SUFFIX
 
     def composed() -> Iterator[tuple[int, Image]]:
         drawn = [

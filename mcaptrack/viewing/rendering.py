@@ -89,11 +89,7 @@ def render(
     McaptrackError
         If there are no pictures in the period, or if they can't be decoded.
     """
-    check_suffix(output)
-    pictures = Pictures(opened, picture_topic)
-    if not len(pictures.t_ns):
-        raise McaptrackError(f"{opened.path}: {picture_topic} has no pictures")
-    numbers = chosen_pictures(opened, pictures.t_ns, "pictures", output, options)
+    pictures, numbers = pictures_of_video(opened, picture_topic, output, options)
     chosen = pictures.t_ns[numbers]
 
     def drawn() -> Iterator[tuple[int, Image]]:
@@ -113,6 +109,17 @@ def render(
             progress("render", done, len(chosen))
 
     return write_clip(output, drawn(), rate_of(chosen))
+
+
+def pictures_of_video(
+    opened: log.Log, picture_topic: str, output: Path, options: RenderOptions
+) -> tuple[Pictures, Ints]:
+    """Return the pictures of a channel, and the numbers (N,) of those that become a video."""
+    check_suffix(output)
+    pictures = Pictures(opened, picture_topic)
+    if not len(pictures.t_ns):
+        raise McaptrackError(f"{opened.path}: {picture_topic} has no pictures")
+    return pictures, chosen_pictures(opened, pictures.t_ns, "pictures", output, options)
 
 
 def render_from_above(
