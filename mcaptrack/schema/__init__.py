@@ -25,6 +25,7 @@ __all__ = [
     "BOX_PX",
     "CAMERA_MOTION",
     "COUNTS",
+    "COVARIANCE_M2",
     "DETECTIONS",
     "EVENTS",
     "EVENT_KINDS",
@@ -253,6 +254,8 @@ class Schema:
 #: The columns of a box in a picture, and of a position in space.
 BOX_PX: Final = ("x_px", "y_px", "w_px", "h_px")
 PLACE_M: Final = ("x_m", "y_m")
+#: The covariance of a position on the ground in columns of Detections.
+COVARIANCE_M2: Final = ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2")
 #: The columns of sizes of boxes, which are not below 0.
 SIZES: Final = ("w_px", "h_px", "length_m", "width_m", "height_m")
 DETECTIONS: Final = Schema("mcaptrack.Detections", BOX_PX, PLACE_M)

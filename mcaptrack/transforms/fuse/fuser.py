@@ -10,7 +10,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.schema import DETECTIONS, SIGHTINGS, Frame, Rows, Schema
+from mcaptrack.schema import COVARIANCE_M2, DETECTIONS, SIGHTINGS, Frame, Rows, Schema
 from mcaptrack.transforms.fuse.grouping import Places, group, means
 from mcaptrack.transforms.fuse.view import Views
 from mcaptrack.transforms.protocol import Suited, check_options, context, option
@@ -21,13 +21,12 @@ _LEAST, _MOST = 0.02, 0.98
 #: Limits of people's motion for a tracker of the result (see ``motion_limits``).
 _WALKS: Final = "person=:0.4::1.2"
 _TRACKED: Final = MappingProxyType({"birth_score": 0.8, "confirm_score": 2.0, "max_age_s": 1.0, "class_limits": _WALKS})
-_COV: Final = ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2")
 
 
 def places_of(rows: Rows) -> Places:
     """The places of sightings (N,)."""
     xy_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
-    return Places(xy_m, np.stack([rows[name] for name in _COV], axis=-1))
+    return Places(xy_m, np.stack([rows[name] for name in COVARIANCE_M2], axis=-1))
 
 
 @dataclass(frozen=True, kw_only=True)

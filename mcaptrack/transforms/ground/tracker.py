@@ -16,7 +16,7 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
-from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
+from mcaptrack.schema import COVARIANCE_M2, DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.ground.association import Cost, associate
 from mcaptrack.transforms.ground.lost_tracks import LostTracks, continuations
 from mcaptrack.transforms.ground.output import Waiting, rows_to_frames
@@ -65,8 +65,6 @@ _COLUMNS: Final = (
     "class_id",
     "source_id",
 )
-#: The same of covariances, where there are any.
-_COVARIANCES: Final = ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -275,7 +273,7 @@ class _Run:
         """The detections of a frame that are used, in an order of their own: (rows, N)."""
         rows, options = frame.rows, self._options
         found = np.stack([rows[name] for name in _COLUMNS]).astype(float)
-        xx, xy, yy = given = np.stack([rows[name] for name in _COVARIANCES])
+        xx, xy, yy = given = np.stack([rows[name] for name in COVARIANCE_M2])
         is_given = (xx > 0) & (yy > 0) & (xy * xy < xx * yy) & np.isfinite(given).all(axis=0)
         if is_given.any():
             found = np.concatenate([found, np.where(is_given, given, np.nan)])
