@@ -21,7 +21,7 @@ from mcaptrack.notices import collected
 from mcaptrack.pipeline.planes import planes_to_json, read_planes
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
-from mcaptrack.sources.calibrations import _is_rectified, find_calibration, read_calibrations, see_ground
+from mcaptrack.sources.calibrations import find_calibration, is_rectified_topic, read_calibrations, see_ground
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.foreign import MessageType
 from tests.commands import call, done
@@ -305,7 +305,7 @@ class TestGround:
         ],
     )
     def test_rectified_pictures_by_their_topic(self, topic, is_rectified):
-        assert _is_rectified(topic) is is_rectified
+        assert is_rectified_topic(topic) is is_rectified
 
     def test_a_given_plane_wins(self, straight, tmp_path):
         path = tmp_path / "robot.mcap"

@@ -175,6 +175,7 @@ COMMANDS: dict[str, dict[str, Any]] = {
         "image_format": "auto",
         "point": "foot",
         "label_format": "auto",
+        "calibration_unit": "auto",
         "camera": "camera",
     },
     "render": {"start_s": 0.0},

@@ -91,6 +91,10 @@ def template(template, tmp_path_factory) -> Path:
     for n in range(30):
         (folder / "yolo" / f"{n:04}.txt").write_text(f"0 {0.1 + n / 100} 0.5 0.1 0.3\n")
     (folder / "motion.txt").write_text("".join(f"{n}\t1\t0\t0.5\t0\t1\t0\n" for n in range(30)))
+    lens, down = "[40, 0, 31.5, 0, 40, 23.5, 0, 0, 1]", "[0, -2.2, 2.2]"
+    (folder / "pose.yml").write_text(f"%YAML:1.0\n---\nK: {lens}\nrvec: {down}\ntvec: [0, 0, 9]\n")
+    pinhole = "{camera_model: pinhole, distortion_model: none, intrinsics: [40, 40, 31.5, 23.5]}"
+    (folder / "camchain.yaml").write_text(f"cam0: {pinhole}\ncam1: {pinhole.replace('40', '50')}\n")
     (folder / "query.sql").write_text("select count(*) as n from tracks")
     (folder / "more.csv").write_text("a\n1\n")
     (folder / "verbose.toml").write_text("\n".join(f"[{name}]\nverbose = true" for name in GROUP.commands))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -31,6 +32,7 @@ from mcaptrack.sources.corrections import CORRECTED
 from mcaptrack.sources.ingest import Format, ImageFormat, IngestOptions, IngestReport, InputRole
 from mcaptrack.sources.ingest import ingest as make_log
 from mcaptrack.sources.ingest.bags.metadata_update import update_metadata
+from mcaptrack.sources.ingest.calibration import LengthUnit
 from mcaptrack.sources.ingest.labels.columns import check_keys, parse_columns
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
@@ -87,6 +89,9 @@ def ingest(
     quality: int | None = None,
     keyframe_interval_s: float | None = None,
     ground_plane: PathLike | None = None,
+    calibration: PathLike | Sequence[PathLike] | None = None,
+    calibration_name: str | None = None,
+    calibration_unit: LengthUnit = "auto",
     point: Point = "foot",
     detections: PathLike | None = None,
     tracks: PathLike | None = None,
@@ -128,6 +133,15 @@ def ingest(
         Longest time between keyframes in seconds.
     ground_plane : path, optional
         File with a 3x3 homography from pixels to metres on the ground.
+    calibration : path or sequence of path, optional
+        Files with the calibration of the camera, of OpenCV (XML, YAML or JSON), ROS (``camera_info``) or Kalibr:
+        intrinsics and, in the same file or another one, its pose in the world, from which the ground plane follows
+        (z = 0).
+    calibration_name : str, optional
+        Which camera, if a file has several, such as "cam1"; by default the one of this topic or name.
+    calibration_unit : {"auto", "m", "cm", "mm"}, default "auto"
+        Unit of lengths of the pose. By default the one in which the camera has a usual height, with a warning if that
+        isn't metres.
     point : {"foot", "center"}, default "foot"
         Which point of a box touches the ground.
     detections, tracks, truth : path, optional
@@ -156,9 +170,10 @@ def ingest(
         Frame of reference of 3D boxes; by default that of the format, or else the root of the log's transforms.
     scene : str, optional
         Name of the scene, if the labels are of nuScenes.
-    role : {"detections", "tracks", "truth", "corrections", "motion"}, optional
-        What ``source`` holds, if it is a label file; by default as its ids tell. The motion of a camera and corrections
-        of its tracks go ``into`` a log; ``run`` then takes corrected tracks in place of those that it found.
+    role : {"detections", "tracks", "truth", "corrections", "motion", "calibration"}, optional
+        What ``source`` holds, if it is a label file; by default as its ids tell. The motion of a camera, its
+        calibration and corrections of its tracks go ``into`` a log; ``run`` then takes corrected tracks in place of
+        those that it found.
     into : path, optional
         Add to this log instead of making a new one.
     sidecar : bool, optional
@@ -199,6 +214,9 @@ def ingest(
         quality=quality,
         keyframe_interval_s=keyframe_interval_s,
         ground_plane=optional_path(ground_plane),
+        calibration=tuple(as_path(one) for one in _each(calibration)),
+        calibration_name=calibration_name,
+        calibration_unit=calibration_unit,
         point=point,
         labels={name: as_path(label) for name, label in labels.items() if label is not None},  # type: ignore[misc]
         label_format=label_format,
@@ -239,7 +257,11 @@ def ingest(
         without_3d = not report.holds_boxes_3d
         warn_unused("there are no 3D boxes", frame=frame is not None and without_3d)
         warn_unused("there are no tables of nuScenes", scene=scene is not None and without_3d)
-        warn_unused("there is no ground plane", point=point != "foot" and ground_plane is None)
+        is_calibrated = bool(options.calibration) or any(topic.endswith("/calibration") for topic in report.messages)
+        without_plane = ground_plane is None and not is_calibrated
+        warn_unused("there is no ground plane", point=point != "foot" and without_plane)
+        about = {"calibration_name": calibration_name is not None, "calibration_unit": calibration_unit != "auto"}
+        warn_unused("there is no calibration", **{} if is_calibrated else about)
         keep = "the channels of a recording keep their names"
         warn_unused(keep, camera=camera != "camera" and not report.uses_camera)
     return IngestResult(
@@ -265,6 +287,13 @@ def _changes(path: Path, report: IngestReport) -> dict[str, Any] | None:
         return None
     report.remarks.append(f"{topic}: {found.words}; {call('run', path)} takes it over")
     return found.to_json()
+
+
+def _each(paths: PathLike | Sequence[PathLike] | None) -> Sequence[PathLike]:
+    """Return a path, or several, as a sequence."""
+    if paths is None:
+        return ()
+    return (paths,) if isinstance(paths, str | os.PathLike) else tuple(paths)
 
 
 def default_log(source: Path) -> Path:

@@ -101,6 +101,36 @@ def ingest(
         ),
     ] = None,
     ground_plane: labels.GroundPlane = None,
+    calibration: Annotated[
+        list[Path] | None,
+        common.option(
+            "--calibration",
+            panel=labels.LABELS,
+            metavar="FILE",
+            help="File with the calibration of the camera, of OpenCV, ROS (camera_info) or Kalibr; twice if intrinsics "
+            "and the pose in the world are two files. The ground plane follows from both.",
+            show_default=False,
+        ),
+    ] = None,
+    calibration_name: Annotated[
+        str | None,
+        common.option(
+            "--calibration-name",
+            panel=labels.LABELS,
+            metavar="NAME",
+            help="Which camera of a calibration of several, such as cam1.",
+            show_default="the one of the same topic or name",
+        ),
+    ] = None,
+    calibration_unit: Annotated[
+        Literal["auto", "m", "cm", "mm"],
+        common.option(
+            "--calibration-unit",
+            panel=labels.LABELS,
+            tuning=True,
+            help="Unit of lengths of the pose. auto: that in which the camera has a usual height.",
+        ),
+    ] = "auto",
     point: labels.Point = "foot",
     detections: Annotated[Path | None, _label_file("detections: boxes without ids")] = None,
     tracks: Annotated[Path | None, _label_file("tracks: boxes or positions with ids")] = None,
@@ -204,7 +234,7 @@ def ingest(
         ),
     ] = None,
     role: Annotated[
-        Literal["detections", "tracks", "truth", "corrections", "motion"] | None,
+        Literal["detections", "tracks", "truth", "corrections", "motion", "calibration"] | None,
         common.option(
             "--as",
             panel=labels.LABELS,
@@ -233,9 +263,10 @@ def ingest(
 ) -> None:
     """Make a log of a video, a folder of images, a ROS bag, an MCAP file, or a label file.
 
-    Writes /camera/video, /camera/ground_plane, /camera/detections, /camera/tracks, /camera/truth and /camera/motion,
-    as far as they are given. Streams that viewers can play (H.264, VP9, AV1) are copied without re-encoding; others are
-    re-encoded as H.264, and the reason is printed. Timestamps are those of the file, exact to the nanosecond.
+    Writes /camera/video, /camera/ground_plane, /camera/calibration, /camera/detections, /camera/tracks, /camera/truth
+    and /camera/motion, as far as they are given. Streams that viewers can play (H.264, VP9, AV1) are copied without
+    re-encoding; others are re-encoded as H.264, and the reason is printed. Timestamps are those of the file, exact to
+    the nanosecond.
 
     From a ROS 1 bag, a rosbag2 folder or database, or an MCAP file every message is copied unchanged, with its
     timestamps; labels belong to its only camera, or to the one that --camera names.
@@ -256,6 +287,9 @@ def ingest(
         "quality": quality,
         "keyframe_interval_s": keyframe_interval_s,
         "ground_plane": ground_plane,
+        "calibration": calibration or None,
+        "calibration_name": calibration_name,
+        "calibration_unit": calibration_unit,
         "point": point,
         "detections": detections,
         "tracks": tracks,

@@ -3,6 +3,7 @@
 from mcaptrack.foxglove.annotations import Annotations
 from mcaptrack.foxglove.messages import (
     ANNOTATIONS,
+    CALIBRATION,
     IMAGE,
     LOG,
     PICTURES,
@@ -12,6 +13,7 @@ from mcaptrack.foxglove.messages import (
     message_class,
     pack_log,
     pack_picture,
+    pack_stamped,
     pack_transform,
     schema_record,
     unpack,
@@ -23,6 +25,7 @@ from mcaptrack.foxglove.scenes import CuboidMarker, Cuboids, PersonMarker, Scene
 
 __all__ = [
     "ANNOTATIONS",
+    "CALIBRATION",
     "IMAGE",
     "LOG",
     "PICTURES",
@@ -41,6 +44,7 @@ __all__ = [
     "messages_in",
     "pack_log",
     "pack_picture",
+    "pack_stamped",
     "pack_transform",
     "record_in",
     "schema_record",

@@ -14,6 +14,7 @@ ANNOTATIONS: Final = "foxglove.ImageAnnotations"
 SCENE: Final = "foxglove.SceneUpdate"
 TRANSFORM: Final = "foxglove.FrameTransform"
 LOG: Final = "foxglove.Log"
+CALIBRATION: Final = "foxglove.CameraCalibration"
 #: Schemas of pictures.
 PICTURES: Final = (VIDEO, IMAGE)
 
@@ -64,6 +65,13 @@ def pack_transform(t_ns: int, parent_frame_id: str, frame_id: str) -> bytes:
     _stamp(message, t_ns)
     message.translation.SetInParent()
     message.rotation.w = 1.0
+    payload: bytes = message.SerializeToString(deterministic=True)
+    return payload
+
+
+def pack_stamped(message: Any, t_ns: int) -> bytes:
+    """A message of a Foxglove schema with this time."""
+    _stamp(message, t_ns)
     payload: bytes = message.SerializeToString(deterministic=True)
     return payload
 

@@ -37,7 +37,7 @@ from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, Frame, Rows
 from mcaptrack.schema.classes import PERSON, UNKNOWN, is_person
 from mcaptrack.schema.framing import join_frames, thinned
 from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
-from mcaptrack.schema.provenance import Provenance
+from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.calibrations import holds_calibrations, see_ground
 from mcaptrack.sources.cameras import camera_at, lineage, provenance_of
@@ -123,6 +123,7 @@ def is_plane_due(opened: log.Log, prefix: str, source: str, choice: PlaneChoice)
         return False
     is_untried = _UNCALIBRATED not in made.parameters or any(choice.frames(made))
     is_new = made.transform in (_ASSUME, _ESTIMATE) and is_untried and _is_calibrated(opened)
+    is_new = is_new or _is_recalibrated(opened, prefix, made)
     return choice.is_another(made) or is_new
 
 
@@ -153,6 +154,15 @@ def _is_calibrated(opened: log.Log) -> bool:
     return any(map(holds_calibrations, opened.channels.values()))
 
 
+def _is_recalibrated(opened: log.Log, prefix: str, made: Provenance | None) -> bool:
+    """Return whether a calibration was ingested for a camera after its planes were made from a calibration."""
+    topic = f"{prefix}/calibration"
+    given = provenance_of(opened, topic)
+    if made is None or made.transform != _CALIBRATE or given is None or given.transform != INGEST:
+        return False
+    return made.input != topic or made.input_digest != digest_of(opened, topic)
+
+
 def calibrated_planes(
     opened: log.Log, prefix: str, choice: PlaneChoice = AS_BEFORE
 ) -> tuple[Planes | None, Made | None, str]:
@@ -165,6 +175,7 @@ def calibrated_planes(
     before = provenance_of(opened, camera.ground_plane)
     is_given = camera.ground_plane in opened.channels and (before is None or before.transform not in _MADE)
     is_made = before is not None and before.transform == _CALIBRATE and not choice.is_another(before)
+    is_made = is_made and not _is_recalibrated(opened, camera.prefix, before)
     if is_given or is_made or not _is_calibrated(opened):
         return None, None, ""
     frame, ground_frame = choice.frames(before)

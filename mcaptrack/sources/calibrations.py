@@ -20,7 +20,8 @@ from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.geometry.transform_series import OTHER_CLOCK_S
 from mcaptrack.geometry.transform_tree import Poses, TransformTree
 from mcaptrack.notices import warn
-from mcaptrack.sources.cameras import Camera
+from mcaptrack.schema.provenance import INGEST
+from mcaptrack.sources.cameras import Camera, provenance_of
 from mcaptrack.sources.foreign import stamp_of
 from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name
 from mcaptrack.sources.foreign.flatten import message_type_of
@@ -80,13 +81,15 @@ def find_calibration(opened: log.Log, source: str, frame_id: str) -> str:
     It is one in the same frame, or else in the same folder of topics; of several, the one with the most similar name.
     Raises McaptrackError if there is none, or if several are as similar.
     """
-    known = {topic: _frame_of(opened, topic) for topic, one in opened.channels.items() if holds_calibrations(one)}
+    known = {topic: frame_of(opened, topic) for topic, one in opened.channels.items() if holds_calibrations(one)}
     same = [topic for topic, named in known.items() if frame_id and named == frame_id]
     # Compressed pictures are one level lower: /front/image/compressed is beside /front/camera_info.
     folder = source.rpartition("/")[0]
     folders = (folder, folder.rpartition("/")[0]) if folder.count("/") > 1 else (folder,)
     beside = [topic for topic in known if topic.rpartition("/")[0] in folders]
     fitting = same or beside
+    given = [topic for topic in fitting if (made := provenance_of(opened, topic)) and made.transform == INGEST]
+    fitting = given or fitting  # what a user gave replaces what was recorded
     if not fitting:
         frames = ", ".join(f"{topic} (frame {named or 'without a name'})" for topic, named in sorted(known.items()))
         raise McaptrackError(f"no calibration is of the frame {frame_id!r} of {source}; there is {frames or 'none'}")
@@ -103,7 +106,7 @@ def read_calibrations(opened: log.Log, topic: str, is_rectified: bool) -> list[t
 
     ``is_rectified``: of pictures that are rectified already. Raises McaptrackError for what can't be read.
     """
-    decode = decoder_with_errors(message_type_of(opened, topic), lambda message: _calibration(message, is_rectified))
+    decode = decoder_with_errors(message_type_of(opened, topic), lambda message: calibration_of(message, is_rectified))
     out: list[tuple[int, Calibration]] = []
     for message in opened.timed(topic):
         try:
@@ -130,7 +133,7 @@ def see_ground(opened: log.Log, camera: Camera, frame: str = "", ground_frame: s
     log_ns, stamp_ns, frame_id = _headers(opened, sources)
     topic = find_calibration(opened, sources[0], frame_id)
     size = _picture_size(opened, camera.pictures)
-    found = read_calibrations(opened, topic, _is_rectified(sources[0]))
+    found = read_calibrations(opened, topic, is_rectified_topic(sources[0]))
     known = [(since_ns, _fitted(one, size, topic)) for since_ns, one in found]
     eye = known[0][1].frame_id or frame_id
     tree = transforms_of(opened)
@@ -158,7 +161,7 @@ def moving_camera(opened: log.Log, topic: str, frame: str) -> MovingCamera:
     """
     log_ns, stamp_ns, frame_id = _headers(opened, [topic])
     source = find_calibration(opened, topic, frame_id)
-    found = read_calibrations(opened, source, _is_rectified(topic))
+    found = read_calibrations(opened, source, is_rectified_topic(topic))
     size = _picture_size(opened, topic)
     known = [(since_ns, _fitted(one, size, source)) for since_ns, one in found]
     first = known[0][1]
@@ -175,7 +178,7 @@ def moving_camera(opened: log.Log, topic: str, frame: str) -> MovingCamera:
     )  # fmt: skip
 
 
-def _is_rectified(topic: str) -> bool:
+def is_rectified_topic(topic: str) -> bool:
     """Return whether the pictures of a topic are rectified, by its last part or that before a kind of compression."""
     return any(_RECTIFIED.search(part) for part in topic.split("/")[-2:])
 
@@ -252,7 +255,7 @@ def _headers(opened: log.Log, topics: Sequence[str]) -> tuple[Ints, Ints, str]:
     frame_id = ""
     for topic in topics:
         try:
-            decode = decoder_with_errors(message_type_of(opened, topic), lambda one: (stamp_of(one), _name_of(one)))
+            decode = decoder_with_errors(message_type_of(opened, topic), lambda one: (stamp_of(one), frame_named(one)))
             for message in opened.timed(topic):
                 stamp_ns, named = decode(message.payload)
                 frame_id = frame_id or named
@@ -271,10 +274,10 @@ def _picture_size(opened: log.Log, topic: str | None) -> tuple[int, int] | None:
         return None
 
 
-def _frame_of(opened: log.Log, topic: str) -> str:
+def frame_of(opened: log.Log, topic: str) -> str:
     """Return the frame of the first message of a channel; "" if there is none, or it can't be read."""
     try:
-        decode = decoder_with_errors(message_type_of(opened, topic), _name_of)
+        decode = decoder_with_errors(message_type_of(opened, topic), frame_named)
         return next((str(decode(message.payload)) for message in opened.messages(topic)), "")
     except McaptrackError:
         return ""
@@ -293,19 +296,24 @@ def _is_usable(opened: log.Log, topic: str) -> bool:
         return False
 
 
-def _name_of(message: Any) -> str:
+def frame_named(message: Any) -> str:
+    """Return the frame of reference that a message names; "" if it names none."""
     holder = message.header if hasattr(message, "header") else message
     return str(getattr(holder, "frame_id", "")).removeprefix("/")
 
 
-def _calibration(message: Any, is_rectified: bool) -> Calibration:
+def calibration_of(message: Any, is_rectified: bool) -> Calibration:
+    """Return the calibration that a message holds; ``is_rectified``: of pictures that are rectified already.
+
+    Raises McaptrackError if it isn't calibrated, or has distortion of another kind.
+    """
     width, height = int(message.width), int(message.height)
     numbers = {name: _numbers(message, name) for name in "DKRP"}
     model = str(message.distortion_model).strip().lower()
     if is_rectified and len(numbers["P"]) == 12 and numbers["P"][0] > 0:
         p = numbers["P"]
         turn = np.reshape(numbers["R"], (3, 3)) if any(numbers["R"]) else np.eye(3)
-        return Calibration(_name_of(message), Lens((p[0], p[5]), (p[2], p[6])), width, height, turn)
+        return Calibration(frame_named(message), Lens((p[0], p[5]), (p[2], p[6])), width, height, turn)
     k = numbers["K"]
     if len(k) != 9 or not k[0] > 0:
         raise McaptrackError(f"it isn't calibrated: its focal length is {k[0] if k else 0:g} pixels")
@@ -316,7 +324,7 @@ def _calibration(message: Any, is_rectified: bool) -> Calibration:
     while not is_fisheye and len(bent) > 8 and not bent[-1]:
         bent.pop()
     lens = Lens((k[0], k[4]), (k[2], k[5]), tuple(bent), is_fisheye)
-    return _cropped(message, Calibration(_name_of(message), lens, width, height, np.eye(3)))
+    return _cropped(message, Calibration(frame_named(message), lens, width, height, np.eye(3)))
 
 
 def _cropped(message: Any, one: Calibration) -> Calibration:

@@ -13,6 +13,8 @@ from mcaptrack.files import is_same_file, refuse_special
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.ingest.bags.opening import open_recording
 from mcaptrack.sources.ingest.boxes_3d_job import Boxes3DJob
+from mcaptrack.sources.ingest.calibration import is_calibration
+from mcaptrack.sources.ingest.calibration_job import CalibrationJob
 from mcaptrack.sources.ingest.job import MOTION, IngestJob, IngestOptions, IngestReport, InputRole, Progress
 from mcaptrack.sources.ingest.label_job import LabelJob, label_frames
 from mcaptrack.sources.ingest.labels.box_rows import OTHERS
@@ -100,8 +102,9 @@ def ingest(
         job.report.warnings, job.report.has_labels = warned, job.has_labels
         job.report.uses_classes = bool(job.roles - {"detections"})
         job.report.holds_boxes_3d = isinstance(job, Boxes3DJob)
-        job.report.uses_size = any(labels.format in OTHERS for _, labels in job.labels.values())
-        job.report.uses_camera = bool(job.has_labels or job.homography or job.options.motion) or isinstance(
+        is_sized = bool(job.options.calibration) and not job.pictures
+        job.report.uses_size = is_sized or any(labels.format in OTHERS for _, labels in job.labels.values())
+        job.report.uses_camera = bool(job.has_labels or job.ground_given.is_given or job.options.motion) or isinstance(
             job, VideoJob
         )
     return job.report
@@ -112,6 +115,8 @@ def _job(source: Path, options: IngestOptions, progress: Progress, into: log.Log
     if recorded is not None:
         return RecordingJob(source, options, recorded, progress, into)
     role = options.role
+    if role == "calibration" or (role is None and is_calibration(source)):
+        return CalibrationJob(source, options, into)
     if role != MOTION and is_3d(source, options.label_format, options.columns):
         return Boxes3DJob([(role, source)], options, into)
     if source.is_dir() and role != MOTION and (role or is_label_folder(source)):

@@ -74,6 +74,7 @@ class Boxes3DJob(IngestJob):
         given = {
             options.for_videos(): bool(options.for_videos()),
             "`ground_plane=`": options.ground_plane is not None,
+            "`calibration=`": bool(options.calibration),
             "`motion=`": options.motion is not None,
             "`size=`": options.size is not None,
             "`frames=`": options.frames is not None,

@@ -24,12 +24,14 @@ from mcaptrack.schema.encodings import PROTOBUF, Encoding, encoded, record_of
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance, digest
 from mcaptrack.sources.corrections import CORRECTED
+from mcaptrack.sources.ingest.calibration import GivenCalibration, LengthUnit
+from mcaptrack.sources.ingest.ground import PLANE, GivenGround
 from mcaptrack.sources.ingest.labels.box_rows import OTHERS, fitted
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
 from mcaptrack.sources.ingest.labels.formats import Format, Labels, Role
 from mcaptrack.sources.ingest.labels.label_rows import label_rows
 from mcaptrack.sources.ingest.labels.motions import motion_frames, read_motions
-from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
+from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline
 from mcaptrack.sources.ingest.labels.wanted import ONLY_PEOPLE, WantedClasses, describe_classes
 from mcaptrack.sources.ingest.sidecar import encoding_for
@@ -51,7 +53,7 @@ TOPIC_OF: Final[Mapping[Role, str]] = {"corrections": CORRECTED}
 #: The role of a file with the motion of the camera, and the last part of its topic.
 MOTION: Final = "motion"
 #: What an input that is a text file can hold.
-InputRole: TypeAlias = Role | Literal["motion"]
+InputRole: TypeAlias = Role | Literal["motion", "calibration"]
 _BLOCK: Final = 4096
 
 
@@ -59,7 +61,8 @@ _BLOCK: Final = 4096
 class IngestOptions:
     """Options of making a log. ``labels`` are label files by role; ``role`` is that of an input that is a label file.
 
-    ``motion`` is a file with the motion of the camera.
+    ``motion`` is a file with the motion of the camera, ``calibration`` are files with its calibration; of a file with
+    several cameras ``calibration_name`` chooses one, and ``calibration_unit`` is that of lengths.
 
     ``fps``, ``image_format``, ``quality`` and ``keyframe_interval_s`` are as in ``video.VideoOptions``. ``first_frame``
     is the number that label files give the first picture, if it isn't that of their format; ``frames`` is the number of
@@ -76,6 +79,9 @@ class IngestOptions:
     quality: int | None = None
     keyframe_interval_s: float | None = None
     ground_plane: Path | None = None
+    calibration: tuple[Path, ...] = ()
+    calibration_name: str | None = None
+    calibration_unit: LengthUnit = "auto"
     point: Point = "foot"
     labels: Mapping[Role, Path] = field(default_factory=dict)
     label_format: Format = "auto"
@@ -149,7 +155,10 @@ class IngestJob:
         self.prefix = "/" + options.camera.strip("/")
         #: The topic of the pictures that labels belong to; "" if there is none.
         self.pictures = ""
-        self.homography = read_homography(options.ground_plane) if options.ground_plane else None
+        given = (options.calibration, options.calibration_name, options.calibration_unit)
+        calibration = GivenCalibration.read(*given) if options.calibration else None
+        #: The ground plane and the calibration that were given.
+        self.ground_given = GivenGround(options.ground_plane, calibration, options.point)
         self.labels: dict[Role, tuple[Path, Labels]] = {
             role: (path, self.read(path, role)) for role, path in options.labels.items()
         }
@@ -281,26 +290,25 @@ class IngestJob:
     def topics(self) -> Iterator[str]:
         """The topics that will be written."""
         yield from (f"{self.prefix}/{TOPIC_OF.get(role, role)}" for role in self.labels)
-        if self.homography:
-            yield f"{self.prefix}/ground_plane"
+        yield from (f"{self.prefix}/{suffix}" for suffix in self.ground_given.suffixes())
         if self.motions is not None:
             yield f"{self.prefix}/{MOTION}"
 
-    def plane(self, width_px: int, height_px: int) -> GroundPlane | None:
-        """The ground plane for pictures of this size; None if none was given."""
-        if self.homography is None:
-            return None
-        try:
-            return GroundPlane(self.homography, width_px, height_px, self.options.point)
-        except McaptrackError as error:
-            raise McaptrackError(f"{self.options.ground_plane}: {error}") from None
+    #: The frame of reference of the pictures, where it isn't the name of the camera.
+    frame_id = ""
+
+    def plane(self, width_px: int, height_px: int, is_stated: bool = True) -> GroundPlane | None:
+        """The ground plane for pictures of this size; None if none was given. ``is_stated``: they have this size."""
+        frame_id, remarks = self.frame_id or self.prefix.lstrip("/"), self.report.remarks
+        return self.ground_given.plane((width_px, height_px), self.prefix, self.pictures, frame_id, is_stated, remarks)
 
     def write_plane(self, writer: log.LogWriter, plane: GroundPlane | None, t_ns: int) -> None:
-        """Write the ground plane, if there is one, valid from a time on."""
-        if plane is not None and self.options.ground_plane:
-            rows = plane_to_rows(plane)
-            parameters = {"file": self.options.ground_plane.name, "point": self.options.point}
-            self.write_rows(writer, "ground_plane", GROUND_PLANE, lambda: iter([Frame(t_ns, 0, rows)]), parameters)
+        """Write the ground plane and the calibration, if they were given, valid from a time on."""
+        given = self.ground_given
+        if plane is not None and given.has_plane:
+            frame = Frame(t_ns, 0, plane_to_rows(plane))
+            self.write_rows(writer, PLANE, GROUND_PLANE, lambda: iter([frame]), given.parameters())
+        self.report.messages |= given.write_calibration(writer, self.prefix, self.pictures, t_ns, self.encoding)
 
     def write_labels(self, writer: log.LogWriter, plane: GroundPlane | None, timeline: Timeline) -> None:
         """Write the labels, each frame at the time of its picture."""

@@ -22,6 +22,7 @@ from mcaptrack.notices import warn
 from mcaptrack.schema import GROUND_PLANE, Frame
 from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.schema.provenance import CLOCK
+from mcaptrack.sources.calibrations import frame_of
 from mcaptrack.sources.foreign import holds_pictures
 from mcaptrack.sources.ingest.job import IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.camera import (
@@ -86,18 +87,22 @@ class LabelJob(IngestJob):
         self._start_ns = options.start_ns or 0
         if into is not None:
             self.prefix, self.pictures = camera_of(into, options.camera)
+            self.frame_id = frame_of(into, self.pictures) if self.pictures else ""
         seen = detections_topic(into, self.prefix) if into is not None and not self.pictures else ""
         pictures_of = partial(picture_size, into, self.pictures) if into is not None and self.pictures else None
         self.fit_to_pictures(pictures_of)
         size = self._boxes_extent()
         if into is not None and (self.pictures or seen):
             self.timeline = self._of_pictures(into, self.pictures or seen)
-            needs_size = self.homography or self.motions is not None
+            needs_size = self.ground_given.is_given or self.motions is not None
             size = pictures_of() if needs_size and pictures_of else size
         else:
             self.timeline = self._of_rate(default_fps)
         self._size = size
-        self.ground = self.plane(*size) or self._measured_plane()
+        is_stated = bool(into is not None and self.pictures)
+        if not is_stated and options.size and options.calibration:
+            size, is_stated = options.size, True
+        self.ground = self.plane(*size, is_stated) or self._measured_plane()
 
     def _role_of(self, path: Path) -> Role:
         """The role of a file: tracks if its rows have ids. Detections keep boxes that tracks leave out."""

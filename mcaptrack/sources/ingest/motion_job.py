@@ -6,14 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.schema import DETECTIONS
 from mcaptrack.sources.ingest.job import IngestJob, IngestOptions
-from mcaptrack.sources.ingest.labels.camera import camera_of, picture_size, timeline_of
+from mcaptrack.sources.ingest.labels.camera import boxes_extent, camera_of, picture_size, timeline_of
 
 _BOXES: Final = "detections"
 
@@ -28,6 +25,8 @@ class MotionJob(IngestJob):
             raise McaptrackError(
                 f"{source}: the motion of a camera belongs to a log with its pictures or boxes; name it with `into=`"
             )
+        if options.calibration:
+            raise McaptrackError(f"{source} is the motion of a camera; its calibration is added in a call of its own")
         super().__init__(source, replace(options, motion=source), into)
         self.prefix, self.pictures = camera_of(into, options.camera)
         boxes = into.channels.get(f"{self.prefix}/{_BOXES}")
@@ -35,9 +34,7 @@ class MotionJob(IngestJob):
             self._timeline, self._size = timeline_of(into, self.pictures), picture_size(into, self.pictures)
         elif boxes is not None and boxes.messages and boxes.schema_name == DETECTIONS.name:
             self._timeline = timeline_of(into, boxes.topic)
-            corner = columns_to_boxes(into.rows(boxes.topic, DETECTIONS).rows)
-            right, bottom = (corner[:, :2] + corner[:, 2:]).max(axis=0, initial=1.0)
-            self._size = (int(np.ceil(right)), int(np.ceil(bottom)))
+            self._size = boxes_extent(into, boxes.topic)
         else:
             raise McaptrackError(f"{into.path}: {self.prefix} has no pictures or detections that {source} is about")
 

@@ -18,6 +18,8 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import warn
 from mcaptrack.schema.encodings import CDR
 from mcaptrack.sources import foreign
+from mcaptrack.sources.calibrations import frame_named
+from mcaptrack.sources.foreign.decoding import decoder_with_errors
 from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
 from mcaptrack.sources.ingest.job import IngestJob, IngestOptions, Progress
 from mcaptrack.sources.ingest.labels.camera import choose_camera, picture_predicate, timeline_of
@@ -61,7 +63,7 @@ class RecordingJob(IngestJob):
             self._connections: list[Connection] = []
             self._channels: dict[Connection, int] = {}
             self._written: dict[int, int] = {}
-            if self.labels or self.homography or self.motions is not None:
+            if self.labels or self.ground_given.is_given or self.motions is not None:
                 self._find_pictures()
                 self.fit_to_pictures(self._picture_size)
         except BaseException:
@@ -240,7 +242,18 @@ class RecordingJob(IngestJob):
     # Pictures
 
     def _plane(self) -> GroundPlane | None:
-        return None if self.homography is None else self.plane(*self._picture_size())
+        if not self.ground_given.is_given:
+            return None
+        self.frame_id = self._picture_frame()
+        return self.plane(*self._picture_size())
+
+    def _picture_frame(self) -> str:
+        """The frame of reference of the pictures that labels belong to, by the first of them; "" if it names none."""
+        for connection, message in self._recorded.messages(ReadingNotes()):
+            if connection in self._connections:
+                kind = foreign.MessageType(*connection.schema, connection.encoding)
+                return str(decoder_with_errors(kind, frame_named)(message.payload))
+        return ""
 
     def _picture_size(self) -> tuple[int, int]:
         """Width and height of the pictures that labels belong to."""

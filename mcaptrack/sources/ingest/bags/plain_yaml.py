@@ -7,7 +7,7 @@ reader of a field determines its type.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any, Final, Self
 
 #: Larger than the metadata of a recording with thousands of topics and files.
@@ -37,8 +37,11 @@ class UnsupportedYamlError(ValueError):
     """Invalid YAML, or features that are not supported; the message says where and why."""
 
 
-def load(data: bytes) -> Any:
-    """The only document of ``data``: a Scalar, a list, or a dict with text as its keys. Raises NotPlainError."""
+def load(data: bytes, tags: Collection[str] = ()) -> Any:
+    """The only document of ``data``: a Scalar, a list, or a dict with text as its keys.
+
+    Values may have these tags, which change nothing. Raises UnsupportedYamlError.
+    """
     import yaml
 
     if len(data) > MAX_BYTES:
@@ -51,12 +54,12 @@ def load(data: bytes) -> Any:
         raise UnsupportedYamlError(f"byte {error.start} is no UTF-8") from None
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        return _build(yaml, yaml.parse(text, Loader=loader))
+        return _build(yaml, yaml.parse(text, Loader=loader), tags)
     except yaml.YAMLError as error:
         raise UnsupportedYamlError(" ".join(str(error).split())) from None
 
 
-def _build(yaml: Any, events: Iterator[Any]) -> Any:
+def _build(yaml: Any, events: Iterator[Any], tags: Collection[str]) -> Any:
     """Build the value from parser events, in one loop, because deep nesting must not use the stack."""
     documents: list[Any] = []
     open_values: list[tuple[Any, list[str]]] = [(documents, [])]  # each with the key of the next value
@@ -66,7 +69,7 @@ def _build(yaml: Any, events: Iterator[Any]) -> Any:
             raise UnsupportedYamlError(f"{where}: it has more than {_MAX_VALUES} values")
         if getattr(event, "anchor", None) is not None:
             raise UnsupportedYamlError(f"{where}: anchors and aliases are not read")
-        if getattr(event, "tag", None) not in (None, "!"):
+        if getattr(event, "tag", None) not in (None, "!", *tags):
             raise UnsupportedYamlError(f"{where}: tags are not read")
         value: Any
         if isinstance(event, yaml.ScalarEvent):

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import parse_fps
-from mcaptrack.schema import VIDEO
+from mcaptrack.schema import DETECTIONS, VIDEO
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.foreign.flatten import message_type_of
@@ -162,6 +163,16 @@ def labels_of(opened: log.Log, prefix: str) -> dict[str, ExistingLabels]:
             frames = 1 + max(message.sequence for message in opened.messages(channel.topic, int(t_ns[-1])))
             out[channel.topic] = ExistingLabels(t_ns, frames, fps)
     return out
+
+
+def boxes_extent(opened: log.Log, topic: str) -> tuple[int, int]:
+    """Width and height, at least 1, of pictures that contain all boxes of a channel; (0, 0) if it has no detections."""
+    channel = opened.channels.get(topic)
+    if channel is None or not channel.messages or channel.schema_name != DETECTIONS.name:
+        return 0, 0
+    corner = columns_to_boxes(opened.rows(topic, DETECTIONS).rows)
+    right, bottom = (corner[:, :2] + corner[:, 2:]).max(axis=0, initial=1.0)
+    return int(np.ceil(right)), int(np.ceil(bottom))
 
 
 def picture_size(opened: log.Log, topic: str) -> tuple[int, int]:

@@ -1,0 +1,320 @@
+"""The content of calibration files: intrinsics, distortion, the size of pictures, and the pose of a camera.
+
+Three families are understood: OpenCV's FileStorage, in which names are free and the usual ones are known; ROS's
+``camera_info``, as camera_calibration and camera_info_manager write it, and as ``ros2 topic echo`` prints it; and
+Kalibr's camchain.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Floats
+from mcaptrack.sources.ingest.calibration.trees import read_tree
+
+#: Names of values in files of OpenCV, in small letters and without "_", "-" and blanks.
+_MATRIX: Final = ("cameramatrix", "intrinsicmatrix", "intrinsics", "intrinsic", "mtx", "k", "m1")
+_BENT: Final = (
+    "distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoefs", "distortion", "dist", "d", "d1",
+)  # fmt: skip
+_RVEC: Final = ("rvec", "rotationvector", "rvecs", "rodrigues")
+_TVEC: Final = ("tvec", "translationvector", "tvecs", "translation", "t")
+_ROTATION: Final = ("rotationmatrix", "rotation", "r", "rmat")
+_POSE: Final = ("extrinsicmatrix", "extrinsics", "extrinsic", "tcamworld", "tcw", "rt")
+#: Names that are of one camera of two, and those of the other one.
+_SECOND: Final = ("m2", "cameramatrix2", "d2")
+_FISHEYE: Final = ("fisheyemodel", "fisheye", "isfisheye")
+#: Models of distortion, as ROS, Kalibr and Foxglove name them, and what Foxglove's messages call them.
+POLYNOMIAL, RATIONAL, EQUIDISTANT = "plumb_bob", "rational_polynomial", "kannala_brandt"
+_MODELS: Final = {
+    "plumb_bob": POLYNOMIAL, "radtan": POLYNOMIAL, "radial-tangential": POLYNOMIAL, "brown_conrady": POLYNOMIAL,
+    "rational_polynomial": RATIONAL, "radtan8": RATIONAL,
+    "equidistant": EQUIDISTANT, "equi": EQUIDISTANT, "kannala_brandt": EQUIDISTANT, "fisheye": EQUIDISTANT,
+    "none": POLYNOMIAL, "": POLYNOMIAL,
+}  # fmt: skip
+_READ: Final = "plumb_bob (radtan), rational_polynomial and equidistant (kannala_brandt) are read"
+#: Numbers of coefficients that the models have in messages.
+_COUNTS: Final = {POLYNOMIAL: 5, RATIONAL: 8, EQUIDISTANT: 4}
+_MOST_PX: Final = 1e5
+#: A rotation is one if R R^T is the identity but for so much.
+_ORTHONORMAL: Final = 1e-3
+_NAMED: Final = 12
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """The calibration of one camera, as far as a file has it; the rest is None, or "".
+
+    ``matrix`` (3, 3) and ``bent``, the coefficients of ``model``, are its intrinsics, for pictures of ``size`` (width,
+    height). ``rectified`` (3, 3) and ``projection`` (3, 4) are those of rectified pictures. ``rotation`` (3, 3) and
+    ``translation`` (3,) map points of the world to the camera. ``relative`` names a pose that is relative to another
+    sensor instead. ``topic`` is that of its pictures.
+    """
+
+    path: Path
+    name: str = ""
+    matrix: Floats | None = None
+    bent: tuple[float, ...] = ()
+    model: str = POLYNOMIAL
+    size: tuple[int, int] | None = None
+    rectified: Floats | None = None
+    projection: Floats | None = None
+    rotation: Floats | None = None
+    translation: Floats | None = None
+    relative: str = ""
+    topic: str = ""
+
+
+def read_cameras(path: Path) -> list[CameraFile]:
+    """Return the cameras of a file. Raises McaptrackError, with what is wrong, if it holds no calibration."""
+    tree = read_tree(path)
+    chain = {name: one for name, one in tree.items() if re.fullmatch(r"cam\d+", name) and isinstance(one, dict)}
+    if chain:
+        return [_of_kalibr(path, name, one) for name, one in chain.items()]
+    known = {_plain(name): value for name, value in tree.items()}
+    if "camerainfo" in known and isinstance(known["camerainfo"], dict):
+        known = {_plain(name): value for name, value in known["camerainfo"].items()}
+    if "distortionmodel" in known and ({"cameramatrix", "k"} & known.keys()):
+        return [_of_ros(path, known)]
+    return [_of_opencv(path, known, tree)]
+
+
+def _of_ros(path: Path, known: Mapping[str, Any]) -> CameraFile:
+    width = known.get("imagewidth", known.get("width"))
+    height = known.get("imageheight", known.get("height"))
+    bent = known.get("distortioncoefficients", known.get("d", []))
+    model, coefficients = _distortion(path, str(known["distortionmodel"]), _numbers(path, "distortion", bent))
+    rectified = known.get("rectificationmatrix", known.get("r"))
+    projection = known.get("projectionmatrix", known.get("p"))
+    is_binned = any(_is_set(known.get(name)) and known[name] != "1" for name in ("binningx", "binningy"))
+    if is_binned or _is_cropped(known.get("roi")):
+        raise McaptrackError(
+            f"{path} is for pictures that are binned or a region of others; give that of whole pictures"
+        )
+    name = known.get("cameraname", "")
+    header = known.get("header")
+    name = (
+        name if isinstance(name, str) and name else str(header.get("frame_id", "")) if isinstance(header, dict) else ""
+    )
+    return CameraFile(
+        path, name,
+        matrix=_camera_matrix(path, _matrix(path, "camera_matrix", known.get("cameramatrix", known.get("k")), (3, 3))),
+        bent=coefficients,
+        model=model,
+        size=_size(path, width, height),
+        rectified=None if rectified is None else _matrix(path, "rectification_matrix", rectified, (3, 3)),
+        projection=None if projection is None else _matrix(path, "projection_matrix", projection, (3, 4)),
+    )  # fmt: skip
+
+
+def _of_kalibr(path: Path, name: str, one: Mapping[str, Any]) -> CameraFile:
+    where = f"{path}: {name}"
+    kind = str(one.get("camera_model", ""))
+    if kind != "pinhole":
+        raise McaptrackError(f"{where} is of the camera model {kind or 'unknown'!r:.40}; pinhole is read")
+    inner = _numbers(where, "intrinsics", one.get("intrinsics"))
+    if len(inner) != 4:
+        raise McaptrackError(f"{where} has {len(inner)} intrinsics; a pinhole camera has 4: fu, fv, pu, pv")
+    fu, fv, pu, pv = inner
+    bent = _numbers(where, "distortion_coeffs", one.get("distortion_coeffs", []))
+    model, coefficients = _distortion(where, str(one.get("distortion_model", "")), bent)
+    sizes = one.get("resolution")
+    width, height = sizes if isinstance(sizes, list) and len(sizes) == 2 else (None, None)
+    poses = [key for key in ("T_cam_imu", "T_cn_cnm1") if key in one]
+    for key in poses:
+        _rigid(where, key, _matrix(where, key, one[key], (4, 4)))
+    relative = {"T_cam_imu": "the IMU", "T_cn_cnm1": "the camera before it"}
+    return CameraFile(
+        path, name,
+        matrix=_camera_matrix(where, np.array([[fu, 0, pu], [0, fv, pv], [0, 0, 1.0]])),
+        bent=coefficients,
+        model=model,
+        size=_size(where, width, height),
+        relative=" and ".join(f"{relative[key]} ({key})" for key in poses),
+        topic=str(one.get("rostopic", "")),
+    )  # fmt: skip
+
+
+def _of_opencv(path: Path, known: Mapping[str, Any], tree: Mapping[str, Any]) -> CameraFile:
+    matrix, bent = _first(known, _MATRIX), _first(known, _BENT)
+    names = ", ".join(list(tree)[:_NAMED]) + (" ..." if len(tree) > _NAMED else "") or "nothing"
+    if (second := _first(known, _SECOND)) is not None and matrix is not None:
+        raise McaptrackError(f"{path} holds two cameras ({names}), of which {second[0]} is one; save each to a file")
+    model, coefficients = POLYNOMIAL, tuple[float, ...]()
+    if bent is not None:
+        is_fisheye = any(_is_set(known.get(name)) for name in _FISHEYE)
+        named = str(known.get("distortionmodel", "")) or ("equidistant" if is_fisheye else "")
+        model, coefficients = _distortion(path, named, _numbers(path, bent[0], bent[1]), is_open=not named)
+    size = known.get("imagesize")
+    width, height = size if isinstance(size, list) and len(size) == 2 else _words(size)
+    width = known.get("imagewidth", known.get("width", width))
+    height = known.get("imageheight", known.get("height", height))
+    rotation, translation = _pose(path, known)
+    if matrix is None and rotation is None:
+        raise McaptrackError(
+            f"{path} holds {names}; a calibration has a camera matrix (camera_matrix), a pose (rvec and tvec, or R and "
+            "T), or both"
+        )
+    return CameraFile(
+        path,
+        matrix=None if matrix is None else _camera_matrix(path, _matrix(path, *matrix, (3, 3))),
+        bent=coefficients,
+        model=model,
+        size=_size(path, width, height),
+        rotation=rotation,
+        translation=translation,
+    )
+
+
+def _pose(path: Path, known: Mapping[str, Any]) -> tuple[Floats | None, Floats | None]:
+    """The rotation and the translation of a file of OpenCV; None if it has neither."""
+    rvec, tvec, turn, both = (_first(known, names) for names in (_RVEC, _TVEC, _ROTATION, _POSE))
+    if rvec is None and turn is None and both is not None:
+        name, value = both
+        numbers = _numbers(path, name, value)
+        if len(numbers) not in (12, 16):
+            raise McaptrackError(f"{path}: {name} has {len(numbers)} numbers; a pose is a matrix of 3 x 4 or 4 x 4")
+        pose = np.vstack([np.reshape(numbers, (-1, 4))[:3], [0, 0, 0, 1.0]])
+        _rigid(path, name, pose)
+        return pose[:3, :3], pose[:3, 3]
+    if rvec is None and turn is None and tvec is None:
+        return None, None
+    if tvec is None or (rvec is None and turn is None):
+        there, lacks = ("a rotation", "translation (tvec)") if tvec is None else ("a translation", "rotation (rvec)")
+        raise McaptrackError(f"{path} has {there} and no {lacks}; a pose is both")
+    translation = np.array(_numbers(path, *tvec))
+    given = rvec or turn
+    assert given is not None
+    numbers = _numbers(path, *given)
+    if len(translation) != 3 or len(numbers) not in (3, 9):
+        raise McaptrackError(
+            f"{path}: {given[0]} has {len(numbers)} numbers and {tvec[0]} {len(translation)}; the pose of a camera is "
+            "3 (or a matrix of 9) and 3. Poses of pictures of a board aren't that of the camera in the world"
+        )
+    if len(numbers) == 3:
+        import cv2
+
+        return np.asarray(cv2.Rodrigues(np.array(numbers))[0], np.float64), translation
+    rotation = np.reshape(numbers, (3, 3))
+    _rigid(path, given[0], np.vstack([np.column_stack([rotation, translation]), [0, 0, 0, 1.0]]))
+    return rotation, translation
+
+
+def _rigid(where: object, name: str, pose: Floats) -> None:
+    """Raise McaptrackError unless a matrix (4, 4) is a rotation and a translation."""
+    turn = pose[:3, :3]
+    is_one = np.abs(turn @ turn.T - np.eye(3)).max() < _ORTHONORMAL and np.linalg.det(turn) > 0
+    if not is_one or np.abs(pose[3] - [0, 0, 0, 1]).max() > 0:
+        raise McaptrackError(f"{where}: {name} is not a rotation and a translation")
+
+
+def _camera_matrix(where: object, k: Floats) -> Floats:
+    fx, fy, skew = float(k[0, 0]), float(k[1, 1]), float(k[0, 1])
+    if not (0 < fx < _MOST_PX and 0 < fy < _MOST_PX):
+        raise McaptrackError(f"{where} isn't calibrated: its focal lengths are {fx:g} and {fy:g} pixels")
+    if np.abs([k[1, 0], k[2, 0], k[2, 1], k[2, 2] - 1]).max() > 1e-9 or np.abs(k).max() > _MOST_PX:
+        raise McaptrackError(f"{where}: its camera matrix is not fx 0 cx, 0 fy cy, 0 0 1")
+    if abs(skew) > 1e-3 * fx:
+        raise McaptrackError(f"{where}: its camera matrix has a skew of {skew:g}, which isn't supported")
+    return k
+
+
+def _distortion(where: object, model: str, bent: list[float], is_open: bool = False) -> tuple[str, tuple[float, ...]]:
+    """The model as messages name it, and its coefficients; ``is_open``: the count says which polynomial it is."""
+    kind = _MODELS.get(model.strip().lower())
+    if kind is None:
+        if not any(bent):
+            return POLYNOMIAL, ()
+        raise McaptrackError(f"{where} has distortion by {model!r:.40}; {_READ}")
+    while len(bent) > _COUNTS[RATIONAL] and not bent[-1]:
+        bent = bent[:-1]
+    if len(bent) > _COUNTS[RATIONAL]:
+        raise McaptrackError(
+            f"{where} has {len(bent)} coefficients of distortion, with thin prisms or a tilted sensor; {_READ}"
+        )
+    if kind == POLYNOMIAL and len(bent) > _COUNTS[POLYNOMIAL] and (is_open or any(bent[5:])):
+        kind = RATIONAL
+    if kind == EQUIDISTANT and len(bent) > _COUNTS[EQUIDISTANT] and not any(bent[4:]):
+        bent = bent[:4]
+    if len(bent) not in (0, 4, *([] if kind == EQUIDISTANT else [5, 8])):
+        raise McaptrackError(f"{where} has {len(bent)} coefficients of distortion; {kind} has {_COUNTS[kind]}")
+    wanted = _COUNTS[kind] if bent else 0
+    return kind, tuple((bent + [0.0] * wanted)[:wanted])
+
+
+def _size(where: object, width: Any, height: Any) -> tuple[int, int] | None:
+    """Width and height, if both are given. Raises McaptrackError for what is no size."""
+    if width is None or height is None:
+        return None
+    try:
+        values = float(str(width)), float(str(height))
+    except ValueError:
+        values = (0.0, 0.0)
+    if not all(value.is_integer() and 0 < value < _MOST_PX for value in values):
+        raise McaptrackError(f"{where}: {width!s:.20} x {height!s:.20} is no size of pictures in pixels")
+    return int(values[0]), int(values[1])
+
+
+def _matrix(where: object, name: str, value: Any, shape: tuple[int, int]) -> Floats:
+    numbers = _numbers(where, name, value)
+    if len(numbers) != shape[0] * shape[1]:
+        raise McaptrackError(f"{where}: {name} has {len(numbers)} numbers, and needs {shape[0]} x {shape[1]}")
+    return np.reshape(np.array(numbers), shape)
+
+
+def _numbers(where: object, name: str, value: Any) -> list[float]:
+    """The numbers of a matrix of OpenCV or ROS (rows, cols, data), of a list, of lists of them, or of text."""
+    is_matrix = isinstance(value, dict) and "data" in value
+    data = value["data"] if is_matrix else value
+    try:
+        numbers = [float(part) for part in _flat(data)]
+    except (TypeError, ValueError):
+        numbers = [np.nan]
+    if not np.isfinite(numbers).all():
+        raise McaptrackError(f"{where}: {name} holds something else than finite numbers")
+    counts = [value.get(key) for key in ("rows", "cols")] if is_matrix else []
+    if all(isinstance(one, str) and one.isascii() and one.isdigit() for one in counts) and counts:
+        rows, columns = (int(one[:9]) for one in counts)
+        if rows * columns != len(numbers):
+            raise McaptrackError(f"{where}: {name} has {len(numbers)} numbers, and says that it is {rows} x {columns}")
+    return numbers
+
+
+def _flat(data: Any) -> Iterable[str]:
+    if isinstance(data, str):
+        yield from data.replace(",", " ").split()
+    elif isinstance(data, list):
+        for one in data:
+            yield from _flat(one)
+    else:
+        raise ValueError("no numbers")
+
+
+def _words(value: Any) -> list[str | None]:
+    parts = value.split() if isinstance(value, str) else []
+    return [*parts] if len(parts) == 2 else [None, None]
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[_\-\s]", "", name).lower()
+
+
+def _first(known: Mapping[str, Any], names: Iterable[str]) -> tuple[str, Any] | None:
+    """The first of these names that is known, and its value."""
+    return next(((name, known[name]) for name in names if name in known), None)
+
+
+def _is_set(value: Any) -> bool:
+    """Whether a flag or a number is given and isn't 0 or false."""
+    return isinstance(value, str) and value.strip().lower() not in ("", "0", "0.0", "false", "no")
+
+
+def _is_cropped(roi: Any) -> bool:
+    return isinstance(roi, dict) and any(_is_set(roi.get(key)) for key in ("x_offset", "y_offset", "width", "height"))
