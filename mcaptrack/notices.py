@@ -9,6 +9,7 @@ Python warnings (``McaptrackWarning``), so that scripts and notebooks show them.
 from __future__ import annotations
 
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -132,6 +133,20 @@ def listening(listener: Listener) -> Iterator[None]:
         yield
     finally:
         _LISTENER.reset(token)
+
+
+@contextmanager
+def naming(name: str) -> Iterator[None]:
+    """Warnings in this block begin with this name, unless they have it already."""
+    outside = _LISTENER.get()
+
+    def hear(notice: Notice) -> None:
+        is_named = name in re.split(r"[^\w.-]+", notice.message)
+        words = notice.message if is_named else f"{name}: {notice.message}"
+        _pass_on(notice._replace(message=words), outside)
+
+    with listening(hear):
+        yield
 
 
 @contextmanager

@@ -180,7 +180,7 @@ COMMANDS: dict[str, dict[str, Any]] = {
     },
     "render": {"start_s": 0.0},
     "retrack": {"mode": "both"},
-    "run": {"events": True, "tables": True},
+    "run": {"events": True, "fuse": True, "tables": True},
     "track": {"tracker": "sort"},
     "train": {
         "recipe": "red",

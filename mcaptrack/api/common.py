@@ -86,6 +86,21 @@ def names_of(names: str | Sequence[str] | None) -> tuple[str, ...]:
     return () if names is None else (names,) if isinstance(names, str) else tuple(names)
 
 
+def split_names(parameter: str, given: str | Sequence[str] | None) -> tuple[str, ...]:
+    """Return names that were given as a sequence, or as text with commas between them.
+
+    Raises McaptrackError for an empty name; ``parameter`` is what they were given as.
+    """
+    if given is None:
+        return ()
+    if not isinstance(given, str) and not all(isinstance(name, str) for name in given):
+        raise McaptrackError(f"`{parameter}=` has names, with commas between several, not {given!r:.40}")
+    names = tuple(name.strip() for name in (given.split(",") if isinstance(given, str) else given))
+    if not names or not all(name.strip("/") for name in names):
+        raise McaptrackError(f"`{parameter}=` has an empty name, in {given!r:.40}")
+    return names
+
+
 def log_output(path: PathLike, source: Location) -> Path:
     """Return the path of a log to write, made from ``source``.
 

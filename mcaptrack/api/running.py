@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from time import monotonic
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from mcaptrack import log as logs
-from mcaptrack import pipeline
+from mcaptrack import notices, pipeline
 from mcaptrack.api.common import Notes, PathLike, Progress, as_location, log_output, no_progress, warnings_about
+from mcaptrack.api.several import Act, Done, EveryCamera, refuse_failed, together
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation.zones import ZoneTotals
 from mcaptrack.files import is_same_file, publish_bytes, refuse_overwrite
@@ -26,10 +27,42 @@ from mcaptrack.sources.ingest.bags.metadata_update import update_metadata
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
 from mcaptrack.tables.export import default_folder, export
 from mcaptrack.transforms import STAGES, Transform
+from mcaptrack.transforms.fuse import FootFuser
 
 #: The value of a transform's option.
 Option = float | int | bool | str | None
 Mode = Literal["both", "offline", "online"]
+
+
+@dataclass(frozen=True)
+class CameraResult:
+    """The result for one of several cameras of a log, or for the scene that they are fused to.
+
+    Attributes
+    ----------
+    stages : tuple of str
+        The stages that ran, in order; empty if everything was up to date.
+    frames, rows, tracks : dict of str to int
+        Number of frames, rows and track ids by topic, of the channels that were made.
+    summary : mcaptrack.pipeline.Summary
+        What the log holds of it now, in numbers.
+    is_scene : bool
+        Whether it is a scene.
+
+    """
+
+    stages: tuple[str, ...]
+    frames: Mapping[str, int]
+    rows: Mapping[str, int]
+    tracks: Mapping[str, int]
+    summary: Summary
+    is_scene: bool
+
+    @classmethod
+    def of(cls, done: Done, summary: Summary) -> CameraResult:
+        """Return the result of what was done."""
+        report = done.report
+        return cls(tuple(report.stages), report.frames, report.rows, report.tracks, summary, done.is_scene)
 
 
 @dataclass(frozen=True)
@@ -55,7 +88,8 @@ class RunResult:
     tables : dict of str to int
         Number of rows of each table that was written; only ``run`` writes tables.
     summary : mcaptrack.pipeline.Summary or None
-        What the log holds now, in numbers; only ``run`` counts it.
+        What the log holds now, in numbers; only ``run`` counts it. That of the scene if several cameras were run and
+        fused, None if they were not fused.
     written_to : pathlib.Path, str or None
         The file that holds the new channels: the log, or LOG.results.mcap beside it; None if nothing was written.
     written_because : str
@@ -69,6 +103,12 @@ class RunResult:
     seconds_by_part : dict of str to float
         How long each stage took, and "read", "decode" (waiting for pictures, which are decoded while others are worked
         on), "write", "tables" and "summary".
+    cameras : dict of str to CameraResult
+        What was made for each camera, and for the scene, by name; only of runs of several cameras.
+    left_out : dict of str to str
+        The cameras that were left out, each with the reason.
+    not_fused : str
+        Why the cameras were not fused to a scene; "" if they were, and for one camera.
 
     """
 
@@ -89,6 +129,9 @@ class RunResult:
     notes: tuple[str, ...]
     seconds: float
     seconds_by_part: Mapping[str, float]
+    cameras: Mapping[str, CameraResult] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    not_fused: str = ""
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -118,6 +161,13 @@ class Where:
     force: bool
 
 
+class Fusing(NamedTuple):
+    """The cameras to run, all without names, and whether they are fused to a scene."""
+
+    names: tuple[str, ...] = ()
+    is_on: bool = True
+
+
 def work(
     where: Where,
     plan: Plan,
@@ -126,29 +176,45 @@ def work(
     tables: bool | None,
     plane: PlaneChoice = AS_BEFORE,
     zones: ZoneWatch | None = None,
-    fuses: bool = False,
+    fuses: Fusing | None = None,
 ) -> RunResult:
     """Plan and run on one log. ``tables`` is None where a single stage runs, which neither exports nor summarises.
 
-    With ``fuses`` a scene of several cameras is made again first, if it is out of date.
+    With ``fuses`` all cameras are run, if none is named, and a scene of several is made again if it is out of date.
     """
+    force = where.force
 
-    def act(opened: logs.Log, output: Path | None, notes: Notes, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
-        topics = watch.topics if watch else zones.topics if zones else ()
-        prefix = pipeline.find_camera(opened, where.camera, where.topic or next(iter(topics), None))
-        fused = pipeline.fuse_again(opened, prefix, where.force, notes.say, progress) if fuses else {}
-        jobs = plan(opened, prefix, notes.say, fused)
-        return prefix, pipeline.run(opened, prefix, jobs, output, progress, watch, plane, boxes, zones, fused)
+    def run_at(prefix: str, progress: Progress) -> Act:
+        """Run a camera; without a prefix the only one."""
 
-    return change(where, act, progress, tables)
+        def act(opened: logs.Log, output: Path | None, notes: Notes, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
+            topics = watch.topics if watch else zones.topics if zones else ()
+            at = prefix or pipeline.find_camera(opened, where.camera, where.topic or next(iter(topics), None))
+            fused = {}
+            if fuses is not None:
+                fused = pipeline.fuse_again(opened, at, force, notes.say, progress, adds=not fuses.names)
+            jobs = plan(opened, at, notes.say, fused)
+            return at, pipeline.run(opened, at, jobs, output, progress, watch, plane, boxes, zones, fused)
+
+        return act
+
+    def fuse_to(scene: str, names: Sequence[str], progress: Progress) -> Act:
+        def act(opened: logs.Log, output: Path | None, notes: Notes, _: BoxesRead) -> tuple[str, pipeline.Report]:
+            notes.say(f"fusing {', '.join(names)} to /{scene}")
+            return pipeline.fuse_cameras(opened, names, scene, FootFuser(), {}, output, progress, is_asked=False)
+
+        return act
+
+    each = None
+    if fuses is not None and where.topic is None and (where.camera is None or len(fuses.names) > 1):
+        each = EveryCamera(fuses.names, fuses.is_on, run_at, fuse_to)
+    return change(where, run_at("", progress), progress, tables, each)
 
 
-#: Changes an open log, or a copy of it at the path; returns the prefix of the camera, and what was done.
-Act = Callable[[logs.Log, Path | None, Notes, BoxesRead], tuple[str, pipeline.Report]]
-
-
-def change(where: Where, act: Act, progress: Progress, tables: bool | None) -> RunResult:
-    """Change one log; ``tables`` as for ``work``."""
+def change(
+    where: Where, act: Act, progress: Progress, tables: bool | None, each: EveryCamera | None = None
+) -> RunResult:
+    """Change one log; ``tables`` as for ``work``. With ``each`` all its cameras are run, if it has several."""
     began = monotonic()
     path = as_location(where.log)
     output = None if where.output is None else log_output(where.output, path)
@@ -166,9 +232,17 @@ def change(where: Where, act: Act, progress: Progress, tables: bool | None) -> R
         with logs.read(path, sidecar=None if output else place) as opened:
             if output is None:
                 opened.lock()  # a second process is refused before it computes anything
-            prefix, report = act(opened, output, notes, boxes)
-            named = {topic: pipeline.camera_to_name(opened, topic) for topic in report.stale}
+            has_several = each is not None and each.chooses(opened, notes)
+            done = [] if has_several else [Done("", *act(opened, output, notes, boxes))]
             written_to = output or opened.parts[-1].path
+            report = together([one.report for one in done])
+            named = {topic: pipeline.camera_to_name(opened, topic) for topic in report.stale}
+        if each is not None and has_several:
+            done = each.run(path, output, place, notes, progress)
+            report = together([one.report for one in done])
+            with logs.read(target) as opened:
+                report.stale = [topic for topic in report.stale if pipeline.is_stale(opened, topic)]
+                named = {topic: pipeline.camera_to_name(opened, topic) for topic in report.stale}
         if written_to == path and isinstance(path, Path):
             update_metadata(path)
         layouts = write_layouts(target, report.layouts)
@@ -180,14 +254,19 @@ def change(where: Where, act: Act, progress: Progress, tables: bool | None) -> R
             notes.say(
                 f"no tables are written, because {target} is in a store; {call('export', target)} writes them here"
             )
+        refuse_failed(target, done)
         counted = {}
         if report.has_zones:
             with logs.read(target) as opened:
-                counted = {one.topic: one.totals for one in pipeline.counted_zones(opened, prefix)}
-        summary = None
+                found = [one for camera in done for one in pipeline.counted_zones(opened, camera.prefix)]
+                counted = {one.topic: one.totals for one in found}
+        summaries: dict[str, Summary] = {}
         if tables is not None:
             with report.watch.part("summary"), logs.read(target) as opened:
-                summary = pipeline.summarise(opened, prefix, boxes)
+                for one in done:
+                    with notices.naming(one.name) if has_several else nullcontext():
+                        summaries[one.name] = pipeline.summarise(opened, one.prefix, boxes)
+    scene = next((one.name for one in reversed(done) if one.is_scene), None) if has_several else ""
     return RunResult(
         log=target,
         stages=tuple(report.stages),
@@ -199,13 +278,16 @@ def change(where: Where, act: Act, progress: Progress, tables: bool | None) -> R
         stale=tuple(report.stale),
         layouts=tuple(layouts),
         tables=rows,
-        summary=summary,
+        summary=None if scene is None else summaries.get(scene),
         written_to=written_to if report.stages else None,
         written_because=place.why,
         warnings=tuple(dict.fromkeys(warnings)),
         notes=tuple(notes),
         seconds=round(monotonic() - began, 3),
         seconds_by_part={name: round(seconds, 3) for name, seconds in report.watch.seconds.items()},
+        cameras={one.name: CameraResult.of(one, summaries[one.name]) for one in done} if has_several else {},
+        left_out=dict(each.left_out) if each is not None else {},
+        not_fused=each.not_fused if each is not None else "",
     )
 
 

@@ -7,9 +7,11 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import PathLike, Progress, names_of, no_progress, warn_unused
-from mcaptrack.api.running import RunResult, Where, transform_of, transforms_of, work
+from mcaptrack.api.common import PathLike, Progress, names_of, no_progress, split_names, warn_unused
+from mcaptrack.api.running import Fusing, RunResult, Where, transform_of, transforms_of, work
+from mcaptrack.api.several import unfitting
 from mcaptrack.api.zoning import ZonesLike, zones_of
+from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.aligned import Similarity
 from mcaptrack.evaluation.events import EventOptions
 from mcaptrack.evaluation.zones import ZoneOptions
@@ -23,13 +25,14 @@ def run(
     log: PathLike,
     *,
     topic: str | None = None,
-    camera: str | None = None,
+    camera: str | Sequence[str] | None = None,
     frame: str | None = None,
     output: PathLike | None = None,
     sidecar: bool | None = None,
     events: bool | EventOptions = True,
     tables: bool = True,
     zones: ZonesLike | None = None,
+    fuse: bool = True,
     force: bool = False,
     detector: str | Transform | None = None,
     tracker: str | Transform | None = None,
@@ -46,6 +49,9 @@ def run(
 ) -> RunResult:
     """Run all stages that are missing or out of date, then write events, views, layouts and tables.
 
+    Of a log with several cameras all are run, one after the other. Those that have a measured ground plane are then
+    fused to a scene, as ``fuse`` does, and the scene is run, too.
+
     Channels that are up to date stay as they are; those that are out of date are made again with the options that
     they had.
 
@@ -55,8 +61,9 @@ def run(
         The log.
     topic : str, optional
         Begin with the pictures, or the detections, of this channel.
-    camera : str, optional
-        Name of the camera, if the log has several.
+    camera : str or sequence of str, optional
+        Names of the cameras to run, also with commas between them; by default all that have pictures or boxes. One
+        name runs this camera, or this scene, alone.
     frame : str, optional
         Bring boxes in space (3D) to this frame. By default as before, or to the root of the tree of frames, such as
         map.
@@ -72,6 +79,9 @@ def run(
     zones : path or mapping, optional
         Count visits of zones and crossings of lines, of a file of GeoJSON, or of its content (see ``zones``). By
         default those that the log was counted with before, if any.
+    fuse : bool, default True
+        Whether several cameras with measured ground planes are fused to a scene, ``/world``, and scenes that were made
+        before are brought up to date.
     force : bool, default False
         Run everything again, and overwrite ``output`` if it exists.
     detector, tracker, retracker, predictor : str or Transform, optional
@@ -118,6 +128,9 @@ def run(
     True
 
     """
+    names = tuple(dict.fromkeys(split_names("camera", camera)))
+    if len(names) > 1 and topic is not None:
+        raise McaptrackError(f"`topic={topic}` is of one camera, and `camera=` names {len(names)}; leave one out")
     named = {"detector": detector, "tracker": tracker, "retracker": retracker, "predictor": predictor}
     chosen = {kind: one for kind, one in named.items() if one is not None}
     transforms = transforms_of(stages)
@@ -128,16 +141,17 @@ def run(
     shared = {name: value for name, value in given.items() if value is not None}
 
     def plan(opened: logs.Log, prefix: str, say: Callable[[str], None], changed: Collection[str]) -> list[Job]:
-        return pipeline.plan_all(
-            opened, prefix, say, topic, transforms, force, chosen, shared, plane, frame or "", changed
-        )
+        others = unfitting(opened, prefix, transforms, say) if len(names) != 1 and topic is None else set()
+        kept = {stage: one for stage, one in transforms.items() if stage not in others}
+        options = chosen.keys() - {STAGES[stage].option for stage in others}
+        return pipeline.plan_all(opened, prefix, say, topic, kept, force, options, shared, plane, frame or "", changed)
 
     options = events if isinstance(events, EventOptions) else EventOptions()
     watch = Watch(options, force=force) if events else None
     given_zones = zones_of(zones)
     counted = ZoneWatch(given_zones, options=ZoneOptions() if given_zones else None, force=force)
-    where = Where(log, camera, topic, output, sidecar, force)
-    return work(where, plan, watch, progress, tables, plane, counted, fuses=True)
+    where = Where(log, names[0] if len(names) == 1 else None, topic, output, sidecar, force)
+    return work(where, plan, watch, progress, tables, plane, counted, fuses=Fusing(names, fuse))
 
 
 @checked(gate_m=(0.001, 1e6), min_iou=(0.001, 1))

@@ -14,6 +14,7 @@ from mcaptrack.errors import command
 
 if TYPE_CHECKING:
     from mcaptrack import RunResult
+    from mcaptrack.api.running import CameraResult
     from mcaptrack.pipeline import Summary
 
 #: Runs stages on a log; takes the keywords output, sidecar, force and camera, and may take progress.
@@ -59,22 +60,38 @@ def _as_json(result: RunResult) -> dict[str, Any]:
         "written_to": str(result.written_to) if result.written_to else None,
         "written_there_because": with_flags(result.written_because) or None,
     }
-    if result.summary is not None:
+    if result.cameras:
+        data |= {
+            "tables": result.tables,
+            "summary": None if result.summary is None else result.summary.to_json(),
+            "cameras": {name: _camera_as_json(one) for name, one in result.cameras.items()},
+        }
+    elif result.summary is not None:
         data |= {"tables": result.tables, "summary": result.summary.to_json()}
     else:
         data |= {"rows": result.rows, "tracks": result.tracks}
     data |= {"seconds": result.seconds, "seconds_by_part": dict(result.seconds_by_part)}
+    if result.cameras or result.left_out:
+        data |= {"left_out": dict(result.left_out), "not_fused": with_flags(result.not_fused) or None}
     return data | {"next": _next(result)}
+
+
+def _camera_as_json(camera: CameraResult) -> dict[str, Any]:
+    """Return the result for one of several cameras as values of JSON."""
+    counts = {"frames": camera.frames, "rows": camera.rows, "tracks": camera.tracks}
+    return {"is_scene": camera.is_scene, "stages": list(camera.stages), **counts, "summary": camera.summary.to_json()}
 
 
 def _next(result: RunResult) -> list[str]:
     """Return commands to run next."""
     show = "view" if isinstance(result.log, Path) else "report"  # viewers open files
-    if result.summary is None:
+    if result.summary is None and not result.cameras:
         if result.stages == ("fuse",):
             scene = next(iter(result.frames)).split("/")[1]
             return [command("run", result.log, "--camera", scene).strip("`")]
         steps = [show] if result.stages == ("events",) else ["run"]
+    elif result.summary is None:
+        steps = [show if show == "view" else "info"]  # a report is on one camera
     elif not result.summary.tracks:
         steps = ["info"]
     else:
@@ -90,9 +107,10 @@ def _print(result: RunResult, shows_events: bool, talk: common.Talk) -> None:
         (talk.say if shows_events else talk.detail)(f"{topic}: {words}")
     if result.tables:
         talk.detail(f"{result.log}: {', '.join(f'{name} {rows}' for name, rows in result.tables.items())}")
-    did = f"{', '.join(result.stages)} in {result.seconds:.1f} s" if result.stages else _UP_TO_DATE
+    did = f"{', '.join(dict.fromkeys(result.stages))} in {result.seconds:.1f} s" if result.stages else _UP_TO_DATE
     talk.say(f"{result.log}: {did}")
-    lines = [*_lines_of_run(result)] if result.summary is not None else [*_lines_of_stage(result)]
+    is_run = result.summary is not None or result.cameras
+    lines = [*_lines_of_run(result)] if is_run else [*_lines_of_stage(result)]
     if result.stages and (slow := _slow_parts(result)):
         lines.append(("time", slow))
     if result.written_because and result.written_to:
@@ -113,7 +131,10 @@ def _slow_parts(result: RunResult) -> str:
 
 def _line_of(result: RunResult, shows_events: bool) -> str:
     """Return the result for one of many logs in one line."""
-    words = [f"{', '.join(result.stages)} in {result.seconds:.1f} s" if result.stages else _UP_TO_DATE]
+    did = f"{', '.join(dict.fromkeys(result.stages))} in {result.seconds:.1f} s"
+    words = [did if result.stages else _UP_TO_DATE]
+    if result.cameras:
+        words.append(f"{sum(not one.is_scene for one in result.cameras.values())} cameras")
     if shows_events:
         counts = Counter({kind: n for kinds in result.events.values() for kind, n in kinds.items() if n})
         words.append(", ".join(f"{kind} {count}" for kind, count in counts.items()) or "nothing happened")
@@ -127,6 +148,14 @@ def _line_of(result: RunResult, shows_events: bool) -> str:
 
 def _lines_of_run(result: RunResult) -> Iterator[tuple[str, str]]:
     """Yield a line for each part of the result of ``run``: its name and its text."""
+    for name, camera in result.cameras.items():
+        if not camera.is_scene:
+            yield name, _line_of_camera(camera)
+    for name, why in result.left_out.items():
+        yield name, f"left out: it {with_flags(why)}"
+    if result.cameras:
+        scenes = [f"{name}, the scene" for name, camera in result.cameras.items() if camera.is_scene]
+        yield "fused", ", ".join(scenes) or f"no: {with_flags(result.not_fused)}"
     if result.summary is not None:
         yield from _lines_of_summary(result.summary)
     if result.zones:
@@ -136,6 +165,24 @@ def _lines_of_run(result: RunResult) -> Iterator[tuple[str, str]]:
     codes = [notice.code for notice in result.warnings]
     if codes:
         yield "warnings", f"{len(codes)}, see above: {', '.join(dict.fromkeys(codes))}"
+
+
+def _line_of_camera(camera: CameraResult) -> str:
+    """Return what was made of one of several cameras, in one line."""
+    summary, words = camera.summary, []
+    if summary.pictures is not None:
+        words.append(f"{summary.pictures:,} pictures")
+    if summary.boxes is not None:
+        words.append(f"{summary.boxes:,} boxes")
+    if summary.tracks is not None:
+        words.append(f"{summary.tracks:,} {'track' if summary.tracks == 1 else 'tracks'}")
+    if summary.repair is not None:
+        words.append(f"{summary.repair.tracks:,} after re-tracking")
+    if summary.scores is not None:
+        words.append(f"IDF1 {summary.scores.idf1[1]:.1%}")
+    if summary.ground_plane is not None:
+        words.append(f"ground plane {summary.ground_plane}")
+    return ", ".join(words)
 
 
 def _lines_of_summary(summary: Summary) -> Iterator[tuple[str, str]]:

@@ -231,7 +231,16 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
 def run_all(
     logs: common.Logs,
     topic: Topic = None,
-    camera: common.Camera = None,
+    camera: Annotated[
+        str | None,
+        common.option(
+            "--camera",
+            panel=common.FILES,
+            metavar="A,B",
+            help="Which cameras, if the log has several; one alone is not fused.",
+            show_default="all",
+        ),
+    ] = None,
     frame: Frame = None,
     output: common.Output = None,
     sidecar: common.Sidecar = None,
@@ -256,6 +265,14 @@ def run_all(
             show_default="those that were counted before",
         ),
     ] = None,
+    fuse: Annotated[
+        bool,
+        common.option(
+            "--fuse/--no-fuse",
+            tuning=True,
+            help="Fuse several cameras with measured ground planes to a scene, as `mcaptrack fuse` does.",
+        ),
+    ] = True,
     force: Annotated[
         bool,
         common.option("--force", panel=common.FILES, help="Run everything again, and replace the file that -o names."),
@@ -336,9 +353,12 @@ def run_all(
     are made again with the parameters they had. --force makes all again, with the parameters that environment and
     config files set now, otherwise with those they had. Zones of --zones are counted in later runs, too.
 
+    All cameras of a log are run, one after the other. Those with a measured ground plane are fused to /world, as
+    `mcaptrack fuse` does, and this scene is run, too.
+
     Example: mcaptrack run log.mcap
     """
-    given = {"logs": logs, "camera": camera, "output": output, "sidecar": sidecar, "force": force}
+    given = {"logs": logs, "output": output, "sidecar": sidecar, "force": force}
     given |= {"json": json, "quiet": quiet, "verbose": verbose}
     named = {"detector": detector, "tracker": tracker, "retracker": retracker, "predictor": predictor}
     chosen = {kind: name for kind, name in named.items() if name}
@@ -347,7 +367,14 @@ def run_all(
 
     with stdout_to_stderr():
         settings, stages = settings_of("events"), configured(chosen)
-    options: dict[str, Any] = {"topic": topic, "tables": tables, "frame": frame, "camera_motion": camera_motion}
+    options: dict[str, Any] = {
+        "camera": camera,
+        "fuse": fuse,
+        "topic": topic,
+        "tables": tables,
+        "frame": frame,
+        "camera_motion": camera_motion,
+    }
     options |= {"fit_plane": fit_plane, "person_height_m": person_height_m, "ground_frame": ground_frame}
     options |= {"across_classes": across_classes, "class_limits": class_limits, "zones": zones}
     for stage in STAGES.values():

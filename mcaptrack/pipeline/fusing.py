@@ -29,9 +29,9 @@ from mcaptrack.schema import BOX_PX, DETECTIONS, SIGHTINGS, Frame, Schema
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import FUSE, Provenance, frame_id_of
-from mcaptrack.sources.cameras import Camera, cameras, provenance_of
+from mcaptrack.sources.cameras import Camera, cameras, provenance_of, scenes_of
 from mcaptrack.transforms import STAGES
-from mcaptrack.transforms.fuse import CameraView, FootFuser, Offset, compare
+from mcaptrack.transforms.fuse import CameraView, FootFuser, Offset, Shared, compare
 
 #: The frame of the metres, if the ground planes name none.
 _FRAME: Final = "map"
@@ -115,6 +115,7 @@ def fuse_cameras(
     clock_offset_s: Mapping[str, float],
     output: Path | None,
     progress: Callable[[str, int, int], None],
+    is_asked: bool = True,
 ) -> tuple[str, Report]:
     """Fuse the detections of cameras, and write them below the name of the scene.
 
@@ -132,6 +133,8 @@ def fuse_cameras(
         Write to this copy instead.
     progress : callable
         Called as ``progress(stage, done, total)``.
+    is_asked : bool
+        Whether the user asked for it: otherwise cameras that don't see the same people are refused.
 
     Returns
     -------
@@ -142,7 +145,8 @@ def fuse_cameras(
     Raises
     ------
     McaptrackError
-        If there is nothing to fuse, or if a channel that others recorded would be replaced.
+        If there is nothing to fuse, or if a channel that others recorded would be replaced; without ``is_asked`` also
+        if the cameras don't agree.
     """
     prefix = "/" + scene.strip("/")
     for topic in _topics(prefix):
@@ -151,7 +155,7 @@ def fuse_cameras(
                 f"{opened.path}: {topic} {describe_origin(opened, topic)}; give the scene another name with `to=`"
             )
     with collected() as warnings:
-        out = _fuse(opened, names, prefix, fuser, clock_offset_s, progress)
+        out = _fuse(opened, names, prefix, fuser, clock_offset_s, progress, is_asked)
     report = Report(stages=[FUSE], layouts=write(opened, prefix, out, (), {}, output), warnings=list(warnings))
     for topic, channel in out.items():
         report.count(topic, channel)
@@ -160,23 +164,68 @@ def fuse_cameras(
 
 
 def fuse_again(
-    opened: log.Log, prefix: str, force: bool, say: Callable[[str], None], progress: Callable[[str, int, int], None]
+    opened: log.Log,
+    prefix: str,
+    force: bool,
+    say: Callable[[str], None],
+    progress: Callable[[str, int, int], None],
+    adds: bool = False,
 ) -> dict[str, Made]:
     """Make the scene below ``prefix`` again if it is out of date, or with ``force``; {} if there is none to make.
 
-    The cameras and parameters are those that it was made with; so are offsets of clocks that were given. Raises
+    The cameras and parameters are those that it was made with; so are offsets of clocks that were given. With ``adds``
+    it is also made again if cameras can be fused now that it lacks, unless its cameras were chosen. Raises
     McaptrackError as ``fuse_cameras`` does.
     """
     target = next(iter(_topics(prefix)))
     made = provenance_of(opened, target)
-    if made is None or made.transform != FUSE or not (force or is_stale(opened, target)):
+    if made is None or made.transform != FUSE:
         return {}
     names = [str(name) for name in made.parameters["cameras"]]
+    is_open = adds and not made.parameters.get("cameras_given")
+    more = [name for name in fusable(opened, (), prefix)[0] if name not in names] if is_open else []
+    if not (force or more or is_stale(opened, target)):
+        return {}
     offset_s = dict(zip(names, made.parameters["clock_offset_s"], strict=True))
     given = {name: float(offset_s[name]) for name in made.parameters.get("clock_offsets_given", ())}
     options = {one.name: made.parameters[one.name] for one in fields(FootFuser) if one.name in made.parameters}
-    say(f"{target} was made from earlier detections or ground planes: fusing {', '.join(names)} again, as before")
-    return _fuse(opened, names, prefix, FootFuser(**options), given, progress)
+    why = f"was made without {', '.join(more)}" if more else "was made from earlier detections or ground planes"
+    names = sorted((*names, *more)) if more else names
+    say(f"{target} {why}: fusing {', '.join(names)} again, as before")
+    is_chosen = bool(made.parameters.get("cameras_given"))
+    return _fuse(opened, names, prefix, FootFuser(**options), given, progress, is_asked=is_chosen, is_again=True)
+
+
+def fusable(opened: log.Log, names: Sequence[str] = (), scene: str = "/world") -> tuple[list[str], str]:
+    """Return the names of the cameras that can be fused, of these or of all, and why there is nothing to fuse.
+
+    There is if two cameras have detections and a measured ground plane, in the same frame.
+    """
+    scenes = {scene, *scenes_of(opened)}
+    ours = [one for one in cameras(opened) if one.prefix not in scenes and (not names or _has_name(one, names))]
+    lacks = {one: _lack(opened, one) for one in ours}
+    able = [one for one, why in lacks.items() if not why]
+    listed = [one.prefix[1:] for one in able]
+    frames = {name: _frame_of(opened, one) for name, one in zip(listed, able, strict=True)}
+    if len(able) < 2:
+        why = "; ".join(f"{one.prefix[1:]} {reason}" for one, reason in lacks.items() if reason)
+        return [], f"only {listed[0]} can be fused, since {why}" if able else why
+    if len(set(frames.values())) > 1:
+        return [], f"their ground planes are in different frames, {_in_words(frames)}"
+    return listed, ""
+
+
+def _has_name(camera: Camera, names: Sequence[str]) -> bool:
+    return any(name.strip("/") in names for name in camera.names)
+
+
+def _frame_of(opened: log.Log, camera: Camera) -> str:
+    """The frame of the metres of a camera's ground plane."""
+    return frame_id_of(opened.channels[camera.ground_plane].metadata) or _FRAME
+
+
+def _in_words(frames: Mapping[str, str]) -> str:
+    return ", ".join(f"{name} in {frame}" for name, frame in frames.items())
 
 
 def _topics(prefix: str) -> dict[str, Schema]:
@@ -192,6 +241,8 @@ def _fuse(
     fuser: FootFuser,
     clock_offset_s: Mapping[str, float],
     progress: Callable[[str, int, int], None],
+    is_asked: bool = True,
+    is_again: bool = False,
 ) -> dict[str, Made]:
     """Fuse cameras as ``fuse_cameras`` does, and return the channels by topic."""
     topics = _topics(prefix)
@@ -199,13 +250,17 @@ def _fuse(
     with collected() as warnings:
         chosen = _chosen(opened, names, prefix)
         sources, references, classes, frame_id = _sources(opened, chosen, clock_offset_s)
-        gathered, fuser, offsets, offset_s = _compared(sources, fuser, clock_offset_s)
+        gathered, fuser, offsets, offset_s, shared = _compared(sources, fuser, clock_offset_s)
+        if shared.are_strangers and not is_asked and not is_again:
+            raise McaptrackError(f"{shared}; `mcaptrack.fuse` fuses them nevertheless")
         collectors = [FrameCollector(schema) for schema in topics.values()]
         for count, made in enumerate(fuser(gathered), start=1):
             progress(FUSE, count, len(gathered))
             for frame, collector in zip(made, collectors, strict=True):
                 collector.append(frame)
-        _say(opened, fuser.views, offsets, offset_s, clock_offset_s)
+        if shared.are_strangers:
+            warn(str(shared), "cameras-disagree")
+        _say(fuser.views, offsets, offset_s, clock_offset_s)
         if gathered.left_out:
             warn(
                 f"{gathered.left_out} frames of {gathered.at.view.name} are left out: they are before time 0, as its "
@@ -220,6 +275,7 @@ def _fuse(
         "cameras": [view.name for view in fuser.views],
         "clock_offset_s": [offset_s[view.name] for view in fuser.views],
         "clock_offsets_given": sorted(clock_offset_s),
+        **({"cameras_given": True} if names and is_asked else {}),
         "detects": [[round(rate, 4) for rate in view.detects] for view in fuser.views],
         "false_share": [round(view.false_share, 4) for view in fuser.views],
     }
@@ -302,8 +358,7 @@ def _sources(
                     f"{opened.path}: class {number} is {classes[str(number)]} in one camera and {word} in {topic}; "
                     "detect them by the same detector"
                 )
-        plane = opened.channels[camera.ground_plane]
-        frames_of[name] = frame_id_of(plane.metadata) or _FRAME
+        frames_of[name] = _frame_of(opened, camera)
         view = CameraView(name=name, planes=tuple(read_planes(opened, camera.prefix) or ()))
         boxes = [columns_to_boxes(frame.rows) for frame in islice(iter(found.frames), _COMPARED)]
         joined = np.concatenate([part for part in boxes if len(part)] or [np.empty((0, len(BOX_PX)))])
@@ -314,14 +369,13 @@ def _sources(
     if not sources:
         raise McaptrackError(f"{opened.path} has no detections to fuse: all channels are empty")
     if len(set(frames_of.values())) > 1:
-        there = ", ".join(f"{name} in {frame}" for name, frame in frames_of.items())
-        raise McaptrackError(f"{opened.path}: the ground planes are in different frames: {there}")
+        raise McaptrackError(f"{opened.path}: the ground planes are in different frames: {_in_words(frames_of)}")
     return sources, references, classes, next(iter(frames_of.values()))
 
 
 def _compared(
     sources: list[_Source], fuser: FootFuser, given: Mapping[str, float]
-) -> tuple[Gathered, FootFuser, tuple[Offset, ...], dict[str, float]]:
+) -> tuple[Gathered, FootFuser, tuple[Offset, ...], dict[str, float], Shared]:
     """Estimate how well the cameras agree, and the offsets of clocks that are not given."""
     offset_s = {one.view.name: given.get(one.view.name, 0.0) for one in sources}
     for _ in range(3):
@@ -330,7 +384,7 @@ def _compared(
         every = max(len(gathered) // _COMPARED, 1)
         part = (frame for number, frame in enumerate(gathered) if number // 2 % every == 0)
         taken_ns = [round(offset_s[one.view.name] * NS_PER_S) for one in sources]
-        views, offsets = compare(part, fuser, taken_ns)
+        views, offsets, shared = compare(part, fuser, taken_ns)
         late = {
             view.name: round(offset.late_s, 3)
             for view, offset in zip(views, offsets, strict=True)
@@ -343,11 +397,10 @@ def _compared(
         offset_s[worst] = round(offset_s[worst] + late[worst], 3)
         shift_ns = round(late[worst] * NS_PER_S)
         sources = [one._replace(t_ns=one.t_ns - shift_ns) if one.view.name == worst else one for one in sources]
-    return gathered, replace(fuser, views=views), offsets, offset_s
+    return gathered, replace(fuser, views=views), offsets, offset_s, shared
 
 
 def _say(
-    opened: log.Log,
     views: Sequence[CameraView],
     offsets: Sequence[Offset],
     offset_s: Mapping[str, float],

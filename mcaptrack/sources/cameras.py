@@ -19,7 +19,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SCHEMAS, TRACKS, Frame, Rows
 from mcaptrack.schema.framing import JoinedFrames, has_any, mapped_rows
-from mcaptrack.schema.provenance import Provenance, frame_id_of, input_of
+from mcaptrack.schema.provenance import FUSE, Provenance, frame_id_of, input_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.fixed_frame import holds_boxes, holds_boxes_3d
 from mcaptrack.transforms import STAGES
@@ -64,6 +64,8 @@ def name_above(topic: str) -> str:
 def find_camera(opened: log.Log, name: str | None = None, topic: str | None = None) -> str:
     """Return the prefix of a camera: the one of a topic, the one with this name, or the only one of the log.
 
+    Of several cameras the scene that they were fused to is taken, or the one called "camera", with a warning.
+
     Raises McaptrackError if the log has several cameras and none is named, or if the topic belongs to another camera
     than the named one.
     """
@@ -79,7 +81,7 @@ def find_camera(opened: log.Log, name: str | None = None, topic: str | None = No
         return camera_at(opened, "/" + name.strip("/")).prefix
     known = _with_pictures_first(opened, cameras(opened))
     # Recorded cameras without results count only if no camera has any.
-    chosen = [camera for camera in known if _has_own_channels(opened, camera)]
+    chosen = [camera for camera in known if has_own_channels(opened, camera)]
     if not chosen:
         # With several recorded cameras, the planner asks for one by name and lists them.
         if known and all(camera.in_space for camera in known):
@@ -89,7 +91,8 @@ def find_camera(opened: log.Log, name: str | None = None, topic: str | None = No
         return chosen[0].prefix
     names = ", ".join(camera.prefix for camera in chosen)
     kind = "cameras" if not any(camera.in_space for camera in chosen) else "sensors"
-    usual = [camera.prefix for camera in chosen if f"/{DEFAULT_CAMERA}" in camera.names]
+    scenes = list(scenes_of(opened))
+    usual = scenes if len(scenes) == 1 else [one.prefix for one in chosen if f"/{DEFAULT_CAMERA}" in one.names]
     if not usual:
         raise McaptrackError(f"{opened.path} has several {kind}, {names}; choose one with `camera=`")
     warn(f"several {kind}, {names}: taking {usual[0]}; `camera=` chooses another", "chosen-camera")
@@ -103,7 +106,7 @@ def camera_to_name(opened: log.Log, topic: str) -> str:
 
 def _with_pictures_first(opened: log.Log, known: list[Camera]) -> list[Camera]:
     """Return the cameras without those that are boxes in space alone, if there are others; or else all."""
-    return [camera for camera in known if not camera.in_space or _has_own_channels(opened, camera)] or known
+    return [camera for camera in known if not camera.in_space or has_own_channels(opened, camera)] or known
 
 
 def _refuse_several(opened: log.Log, topics: list[str]) -> None:
@@ -129,9 +132,16 @@ def _prefix_of_topic(opened: log.Log, topic: str) -> str:
     return found.prefix if has_results else name
 
 
-def _has_own_channels(opened: log.Log, camera: Camera) -> bool:
+def has_own_channels(opened: log.Log, camera: Camera) -> bool:
     """Return whether a camera has channels that were ingested or made by a stage."""
     return any(Provenance.from_metadata(opened.channels[topic].metadata) for topic in camera.topics)
+
+
+def scenes_of(opened: log.Log) -> tuple[str, ...]:
+    """Return the prefixes of the scenes that several cameras were fused to."""
+    target = STAGES["detect"].output_topic
+    made = ((camera.prefix, provenance_of(opened, f"{camera.prefix}/{target}")) for camera in cameras(opened))
+    return tuple(prefix for prefix, how in made if how is not None and how.transform == FUSE)
 
 
 def camera_at(opened: log.Log, prefix: str) -> Camera:

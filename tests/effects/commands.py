@@ -99,6 +99,7 @@ CASES: dict[str, dict[str, Case]] = {
         events="--no-events",
         tables=("run a.mcap", "--no-tables"),
         zones=("run a.mcap --no-tables", "--zones zones.geojson"),
+        fuse=("run two.mcap --no-tables", "--no-fuse"),
         force=("run a.mcap", "--force"),
         detector=("run a.mcap --no-tables", "--detector mog2"),
         tracker=("run a.mcap --no-tables", "--tracker ocsort"),

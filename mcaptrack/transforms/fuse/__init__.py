@@ -1,7 +1,7 @@
 """Detections of one scene from those of several cameras."""
 
-from mcaptrack.transforms.fuse.agreement import Offset, compare
+from mcaptrack.transforms.fuse.agreement import Offset, Shared, compare
 from mcaptrack.transforms.fuse.fuser import FootFuser
 from mcaptrack.transforms.fuse.view import CameraView
 
-__all__ = ["CameraView", "FootFuser", "Offset", "compare"]
+__all__ = ["CameraView", "FootFuser", "Offset", "Shared", "compare"]

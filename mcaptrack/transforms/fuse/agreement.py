@@ -20,6 +20,8 @@ from mcaptrack.transforms.fuse.view import SHARES, CameraView
 
 #: A place that so many other cameras see is taken for true; others are false if so many should see them.
 _OTHERS, _EXPECTED = 2, 1.5
+#: People are expected to be seen if so much of them is visible.
+_VISIBLE: Final = 0.5
 #: Counts that stand for what is known before anything is counted.
 _PRIOR: Final = 5.0
 #: Boxes that are nearer than this to a place of other cameras are compared with it.
@@ -28,6 +30,28 @@ _NEAR_M: Final = 1.5
 _MOVES_M_PER_S: Final = 0.5
 #: Fewer comparisons say nothing about a camera.
 LEAST_COMPARED: Final = 50
+
+
+#: Cameras that see so few of the people that two of them should see are no cameras of one place.
+_STRANGERS: Final = 0.25
+
+
+class Shared(NamedTuple):
+    """The number of people that two cameras should see, over all frames, and of those that two do see."""
+
+    expected: int
+    seen: int
+
+    @property
+    def are_strangers(self) -> bool:
+        """Whether the cameras seldom see the same people, where they should."""
+        return self.expected >= LEAST_COMPARED and self.seen < _STRANGERS * self.expected
+
+    def __str__(self) -> str:
+        return (
+            f"of {self.expected} people that two cameras should see, two see {self.seen}; the ground planes may be of "
+            "different places, each in metres of its own"
+        )
 
 
 class Offset(NamedTuple):
@@ -50,7 +74,7 @@ class Offset(NamedTuple):
 
 def compare(
     frames: Iterable[Frame], fuser: FootFuser, offset_ns: Sequence[int] = ()
-) -> tuple[tuple[CameraView, ...], tuple[Offset, ...]]:
+) -> tuple[tuple[CameraView, ...], tuple[Offset, ...], Shared]:
     """Estimate how often each camera detects people and how often its boxes are false, and its offset.
 
     Parameters
@@ -68,6 +92,8 @@ def compare(
         The cameras, with the estimates.
     offsets : tuple of Offset
         The offset of each.
+    shared : Shared
+        How many people two cameras should see, and do see.
     """
     count = len(fuser.views)
     offset_ns = offset_ns or [0] * count
@@ -78,6 +104,7 @@ def compare(
     off: list[list[Floats]] = [[] for _ in range(count)]
     late: list[list[Floats]] = [[] for _ in range(count)]
     last: tuple[int, Floats] | None = None
+    shared = Shared(0, 0)
     for frame in frames:
         if not len(frame.rows):
             last = None
@@ -86,6 +113,8 @@ def compare(
         places, camera = places_of(frame.rows), frame.rows["camera"].astype(np.int64)
         visible = np.stack([view.visible(centre.xy_m, frame.t_ns) for view in fuser.views], axis=1)
         rate = np.stack([view.rate(part) for view, part in zip(fuser.views, visible.T, strict=True)], axis=1)
+        by_two = ((visible >= _VISIBLE) | seen).sum(axis=1) > 1
+        shared = Shared(shared.expected + int(by_two.sum()), shared.seen + int((seen.sum(axis=1) > 1).sum()))
         sure = seen.sum(axis=1) > _OTHERS
         speed = _velocities(last, frame.t_ns, centre.xy_m[sure])
         last = frame.t_ns, centre.xy_m[sure]
@@ -117,7 +146,7 @@ def compare(
         replace(view, detects=tuple((hits[i] / tries[i]).tolist()), false_share=float(false[i] / boxes[i]))
         for i, view in enumerate(fuser.views)
     )
-    return views, tuple(_offset(*pair) for pair in zip(off, late, strict=True))
+    return views, tuple(_offset(*pair) for pair in zip(off, late, strict=True)), shared
 
 
 def _velocities(last: tuple[int, Floats] | None, t_ns: int, now: Floats) -> Floats:

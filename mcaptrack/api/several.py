@@ -1,0 +1,198 @@
+"""Run all cameras of a log, one after the other, then the scenes that they are fused to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mcaptrack import log as logs
+from mcaptrack import notices, pipeline
+from mcaptrack.api.common import Notes, Progress
+from mcaptrack.errors import McaptrackError
+from mcaptrack.files import publish
+from mcaptrack.location import Location
+from mcaptrack.notices import warn
+from mcaptrack.pipeline import Report
+from mcaptrack.schema import DETECTIONS, TRACKS
+from mcaptrack.sources.fixed_frame import BoxesRead
+from mcaptrack.sources.ingest.sidecar import SidecarChoice
+from mcaptrack.transforms import STAGES, Transform
+from mcaptrack.transforms.protocol import traits_of
+
+#: Changes an open log, or a copy of it at the path; returns the prefix of the camera, and what was done.
+Act = Callable[[logs.Log, Path | None, Notes, BoxesRead], tuple[str, Report]]
+
+
+@dataclass
+class Done:
+    """The report on a camera, or a scene of several; ``failure``, the reason why it failed, is "" if it didn't."""
+
+    name: str
+    prefix: str
+    report: Report
+    is_scene: bool = False
+    failure: str = ""
+
+
+@dataclass
+class EveryCamera:
+    """Runs all cameras of a log that has several, or those of these names.
+
+    ``run_at`` returns what runs a camera, by its prefix, and ``fuse_to`` what fuses cameras, by their names.
+    ``left_out`` and ``not_fused`` are the reasons why cameras are left out, by name, and why no scene is made.
+    """
+
+    names: Sequence[str]
+    is_fused: bool
+    run_at: Callable[[str, Progress], Act]
+    fuse_to: Callable[[str, Sequence[str], Progress], Act]
+    left_out: dict[str, str] = field(default_factory=dict)
+    not_fused: str = ""
+    prefixes: tuple[str, ...] = ()
+    scenes: tuple[str, ...] = ()
+
+    def chooses(self, opened: logs.Log, notes: Notes) -> bool:
+        """Return whether the log has several cameras, or several are named; says which are run, and which are not."""
+        chosen = pipeline.choose_cameras(opened, self.names)
+        if chosen is None:
+            return False
+        self.prefixes, self.scenes = chosen.prefixes, chosen.scenes
+        self.left_out |= chosen.left_out
+        for name, why in self.left_out.items():
+            warn(f"the camera {name} is left out: it {why}", "left-out")
+        if len(self.prefixes) > 1:
+            listed = ", ".join(prefix[1:] for prefix in self.prefixes)
+            notes.say(f"running {len(self.prefixes)} cameras, {listed}; `camera=` names those to run")
+        for prefix in self.prefixes:
+            if words := pipeline.begins_with(opened, prefix):
+                notes.say(words)
+        return True
+
+    def run(
+        self, path: Location, output: Path | None, sidecar: SidecarChoice, notes: Notes, progress: Progress
+    ) -> list[Done]:
+        """Run each camera, then scenes. The log is written for each of them; ``output`` is written as a whole."""
+        with publish(output) if output is not None else nullcontext() as part:
+            steps = _Steps(path, part, output, sidecar, notes, progress)
+            for prefix in self.prefixes:
+                steps.take(prefix[1:], self.run_at(prefix, _named(progress, prefix[1:])))
+            if steps.failed:
+                self.not_fused = f"{', '.join(steps.failed)} failed"
+            else:
+                self._run_scenes(steps)
+        return steps.done
+
+    def _run_scenes(self, steps: _Steps) -> None:
+        """Make the scenes again that are out of date, or a new one, and run them."""
+        with steps.opened() as opened:
+            scenes = self.scenes or (pipeline.scenes_of(opened) if self.is_fused else ())
+            joined: list[str] = []
+            if self.is_fused and not scenes:
+                given = [prefix[1:] for prefix in self.prefixes]
+                joined, self.not_fused = pipeline.fusable(opened, given)
+        if joined:
+            scenes = ("/world",)
+            if not steps.take("world", self.fuse_to("world", joined, _named(steps.progress, "world")), is_scene=True):
+                self.not_fused = steps.done.pop().failure
+                scenes = ()
+        if not self.is_fused and not self.scenes:
+            self.not_fused = "`fuse=False` was given"
+        elif self.not_fused:
+            steps.notes.say(f"no scene is made of the cameras: {self.not_fused}")
+        for scene in scenes:
+            steps.take(scene[1:], self.run_at(scene, _named(steps.progress, scene[1:])), is_scene=True)
+
+
+def _named(progress: Progress, name: str) -> Progress:
+    """Return a function that reports the progress of the stages of a camera."""
+    return lambda stage, done, total: progress(f"{name} {stage}", done, total)
+
+
+@dataclass
+class _Steps:
+    """The work on a log, step by step: first from ``path``, to ``part`` if it is given."""
+
+    path: Location
+    part: Path | None
+    output: Path | None
+    sidecar: SidecarChoice
+    notes: Notes
+    progress: Progress
+    done: list[Done] = field(default_factory=list)
+
+    @property
+    def failed(self) -> list[str]:
+        """The names of the cameras that failed."""
+        return [one.name for one in self.done if one.failure]
+
+    def opened(self) -> logs.Log:
+        """The log as it is now."""
+        if self.part is not None:
+            return logs.read(self.part if self.part.exists() else self.path)
+        return logs.read(self.path, sidecar=self.sidecar)
+
+    def take(self, name: str, act: Act, is_scene: bool = False) -> bool:
+        """Do one step; returns whether it succeeded."""
+        output = self.part if self.part is not None and not self.part.exists() else None
+        with notices.naming(name), self.opened() as opened:
+            if self.part is None:
+                opened.lock()
+            try:
+                prefix, report = act(opened, output, self.notes, BoxesRead())
+            except McaptrackError as error:
+                why = str(error).replace(str(self.part), str(self.output))
+                self.done = [one for one in self.done if one.name != name]
+                self.done.append(Done(name, f"/{name}", Report(), is_scene, why))
+                return False
+        before = next((one for one in self.done if one.name == name), None)
+        if before is None:
+            self.done.append(Done(name, prefix, report, is_scene))
+        else:
+            before.report = together([before.report, report])
+        return True
+
+
+def unfitting(
+    opened: logs.Log, prefix: str, transforms: Mapping[str, Transform], say: Callable[[str], None]
+) -> set[str]:
+    """Return the stages with a transform that can't take the boxes of one of several cameras, or of a scene.
+
+    A tracker that is named is for the cameras, or for the scene: of boxes in pictures, or of positions in metres.
+    """
+    space = "ground" if pipeline.camera_at(opened, prefix).in_space else "picture"
+    found = set()
+    for stage, one in transforms.items():
+        if one.reads is DETECTIONS and one.writes[""] is TRACKS and traits_of(one).space != space:
+            say(f"{prefix[1:]} is not tracked by {STAGES[stage].choice(one)}, which is for other boxes")
+            found.add(stage)
+    return found
+
+
+def together(reports: Sequence[Report]) -> Report:
+    """Return the reports on several cameras as one; the layouts are those of the last that has any."""
+    out = Report()
+    for one in reports:
+        out.stages += one.stages
+        out.frames |= one.frames
+        out.rows |= one.rows
+        out.tracks |= one.tracks
+        out.events |= one.events
+        out.layouts = one.layouts or out.layouts
+        out.stale = [*dict.fromkeys([*out.stale, *one.stale])]
+        out.warnings += one.warnings
+        out.has_zones |= one.has_zones
+        for name, seconds in one.watch.seconds.items():
+            out.watch.seconds[name] = out.watch.seconds.get(name, 0.0) + seconds
+    return out
+
+
+def refuse_failed(log: Location, done: Sequence[Done]) -> None:
+    """Raise McaptrackError if any camera failed, with its reason."""
+    failed = [one for one in done if one.failure]
+    if failed:
+        why = "; ".join(f"{one.name}: {one.failure}" for one in failed)
+        good = ", ".join(one.name for one in done if not one.failure)
+        rest = f". What was made of {good} is written; `camera=` names cameras to run" if good else ""
+        raise McaptrackError(f"{log}: {len(failed)} of {len(done)} cameras failed: {why}{rest}")

@@ -1,0 +1,166 @@
+"""All cameras of a log in one run: each as if it were alone, then the scene that they see together."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+import mcaptrack
+from mcaptrack import McaptrackError, RunResult, log, pipeline
+from mcaptrack.notices import collected
+from tests.commands import call, done
+from tests.places import CAMERAS, HEIGHT, PEOPLE, WIDTH, said, write_log
+
+
+@pytest.fixture(scope="module")
+def boxes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log with the boxes of three cameras of one place, and of a fourth one that has ground truth only."""
+    path = write_log(tmp_path_factory.mktemp("several") / "boxes.mcap", CAMERAS[:3])
+    labels = path.with_name("labels.txt")
+    labels.write_text(f"1,1,{WIDTH - 20},{HEIGHT - 50},20,50,1,-1,-1,-1\n")
+    mcaptrack.ingest(labels, fps=2, role="truth", camera="labelled", into=path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def ran(boxes: Path) -> tuple[Path, RunResult]:
+    """The log after a run."""
+    path = Path(shutil.copy(boxes, boxes.with_name("ran.mcap")))
+    with collected():
+        return path, mcaptrack.run(path, tables=False)
+
+
+@pytest.fixture
+def path(boxes: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(boxes, tmp_path / "log.mcap"))
+
+
+def topics(path: Path) -> set[str]:
+    return {channel.topic for channel in mcaptrack.info(path).channels}
+
+
+class TestAllCameras:
+    def test_each_camera_and_the_scene_are_tracked(self, ran: tuple[Path, RunResult]) -> None:
+        path, result = ran
+        assert list(result.cameras) == ["east", "north", "south", "world"]
+        assert [one.is_scene for one in result.cameras.values()] == [False, False, False, True]
+        assert {f"/{name}/retracks" for name in result.cameras} <= topics(path)
+        assert result.summary == result.cameras["world"].summary
+        assert result.summary is not None
+        assert result.summary.tracks == PEOPLE
+        assert result.not_fused == ""
+
+    def test_a_camera_with_labels_alone_is_left_out_and_named(self, ran: tuple[Path, RunResult]) -> None:
+        path, result = ran
+        assert dict(result.left_out) == {"labelled": "has neither pictures nor boxes, but /labelled/truth"}
+        assert said(result, "left-out")[0].startswith("the camera labelled is left out")
+        assert not [topic for topic in topics(path) if topic.startswith("/labelled/tracks")]
+
+    def test_it_says_what_each_begins_with(self, ran: tuple[Path, RunResult]) -> None:
+        notes = ran[1].notes
+        assert "running 3 cameras, east, north, south; `camera=` names those to run" in notes
+        wanted = "south has detections in /south/detections already: it is tracked from these, nothing is detected"
+        assert wanted in notes
+        assert "fusing east, north, south to /world" in notes
+
+    def test_a_camera_is_run_as_if_it_were_alone(self, ran: tuple[Path, RunResult], path: Path) -> None:
+        alone = mcaptrack.run(path, camera="north", tables=False)
+        assert not alone.cameras
+        with log.read(path) as opened, log.read(ran[0]) as other:
+            for topic in ("/north/tracks", "/north/retracks/full", "/north/predictions", "/north/tracks/view/scene"):
+                assert [one.payload for one in opened.messages(topic)] == [one.payload for one in other.messages(topic)]
+
+    def test_a_second_run_changes_nothing(self, ran: tuple[Path, RunResult]) -> None:
+        before = ran[0].read_bytes()
+        with collected():
+            again = mcaptrack.run(ran[0], tables=False)
+        assert again.is_up_to_date
+        assert list(again.cameras) == list(ran[1].cameras)
+        assert ran[0].read_bytes() == before
+
+    def test_commands_take_the_scene_and_say_so(self, ran: tuple[Path, RunResult], tmp_path: Path) -> None:
+        told = done("report", ran[0], "-o", tmp_path / "r.html").err
+        assert "/east, /labelled, /north, /south, /world: taking /world; --camera chooses another" in told
+
+    def test_the_command_prints_a_line_for_each_camera(self, ran: tuple[Path, RunResult]) -> None:
+        told = done("run", ran[0], "--no-tables").err
+        lines = {line.split()[0]: line for line in told.splitlines() if line.startswith("  ")}
+        assert "tracks" in lines["south"]
+        assert "left out: it has neither pictures nor boxes" in lines["labelled"]
+        assert lines["fused"].split(maxsplit=1)[1] == "world, the scene"
+
+
+class TestChoice:
+    def test_named_cameras_are_run_and_fused_alone_and_others_join_later(self, path: Path) -> None:
+        with collected():
+            result = mcaptrack.run(path, camera=["east", "south"], tables=False, predictor="cv")
+            assert list(result.cameras) == ["east", "south", "world"]
+            assert "/north/tracks" not in topics(path)
+            later = mcaptrack.run(path, tables=False)
+        assert "/world/detections was made without north: fusing east, north, south again, as before" in later.notes
+        (channel,) = (one for one in mcaptrack.info(path).channels if one.topic == "/world/detections")
+        assert channel.parameters is not None
+        assert channel.parameters["cameras"] == ["east", "north", "south"]
+
+    @pytest.mark.parametrize(
+        ("camera", "words"),
+        [
+            ("east,nowhere", "has no camera nowhere; it has east, labelled, north, south"),
+            ("east,labelled", "labelled has neither pictures nor boxes, but /labelled/truth; leave it out of"),
+            ("east,", "has an empty name"),
+        ],
+    )
+    def test_cameras_that_can_not_be_run_are_refused(self, path: Path, camera: str, words: str) -> None:
+        before = path.read_bytes()
+        outcome = call("run", path, "--camera", camera)
+        assert (outcome.code, path.read_bytes()) == (1, before)
+        assert words in outcome.err
+
+    def test_a_tracker_of_boxes_is_for_the_cameras(self, path: Path) -> None:
+        with collected():
+            result = mcaptrack.run(path, camera="east,south", tracker="ocsort", predictor="cv", tables=False)
+        assert "world is not tracked by ocsort, which is for other boxes" in result.notes
+        made = {channel.topic: channel.parameters for channel in mcaptrack.info(path).channels}
+        assert [(made[f"/{name}/tracks"] or {})["tracker"] for name in ("east", "world")] == ["ocsort", "ground"]
+
+
+def fake_runs(monkeypatch: pytest.MonkeyPatch, bad: str, error: BaseException) -> list[str]:
+    """Let runs do nothing, but raise an error for one camera; returns the prefixes of those that are run."""
+    seen: list[str] = []
+
+    def run(opened: object, prefix: str, *_: object) -> pipeline.Report:
+        seen.append(prefix)
+        if prefix == bad:
+            raise error
+        return pipeline.Report()
+
+    monkeypatch.setattr(pipeline, "run", run)
+    return seen
+
+
+class TestFailures:
+    def test_a_camera_that_fails_keeps_no_other_from_being_run(
+        self, path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        seen = fake_runs(monkeypatch, "/north", McaptrackError("it is broken"))
+        with collected(), pytest.raises(McaptrackError, match=r"1 of 3 cameras failed: north: it is broken\. What was"):
+            mcaptrack.run(path, tables=False)
+        assert seen == ["/east", "/north", "/south"]  # and no scene without one of them
+
+    def test_an_interrupted_run_leaves_no_output(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        fake_runs(monkeypatch, "/south", KeyboardInterrupt())
+        there = {one.name for one in path.parent.iterdir()}
+        with collected(), pytest.raises(KeyboardInterrupt):
+            mcaptrack.run(path, output=path.with_name("new.mcap"), tables=False)
+        assert {one.name for one in path.parent.iterdir()} == there
+
+    def test_cameras_of_different_places_are_not_fused(self, tmp_path: Path) -> None:
+        path = write_log(tmp_path / "rooms.mcap", CAMERAS[:2], moved_m={"east": 2.0})
+        with collected():
+            result = mcaptrack.run(path, tables=False, predictor="cv")
+        assert list(result.cameras) == ["north", "east"][::-1]
+        assert "people that two cameras should see, two see" in result.not_fused
+        assert not [topic for topic in topics(path) if topic.startswith("/world")]
+        assert "ground planes may be of different places" in said(mcaptrack.fuse(path), "cameras-disagree")[0]
