@@ -23,7 +23,8 @@ from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 from mcaptrack.tables.exchange import _HOLDS, _WRITERS
 from mcaptrack.tables.exchange.boxes import BoxTable
-from mcaptrack.tables.exchange.cvat import KEYFRAME_PX
+from mcaptrack.tables.exchange.cvat import KEYFRAME_PX, describe_classes
+from mcaptrack.tables.exchange.text import describe_merged
 
 ALL = WantedClasses("all")
 NAMES = {1: "person", 2: "bicycle", 3: "traffic light", 7: 'a "b" <c> & d'}
@@ -240,6 +241,36 @@ class TestCvat:
         assert labels.labelled.tolist() == [0, 2]
         assert [code for _, code in labels.doubts if "1 of <polygon>, 1 of <tag>" in _] == ["left-out"]
 
+    def test_ids_of_images_are_those_of_the_attribute(self, tmp_path):
+        """CVAT writes tracks as boxes of images, with the attributes of their tracks."""
+        inner = '<box label="person" xtl="1" ytl="2" xbr="4" ybr="8"><attribute name="track_id">{}</attribute></box>'
+        images = "".join(f'<image id="{k}" name="{k}.jpg">{inner.format(7 + k)}</image>' for k in range(2))
+        labels = read(tmp_path, f"<annotations>{images}</annotations>")
+        assert (labels.frame.tolist(), labels.id.tolist()) == ([0, 1], [7, 8])
+
+    def test_a_task_of_every_fifth_picture_has_no_boxes_in_between(self, tmp_path):
+        meta = "<meta><task><size>5</size><start_frame>3</start_frame><stop_frame>23</stop_frame>"
+        meta += "<frame_filter>step=5</frame_filter></task></meta>"
+        boxes = [box(3, 100), box(13, 120), box(18, 150, outside=1)]
+        labels = read(tmp_path, f"<annotations>{meta}{track(0, *boxes)}</annotations>")
+        assert (labels.frame.tolist(), labels.boxes_px[:, 0].tolist()) == ([3, 8, 13], [100, 110, 120])
+        assert labels.labelled.tolist() == [3, 8, 13, 18, 23]
+
+    @pytest.mark.parametrize(
+        ("meta", "inner", "words"),
+        [
+            ("<start_frame>9</start_frame><stop_frame>12</stop_frame>", "", "2 boxes are in frames that its task"),
+            ("", '<attribute name="track_id">seven</attribute>', "not a whole number ('seven')"),
+        ],
+    )
+    def test_what_is_odd_is_said(self, meta, inner, words, tmp_path):
+        text = (
+            f"<annotations><meta><task>{meta}</task></meta>{track(0, box(0, 1, inner=inner), box(1, 1))}</annotations>"
+        )
+        labels = read(tmp_path, text)
+        assert labels.frame.tolist() == [0, 1]
+        assert [words in said for said, _ in labels.doubts] == [True]
+
     def test_a_rotated_box_is_said(self, tmp_path):
         turned = box(0, 1, more='rotation="30.5"')
         labels = read(tmp_path, f"<annotations>{track(0, turned)}</annotations>")
@@ -265,6 +296,12 @@ class TestCvat:
             (ONE.replace('"30"', '"z"'), "corners that aren't numbers"),
             (ONE.replace('"30"', '"nan"'), "not finite"),
             (ONE.replace('"30"', '"3"'), "can't be 10 wide and -7 high"),
+            (f'<?xml version="1.0" encoding="foo"?>{ONE}', "unknown encoding: foo"),
+            ('<annotations><image id="4"/><image id="4"/></annotations>', "image 4 is there before"),
+            (
+                '<annotations><track task_id="1"/><track task_id="2"/></annotations>',
+                "tasks 1 and 2 of a project; export each task",
+            ),
         ],
     )  # fmt: skip
     def test_what_it_would_not_write_is_refused_in_one_line(self, text, words, tmp_path):
@@ -282,6 +319,60 @@ class TestCvat:
         path.write_bytes(data)
         with pytest.raises(McaptrackError, match=r"zip file with an annotations.xml that can't be read"):
             read_labels(path, "cvat", "tracks")
+
+    @pytest.mark.parametrize(
+        ("names", "words"),
+        [
+            (["task/annotations.xml", "images/a.png"], None),
+            (["../../annotations.xml"], None),  # it is read, not extracted
+            (["a/annotations.xml", "b/annotations.xml"], "holds 2 of annotations.xml; give each as a file"),
+            (["instances.json"], "without the annotations.xml of CVAT: it holds instances.json; unpack other"),
+            ([], "without the annotations.xml of CVAT: it is empty"),
+        ],
+    )
+    def test_zip_files_as_others_make_them(self, names, words, tmp_path):
+        with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+            for name in names:
+                archive.writestr(name, ONE)
+        if words is None:
+            assert read_labels(tmp_path / "a.zip").frame.tolist() == [0]
+            return
+        with pytest.raises(McaptrackError) as error:
+            read_labels(tmp_path / "a.zip")
+        assert words in str(error.value)
+
+
+def test_coco_of_polygons_and_of_numbers_with_a_point(tmp_path):
+    """The box around polygons, where there is no bbox; a mask alone is refused; 1.0 is 1, as pandas writes it."""
+    images = [{"id": 1, "file_name": "0.jpg"}, {"id": 2, "file_name": "1.jpg"}]
+    shape = {"image_id": 2.0, "category_id": 1.0, "segmentation": [[5, 7, 9, 7, 9, 20], [4, 8, 5, 8, 5, 9]]}
+    content = {"images": images, "annotations": [shape], "categories": [{"id": 1, "name": "person"}]}
+    labels = read(tmp_path, json.dumps(content), "a.json")
+    assert (labels.frame.tolist(), labels.boxes_px.tolist()) == ([1], [[4, 7, 5, 13]])
+    assert any("1 boxes are those around polygons" in words for words in labels.remarks)
+    shape["segmentation"] = {"counts": "abc", "size": [80, 100]}
+    with pytest.raises(McaptrackError, match=r"annotation 0 has a mask \(RLE\) and no bbox"):
+        read(tmp_path, json.dumps(content), "a.json")
+
+
+def test_a_header_of_motchallenge_names_the_box_not_the_place(tmp_path):
+    head = "frame,id,bb_left,bb_top,bb_width,bb_height,conf,x,y,z"
+    labels = read(tmp_path, f"{head}\n1,3,10,20,30,40,0.5,-1,-1,-1\n", "a.csv")
+    assert (labels.boxes_px.tolist(), labels.id.tolist()) == ([[10, 20, 30, 40]], [3])
+
+
+def test_classes_that_a_file_cannot_tell_apart_are_said():
+    assert describe_merged("kitti", {1: "person", 2: "traffic light", 3: "traffic-light", 4: "car"}) == (
+        "classes that the file can't tell apart: traffic light and traffic-light are both traffic_light"
+    )
+    assert "person and pedestrian are both 1" in describe_merged("mot", {1: "person", 2: "pedestrian", 3: "car"})
+    assert describe_merged("kitti", NAMES) == describe_merged("mot", NAMES) == ""
+    ids = np.array([1, 1, 1, 2])
+    table = BoxTable(
+        "/t", ids, ids, ids, ids, np.ones((4, 4)), np.ones((4, 2)), np.ones(4, np.float32), np.array([3, 2, 3, 2]),
+        np.ones(4, bool), {}, True, False, None, (),
+    )  # fmt: skip
+    assert "1 boxes get that of their track" in describe_classes(table)
 
 
 class TestCommand:

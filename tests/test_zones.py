@@ -390,6 +390,14 @@ WRONG = {
     "feature 1 is a number": collection() | {"features": [5]},
     "needs a list of features": {"type": "FeatureCollection", "features": 3},
     "more than 2000 points": collection(feature("a", "LineString", [[n, n % 2] for n in range(2001)])),
+    "has a hole outside of its outline, at \\(9, 9\\)": collection(
+        feature("a", "Polygon", [SQUARE, [[9, 9], [8, 9], [8, 8], [9, 9]]])
+    ),
+    "has a hole outside of its outline, at \\(-2, 9\\)": collection(feature("a", "Polygon", [HOLED[1], SQUARE])),
+    "has a hole inside another one": collection(
+        feature("a", "Polygon", [*HOLED, [[0, 10.5], [0.5, 10.5], [0.5, 11], [0, 10.5]]])
+    ),
+    "a list as its name": collection(feature(["a"], "Polygon", [SQUARE])),
     "1 to 100 printable characters": collection(feature("a\nb", "Polygon", [SQUARE])),
     "not valid JSON": "{",
     "is not a text file": b"\xff\xfe\x00",
@@ -423,6 +431,12 @@ class TestFiles:
             ("metres", "", 1),
             ("pixels", "a", 2),
         ]
+
+    def test_made_names_are_not_those_of_others_and_a_reference_system_is_said(self):
+        content = collection(feature("zone 2", "Polygon", [SQUARE]), feature(None, "Polygon", [SQUARE]), crs={})
+        with notices.collected() as said:
+            assert [zone.name for zone in parse_zones(content)] == ["zone 2", "zone 2 (2)"]
+        assert ['"crs" is not read' in one.message for one in said] == [True]
 
     def test_points_are_left_out_with_a_warning_and_names_are_made(self):
         content = collection(feature("tree", "Point", [1, 1]), feature(None, "Polygon", [SQUARE]))

@@ -87,6 +87,8 @@ def zones(
     import mcaptrack
     from mcaptrack.fleet import find_logs
 
+    if str(logs[0]) == _DRAW and len(logs) == 1 and not Path(_DRAW).exists():
+        raise McaptrackError("`zones draw` needs a log, as in: mcaptrack zones draw log.mcap")
     if str(logs[0]) == _DRAW and len(logs) > 1:
         given = {"--zones": zones, "--topic": topic, "--margin-m": margin_m, "--max-gap-s": max_gap_s}
         given |= {"--sidecar": sidecar}

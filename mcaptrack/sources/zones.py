@@ -7,7 +7,7 @@ have, so that a file has to say what its numbers are: "units": "metres" or "pixe
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
-from mcaptrack.geometry.zones import Units, Zone, first_crossing
+from mcaptrack.geometry.zones import Shape, Units, Zone, first_crossing
 from mcaptrack.notices import warn
 
 _UNITS: Final[Mapping[str, Units]] = {
@@ -80,12 +80,15 @@ def parse_zones(content: Any) -> tuple[Zone, ...]:
             f"it holds {found}, not GeoJSON; a FeatureCollection with Polygons and LineStrings is read"
         )
     zones: list[Zone] = []
+    taken = {str(name).strip() for name in map(_given_name, features) if name is not None}
     for place, feature in enumerate(features, start=1):
-        zone = _zone(feature, top, place, len(zones) + 1)
+        zone = _zone(feature, top, place, len(zones) + 1, taken)
         if zone is not None:
             zones.append(zone)
         if len(zones) > _MAX_ZONES:
             raise McaptrackError(f"it holds {len(features)} features; at most {_MAX_ZONES} zones and lines are counted")
+    if "crs" in top:
+        warn('"crs" is not read: the numbers of zones are taken in the "units" of the file', "left-out")
     if not zones:
         raise McaptrackError("it holds no zones (Polygons) and no lines (LineStrings)")
     names: dict[str, int] = {}
@@ -98,8 +101,20 @@ def parse_zones(content: Any) -> tuple[Zone, ...]:
     return tuple(zones)
 
 
-def _zone(feature: Any, top: Mapping[str, Any], place: int, number: int) -> Zone | None:
-    """Return the zone of one feature; None for a feature that is no zone."""
+def _given_name(feature: Any) -> Any:
+    """Return what a feature gives as its name; None if it has none."""
+    own = feature.get("properties") if isinstance(feature, dict) else None
+    return own.get("name", feature.get("id")) if isinstance(own, dict) else None
+
+
+def _made_name(kind: str, number: int, taken: Collection[str]) -> str:
+    """Return a name that no other zone has."""
+    names = (f"{kind} {number}{more}" for more in ("", *(f" ({k})" for k in range(2, len(taken) + 3))))
+    return next(name for name in names if name not in taken)
+
+
+def _zone(feature: Any, top: Mapping[str, Any], place: int, number: int, taken: Collection[str]) -> Zone | None:
+    """Return the zone of one feature; None for a feature that is no zone. ``taken`` are the names of others."""
     if not isinstance(feature, dict) or feature.get("type") != "Feature":
         raise McaptrackError(f"feature {place} is {_words(feature)}, not a Feature")
     own = feature.get("properties") or {}
@@ -108,8 +123,10 @@ def _zone(feature: Any, top: Mapping[str, Any], place: int, number: int) -> Zone
         raise McaptrackError(f"feature {place} needs objects as its properties and geometry")
     kind = geometry.get("type")
     is_line = kind == "LineString"
-    name = own.get("name", feature.get("id"))
-    name = f"{'line' if is_line else 'zone'} {number}" if name is None else str(name).strip()
+    given = own.get("name", feature.get("id"))
+    if given is not None and not isinstance(given, str | int | float):
+        raise McaptrackError(f"feature {place} has {_words(given)} as its name; it needs a text")
+    name = _made_name("line" if is_line else "zone", number, taken) if given is None else str(given).strip()
     called = f"zone {name}" if name and own.get("name") is not None else f"feature {place}"
     if not name or len(name) > _MAX_NAME or not name.isprintable():
         raise McaptrackError(f"feature {place} needs a name of 1 to {_MAX_NAME} printable characters, not {name!r:.60}")
@@ -167,7 +184,7 @@ def _list(value: Any, called: str) -> list[Any]:
 
 def _points(ring: Any, called: str) -> Iterator[tuple[float, float]]:
     for point in _list(ring, called):
-        if not isinstance(point, list) or not 2 <= len(point) <= 4:
+        if not isinstance(point, list) or not 2 <= len(point) <= 4:  # heights are allowed, and not needed
             raise McaptrackError(f"{called} has {_words(point)} where a point of two numbers is needed")
         x, y = point[:2]
         for value in (x, y):
@@ -196,6 +213,13 @@ def _check(zone: Zone, called: str) -> None:
             if at is not None:
                 x, y = (f"{value:.6g}" for value in at)
                 raise McaptrackError(f"{called} crosses or touches itself at ({x}, {y}); draw it without")
+            for number, hole in enumerate(rings[1:], start=1):
+                others = rings[1:number] + rings[number + 1 :]
+                depths = [Shape(((ring,),)).depth(hole[:1])[0] for ring in (rings[0], *others)]
+                if depths[0] < 0 or any(depth > 0 for depth in depths[1:]):
+                    x, y = (f"{value:.6g}" for value in hole[0])
+                    where = "outside of its outline" if depths[0] < 0 else "inside another one"
+                    raise McaptrackError(f"{called} has a hole {where}, at ({x}, {y})")
     size, least, unit = (shape.length, _LEAST_M, "m") if zone.is_line else (shape.area, _LEAST_M2, "m²")
     if zone.units == "metres" and size < least:
         x, y = shape.box[0]

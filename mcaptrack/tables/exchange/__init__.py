@@ -118,4 +118,6 @@ def write_boxes(
         progress("export", len(boxes.frame), len(boxes.frame))
     lost = [boxes.left_out(form, _HOLDS[form])]
     lost += [text.describe_mot_numbers(boxes.classes)] if form == "mot" else []
+    lost += [text.describe_merged(form, boxes.classes)] if form in ("mot", "kitti") else []
+    lost += [cvat.describe_classes(boxes)] if form == "cvat" else []
     return WrittenBoxes(chosen, len(boxes.frame), (*boxes.notes, *(f"{output}: {one}" for one in lost if one)))

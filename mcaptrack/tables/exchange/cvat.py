@@ -37,6 +37,20 @@ def cvat(boxes: BoxTable) -> Iterator[bytes]:
     yield b"</annotations>\n"
 
 
+def describe_classes(boxes: BoxTable) -> str:
+    """Say how many boxes get the label of their track in place of their own class; "" if none do."""
+    if not boxes.has_ids:
+        return ""
+    _, track = np.unique(boxes.id, return_inverse=True)
+    _, kind = np.unique(boxes.class_id, return_inverse=True)
+    _, most = np.unique(track * (kind.max() + 1) + kind, return_counts=True)
+    owner = np.unique(track * (kind.max() + 1) + kind) // (kind.max() + 1)
+    largest = np.zeros(track.max() + 1, np.int64)
+    np.maximum.at(largest, owner, most)
+    others = len(track) - int(largest.sum())
+    return f"a track has one label in CVAT: {others:,} boxes get that of their track" if others else ""
+
+
 def _head(boxes: BoxTable) -> str:
     """The beginning, as in CVAT's own files: the labels, and the number and size of pictures."""
     width, height = boxes.size or np.ceil((boxes.boxes[:, :2] + boxes.boxes[:, 2:]).max(axis=0)).astype(int).tolist()

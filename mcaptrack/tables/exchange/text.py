@@ -80,6 +80,16 @@ def kitti_name(name: str) -> str:
     return "Pedestrian" if is_person(name) else word if word[:1].isalpha() else f"class_{word}"
 
 
+def describe_merged(form: str, classes: dict[int, str]) -> str:
+    """Say which classes have one name in KITTI, or one number in MOTChallenge; "" if none have."""
+    numbers = mot_numbers(classes)
+    groups: dict[str, list[str]] = {}
+    for one, name in classes.items():
+        groups.setdefault(kitti_name(name) if form == "kitti" else str(numbers[one]), []).append(name)
+    words = [f"{' and '.join(names)} are both {shared}" for shared, names in groups.items() if len(names) > 1]
+    return f"classes that the file can't tell apart: {', '.join(words)}" if words else ""
+
+
 def boxes_csv(boxes: BoxTable) -> Iterator[bytes]:
     """A table with a header; frames without boxes have a row of their own, without a box."""
     held = io.StringIO()

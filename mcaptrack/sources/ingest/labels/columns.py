@@ -79,6 +79,8 @@ def choose_columns(where: str, header: Sequence[str], given: Mapping[str, str]) 
         fits = [at for name in names for at, one in enumerate(plain) if one == name and at not in out.values()]
         if key in out or key in skipped or not fits:
             continue
+        # In headers of MOTChallenge (bb_left, ..., conf, x, y, z), x and y are a place in the world.
+        fits = [at for at in fits if plain[at].startswith("bb")] or fits
         if len(fits) > 1 and key not in _RANKED:
             words = " and ".join(header[at] for at in fits)
             raise McaptrackError(

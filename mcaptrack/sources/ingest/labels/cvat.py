@@ -1,32 +1,29 @@
 """Read annotations of CVAT: "CVAT for video 1.1" (and 1.0), and "CVAT for images 1.1", as XML or in CVAT's zip files.
 
 A track of a video is a list of boxes. Between two of them that are not next to each other the box is interpolated
-linearly, as CVAT shows it; after a box that is ``outside`` there is none until the next one. CVAT gives tracks new
-numbers whenever it writes them, so an attribute ``track_id`` of a box, if there is one, names the track instead.
+linearly, as CVAT shows it, in the frames that the task has; after a box that is ``outside`` there is none until the
+next one. CVAT gives tracks new numbers whenever it writes them, and none in annotations of images, so an attribute
+``track_id`` of a box, if there is one, names the track instead.
 
 XML may be hostile: document types and entities are refused, depth and sizes are limited. Letters: N rows, F frames.
 """
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from array import array
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, Final, NoReturn
+from typing import Any, Final, NoReturn
 from xml.parsers import expat
 
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import refuse_special
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.schema.classes import PERSON, is_person
 from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows
+from mcaptrack.sources.ingest.labels.cvat_files import opened_xml
 from mcaptrack.sources.ingest.labels.formats import NO_ID, Labels, Role
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
@@ -39,52 +36,13 @@ _MAX_DEPTH: Final = 32
 _MAX_TEXT: Final = 65536
 _MAX_CLASSES: Final = 65536
 _BLOCK: Final = 2**16
-_ZIP: Final = b"PK\x03\x04"
-_MEMBER: Final = "annotations.xml"
 #: The element of a track.
 _TRACK: Final = "track"
 #: Shapes of CVAT that are no boxes.
 _OTHER_SHAPES: Final = ("polygon", "polyline", "points", "point", "cuboid", "ellipse", "mask", "skeleton", "tag")
 #: Numbers of a row: frame, left, top, width, height, track, label, whether it is occluded, line.
 _COLUMNS: Final = 9
-
-
-def is_cvat(path: Path) -> bool:
-    """Whether a file is XML, or a zip file with CVAT's annotations."""
-    refuse_special(path)
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(4096)
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
-    if head.startswith(_ZIP):
-        return _has_member(path)
-    return head.removeprefix(b"\xef\xbb\xbf").lstrip()[:1] == b"<"
-
-
-def _has_member(path: Path) -> bool:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return _MEMBER in archive.namelist()
-    except (zipfile.BadZipFile, OSError, ValueError):
-        return False
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[IO[bytes]]:
-    """The XML of a file or of a zip file. Raises McaptrackError if it can't be read, or is too large."""
-    try:
-        with path.open("rb") as stream:
-            if stream.read(4) != _ZIP:
-                stream.seek(0)
-                yield stream
-                return
-        with zipfile.ZipFile(path) as archive, archive.open(_MEMBER) as member:
-            yield member
-    except (zipfile.BadZipFile, zlib.error, KeyError, NotImplementedError, RuntimeError, EOFError) as error:
-        raise McaptrackError(f"{path} is a zip file with an {_MEMBER} that can't be read: {error}") from None
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror or error}") from None
+_ID: Final = 5
 
 
 @dataclass
@@ -98,6 +56,7 @@ class _Track:
     is_outside: bool = False
     is_occluded: bool = False
     stated: str = ""
+    is_renamed: bool = False
 
 
 @dataclass
@@ -111,9 +70,11 @@ class _Parser:
     others: Counter[str] = field(default_factory=Counter)
     tracks: list[_Track] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
-    images: list[int] = field(default_factory=list)
+    images: dict[int, None] = field(default_factory=dict)
     rotated: int = 0
     interpolated: int = 0
+    task: str | None = None
+    unread: Counter[str] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
         self._track: _Track | None = None
@@ -121,6 +82,7 @@ class _Parser:
         self._text: list[str] | None = None
         self._attribute = ""
         self._size = 0
+        self._steps: tuple[int, int, int] | None = None
         self._reader = expat.ParserCreate()
         self._reader.buffer_text = True
         self._reader.StartDoctypeDeclHandler = self._refuse_doctype
@@ -131,7 +93,7 @@ class _Parser:
     def read(self) -> None:
         """Read the whole file. Raises McaptrackError, with the line, if it isn't what CVAT writes."""
         try:
-            with _opened(self.path) as stream:
+            with opened_xml(self.path) as stream:
                 while block := stream.read(_BLOCK):
                     self._size += len(block)
                     if self._size > _MAX_BYTES:
@@ -141,6 +103,8 @@ class _Parser:
         except expat.ExpatError as error:
             why = expat.ErrorString(error.code)
             raise McaptrackError(f"{self.path}:{error.lineno}: not valid XML: {why}") from None
+        except (LookupError, ValueError) as error:  # what expat says of encodings that it doesn't know
+            raise McaptrackError(f"{self.path}:{self._reader.CurrentLineNumber}: not read: {error}") from None
 
     def _fail(self, words: str) -> NoReturn:
         raise McaptrackError(f"{self.path}:{self._reader.CurrentLineNumber}: {words}")
@@ -157,16 +121,20 @@ class _Parser:
         if "meta" in self.names[:2]:
             self._text = []
         elif name == _TRACK and len(self.names) == 2:
+            self._check_task(given)
             line = self._reader.CurrentLineNumber
             number = len(self.tracks) if "id" not in given else self._whole(given["id"], "the id of a track")
             self._track = _Track(number, self._label(given), line)
         elif name == "image" and len(self.names) == 2:
+            self._check_task(given)
             self._image = self._whole(given.get("id", ""), "the id of an image")
-            self.images.append(self._image)
+            if self._image in self.images:
+                self._fail(f"image {self._image} is there before; give one file for each task")
+            self.images[self._image] = None
         elif name == "box" and self._track is not None:
             self._add_to_track(self._track, given)
         elif name == "box" and self._image is not None:
-            self._add(self._image, self._corners(given), NO_ID, self._label(given), given.get("occluded") == "1")
+            self._add(self._image, self._corners(given), NO_ID, self._label(given), _is(given, "occluded"))
         elif name in _OTHER_SHAPES:
             self.others[name] += 1
         elif name == "attribute":
@@ -176,8 +144,8 @@ class _Parser:
         text = "".join(self._text or ()).strip()
         if "meta" in self.names[:2] and text and len(self.names) <= 4:
             self.meta.setdefault(name, text)
-        elif name == "attribute" and self._track is not None and self._attribute == "track_id":
-            self._track.stated = self._track.stated or text[:40]
+        elif name == "attribute" and self._attribute == "track_id" and self.names[-2:-1] == ["box"]:
+            self._take_id(text[:40])
         elif name == _TRACK and self._track is not None:
             self.tracks.append(self._track)
             if len(self.tracks) > _MAX_ROWS:
@@ -193,6 +161,25 @@ class _Parser:
             self._text.append(text[:_MAX_TEXT])
             if len(self._text) > _MAX_TEXT:
                 self._fail("a text is longer than those of CVAT are")
+
+    def _check_task(self, given: dict[str, str]) -> None:
+        """Fail at the second task of a file of a whole project: frames of all tasks are counted from 0."""
+        task = given.get("task_id")
+        if task is not None and self.task not in (None, task):
+            self._fail(f"tasks {self.task} and {task:.20} of a project; export each task, and give one file for each")
+        self.task = self.task or task
+
+    def _take_id(self, text: str) -> None:
+        """Take the attribute ``track_id`` of a box."""
+        if not text:
+            return
+        if not _is_id(text):
+            self.unread[text] += 1
+        elif self._track is not None:
+            self._track.is_renamed |= self._track.stated not in ("", text)
+            self._track.stated = self._track.stated or text
+        elif self._image is not None:
+            self.values[_ID - _COLUMNS] = int(text)
 
     def _label(self, given: dict[str, str]) -> int:
         name = " ".join(given.get("label", "").split())[:256]
@@ -232,15 +219,37 @@ class _Parser:
                 self._fail(f"the frame of a box is {frame}, and that of the box before is {before:.0f}")
             if not track.is_outside and frame - before > _MAX_FRAMES:
                 self._fail(f"{frame - before - 1:.0f} boxes would be interpolated; at most {_MAX_FRAMES} are")
-            for between in range(int(before) + 1, frame) if not track.is_outside else ():
+            for between in self._between(int(before), frame) if not track.is_outside else ():
                 share = (between - before) / (frame - before)
                 box = tuple(a + share * (b - a) for a, b in zip(start, corners, strict=True))
                 self._add(between, box, own, track.label, track.is_occluded)
                 self.interpolated += 1
         track.last = (frame, *corners)
-        track.is_outside, track.is_occluded = given.get("outside") == "1", given.get("occluded") == "1"
+        track.is_outside, track.is_occluded = _is(given, "outside"), _is(given, "occluded")
         if not track.is_outside:
             self._add(frame, corners, own, track.label, track.is_occluded)
+
+    def _between(self, before: int, frame: int) -> range:
+        """The frames of the task between two that have a box."""
+        if frame == before + 1:
+            return range(0)
+        self._steps = self._steps or self.span()
+        first, _, every = self._steps
+        is_of_task = (before - first) % every == 0 == (frame - first) % every
+        return range(before + every, frame, every) if is_of_task else range(before + 1, frame)
+
+    def span(self) -> tuple[int, int, int]:
+        """The first and the last frame of the task and the step between them, by its description; -1: not known."""
+        meta = {name: int(text) for name, text in self.meta.items() if _is_count(text)}
+        first = meta.get("start_frame", 0)
+        key, _, step = self.meta.get("frame_filter", "").partition("=")
+        every = int(step) if key.strip() == "step" and _is_count(step.strip()) and int(step) else 1
+        last = meta.get("stop_frame", first + (meta.get("size", 0) - 1) * every if "size" in meta else -1)
+        return first, last, every
+
+
+def _is(given: dict[str, str], name: str) -> bool:
+    return given.get(name, "").lower() in ("1", "true")
 
 
 def read_cvat(path: Path, role: Role, wanted: WantedClasses) -> Labels:
@@ -260,19 +269,24 @@ def read_cvat(path: Path, role: Role, wanted: WantedClasses) -> Labels:
         lambda row: f"{path}:{values[row, 8]:.0f}",
         values[:, 0],
         values[:, 1:5],
-        np.where(values[:, 5] < 0, NO_ID, 0.0),
+        values[:, _ID],
         np.full(len(values), np.nan),
         number[values[:, 6].astype(int)],
         names,
-        labelled=_frames(parser, values[:, 0]),
         first_frame=0,
         observed=values[:, 7] == 0,
     )
+    rows.labelled, doubt = _frames(parser, values[:, 0])
+    rows.doubts += [(f"{path}: {doubt}", "clock")] if doubt else []
     if parser.tracks:
-        own = values[:, 5].astype(int)
+        own = values[:, _ID].astype(int)
         ids, words = _ids(path, parser.tracks, np.bincount(own, minlength=len(parser.tracks)))
         rows.id = ids[own].astype(float)
         rows.remarks += words
+    if parser.unread:
+        shown = ", ".join(repr(text) for text in list(parser.unread)[:3])
+        unread = f"{path}: {parser.unread.total()} boxes have a track_id that is not a whole number ({shown})"
+        rows.doubts.append((f"{unread}; these are not read", "other"))
     if parser.interpolated:
         rows.remarks.append(f"{path}: {parser.interpolated} boxes are interpolated between others of their tracks")
     if parser.rotated:
@@ -296,18 +310,22 @@ def _classes(labels: dict[str, int]) -> tuple[Floats, dict[int, str]]:
     return np.array(numbers, float), names or {PERSON: "person"}
 
 
-def _frames(parser: _Parser, frame: Floats) -> Ints:
-    """The frames (F,) that were annotated: those of the task or of its images, or else up to the last box."""
+def _frames(parser: _Parser, frame: Floats) -> tuple[Ints, str]:
+    """The frames (F,) that were annotated, and what is odd: those of the images or the task, or up to the last box."""
     if parser.images:
-        return np.unique(np.array(parser.images, np.int64))
-    meta = {name: int(text) for name, text in parser.meta.items() if _is_count(text)}
-    last = meta.get("stop_frame", meta.get("size", 0) - 1)
-    first = meta.get("start_frame", 0)
-    key, _, step = parser.meta.get("frame_filter", "").partition("=")
-    every = int(step) if key.strip() == "step" and _is_count(step.strip()) and int(step) else 1
-    if not first <= last < first + _MAX_FRAMES or frame.max() > last or frame.min() < first:
-        first, last, every = int(frame.min()), int(min(frame.max(), frame.min() + _MAX_FRAMES)), 1
-    return np.arange(first, last + 1, every)
+        return np.array(sorted(parser.images), np.int64), ""
+    first, last, every = parser.span()
+    if not first <= last < first + _MAX_FRAMES:
+        return np.arange(int(frame.min()), int(min(frame.max(), frame.min() + _MAX_FRAMES)) + 1), ""
+    frames = np.arange(first, last + 1, every)
+    others = ~np.isin(frame, frames)
+    if not others.any():
+        return frames, ""
+    there = f"frames {first} to {last}" + (f" in steps of {every}" if every > 1 else "")
+    words = (
+        f"{int(others.sum())} boxes are in frames that its task doesn't have ({there}), as in {frame[others][0]:.0f}"
+    )
+    return np.unique(frame.astype(np.int64)), f"{words}; frames are taken as they are, and only those with boxes count"
 
 
 def _is_count(text: str) -> bool:
@@ -320,13 +338,15 @@ def _ids(path: Path, tracks: list[_Track], counts: Any) -> tuple[Ints, list[str]
     Of several tracks that state one id, as after a track was split, the one with most boxes keeps it. The others, and
     tracks that were drawn by hand beside those that state an id, get new ids.
     """
-    stated = [int(t.stated) if _is_id(t.stated) else None for t in tracks]
+    stated = [int(t.stated) if t.stated else None for t in tracks]
+    renamed = sum(track.is_renamed for track in tracks)
+    remarks = [f"{path}: {renamed} tracks change their track_id; the first of each is taken"] if renamed else []
     ids = np.full(len(tracks), -1, np.int64)
     if not any(one is not None for one in stated):
         numbers = np.array([track.number for track in tracks], np.int64)
         if len(np.unique(numbers)) == len(numbers):
-            return numbers, []
-        return np.arange(len(tracks)), [f"{path}: ids of tracks occur twice; its tracks are counted from 0"]
+            return numbers, remarks
+        return np.arange(len(tracks)), [*remarks, f"{path}: ids of tracks occur twice; its tracks are counted from 0"]
     taken: set[int] = set()
     split: Counter[int] = Counter()
     for at in np.argsort(-counts, kind="stable").tolist():
@@ -338,7 +358,6 @@ def _ids(path: Path, tracks: list[_Track], counts: Any) -> tuple[Ints, list[str]
         ids[at] = one
     new = np.flatnonzero(ids < 0)
     ids[new] = max(taken) + 1 + np.arange(len(new))
-    remarks = []
     if split:
         shown = ", ".join(map(str, sorted(split)[:8])) + (", ..." if len(split) > 8 else "")
         remarks.append(f"{path}: several tracks state one track_id ({shown}): {split.total()} of them get new ids")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 from array import array
+from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, NoReturn
@@ -97,12 +98,15 @@ class _Rows:
 
     def __init__(self, path: Path, kind: str) -> None:
         self._path, self._kind, self._values = path, kind, array("d")
+        self.outlined = 0
 
     def add(self, number: int, entry: Any, frame_of: Callable[[Any], float]) -> None:
         """Add an annotation or a result. Raises McaptrackError if something is missing or of the wrong type."""
         if not isinstance(entry, dict):
             self.refuse(number, "is not an object")
         box = entry.get("bbox")
+        if box is None or box == []:
+            box = self._around(number, entry.get("segmentation"))
         if not isinstance(box, list) or len(box) != 4 or not all(map(_is_number, box)):
             self.refuse(number, "has no bbox of 4 numbers: left, top, width, height")
         inner = entry.get("attributes")
@@ -129,6 +133,18 @@ class _Rows:
             )
         )
 
+    def _around(self, number: int, outline: Any) -> list[float] | None:
+        """The box around polygons, [x, y, x, y, ...] each; None without any."""
+        if isinstance(outline, dict):
+            self.refuse(number, "has a mask (RLE) and no bbox; boxes are read")
+        flat = [part for part in outline if isinstance(part, list)] if isinstance(outline, list) else []
+        points = [value for part in flat for value in part[: len(part) // 2 * 2]]
+        if not points or not all(map(_is_number, points)):
+            return None
+        self.outlined += 1
+        x, y = ([_float(value) for part in flat for value in part[axis : len(part) // 2 * 2 : 2]] for axis in (0, 1))
+        return [min(x), min(y), max(x) - min(x), max(y) - min(y)]
+
     def refuse(self, number: int, words: str) -> NoReturn:
         raise McaptrackError(f"{self.at(number)} {words}")
 
@@ -142,6 +158,8 @@ class _Rows:
         boxes, is_crowd = values[:, 1:5], crowd != 0
         rows = BoxRows(self._path, "coco", self.at, frame, boxes, track_id, score, number, names, is_crowd)
         rows.observed = unseen == 0
+        if self.outlined:
+            rows.remarks.append(f"{self._path}: {self.outlined} boxes are those around polygons, which have no bbox")
         rows.take_shares()
         return rows
 
@@ -189,7 +207,7 @@ def _annotations(path: Path, content: Mapping[str, Any]) -> BoxRows:
     _check_count(path, entries)
     ids = [_key(image["id"]) for image in images]
     if len(set(ids)) < len(ids):
-        twice = next(one for one in ids if ids.count(one) > 1)
+        twice = Counter(ids).most_common(1)[0][0]
         raise McaptrackError(f"{path}: {twice} is the id of several images")
     videos = {_key(image[key]) for image in images for key in _VIDEOS if key in image}
     if len(videos) > 1:
@@ -223,7 +241,8 @@ def _annotations(path: Path, content: Mapping[str, Any]) -> BoxRows:
 
 
 def _key(value: Any) -> str:
-    return str(value)[:_MAX_NAME]
+    """The id of an image or a video as text; 1.0, as pandas writes it, is 1."""
+    return str(int(value) if isinstance(value, float) and value.is_integer() else value)[:_MAX_NAME]
 
 
 def _check_count(path: Path, entries: list[Any]) -> None:

@@ -12,7 +12,8 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
 from mcaptrack.sources.ingest.labels.columns import choose_columns
-from mcaptrack.sources.ingest.labels.cvat import is_cvat, read_cvat
+from mcaptrack.sources.ingest.labels.cvat import read_cvat
+from mcaptrack.sources.ingest.labels.cvat_files import is_cvat
 from mcaptrack.sources.ingest.labels.delimited import MAX_LINE, SUPERVISION, comment_header, header_of, read_csv
 from mcaptrack.sources.ingest.labels.formats import FORMATS_3D, READERS, Format, Labels, Role
 from mcaptrack.sources.ingest.labels.json_boxes import is_json, read_json
