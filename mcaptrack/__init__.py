@@ -15,6 +15,7 @@ _PARTS = {
     "health": ["DoctorResult", "doctor"],
     "ingesting": ["IngestResult", "ingest"],
     "exporting": ["ExportResult", "export"],
+    "notebook": ["Player"],
     "outputs": ["ReportResult", "report"],
     "querying": ["ColumnInfo", "TableInfo", "TableList", "list_tables", "query"],
     "recording": ["Recording", "open"],

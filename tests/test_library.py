@@ -36,12 +36,12 @@ from tests.worlds import small_scene
 PACKAGE = Path(mcaptrack.__file__).parent
 FUNCTIONS = [name for name in mcaptrack.__all__ if inspect.isfunction(getattr(mcaptrack, name))]
 CLASSES = [name for name in mcaptrack.__all__ if inspect.isclass(getattr(mcaptrack, name))]
-#: The public methods that classes of the package define, by name.
+#: The public methods of classes of the package, by name, also those that they inherit.
 METHODS = {
     f"{name}.{method}": value
     for name in CLASSES
-    for method, value in vars(getattr(mcaptrack, name)).items()
-    if inspect.isfunction(value) and not method.startswith("_")
+    for method, value in inspect.getmembers(getattr(mcaptrack, name), inspect.isfunction)
+    if value.__module__.startswith("mcaptrack.") and not method.startswith("_")
 }
 SECTIONS = ["Parameters", "Returns", "Raises", "Examples"]
 #: Optional packages that examples need.

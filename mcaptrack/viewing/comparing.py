@@ -138,9 +138,11 @@ def compare(
                 total = options.width_px or min(_WIDTH_PX, whole.shape[1] * len(panels))
                 width = max(2, total // len(panels) // 2 * 2)
                 if scene in opened.channels:
-                    ground = at_times(opened.messages(scene, *span)), message_decoder(opened, scene)
+                    read = message_decoder(opened, scene)
+                    ground = at_times(opened.messages(scene, *span)), read
                     inset = max(16, round(width * len(panels) * _GROUND))
-                    sight = sights(opened, [scene], span, inset, None, 1)[0]
+                    scenes = (read(message.payload) for message in opened.messages(scene, *span))
+                    sight = sights(scenes, inset, None, 1)[0]
             plain = scaled(whole, width)
             parts = []
             for view, read in drawn:

@@ -13,7 +13,8 @@ from mcaptrack.foxglove import ANNOTATIONS
 from mcaptrack.foxglove.messages import message_class
 from mcaptrack.geometry.arrays import Floats, Image
 
-_BACKGROUND: Final = (32, 28, 26)
+#: The colour of the ground: blue, green, red.
+BACKGROUND: Final = (32, 28, 26)
 _GRID: Final = (0.2, 0.22, 0.25, 1.0)
 _INK: Final = (0.85, 0.87, 0.9, 1.0)
 _ROBOT: Final = (1.0, 1.0, 1.0, 0.9)
@@ -52,7 +53,7 @@ class Sight(NamedTuple):
 
 def ground(sight: Sight) -> Image:
     """The empty ground, BGR (height, width, 3)."""
-    return np.full((sight.height_px, sight.width_px, 3), _BACKGROUND, np.uint8)
+    return np.full((sight.height_px, sight.width_px, 3), BACKGROUND, np.uint8)
 
 
 def grid(sight: Sight) -> Any:
@@ -148,7 +149,7 @@ def _text(out: Any, words: str, at_px: Floats, rgba: Shade) -> None:
     text = out.texts.add(text=words, font_size=_TEXT_PX)
     text.position.x, text.position.y = at_px.tolist()
     _paint(text.text_color, rgba)
-    _paint(text.background_color, (_BACKGROUND[2] / 255, _BACKGROUND[1] / 255, _BACKGROUND[0] / 255, 1.0))
+    _paint(text.background_color, (BACKGROUND[2] / 255, BACKGROUND[1] / 255, BACKGROUND[0] / 255, 1.0))
 
 
 def _paint(colour: Any, rgba: Shade) -> None:

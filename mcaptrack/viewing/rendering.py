@@ -7,7 +7,7 @@ Letters: P points.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -161,7 +161,9 @@ def render_from_above(
     chosen = times[chosen_pictures(opened, times, "scenes", output, options)]
     span = int(chosen[0]), int(chosen[-1]) + 1
     path = path_of_robot(chosen)
-    seen = sights(opened, view_topics, span, options.width_px or _WIDTH_PX, path, len(chosen))
+    read_first = message_decoder(opened, view_topics[0])
+    scenes = (read_first(message.payload) for message in opened.messages(view_topics[0], *span))
+    seen = sights(scenes, options.width_px or _WIDTH_PX, path, len(chosen))
 
     def drawn() -> Iterator[tuple[int, Image]]:
         views = [(at_times(opened.messages(topic, *span)), message_decoder(opened, topic)) for topic in view_topics]
@@ -179,21 +181,18 @@ def render_from_above(
     return write_clip(output, drawn(), rate_of(chosen))
 
 
-def sights(
-    opened: log.Log, topics: Sequence[str], span: tuple[int, int], width_px: int, path: RobotPath | None, count: int
-) -> list[Sight]:
-    """The part of the ground in each picture: the surroundings of the robot, or all boxes and people."""
+def sights(scenes: Iterable[Any], width_px: int, path: RobotPath | None, count: int) -> list[Sight]:
+    """The part of the ground in each picture: the surroundings of the robot, or all boxes and people of the scenes."""
     size = width_px // 2 * 2, max(2, round(width_px * _HEIGHT) // 2 * 2)
     if path is not None:
         known = np.flatnonzero(np.isfinite(path.at_m).all(axis=1))
         if len(known):
             nearest = known[np.abs(known[None] - np.arange(count)[:, None]).argmin(axis=1)]
             return [Sight(x, y, size[0] / _AROUND_M, *size) for x, y in path.at_m[nearest].tolist()]
-    read = message_decoder(opened, topics[0])
     places = [
         (shape.pose.position.x, shape.pose.position.y)
-        for message in opened.messages(topics[0], *span)
-        for entity in read(message.payload).entities
+        for scene in scenes
+        for entity in scene.entities
         for shape in (*entity.cubes, *entity.cylinders)
     ]
     low, high = np.quantile(np.array(places), [0.01, 0.99], axis=0) if places else np.array([[-5.0, -5.0], [5.0, 5.0]])

@@ -1,0 +1,217 @@
+"""Logs in notebooks: players and stills that Jupyter and its relatives show, without widgets.
+
+HTML with a script needs no package and no server, and stays in the notebook when it is converted or sent to someone; a
+widget needs both, and is blank there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack import log as logs
+from mcaptrack import pipeline
+from mcaptrack.api.common import PathLike, Progress, as_path, warn_unused, warnings_about
+from mcaptrack.errors import McaptrackError
+from mcaptrack.files import publish_bytes, refuse_overwrite
+from mcaptrack.foxglove.views import SCENE_SUFFIX
+from mcaptrack.location import Location
+from mcaptrack.notices import Notice
+from mcaptrack.viewing.moments import find_moments, opening_moment
+from mcaptrack.viewing.notebook.page import Still, player_html, still_html
+from mcaptrack.viewing.notebook.pictures import PLAYER_PX, PictureSource, still_jpeg
+
+_MB: Final = 1e6
+#: The part of the largest size that is planned for, because sizes are estimated.
+_PLANNED: Final = 0.92
+
+
+class Choice(NamedTuple):
+    """Which pictures: from ``start_s`` to ``end_s`` (None: the end) every ``every``-th (None: as many as fit).
+
+    ``width_px`` is their width in pixels; None stands for a usual one.
+    """
+
+    start_s: float = 0.0
+    end_s: float | None = None
+    every: int | None = None
+    width_px: int | None = None
+
+
+@dataclass(frozen=True)
+class Player:
+    """Pictures of a log with what was found in them, made by ``Recording.show``; notebooks show it.
+
+    Attributes
+    ----------
+    log : pathlib.Path or str
+        The log; the URL of one in a store.
+    topic : str
+        The channel of the pictures, or of the scenes.
+    is_above : bool
+        Whether scenes are shown, from above, instead of pictures.
+    views : tuple of str
+        Topics of the views that are drawn.
+    pictures : int
+        Number of pictures in the player; 1 for a still.
+    of : int
+        Number of pictures of the log in the period.
+    every : int
+        Every such picture of them is shown.
+    first_s, last_s : float
+        Times of the first and the last picture, in seconds since the start of the log.
+    html : str
+        What notebooks show. It opens no connection.
+    still : bytes
+        A JPEG file: the picture that the player opens with, for programs that show no HTML.
+    warnings : tuple of mcaptrack.Notice
+        What was left out or looks odd.
+
+    """
+
+    log: Location
+    topic: str
+    is_above: bool
+    views: tuple[str, ...]
+    pictures: int
+    of: int
+    every: int
+    first_s: float
+    last_s: float
+    html: str = field(repr=False)
+    still: bytes = field(repr=False)
+    warnings: tuple[Notice, ...] = ()
+
+    def __repr__(self) -> str:
+        return f"Player({self.log.name}: {self.caption}; {len(self.html) / _MB:.1f} MB)"
+
+    @property
+    def caption(self) -> str:
+        """The pictures and their number, in a line."""
+        return _caption(self)
+
+    def save(self, path: PathLike, *, force: bool = False) -> Path:
+        """Write it as a page that needs no other file.
+
+        Parameters
+        ----------
+        path : path
+            The HTML file.
+        force : bool, default False
+            Overwrite the file if it exists.
+
+        Returns
+        -------
+        pathlib.Path
+            The file.
+
+        Raises
+        ------
+        McaptrackError
+            If the file exists, or can't be written.
+
+        Examples
+        --------
+        >>> import mcaptrack
+        >>> with mcaptrack.open("log.mcap") as log:
+        ...     log.show(end_s=1.0).save("walk.html").name
+        'walk.html'
+
+        """
+        target = as_path(path)
+        refuse_overwrite(target, force)
+        head = '<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>mcaptrack</title>\n'
+        page = f"{head}{self.html}</html>\n"
+        publish_bytes(target, page.encode("utf-8"))
+        return target
+
+    def _repr_mimebundle_(self, **_: Any) -> dict[str, Any]:
+        """The forms that a notebook keeps: HTML, a picture for programs without it, and text."""
+        return {"text/html": self.html, "image/jpeg": self.still, "text/plain": repr(self)}
+
+
+def show_log(
+    opened: logs.Log,
+    at_s: float | None,
+    *,
+    topics: Sequence[str],
+    camera: str | None,
+    choice: Choice,
+    max_mb: float,
+    progress: Progress,
+) -> Player:
+    """Return a player, or a still of a time, of an open log. See ``Recording.show``."""
+    with warnings_about(opened.path) as warnings:
+        source = PictureSource(opened, pipeline.find_camera(opened, camera), topics)
+        if at_s is None:
+            made = _player(opened, source, choice, max_mb, progress)
+        else:
+            given = {"start_s": choice.start_s > 0, "end_s": choice.end_s is not None, "every": bool(choice.every)}
+            warn_unused("a still is one picture", **given)
+            made = _still(opened, source, source.number_at(at_s), choice.width_px)
+    return replace(made, warnings=tuple(dict.fromkeys(warnings)))
+
+
+def _still(opened: logs.Log, source: PictureSource, number: int, width_px: int | None) -> Player:
+    seconds = source.seconds(int(source.t_ns[number]))
+    image = source.still(number, width_px)
+    jpeg = still_jpeg(image)
+    made = Player(
+        opened.path, source.topic, source.is_above, source.views, 1, 1, 1, seconds, seconds, html="", still=jpeg
+    )
+    title = f"{opened.path.name}: {made.caption}"
+    return replace(made, html=still_html(jpeg, image.shape[1], title))
+
+
+def _player(opened: logs.Log, source: PictureSource, choice: Choice, max_mb: float, progress: Progress) -> Player:
+    numbers = source.numbers(choice.start_s, choice.end_s)
+    moments = find_moments(opened)
+    at_ns, _ = opening_moment(opened, moments)
+    events = [
+        (source.seconds(one.t_ns), one.text)
+        for one in moments
+        if any(f"{view}/".startswith(f"{one.topic}/") for view in source.views)
+    ]
+    every = choice.every or source.step(numbers, _PLANNED * max_mb * _MB, choice.width_px)
+    taken = source.take(numbers[::every], choice.width_px, progress)
+    while True:
+        seconds = [source.seconds(t_ns) for t_ns in taken.t_ns]
+        opens_at = max(0, int(np.searchsorted(taken.t_ns, at_ns, "right")) - 1) if at_ns <= taken.t_ns[-1] else 0
+        image = source.still(taken.numbers[opens_at], choice.width_px or min(PLAYER_PX, taken.sizes[0][0]))
+        still = Still(still_jpeg(image), image.shape[1])
+        span = seconds[0], seconds[-1]
+        made = Player(
+            opened.path, source.topic, source.is_above, source.views,
+            len(seconds), len(numbers), every, *span, html="", still=still.jpeg,
+        )  # fmt: skip
+        inside = [(at, text) for at, text in events if span[0] <= at <= span[1]]
+        html = player_html(taken, seconds, inside, opens_at, still, f"{opened.path.name}: {made.caption}")
+        if len(html) <= max_mb * _MB or len(seconds) == 1:
+            return replace(made, html=html)
+        if choice.every is not None:
+            raise McaptrackError(
+                f"{opened.path}: {len(seconds)} {source.noun} make a player of {len(html) / _MB:.1f} MB, and "
+                f"`max_mb={max_mb:g}` is the limit; give a larger `every=`, a smaller `width=` or a shorter period"
+            )
+        taken, every = taken.half(), 2 * every
+
+
+def _caption(player: Player) -> str:
+    """Describe the contents of a player in a line."""
+    shown = f"{player.topic.removesuffix(SCENE_SUFFIX)} from above" if player.is_above else player.topic
+    if player.pictures == player.of == 1:
+        return f"{shown} at {player.first_s:.2f} s"
+    step = "" if player.every == 1 else f" (every {_ordinal(player.every)})"
+    is_all = player.pictures == player.of
+    count = f"all {player.of:,}" if is_all else f"{player.pictures:,} of {player.of:,}"
+    what = "scenes" if player.is_above else "pictures"
+    return f"{shown}, {player.first_s:.1f} to {player.last_s:.1f} s: {count} {what}{step}"
+
+
+def _ordinal(number: int) -> str:
+    end = "th" if number % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(number % 10, "th")
+    return f"{number}{end}"

@@ -1,0 +1,1 @@
+"""Players, stills, tables and pages for notebooks, as HTML that needs no other file."""

@@ -1,0 +1,84 @@
+"""The HTML of players, stills and pages in notebooks: one piece that needs no other file and opens no connection.
+
+A player is a page of its own in a frame, so that its style and script and those of the notebook don't meet. Below the
+frame lies a still with a caption: it is what remains where frames are taken out, as in notebooks that are not trusted.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from base64 import b64encode
+from collections.abc import Sequence
+from hashlib import sha256
+from typing import Any, Final, NamedTuple
+
+from mcaptrack.foxglove.views import SUFFIXES
+from mcaptrack.viewing.from_above import BACKGROUND
+from mcaptrack.viewing.notebook.pictures import Clip
+from mcaptrack.viewing.report.html import render
+
+#: The least width of a player in pixels: there is room for what it is controlled with.
+_LEAST_PX: Final = 420
+
+
+class Still(NamedTuple):
+    """A picture with drawings as a JPEG file, and its width in pixels."""
+
+    jpeg: bytes
+    width_px: int
+
+
+def still_html(jpeg: bytes, width_px: int, caption: str) -> str:
+    """Return a picture with a caption."""
+    return str(render("in_notebook.html", width=width_px, jpeg=jpeg, caption=caption, page=""))
+
+
+def player_html(
+    taken: Clip,
+    seconds: Sequence[float],
+    events: Sequence[tuple[float, str]],
+    opens_at: int,
+    still: Still,
+    caption: str,
+) -> str:
+    """Return the player of N pictures at times in seconds (N,), with events at times, each with a text.
+
+    ``opens_at`` is the picture that it begins with, ``still``.
+    """
+    data = {
+        "seconds": [round(one, 3) for one in seconds],
+        "numbers": taken.numbers,
+        "sizes": taken.sizes,
+        "layers": taken.layers,
+        "names": {topic: _name(topic) for topic in taken.layers if topic},
+        "colours": taken.strokes.colours,
+        "drawn": taken.drawn,
+        "events": [[round(at, 3), text] for at, text in events],
+        "open": opens_at,
+        "ground": "#" + bytes(BACKGROUND[::-1]).hex(),
+    }
+    page = render(
+        "player.html",
+        caption=caption,
+        pictures=" ".join(_base64(jpeg) for jpeg in taken.jpegs),
+        data=_base64(_packed(data)),
+        nonce=_base64(sha256(caption.encode("utf-8", "replace")).digest()[:12]),
+    )
+    width = max(still.width_px, _LEAST_PX)
+    return str(render("in_notebook.html", width=width, jpeg=still.jpeg, caption=caption, page=str(page)))
+
+
+def _name(topic: str) -> str:
+    """The name of a view: the channel that it draws, without the camera."""
+    for suffix in SUFFIXES:
+        topic = topic.partition(suffix)[0]
+    return topic.lstrip("/").partition("/")[2] or topic
+
+
+def _packed(data: Any) -> bytes:
+    return zlib.compress(json.dumps(data, allow_nan=False, separators=(",", ":")).encode(), 9)
+
+
+def _base64(data: bytes) -> str:
+    return b64encode(data).decode()

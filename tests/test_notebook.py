@@ -1,0 +1,319 @@
+"""What notebooks show of a log: a player that needs no other file, a still, tables and reports."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+import zlib
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+from google.protobuf import json_format
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+import mcaptrack
+from mcaptrack.errors import McaptrackError
+from tests.commands import done
+
+CLOSED, PAIRS = 0, 2
+
+
+class Elements(HTMLParser):
+    """The elements of a page with their attributes, and the text in each element with an id."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str]]] = []
+        self.texts: dict[str, str] = {}
+        self._id = ""
+        self.feed(html)
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, {name: value or "" for name, value in attrs}))
+        self._id = self.found[-1][1].get("id", "")
+
+    def handle_endtag(self, tag):
+        self._id = ""
+
+    def handle_data(self, data):
+        if self._id:
+            self.texts[self._id] = self.texts.get(self._id, "") + data
+
+    def of(self, tag: str) -> list[dict[str, str]]:
+        return [attributes for name, attributes in self.found if name == tag]
+
+
+class Shown(NamedTuple):
+    """What is in a player: the page in its frame, its data, and its pictures (height, width, 3)."""
+
+    page: Elements
+    data: dict[str, Any]
+    pictures: list[np.ndarray]
+
+
+def decoded(text: str) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(base64.b64decode(text), np.uint8), cv2.IMREAD_COLOR)
+
+
+def shown(player: mcaptrack.Player) -> Shown:
+    (frame,) = Elements(player.html).of("iframe")
+    assert frame["sandbox"] == "allow-scripts"
+    page = Elements(frame["srcdoc"])
+    data = json.loads(zlib.decompress(base64.b64decode(page.texts["data"])))
+    return Shown(page, data, [decoded(one) for one in page.texts.get("pictures", "").split()])
+
+
+def stored(path: Path, topic: str) -> dict[int, Any]:
+    """The messages of a channel by log time, as the stock MCAP library and the protobuf runtime read them."""
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        return {message.log_time: decoded for _, _, message, decoded in reader.iter_decoded_messages([topic])}
+
+
+def start_of(path: Path) -> int:
+    with path.open("rb") as file:
+        return make_reader(file).get_summary().statistics.message_start_time
+
+
+@pytest.fixture(scope="module")
+def player(finished) -> mcaptrack.Player:
+    with mcaptrack.open(finished) as log:
+        return log.show()
+
+
+class TestPlayer:
+    def test_its_boxes_are_the_rows_of_the_log(self, finished, player):
+        data, start_ns = shown(player).data, start_of(finished)
+        rows = {round((t - start_ns) / 1e9, 3): m for t, m in stored(finished, "/camera/retracks/full").items()}
+        layer = data["layers"].index("/camera/retracks/full/view/image")
+        compared = 0
+        for second, drawn in zip(data["seconds"], data["drawn"], strict=True):
+            lines, texts = drawn[layer]
+            boxes = sorted(line[4] for line in lines if line[0] == CLOSED and len(line[4]) == 8)
+            message = rows.get(second)
+            expected = sorted(
+                [r.x_px, r.y_px, r.x_px + r.w_px, r.y_px, r.x_px + r.w_px, r.y_px + r.h_px, r.x_px, r.y_px + r.h_px]
+                for r in (message.rows if message else ())
+            )
+            assert len(boxes) == len(expected)
+            if boxes:
+                np.testing.assert_allclose(boxes, expected, atol=0.126)
+                assert sorted(text[5] for text in texts) == sorted(str(r.track_id) for r in message.rows)
+            compared += len(boxes)
+        assert compared > 60
+
+    def test_each_drawing_is_that_of_the_view_in_its_colours(self, finished, player):
+        data, start_ns = shown(player).data, start_of(finished)
+        assert data["layers"] == list(player.views)
+        for layer, topic in enumerate(player.views):
+            views = {round((t - start_ns) / 1e9, 3): m for t, m in stored(finished, topic).items()}
+            for second, drawn in zip(data["seconds"], data["drawn"], strict=True):
+                lines, texts = drawn[layer]
+                view = views[second]
+                assert [text[5] for text in texts] == [text.text for text in view.texts]
+                visible = [part for part in view.points if part.type in (2, 4)]
+                points = sum(len(part.points) for part in visible)
+                assert sum(len(line[4]) // 2 for line in lines) == points
+                colours = {
+                    "#" + bytes(round(255 * c) for c in (o.r, o.g, o.b, o.a)).hex()
+                    for part in visible
+                    for o in (part.outline_colors or [part.outline_color])
+                }
+                assert {data["colours"][line[2]] for line in lines} == colours
+
+    def test_its_pictures_are_those_of_the_video(self, finished, player):
+        found = shown(player)
+        assert (player.pictures, player.of, player.every) == (60, 60, 1)
+        with mcaptrack.open(finished) as log:
+            for frame, picture in zip(log.frames("video"), found.pictures, strict=True):
+                assert np.abs(picture.astype(int) - frame.rows).mean() < 8
+        assert found.data["sizes"] == [[320, 180]] * 60
+        assert found.data["numbers"] == list(range(60))
+
+    def test_it_opens_at_the_first_event_and_names_all(self, finished, player):
+        data = shown(player).data
+        with mcaptrack.view(finished) as server:
+            events = [one for one in server.events if one.topic == "/camera/retracks"]
+            at_s = server.at_s
+        assert [text for _, text in data["events"]] == [one.text for one in events]
+        assert abs(data["seconds"][data["open"]] - at_s) <= 0.1
+
+    def test_it_opens_no_connection_and_runs_only_its_own_script(self, player):
+        page = shown(player).page
+        (policy,) = (one["content"] for one in page.of("meta") if one.get("http-equiv") == "Content-Security-Policy")
+        rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
+        assert rules["default-src"] == "'none'"
+        assert rules["img-src"] == "data:"
+        scripts = [one for one in page.of("script") if one.get("type") != "text/plain"]
+        assert [f"'nonce-{one['nonce']}'" for one in scripts] == [rules["script-src"]]
+        assert "http:" not in player.html
+        assert "https:" not in player.html
+        for part in (Elements(player.html), page):
+            for _, attributes in part.found:
+                assert not any(name.startswith("on") for name in attributes)
+                assert attributes.get("src", "data:").startswith("data:image/jpeg;base64,") or "src" not in attributes
+
+    def test_a_still_remains_where_frames_are_taken_out(self, player):
+        outside = Elements(player.html)
+        (image,) = outside.of("img")
+        still = decoded(image["src"].partition(",")[2])
+        assert still.shape == (180, 320, 3)
+        assert np.array_equal(still, cv2.imdecode(np.frombuffer(player.still, np.uint8), cv2.IMREAD_COLOR))
+        assert player.caption in re.sub(r"<iframe.*</iframe>", "", player.html)
+
+    def test_notebooks_get_html_a_picture_and_text(self, player):
+        bundle = player._repr_mimebundle_(include=None, exclude=None)
+        assert bundle == {"text/html": player.html, "image/jpeg": player.still, "text/plain": repr(player)}
+        assert "all 60 pictures" in repr(player)
+
+    def test_a_player_is_no_larger_than_asked_for_and_says_what_it_leaves_out(self, finished):
+        with mcaptrack.open(finished) as log:
+            small = log.show(max_mb=0.2)
+            assert len(small.html) <= 200_000
+            assert small.pictures == len(shown(small).pictures) == -(-60 // small.every)
+            assert small.of == 60
+            assert f"{small.pictures} of 60 pictures (every " in small.caption
+            numbers = shown(small).data["numbers"]
+            assert numbers == list(range(0, 60, small.every))
+            with pytest.raises(McaptrackError, match=r"60 pictures make a player of .* MB, and `max_mb=0.2` is the"):
+                log.show(max_mb=0.2, every=1)
+
+    def test_a_period_every_picture_and_the_width_are_chosen(self, finished):
+        with mcaptrack.open(finished) as log:
+            part = log.show(start_s=1.0, end_s=3.0, every=5, width=160, topic="/camera/tracks")
+        found = shown(part)
+        assert found.data["seconds"] == [1.0, 1.5, 2.0, 2.5, 3.0]
+        assert {picture.shape for picture in found.pictures} == {(90, 160, 3)}
+        assert part.views == ("/camera/tracks/view/image",)
+        assert (part.first_s, part.last_s, part.of) == (1.0, 3.0, 21)
+
+    def test_it_is_saved_as_a_page(self, player, tmp_path):
+        target = player.save(tmp_path / "walk.html")
+        assert player.html in target.read_text(encoding="utf-8")
+        with pytest.raises(McaptrackError, match="exists"):
+            player.save(target)
+        assert player.save(target, force=True) == target
+
+
+class TestStill:
+    def test_it_shows_the_picture_of_a_time_with_its_boxes(self, finished):
+        with mcaptrack.open(finished) as log:
+            still = log.show(2.04, width=320)
+            (plain,) = log.frames("video", times=[start_of(finished) + 2_000_000_000])
+        assert (still.pictures, still.first_s) == (1, 2.0)
+        assert Elements(still.html).of("iframe") == []
+        image = cv2.imdecode(np.frombuffer(still.still, np.uint8), cv2.IMREAD_COLOR)
+        (message,) = [m for t, m in stored(finished, "/camera/retracks/full").items() if t - start_of(finished) == 2e9]
+        changed = np.abs(image.astype(int) - plain.rows).max(axis=2)
+        for row in message.rows:
+            edge = changed[round(row.y_px) + 3 : round(row.y_px + row.h_px) - 3, round(row.x_px)]
+            assert np.median(edge) > 40
+
+    @pytest.mark.parametrize("at_s", [6.2, 100.0])
+    def test_a_time_without_a_picture_is_refused(self, finished, at_s):
+        with (
+            mcaptrack.open(finished) as log,
+            pytest.raises(McaptrackError, match=r"its pictures are from 0.000 to 5.9"),
+        ):
+            log.show(at_s)
+
+
+class TestOtherLogs:
+    def test_a_log_without_pictures_is_seen_from_above(self, finished, tmp_path):
+        path = tmp_path / "none.mcap"
+        rows = [f"{f + 1},{p},{30 + 4 * f + 60 * p},{60 + 9 * p},20,60,1" for f in range(30) for p in (1, 2)]
+        (tmp_path / "boxes.txt").write_text("\n".join(rows))
+        (tmp_path / "plane.txt").write_text("0.02 0 0\n0 0.02 0\n0 0 1")
+        done("ingest", tmp_path / "boxes.txt", "--fps", "10", "--as", "tracks",
+             "--ground-plane", tmp_path / "plane.txt", "-o", path)  # fmt: skip
+        with mcaptrack.open(path) as log:
+            above = log.show()
+            still = log.show(1.0)
+            tracks = log.array("tracks", "/camera/tracks")
+        data = shown(above).data
+        assert shown(above).pictures == []
+        assert data["layers"][0] == ""
+        assert "from above" in above.caption
+        assert data["sizes"][0] == [640, 480]
+        # Both discs of a scene are as far apart as the people, by the scale that the bar of the grid shows.
+        ground, (lines, _) = data["drawn"][10]
+        (bar,) = (line for line in ground[0] if line[1] == 3.0)
+        (words,) = (text[5] for text in ground[1])
+        px_per_m = (bar[4][2] - bar[4][0]) / float(words.removesuffix(" m"))
+        places = np.array([np.reshape(line[4], (-1, 2)).mean(axis=0) for line in lines if line[0] == CLOSED])
+        at = tracks[tracks["t_ns"] == np.unique(tracks["t_ns"])[10]]
+        metres = np.hypot(*(at["x_m"][1] - at["x_m"][0], at["y_m"][1] - at["y_m"][0]))
+        assert np.hypot(*(places[1] - places[0])) == pytest.approx(metres * px_per_m, abs=1.0)
+        assert still.still[:2] == b"\xff\xd8"
+
+    def test_rows_without_a_view_are_drawn(self, fresh):
+        with mcaptrack.open(fresh) as log:
+            labels = log.show(end_s=1.0)
+            assert labels.views == ("/camera/truth",)
+            assert log.show(end_s=0.2, topic="truth").views == labels.views
+        data, start_ns = shown(labels).data, start_of(fresh)
+        rows = stored(fresh, "/camera/truth")
+        for second, drawn in zip(data["seconds"], data["drawn"], strict=True):
+            expected = sorted((r.x_px, r.y_px) for r in rows[start_ns + round(second * 1e9)].rows)
+            found = sorted(tuple(line[4][:2]) for line in drawn[0][0] if line[0] == CLOSED and len(line[4]) == 8)
+            np.testing.assert_allclose(found, expected, atol=0.126)
+
+    def test_pictures_alone_are_shown_and_it_is_said(self, footage, tmp_path):
+        path = tmp_path / "plain.mcap"
+        done("ingest", footage.video, "-o", path)
+        with mcaptrack.open(path) as log:
+            with pytest.warns(mcaptrack.McaptrackWarning, match="nothing is drawn on the pictures: .* no views"):
+                plain = log.show(end_s=0.5)
+            assert (plain.views, plain.pictures) == ((), 6)
+            assert [one.code for one in plain.warnings] == ["nothing-found"]
+            with pytest.raises(McaptrackError, match="has no boxes, tracks or predictions to draw; there are none"):
+                log.show(topic="video")
+
+    def test_a_log_with_nothing_to_see_is_refused(self, tmp_path):
+        with mcaptrack.open(tmp_path / "new.mcap", create=True) as log, pytest.raises(McaptrackError) as refused:
+            log.show()
+        assert "\n" not in str(refused.value)
+
+    def test_names_in_a_log_are_text(self, finished, tmp_path):
+        name = "<script>alert(1)</script>&\"'.mcap"
+        path = Path(shutil.copy(finished, tmp_path / name.replace("/", "_")))
+        with mcaptrack.open(path) as log:
+            log.write("/a<img src=x>/tracks", log.array("tracks", "/camera/tracks")[:20])
+            made = log.show(camera="camera", end_s=0.3)
+        page = shown(made).page
+        assert [one for one in page.of("script") if one.get("type") != "text/plain"] == page.of("script")[-1:]
+        assert page.of("title") == [{}]
+        assert "<script>alert" not in made.html
+
+
+def test_the_strokes_of_any_annotations_can_be_written_as_json():
+    from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+
+    from mcaptrack.viewing.notebook.strokes import Strokes
+
+    black, clear = {"a": 1.0}, {"a": 0.0}
+    message = json_format.ParseDict(
+        {
+            "points": [
+                {"type": 2, "points": [{"x": "NaN", "y": 1}], "outlineColor": black},
+                {"type": 2, "points": [{"x": 1, "y": 1}], "outlineColor": clear},
+                {"type": 3, "points": [{"x": k, "y": 0} for k in range(3)], "outlineColors": [black, black, clear]},
+                {"type": 4, "points": [{"x": k, "y": 0} for k in range(3)], "outlineColor": {"a": "NaN"}},
+                {"type": 1, "points": [{"x": 1, "y": 1}], "outlineColor": black},
+            ],
+            "texts": [{"position": {"x": "Infinity"}, "text": "a"}, {"position": {}, "text": "b", "textColor": black}],
+        },
+        ImageAnnotations(),
+    )
+    strokes = Strokes()
+    lines, texts = strokes.of(message)
+    assert lines == [[PAIRS, 0.0, 0, -1, [0.0, 0.0, 1.0, 0.0]]]
+    assert texts == [[0.0, 0.0, 0.0, 0, -1, "b"]]
+    assert strokes.colours == ["#000000ff"]
