@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -20,7 +21,9 @@ import mcaptrack
 from mcaptrack import foxglove, log
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.sources.foreign import MessageType, picture_decoder
+from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.foreign.replaced_pictures import picture_replacer
+from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video.raw_pixels import RAW_ENCODINGS, PixelLayout, raw_bgr, raw_with
 from mcaptrack.viewing.blur.mosaic import hide
 from tests.commands import call, printed
@@ -74,8 +77,10 @@ def test_a_person_is_a_handful_of_colours():
     )
 
 
-def walk_log(path: Path) -> dict[int, tuple[float, float, float, float]]:
+def walk_log(path: Path, watched: int = 50) -> dict[int, tuple[float, float, float, float]]:
     """A log of 5 s: somebody tracked with a hole of 2.7 s, found 1 s late and lost 1 s early, a car and a detection.
+
+    Only the first pictures, ``watched``, have frames of tracks and detections.
 
     Returns the true box of the person in each picture.
     """
@@ -107,10 +112,10 @@ def walk_log(path: Path) -> dict[int, tuple[float, float, float, float]]:
             )
 
         car = (5, 3, (100.0, 5.0, 40.0, 20.0))
-        frames = [frame(n, *([(1, 1, true[n])] if n in tracked else []), car) for n in range(50)]
+        frames = [frame(n, *([(1, 1, true[n])] if n in tracked else []), car) for n in range(watched)]
         add_rows(writer, "/camera/tracks", TRACKS, frames, "track", "/camera/video")
         found = DETECTIONS.rows(x_px=[30.0], y_px=[80.0], w_px=[10.0], h_px=[20.0], score=[0.5], class_id=[1])
-        seen = [Frame(ns(n / 10), n, found if n == 20 else found[:0]) for n in range(50)]
+        seen = [Frame(ns(n / 10), n, found if n == 20 else found[:0]) for n in range(watched)]
         add_rows(writer, "/camera/detections", DETECTIONS, seen, "detect", "/camera/video")
     return true
 
@@ -155,6 +160,54 @@ def test_a_person_stays_hidden_in_gaps_and_around_the_track_and_all_else_is_kept
         assert opened.attachment("notes.txt") == b"secret"
 
 
+def test_pictures_that_no_detector_saw_are_counted_in_a_warning(tmp_path):
+    """Frames end at 1.9 s; the pictures from 3 s on are more than a second later."""
+    walk_log(tmp_path / "a.mcap", watched=20)
+    done = mcaptrack.render(tmp_path / "a.mcap", tmp_path / "b.mp4", blur="people", end_s=0.1)
+    said = [one.message for one in done.warnings if one.code == "not-blurred"]
+    assert [("no detector saw 20 of the 50 pictures of /camera/video" in one) for one in said] == [True]
+
+
+@pytest.mark.parametrize("codec", ["libx265", "libvpx-vp9"])
+def test_videos_that_few_viewers_play_become_h264_and_are_hidden(tmp_path, codec):
+    """A recorded video of a robot: a message for each packet, with a box in the middle of all pictures."""
+    name = {"libx265": "h265", "libvpx-vp9": "vp9"}[codec]
+    options = {"x265-params": "log-level=none:bframes=0:keyint=4"} if name == "h265" else {"lag-in-frames": "0"}
+    image = noise(2)
+    context = av.CodecContext.create(codec, "w")
+    context.width, context.height, context.pix_fmt = *SIZE, "yuv420p"
+    context.time_base, context.framerate, context.options = Fraction(1, 10), Fraction(10), options
+    packets = []
+    for n in range(6):
+        frame = av.VideoFrame.from_ndarray(image, format="bgr24")
+        frame.pts = n
+        packets += [bytes(packet) for packet in context.encode(frame)]
+    packets += [bytes(packet) for packet in context.encode(None)]
+    assert len(packets) == 6
+    with log.create(tmp_path / "a.mcap") as writer:
+        video = writer.add_channel("/front/video", foxglove.schema_record(foxglove.VIDEO), "protobuf", {}, "media")
+        for n, data in enumerate(packets):
+            writer.add_message(
+                video, ns(n / 10), n, foxglove.pack_picture(foxglove.VIDEO, ns(n / 10), "eye", name, data)
+            )
+        box = DETECTIONS.rows(x_px=[60.0], y_px=[30.0], w_px=[30.0], h_px=[60.0], score=[0.9], class_id=[1])
+        found = [Frame(ns(n / 10), n, box) for n in range(6)]
+        add_rows(writer, "/front/detections", DETECTIONS, found, "detect", "/front/video")
+    done = mcaptrack.render(tmp_path / "a.mcap", tmp_path / "b.mcap", blur="people")
+    assert [one.message.split(": ", 1)[1] for one in done.warnings] == [f"/front/video: pictures in {name} become h264"]
+    with log.read(tmp_path / "b.mcap") as opened:
+        kept = [
+            picture_decoder(message_type_of(opened, "/front/video"))(one.payload)
+            for one in opened.messages("/front/video")
+        ]
+        assert [(one.format, one.stamp_ns) for one in kept] == [("h264", ns(n / 10)) for n in range(6)]
+        for frame in Pictures(opened, "/front/video").frames(range(6)):
+            detail = np.abs(np.diff(frame.rows.astype(int), axis=0))
+            assert detail[32:88, 62:88].mean() < 0.3 * detail[:, :40].mean()
+    drawn = mcaptrack.render(tmp_path / "a.mcap", tmp_path / "b.mp4", blur="people")
+    assert drawn.pictures == 6
+
+
 def test_pictures_of_a_robot_keep_their_messages_and_cameras_without_boxes_are_named(tmp_path):
     path = tmp_path / "robot.mcap"
     shots = write_log(path, "/front/image", "/rear/image", boxes="/front/boxes")
@@ -188,7 +241,6 @@ def test_a_video_is_written_too_and_results_stay_up_to_date(finished, tmp_path):
         clip = [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
     with log.read(finished) as one, log.read(tmp_path / "a.mcap") as other:
         from mcaptrack.pipeline.staleness import is_stale
-        from mcaptrack.sources.pictures import Pictures
 
         original = [frame.rows for frame in Pictures(one, "/camera/video").frames(range(len(clip)))]
         stored = [frame.rows for frame in Pictures(other, "/camera/video").frames(range(len(clip)))]

@@ -16,6 +16,7 @@ from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 
 import mcaptrack
 from mcaptrack import foxglove, log, notices
+from mcaptrack.errors import McaptrackError
 from mcaptrack.foxglove import class_colour
 from mcaptrack.foxglove.views import Drawing, MovingCamera
 from mcaptrack.geometry.arrays import Floats
@@ -23,6 +24,7 @@ from mcaptrack.geometry.pinhole import Lens
 from mcaptrack.pipeline.write import Made, write
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.provenance import Provenance
+from mcaptrack.viewing.blur.in_space import outlines
 from tests.worlds import ns
 
 PX = 0.13  # coordinates are multiples of a quarter of a pixel
@@ -167,9 +169,9 @@ def test_forecasts_stay_on_the_ground_while_the_camera_moves():
 # In a log
 
 
-def recorded(path: Path, calibrated: bool = True) -> Path:
+def recorded(path: Path, calibrated: bool = True, scene: Floats | None = None) -> Path:
     """Pictures of a camera on a robot that drives, late by 20 ms, and another camera without calibration."""
-    jpeg = cv2.imencode(".jpg", np.zeros((HEIGHT, WIDTH), np.uint8))[1].tobytes()
+    jpeg = cv2.imencode(".jpg", np.zeros((HEIGHT, WIDTH), np.uint8) if scene is None else scene)[1].tobytes()
     with log.create(path) as writer:
 
         def channel(topic: str, schema: str) -> int:
@@ -204,8 +206,8 @@ def recorded(path: Path, calibrated: bool = True) -> Path:
     return path
 
 
-def with_tracks(path: Path) -> tuple[dict[str, bytes], list[str]]:
-    frames = [Frame(ns(10 + n / 10), n, rows((7, 3, 14.0 + n, 2.0, 0.0))) for n in range(PICTURES)]
+def with_tracks(path: Path, frames: list[Frame] | None = None) -> tuple[dict[str, bytes], list[str]]:
+    frames = frames or [Frame(ns(10 + n / 10), n, rows((7, 3, 14.0 + n, 2.0, 0.0))) for n in range(PICTURES)]
     made = {"/lidar/retracks": Made.of(TRACKS, frames, Provenance("retrack", {}, frame_id="map"))}
     with log.read(path) as opened, notices.listening(lambda _: None), notices.collected() as warned:
         layouts = write(opened, "/lidar", made, (), {}, None)
@@ -258,3 +260,72 @@ def test_without_any_calibration_nothing_is_said_and_older_drawings_go(tmp_path)
     assert said == []
     with log.read(path) as opened:
         assert not [topic for topic in opened.channels if "/view/image" in topic]
+
+
+# People who are hidden
+
+
+def test_people_in_3d_boxes_are_hidden_where_a_calibrated_camera_sees_them(tmp_path):
+    """The person is found in the first and in the last picture but one only, the car in all."""
+    noise = np.random.default_rng(4).integers(0, 256, (HEIGHT, WIDTH), np.uint8)
+    path = recorded(tmp_path / "drive.mcap", scene=noise)
+    car = (3, 3, 16.0, -5.0, 0.0)
+    seen = {n: (7, 1, 14.0 + n, 2.0, 0.0) for n in (0, PICTURES - 2)}
+    with_tracks(path, [Frame(ns(10 + n / 10), n, rows(car, *filter(None, [seen.get(n)]))) for n in range(PICTURES)])
+    done = mcaptrack.render(path, tmp_path / "out.mcap", blur="people")
+    assert done.blurred == ("/front/image",)
+    said = [one.message for one in done.warnings if one.code == "not-blurred"]
+    assert any("/lidar/retracks can't be placed in /back/image: no calibration" in one for one in said)
+    assert any("/back/image" in one and "kept as recorded and may show people" in one for one in said)
+    with log.read(tmp_path / "out.mcap") as opened:
+        assert json.loads(opened.channel("/front/image").metadata["mcaptrack.blurred"])["boxes"] == ["/lidar/retracks"]
+        shown = [CompressedImage.FromString(one.payload).data for one in opened.messages("/front/image")]
+    for number, jpeg in enumerate(shown):
+        image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE).astype(float)
+        detail = np.abs(np.diff(image, axis=0))
+        for hidden, (x, y) in ((True, (14.0 + number, 2.0)), (False, (16.0, -5.0))):
+            px = by_opencv(corners(x, y, 0.0), number)
+            (left, top), (right, bottom) = px.min(axis=0).astype(int), px.max(axis=0).astype(int)
+            part = detail[max(top, 0) : bottom, max(left, 0) : right]
+            assert (part.mean() < 25) == hidden, (number, part.mean())
+    printed = mcaptrack.render(path, tmp_path / "out.mp4", blur="people")
+    assert (printed.pictures, printed.blurred) == (PICTURES, ("/front/image",))
+
+
+def test_without_calibrations_people_in_3d_boxes_are_a_mistake_that_says_why(tmp_path):
+    path = recorded(tmp_path / "drive.mcap", calibrated=False)
+    with_tracks(path, [Frame(ns(10), 0, rows((7, 1, 14.0, 2.0, 0.0)))])
+    with pytest.raises(McaptrackError, match=r"no boxes of people in them to hide .*can't be placed in /front/image"):
+        mcaptrack.render(path, tmp_path / "out.mcap", blur="people")
+
+
+@pytest.mark.parametrize("distortion", [(), BENT], ids=["pinhole", "bent"])
+def test_whatever_the_camera_sees_of_a_3d_box_is_inside_its_outline(distortion):
+    """Points of boxes before, beside and partly behind the camera."""
+    rng = np.random.default_rng(6)
+    seen = camera(distortion)
+    count = 60
+    places = np.column_stack([rng.uniform(-1, 12, count), rng.uniform(-5, 5, count), rng.uniform(-1, 2, count)])
+    states = np.column_stack([FAR + places, rng.uniform(0.3, 4, (count, 3)), rng.uniform(-3, 3, count)])
+    picture = rng.integers(0, PICTURES, count)
+    found = outlines(states, picture, seen)
+    inside = 0
+    for state, number, box in zip(states, picture.tolist(), found, strict=True):
+        local = rng.uniform(-0.5, 0.5, (300, 3)) * state[3:6]
+        turn = np.array([[np.cos(state[6]), -np.sin(state[6])], [np.sin(state[6]), np.cos(state[6])]])
+        points = state[:3] + np.column_stack([local[:, :2] @ turn.T, local[:, 2]])
+        points = points[(points @ AHEAD.T + seen.translation[number])[:, 2] > 0.2]
+        px = by_opencv(points, number, distortion) if len(points) else np.empty((0, 2))
+        straight = by_opencv(points, number) if len(points) else px
+        # Far outside, polynomials of lenses fold back into the picture.
+        px = px[(np.abs(straight - [WIDTH / 2, HEIGHT / 2]) < WIDTH).all(axis=1)]
+        px = px[((px > 0) & (px < [WIDTH, HEIGHT])).all(axis=1)]
+        inside += len(px)
+        if len(px):
+            assert (px >= box[:2] - 0.5).all()
+            assert (px <= box[:2] + box[2:] + 0.5).all()
+    assert inside > 2000
+    assert np.isnan(found).any()
+    ahead = outlines(np.array([[*(FAR + [14, 2, 0.75]), 4, 2, 1.5, 0.5]]), np.array([3]), seen)[0]
+    wanted = by_opencv(corners(14.0, 2.0, 0.0), 3, distortion)
+    assert ahead == pytest.approx([*wanted.min(axis=0), *np.ptp(wanted, axis=0)], abs=0.1)

@@ -23,6 +23,7 @@ from mcaptrack.api.common import (
 )
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_overwrite
+from mcaptrack.foxglove.views import SCENE_SUFFIX, SUFFIX
 from mcaptrack.location import Location, local_name
 from mcaptrack.notices import Notice
 from mcaptrack.sources.cameras import camera_at
@@ -167,14 +168,15 @@ def render(
             done = write_blurred_log(opened, blurrable(opened, only), target, progress)
             found = tuple(dict.fromkeys(warnings))
             return RenderResult(path, target, sum(done.pictures.values()), (), found, tuple(done.pictures))
-        prefix = pipeline.find_camera(opened, camera)
         if blur is not None:
-            hidden = blurrable(opened, prefix)
+            hidden = blurrable(opened, None if camera is None else pipeline.find_camera(opened, camera))
+            pictures = _one_of(opened, list(hidden), camera)
+            prefix = pipeline.find_camera(opened, camera) if topic else ""
             views = list(pipeline.find_views(opened, prefix, names_of(topic)).views) if topic else []
-            pictures = next(iter(hidden))
             count = draw_video(opened, pictures, views, target, options, progress, hidden[pictures])
             found = tuple(dict.fromkeys(warnings))
             return RenderResult(path, target, count, tuple(views), found, (pictures,))
+        prefix = pipeline.find_camera(opened, camera)
         if heatmap:
             warn_unused("a heat map is one picture", max_fps=max_fps is not None, gif=gif and output is None)
             pictures_of = camera_at(opened, prefix).pictures
@@ -182,11 +184,10 @@ def render(
             return RenderResult(path, target, 1, (heat.topic,), tuple(dict.fromkeys(warnings)))
         if compare:
             warn_unused("SORT's tracks, re-tracked ones and ground truth are drawn", topic=bool(topic))
-            panels = find_panels(opened, prefix)
             pictures_of = camera_at(opened, prefix).pictures
-            if pictures_of is None:
-                raise McaptrackError(f"{opened.path} has no pictures of {prefix} to compare tracks on")
-            count = draw_comparison(opened, pictures_of, panels, target, options, progress)
+            panels = find_panels(opened, prefix, SCENE_SUFFIX if pictures_of is None else SUFFIX)
+            follow = partial(pipeline.robot_path, opened, prefix, panels[1].view)
+            count = draw_comparison(opened, pictures_of, panels, target, options, follow, progress)
             drawn = tuple(panel.view for panel in panels)
             return RenderResult(path, target, count, drawn, tuple(dict.fromkeys(warnings)))
         shown = pipeline.find_views(opened, prefix, names_of(topic))
@@ -196,6 +197,18 @@ def render(
             follow = partial(pipeline.robot_path, opened, prefix, shown.views[0])
             count = draw_from_above(opened, shown.views, target, options, follow, progress)
     return RenderResult(path, target, count, tuple(shown.views), tuple(dict.fromkeys(warnings)))
+
+
+def _one_of(opened: logs.Log, pictures: Sequence[str], camera: str | None) -> str:
+    """Return the channel of pictures of a video: the only one, or that of the camera with results."""
+    if len(pictures) == 1 or camera is not None:
+        return pictures[0]
+    chosen = camera_at(opened, pipeline.find_camera(opened)).pictures
+    if chosen in pictures:
+        return chosen
+    raise McaptrackError(
+        f"{opened.path} has people to hide in {', '.join(pictures)}; choose a camera with `camera=`, or write a log"
+    )
 
 
 def refuse_both(**given: bool) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final, NamedTuple, Self
+from typing import Final, Self
 
 from mcaptrack import log as logs
 from mcaptrack.api.checked import checked
@@ -21,39 +21,11 @@ from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path
 from mcaptrack.viewing import moments
 from mcaptrack.viewing.linked_report import is_about, with_links
 from mcaptrack.viewing.links import LICHTBLICK, viewer_links
-from mcaptrack.viewing.moments import Moment
+from mcaptrack.viewing.moments import LinkedEvent
 from mcaptrack.viewing.serving import Server
 
 #: The names of codecs of videos.
 _CODECS: Final = {"h264": "H.264", "h265": "H.265", "vp9": "VP9", "av1": "AV1"}
-
-
-class LinkedEvent(NamedTuple):
-    """An identity switch or a repair, and the address that opens it.
-
-    Attributes
-    ----------
-    event : int
-        Its number in the log, from 1, in the order of time.
-    t_ns : int
-        Log time.
-    topic : str
-        The tracks that it happened to.
-    kind : str
-        "identity switch", "joined" or "parted".
-    text : str
-        What happened, and when in seconds of the log.
-    link : str
-        The address that opens the log in Lichtblick, a second before.
-
-    """
-
-    event: int
-    t_ns: int
-    topic: str
-    kind: str
-    text: str
-    link: str
 
 
 @dataclass(frozen=True)
@@ -64,7 +36,7 @@ class _Contents:
 
     files: Mapping[str, Path | bytes]
     layouts: Mapping[str, tuple[str, Path | bytes]]
-    events: Sequence[Moment]
+    events: Sequence[LinkedEvent]
     report: tuple[str, bytes] | None
     start_ns: int
     at_ns: int
@@ -122,7 +94,7 @@ class LogServer:
         }
         self.links = links_to(first, contents.at_ns)
         self.events = tuple(
-            LinkedEvent(*one, links_to(first, moments.before(one.t_ns, contents.start_ns))["Lichtblick"])
+            one._replace(link=links_to(first, moments.before(one.t_ns, contents.start_ns))["Lichtblick"])
             for one in contents.events
         )
         self.report = None
@@ -250,7 +222,7 @@ def view(
     return server
 
 
-def _opening(opened: logs.Log, events: Sequence[Moment], at_s: float | None, event: int | None) -> tuple[int, str]:
+def _opening(opened: logs.Log, events: Sequence[LinkedEvent], at_s: float | None, event: int | None) -> tuple[int, str]:
     """Return the log time in ns at which viewers open, and why. Raises McaptrackError if the log has no such time."""
     if at_s is not None:
         length_s = moments.seconds_of(opened, opened.end_ns)

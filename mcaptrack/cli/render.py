@@ -128,8 +128,9 @@ def render(
     def line(done: RenderResult) -> str:
         if heatmap:
             return f"where people of {', '.join(done.views)} spend their time"
+        drawn = f" with {', '.join(done.views)}" if done.views else ""
         hidden = f", people hidden in {', '.join(done.blurred)}" if done.blurred else ""
-        return f"{done.pictures} pictures with {', '.join(done.views) or 'nothing drawn'}{hidden}"
+        return f"{done.pictures} picture{'' if done.pictures == 1 else 's'}{drawn}{hidden}"
 
     def data(done: RenderResult) -> dict[str, object]:
         written = {"log": str(done.log), "output": str(done.video), "pictures": done.pictures}

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mcaptrack.cli import common
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.many import LogWork, process
+from mcaptrack.cli.zones import zones_in_short
 from mcaptrack.errors import command
 
 if TYPE_CHECKING:
@@ -159,9 +160,7 @@ def _lines_of_run(result: RunResult) -> Iterator[tuple[str, str]]:
     if result.summary is not None:
         yield from _lines_of_summary(result.summary)
     if result.zones:
-        names = {one.zone for totals in result.zones.values() for one in totals}
-        again = command("zones", result.log)
-        yield "zones", f"{len(names)} zones and lines of {len(result.zones)} channels; {again} prints them"
+        yield "zones", f"{zones_in_short(result)}; {command('zones', result.log)} prints them"
     codes = [notice.code for notice in result.warnings]
     if codes:
         yield "warnings", f"{len(codes)}, see above: {', '.join(dict.fromkeys(codes))}"

@@ -111,11 +111,19 @@ def zones(
             options,
             show=lambda _, result: _print(result, talk, json),
             data=_as_json,
-            line=lambda result: f"{sum(map(len, result.zones.values()))} zones and lines of {len(result.zones)} topics",
+            line=zones_in_short,
         )
         results, totals = process(find_logs(logs), work, talk, output)
     if json:
         common.print_json({"results": [_as_json(result) for result in results], **totals})
+
+
+def zones_in_short(result: RunResult) -> str:
+    """How many zones and lines were counted, of how many channels of tracks, in words."""
+    zones = len({one.zone for totals in result.zones.values() for one in totals})
+    topics = len(result.zones)
+    named = "zone or line" if zones == 1 else "zones and lines"
+    return f"{zones} {named}, of {topics} channel{'' if topics == 1 else 's'} of tracks"
 
 
 def zones_as_json(result: RunResult) -> dict[str, Any]:

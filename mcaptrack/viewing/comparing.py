@@ -1,4 +1,5 @@
 """A video that compares tracks: the same pictures side by side, with SORT's tracks, re-tracked ones and ground truth.
+Logs without pictures are compared from above.
 
 Above each picture stands a counter: identity switches so far where the log has ground truth, otherwise tracks and
 repairs. Below are the clock, what happened in the last seconds, and the re-tracked people on the ground.
@@ -20,20 +21,27 @@ from mcaptrack.evaluation.event_text import describe
 from mcaptrack.foxglove import views
 from mcaptrack.geometry.arrays import Image, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.pipeline import RobotPath
 from mcaptrack.schema import EVENTS, TRACKS, EventKind
 from mcaptrack.schema.framing import frame_times, joined_parts
 from mcaptrack.schema.resampling import interval_ns
+from mcaptrack.sources.cameras import provenance_of
 from mcaptrack.sources.foreign.flatten import message_decoder
+from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import write_clip
 from mcaptrack.transforms import FULL
 from mcaptrack.viewing import from_above
+from mcaptrack.viewing.names import tracker_name
 from mcaptrack.viewing.rendering import (
     RenderOptions,
+    SceneDrawing,
     at_times,
     draw,
     pictures_of_video,
     rate_of,
     scaled,
+    scene_times,
+    scenes_of,
     sights,
 )
 
@@ -67,46 +75,51 @@ class _Happened(NamedTuple):
     is_compared: bool
 
 
-def find_panels(opened: log.Log, prefix: str) -> list[Panel]:
+def find_panels(opened: log.Log, prefix: str, suffix: str = views.SUFFIX) -> list[Panel]:
     """Return what can be compared: SORT's tracks, re-tracked ones, and ground truth if there is any.
 
-    Raises McaptrackError if the log lacks the views of one of the first two.
+    ``suffix`` is that of the views to draw. Raises McaptrackError if the log lacks the views of one of the first two.
     """
-    names = (("SORT", "tracks", ""), ("re-tracked", "retracks", FULL), ("ground truth", "truth", ""))
+    names = (("", "tracks", ""), ("re-tracked", "retracks", FULL), ("ground truth", "truth", ""))
     out = []
     for title, name, rest in names:
         topic = f"{prefix}/{name}"
         found = (topic + rest, topic)
-        view = next((one + views.SUFFIX for one in found if one + views.SUFFIX in opened.channels), "")
+        view = next((one + suffix for one in found if one + suffix in opened.channels), "")
         if view:
-            shown = view.removesuffix(views.SUFFIX)
+            shown = view.removesuffix(suffix)
             events = topic + "/events" if topic + "/events" in opened.channels else ""
-            out.append(Panel(title, shown, view, events))
+            own = tracker_name(provenance_of(opened, topic)) if name == "tracks" else title
+            out.append(Panel(own, shown, view, events))
         elif name != "truth":
             raise McaptrackError(
-                f"{opened.path} has no view {topic}{views.SUFFIX} to compare; {call('run', opened.path)} makes it"
+                f"{opened.path} has no view {topic}{suffix} to compare; {call('run', opened.path)} makes it"
             )
     return out
 
 
 def compare(
     opened: log.Log,
-    picture_topic: str,
+    picture_topic: str | None,
     panels: Sequence[Panel],
     output: Path,
     options: RenderOptions,
+    path_of_robot: Callable[[Ints], RobotPath | None] = lambda _: None,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> int:
-    """Draw panels side by side on the pictures of a channel and write a video, .mp4 or .gif by the suffix.
+    """Draw panels side by side on the pictures of a channel, or from above, and write a video, .mp4 or .gif.
 
     Parameters
     ----------
     opened : Log
-    picture_topic : str
+    picture_topic : str or None
+        None: the views of the panels are scenes, and they are seen from above.
     panels : sequence of Panel
     output : Path
     options : RenderOptions
         The width is that of all panels together.
+    path_of_robot : callable
+        Where the robot is at times (M,) in ns; what is seen from above follows it.
     progress : callable
         Called with "render", the number of finished pictures and their total.
 
@@ -118,50 +131,85 @@ def compare(
     Raises
     ------
     McaptrackError
-        If there are no pictures in the period, or if they can't be decoded.
+        If there are no pictures, or scenes, in the period, or if pictures can't be decoded.
     """
-    pictures, numbers = pictures_of_video(opened, picture_topic, output, options)
-    chosen = pictures.t_ns[numbers]
-    span = int(chosen[0]), int(chosen[-1]) + 1
-    start_ns = int(pictures.t_ns[0])
+    if picture_topic is None:
+        times = scene_times(opened, panels[1].view, output, options)
+        shown = _from_above(opened, panels, times, options, path_of_robot(times))
+        scene, first = "", opened.times(panels[1].view)
+    else:
+        pictures, numbers = pictures_of_video(opened, picture_topic, output, options)
+        times, first = pictures.t_ns[numbers], pictures.t_ns
+        shown = _on_pictures(opened, panels, pictures, numbers, options)
+        scene = panels[1].topic + views.SCENE_SUFFIX
+    span = int(times[0]), int(times[-1]) + 1
+    start_ns = int(first[0])
     happened = [_happened(opened, panel, start_ns) for panel in panels]
-    scene = panels[1].topic + views.SCENE_SUFFIX
 
     def composed() -> Iterator[tuple[int, Image]]:
-        drawn = [
-            (at_times(opened.messages(panel.view, *span)), message_decoder(opened, panel.view)) for panel in panels
-        ]
-        width, ground, sight = 0, None, None
-        for done, frame in enumerate(pictures.frames(numbers.tolist()), 1):
-            whole = np.asarray(frame.rows, np.uint8)
-            if not width:
-                total = options.width_px or min(_WIDTH_PX, whole.shape[1] * len(panels))
-                width = max(2, total // len(panels) // 2 * 2)
-                if scene in opened.channels:
-                    read = message_decoder(opened, scene)
-                    ground = at_times(opened.messages(scene, *span)), read
-                    inset = max(16, round(width * len(panels) * _GROUND))
-                    scenes = (read(message.payload) for message in opened.messages(scene, *span))
-                    sight = sights(scenes, inset, None, 1)[0]
-            plain = scaled(whole, width)
-            parts = []
-            for view, read in drawn:
-                payload, image = view(frame.t_ns), plain.copy()
-                parts.append(image if payload is None else draw(image, read(payload), width / whole.shape[1]))
-            inset_image = None
-            if ground is not None and sight is not None:
-                inset_image = draw(from_above.ground(sight), from_above.grid(sight))
-                payload = ground[0](frame.t_ns)
-                if payload is not None:
-                    inset_image = draw(inset_image, from_above.drawing(ground[1](payload), sight))
-            counters = [_counter(panel, one, frame.t_ns) for panel, one in zip(panels, happened, strict=True)]
-            captions = _captions(panels, happened, frame.t_ns)
-            clock = _clock((frame.t_ns - start_ns) / NS_PER_S)
+        ground: _Ground | None = None
+        for done, (t_ns, parts) in enumerate(shown, 1):
+            if ground is None and scene in opened.channels:
+                ground = _Ground(opened, scene, span, max(16, round(parts[0].shape[1] * len(parts) * _GROUND)))
+            counters = [_counter(panel, one, t_ns) for panel, one in zip(panels, happened, strict=True)]
+            captions = _captions(panels, happened, t_ns)
+            clock = _clock((t_ns - start_ns) / NS_PER_S)
             titles = [panel.title for panel in panels]
-            yield frame.t_ns, _composed(parts, titles, counters, clock, captions, inset_image)
-            progress("render", done, len(chosen))
+            inset = ground.at(t_ns) if ground is not None else None
+            yield t_ns, _composed(parts, titles, counters, clock, captions, inset)
+            progress("render", done, len(times))
 
-    return write_clip(output, composed(), rate_of(chosen))
+    return write_clip(output, composed(), rate_of(times))
+
+
+def _on_pictures(
+    opened: log.Log, panels: Sequence[Panel], pictures: Pictures, numbers: Ints, options: RenderOptions
+) -> Iterator[tuple[int, list[Image]]]:
+    """The time of each picture, and the panels drawn on it."""
+    span = int(pictures.t_ns[numbers[0]]), int(pictures.t_ns[numbers[-1]]) + 1
+    drawn = [(at_times(opened.messages(panel.view, *span)), message_decoder(opened, panel.view)) for panel in panels]
+    width = 0
+    for frame in pictures.frames(numbers.tolist()):
+        whole = np.asarray(frame.rows, np.uint8)
+        width = width or _panel_width(options, whole.shape[1], len(panels))
+        plain, parts = scaled(whole, width), []
+        for view, read in drawn:
+            payload, image = view(frame.t_ns), plain.copy()
+            parts.append(image if payload is None else draw(image, read(payload), width / whole.shape[1]))
+        yield frame.t_ns, parts
+
+
+def _from_above(
+    opened: log.Log, panels: Sequence[Panel], times: Ints, options: RenderOptions, path: RobotPath | None
+) -> Iterator[tuple[int, list[Image]]]:
+    """The time of each scene, and the panels seen from above."""
+    span = int(times[0]), int(times[-1]) + 1
+    drawn = [SceneDrawing(opened, [panel.view], span) for panel in panels]
+    width = _panel_width(options, _WIDTH_PX // 2, len(panels))
+    seen = sights(scenes_of(opened, panels[1].view, span), width, path, len(times))
+    for number, (t_ns, sight) in enumerate(zip(times.tolist(), seen, strict=True)):
+        plain = draw(from_above.ground(sight), from_above.grid(sight))
+        if path is not None:
+            plain = draw(plain, from_above.robot(sight, path.at_m[number], float(path.heading_rad[number])))
+        yield t_ns, [one.drawn(plain.copy(), t_ns, sight) for one in drawn]
+
+
+def _panel_width(options: RenderOptions, usual_px: int, count: int) -> int:
+    total = options.width_px or min(_WIDTH_PX, usual_px * count)
+    return max(2, total // count // 2 * 2)
+
+
+class _Ground:
+    """The re-tracked people on the ground, below the panels."""
+
+    def __init__(self, opened: log.Log, scene: str, span: tuple[int, int], width_px: int) -> None:
+        self._drawing = SceneDrawing(opened, [scene], span)
+        self._sight = sights(scenes_of(opened, scene, span), width_px, None, 1)[0]
+
+    def at(self, t_ns: int) -> Image:
+        """The picture at a time, for rising times."""
+        plain = draw(from_above.ground(self._sight), from_above.grid(self._sight))
+        return self._drawing.drawn(plain, t_ns, self._sight)
 
 
 def _happened(opened: log.Log, panel: Panel, start_ns: int) -> _Happened:

@@ -35,6 +35,13 @@ _TEXT_PX: Final = 12.0
 _BESIDE_PX: Final = np.array([8.0, -8.0])
 
 
+#: Labels that moved away come back by this part of a line a picture, and move by so many lines at most.
+_BACK: Final = 0.1
+_MOST_SHIFT: Final = 5.0
+#: Labels may overlap by less than this.
+_APART_PX: Final = 1e-3
+
+
 class Sight(NamedTuple):
     """The part of the ground in a picture: its middle in metres, pixels per metre, and width and height in pixels."""
 
@@ -49,6 +56,53 @@ class Sight(NamedTuple):
         x = self.width_px / 2 + (points_m[:, 0] - self.x_m) * self.px_per_m
         y = self.height_px / 2 - (points_m[:, 1] - self.y_m) * self.px_per_m
         return np.stack([x, y], axis=-1)
+
+
+class LabelPlaces:
+    """Keeps labels of drawings apart, picture after picture: those that come later move up, and come back slowly.
+
+    Labels that would have to move by more than some lines stay where they are.
+    """
+
+    def __init__(self) -> None:
+        self._shifts: dict[str, float] = {}
+        self._taken: list[tuple[float, float, float, float]] = []
+        self._now: dict[str, float] = {}
+
+    def next_picture(self) -> None:
+        """Begin another picture."""
+        self._shifts, self._now, self._taken = self._now, {}, []
+
+    def spread(self, drawn: Any) -> Any:
+        """Move the texts of annotations away from each other and from those before in this picture; returns them."""
+        for text in drawn.texts:
+            wide, high = text_size(text.text, text.font_size)
+            x, y = text.position.x, text.position.y
+            back_px = _BACK * high
+            shift = max(0.0, self._shifts.get(text.text, 0.0) - back_px)
+            for _ in range(len(self._taken)):
+                low = y - shift
+                hit = [
+                    top
+                    for left, top, right, bottom in self._taken
+                    if left < x + wide and x < right and top < low - _APART_PX and low - high < bottom - _APART_PX
+                ]
+                if not hit:
+                    break
+                shift = y - min(hit)
+            shift = shift if shift <= _MOST_SHIFT * high else 0.0
+            self._now[text.text] = shift
+            self._taken.append((x, y - shift - high, x + wide, y - shift))
+            text.position.y = y - shift
+        return drawn
+
+
+def text_size(words: str, font_size: float) -> tuple[float, float]:
+    """Width and height in px of a text of annotations in a video."""
+    import cv2
+
+    (wide, high), below = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, font_size / 24, 1)
+    return float(wide + 2), float(high + below + 1)
 
 
 def ground(sight: Sight) -> Image:

@@ -27,12 +27,12 @@ LEAD_S: Final = 1.0
 _BEST: Final = ("retracks", "tracks")
 
 
-class Moment(NamedTuple):
-    """An identity switch or a repair.
+class LinkedEvent(NamedTuple):
+    """An identity switch or a repair, and the address that opens it.
 
     Attributes
     ----------
-    number : int
+    event : int
         Its number in the log, from 1, in the order of time.
     t_ns : int
         Log time.
@@ -41,17 +41,21 @@ class Moment(NamedTuple):
     kind : str
         "identity switch", "joined" or "parted".
     text : str
-        What happened.
+        What happened, and when in seconds of the log.
+    link : str
+        The address that opens the log in Lichtblick, a second before; "" until the log is served.
+
     """
 
-    number: int
+    event: int
     t_ns: int
     topic: str
     kind: str
     text: str
+    link: str = ""
 
 
-def find_moments(opened: log.Log) -> list[Moment]:
+def find_moments(opened: log.Log) -> list[LinkedEvent]:
     """Return the identity switches and repairs in the channels of events of a log, in the order of time.
 
     Channels that can't be read are left out, with a warning.
@@ -76,7 +80,7 @@ def find_moments(opened: log.Log) -> list[Moment]:
             text = describe(row, f"at {seconds_of(opened, t_ns):.1f} s", 0.0, nouns)
             found.append((t_ns, tracks, EVENT_KINDS[EventKind(int(row["kind"]))], text))
     found.sort(key=lambda one: (one[0], one[1]))
-    return [Moment(number, *one) for number, one in enumerate(found, 1)]
+    return [LinkedEvent(number, *one) for number, one in enumerate(found, 1)]
 
 
 def _nouns(opened: log.Log, topic: str) -> Nouns:
@@ -90,7 +94,7 @@ def _nouns(opened: log.Log, topic: str) -> Nouns:
     return nouns_of((), opened.frame_columns(topic, TRACKS), ({}, names))
 
 
-def opening_moment(opened: log.Log, moments: Sequence[Moment]) -> tuple[int, str]:
+def opening_moment(opened: log.Log, moments: Sequence[LinkedEvent]) -> tuple[int, str]:
     """Return the log time in ns at which viewers open, and why, as text.
 
     It is a second before the first event of the tracks that layouts show; without any, the first time with at least
@@ -99,7 +103,7 @@ def opening_moment(opened: log.Log, moments: Sequence[Moment]) -> tuple[int, str
     for name in _BEST:
         first = next((one for one in moments if one.topic.endswith(f"/{name}")), None)
         if first is not None:
-            return before(first.t_ns, opened.start_ns), f"a second before event {first.number} ({first.text})"
+            return before(first.t_ns, opened.start_ns), f"a second before event {first.event} ({first.text})"
     for name in _BEST:
         for topic, channel in sorted(opened.channels.items()):
             if topic.endswith(f"/{name}/counts") and channel.holds(COUNTS):

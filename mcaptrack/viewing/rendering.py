@@ -154,31 +154,54 @@ def render_from_above(
     McaptrackError
         If there is no scene in the period.
     """
-    check_suffix(output)
-    times = opened.times(view_topics[0])
-    if not len(times):
-        raise McaptrackError(f"{opened.path}: {view_topics[0]} has no scenes")
-    chosen = times[chosen_pictures(opened, times, "scenes", output, options)]
+    chosen = scene_times(opened, view_topics[0], output, options)
     span = int(chosen[0]), int(chosen[-1]) + 1
     path = path_of_robot(chosen)
-    read_first = message_decoder(opened, view_topics[0])
-    scenes = (read_first(message.payload) for message in opened.messages(view_topics[0], *span))
+    scenes = scenes_of(opened, view_topics[0], span)
     seen = sights(scenes, options.width_px or _WIDTH_PX, path, len(chosen))
 
     def drawn() -> Iterator[tuple[int, Image]]:
-        views = [(at_times(opened.messages(topic, *span)), message_decoder(opened, topic)) for topic in view_topics]
+        drawing = SceneDrawing(opened, view_topics, span)
         for done, (t_ns, sight) in enumerate(zip(chosen.tolist(), seen, strict=True), 1):
             image = draw(from_above.ground(sight), from_above.grid(sight))
             if path is not None:
                 image = draw(image, from_above.robot(sight, path.at_m[done - 1], float(path.heading_rad[done - 1])))
-            for view, read in views:
-                payload = view(t_ns)
-                if payload is not None:
-                    image = draw(image, from_above.drawing(read(payload), sight))
-            yield t_ns, image
+            yield t_ns, drawing.drawn(image, t_ns, sight)
             progress("render", done, len(chosen))
 
     return write_clip(output, drawn(), rate_of(chosen))
+
+
+def scene_times(opened: log.Log, topic: str, output: Path, options: RenderOptions) -> Ints:
+    """The times of the scenes of a channel that become a video. Raises McaptrackError if there is none."""
+    check_suffix(output)
+    times = opened.times(topic)
+    if not len(times):
+        raise McaptrackError(f"{opened.path}: {topic} has no scenes")
+    return times[chosen_pictures(opened, times, "scenes", output, options)]
+
+
+def scenes_of(opened: log.Log, topic: str, span: tuple[int, int]) -> Iterator[Any]:
+    """The scenes of a channel from a time to before another."""
+    read = message_decoder(opened, topic)
+    return (read(message.payload) for message in opened.messages(topic, *span))
+
+
+class SceneDrawing:
+    """Draws scenes of channels, seen from above, at rising times; their labels keep apart."""
+
+    def __init__(self, opened: log.Log, topics: Sequence[str], span: tuple[int, int]) -> None:
+        self._views = [(at_times(opened.messages(topic, *span)), message_decoder(opened, topic)) for topic in topics]
+        self._places = from_above.LabelPlaces()
+
+    def drawn(self, image: Image, t_ns: int, sight: Sight) -> Image:
+        """The picture with the scenes at a time."""
+        self._places.next_picture()
+        for view, read in self._views:
+            payload = view(t_ns)
+            if payload is not None:
+                image = draw(image, self._places.spread(from_above.drawing(read(payload), sight)))
+        return image
 
 
 def sights(scenes: Iterable[Any], width_px: int, path: RobotPath | None, count: int) -> list[Sight]:

@@ -11,9 +11,11 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from mcaptrack.foxglove import Annotations, Cuboids, colours
+from mcaptrack.foxglove.views import label_places
 from mcaptrack.foxglove.views.ground import class_colours, raised
 from mcaptrack.foxglove.views.image import BATCH, PictureTimes, View, fade
 from mcaptrack.foxglove.views.people import (
+    People,
     PeopleInParts,
     ellipse_points,
     ellipses,
@@ -61,30 +63,39 @@ def tracks(frames: Sequence[Frame], camera: MovingCamera, style: TrackStyle, cla
     unit = unit_of_width(camera.width_px)
     pictures = PictureTimes(camera.t_ns, camera.stamp_ns)
     for first, last, people in PeopleInParts(frames, camera.at_ns, (), classes).parts(BATCH):
-        known = people.has_body()
+        known = np.flatnonzero(people.has_body())
         rgb = np.broadcast_to(_WHITE, (len(people.number), 3)) if style.is_white else colours(people.number)
         body_rgb = rgb if style.is_white else class_colours(people.class_id, classes)
         alpha = np.where(people.observed, OBSERVED, INTERPOLATED)
+        px, is_seen = _on_pictures(corners(people.body.chosen(known))[:, _EDGES], people.frame[known], camera)
+        named, corner = _label_corners(people, known, px, is_seen, unit, camera.at_ns)
         for span, drawn in pictures.batches(first, last):
-            rows = np.arange(*np.searchsorted(people.frame, [span.start, span.stop]))
-            rows = rows[known[rows]]
-            ends = corners(people.body.chosen(rows))[:, _EDGES]
-            px, is_seen = _on_pictures(ends, people.frame[rows], camera)
-            _draw(
-                drawn,
-                people.frame[rows] - span.start,
-                px,
-                is_seen,
-                body_rgb[rows],
-                alpha[rows, None],
-                style.thickness * unit,
-            )
-            named = is_seen.any(axis=1)
-            inside = np.where(is_seen[..., None, None], px, np.inf)[named].reshape(int(named.sum()), -1, 2)
-            corner = np.maximum(inside.min(axis=1, initial=np.inf), [0.0, _TEXT_PX * unit])
-            these = rows[named]
-            drawn.labels(people.frame[these] - span.start, corner, people.label[these], rgb[these], _TEXT_PX * unit)
+            some = slice(*np.searchsorted(people.frame[known], [span.start, span.stop]))
+            rows = known[some]
+            frame = people.frame[rows] - span.start
+            thickness = style.thickness * unit
+            _draw(drawn, frame, px[some], is_seen[some], body_rgb[rows], alpha[rows, None], thickness)
+            here = slice(*np.searchsorted(people.frame[named], [span.start, span.stop]))
+            these = named[here]
+            frame = people.frame[these] - span.start
+            drawn.labels(frame, corner[here], people.label[these], rgb[these], _TEXT_PX * unit)
             yield from pictures.numbered(span, drawn)
+
+
+def _label_corners(
+    people: People, rows: Ints, px: Floats, is_seen: Bools, unit: float, at_ns: Ints
+) -> tuple[Ints, Floats]:
+    """The people whose boxes are seen, of those with lines (N, E, 2, 2) in pictures, and the lower left corners of
+    their labels: at the upper left of what is seen of a box, and away from each other.
+    """
+    has_name = is_seen.any(axis=1)
+    named = rows[has_name]
+    inside = np.where(is_seen[..., None, None], px, np.inf)[has_name].reshape(len(named), -1, 2)
+    corner = np.maximum(inside.min(axis=1, initial=np.inf), [0.0, _TEXT_PX * unit])
+    extent = label_places.extents(people.label[named], _TEXT_PX * unit)
+    frame, number = people.frame[named], people.number[named]
+    corner[:, 1] += label_places.shifts(at_ns, frame, number, corner, extent, is_down=False)
+    return named, corner
 
 
 def predictions(frames: Sequence[Frame], camera: MovingCamera, bodies: Sequence[Frame]) -> View:

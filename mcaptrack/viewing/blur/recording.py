@@ -49,29 +49,45 @@ class Blurred(NamedTuple):
 def blurrable(opened: log.Log, only: str | None = None) -> dict[str, HiddenPeople]:
     """The channels of pictures in which people can be hidden, each with what to hide.
 
-    ``only`` is the prefix of one camera. Raises McaptrackError if there are none; warns of cameras without boxes and
-    of pictures that no detector saw.
+    ``only`` is the prefix of one camera. Raises McaptrackError if there are none; warns of cameras without boxes, of
+    boxes in space that can't be placed in the pictures, and of pictures that no detector saw.
     """
     out: dict[str, HiddenPeople] = {}
     there: list[Camera] = [one for one in cameras(opened) if one.pictures and (only is None or one.prefix == only)]
-    for camera in there:
-        assert camera.pictures is not None
-        people = HiddenPeople(opened, camera, opened.times(camera.pictures))
+    problems: list[str] = []
+    for topic in dict.fromkeys(camera.pictures for camera in there if camera.pictures):
+        people = HiddenPeople(opened, [camera for camera in there if camera.pictures == topic], topic)
+        problems += people.problems
         if people.topics:
-            out[camera.pictures] = people
-            if unseen := people.unseen():
-                total = len(opened.times(camera.pictures))
-                warn(
-                    f"{opened.path}: no detector saw {unseen} of the {total} pictures of {camera.pictures}; "
-                    "people in them may be recognisable",
-                    "not-blurred",
-                )
+            out[topic] = people
+            _warn_of_pictures(opened, topic, people)
+    if not there:
+        raise McaptrackError(f"{opened.path} has no pictures{_of(only)} in which people could be hidden")
     if not out:
-        found = ", ".join(str(camera.pictures) for camera in there) or "no pictures"
+        found = ", ".join(dict.fromkeys(str(camera.pictures) for camera in there))
+        why = f" ({'; '.join(dict.fromkeys(problems))})" if problems else ""
         raise McaptrackError(
-            f"{opened.path} has {found} and no boxes of people in them to hide; {call('run', opened.path)} finds people"
+            f"{opened.path} has {found} and no boxes of people in them to hide{why}; "
+            f"{call('run', opened.path)} finds people"
         )
+    for problem in dict.fromkeys(problems):
+        warn(f"{opened.path}: people in boxes in space may be recognisable: {problem}", "not-blurred")
     return out
+
+
+def _of(prefix: str | None) -> str:
+    return f" of {prefix}" if prefix else ""
+
+
+def _warn_of_pictures(opened: log.Log, topic: str, people: HiddenPeople) -> None:
+    """Warn of pictures that no detector saw, and of those into which 3D boxes can't be projected."""
+    total = len(opened.times(topic))
+    unseen, unplaced = people.unseen(), people.unplaced()
+    said = [f"no detector saw {unseen:,} of the {total:,} pictures of {topic}"] if unseen else []
+    if unplaced:
+        said.append(f"where the camera was is not known for {unplaced:,} of the {total:,} pictures of {topic}")
+    for words in said:
+        warn(f"{opened.path}: {words}; people in them may be recognisable", "not-blurred")
 
 
 def warn_of_rest(opened: log.Log, blurred: Sequence[str]) -> None:

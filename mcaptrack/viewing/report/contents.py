@@ -18,14 +18,15 @@ from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events
 from mcaptrack.evaluation.people import PersonScores, person_scores
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes, is_estimated, origin_of, plane_at
-from mcaptrack.schema import DETECTIONS, EVENTS, TRACKS, Frame
+from mcaptrack.schema import EVENTS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.camera_motion import read_ground_truth
 from mcaptrack.sources.cameras import provenance_of, repaired_tracks
+from mcaptrack.sources.corrections import CORRECTED
 from mcaptrack.sources.pictures import Pictures
-from mcaptrack.transforms import STAGES
+from mcaptrack.viewing.names import tracker_name
 from mcaptrack.viewing.report import statistics
 from mcaptrack.viewing.report.doubts import Doubt, find_doubts
 from mcaptrack.viewing.report.formatting import plain
@@ -48,9 +49,6 @@ ROLES: Final = {
     "retracks": "offline",
     "truth": "truth",
 }
-#: How trackers are called; channels of earlier versions that name none were made by the first.
-_TRACKERS: Final = {"sort": "SORT", "bytetrack": "ByteTrack", "ocsort": "OC-SORT"}
-_FIRST_TRACKER: Final = next(iter(_TRACKERS))
 #: What is added to the name of tracks at the video rate, beside those at the prediction rate that are compared.
 EVERY_PICTURE: Final = ", every picture"
 #: The number of events with thumbnails.
@@ -161,14 +159,12 @@ def _without_path(error: McaptrackError, opened: log.Log) -> str:
 def _read(opened: log.Log, out: LogReport) -> None:
     """Read the tracks and the ground planes."""
     camera = pipeline.camera_at(opened, out.prefix)
-    made = provenance_of(opened, f"{out.prefix}/tracks")
-    stage = STAGES.get(made.transform) if made else None
-    tracker = "tracks as given"
-    if made and stage and stage.default.reads is DETECTIONS:
-        tracker = _TRACKERS.get(str(made.parameters.get(stage.option, _FIRST_TRACKER)), "tracker")
+    tracker = tracker_name(provenance_of(opened, f"{out.prefix}/tracks"))
+    sampled = provenance_of(opened, f"{out.prefix}/samples")
+    is_corrected = sampled is not None and any(one.endswith(f"/{CORRECTED}") for one in sampled.references)
     names = {
         "tracks": f"{tracker}{EVERY_PICTURE}" if f"{out.prefix}/samples" in opened.channels else tracker,
-        "samples": tracker,
+        "samples": f"{tracker}, corrected" if is_corrected else tracker,
         "online": "re-tracked online",
         "offline": "re-tracked",
         "truth": "ground truth",

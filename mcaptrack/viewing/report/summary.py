@@ -11,7 +11,7 @@ from mcaptrack.evaluation import EvaluationRow, combined, set_means
 from mcaptrack.evaluation.people import Intervals, intervals
 from mcaptrack.viewing.report.contents import LogReport
 from mcaptrack.viewing.report.formatting import NONE, counted, number, percent, short, times
-from mcaptrack.viewing.report.headline import BeforeAfter, compared, rule_text
+from mcaptrack.viewing.report.headline import BEFORE, BeforeAfter, compared, rule_text
 
 
 def before_after(report: LogReport, results: Sequence[EvaluationRow]) -> BeforeAfter | None:
@@ -72,8 +72,9 @@ def summarize(reports: Sequence[LogReport]) -> dict[str, Any]:
 
 
 def _with_ground_truth(reports: Sequence[LogReport], scored: Sequence[LogReport], found: BeforeAfter) -> str:
-    names = {short(one.track_sets["tracks"].name) for one in scored if "tracks" in one.track_sets}
-    name = names.pop() if len(names) == 1 and "tracks" in scored[0].track_sets else "the tracker"
+    before = [next((role for role in BEFORE if role in one.track_sets), "") for one in scored]
+    names = {short(one.track_sets[role].name) for one, role in zip(scored, before, strict=True) if role}
+    name = names.pop() if len(names) == 1 and before[0] else "the tracker"
     name = "the tracks as given" if name == "tracks as given" else name
     switches = [times(int(value)) for value in found.values("IDSW")]
     where = ""
