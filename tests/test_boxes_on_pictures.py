@@ -125,6 +125,16 @@ def test_boxes_outside_of_the_picture_and_behind_the_camera_are_not_drawn():
         assert [text.text for text in message.texts] == ["1 car"]
 
 
+def test_labels_of_3d_boxes_that_overlap_stand_one_above_the_other():
+    """Two boxes of one size behind each other: both labels were at about one place."""
+    there = [(1, 3, 14.0, 2.0, 0.0), (2, 3, 14.3, 2.05, 0.0)]
+    for message in drawn(TRACKS, still(*there)):
+        first, second = sorted(message.texts, key=lambda text: text.text)
+        alone = [drawn(TRACKS, still(one))[0].texts[0].position.y for one in there]
+        assert abs(alone[0] - alone[1]) < 10
+        assert first.position.y - second.position.y == pytest.approx(1.5 * 12, abs=0.5)
+
+
 def test_lines_end_before_the_camera():
     """A box beside the camera, half of it behind: all is finite, and every end is on an edge."""
     for message in drawn(TRACKS, still((1, 3, 1.5, 2.5, -1.0))):
@@ -329,3 +339,10 @@ def test_whatever_the_camera_sees_of_a_3d_box_is_inside_its_outline(distortion):
     ahead = outlines(np.array([[*(FAR + [14, 2, 0.75]), 4, 2, 1.5, 0.5]]), np.array([3]), seen)[0]
     wanted = by_opencv(corners(14.0, 2.0, 0.0), 3, distortion)
     assert ahead == pytest.approx([*wanted.min(axis=0), *np.ptp(wanted, axis=0)], abs=0.1)
+    # From 1 m behind the camera to 3 m ahead, half a metre to its right: only what is ahead counts.
+    eye = eye_at(3)
+    beside = outlines(np.array([[*(eye + [1.0, -1.0, 0.0]), 4, 1, 1.5, 0.0]]), np.array([3]), seen)[0]
+    farthest = np.array([eye + [3.0, -0.5, up] for up in (-0.75, 0.0, 0.75)])
+    wanted = by_opencv(farthest, 3, distortion)
+    assert beside[0] == pytest.approx(wanted[:, 0].min(), abs=2)
+    assert beside[0] + beside[2] > WIDTH

@@ -11,12 +11,17 @@ import numpy as np
 import pytest
 
 import mcaptrack
-from mcaptrack import log
+from mcaptrack import log, notices
 from mcaptrack.evaluation.occupancy import Occupancy
+from mcaptrack.foxglove import ANNOTATIONS
+from mcaptrack.foxglove.messages import message_class
 from mcaptrack.geometry.plane import GroundPlane
-from mcaptrack.schema import EVENTS, TRACKS
-from mcaptrack.viewing import comparing, heat_map
+from mcaptrack.pipeline.write import Made, write
+from mcaptrack.schema import EVENTS, TRACKS, Frame
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.viewing import comparing, from_above, heat_map
 from tests.commands import call, printed
+from tests.worlds import ns
 
 
 def clip(path: Path) -> list[np.ndarray]:
@@ -38,6 +43,88 @@ def test_three_panels_show_the_views_of_their_channels(finished, tmp_path):
         # Somewhere below the title stands the same picture.
         apart = [abs(part[top : top + high] - single[:, 2:158]).mean() for top in range(4, 40)]
         assert min(apart) < 4
+
+
+def crossing_log(path: Path) -> Path:
+    """Boxes in space and no pictures: two people meet on a line at 2 s."""
+    names = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "heading_rad")
+    frames = []
+    for n in range(40):
+        at = [(-2 + n / 10, 0.0), (2 - n / 10, 0.1)]
+        place = dict(zip(names, np.array([(x, y, 0.9, 0.6, 0.6, 1.8, 0.0) for x, y in at]).T, strict=True))
+        which = {"track_id": [1, 2], "class_id": np.ones(2, np.uint32), "source_id": [-1, -1]}
+        frames.append(Frame(ns(n / 10), n, TRACKS.rows(**which, **place, observed=np.ones(2, bool))))
+    with log.create(path):
+        pass
+    made = {
+        f"/lidar/{name}": Made.of(TRACKS, frames, Provenance(how, {}, frame_id="map"))
+        for name, how in (("tracks", "track"), ("retracks", "retrack"))
+    }
+    with log.read(path) as opened, notices.listening(lambda _: None):
+        write(opened, "/lidar", made, (), {}, None)
+    return path
+
+
+def test_logs_without_pictures_are_compared_from_above(tmp_path):
+    path = crossing_log(tmp_path / "a.mcap")
+    done = mcaptrack.render(path, compare=True, width=400, start_s=1, end_s=2)
+    assert done.views == tuple(f"/lidar/{name}/view/scene" for name in ("tracks", "retracks"))
+    assert done.video == tmp_path / "a.compared.mp4"
+    frames = clip(done.video)
+    assert len(frames) == done.pictures == 11
+    single = mcaptrack.render(path, topic=done.views[1], width=200, start_s=1, end_s=2)
+    (first, *_) = clip(single.video)
+    high = first.shape[0]
+    right = frames[0][:, 204:396].astype(int)
+    apart = [abs(right[top : top + high] - first[:, 4:196]).mean() for top in range(4, 40)]
+    assert min(apart) < 4
+    with log.read(path) as opened:
+        assert [one.title for one in comparing.find_panels(opened, "/lidar", "/view/scene")][1:] == ["re-tracked"]
+
+
+def test_labels_from_above_never_overlap():
+    """Eight people walk at random in a narrow place; labels are boxes of their text, measured here."""
+    rng, places = np.random.default_rng(3), from_above.LabelPlaces()
+    at = rng.uniform(0, 60, (8, 2)) + 200
+    before: dict[str, float] = {}
+    moved = 0
+    for _ in range(60):
+        at += rng.normal(0, 1.0, (8, 2))
+        places.next_picture()
+        drawn = message_class(ANNOTATIONS)()
+        for number, (x, y) in enumerate(at.tolist(), 1):
+            text = drawn.texts.add(text=f"{number} car", font_size=12.0)
+            text.position.x, text.position.y = x, y
+        found = places.spread(drawn)
+        boxes = []
+        for text, (_, y) in zip(found.texts, at.tolist(), strict=True):
+            (wide, high), below = cv2.getTextSize(text.text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
+            low = text.position.y
+            boxes.append((text.position.x, low - high - below, text.position.x + wide, low))
+            moved += low < y - 1
+            before[text.text] = low - y
+        for n, a in enumerate(boxes):
+            hits = [b for b in boxes[:n] if a[0] < b[2] and b[0] < a[2] and a[1] < b[3] - 0.1 and b[1] < a[3] - 0.1]
+            assert not hits or abs(before[f"{n + 1} car"]) < 1e-9  # too far away: it stays where it is
+    assert moved > 60
+
+
+def test_a_label_from_above_that_moved_up_comes_back_by_small_steps():
+    """Two stand at one place, then the first one is gone."""
+    places, heights = from_above.LabelPlaces(), []
+    for names in (("4", "7"), *[("7",)] * 14):
+        places.next_picture()
+        drawn = message_class(ANNOTATIONS)()
+        for name in names:
+            text = drawn.texts.add(text=name, font_size=12.0)
+            text.position.x, text.position.y = 5.0, 50.0
+        heights.append({text.text: text.position.y for text in places.spread(drawn).texts})
+    assert heights[0]["4"] == 50.0
+    own = np.array([one["7"] for one in heights])
+    assert 50 - own[0] > 12
+    assert (np.diff(own) >= 0).all()
+    assert np.diff(own).max() < 3
+    assert own[-1] == 50.0
 
 
 def test_counters_are_those_of_the_events_and_captions_tell_the_last_ones(finished):
@@ -71,6 +158,9 @@ def test_heat_stands_where_people_stood_in_the_picture_and_nowhere_beyond_the_ho
     heat = Occupancy(np.zeros((20, 20)), (-5.0, 0.0), 0.5, 0.0)
     column, row = ((at - (-5.0, 0.0)) // 0.5).astype(int)
     heat.person_s[row, column] = 100.0
+    # Ground farther than 54.5 m, above y = 62, is near the horizon: a pixel is 20 times as large as at the lower edge.
+    far = Occupancy(np.full((1200, 1200), 1.0), (-300.0, 60.0), 0.5, 0.0)
+    assert (heat_map._over_picture(np.full((480, 640, 3), 80, np.uint8), far, plane) == 60).all()
     image = heat_map._over_picture(np.full((480, 640, 3), 80, np.uint8), heat, plane)
     bright = np.unravel_index(image.astype(int).sum(axis=2).argmax(), (480, 640))
     wanted = plane.metres_to_pixels(at[None])[0]
