@@ -204,7 +204,7 @@ def _one_of(opened: logs.Log, pictures: Sequence[str], camera: str | None) -> st
     if len(pictures) == 1 or camera is not None:
         return pictures[0]
     chosen = camera_at(opened, pipeline.find_camera(opened)).pictures
-    if chosen in pictures:
+    if chosen is not None and chosen in pictures:
         return chosen
     raise McaptrackError(
         f"{opened.path} has people to hide in {', '.join(pictures)}; choose a camera with `camera=`, or write a log"

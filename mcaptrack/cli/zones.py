@@ -119,7 +119,7 @@ def zones(
 
 
 def zones_in_short(result: RunResult) -> str:
-    """How many zones and lines were counted, of how many channels of tracks, in words."""
+    """The number of zones and lines that were counted, and of channels of tracks, in words."""
     zones = len({one.zone for totals in result.zones.values() for one in totals})
     topics = len(result.zones)
     named = "zone or line" if zones == 1 else "zones and lines"

@@ -1,4 +1,4 @@
-"""How tracks are called, in reports and videos."""
+"""Names of trackers, in reports and videos."""
 
 from __future__ import annotations
 

@@ -85,8 +85,8 @@ def tracks(frames: Sequence[Frame], camera: MovingCamera, style: TrackStyle, cla
 def _label_corners(
     people: People, rows: Ints, px: Floats, is_seen: Bools, unit: float, at_ns: Ints
 ) -> tuple[Ints, Floats]:
-    """The people whose boxes are seen, of those with lines (N, E, 2, 2) in pictures, and the lower left corners of
-    their labels: at the upper left of what is seen of a box, and away from each other.
+    """The rows with boxes in view, of those with lines (N, E, 2, 2) in pictures, and the lower left corners of their
+    labels: at the upper left of what is seen of a box, and away from each other.
     """
     has_name = is_seen.any(axis=1)
     named = rows[has_name]

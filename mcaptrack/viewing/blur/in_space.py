@@ -47,7 +47,7 @@ class SeenInSpace(NamedTuple):
 
     def between(self, first: int, last: int) -> tuple[Ints, Floats, Floats]:
         """The boxes in the pictures ``first`` to before ``last``: their pictures (N,) from 0, the boxes (N, 4), and for
-        how long nobody was seen (N,), in s.
+        how long a person was not seen (N,), in s.
         """
         picture, states, unseen_s = self.pieces.at(self.camera.at_ns[first:last])
         boxes = outlines(states, picture + first, self.camera)
@@ -56,7 +56,7 @@ class SeenInSpace(NamedTuple):
 
     def unknown(self) -> Bools:
         """Which pictures (M,) can't have boxes, because it is not known where the camera was."""
-        return ~np.isfinite(self.camera.rotation).all(axis=(1, 2))
+        return np.asarray(~np.isfinite(self.camera.rotation).all(axis=(1, 2)), np.bool_)
 
 
 def people_in_space(opened: log.Log, pictures: str, problems: list[str]) -> list[SeenInSpace]:
