@@ -1,5 +1,6 @@
 # make demo   install into .venv and run everything on a scene that is drawn for it
 # make test   install into .venv and run all checks and tests
+# make test-all   the same with the tests that take long
 # make mutants [ARGS="mcaptrack/evaluation/metrics --count 20 --seed 2"]   change the code at random; print what no test notices
 
 PYTHON ?= python3
@@ -11,7 +12,7 @@ BIN := $(VENV)/bin
 export PIP_CONSTRAINT := constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test mutants clean
+.PHONY: demo test test-all mutants clean
 
 demo: $(VENV)/installed
 	$(BIN)/mcaptrack demo --output mcaptrack-demo --force
@@ -22,6 +23,9 @@ test: $(VENV)/installed-for-tests
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/pytest --numprocesses auto --dist worksteal
+
+test-all: test
+	$(BIN)/pytest -m thorough --numprocesses auto --dist worksteal
 
 mutants: $(VENV)/installed-for-tests
 	$(BIN)/python -m tools.mutants $(ARGS)

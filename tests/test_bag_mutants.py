@@ -16,6 +16,7 @@ from mcap.reader import make_reader
 
 from tests import bounded
 from tests.bag_mutants import KINDS, mutant
+from tests.tiers import thorough
 
 MUTANTS = int(os.environ.get("MUTANTS", "27"))
 FIRST = int(os.environ.get("FIRST_MUTANT", "0"))
@@ -56,6 +57,7 @@ def fault(commands: bounded.Commands, folder: Path, seed: int) -> str:
     return ""
 
 
+@thorough
 def test_mutants_are_read_or_refused(commands, tmp_path):
     faults, codes = {}, set()
     for seed in range(FIRST, FIRST + MUTANTS):

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.commands import GROUP, call, made_log, zones_file
+from tests.tiers import one_in
 
 #: Commands that make one thing of all their inputs: without one of them it would be another thing, so they refuse.
 COMBINING = {"report", "query", "evaluate", "tune", "train"}
@@ -48,7 +49,7 @@ def inputs(command: str, *names: str) -> list[str]:
     return list(names)
 
 
-@pytest.mark.parametrize("command", sorted(SEVERAL - COMBINING))
+@pytest.mark.parametrize("command", one_in(3, sorted(SEVERAL - COMBINING)))
 def test_a_broken_input_does_not_stop_the_others(command, folder):
     bad = ["missing.mcap"] if command == "check" else ["broken.mcap", "missing.mcap"]  # check tells what is broken
     *bad, good = inputs(command, *bad, "a.mcap")

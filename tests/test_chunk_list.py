@@ -12,6 +12,7 @@ from mcaptrack import log
 from mcaptrack.log.chunk_list import ChunkList
 from mcaptrack.log.records import ChunkIndexRecord
 from tests.memory import held
+from tests.tiers import thorough
 
 NUMBERS = st.integers(0, 2**64 - 1)
 CHANNELS = st.dictionaries(st.one_of(st.integers(0, 3), st.just(2**16 - 1)), NUMBERS, max_size=3)
@@ -82,6 +83,7 @@ def many_chunks(tmp_path_factory):
     return path
 
 
+@thorough
 def test_a_log_of_many_chunks_takes_few_bytes_a_chunk(many_chunks):
     """80 for its entry, and 8 for its checksum; objects take a kilobyte. Of a message 16 are held, and its time."""
 

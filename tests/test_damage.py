@@ -20,6 +20,7 @@ from mcaptrack.log import records
 from mcaptrack.log.records import MAGIC
 from tests.commands import call
 from tests.logs import FORTY, MESSAGES, SCHEMA, STOCK_OPTIONS, our_messages, stock_messages, write_log, write_stock
+from tests.tiers import thorough
 
 WITH_CHECKSUMS = {
     "small chunks": {"chunk_size": 100, "enable_data_crcs": True},
@@ -300,6 +301,7 @@ for path in map(Path, sys.argv[1:]):
 """
 
 
+@thorough
 def test_hostile_logs_cost_neither_time_nor_memory(tmp_path):
     import lz4.frame
     import zstandard

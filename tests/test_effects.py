@@ -32,6 +32,7 @@ from tests.bags import plain
 from tests.commands import GROUP, call, done
 from tests.effects.commands import CASES
 from tests.models import DATA, stocked
+from tests.tiers import one_in
 from tests.worlds import small_scene, write_eventful
 
 
@@ -233,7 +234,9 @@ def _interrupted(*_: object, **__: object) -> None:
 KNOWN: dict[str, Seen] = {}
 
 
-@pytest.mark.parametrize(("command", "option"), [(name, option) for name, known in CASES.items() for option in known])
+@pytest.mark.parametrize(
+    ("command", "option"), one_in(3, [(name, option) for name, known in CASES.items() for option in known])
+)
 def test_an_option_has_an_effect(command, option, see):
     case = CASES[command][option]
     if case.base not in KNOWN:

@@ -13,6 +13,7 @@ from mcaptrack import fleet
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import cluster
 from tests import fleet_cluster, fleet_tasks
+from tests.tiers import thorough
 
 pytestmark = pytest.mark.usefixtures("never_waits")
 
@@ -65,6 +66,7 @@ def test_a_cluster_does_what_processes_do_until_its_scheduler_is_lost(scheduler,
     assert Path("hang.mcap").read_text() == "good+"
 
 
+@thorough
 def test_what_is_wrong_is_one_line(monkeypatch, tmp_path):
     (tmp_path / "a.mcap").write_text("a")
     monkeypatch.setattr(cluster, "_ANSWER_S", 0.2)

@@ -18,6 +18,7 @@ from mcaptrack.viewing.report import ELEMENT, fleet, fleet_data, fleet_page
 from tests.commands import call, done
 from tests.logs import some_log
 from tests.test_report import _ELEMENTS, _NASTY, Reader
+from tests.tiers import thorough
 
 #: 2026-11-01, midnight.
 FIRST_S = 1_793_491_200
@@ -152,6 +153,7 @@ def test_names_are_only_text_and_links_only_lead_to_files():
     assert not reader.open
 
 
+@thorough
 def test_a_page_about_five_thousand_logs_is_light():
     rows = [
         row(f"log{n:05}", start_t_ns=(FIRST_S + 3600 * n) * 10**9, IDF1=(n % 97) / 97, tracks=1 + n % 50)

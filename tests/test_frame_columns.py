@@ -21,6 +21,7 @@ from mcaptrack.schema import DETECTIONS, TRACKS, Frame, frame_columns, framing
 from mcaptrack.schema.frame_columns import FrameCollector, collect
 from mcaptrack.schema.framing import filtered_rows, join_frames, joined_parts, mapped_rows, thinned, unique_values
 from mcaptrack.schema.provenance import INGEST, Provenance, digest
+from tests.tiers import thorough
 from tests.worlds import ns
 
 
@@ -138,6 +139,7 @@ def test_a_log_is_the_same_whatever_the_size_of_blocks_and_parts(tmp_path, reque
     assert all((tmp_path / "parts" / name).read_bytes() == path.read_bytes() for name, path in tables.items())
 
 
+@thorough
 def test_a_log_four_times_as_long_takes_hardly_more_memory(monkeypatch, tmp_path):
     monkeypatch.setattr(frame_columns, "BLOCK_BYTES", 2**14)
     monkeypatch.setattr(framing, "PART_ROWS", 1000)

@@ -17,6 +17,8 @@ from pathlib import Path
 import pytest
 from hatchling.builders.wheel import WheelBuilder
 
+from tests.tiers import thorough
+
 ROOT = Path(__file__).parent.parent
 TEXT = (ROOT / "Dockerfile").read_text()
 #: The instructions, and what follows them.
@@ -119,6 +121,7 @@ def test_what_is_left_out_is_what_nothing_needs(tmp_path):
     assert (tmp_path / "bin" / "python.said").read_text() == "-m pip uninstall --yes pip\n"
 
 
+@thorough
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a shell")
 def test_a_nights_job_names_what_failed_and_does_the_rest_once(template, tmp_path):
     (tmp_path / "recordings" / "deep").mkdir(parents=True)

@@ -17,6 +17,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.log import byte_source
 from mcaptrack.schema import TRACKS
 from tests.logs import write_stock
+from tests.tiers import thorough
 from tests.worlds import tracks_at
 
 KINDS = {
@@ -173,6 +174,7 @@ assert len(seen) > 1, seen
 """
 
 
+@thorough
 def test_a_process_that_reads_outlives_whatever_happens_to_the_file(tmp_path):
     """A second process reads while this one shortens, overwrites, replaces and extends the log."""
     path = tmp_path / "a.mcap"

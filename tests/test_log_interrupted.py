@@ -18,6 +18,7 @@ from mcaptrack.log import in_place
 from mcaptrack.log.journal import journal_of
 from tests.interrupted import CALLS, SCHEMA, add_results, contents, killed, sabotage
 from tests.logs import write_stock
+from tests.tiers import one_in
 
 #: Results of so many messages are replaced by so many others.
 CHANGES = {"grows": (30, 1500), "shrinks": (1500, 30), "stays as long": (400, 400)}
@@ -54,7 +55,7 @@ class Change(NamedTuple):
     make: Callable[[Path], None]
 
 
-@pytest.fixture(scope="module", params=[*CHANGES, "has two names"])
+@pytest.fixture(scope="module", params=one_in(2, [*CHANGES, "has two names"]))
 def change(request, tmp_path_factory) -> Change:
     """A log before and after a change that is made in place, in several pieces."""
     path = tmp_path_factory.mktemp("whole") / "a.mcap"

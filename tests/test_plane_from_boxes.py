@@ -7,6 +7,7 @@ import pytest
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane_from_boxes import PlaneFit, plane_from_boxes, whole_people
+from tests.tiers import thorough
 
 WIDTH, HEIGHT = 1280, 720
 
@@ -80,6 +81,7 @@ def test_a_camera_is_found_from_people_before_it(high, pitch, focal, roll):
     assert (fit.nearest_m, fit.farthest_m) == pytest.approx((near, far), rel=0.2)
 
 
+@thorough
 def test_noise_and_hidden_people_change_the_scale_little_over_random_cameras():
     rng = np.random.default_rng(5)
     off = []

@@ -14,6 +14,7 @@ from mcaptrack.log.journal import journal_of
 from tests.commands import GROUP, call, done, made_log
 from tests.interrupted import everything, first_journal, interrupt
 from tests.logs import READING
+from tests.tiers import one_in
 
 #: Those that read no log.
 OTHERS = {"delta", "demo", "docs", "doctor", "models"} | ({"train"} - READING.keys())
@@ -94,7 +95,7 @@ BESIDE: dict[str, Callable[[Path], object]] = {
 }
 
 
-@pytest.mark.parametrize("thing", BESIDE)
+@pytest.mark.parametrize("thing", one_in(2, BESIDE))
 @pytest.mark.parametrize("command", sorted(READING))
 def test_anything_at_the_path_of_the_journal_is_harmless(command, thing, whole, out):
     folder = out / "logs"

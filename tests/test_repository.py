@@ -95,7 +95,8 @@ def test_the_pythons_and_systems_that_are_claimed_are_those_that_have_to_pass(jo
 
 def test_the_workflow_checks_what_make_test_checks(jobs):
     run = [re.sub(r"^(?:python -m )?", "", command) for command in steps(jobs["tests"])]
-    assert checks_of_make() == [command for command in run if not command.startswith("pip ")]
+    # And the tests that are left to `make test-all`.
+    assert checks_of_make() == [command.replace('-m "" ', "") for command in run if not command.startswith("pip ")]
     assert 'pip install --editable ".[test]"' in run
     assert steps(jobs["make"]) == ["make demo", "make test"]
 

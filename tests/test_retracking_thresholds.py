@@ -19,6 +19,7 @@ from mcaptrack.transforms.retrack.linking import candidates, link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
 from tests.references.offline import Motion, Path, encounters, exchanged, links, person_log_odds
 from tests.references.online import OnlineTracker
+from tests.tiers import one_in
 from tests.worlds import walk
 
 NUMBERS = (0.2, 1.75, 0.12, 0.08)
@@ -112,7 +113,7 @@ def line(first: int, steps: int, start: tuple[float, float], speed: tuple[float,
 
 
 @pytest.mark.parametrize(("others", "least"), [(0, 0.5), (4, 0.1), (4, 0.9)])
-@pytest.mark.parametrize(("speed", "gap"), [(0.0, 3), (0.0, 30), (1.2, 3), (1.2, 20)])
+@pytest.mark.parametrize(("speed", "gap"), one_in(2, [(0.0, 3), (0.0, 30), (1.2, 20), (1.2, 3)]))
 def test_the_largest_sideways_distance_of_a_link(speed, gap, others, least):
     def paths(aside_m: float) -> dict[int, Path]:
         out = {

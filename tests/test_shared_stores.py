@@ -20,6 +20,7 @@ from mcaptrack.fleet.claims import Claims, claim_name
 from mcaptrack.location import parse
 from tests import fleet_tasks
 from tests.commands import call, done
+from tests.tiers import thorough
 
 NIGHT = parse("s3://bucket/night")
 LOG = "s3://bucket/night/x.mcap"
@@ -115,6 +116,7 @@ class TestClaims:
         assert objects.read(CLAIM) == b"text"
 
 
+@thorough
 @pytest.mark.usefixtures("never_waits")
 def test_two_fleets_over_one_bucket_do_no_log_twice(store):
     for number in range(5):

@@ -13,6 +13,7 @@ import pytest
 from tests import bounded
 from tests.commands import made_log
 from tests.text_mutants import WHOLE, mutant
+from tests.tiers import thorough
 
 MUTANTS = int(os.environ.get("TEXT_MUTANTS", "10"))
 FIRST = int(os.environ.get("FIRST_MUTANT", "0"))
@@ -47,6 +48,7 @@ def fault(commands, line, folder, out) -> str:
     return "" if outcome.code == 0 or not list(out.glob("*.mcap")) or outcome.code == 3 else f"left behind: {outcome}"
 
 
+@thorough
 def test_mutants_of_labels_and_settings_are_read_or_refused(made, commands, tmp_path):
     faults = {}
     for seed in range(FIRST, FIRST + MUTANTS):

@@ -27,6 +27,7 @@ from mcaptrack.transforms import (
     Transform,
 )
 from mcaptrack.transforms.protocol import bare_type
+from tests.tiers import one_in
 from tests.worlds import ids, walk
 
 PLANE = GroundPlane((0.05, 0, 0, 0, 0.05, 0, 0, 0, 1), 640, 480)
@@ -66,7 +67,12 @@ def describe(value: object) -> str:
     return str(value)[:60]
 
 
-every = pytest.mark.parametrize(("name", "transform"), variants(), ids=describe)
+def _variants() -> list[object]:
+    """All variants, of which those after the defaults run in the thorough tier, but for one in three."""
+    return [*variants()[: len(TRANSFORMS)], *one_in(3, variants()[len(TRANSFORMS) :])]
+
+
+every = pytest.mark.parametrize(("name", "transform"), _variants(), ids=describe)
 
 
 @every

@@ -26,6 +26,7 @@ from mcaptrack.sources.video import (
 )
 from mcaptrack.sources.video.h264 import inspect
 from mcaptrack.sources.video.reader import images as upright_images
+from tests.tiers import thorough
 from tests.worlds import write_clip
 
 NO_B = {"bf": "0", "g": "10"}
@@ -294,6 +295,7 @@ def test_pictures_that_are_broken_say_which():
         list(decode_gray([EncodedPicture(0, 7, "jpeg", b"\xff\xd8 no picture")]))
 
 
+@thorough
 def test_a_decoder_that_is_let_go_while_its_threads_work_does_not_wait_for_ever(tmp_path):
     """FFmpeg's threads give packets back; memory of Python's would need Python, which waits for these threads."""
     code = (

@@ -14,8 +14,7 @@ from urllib.parse import urlsplit
 
 def distribution_of(module: str) -> tuple[str, str]:
     """Name and version of the distribution of a module; "" and "" if unknown."""
-    places = tuple((place, _changed_ns(place)) for place in sys.path)
-    found = [name for name in _distributions(places).get(module.partition(".")[0], []) if name]
+    found = [name for name in _distributions(_places()).get(module.partition(".")[0], []) if name]
     try:
         return _name_and_version(Distribution.from_name(found[0]) if found else _editable(module))
     except PackageNotFoundError:
@@ -46,6 +45,11 @@ def _project(distribution: Distribution) -> Path | None:
         return Path(url2pathname(urlsplit(source["url"]).path)).resolve() if is_used_there else None
     except Exception:  # metadata that can't be read
         return None
+
+
+def _places() -> tuple[tuple[str, int], ...]:
+    """The folders of ``sys.path`` and when each last changed: they tell whether something was installed."""
+    return tuple((place, _changed_ns(place)) for place in sys.path)
 
 
 def _changed_ns(place: str) -> int:
@@ -79,17 +83,28 @@ def entry_points(group: str, unreadable: list[str] | None = None) -> list[EntryP
 
     Packages with entry points that can't be read are left out; their names are added to ``unreadable``.
     """
+    found, failed = _declared(_places(), group)
+    if unreadable is not None:
+        unreadable += failed
+    return list(found)
+
+
+@lru_cache(maxsize=32)
+def _declared(_places: tuple[tuple[str, int], ...], group: str) -> tuple[list[EntryPoint], list[str]]:
+    """Entry points of a group, and packages with entry points that can't be read; kept until something is installed.
+
+    A command asks several times for each of its stages, and each time all metadata would be read.
+    """
     points = [(found, _points(found, group)) for found in distributions()]
     if not any(point is None or point for _, point in points):
-        return []
+        return [], []
     first: dict[str, tuple[str, list[EntryPoint] | None]] = {}
     for distribution, found in points:
         name = _name(distribution)
         key = name.lower().replace("-", "_") or f"{distribution!r}"
         first.setdefault(key, (name, found))  # the first one on the path is the one that is imported
-    if unreadable is not None:
-        unreadable += [name for name, found in first.values() if found is None]
-    return [point for _, found in first.values() for point in found or () if ":" not in point.name]
+    failed = [name for name, found in first.values() if found is None]
+    return [point for _, found in first.values() for point in found or () if ":" not in point.name], failed
 
 
 def _name(distribution: Distribution) -> str:
