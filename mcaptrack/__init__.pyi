@@ -34,7 +34,7 @@ from mcaptrack.api.rendering import RenderResult as RenderResult
 from mcaptrack.api.rendering import render as render
 from mcaptrack.api.rows import detections as detections
 from mcaptrack.api.running import RunResult as RunResult
-from mcaptrack.api.scoring import Scores as Scores
+from mcaptrack.api.scores import Scores as Scores
 from mcaptrack.api.scoring import evaluate as evaluate
 from mcaptrack.api.stages import predict as predict
 from mcaptrack.api.stages import retrack as retrack

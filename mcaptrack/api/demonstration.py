@@ -9,7 +9,8 @@ from typing import Final, Literal
 from mcaptrack.api.checked import checked
 from mcaptrack.api.common import Notes, PathLike, Progress, as_path, no_progress
 from mcaptrack.api.ingesting import ingest
-from mcaptrack.api.scoring import Scores, evaluate
+from mcaptrack.api.scores import Scores
+from mcaptrack.api.scoring import evaluate
 from mcaptrack.api.whole import run
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import Notice, collected

@@ -18,16 +18,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import spread
 from mcaptrack.evaluation.aligned import MAX_GAP_S, on_ground, resample_frames
 from mcaptrack.evaluation.metrics.calibration import RELIABILITY_LEVELS
-from mcaptrack.evaluation.metrics.displacement import (
-    TAU_M2,
-    Displacement,
-    Forecasts,
-    PairedForecasts,
-    Positions,
-    displacement,
-    forecast_errors,
-    pair_forecasts,
-)
+from mcaptrack.evaluation.metrics.displacement import TAU_M2, Displacement, displacement, forecast_errors
+from mcaptrack.evaluation.metrics.pairing import Forecasts, PairedForecasts, Positions, pair_forecasts
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.mixtures import Tails
