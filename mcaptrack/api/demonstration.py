@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -15,10 +16,10 @@ from mcaptrack.api.whole import run
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import Notice, collected
 from mcaptrack.sources import demo as drawing
-from mcaptrack.sources.synthetic import SCENES
+from mcaptrack.sources.synthetic import PLACES, SCENES, SyntheticScene
 from mcaptrack.tables.export import default_folder
 
-SceneName = Literal["square", "walkers", "crowd", "side-by-side", "standing"]
+SceneName = Literal["square", "walkers", "crowd", "side-by-side", "standing", "three-cameras"]
 #: Largest distance in metres at which ground truth and a track match in the scores.
 GATE_M: Final = 1.0
 
@@ -30,13 +31,15 @@ class DemoResult:
     Attributes
     ----------
     log, video, truth, ground_plane : pathlib.Path
-        The log, and what it was made of: the video, label file and homography.
+        The log, and what it was made of: the video, label file and homography. With several cameras the first video
+        and homography, and the table of positions in metres.
     tables : pathlib.Path
         The folder with the tables.
     layouts : tuple of pathlib.Path
         Layout files for Foxglove and Lichtblick.
     scores : mcaptrack.Scores
-        Scores of SORT (the samples of its tracks) and of re-tracking, matched within 1 m.
+        Scores of SORT (the samples of its tracks) and of re-tracking, matched within 1 m; with several cameras those
+        of the scene that they are fused to.
     notes : tuple of str
         What was done.
     warnings : tuple of mcaptrack.Notice
@@ -70,9 +73,9 @@ def demo(
     ----------
     output : path, default "mcaptrack-demo"
         Folder for the video, the log, the tables and the layouts.
-    scene : {"square", "walkers", "crowd", "side-by-side", "standing"}, default "square"
+    scene : {"square", "walkers", "crowd", "side-by-side", "standing", "three-cameras"}, default "square"
         The scene to draw: people who cross, meet and part on a square; 10 walkers or a crowd of 20 on random routes;
-        three pairs side by side; people who stand still for a while.
+        three pairs side by side; people who stand still for a while; 8 walkers seen by three cameras from three sides.
     seed : int, default 2
         Random seed of the noise, the shaking and the routes.
     force : bool, default False
@@ -105,24 +108,29 @@ def demo(
     if target.exists() and not force:
         raise McaptrackError(f"{target} exists; give another folder with `output=`, or `force=True` to replace it")
     with collected() as warnings:
-        drawn = SCENES[scene](seed)
-        notes.say(f"drawing {drawn.seconds:g} seconds of the scene {scene} ...")
-        footage = drawing.draw(drawn, folder, progress)
-        ingest(
-            footage.video,
-            target,
-            ground_plane=footage.ground_plane,
-            truth=footage.ground_truth,
-            force=force,
-            progress=progress,
-        )
-        made = run(target, progress=progress)
-        topics = ("/camera/samples", "/camera/retracks")
-        scores = evaluate(target, similarity="metres", gate_m=GATE_M, topic=topics)
+        if scene in PLACES:
+            footage, truth = _several(PLACES[scene](seed), folder, target, force, notes, progress)
+            made = run(target, progress=progress)
+            name = "world"
+        else:
+            drawn = SCENES[scene](seed)
+            notes.say(f"drawing {drawn.seconds:g} seconds of the scene {scene} ...")
+            footage = drawing.draw(drawn, folder, progress)
+            ingest(
+                footage.video,
+                target,
+                ground_plane=footage.ground_plane,
+                truth=footage.ground_truth,
+                force=force,
+                progress=progress,
+            )
+            made, name, truth = run(target, progress=progress), "camera", footage.ground_truth
+        topics = (f"/{name}/samples", f"/{name}/retracks")
+        scores = evaluate(target, similarity="metres", gate_m=GATE_M, topic=topics, camera=name)
     return DemoResult(
         log=target,
         video=footage.video,
-        truth=footage.ground_truth,
+        truth=truth,
         ground_plane=footage.ground_plane,
         tables=default_folder(target),
         layouts=made.layouts,
@@ -130,3 +138,17 @@ def demo(
         notes=(*notes, *made.notes),
         warnings=tuple(dict.fromkeys(warnings)),
     )
+
+
+def _several(
+    cameras: Mapping[str, SyntheticScene], folder: Path, target: Path, force: bool, notes: Notes, progress: Progress
+) -> tuple[drawing.Footage, Path]:
+    """Draw a scene that several cameras see, and ingest it; returns the footage of the first, and the positions."""
+    seconds = next(iter(cameras.values())).seconds
+    notes.say(f"drawing {seconds:g} seconds for each of the cameras {', '.join(cameras)} ...")
+    footage, positions = drawing.draw_place(cameras, folder, progress)
+    for name, one in footage.items():
+        where = {"output": target, "force": force} if one is next(iter(footage.values())) else {"into": target}
+        ingest(one.video, ground_plane=one.ground_plane, camera=name, progress=progress, **where)
+    ingest(positions, into=target, role="truth", camera="world", frame="map")
+    return next(iter(footage.values())), positions

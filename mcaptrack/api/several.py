@@ -15,6 +15,7 @@ from mcaptrack.files import publish
 from mcaptrack.location import Location
 from mcaptrack.notices import warn
 from mcaptrack.pipeline import Report
+from mcaptrack.pipeline.several import SCENE
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
@@ -93,8 +94,8 @@ class EveryCamera:
                 given = [prefix[1:] for prefix in self.prefixes]
                 joined, self.not_fused = pipeline.fusable(opened, given)
         if joined:
-            scenes = ("/world",)
-            if not steps.take("world", self.fuse_to("world", joined, _named(steps.progress, "world")), is_scene=True):
+            scenes, name = (SCENE,), SCENE[1:]
+            if not steps.take(name, self.fuse_to(name, joined, _named(steps.progress, name)), is_scene=True):
                 self.not_fused = steps.done.pop().failure
                 scenes = ()
         if not self.is_fused and not self.scenes:

@@ -21,11 +21,11 @@ def demo(
         Path, common.option("--output", "-o", panel=common.FILES, help="Folder for all files.", show_default=True)
     ] = Path("mcaptrack-demo"),
     scene: Annotated[
-        Literal["square", "walkers", "crowd", "side-by-side", "standing"],
+        Literal["square", "walkers", "crowd", "side-by-side", "standing", "three-cameras"],
         common.option(
             "--scene",
             help="Scene to draw: people who cross, meet and part on a square; 10 walkers or a crowd of 20 on random "
-            "routes; three pairs side by side; people who stand still for a while.",
+            "routes; three pairs side by side; people who stand still for a while; 8 walkers seen by three cameras.",
         ),
     ] = "square",
     seed: Annotated[
@@ -55,7 +55,7 @@ def demo(
         common.print_json({"scene": scene, "seed": seed, "results": [sort, retracked]})
         return
     show(
-        *_side_by_side(sort, retracked),
+        *_side_by_side(sort, retracked, "tracker" if made.truth.suffix == ".csv" else "SORT"),
         "",
         *_over_seeds(scene, seed),
         "",
@@ -94,8 +94,8 @@ def _from_here(path: Path) -> str:
     return quote(str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path))
 
 
-def _side_by_side(sort: dict[str, float], retracked: dict[str, float]) -> list[str]:
-    """Return the scores of SORT and of re-tracking side by side."""
+def _side_by_side(sort: dict[str, float], retracked: dict[str, float], tracker: str) -> list[str]:
+    """Return the scores of SORT, or another tracker, and of re-tracking side by side."""
     words = {
         "IDF1": "identity kept (IDF1)",
         "MOTA": "accuracy (MOTA)",
@@ -104,7 +104,7 @@ def _side_by_side(sort: dict[str, float], retracked: dict[str, float]) -> list[s
         "FN": "missed rows (hidden, merged)",
         "Frag": "fragments",
     }
-    lines = [f"{'within 1 m, 2.5 Hz':<36}{'SORT':>10}{'re-tracked':>14}"]
+    lines = [f"{'within 1 m, 2.5 Hz':<36}{tracker:>10}{'re-tracked':>14}"]
     for name, meaning in words.items():
         values = [
             f"{100 * part[name]:.1f} %" if name in ("IDF1", "MOTA") else str(part[name]) for part in (sort, retracked)

@@ -16,6 +16,7 @@ from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.geometry.transform_tree import TransformTree
 from mcaptrack.notices import warn
+from mcaptrack.pipeline.scene_views import SceneOnPictures
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.framing import frame_times, has_any
 from mcaptrack.schema.provenance import VIEW, Provenance
@@ -87,7 +88,8 @@ class ViewFactory:
     """Draws the channels of a camera: in its pictures, and in the frame of their metres.
 
     ``frames`` are the coordinate frames that no transform of the log names; None for that of the ground plane alone.
-    ``cameras`` are calibrated ones by the topics of their pictures, for tracks with 3D boxes.
+    ``cameras`` are calibrated ones by the topics of their pictures, for tracks with 3D boxes; ``scene`` has the cameras
+    that a scene was fused of.
     """
 
     def __init__(
@@ -99,7 +101,9 @@ class ViewFactory:
         path: CameraPath | None = None,
         frames: Sequence[str] | None = None,
         cameras: Mapping[str, views.MovingCamera] = {},
+        scene: SceneOnPictures | None = None,
     ) -> None:
+        self._scene = scene
         self._prefix, self._picture_ns, self._stamp_ns, self._planes = prefix, picture_ns, stamp_ns, planes
         self._path, self._cameras = path, cameras
         self._frames = (views.ground.frame_of(prefix),) if frames is None else frames
@@ -125,6 +129,12 @@ class ViewFactory:
             for pictures, camera in self._cameras.items() if is_solid and channel.schema is not DETECTIONS else ():
                 seen = drawing.on_camera(camera, channel.bodies)
                 yield View(topic + views.SUFFIX + pictures, foxglove.ANNOTATIONS, made_from, group, seen)
+            if self._scene is not None and channel.schema is not DETECTIONS:
+                for one in self._scene.cameras:
+                    rows, planes = self._scene.on_camera(one, channel.schema, frames, is_true=not channel.made_by)
+                    on_picture = views.Drawing(topic, channel.schema, rows, planes, is_retracked, names)
+                    seen = on_picture.on_pictures(one.clock.t_ns, one.clock.stamp_ns)
+                    yield View(topic + views.SUFFIX + one.pictures, foxglove.ANNOTATIONS, made_from, group, seen)
             if channel.is_on_ground():
                 own_ns = frame_times(channel.frames)
                 t_ns = self._picture_ns if len(self._picture_ns) and not is_solid else own_ns

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, list_names
@@ -12,8 +12,10 @@ from mcaptrack.sources.cameras import Camera, camera_at, cameras, has_own_channe
 from mcaptrack.sources.pictures import size_of_pictures
 from mcaptrack.transforms import STAGES
 
+#: The scene that a run fuses cameras to.
+SCENE: Final = "/world"
 #: The channels that a run can begin with, if a camera has no pictures and no boxes of others.
-_BEGINNINGS = tuple(STAGES[name].input_topic for name in ("track", "sample", "predict"))
+_BEGINNINGS: Final = tuple(STAGES[name].input_topic for name in ("track", "sample", "predict"))
 
 
 class ChosenCameras(NamedTuple):
@@ -42,7 +44,7 @@ def choose_cameras(opened: log.Log, names: Sequence[str] = ()) -> ChosenCameras 
         wanted = [camera for camera in wanted if camera.prefix not in scenes]
     else:
         wanted_scenes = ()
-        wanted = [camera for camera in known if camera.prefix not in scenes]
+        wanted = [camera for camera in known if camera.prefix not in scenes and not _is_truth_of_scene(opened, camera)]
         wanted = [camera for camera in wanted if not camera.in_space or has_own_channels(opened, camera)] or wanted
         if len(wanted) + len(scenes) < 2 or all(camera.in_space for camera in wanted):
             return None
@@ -56,10 +58,18 @@ def choose_cameras(opened: log.Log, names: Sequence[str] = ()) -> ChosenCameras 
     return ChosenCameras(chosen, lacks, wanted_scenes)
 
 
+def _is_truth_of_scene(opened: log.Log, camera: Camera) -> bool:
+    """Whether these are the labels of a scene that isn't made yet."""
+    return camera.prefix == SCENE and camera.pictures is None and camera.boxes is None and _is_bare(opened, camera)
+
+
+def _is_bare(opened: log.Log, camera: Camera) -> bool:
+    return not any(f"{camera.prefix}/{name}" in opened.channels for name in _BEGINNINGS)
+
+
 def _lack(opened: log.Log, camera: Camera) -> str:
     """The reason why nothing can be made of a camera; "" if there is none."""
-    begun = (opened.channels.get(f"{camera.prefix}/{name}") for name in _BEGINNINGS)
-    if camera.boxes or any(channel is not None for channel in begun):
+    if camera.boxes or not _is_bare(opened, camera):
         return ""
     if camera.pictures is None:
         there = sorted(one for one in camera.topics if foreign.holds_pictures(opened.channels[one]))

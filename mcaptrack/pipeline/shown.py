@@ -16,7 +16,7 @@ from mcaptrack.geometry.angles import headings
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.drawing import recorded_sources, robot_frame
-from mcaptrack.sources.cameras import camera_at
+from mcaptrack.sources.cameras import camera_at, scenes_of
 from mcaptrack.sources.foreign.flatten import message_decoder
 from mcaptrack.sources.frames import transforms_of
 from mcaptrack.transforms import FULL
@@ -42,6 +42,11 @@ def find_views(opened: log.Log, prefix: str, topics: Sequence[str] = ()) -> Show
     if topics:
         return _given(opened, prefix, topics, pictures)
     if pictures is not None:
+        for scene in scenes_of(opened):
+            if found := _best(opened, scene, views.SUFFIX + pictures):
+                words = f"drawing the tracks of {scene} on {pictures}; `topic=` names those of {prefix}"
+                warn(words, "chosen-camera")
+                return Shown(found, pictures)
         if found := _best(opened, prefix, views.SUFFIX):
             return Shown(found, pictures)
         raise McaptrackError(f"{opened.path} has no views of {prefix} yet; {call('run', opened.path)} makes them")

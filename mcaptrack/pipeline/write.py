@@ -32,7 +32,9 @@ from mcaptrack.pipeline.drawing import (
     recorded_sources,
     robot_frame,
 )
+from mcaptrack.pipeline.picture_times import picture_clock
 from mcaptrack.pipeline.plots import highest_values
+from mcaptrack.pipeline.scene_views import scene_on_pictures
 from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names, classes_beside_rows, has_classes, only_class, without_class
 from mcaptrack.schema.encodings import PROTOBUF, Encoding, encoded, record_of
@@ -40,7 +42,7 @@ from mcaptrack.schema.frame_columns import collect
 from mcaptrack.schema.framing import has_any, join_frames, joined_parts, thinned, unique_values
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, digest, frame_id_of
 from mcaptrack.sources import foreign
-from mcaptrack.sources.cameras import VIDEO, Camera, camera_at
+from mcaptrack.sources.cameras import Camera, camera_at
 from mcaptrack.sources.frames import transforms_of
 from mcaptrack.sources.ingest.sidecar import check_topics, encoding_for
 
@@ -121,41 +123,12 @@ class DrawnMessages(Collection[tuple[int, int, bytes]]):
         return any(message == one for one in self)
 
 
-class PictureClock(NamedTuple):
-    """The topic of a camera's pictures, None without any; their times, rising, and their stamps (M,) in ns."""
-
-    topic: str | None
-    t_ns: Ints
-    stamp_ns: Ints
-
-
-def picture_clock(opened: log.Log, prefix: str, stamps: Mapping[str, Sequence[int]]) -> PictureClock:
-    """Return the times of a camera's pictures; ``stamps`` as for ``write``."""
-    usual = f"{prefix}/{VIDEO}"
-    video = usual if usual in opened.channels else next(iter(stamps), None) or camera_at(opened, prefix).pictures
-    picture_ns = opened.times(video) if video else np.empty(0, np.int64)
-    video = video if len(picture_ns) else None
-    stamp_ns = _stamps(opened, video, stamps.get(video, ())) if video else picture_ns
-    return PictureClock(video, picture_ns, stamp_ns)
-
-
 def digest_of(opened: log.Log, topic: str) -> str:
     """Return the digest of a channel's messages: from its provenance if possible, else computed."""
     known = Provenance.from_metadata(opened.channel(topic).metadata)
     if known and known.digest:
         return known.digest
     return digest((message.t_ns, message.sequence, message.payload) for message in opened.messages(topic))
-
-
-def _stamps(opened: log.Log, topic: str, known: Sequence[int]) -> Ints:
-    """Return the capture times of a channel's pictures in ns, (M,) for M pictures.
-
-    ``known`` are times that were read before. Pictures that were ingested have their capture time as log time; in other
-    recordings the messages contain it.
-    """
-    if Provenance.from_metadata(opened.channel(topic).metadata):
-        return opened.times(topic)
-    return np.array(known, np.int64) if known else foreign.stamps(opened, topic)
 
 
 def write(
@@ -187,8 +160,10 @@ def write(
     solid_in = next((one.frame_id for one in shown.values() if one.is_solid()), "")
     cameras = calibrated_cameras(opened, solid_in) if solid_in and tree else {}
     outdated |= {one for one in opened.channels for topic in shown if one.startswith(f"{topic}{views.SUFFIX}/")}
-    outdated |= {topic + views.SUFFIX + pictures for topic in shown for pictures in cameras}
-    drawn = ViewFactory(prefix, picture_ns, stamp_ns, planes, path, frames, cameras)
+    scene = scene_on_pictures(opened, prefix, {topic: (one.frames, one.provenance) for topic, one in made.items()})
+    seen_on = (*cameras, *(one.pictures for one in scene.cameras))
+    outdated |= {topic + views.SUFFIX + pictures for topic in shown for pictures in seen_on}
+    drawn = ViewFactory(prefix, picture_ns, stamp_ns, planes, path, frames, cameras, scene)
     if frames:
         outdated.add(frame_topic(prefix))
     recorded = {topic for topic in outdated if not may_replace(opened, topic, VIEW)}
@@ -214,7 +189,7 @@ def write(
     frame_id = frame_id or views.ground.frame_of(prefix)
     channels = layouts.CameraChannels(
         prefix, names, video, frame_id, eye._replace(z_m=floor_m), last_step, is_truth_known, follow, by_viewers,
-        tuple(cameras), highest,
+        seen_on, highest,
     )  # fmt: skip
     layout_files = layouts.make(channels)
     new = {attachment_of(name): content for name, content in layout_files.items()}

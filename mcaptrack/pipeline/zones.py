@@ -37,9 +37,10 @@ from mcaptrack.geometry.zones import Zone
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import describe_origin, may_replace
 from mcaptrack.pipeline.motion import ground_truth_with, path_with
+from mcaptrack.pipeline.picture_times import PictureClock, picture_clock
 from mcaptrack.pipeline.planes import planes_to_json
 from mcaptrack.pipeline.staleness import is_stale
-from mcaptrack.pipeline.write import DrawnMessages, Made, PictureClock, digest_of, picture_clock
+from mcaptrack.pipeline.write import DrawnMessages, Made, digest_of
 from mcaptrack.schema import TRACKS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS, Frame, Schema
 from mcaptrack.schema.provenance import VIEW, Provenance, frame_id_of
 from mcaptrack.sources.cameras import camera_at, provenance_of

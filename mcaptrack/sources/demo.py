@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -22,6 +23,8 @@ from mcaptrack.sources.video import write_mp4
 VIDEO: Final = "demo.mp4"
 TRUTH: Final = "truth.txt"
 PLANE: Final = "ground_plane.txt"
+#: The file with the true positions of people in a scene that several cameras see.
+POSITIONS: Final = "positions.csv"
 
 
 #: Scores of every scene and seed, written by tools/bench/demo.py.
@@ -52,6 +55,35 @@ class Footage:
     ground_plane: Path
 
 
+def draw_place(
+    cameras: Mapping[str, SyntheticScene],
+    folder: Path,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+) -> tuple[dict[str, Footage], Path]:
+    """Write a scene that several cameras see to a folder: the footage of each camera, and where people truly are.
+
+    Returns the footage by camera, and a table of positions in metres.
+    """
+    footage = {name: draw(scene, folder / name, progress) for name, scene in cameras.items()}
+    rows = ["t,id,class,x_m,y_m"]
+    seen = {name: iter(scene.shots(draw=False)) for name, scene in cameras.items()}
+    for shots in zip(*seen.values(), strict=True):
+        found = {one: at for shot in shots for one, at in zip(shot.ids, shot.places_m.tolist(), strict=True)}
+        rows += [f"{shots[0].seconds:.6f},{one},person,{x:.4f},{y:.4f}" for one, (x, y) in sorted(found.items())]
+    with writing_to(folder):
+        _write_text(folder / POSITIONS, "\n".join(rows) + "\n")
+    return footage, folder / POSITIONS
+
+
+@contextmanager
+def writing_to(folder: Path) -> Iterator[None]:
+    """Report errors of writing to a folder. Raises McaptrackError."""
+    try:
+        yield
+    except OSError as error:
+        raise McaptrackError(f"{folder} can't be written to: {error.strerror or error}") from error
+
+
 def draw(
     scene: SyntheticScene,
     folder: Path,
@@ -74,7 +106,7 @@ def draw(
             progress("draw", number, total)
             yield shot.image
 
-    try:
+    with writing_to(folder):
         folder.mkdir(parents=True, exist_ok=True)
         if video:
             write_mp4(footage.video, images(), scene.fps)
@@ -83,8 +115,6 @@ def draw(
         _write_text(footage.ground_truth, "\n".join(lines) + "\n")
         rows = np.array(scene.ground_plane().homography).reshape(3, 3).tolist()
         _write_text(footage.ground_plane, "\n".join(",".join(f"{value:.17g}" for value in row) for row in rows) + "\n")
-    except OSError as error:
-        raise McaptrackError(f"{folder} can't be written to: {error.strerror or error}") from error
     return footage
 
 

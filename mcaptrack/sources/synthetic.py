@@ -20,6 +20,8 @@ from mcaptrack.geometry.plane import GroundPlane
 
 _PERSON_M: Final = 1.75
 _STRIDE_HZ: Final = 1.8
+#: People who are nearer to the plane of the camera, or behind it, are not drawn.
+_NEAREST_M: Final = 0.5
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,28 @@ class Block(NamedTuple):
     y_m: float
     width_m: float
     height_m: float
+
+
+class Pose(NamedTuple):
+    """A camera's place on the ground, and the direction that it looks in, in degrees clockwise from the second axis."""
+
+    x_m: float = 0.0
+    y_m: float = 0.0
+    bearing_deg: float = 0.0
+
+    def seen(self, points_m: Floats) -> Floats:
+        """Points (N, 2 or 3) as the camera sees them: to the right of it, ahead of it, and above the ground."""
+        turn = np.deg2rad(self.bearing_deg)
+        x, y = points_m[:, 0] - self.x_m, points_m[:, 1] - self.y_m
+        right, ahead = x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn)
+        return np.column_stack([right, ahead, points_m[:, 2:]])
+
+    def placed(self, points_m: Floats) -> Floats:
+        """The inverse of ``seen`` for points (N, 2)."""
+        turn = np.deg2rad(self.bearing_deg)
+        right, ahead = points_m.T
+        x, y = right * np.cos(turn) + ahead * np.sin(turn), -right * np.sin(turn) + ahead * np.cos(turn)
+        return np.column_stack([x + self.x_m, y + self.y_m])
 
 
 class SyntheticFrame(NamedTuple):
@@ -74,9 +98,15 @@ class SyntheticScene:
     mast_m: float = 7.0
     tilt_deg: float = 27.0
     seed: int = 1
+    pose: Pose | None = None  # of the camera; None: at the origin, looking along the second axis
+
+    def _depth_m(self, x_m: float, y_m: float) -> float:
+        """The distance of a point ahead of the camera."""
+        return y_m if self.pose is None else float(self.pose.seen(np.array([[x_m, y_m]]))[0, 1])
 
     def _project(self, points_m: Floats) -> Floats:
         """Points (N, 3) in metres -> pixels (N, 2)."""
+        points_m = points_m if self.pose is None else self.pose.seen(points_m)
         focal = 0.95 * self.width_px
         tilt = np.deg2rad(self.tilt_deg)
         right = points_m[:, 0]
@@ -89,6 +119,8 @@ class SyntheticScene:
     def ground_plane(self) -> GroundPlane:
         """The plane of the steady camera, from its geometry."""
         corners_m = np.array([[-5.0, 6.0, 0], [5.0, 6.0, 0], [5.0, 20.0, 0], [-5.0, 20.0, 0]])
+        if self.pose is not None:
+            corners_m[:, :2] = self.pose.placed(corners_m[:, :2])
         rows = []
         for (x, y), (u, v) in zip(corners_m[:, :2], self._project(corners_m), strict=True):
             rows.append([u, v, 1, 0, 0, 0, -x * u, -x * v, -x])
@@ -112,13 +144,14 @@ class SyntheticScene:
             now = number / self.fps
             image = ground.copy() if draw else ground
             people = [(walker, walker.at(now)) for walker in self.people]
-            there = [(walker, place) for walker, place in people if place]
+            there = [(walker, place) for walker, place in people if place and self._depth_m(*place) > _NEAREST_M]
             boxes = {walker.id: self._figure(image, walker, place, now, draw=False) for walker, place in there}
             # From far to near, so that nearer objects occlude those behind them.
             acts: list[tuple[float, Callable[[], object]]] = [
-                (place[1], partial(self._figure, image, person, place, now, draw=True)) for person, place in there
+                (self._depth_m(*place), partial(self._figure, image, person, place, now, draw=True))
+                for person, place in there
             ]
-            acts += [(block.y_m, partial(self._block, image, block)) for block in self.blocks]
+            acts += [(self._depth_m(block.x_m, block.y_m), partial(self._block, image, block)) for block in self.blocks]
             for _, act in sorted(acts, key=lambda pair: -pair[0]) if draw else ():
                 act()
             if self.tree_at_m and draw:
@@ -162,10 +195,29 @@ class SyntheticScene:
         lines = [((x, 2.0), (x, 40.0)) for x in np.arange(-20, 21, 2.0)] + [
             ((-20.0, y), (20.0, y)) for y in np.arange(2, 40, 2.0)
         ]
+        if self.pose is not None:
+            self._lines(image)
+            return image
         for (x0, y0), (x1, y1) in lines:
             start, end = self._project(np.array([[x0, y0, 0.0], [x1, y1, 0.0]])).round().astype(int).tolist()
             cv2.line(image, start, end, (128, 134, 136), 1, cv2.LINE_AA)
         return image
+
+    def _lines(self, image: Image) -> None:
+        """Draw the lines of the paving that are before a camera that stands anywhere."""
+        import cv2
+
+        along = np.arange(-40.0, 60.5, 0.5)
+        for at in np.arange(-40, 61, 2.0).tolist():
+            for line in (
+                np.column_stack([along, np.full_like(along, at)]),
+                np.column_stack([np.full_like(along, at), along]),
+            ):
+                points = np.column_stack([line, np.zeros(len(line))])
+                ahead = points if self.pose is None else self.pose.seen(points)
+                pixels = self._project(points[ahead[:, 1] > 2.0]).round().astype(np.int32)
+                if len(pixels) > 1:
+                    cv2.polylines(image, [pixels[:, None]], False, (128, 134, 136), 1, cv2.LINE_AA)
 
     def _figure(
         self, image: Image, walker: Pedestrian, place: tuple[float, float], now: float, draw: bool
@@ -331,6 +383,43 @@ def _random_colour(rng: np.random.Generator) -> tuple[int, int, int]:
     return b, g, r
 
 
+#: The duration of a scene that several cameras see.
+_PLACE_S: Final = 36.0
+
+
+def three_cameras(seed: int = 1) -> dict[str, SyntheticScene]:
+    """Eight people cross a square that three cameras look at from three sides: the scene of each camera, by its name.
+
+    Each camera sees a part of the square, so that people go out of one picture and come into the next.
+    """
+    rng = np.random.default_rng([seed, 5])
+    people = []
+    for number in range(1, 9):
+        side = 1.0 if number % 2 else -1.0
+        start, end = (side * 13.0, rng.uniform(8.0, 18.0)), (-side * 13.0, rng.uniform(8.0, 18.0))
+        seconds = float(np.hypot(end[0] - start[0], end[1] - start[1]) / rng.uniform(1.1, 1.7))
+        begin = float(rng.uniform(0.0, _PLACE_S - seconds))
+        route = ((begin, start[0], float(start[1])), (begin + seconds, end[0], float(end[1])))
+        people.append(Pedestrian(number, route, _random_colour(rng)))
+    poses = {"left": Pose(-12.0, 2.0, 30.0), "right": Pose(12.0, 2.0, -30.0), "back": Pose(0.0, 25.0, 180.0)}
+    return {
+        name: SyntheticScene(
+            tuple(people),
+            _PLACE_S,
+            fps=10,
+            width_px=640,
+            height_px=360,
+            mast_m=6.0,
+            tilt_deg=24.0,
+            seed=seed + n,
+            pose=pose,
+        )
+        for n, (name, pose) in enumerate(poses.items())
+    }
+
+
+#: The scenes that several cameras see, by name: for each a function of a seed that gives the scene of each camera.
+PLACES: Final[Mapping[str, Callable[[int], dict[str, SyntheticScene]]]] = {"three-cameras": three_cameras}
 #: The scenes of the demonstration by name: the default one and others, most of them harder. Each takes a seed.
 SCENES: Final[Mapping[str, Callable[[int], SyntheticScene]]] = {
     "square": demo_scene,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import ClassVar, Final, Self
 
 import numpy as np
 
@@ -12,8 +12,6 @@ from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.geometry.plane import GroundPlane, Planes, plane_at
 from mcaptrack.transforms.fuse.grouping import Places
 
-#: The usual width of a standing person, as a share of the height.
-_WIDTH: Final = 0.4
 #: Heights of boxes are modelled if there are so many.
 _LEAST_BOXES: Final = 20
 #: Steps of the robust fit of heights, and the relative error above which boxes count less.
@@ -45,6 +43,9 @@ class CameraView:
     heights: tuple[float, float, float] | None = None
     detects: tuple[float, ...] = (0.1, 0.4, 0.7, 0.85)
     false_share: float = 0.15
+
+    #: The usual width of a standing person, as a share of the height.
+    width: ClassVar[float] = 0.4
 
     def with_heights(self, xywh: Floats) -> Self:
         """The same camera with heights as in these boxes (N, 4)."""
@@ -91,9 +92,9 @@ class CameraView:
             return np.zeros(len(xy_m))
         foot = plane.metres_to_pixels(xy_m)
         x, y = foot.T
-        height = self._heights(plane, foot)
+        height = self.heights_at(plane, foot)
         is_there: Bools = np.asarray(np.isfinite(x) & (height > 1))
-        half = _WIDTH / 2 * height
+        half = self.width / 2 * height
         left, right, top = x - half, x + half, y - height
         inside = _overlap(left, right, 0, plane.width_px) * _overlap(top, y, 0, plane.height_px)
         area = np.maximum(2 * half * height, 1e-9)
@@ -108,7 +109,7 @@ class CameraView:
         out: Floats = np.minimum(seen, 1.0) * np.prod(1 - np.clip(hidden, 0, 1), axis=1)
         return out
 
-    def _heights(self, plane: GroundPlane, foot: Floats) -> Floats:
+    def heights_at(self, plane: GroundPlane, foot: Floats) -> Floats:
         """The heights (G,) in px of boxes that touch the ground at these points (G, 2)."""
         if self.heights is None:
             return np.full(len(foot), 2.0)

@@ -1,0 +1,179 @@
+"""Draw the tracks of a scene on the pictures of the cameras that it was fused of, with the ids of the scene.
+
+A track gets the box that a camera has of the detection that the track was at, and a box as large as those of others
+that stand there where the camera has none. Letters: N rows, F frames, D detections.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Final
+
+import numpy as np
+
+from mcaptrack import log
+from mcaptrack.foxglove.views.people import by_plane
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.assignment import assign
+from mcaptrack.geometry.boxes import columns_to_boxes
+from mcaptrack.geometry.clocks import seconds_to_ns
+from mcaptrack.geometry.plane import Planes
+from mcaptrack.pipeline.checks import read_frames
+from mcaptrack.pipeline.picture_times import PictureClock, picture_clock
+from mcaptrack.schema import BOX_PX, DETECTIONS, GROUND_PLANE, SIGHTINGS, TRACKS, Frame, Schema
+from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
+from mcaptrack.schema.framing import JoinedFrames, frame_numbers, frame_times, joined_parts
+from mcaptrack.schema.ground_plane import rows_to_plane
+from mcaptrack.schema.provenance import FUSE, Provenance
+from mcaptrack.sources.cameras import camera_at, provenance_of
+from mcaptrack.transforms import STAGES
+from mcaptrack.transforms.fuse import CameraView
+
+#: A track is at a detection of its time if it is at most so far away.
+_AT_M: Final = 1.0
+#: The height of boxes at a place follows from those of so many frames.
+_HEIGHTS: Final = 3000
+#: Boxes that a camera doesn't have are drawn if so much of their height and width is in the picture.
+_INSIDE: Final = 0.5
+
+
+@dataclass(frozen=True)
+class SceneCamera:
+    """A camera of a scene, and its pictures; ``number`` is that of its sightings, ``late_ns`` how late its clock is."""
+
+    number: int
+    clock: PictureClock
+    view: CameraView
+    boxes: Sequence[Frame]
+    late_ns: int
+
+    @property
+    def pictures(self) -> str:
+        """The topic of its pictures."""
+        return self.clock.topic or ""
+
+
+class SceneOnPictures:
+    """A scene, and the cameras of it that have pictures."""
+
+    def __init__(self, detections: Sequence[Frame], sightings: Sequence[Frame], cameras: Sequence[SceneCamera]) -> None:
+        self._detections, self._sightings, self.cameras = detections, sightings, cameras
+
+    def on_camera(
+        self, camera: SceneCamera, schema: Schema, frames: Sequence[Frame], is_true: bool
+    ) -> tuple[Sequence[Frame], Planes]:
+        """Tracks or forecasts, at the times of the pictures of a camera, tracks with boxes in them; and its planes.
+
+        Tracks that are ground truth have no boxes of detections.
+        """
+        if schema is TRACKS:
+            return self._boxes(frames, camera, is_true), camera.view.planes
+        return [frame._replace(t_ns=frame.t_ns + camera.late_ns) for frame in frames], camera.view.planes
+
+    def _boxes(self, tracks: Sequence[Frame], camera: SceneCamera, is_true: bool) -> FrameColumns:
+        """Tracks with boxes in the pictures of a camera, at the times of these; ground truth has none of detections."""
+        out, numbers, last_ns = FrameCollector(TRACKS), frame_numbers(tracks), -1
+        for low, high, joined in joined_parts(TRACKS, tracks):
+            rows, box = joined.rows.copy(), np.full((len(joined.rows), 4), np.nan)
+            t_ns = joined.t_ns + camera.late_ns
+            if not is_true:
+                box, t_ns = self._detected(joined, camera, t_ns)
+                rows["observed"] = np.isfinite(box[:, 0])
+            lacks = np.isnan(box[:, 0])
+            xy_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
+            box[lacks] = _standing(camera.view, xy_m[lacks], t_ns[joined.frame[lacks]])
+            for name, values in zip(BOX_PX, box.T, strict=True):
+                rows[name] = values
+            kept = np.isfinite(box).all(axis=1)
+            later = t_ns > np.maximum.accumulate(np.concatenate([[last_ns], t_ns[:-1]]))
+            kept &= later[joined.frame]
+            ends = np.concatenate([[0], np.cumsum(np.bincount(joined.frame[kept], minlength=len(t_ns))[later])])
+            out.extend(t_ns[later], numbers[low:high][later], ends, rows[kept])
+            last_ns = int(t_ns[later][-1]) if later.any() else last_ns
+        return out.done()
+
+    def _detected(self, joined: JoinedFrames, camera: SceneCamera, usual_ns: Ints) -> tuple[Floats, Ints]:
+        """The boxes (N, 4) that a camera has of tracks, NaN where none; and the times (F,) of its pictures."""
+        box, t_ns = np.full((len(joined.rows), 4), np.nan), usual_ns.copy()
+        there, box_ns = frame_times(self._detections), frame_times(camera.boxes)
+        for number, now_ns in enumerate(joined.t_ns.tolist()):
+            at = int(np.searchsorted(there, now_ns))
+            if at == len(there) or there[at] != now_ns:
+                continue
+            seen = self._sightings[at].rows
+            seen = seen[seen["camera"] == camera.number]
+            if not len(seen):
+                continue
+            picture_ns = int(seen["picture_ns"][0])
+            t_ns[number] = picture_ns
+            own = int(np.searchsorted(box_ns, picture_ns))
+            low, high = int(joined.ends[number]), int(joined.ends[number + 1])
+            track, detection = _matched(joined.rows[low:high], self._detections[at].rows)
+            of, box_row = np.full(len(self._detections[at].rows), -1), seen["box_row"].astype(np.int64)
+            used = seen["detection"] >= 0
+            of[seen["detection"][used].astype(np.int64)] = box_row[used]
+            has_box = of[detection] >= 0
+            boxes = columns_to_boxes(camera.boxes[own].rows)
+            box[low + track[has_box]] = boxes[of[detection[has_box]]]
+        return box, t_ns
+
+
+def _matched(tracks: np.ndarray, detections: np.ndarray) -> tuple[Ints, Ints]:
+    """The rows of tracks, and those of the detections that they are at."""
+    here, there = (np.stack([rows["x_m"], rows["y_m"]], axis=-1) for rows in (tracks, detections))
+    apart = here[:, None] - there
+    cost = np.where(tracks["observed"][:, None], np.hypot(apart[..., 0], apart[..., 1]), np.inf)
+    cost[tracks["class_id"][:, None] != detections["class_id"]] = np.inf
+    return assign(cost, _AT_M)
+
+
+def _standing(view: CameraView, xy_m: Floats, t_ns: Ints) -> Floats:
+    """Boxes (N, 4) around people who stand at places (N, 2) at times (N,); NaN outside of the picture."""
+    box = np.full((len(xy_m), 4), np.nan)
+    if view.heights is None:
+        return box
+    for plane, held in by_plane(view.planes, t_ns):
+        foot = plane.metres_to_pixels(xy_m[held])
+        high = view.heights_at(plane, foot)
+        found = plane.standing_boxes(xy_m[held], np.stack([view.width * high, high], axis=-1))
+        size = np.array([plane.width_px, plane.height_px], float)
+        low, up = found[:, :2], found[:, :2] + found[:, 2:]
+        inside = np.minimum(up, size) - np.maximum(low, 0)
+        is_seen: Bools = (high > 1) & (inside > _INSIDE * found[:, 2:]).all(axis=1)
+        box[held] = np.where(is_seen[:, None], found, np.nan)
+    return box
+
+
+def scene_on_pictures(
+    opened: log.Log, prefix: str, made: Mapping[str, tuple[Sequence[Frame], Provenance]]
+) -> SceneOnPictures:
+    """The scene below ``prefix`` and its cameras with pictures; no cameras if it is no scene.
+
+    ``made`` are the frames and the provenance of channels that are not written yet, by topic.
+    """
+    target = f"{prefix}/{STAGES['detect'].output_topic}"
+    how = made[target][1] if target in made else provenance_of(opened, target)
+    if how is None or how.transform != FUSE:
+        return SceneOnPictures((), (), ())
+    found = []
+    offsets = dict(zip(how.parameters["cameras"], how.parameters["clock_offset_s"], strict=True))
+    for number, (name, late_s) in enumerate(offsets.items()):
+        camera = camera_at(opened, f"/{name}")
+        clock = picture_clock(opened, camera.prefix, {})
+        topic = f"{camera.prefix}/{STAGES['detect'].output_topic}"
+        topic = topic if topic in opened.channels else camera.boxes or ""
+        if clock.topic is None or not {topic, camera.ground_plane} <= opened.channels.keys():
+            continue
+        planes = [(one.t_ns, rows_to_plane(one.rows)) for one in opened.frames(camera.ground_plane, GROUND_PLANE)]
+        boxes = read_frames(opened, topic, DETECTIONS)
+        some = [columns_to_boxes(frame.rows) for frame in islice(iter(boxes), _HEIGHTS)]
+        joined = np.concatenate([np.empty((0, 4)), *some])
+        view = CameraView(name=name, planes=tuple(planes)).with_heights(joined[np.isfinite(joined).all(axis=1)])
+        found.append(SceneCamera(number, clock, view, boxes, seconds_to_ns(late_s)))
+    if not found:
+        return SceneOnPictures((), (), ())
+    parts = {target: DETECTIONS, f"{target}/sightings": SIGHTINGS}
+    frames = [made[one][0] if one in made else opened.frame_columns(one, schema) for one, schema in parts.items()]
+    return SceneOnPictures(frames[0], frames[1], found)

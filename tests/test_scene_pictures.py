@@ -1,0 +1,169 @@
+"""A scene that three cameras see: people keep their ids from picture to picture, and pictures show those ids."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from hypothesis import given
+from hypothesis import strategies as st
+
+import mcaptrack
+from mcaptrack import McaptrackError, log, pipeline
+from mcaptrack.api import demonstration
+from mcaptrack.notices import collected
+from mcaptrack.sources import synthetic
+from mcaptrack.sources.synthetic import Pedestrian, Pose, SyntheticScene, three_cameras
+from mcaptrack.sources.video import write_mp4
+from tests.commands import done
+
+FPS, NS = 2, 1_000_000_000
+#: Coordinates in views are written to a quarter of a pixel.
+PX = 0.3
+SCENES = {name: replace(scene, fps=FPS, seconds=26.0) for name, scene in three_cameras(2).items()}
+BLANK = np.full((360, 640, 3), 128, np.uint8)
+
+
+def shown(scene: SyntheticScene) -> list[dict[int, tuple[np.ndarray, np.ndarray]]]:
+    """For each picture the boxes (4,) and places (2,) of the people who are whole in it, by their numbers."""
+    pictures = []
+    for shot in scene.shots(draw=False):
+        ends = np.concatenate([shot.boxes[:, :2], shot.boxes[:, :2] + shot.boxes[:, 2:]], axis=1)
+        whole = (ends >= 0).all(axis=1) & (ends <= [640, 360, 640, 360]).all(axis=1)
+        people = zip(shot.ids, shot.boxes, shot.places_m, whole, strict=True)
+        pictures.append({number: (box, at) for number, box, at, is_whole in people if is_whole})
+    return pictures
+
+
+TRUTH = {name: shown(scene) for name, scene in SCENES.items()}
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log with the pictures of three cameras, which are blank, and with the boxes of those who are whole in them."""
+    folder = tmp_path_factory.mktemp("scene")
+    made = folder / "scene.mcap"
+    for name, scene in SCENES.items():
+        write_mp4(folder / f"{name}.mp4", [BLANK] * len(TRUTH[name]), FPS)
+        np.savetxt(folder / "plane.txt", np.reshape(scene.ground_plane().homography, (3, 3)), delimiter=",")
+        lines = [
+            f"{number},-1,{','.join(f'{value:.3f}' for value in box)},0.9,-1,-1,-1\n"
+            for number, people in enumerate(TRUTH[name], 1)
+            for box, _ in people.values()
+        ]
+        (folder / "boxes.txt").write_text("".join(lines))
+        where = {"into": made} if made.exists() else {"output": made}
+        files = {"ground_plane": folder / "plane.txt", "detections": folder / "boxes.txt"}
+        mcaptrack.ingest(folder / f"{name}.mp4", camera=name, **files, **where)
+    with collected():
+        mcaptrack.fuse(made)
+        mcaptrack.run(made, camera="world", predictor="cv", events=False, tables=False)
+    return made
+
+
+def drawn(path: Path, topic: str) -> dict[int, dict[str, np.ndarray]]:
+    """The boxes (4,) of a view by label, for each picture."""
+    found = {}
+    with log.read(path) as opened:
+        for message in opened.messages(topic):
+            read = ImageAnnotations.FromString(message.payload)
+            boxes = [
+                np.array([[point.x, point.y] for point in one.points])
+                for one in read.points
+                if one.type == one.LINE_LOOP
+            ]
+            ends = [np.concatenate([one.min(axis=0), one.max(axis=0) - one.min(axis=0)]) for one in boxes]
+            labels = [one.text for one in read.texts]
+            found[round(message.t_ns * FPS / NS)] = dict(zip(labels, ends, strict=True))
+    return found
+
+
+def test_who_goes_out_of_one_picture_and_comes_into_the_next_keeps_the_id(path: Path) -> None:
+    with mcaptrack.open(path) as opened:
+        rows = opened.array("tracks", "/world/retracks/full")
+    ids: dict[int, list[int]] = {}
+    cameras: dict[int, set[str]] = {}
+    for number in range(len(TRUTH["left"])):
+        now = rows[rows["t_ns"] == round(number * NS / FPS)]
+        xy = np.stack([now["x_m"], now["y_m"]], axis=-1)
+        for name, pictures in TRUTH.items():
+            for person, (_, at) in pictures[number].items():
+                away = np.linalg.norm(xy - at, axis=-1)
+                if len(away) and away.min() < 0.5:
+                    ids.setdefault(person, []).append(int(now["track_id"][away.argmin()]))
+                    cameras.setdefault(person, set()).add(name)
+    assert len([1 for seen in cameras.values() if {"left", "right"} <= seen]) >= 4
+    for person, seen in ids.items():
+        assert len(set(seen)) == 1, f"person {person} has the ids {set(seen)}"
+    assert len({seen[0] for seen in ids.values()}) == len(ids)
+
+
+def test_each_picture_has_the_boxes_of_its_camera_with_the_ids_of_the_scene(path: Path) -> None:
+    with mcaptrack.open(path) as opened:
+        rows = opened.array("tracks", "/world/retracks/full")
+    for name, pictures in TRUTH.items():
+        views = drawn(path, f"/world/retracks/full/view/image/{name}/video")
+        assert len(views) == len(pictures)
+        for number, people in enumerate(pictures):
+            now = rows[rows["t_ns"] == round(number * NS / FPS)]
+            for box, at in people.values():
+                away = np.hypot(now["x_m"] - at[0], now["y_m"] - at[1])
+                if len(away) and away.min() < 0.5:
+                    label = str(now["track_id"][away.argmin()])
+                    assert views[number][label] == pytest.approx(box, abs=PX), (name, number, label)
+
+
+def test_layouts_and_videos_show_the_scene_on_the_pictures(path: Path, tmp_path: Path) -> None:
+    layout = json.loads(path.with_name("scene.layout.json").read_text())["configById"]
+    panels = [one["imageMode"] for name, one in layout.items() if name.startswith("Image!")]
+    assert {panel["imageTopic"] for panel in panels} == {f"/{name}/video" for name in SCENES}
+    for panel in panels:
+        assert f"/world/retracks/full/view/image{panel['imageTopic']}" in panel["annotations"]
+    with log.read(path) as opened, collected() as warnings:
+        views, pictures = pipeline.find_views(opened, "/right")
+    assert (pictures, views[0]) == ("/right/video", "/world/retracks/full/view/image/right/video")
+    assert "drawing the tracks of /world on /right/video; `topic=` names those of /right" in warnings[0].message
+    told = done("render", path, "--camera", "right", "-o", tmp_path / "a.gif", "--width", "64", "--end-s", "0.5").err
+    assert "/world/retracks/full/view/image/right/video" in told
+
+
+@given(st.tuples(*[st.floats(-50, 50)] * 2, st.floats(-360, 360)), st.lists(st.tuples(*[st.floats(-99, 99)] * 2)))
+def test_places_before_a_camera_are_placed_back(
+    pose: tuple[float, float, float], points: list[tuple[float, float]]
+) -> None:
+    at = np.array(points).reshape(-1, 2)
+    assert np.allclose(Pose(*pose).placed(Pose(*pose).seen(at)), at, atol=1e-9)
+
+
+def test_a_camera_looks_along_its_bearing() -> None:
+    # 3 m to the east of a camera at (1, 2) that looks to the east (90 degrees clockwise from north)
+    assert np.allclose(
+        Pose(1.0, 2.0, 90.0).seen(np.array([[4.0, 2.0, 1.5], [1.0, 1.0, 0.0]])), [[0, 3, 1.5], [1, 0, 0]]
+    )
+
+
+def test_the_demonstration_of_three_cameras_draws_and_ingests_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def short(seed: int) -> dict[str, SyntheticScene]:
+        people = (Pedestrian(1, ((0.0, 0.0, 12.0), (9.0, 0.5, 12.0))),)
+        return {name: replace(one, seconds=0.4, people=people) for name, one in three_cameras(seed).items()}
+
+    def stop(*_: object, **__: object) -> None:
+        raise McaptrackError("it is drawn")
+
+    monkeypatch.setitem(synthetic.PLACES, "three-cameras", short)
+    monkeypatch.setattr(demonstration, "run", stop)
+    with collected(), pytest.raises(McaptrackError, match="it is drawn"):
+        mcaptrack.demo(tmp_path, scene="three-cameras", seed=4)
+    with log.read(tmp_path / "demo.mcap") as opened:
+        names = {"/world/truth", *(f"/{name}/{part}" for name in SCENES for part in ("video", "ground_plane"))}
+        assert names <= opened.channels.keys()
+        assert opened.channels["/left/video"].messages == 4
+        chosen = pipeline.choose_cameras(opened)
+    assert chosen is not None
+    assert (chosen.prefixes, dict(chosen.left_out)) == (("/back", "/left", "/right"), {})
