@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -16,7 +17,9 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.corrections import compare
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.framing import join_frames
-from mcaptrack.sources.corrections import fixed_ids, with_corrections
+from mcaptrack.sources.corrections import fixed_ids, with_corrections, without_filled
+from mcaptrack.sources.ingest.correcting import with_new_ids
+from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.transforms import Retrack
 from mcaptrack.transforms.retrack.fixed_tracks import fix_tracks
 from mcaptrack.viewing.report import gather
@@ -91,7 +94,27 @@ class TestWithCorrections:
         assert ids(both) == [[3, 4], [3, 4], [5], [], [5, 6], [3, 4]]
         assert both[2].rows["y_px"].tolist() == [10]
 
-    @settings(max_examples=25, deadline=None)
+    def test_between_pictures_of_a_task_with_a_step_boxes_are_interpolated(self):
+        tracks = [frame(k, {3: (k, 0), 4: (k, 9)}) for k in range(12)]
+        corrected = [frame(k, {7: (k, 1), **({8: (k, 5)} if k < 6 else {})}) for k in (2, 5, 8)]
+        both = with_corrections(tracks, corrected)
+        assert ids(both) == [[3, 4]] * 2 + [[5, 6]] * 4 + [[5]] * 3 + [[3, 4]] * 3
+        np.testing.assert_allclose([one.rows["x_px"][0] for one in both[2:9]], np.arange(2, 9) * 10.0)
+        assert all(one.rows["observed"].all() for one in both)
+
+    def test_after_a_long_break_the_tracks_are_those_of_the_tracker(self):
+        tracks = [frame(k, {3: (k, 0)}) for k in range(12)]
+        both = with_corrections(tracks, [frame(k, {7: (k, 1)}) for k in (0, 1, 2, 9, 10)])
+        assert ids(both) == [[4]] * 3 + [[3]] * 6 + [[4]] * 2 + [[3]]
+
+    def test_nobody_is_put_where_a_person_said_that_there_is_none(self):
+        rows = frame(1, {5: (1, 0), 6: (1, 9)})
+        rows.rows["source_id"] = [-1, 4]
+        frames = [rows._replace(t_ns=k * STEP_NS, index=k) for k in range(4)]
+        assert ids(without_filled(frames, [frame(1, {}), frame(2, {})])) == [[5, 6], [6], [6], [5, 6]]
+        assert ids(without_filled(frames, [])) == [[5, 6]] * 4
+
+    @settings(max_examples=15, deadline=None)
     @given(st.sets(st.integers(0, 8)), st.sets(st.integers(0, 8)))
     def test_every_time_is_there_once_in_order(self, those, others):
         tracks = [frame(k, {1: (k, 0)}) for k in sorted(those)]
@@ -99,7 +122,8 @@ class TestWithCorrections:
         found = with_corrections(tracks, corrected)
         assert [one.index for one in found] == sorted(those | others)
         ours = [one.index for one in found if one.rows["y_px"].tolist() == [50]]
-        assert ours == sorted(others)
+        assert set(others) <= set(ours)
+        assert all(min(others) <= one <= max(others) for one in ours)
 
 
 class TestRetrack:
@@ -139,6 +163,18 @@ class TestCompare:
         assert (found.new_tracks, found.removed_tracks) == ([9], [3])
         assert "tracks 1, 2 joined to 1, track 2 split into 1, 2, new tracks 9, tracks 3 removed" in found.words
 
+    def test_another_class_is_said_by_its_name_and_a_box_that_was_moved_far_keeps_its_id(self):
+        before = [frame(k, {1: (k, 0), 2: (k, 9)}) for k in range(4)]
+        after = [frame(k, {1: (k, 0), 2: (k + 40, 9)}) for k in range(4)]
+        for one in before:
+            one.rows["class_id"] = 1
+        for one in after:
+            one.rows["class_id"] = [3, 1]
+        found, kept = compare("/camera/tracks", before, after, {1: "pedestrian"}, {1: "person", 3: "car"})
+        assert (found.same, found.moved, found.added, found.removed, kept) == (4, 4, 0, 0, 8)
+        assert found.relabelled == {1: ("person", "car")}
+        assert found.words.endswith("4 moved, track 1 from person to car")
+
 
 def test_corrections_made_in_cvat_come_back_and_run_keeps_them(template, tmp_path):
     path = Path(shutil.copy(template, tmp_path / "a.mcap"))
@@ -148,18 +184,23 @@ def test_corrections_made_in_cvat_come_back_and_run_keeps_them(template, tmp_pat
     assert list(unchanged.messages) == ["/camera/corrected"]
     assert unchanged.changes["of"] == "/camera/retracks/full"
     assert [unchanged.changes[name] for name in ("moved", "added", "removed")] == [0, 0, 0]
-    # A person draws another one, who stands in the first 20 pictures, and nobody found.
+    # A person draws another one, who nobody found: there in the first 10 pictures, and again from the 21st to the 28th.
     corner = 'xtl="50" ytl="2" xbr="58" ybr="12" occluded="0"'
     drawn = f'<track id="9" label="person"><box frame="0" keyframe="1" outside="0" {corner}/>'
-    drawn += f'<box frame="20" keyframe="1" outside="1" {corner}/></track>'
+    drawn += "".join(f'<box frame="{k}" outside="{int(k != 20)}" {corner}/>' for k in (10, 20, 28)) + "</track>"
     boxes.write_text(text.replace("</annotations>", drawn + "</annotations>"))
     out = done("ingest", boxes, "--as", "corrections", "--into", path, "--force")
-    assert "20 added, new tracks" in " ".join((out.out + out.err).split())
+    assert "18 added, new tracks" in " ".join((out.out + out.err).split())
     (new,) = mcaptrack.ingest(boxes, role="corrections", into=path, force=True).changes["new_tracks"]
     assert mcaptrack.info(path).to_json()["channels"]
     with log.read(path) as opened:
         before = len(np.unique(opened.rows("/camera/retracks", TRACKS).rows["track_id"]))
-    assert set(mcaptrack.run(path).stages) >= {"sample", "predict", "retrack"}
+    said = done("run", path)
+    told = said.out + said.err
+    assert "corrections of /camera/tracks have changed: running sample again" in " ".join(told.split())
+    assert re.search(r"corrected +\d+ boxes of \d+ tracks by people, in 30 pictures", told)
+    assert re.search(r"re-tracked .* 0 left out", told)
+    assert "/camera/samples  sample  with /camera/corrected" in done("info", path).out
     with log.read(path) as opened:
         topics = "/camera/corrected", "/camera/retracks/full"
         corrected, full = (join_frames(TRACKS, opened.frame_columns(topic, TRACKS)) for topic in topics)
@@ -174,13 +215,32 @@ def test_corrections_made_in_cvat_come_back_and_run_keeps_them(template, tmp_pat
         owner.setdefault(int(row["track_id"]), set()).update(full.rows["track_id"][same].tolist())
     assert len(owner[new]) == 1
     assert sorted(len(one) for one in owner.values()) == [1] * len(owner)
+    assert len(full.rows) == len(corrected.rows)  # and nothing else
     assert mcaptrack.run(path).stages == ()
+    (tmp_path / "part.txt").write_text("3,1,2,3,4,5,1,1,1\n4,1,2,3,4,5,1,1,1\n")
+    part = mcaptrack.ingest(tmp_path / "part.txt", role="corrections", into=path, force=True)
+    assert ["/camera/corrected covered 28 pictures more" in one.message for one in part.warnings] == [True]
     mcaptrack.drop(path, ["/camera/corrected"])
     mcaptrack.run(path)
     with log.read(path) as opened, log.read(template) as first:
         assert opened.rows("/camera/retracks", TRACKS).rows.tobytes() == (
             first.rows("/camera/retracks", TRACKS).rows.tobytes()
         )
+
+
+def test_parts_of_tracks_get_ids_that_no_track_of_the_log_has(template, tmp_path):
+    box = '<box frame="{}" xtl="1" ytl="1" xbr="9" ybr="9"><attribute name="track_id">0</attribute></box>'
+    parts = "".join(f'<track label="person">{box.format(k)}</track>' for k in (3, 7, 9))
+    (tmp_path / "a.xml").write_text(f"<annotations>{parts}</annotations>")
+    labels = read_labels(tmp_path / "a.xml", role="corrections")
+    assert sorted(labels.id.tolist()) == [0, 1, 2]
+    with log.read(Path(template)) as opened:
+        found = with_new_ids(opened, "/camera", labels)
+        topics = "/camera/tracks", "/camera/retracks/full"
+        used = {one for topic in topics for one in opened.rows(topic, TRACKS).rows["track_id"].tolist()}
+    assert 1 in used
+    assert (found.id[0], len(np.unique(found.id))) == (0, 3)
+    assert not used & set(found.id[1:].tolist())
 
 
 def test_corrections_need_a_log_and_ids(template, tmp_path):

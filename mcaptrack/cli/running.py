@@ -191,6 +191,9 @@ def _lines_of_summary(summary: Summary) -> Iterator[tuple[str, str]]:
         yield "boxes", f"{summary.boxes:,}{where}"
     if summary.tracks is not None:
         yield "tracks", f"{summary.tracks:,}"
+    if summary.corrected is not None:
+        count, tracks, pictures = summary.corrected.boxes, summary.corrected.tracks, summary.corrected.pictures
+        yield "corrected", f"{count:,} boxes of {tracks:,} tracks by people, in {pictures:,} pictures"
     if summary.repair is not None:
         done = (("joined", "gaps closed"), ("parted", "split"), ("left_out", "left out"))
         words = ", ".join(f"{getattr(summary.repair, name):,} {word}" for name, word in done)

@@ -122,6 +122,8 @@ def _lineage(channels: list[dict[str, Any]], verbose: bool) -> Tree:
             package = f"{plugin['distribution']} {plugin['version']}".strip()
             words = f"  {plugin['name']}" + (f" ({package})" if package else "")
             label.append(printable(words), "dim")
+        corrections = [topic for topic in channel.get("references") or () if topic.endswith("/corrected")]
+        label.append(f"  with {printable(corrections[0])}" if corrections else "", "dim")
         label.append(f"  in {printable(channel['frame'])}" if channel["frame"] else "", "dim")
         label.append("  out of date" if channel["stale"] else "", "red")
         node = parent.add(label)

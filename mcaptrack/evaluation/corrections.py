@@ -5,8 +5,8 @@ Letters: N rows of one side, P pairs.
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
@@ -17,7 +17,8 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.assignment import assign_by_gain
 from mcaptrack.geometry.boxes import columns_to_boxes, iou
 from mcaptrack.schema import TRACKS, Frame, Rows
-from mcaptrack.sources.corrections import CORRECTED
+from mcaptrack.schema.classes import class_name, class_names, is_person
+from mcaptrack.sources.corrections import CORRECTED, CORRECTED_FROM
 
 #: Boxes are the same object from this overlap on.
 _SAME_IOU: Final = 0.3
@@ -25,8 +26,6 @@ _SAME_IOU: Final = 0.3
 MOVED_PX: Final = 2.0
 #: A track is joined or split if each part has at least so many boxes; fewer may be boxes that were matched by chance.
 _LEAST_BOXES: Final = 2
-#: The channels that people may have corrected, the likeliest first.
-_CORRECTED_FROM: Final = ("retracks/full", "tracks")
 _SHOWN: Final = 5
 
 
@@ -36,6 +35,7 @@ class Changes:
 
     ``same``, ``moved``, ``added`` and ``removed`` are numbers of boxes. ``joined`` are corrected ids with the ids that
     they are of, ``split`` ids with the corrected ids that they became; ``new_tracks`` and ``removed_tracks`` are ids.
+    ``relabelled`` are corrected ids with the names of the class that their boxes had, and of the one that they have.
     """
 
     of: str
@@ -48,6 +48,7 @@ class Changes:
     split: dict[int, list[int]]
     new_tracks: list[int]
     removed_tracks: list[int]
+    relabelled: dict[int, tuple[str, str]]
 
     @property
     def words(self) -> str:
@@ -59,6 +60,14 @@ class Changes:
         parts += [f"track {one} split into {_listed(ids)}" for one, ids in list(self.split.items())[:_SHOWN]]
         more = max(len(self.joined) - _SHOWN, 0) + max(len(self.split) - _SHOWN, 0)
         parts += [f"{more} more joined or split"] if more else []
+        changed: dict[tuple[str, str], list[int]] = {}
+        for one, classes in self.relabelled.items():
+            changed.setdefault(classes, []).append(one)
+        shown = list(changed.items())
+        parts += [
+            f"track{'s' * (len(ids) > 1)} {_listed(ids)} from {was} to {now}" for (was, now), ids in shown[:_SHOWN]
+        ]
+        parts += [f"{len(shown) - _SHOWN} more changes of class"] if len(shown) > _SHOWN else []
         parts += [f"new tracks {_listed(self.new_tracks)}"] if self.new_tracks else []
         parts += [f"tracks {_listed(self.removed_tracks)} removed"] if self.removed_tracks else []
         return f"of {self.of}, in {self.frames} frames: {', '.join(parts)}"
@@ -78,18 +87,29 @@ def changes_in(opened: log.Log, topic: str) -> Changes | None:
     They are of the re-tracked boxes of their camera, or of its tracks if the ids fit those better.
     """
     prefix = topic.removesuffix(f"/{CORRECTED}")
-    names = [f"{prefix}/{name}" for name in _CORRECTED_FROM]
+    names = [f"{prefix}/{name}" for name in CORRECTED_FROM]
     there = [name for name in names if name in opened.channels and opened.channels[name].holds(TRACKS)]
     corrected = opened.frame_columns(topic, TRACKS)
-    found = [compare(name, opened.frame_columns(name, TRACKS), corrected) for name in there]
+    classes = {name: class_names(opened.channel(name).metadata) for name in (*there, topic)}
+    found = [compare(one, opened.frame_columns(one, TRACKS), corrected, classes[one], classes[topic]) for one in there]
     return max(found, key=lambda one: one[1])[0] if found else None
 
 
-def compare(of: str, before: Sequence[Frame], after: Sequence[Frame]) -> tuple[Changes, int]:
-    """Compare tracks with their corrections, frame by frame; also return the number of boxes with the id they had."""
+def compare(
+    of: str,
+    before: Sequence[Frame],
+    after: Sequence[Frame],
+    classes: Mapping[int, str] = {},
+    corrected_classes: Mapping[int, str] = {},
+) -> tuple[Changes, int]:
+    """Compare tracks with their corrections, frame by frame; also return the number of boxes with the id they had.
+
+    ``classes`` and ``corrected_classes`` are the names of classes of both.
+    """
     counts = np.zeros(4, np.int64)  # same, moved, added, removed
     kept, frames = 0, 0
     parts: dict[tuple[int, int], int] = defaultdict(int)
+    labels: dict[int, Counter[tuple[str, str]]] = defaultdict(Counter)
     ids: tuple[set[int], set[int]] = set(), set()
     for old, new in _pairs(before, after):
         frames += 1
@@ -101,6 +121,9 @@ def compare(of: str, before: Sequence[Frame], after: Sequence[Frame]) -> tuple[C
         counts += (int((~is_moved).sum()), int(is_moved.sum()), len(new) - len(j), len(old) - len(i))
         for pair in zip(old["track_id"][i].tolist(), new["track_id"][j].tolist(), strict=True):
             parts[pair] += 1
+        kinds = zip(new["track_id"][j].tolist(), old["class_id"][i].tolist(), new["class_id"][j].tolist(), strict=True)
+        for one, was, now in kinds:
+            labels[one][_class(was, classes), _class(now, corrected_classes)] += 1
         kept += int((old["track_id"][i] == new["track_id"][j]).sum())
         ids[0].update(old["track_id"].tolist())
         ids[1].update(new["track_id"].tolist())
@@ -116,8 +139,15 @@ def compare(of: str, before: Sequence[Frame], after: Sequence[Frame]) -> tuple[C
         {one: parts_of for one, parts_of in sorted(made_of.items()) if len(parts_of) > 1},
         {one: parts_of for one, parts_of in sorted(became.items()) if len(parts_of) > 1},
         sorted(ids[1] - {other for _, other in parts}), sorted(ids[0] - {one for one, _ in parts}),
+        {one: usual for one, found in sorted(labels.items()) if len(set(usual := found.most_common(1)[0][0])) > 1},
     )  # fmt: skip
     return changes, kept
+
+
+def _class(number: int, names: Mapping[int, str]) -> str:
+    """The name of a class; formats call people by several."""
+    name = class_name(number, names)
+    return "person" if is_person(name) else name
 
 
 def _pairs(before: Sequence[Frame], after: Sequence[Frame]) -> Iterator[tuple[Rows, Rows]]:
@@ -137,11 +167,17 @@ def _with_boxes(rows: Rows) -> Rows:
 
 
 def _matched(old: Rows, new: Rows) -> tuple[Ints, Ints]:
-    """The rows (P,) of both sides that are the same object: by overlap, with some preference for the same id."""
+    """The rows (P,) of both sides that are the same object: by overlap, with some preference for the same id.
+
+    Boxes with the same id that are left over are the same object, too, however far a person has moved them.
+    """
     if not len(old) or not len(new):
         return np.empty(0, np.int64), np.empty(0, np.int64)
     overlap = iou(columns_to_boxes(old), columns_to_boxes(new))
     gain = np.where(overlap >= _SAME_IOU, overlap + 0.1 * (old["track_id"][:, None] == new["track_id"][None]), -1.0)
     i, j = assign_by_gain(gain)
     good = gain[i, j] > 0
-    return i[good], j[good]
+    i, j = i[good], j[good]
+    _, left, moved = np.intersect1d(np.delete(old["track_id"], i), np.delete(new["track_id"], j), return_indices=True)
+    others = np.delete(np.arange(len(old)), i)[left], np.delete(np.arange(len(new)), j)[moved]
+    return np.concatenate([i, others[0]]), np.concatenate([j, others[1]])

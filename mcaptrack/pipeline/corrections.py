@@ -11,7 +11,7 @@ from mcaptrack.pipeline.write import Made, digest_of
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.cameras import camera_at, provenance_of
-from mcaptrack.sources.corrections import corrections_of, fixed_ids, with_corrections
+from mcaptrack.sources.corrections import CORRECTED, corrections_of, fixed_ids, with_corrections, without_filled
 
 #: The stage that takes corrections.
 _STAGE: Final = "sample"
@@ -37,6 +37,21 @@ def corrected_tracks(opened: log.Log, prefix: str, source: str, tracks: Sequence
     """The tracks at ``source`` with corrections, if they have any."""
     topic = corrections_of(opened, prefix, source)
     return tracks if topic is None else with_corrections(tracks, opened.frame_columns(topic, TRACKS))
+
+
+def without_filled_in(opened: log.Log, prefix: str, source: str, frames: Sequence[Frame]) -> Sequence[Frame]:
+    """Re-tracked tracks at the rate of those at ``source``, without boxes that corrections of these don't have."""
+    topic = corrections_of(opened, prefix, source)
+    return frames if topic is None else without_filled(frames, opened.frame_columns(topic, TRACKS))
+
+
+def is_of_corrections(opened: log.Log, prefix: str, made: Provenance) -> bool:
+    """Whether samples are out of date because corrections of their tracks are new, changed or gone."""
+    ending = f"/{CORRECTED}"
+    then = {topic: digest for topic, digest in made.references.items() if topic.endswith(ending)}
+    found = corrections_of(opened, camera_at(opened, prefix).prefix, made.input) if made.transform == _STAGE else None
+    now = {found: digest_of(opened, found)} if found is not None else {}
+    return made.transform == _STAGE and then != now
 
 
 def fixed_in(opened: log.Log, prefix: str, source: str, made: Mapping[str, Made]) -> tuple[int, ...]:

@@ -16,6 +16,7 @@ from mcaptrack.geometry.plane import is_assumed
 from mcaptrack.notices import warn
 from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, fits
+from mcaptrack.pipeline.corrections import is_of_corrections
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, read_planes, warn_unused
 from mcaptrack.pipeline.rebuild import MissingPluginError, differing, rebuild
 from mcaptrack.pipeline.spaces import check_spaces, suited_tracker
@@ -305,7 +306,10 @@ class _Planner:
         elif is_projected:
             self._notes.append(f"{topic} was made with another ground plane: running {stage} again, as before")
         elif is_due and not self._force:
-            self._notes.append(f"{topic} was made from an earlier {source}: running {stage} again, as before")
+            is_corrected = is_of_corrections(self._opened, self._prefix, made)
+            why = f"{topic} was made from an earlier {source}"
+            why = f"corrections of {source} have changed" if is_corrected else why
+            self._notes.append(f"{why}: running {stage} again, as before")
         there = [f"{main}/{suffix}".rstrip("/") for suffix in transform.writes]
         kept = [one == topic or one in self._opened.channels for one in there]
         keep = tuple(suffix for suffix, is_kept in zip(transform.writes, kept, strict=True) if is_kept)

@@ -17,7 +17,7 @@ from mcaptrack.geometry.plane import Planes, scene_planes
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline.checks import Job, check_inputs, read_named_frames
 from mcaptrack.pipeline.context import in_context
-from mcaptrack.pipeline.corrections import corrected_input, corrected_tracks, fixed_in
+from mcaptrack.pipeline.corrections import corrected_input, corrected_tracks, fixed_in, without_filled_in
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.findings import warn_findings, warn_memory, warn_no_rows
@@ -327,7 +327,8 @@ def _at_video_rate(
         there = source in opened.channels and opened.channels[source].schema_name == TRACKS.name
         tracks = opened.frame_columns(source, TRACKS) if there else ()
     tracks = corrected_tracks(opened, prefix, source, tracks) if len(tracks) else tracks
-    return to_pictures(carry(to_scene(tracks, path), retracked, planes), path)
+    carried = without_filled_in(opened, prefix, source, carry(to_scene(tracks, path), retracked, planes))
+    return to_pictures(carried, path)
 
 
 def _input(

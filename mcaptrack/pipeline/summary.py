@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -15,14 +15,16 @@ from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M, are_3d
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.plane import origin_of
 from mcaptrack.notices import warn
+from mcaptrack.pipeline.corrections import corrected_tracks
 from mcaptrack.pipeline.planes import fit_of, read_planes
-from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, PREDICTIONS, TRACKS, Rows, Schema
+from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, PREDICTIONS, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.camera_motion import rows_to_verdict
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameColumns
-from mcaptrack.schema.framing import joined_parts, row_ends
+from mcaptrack.schema.framing import joined_parts, row_ends, unique_values
 from mcaptrack.sources.camera_motion import motion_topic, read_ground_truth
 from mcaptrack.sources.cameras import camera_at, provenance_of
+from mcaptrack.sources.corrections import corrections_of
 from mcaptrack.sources.fixed_frame import BoxesRead, holds_boxes
 from mcaptrack.transforms import STAGES
 
@@ -50,6 +52,15 @@ class SummaryScores:
 
 
 @dataclass(frozen=True)
+class Corrected:
+    """The corrections by people that re-tracking took: boxes, their tracks, and the pictures that were looked at."""
+
+    boxes: int
+    tracks: int
+    pictures: int
+
+
+@dataclass(frozen=True)
 class Summary:
     """Counts and scores for one camera; None for channels that the log lacks.
 
@@ -68,6 +79,7 @@ class Summary:
     ground_plane: str | None = None
     plane_fit: Mapping[str, float] | None = None
     camera_motion: str | None = None
+    corrected: Corrected | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Convert the summary to JSON values."""
@@ -85,6 +97,10 @@ def summarise(opened: log.Log, prefix: str, boxes_read: BoxesRead | None = None)
     boxes, tracks, samples, predictions, retracks = (f"{prefix}/{STAGES[name].output_topic}" for name in names)
     motion = _rows(opened, motion_topic(prefix), CAMERA_MOTION)
     tracked, repaired = _sources(opened, tracks), _sources(opened, retracks)
+    corrected = _corrected(opened, prefix, tracks, samples)
+    given = tracked
+    if corrected:
+        given = _pairs(corrected_tracks(opened, prefix, tracks, opened.frame_columns(tracks, TRACKS)))
     forecasts = _forecasts(opened, f"{retracks}/predictions") or _forecasts(opened, predictions)
     planes = read_planes(opened, prefix)
     scores = _scores(opened, prefix, camera.truth, (samples, retracks))
@@ -98,14 +114,24 @@ def summarise(opened: log.Log, prefix: str, boxes_read: BoxesRead | None = None)
         pictures=opened.channels[camera.pictures].messages if camera.pictures else None,
         boxes=_count_boxes(opened, tracks, boxes, boxes_read or BoxesRead()),
         tracks=None if tracked is None else len(np.unique(tracked[0])),
-        repair=None if tracked is None or repaired is None else _repair(tracked, repaired),
+        repair=None if given is None or repaired is None else _repair(given, repaired),
         forecasts=None if forecasts is None else forecasts[0],
         horizon_s=None if forecasts is None else forecasts[1],
         scores=scores,
         ground_plane=None if planes is None else origin_of(planes),
         plane_fit=fit_of(provenance_of(opened, camera.ground_plane)),
         camera_motion=None if motion is None else rows_to_verdict(motion).name.lower(),
+        corrected=corrected,
     )
+
+
+def _corrected(opened: log.Log, prefix: str, tracks: str, samples: str) -> Corrected | None:
+    """Count the corrections that the samples were made with; None if there are none."""
+    topic, made = corrections_of(opened, prefix, tracks), provenance_of(opened, samples)
+    if topic is None or made is None or topic not in made.references:
+        return None
+    frames = opened.frame_columns(topic, TRACKS)
+    return Corrected(int(row_ends(frames)[-1]), len(unique_values(TRACKS, frames, "track_id")), len(frames))
 
 
 def _frames(opened: log.Log, topic: str, schema: Schema) -> FrameColumns | None:
@@ -122,8 +148,11 @@ def _rows(opened: log.Log, topic: str, schema: Schema) -> Rows | None:
 def _sources(opened: log.Log, topic: str) -> Ints | None:
     """Return the different pairs of a track's id and the id that its rows had before, (2, P); None without tracks."""
     frames = _frames(opened, topic, TRACKS)
-    if frames is None:
-        return None
+    return None if frames is None else _pairs(frames)
+
+
+def _pairs(frames: Sequence[Frame]) -> Ints:
+    """Return the different pairs of a track's id and the id that its rows had before, (2, P)."""
     pairs = np.empty((2, 0), np.int64)
     for _, _, joined in joined_parts(TRACKS, frames):
         those = np.stack([joined.rows["track_id"], joined.rows["source_id"]]).astype(np.int64)

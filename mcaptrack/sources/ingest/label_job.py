@@ -23,7 +23,9 @@ from mcaptrack.schema import GROUND_PLANE, Frame
 from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.calibrations import frame_of
+from mcaptrack.sources.corrections import CORRECTED
 from mcaptrack.sources.foreign import holds_pictures
+from mcaptrack.sources.ingest.correcting import warn_uncovered, with_new_ids
 from mcaptrack.sources.ingest.job import IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.camera import (
     ExistingLabels,
@@ -87,6 +89,9 @@ class LabelJob(IngestJob):
         self._start_ns = options.start_ns or 0
         if into is not None:
             self.prefix, self.pictures = camera_of(into, options.camera)
+        if into is not None and "corrections" in self.labels:
+            path, labels = self.labels["corrections"]
+            self.labels = {**self.labels, "corrections": (path, with_new_ids(into, self.prefix, labels))}
             self.frame_id = frame_of(into, self.pictures) if self.pictures else ""
         seen = detections_topic(into, self.prefix) if into is not None and not self.pictures else ""
         pictures_of = partial(picture_size, into, self.pictures) if into is not None and self.pictures else None
@@ -259,6 +264,10 @@ class LabelJob(IngestJob):
         if not has_clock and not self.pictures:
             writer.add_metadata(CLOCK, {"start_ns": str(self._start_ns)})
         self.write_plane(writer, self.ground, int(self.timeline.t_ns[0]))
+        if self.into is not None and "corrections" in self.labels:
+            path, labels = self.labels["corrections"]
+            placed = self.timeline.place(path, labels, []).between(int(labels.labelled[0]), int(labels.labelled[-1]))
+            warn_uncovered(self.into, f"{self.prefix}/{CORRECTED}", placed)
         self.write_labels(writer, self.ground, self.timeline)
         self.write_motion(writer, self.timeline, self._size)
 

@@ -53,7 +53,7 @@ class BoxRows:
     ``names`` are the class names by number, None if the file has none. ``at`` names the place of a row in messages.
     ``crowd`` (N,) marks regions of people that have no boxes of their own. ``labelled`` (F,) are frames that the file
     describes, with or without boxes. ``times_s`` (F,): the times of frames, which are then numbered from 0.
-    ``is_normalised``: boxes are in shares of the picture's size. ``observed`` (N,): see ``Labels``.
+    ``is_normalised``: boxes are in shares of the picture's size. ``observed`` (N,), ``made_ids``: see ``Labels``.
     """
 
     path: Path
@@ -71,6 +71,7 @@ class BoxRows:
     times_s: Floats | None = None
     is_normalised: bool = False
     observed: Bools | None = None
+    made_ids: Ints | None = None
     remarks: list[str] = field(default_factory=list)
     doubts: list[tuple[str, Code]] = field(default_factory=list)
 
@@ -120,6 +121,7 @@ class BoxRows:
             self.is_normalised,
             self.times_s,
             None if self.observed is None else self.observed[kept],
+            self.made_ids,
         )
 
     def take_shares(self) -> None:

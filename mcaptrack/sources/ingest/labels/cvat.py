@@ -280,8 +280,8 @@ def read_cvat(path: Path, role: Role, wanted: WantedClasses) -> Labels:
     rows.doubts += [(f"{path}: {doubt}", "clock")] if doubt else []
     if parser.tracks:
         own = values[:, _ID].astype(int)
-        ids, words = _ids(path, parser.tracks, np.bincount(own, minlength=len(parser.tracks)))
-        rows.id = ids[own].astype(float)
+        ids, made, words = _ids(path, parser.tracks, np.bincount(own, minlength=len(parser.tracks)))
+        rows.id, rows.made_ids = ids[own].astype(float), made
         rows.remarks += words
     if parser.unread:
         shown = ", ".join(repr(text) for text in list(parser.unread)[:3])
@@ -332,8 +332,8 @@ def _is_count(text: str) -> bool:
     return text.isascii() and text.isdecimal() and len(text) < 10
 
 
-def _ids(path: Path, tracks: list[_Track], counts: Any) -> tuple[Ints, list[str]]:
-    """The id of each track, and remarks: the one that its attribute states, or else its number in the file.
+def _ids(path: Path, tracks: list[_Track], counts: Any) -> tuple[Ints, Ints | None, list[str]]:
+    """The id of each track, those that are new, and remarks: the id that its attribute states, or its number.
 
     Of several tracks that state one id, as after a track was split, the one with most boxes keeps it. The others, and
     tracks that were drawn by hand beside those that state an id, get new ids.
@@ -345,8 +345,9 @@ def _ids(path: Path, tracks: list[_Track], counts: Any) -> tuple[Ints, list[str]
     if not any(one is not None for one in stated):
         numbers = np.array([track.number for track in tracks], np.int64)
         if len(np.unique(numbers)) == len(numbers):
-            return numbers, remarks
-        return np.arange(len(tracks)), [*remarks, f"{path}: ids of tracks occur twice; its tracks are counted from 0"]
+            return numbers, None, remarks
+        remarks.append(f"{path}: ids of tracks occur twice; its tracks are counted from 0")
+        return np.arange(len(tracks)), None, remarks
     taken: set[int] = set()
     split: Counter[int] = Counter()
     for at in np.argsort(-counts, kind="stable").tolist():
@@ -363,8 +364,8 @@ def _ids(path: Path, tracks: list[_Track], counts: Any) -> tuple[Ints, list[str]
         remarks.append(f"{path}: several tracks state one track_id ({shown}): {split.total()} of them get new ids")
     drawn = sum(one is None for one in stated)
     if drawn:
-        remarks.append(f"{path}: {drawn} tracks state no track_id and get new ids, from {int(ids[new].min())} on")
-    return ids, remarks
+        remarks.append(f"{path}: {drawn} tracks state no track_id and get new ids")
+    return ids, ids[new] if len(new) else None, remarks
 
 
 def _is_id(text: str) -> bool:

@@ -111,7 +111,7 @@ class Labels:
     rows that were left out; those of ground truth are in ``ignored``. ``remarks`` and ``doubts`` (warnings and their
     codes) say how the file was understood. ``is_normalised``: boxes are in shares of the picture's size. ``times_s``
     (F,): the times of frames by the file itself; its frames are then numbered from 0. ``observed`` (N,): which boxes
-    were seen, and not filled in or occluded, if the file says so.
+    were seen, and not filled in or occluded, if the file says so. ``made_ids``: rising ids that are not of the file.
     """
 
     format: Format
@@ -131,6 +131,7 @@ class Labels:
     is_normalised: bool = False
     times_s: Floats | None = None
     observed: Bools | None = None
+    made_ids: Ints | None = None
 
     @property
     def step(self) -> int:
