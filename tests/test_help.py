@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import pytest
 
 from mcaptrack import environment
-from mcaptrack.cli.command import LAST_PANELS
 from mcaptrack.cli.many import NAMES
+from mcaptrack.cli.most_used import FIRST_PANEL, LAST_PANELS, MOST_USED
 from mcaptrack.cli.stages import shown_default
 from mcaptrack.transforms import STAGES
 from tests.commands import GROUP, call
@@ -82,8 +82,21 @@ class TestHelp:
     def test_options_are_grouped_below_headings(self, command):
         panels = [option.rich_help_panel for option in shown(command)]
         assert max(Counter(panels).values()) <= 9
-        order = [LAST_PANELS.index(panel) + 1 if panel in LAST_PANELS else 0 for panel in panels]
+        order = [LAST_PANELS.index(panel) + 1 if panel in LAST_PANELS else -(panel == FIRST_PANEL) for panel in panels]
         assert order == sorted(order)
+
+    @EVERY_COMMAND
+    def test_the_options_that_most_people_need_come_first(self, command):
+        """Commands with many options begin with the file to write, what is read, and the methods to choose from."""
+        first = [option.name for option in shown(command) if option.rich_help_panel == FIRST_PANEL]
+        assert first == list(MOST_USED.get(command, ()))
+        own = [option.name for option in shown(command) if option.rich_help_panel not in LAST_PANELS[1:]]
+        choices = {"detector", "tracker", "retracker", "predictor", "output", "topic", "force", "truth", "profile"}
+        if len(own) > 9:
+            assert choices & set(own) <= set(first)
+            words = call(command, "--help").out
+            names = [max(option.opts, key=len) for option in shown(command)]
+            assert words.index(FIRST_PANEL) < min(words.index(f" {name} ") for name in names[len(first) :])
 
     def test_common_options_are_the_same_in_all_commands(self):
         def common(command: str) -> list[tuple[list[str], str]]:
@@ -149,6 +162,7 @@ class TestHelp:
         ((1.0, 2.5), "1.0 2.5"),
         ((), "none"),
         (None, "none"),
+        ("", "none"),
         (True, "true"),
         (False, "false"),
         (0.5, "0.5"),

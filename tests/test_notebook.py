@@ -258,6 +258,10 @@ class TestOtherLogs:
             labels = log.show(end_s=1.0)
             assert labels.views == ("/camera/truth",)
             assert log.show(end_s=0.2, topic="truth").views == labels.views
+            with pytest.raises(
+                McaptrackError, match="/camera/ground_plane has no boxes, tracks or predictions to draw"
+            ):
+                log.show(topic="ground_plane")
         data, start_ns = shown(labels).data, start_of(fresh)
         rows = stored(fresh, "/camera/truth")
         for second, drawn in zip(data["seconds"], data["drawn"], strict=True):
@@ -273,8 +277,8 @@ class TestOtherLogs:
                 plain = log.show(end_s=0.5)
             assert (plain.views, plain.pictures) == ((), 6)
             assert [one.code for one in plain.warnings] == ["nothing-found"]
-            with pytest.raises(McaptrackError, match="has no boxes, tracks or predictions to draw; there are none"):
-                log.show(topic="video")
+            alone = log.show(topic="video", end_s=0.5)
+            assert (alone.views, alone.pictures, alone.warnings) == ((), 6, ())
 
     def test_a_log_with_nothing_to_see_is_refused(self, tmp_path):
         with mcaptrack.open(tmp_path / "new.mcap", create=True) as log, pytest.raises(McaptrackError) as refused:
@@ -291,6 +295,73 @@ class TestOtherLogs:
         assert [one for one in page.of("script") if one.get("type") != "text/plain"] == page.of("script")[-1:]
         assert page.of("title") == [{}]
         assert "<script>alert" not in made.html
+
+
+class TestTables:
+    @pytest.fixture
+    def shell(self, monkeypatch):
+        """A running IPython, as in a notebook."""
+        import IPython
+        from IPython.core.formatters import DisplayFormatter
+
+        class Shell:
+            display_formatter = DisplayFormatter()
+
+        monkeypatch.setattr(IPython, "get_ipython", lambda: Shell)
+        return Shell.display_formatter
+
+    def test_a_table_shows_units_rows_and_what_it_leaves_out(self, finished, shell):
+        with mcaptrack.open(finished) as log:
+            table = log.table("tracks", "/camera/tracks")
+        html = Elements(shell.format(table)[0]["text/html"])
+        text = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", shell.format(table)[0]["text/html"]))
+        assert len(html.of("th")) == len(table.column_names)
+        titles = {title["title"] for title in html.of("th")}
+        assert table.schema.field("x_m").metadata[b"description"].decode() in titles
+        assert f"{table.num_rows:,} rows, {len(table.column_names)} columns; the first 8 and the last 2 rows" in text
+        assert len(html.of("tr")) == 1 + 8 + 1 + 2
+        rows = table.slice(0, 8).to_pylist() + table.slice(table.num_rows - 2).to_pylist()
+        assert all(f" {row['t_ns']} " in text for row in rows)
+
+    def test_a_small_table_is_whole_and_what_is_missing_is_a_dash(self, finished, shell):
+        with mcaptrack.open(finished) as log:
+            table = log.table("tracks", "/camera/truth").slice(0, 10)
+        html = shell.format(table)[0]["text/html"]
+        assert "10 rows" in html
+        assert "first" not in re.sub(r'title="[^"]*"', "", html)
+        missing = sum(column.null_count for column in table.columns)
+        assert html.count("&ndash;") == missing > 0
+
+    def test_tables_of_others_and_printers_of_the_user_stay(self, finished, shell):
+        import pyarrow as pa
+
+        with mcaptrack.open(finished) as log:
+            assert "text/html" not in shell.format(pa.table({"a": [1]}))[0]
+            shell.formatters["text/html"].for_type(pa.Table, lambda table: "mine")
+            mcaptrack.open(finished).close()
+            assert shell.format(log.table("tracks"))[0]["text/html"] == "mine"
+
+    def test_names_and_texts_are_escaped(self, shell, finished):
+        import pyarrow as pa
+
+        mcaptrack.open(finished).close()
+        about = {"unit": "<u>", "description": '"><script>'}
+        table = pa.table([["<img src=x>" + 80 * "a"]], pa.schema([pa.field("<b>", pa.string(), metadata=about)]))
+        html = Elements(shell.format(table)[0]["text/html"])
+        assert {tag for tag, _ in html.found} <= {"div", "table", "thead", "tbody", "tr", "th", "td", "br", "span", "p"}
+
+
+class TestReport:
+    def test_a_report_is_shown_as_it_is_without_scripts(self, finished, tmp_path):
+        made = mcaptrack.report(finished, tmp_path / "page.html")
+        (frame,) = Elements(made._repr_html_()).of("iframe")
+        assert frame["srcdoc"] == made.page.read_text(encoding="utf-8")
+        assert "allow-scripts" not in frame["sandbox"]
+        made.page.write_bytes(b" " * 8_000_001)
+        assert "too large to show here" in made._repr_html_()
+        made.page.unlink()
+        assert Elements(made._repr_html_()).of("iframe") == []
+        assert "can&#39;t be read: No such file" in made._repr_html_()
 
 
 def test_the_strokes_of_any_annotations_can_be_written_as_json():

@@ -6,15 +6,16 @@ widget needs both, and is blank there.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack import log as logs
-from mcaptrack import pipeline
+from mcaptrack import pipeline, tables
 from mcaptrack.api.common import PathLike, Progress, as_path, warn_unused, warnings_about
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish_bytes, refuse_overwrite
@@ -24,7 +25,13 @@ from mcaptrack.notices import Notice
 from mcaptrack.viewing.moments import find_moments, opening_moment
 from mcaptrack.viewing.notebook.page import Still, player_html, still_html
 from mcaptrack.viewing.notebook.pictures import PLAYER_PX, PictureSource, still_jpeg
+from mcaptrack.viewing.notebook.table import FIRST, LAST, ShownColumn, table_html
 
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+#: The module and name of the class of Arrow tables.
+_ARROW: Final = ("pyarrow.lib", "Table")
 _MB: Final = 1e6
 #: The part of the largest size that is planned for, because sizes are estimated.
 _PLANNED: Final = 0.92
@@ -132,6 +139,46 @@ class Player:
     def _repr_mimebundle_(self, **_: Any) -> dict[str, Any]:
         """The forms that a notebook keeps: HTML, a picture for programs without it, and text."""
         return {"text/html": self.html, "image/jpeg": self.still, "text/plain": repr(self)}
+
+
+def show_tables() -> None:
+    """Let the running notebook show tables of logs with their units, unless it has its own way to show Arrow tables."""
+    jupyter = sys.modules.get("IPython")
+    shell = jupyter.get_ipython() if jupyter is not None else None
+    if shell is None:
+        return
+    html = shell.display_formatter.formatters["text/html"]
+    if _ARROW not in html.deferred_printers and not any(_name_of(one) == _ARROW for one in html.type_printers):
+        html.for_type_by_name(*_ARROW, arrow_html)
+
+
+def _name_of(one: type) -> tuple[str, str]:
+    return one.__module__, one.__qualname__
+
+
+def arrow_html(table: pa.Table) -> str | None:
+    """Return a table of a log as HTML; None for tables of others, which are shown as always.
+
+    Examples
+    --------
+    >>> import pyarrow
+    >>> arrow_html(pyarrow.table({"a": [1]})) is None
+    True
+    """
+    about = [{key.decode(): text.decode() for key, text in (field.metadata or {}).items()} for field in table.schema]
+    if not any("unit" in one and "description" in one for one in about):
+        return None
+    rows = table.num_rows
+    is_whole = rows <= FIRST + LAST
+    numbers, texts = tables.cells(table, rows if is_whole else FIRST)
+    texts += [] if is_whole else tables.cells(table.slice(rows - LAST), LAST)[1]
+    columns = [
+        ShownColumn(
+            name, found.get("unit", ""), found.get("description", ""), is_number, [line[place] for line in texts]
+        )
+        for place, (name, found, is_number) in enumerate(zip(table.column_names, about, numbers, strict=True))
+    ]
+    return table_html(columns, rows)
 
 
 def show_log(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from mcaptrack import log as logs
 from mcaptrack.api.checked import checked
@@ -26,6 +26,9 @@ from mcaptrack.location import Location, local_name
 from mcaptrack.notices import Notice, collected
 from mcaptrack.tables.catalogue import is_folder_of_tables
 from mcaptrack.viewing import report as pages
+
+#: The largest page in bytes that notebooks show and keep.
+_MOST_INLINE: Final = 8_000_000
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,18 @@ class ReportResult:
 
     def __repr__(self) -> str:
         return f"ReportResult({str(self.page)!r}, {self.size} bytes)"
+
+    def _repr_html_(self) -> str:
+        """The page in a frame, for notebooks, as long as the file is there and not too large to be kept in one."""
+        from mcaptrack.viewing.notebook.page import framed_html
+
+        caption = f"{self.page} ({self.size / 1e6:.1f} MB)"
+        try:
+            size = self.page.stat().st_size
+            page = self.page.read_text(encoding="utf-8") if size <= _MOST_INLINE else None
+        except OSError as error:
+            return framed_html(None, f"{caption} can't be read: {error.strerror}")
+        return framed_html(page, caption if page is not None else f"{caption} is too large to show here; open the file")
 
 
 @checked()

@@ -16,7 +16,7 @@ from mcaptrack import tables
 from mcaptrack.api.checked import checked
 from mcaptrack.api.common import Progress, names_of, no_progress
 from mcaptrack.api.fetching import FetchedMessage, fetch_message, shown_pictures
-from mcaptrack.api.notebook import Choice, Player, show_log
+from mcaptrack.api.notebook import Choice, Player, show_log, show_tables
 from mcaptrack.api.supervision import supervision_of
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.location import Location, Url
@@ -39,6 +39,7 @@ class LogReader:
         self._place = path if isinstance(path, Url) else path.absolute()  # wherever the working folder moves
         self._reading = RLock()  # tables are kept once they were made, and several threads may ask for them
         self._open(path)
+        show_tables()
 
     def _open(self, path: Location) -> None:
         self._there = logs.read(path)
@@ -227,7 +228,7 @@ class LogReader:
         at_s : float, optional
             Return a still of this time instead. All times are in seconds since the start of the log.
         topic : str or sequence of str, optional
-            Draw these channels, or views; by default those that ``render`` draws.
+            Draw these channels, or views; by default those that ``render`` draws. That of pictures shows them alone.
         camera : str, optional
             Name of the camera, if the log has several.
         start_s, end_s : float, optional

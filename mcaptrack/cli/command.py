@@ -14,13 +14,10 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from mcaptrack.cli.flags import RUNNING
+from mcaptrack.cli.most_used import LAST_PANELS, arrange
 from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, gather
 from mcaptrack.cli.text import log_format, refuse_usage, say
 from mcaptrack.notices import warn
-
-#: The last headings of options in the help.
-LAST_PANELS: Final = ("Input and output", "Options of all commands")
-
 
 #: The exception of Typer for a command line that it can't parse.
 _UsageError: Final[Any] = typer.BadParameter.__bases__[0]
@@ -120,7 +117,7 @@ class Command(TyperCommand):
             self.params.append(hidden)
             first = targets[0]
             self.settings[old] = Setting(name, old, hidden.name, first.kind, first.many, first.declared)
-        self.params.sort(key=_place)
+        arrange(name, self.params)
         config = parameters["config"]
         config.envvar = now["config"].variable  # the others are read with the files, once this is known
 
@@ -216,12 +213,6 @@ def _rank(ctx: Any, parameter: str, found: Mapping[str, tuple[Setting, Given]]) 
 
 def _python_name(name: str) -> str:
     return "old_" + name.replace("-", "_")
-
-
-def _place(parameter: Any) -> int:
-    """Return the sort key of an option in the help: the common headings are last."""
-    panel = getattr(parameter, "rich_help_panel", None)
-    return 1 + LAST_PANELS.index(panel) if panel in LAST_PANELS else 0
 
 
 def _hidden(parameter: Any, old: str) -> Any:

@@ -22,9 +22,10 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, ParamSpec, get_ty
 import typer
 
 from mcaptrack import SCHEMA_VERSION, notices
-from mcaptrack.cli.command import LAST_PANELS, Command, Reading, check_ranges, is_on_command_line, read_config
+from mcaptrack.cli.command import Command, Reading, check_ranges, is_on_command_line, read_config
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.inputs import check_paths
+from mcaptrack.cli.most_used import LAST_PANELS
 from mcaptrack.cli.settings import Declared
 from mcaptrack.cli.text import Level, is_json, say
 from mcaptrack.errors import McaptrackError
@@ -58,8 +59,8 @@ _UNUSED: Final = re.compile(r"`(\w+)=` ")
 #: The warnings of the running command, and its inputs.
 _WARNED: Final[ContextVar[list[Notice]]] = ContextVar("warned")
 _BATCH: Final[ContextVar[_Batch]] = ContextVar("batch")
-#: Headings of options in the help: input and output, and options of all commands.
-FILES, COMMON = LAST_PANELS
+#: Headings of options in the help: input and output, many logs, and options of all commands.
+FILES, MANY, COMMON = LAST_PANELS
 
 #: Seconds between two lines about progress, with ``--log-format json``.
 PROGRESS_S: Final = 5.0

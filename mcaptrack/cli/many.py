@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 #: Heading of the options in the help.
-PANEL: Final = "Many logs"
+PANEL: Final = common.MANY
 _TIME: Final = re.compile(r"([0-9]+(?:\.[0-9]+)?)\s*([smh]?)")
 _SECONDS: Final = {"": 1, "s": 1, "m": 60, "h": 3600}
 #: The number of logs from which on the summary repeats why logs failed.

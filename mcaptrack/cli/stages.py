@@ -134,7 +134,13 @@ def shown_default(default: Any) -> str:
     """Return a default as text for the help."""
     if isinstance(default, tuple):
         return " ".join(map(str, default)) or "none"
-    return "none" if default is None else str(default).lower() if isinstance(default, bool) else f"{default}"
+    return (
+        "none"
+        if default is None or default == ""
+        else str(default).lower()
+        if isinstance(default, bool)
+        else f"{default}"
+    )
 
 
 def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
@@ -281,10 +287,12 @@ def run_all(
     quiet: common.Quiet = False,
     verbose: common.Verbose = False,
     config: common.Config = None,
-    detector: Annotated[str | None, chooser("detector", words=_AGAIN)] = None,
-    tracker: Annotated[str | None, chooser("tracker", words=_AGAIN)] = None,
-    retracker: Annotated[str | None, chooser("retracker", words=_AGAIN)] = None,
-    predictor: Annotated[str | None, chooser("predictor", words=_AGAIN)] = None,
+    detector: Annotated[str | None, chooser("detector", words=_AGAIN, shown="as before, or median")] = None,
+    tracker: Annotated[
+        str | None, chooser("tracker", words=_AGAIN, shown="as before, or one that suits the detections")
+    ] = None,
+    retracker: Annotated[str | None, chooser("retracker", words=_AGAIN, shown="as before, or likelihood")] = None,
+    predictor: Annotated[str | None, chooser("predictor", words=_AGAIN, shown="as before, or red")] = None,
     camera_motion: Annotated[
         Literal["auto", "on", "off"] | None,
         common.option(

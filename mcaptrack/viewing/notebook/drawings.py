@@ -21,6 +21,7 @@ from mcaptrack.schema import PREDICTIONS, Schema
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.framing import has_any
 from mcaptrack.sources.camera_motion import path_of, tracks_topic
+from mcaptrack.sources.foreign import holds_pictures
 from mcaptrack.sources.foreign.flatten import message_decoder
 from mcaptrack.transforms import FULL
 
@@ -72,10 +73,13 @@ class ToShow(NamedTuple):
 def find_drawings(opened: log.Log, prefix: str, topics: Sequence[str]) -> ToShow:
     """Return what is shown of a camera: given channels, or those that layouts show by default.
 
-    Pictures without anything to draw on them are shown, too, with a warning. Raises McaptrackError if there is nothing
-    to see, if a given channel can't be drawn, or if the views of given ones don't fit together.
+    A given channel of pictures is shown with nothing on it. Pictures without anything to draw on them are shown, too,
+    with a warning. Raises McaptrackError if there is nothing to see, if a given channel can't be drawn, or if the views
+    of given ones don't fit together.
     """
     given = [_full(opened, prefix, topic) for topic in topics]
+    if len(given) == 1 and given[0] in opened.channels and holds_pictures(opened.channels[given[0]]):
+        return ToShow([], given[0], opened.times(given[0]))
     without = [topic for topic in given if not _has_view(opened, topic)]
     if without:
         for topic in given:

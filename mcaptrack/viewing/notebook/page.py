@@ -82,3 +82,8 @@ def _packed(data: Any) -> bytes:
 
 def _base64(data: bytes) -> str:
     return b64encode(data).decode()
+
+
+def framed_html(page: str | None, caption: str) -> str:
+    """Return a page without scripts in a frame, with a caption; the caption alone without a page."""
+    return str(render("framed.html", page=page or "", caption=caption))
