@@ -100,11 +100,16 @@ def scene_panel(title: str, frame_id: str, topics: Mapping[str, bool], eye: Eye,
         # Lines to the parents of frames end at the origin of the map, which may be far away.
         "scene": {"transforms": {"visible": False, **({"lineWidth": 0} if follow else {})}},
         "transforms": {},
-        "topics": {topic: {"visible": is_on} for topic, is_on in topics.items()},
+        "topics": {topic: {"visible": is_on, **_scene_style(topic)} for topic, is_on in topics.items()},
         "layers": {"grid": grid},
         "imageMode": {},
     }
     return panel(title, scene)
+
+
+def _scene_style(topic: str) -> Config:
+    """The settings of a topic of scenes: the discs of forecasts are large, and white outlines would hide the rest."""
+    return {"showOutlines": False} if "/predictions/" in topic else {}
 
 
 def plot_panel(title: str, paths: Mapping[str, str], most: float | None = None) -> dict[str, Any]:

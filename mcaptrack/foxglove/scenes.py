@@ -304,8 +304,8 @@ def _forecast(
         "size": {"x": Slot("wide"), "y": Slot("deep"), "z": 0.01},
         "bottom_scale": 1.0,
         "top_scale": 1.0,
-        # Ellipses of vehicles are large, and many lie over one another.
-        "color": {**_paint(), "a": 0.0625 if is_high else 0.25},
+        # Ellipses are large, those of vehicles more so, and many lie over one another.
+        "color": {**_paint(), "a": 0.0625 if is_high else 0.125},
     }
     lines, discs = _lines(points, thickness_px, is_high=is_high), [disc] if has_ellipse else []
     return _entity(frame_id, lifetime_ns, TextSlot("entity_id", length), cylinders=discs, lines=lines)

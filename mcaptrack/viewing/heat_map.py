@@ -44,6 +44,8 @@ _OPACITY: Final = 0.8
 _FADED: Final = 0.04
 #: Pixels that are this many times as large on the ground as at the lower edge are near the horizon.
 _FARTHEST: Final = 20.0
+#: Narrower pictures are enlarged, so that their legend can be read.
+_LEAST_PX: Final = 240
 _INK: Final = (235, 230, 225)
 
 
@@ -95,6 +97,8 @@ def draw_heat_map(
             warn(f"{opened.path}: the heat map is drawn from above, because {why}", "other")
         image = _from_above(heat, options.width_px or _WIDTH_PX)
     most = float(heat.person_s.max()) / heat.cell_m**2
+    if options.width_px is None and image.shape[1] < _LEAST_PX:
+        image = scaled(image, _LEAST_PX)
     image = _with_legend(image, most, float(heat.person_s.sum()), topic)
     data = encode_image(image, "jpeg" if SUFFIXES[output.suffix.lower()] == "jpeg" else "png")
     publish_bytes(output, data)
@@ -215,14 +219,14 @@ def _with_legend(image: Image, most: float, total_s: float, topic: str) -> Image
     import cv2
 
     width = image.shape[1]
-    line = max(10, round(min(width, 900) / 45))
+    line = round(np.clip(width / 45, 10, 40))
     strip = np.full((line * 4, width, 3), (32, 28, 26), np.uint8)
     long = width // 3
     level = np.linspace(0, 1, long)
     colours = cv2.applyColorMap(np.rint(55 + 200 * level).astype(np.uint8)[None], cv2.COLORMAP_INFERNO)
     strip[line // 2 : line // 2 + line, line : line + long] = colours
     font, size = cv2.FONT_HERSHEY_SIMPLEX, line / 34
-    for share in (0.0, 0.5, 1.0):
+    for share in (0.0, 0.5, 1.0) if long > line * 8 else (0.0, 1.0):
         words = f"{most * share**2:.2g}" + (" s/m2" if share == 1 else "")
         cv2.putText(
             strip, words, (line + round(long * share * 0.96), round(line * 2.6)), font, size, _INK, 1, cv2.LINE_AA

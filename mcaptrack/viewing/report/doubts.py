@@ -41,7 +41,7 @@ class Doubt(NamedTuple):
 
 
 def find_doubts(repairs: ChannelEvents | None, tracks: Sequence[Frame], people: PersonScores | None) -> list[Doubt]:
-    """The repairs that are farthest from where the person was expected, in the order of time.
+    """The repairs that are farthest from where the person was expected, the farthest first.
 
     The person is expected to go on as in the last two seconds before the gap. ``people`` are the scores of these
     ``tracks`` by person, if there is ground truth. Repairs without positions in metres are left out.
@@ -57,8 +57,7 @@ def find_doubts(repairs: ChannelEvents | None, tracks: Sequence[Frame], people: 
         if away_m is not None and away_m >= _LEAST_M:
             verdict, is_right = _verdict(people, event) if people is not None else ("", None)
             found.append(Doubt(event, away_m, verdict, is_right))
-    chosen = sorted(found, key=lambda one: (-one.away_m, one.event.t_ns))[:_MOST]
-    return sorted(chosen, key=lambda one: one.event.t_ns)
+    return sorted(found, key=lambda one: (-one.away_m, one.event.t_ns))[:_MOST]
 
 
 def _away_m(rows: Any, t_ns: Any, event: IdentityEvent) -> float | None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from mcaptrack.errors import command
 from mcaptrack.foxglove.palette import COUNT as COLOURS
@@ -24,6 +25,8 @@ from mcaptrack.viewing.report.scene_map import (
     pixel_paths,
 )
 
+#: The time in the text of an event.
+_WHEN: Final = re.compile(r",? at [0-9]+\.[0-9] s\b")
 _NO_GROUND = (
     "Tracks can't be drawn: there is no picture, and without a ground plane positions on the ground are not known."
 )
@@ -98,7 +101,7 @@ def _event(event: IdentityEvent, text: str, report: LogReport) -> dict[str, Any]
     """An event with its time for a viewer: in ns since 1970, and in seconds of the log."""
     seconds = (event.t_ns - report.start_ns) / NS_PER_S
     return {
-        "text": text,
+        "text": _WHEN.sub("", text, count=1),  # the time stands before the text
         "is_wrong": False,
         "t_ns": event.t_ns,
         "clock": clock(seconds),

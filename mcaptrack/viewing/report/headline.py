@@ -32,10 +32,32 @@ class BeforeAfter(NamedTuple):
 
 def rule_text(similarity: str, gate: float) -> str:
     """A rule in words."""
+    return _rule_text(similarity, f"{gate:g}")
+
+
+def _rule_text(similarity: str, gate: str) -> str:
     if similarity == "metres":
-        return f"within {gate:g} m on the ground"
+        return f"within {gate} m on the ground"
     seen = {"bev-iou": ", seen from above,", "3d-iou": " in space"}.get(similarity, "")
-    return f"by overlap of boxes{seen} of at least {gate:g}"
+    return f"by overlap of boxes{seen} of at least {gate}"
+
+
+def rules_text(rules: Sequence[tuple[str, float]]) -> str:
+    """Rules in words, those that differ in their limit together.
+
+    Examples
+    --------
+    >>> rules_text([("iou", 0.5), ("metres", 0.5), ("metres", 2.0)])
+    'by overlap of boxes of at least 0.5; within 0.5 or 2 m on the ground'
+    """
+    gates: dict[str, list[str]] = {}
+    for similarity, gate in rules:
+        gates.setdefault(similarity, []).append(f"{gate:g}")
+    texts = []
+    for similarity, some in gates.items():
+        several = ", ".join(some[:-1]) + f" or {some[-1]}" if len(some) > 1 else some[0]
+        texts.append(_rule_text(similarity, several))
+    return "; ".join(texts)
 
 
 def result_of(results: Sequence[EvaluationRow], topic: str, similarity: str, gate: float) -> EvaluationRow | None:

@@ -15,7 +15,7 @@ from mcaptrack.evaluation.metrics.calibration import LEVELS
 from mcaptrack.viewing.report.charts import Axis, Bars, Line, histogram_chart, line_chart, round_most
 from mcaptrack.viewing.report.contents import LogReport
 from mcaptrack.viewing.report.formatting import counted, number, percent, short
-from mcaptrack.viewing.report.headline import rule_text
+from mcaptrack.viewing.report.headline import rule_text, rules_text
 from mcaptrack.viewing.report.summary import before_after
 
 #: The columns of the table of scores: whether a column is a share, and whether its lowest value is the best.
@@ -47,7 +47,7 @@ def scores(report: LogReport) -> dict[str, Any]:
         "other_columns": _columns(rest),
         "other_groups": _score_groups(rest, report),
         "has_averages": any(row.averages for row in report.results),
-        "other_rules": "; ".join(rule_text(*rule) for rule in rules),
+        "other_rules": rules_text(rules),
         "is_at_prediction_rate": bool(beside),
         "missing": report.missing.get("scores", ""),
         "tracks": _track_rows(report),
