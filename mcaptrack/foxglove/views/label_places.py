@@ -1,7 +1,8 @@
 """Where labels of people stand who are close to each other: one above the other, and steadily so.
 
 A label moves away from those of lower ids, along the side of its box that its style has, as far as it has to. Once two
-labels have met, they stay apart for a while, so that noise of boxes does not make them jump. Places depend on the
+labels have met, they stay apart for a while, so that noise of boxes does not make them jump; then the one comes back
+slowly, if no other is in its way. Places depend on the
 present and the last second alone; they are the same whichever part of a log is drawn.
 
 Letters: N labels, F pictures, K pairs of labels in a picture.
@@ -15,14 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Floats, Ints
-from mcaptrack.geometry.clocks import seconds_to_ns
+from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
 
 #: Width of a character and height of a line, in sizes of the font: as much as viewers and videos need.
 _WIDE: Final = 0.75
 _HIGH: Final = 1.5
-#: Labels that have met stay apart for this time, unless they are farther apart than this many lines.
+#: Labels that have met stay apart for this time, unless they are farther apart than this many lines; those that are
+#: beside each other come back in its last part.
 _HOLD_S: Final = 1.0
+_BACK_S: Final = 0.5
 _APART: Final = 1.5
 #: Labels that would have to move by more lines than this stay where they are.
 _MOST_LINES: Final = 4.0
@@ -59,9 +62,12 @@ def shifts(at_ns: Ints, frame: Ints, number: Ints, corner_px: Floats, extent_px:
         Pixels to add to the second coordinate: of 0 or less, or of 0 or more with ``is_down``.
     """
     out = np.zeros(len(frame))
-    lower, higher = _held(at_ns, frame, number, *_meeting(frame, number, corner_px, extent_px))
+    lower, higher, age_s = _held(at_ns, frame, number, *_meeting(frame, number, corner_px, extent_px))
     if not len(lower):
         return out
+    left, right = corner_px[:, 0], corner_px[:, 0] + extent_px[:, 0]
+    is_beside = (left[lower] >= right[higher]) | (left[higher] >= right[lower])
+    share = np.where(is_beside, np.clip((_HOLD_S - age_s) / _BACK_S, 0.0, 1.0), 1.0)
     sign = 1.0 if is_down else -1.0
     away = sign * corner_px[:, 1]
     high = extent_px[:, 1]
@@ -74,7 +80,10 @@ def shifts(at_ns: Ints, frame: Ints, number: Ints, corner_px: Floats, extent_px:
         if not is_near.any():
             break
         moved = (away + out)[lower[is_near]] + needed[is_near] - away[higher[is_near]]
-        np.maximum.at(out, higher[is_near], moved)
+        before = out.copy()
+        np.maximum.at(out, higher[is_near], share[is_near] * moved)
+        if np.array_equal(out, before):
+            break
     out[out > _MOST_LINES * high] = 0.0
     return sign * out
 
@@ -101,10 +110,10 @@ def _meeting(frame: Ints, number: Ints, corner_px: Floats, extent_px: Floats) ->
     return np.where(is_first, one, other).astype(np.int64), np.where(is_first, other, one).astype(np.int64)
 
 
-def _held(at_ns: Ints, frame: Ints, number: Ints, lower: Ints, higher: Ints) -> tuple[Ints, Ints]:
-    """The pairs of labels in each picture that overlap in it, or did in the last second."""
+def _held(at_ns: Ints, frame: Ints, number: Ints, lower: Ints, higher: Ints) -> tuple[Ints, Ints, Floats]:
+    """The pairs of labels in each picture that overlap in it, or did in the last second, and how long ago, in s."""
     if not len(lower):
-        return lower, higher
+        return lower, higher, np.empty(0)
     ids, which = np.unique(number, return_inverse=True)
     pair = which[lower].astype(np.int64) * len(ids) + which[higher]
     order = np.lexsort((frame[lower], pair))
@@ -115,6 +124,7 @@ def _held(at_ns: Ints, frame: Ints, number: Ints, lower: Ints, higher: Ints) -> 
     following[np.append(starts[1:], True)] = len(at_ns)
     count = np.minimum(end, following) - begin
     of, at = pair[group_index(count)], ragged_range(begin, count)
+    age_s = (at_ns[at] - at_ns[begin[group_index(count)]]) / NS_PER_S
     # Where both are: the rows by picture and id.
     keys = frame * len(ids) + which
     rows = np.argsort(keys, kind="stable")
@@ -125,4 +135,4 @@ def _held(at_ns: Ints, frame: Ints, number: Ints, lower: Ints, higher: Ints) -> 
         place = np.minimum(np.searchsorted(sorted_keys, wanted), len(rows) - 1)
         found.append(np.where(sorted_keys[place] == wanted, rows[place], -1))
     both = (found[0] >= 0) & (found[1] >= 0)
-    return found[0][both].astype(np.int64), found[1][both].astype(np.int64)
+    return found[0][both].astype(np.int64), found[1][both].astype(np.int64), age_s[both]
