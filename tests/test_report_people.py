@@ -6,6 +6,7 @@ import itertools
 import json
 import re
 from html import escape, unescape
+from importlib import import_module
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 from urllib.request import urlopen
@@ -28,6 +29,7 @@ from mcaptrack.viewing.report.doubts import find_doubts
 from mcaptrack.viewing.report.identity_events import summarize_events
 from mcaptrack.viewing.report.identity_timeline import counts_over_time, identity_timeline, pieces
 from mcaptrack.viewing.report.scene_map import heat_map
+from mcaptrack.viewing.report.statistics import rows_by_track
 from tests.worlds import crossing_tracks, ns, tracks_at, walk, write_eventful
 
 
@@ -234,6 +236,17 @@ def test_people_over_time_keep_their_mean(counts):
         assert found.tolist() == counts
 
 
+def test_those_who_stay_longest_have_a_bar(told, monkeypatch):
+    monkeypatch.setattr(import_module("mcaptrack.viewing.report.identity_timeline"), "_MOST", 1)
+    rows, t_ns = rows_by_track(told.track_sets["truth"].frames)
+    stays = {int(one): int(np.ptp(t_ns[rows["track_id"] == one])) for one in np.unique(rows["track_id"])}
+    longest = max(stays.values())
+    assert min(stays.values()) < longest
+    found = identity_timeline(told)
+    assert [stays[int(row["name"])] for row in found["rows"]] == [longest]
+    assert found["left_out"] == len(stays) - 1
+
+
 # Maps and doubts
 
 
@@ -286,6 +299,41 @@ def test_doubts_say_how_far_a_repair_is_from_the_expected_place(other, verdict):
     assert (alone.is_right, alone.verdict) == (None, "")
     nothing, _ = joined(0.0, False)
     assert find_doubts(told, nothing, None) == []
+
+
+def test_the_farthest_repair_is_the_first_whenever_it_happened():
+    near, far = joined(1.5, False)[0], joined(2.5, False)[0]
+    both = []
+    for one, other in zip(near, far, strict=True):
+        rows = other.rows.copy()
+        rows["track_id"] = 8
+        rows["source_id"] += 10
+        rows["y_m"] += 20
+        both.append(Frame(one.t_ns, one.index, np.concatenate([one.rows, rows]).astype(one.rows.dtype)))
+    found = mcaptrack.evaluation.events.find_events(both, None)
+    told = summarize_events("/a", found.events, None, both, None, (0, ns(16)))
+    doubts = find_doubts(told, both, None)
+    assert [(int(one.event.row["track_id"]), round(one.away_m, 1)) for one in doubts] == [(8, 2.5), (7, 1.5)]
+
+
+def test_the_time_of_an_event_stands_once(text):
+    events = re.findall(r'<figcaption><span class="at"[^>]*>([^<]+)</span> ([^<]+)</figcaption>', text)
+    assert len(events) >= 3
+    assert any("became track" in words for _, words in events)
+    assert not any(re.search(r"\bat [0-9]|[0-9]\s+s\s+at\b|\s,", words) for _, words in events)
+
+
+def test_every_row_of_a_table_hides_the_same_columns_on_a_phone(text):
+    tables = re.findall(r"<table>(.*?)</table>", text, re.DOTALL)
+    assert len(tables) >= 3
+    for table in tables:
+        head, *rows = re.findall(r"<tr>(.*?)</tr>", table, re.DOTALL)
+        wanted = ["opt" in one for one in re.findall(r"<th\b([^>]*)>", head)]
+        for row in rows:
+            cells = re.findall(r"<t[hd]\b([^>]*)>", row)
+            if "colspan" not in cells[0]:
+                assert ["opt" in one for one in cells] == wanted, row
+    assert sum('class="opt"' in one for one in tables) >= 2
 
 
 # Links

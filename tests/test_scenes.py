@@ -60,6 +60,25 @@ def test_every_scene_is_whole():
                 assert opacity == sorted(opacity)
 
 
+@pytest.mark.parametrize(("topic", "sign"), [("/c/retracks/full", 1), ("/c/tracks", -1), ("/c/truth", 1)])
+def test_labels_of_neighbours_stand_one_above_the_other_and_come_back_slowly(topic, sign):
+    """3 and 5 stand 0.5 m apart, 9 elsewhere; after the tenth scene 5 is 3 m away. There are 7 scenes a second."""
+    frames = [
+        Frame(int(t), n, tracks_at({3: (1.0, 1.0), 5: (1.5 if n < 10 else 4.0, 1.0), 9: (8.0, 1.0)}))
+        for n, t in enumerate(PICTURES)
+    ]
+    found = [
+        {entity.id: entity.texts[0].pose.position.z for entity in one.entities} for one in scenes(topic, TRACKS, frames)
+    ]
+    usual = found[0]["9"]
+    assert {one["9"] for one in found} == {one["3"] for one in found} == {usual}
+    own = np.array([sign * (one["5"] - usual) for one in found])
+    assert own[:13] == pytest.approx(1.2, abs=M)  # until half a second later
+    assert (np.diff(own[12:]) <= 0).all()
+    assert 0.2 < -np.diff(own[12:]).min() < 0.5
+    assert own[17:] == pytest.approx(0, abs=M)
+
+
 def test_interpolated_positions_are_fainter_and_unknown_ones_left_out():
     frames = [Frame(int(t), n, tracks_at({2: (1.0, 1.0)}, observed=n != 3)) for n, t in enumerate(PICTURES[:6])]
     alpha = [m.entities[0].cylinders[0].color.a for m in scenes("/c/tracks", TRACKS, frames)[:6]]

@@ -87,19 +87,22 @@ class SceneMessages:
 
     def people(
         self, frame: Ints, labels: NDArray[Any], xy_m: Floats, rgb: Floats, alpha: Floats, marker: PersonMarker,
-        trail_m: Floats, fade: Floats,
+        trail_m: Floats, fade: Floats, apart_m: Floats,
     ) -> None:  # fmt: skip
         """Draw people at (N, 2) with labels (N,), numbers or texts, and a trail through points (N, P, 2), oldest first.
+
+        ``apart_m`` (N,) is how much farther from the ground labels stand than usual.
 
         ``fade`` (P,) is the opacity at each point. A trail in pieces is drawn between the first and the second point,
         the third and the fourth, and so on. Trails with another number of points need another call.
         """
         xy, trail = _short(xy_m), _short(trail_m)
+        text_z = marker.number_m + np.sign(marker.number_m) * _short(apart_m)
         for length, chosen, words in by_length(labels):
             template = _person(self._frame_id, self._lifetime_ns, length, marker, trail.shape[1])
             self._add(
                 frame[chosen], template, entity_id=words, label=words, x=xy[chosen, 0], y=xy[chosen, 1],
-                text_x=xy[chosen, 0], text_y=xy[chosen, 1], a=alpha[chosen],
+                text_x=xy[chosen, 0], text_y=xy[chosen, 1], text_z=text_z[chosen], a=alpha[chosen],
                 **_shades("", rgb[chosen]), **_shades("text_", rgb[chosen]), **_line(trail[chosen], rgb[chosen], fade),
             )  # fmt: skip
 
@@ -254,7 +257,7 @@ def _person(frame_id: str, lifetime_ns: int, length: int, marker: PersonMarker, 
         "top_scale": 1.0,
         "color": _paint(),
     }
-    name = _label(length, marker.number_m)
+    name = _label(length, Slot("text_z"))
     lines = _lines(points, marker.thickness_px, marker.in_pieces)
     return _entity(frame_id, lifetime_ns, TextSlot("entity_id", length), cylinders=[body], texts=[name], lines=lines)
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.foxglove import SceneMessages, class_colour, colours
+from mcaptrack.foxglove.views import label_places
 from mcaptrack.foxglove.views.image import BATCH, View, fade
 from mcaptrack.foxglove.views.people import (
     ForecastPaths,
@@ -94,6 +95,8 @@ def tracks(shown: PeopleInParts, t_ns: Ints, frame_id: str, style: TrackStyle, c
         strength = np.where(people.observed, OBSERVED, INTERPOLATED)
         alpha, body_alpha = 0.875 * strength, 0.625 * strength
         places = np.column_stack([people.at_m, people.body.base_m()])
+        apart_m = np.zeros(len(people.number))
+        apart_m[known] = label_places.heights(t_ns, people.frame[known], people.number[known], people.at_m[known])
         for span, scene in instants.batches(first, last):
             rows = np.arange(*np.searchsorted(people.frame, [span.start, span.stop]))
             rows = rows[known[rows]]
@@ -111,8 +114,9 @@ def tracks(shown: PeopleInParts, t_ns: Ints, frame_id: str, style: TrackStyle, c
                     )  # fmt: skip
                 else:
                     scene.people(
-                        frame, label, people.at_m[these], rgb[these], alpha[these], style.marker, trail, opacity
-                    )
+                        frame, label, people.at_m[these], rgb[these], alpha[these], style.marker, trail, opacity,
+                        apart_m[these],
+                    )  # fmt: skip
             yield from instants.numbered(span, scene)
 
 

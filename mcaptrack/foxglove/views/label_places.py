@@ -30,6 +30,11 @@ _APART: Final = 1.5
 #: Labels that would have to move by more lines than this stay where they are.
 _MOST_LINES: Final = 4.0
 _ROUNDS: Final = 8
+#: On the ground: people closer than this are neighbours; labels of neighbours are so far above each other, and so
+#: often at most.
+_NEIGHBOURS_M: Final = 1.2
+_STEP_M: Final = 1.2
+_MOST_STEPS: Final = 4
 
 
 def extents(labels: NDArray[Any], size_px: float) -> Floats:
@@ -86,6 +91,38 @@ def shifts(at_ns: Ints, frame: Ints, number: Ints, corner_px: Floats, extent_px:
             break
     out[out > _MOST_LINES * high] = 0.0
     return sign * out
+
+
+def heights(at_ns: Ints, frame: Ints, number: Ints, at_m: Floats) -> Floats:
+    """Compute how much higher labels of people on the ground stand, so that those of neighbours keep apart.
+
+    Viewers see a scene from any side and any distance, so this can't be exact: neighbours are closer than
+    ``_NEIGHBOURS_M``, and the label of the higher id is ``_STEP_M`` above that of the lower one. After neighbours have
+    parted, labels come back as in pictures.
+
+    Parameters
+    ----------
+    at_ns : (F,) of int64
+        Times of the scenes, rising.
+    frame : (N,) of int64
+        The scene of each person, rising.
+    number : (N,) of int64
+        Ids.
+    at_m : (N, 2)
+        Positions.
+
+    Returns
+    -------
+    (N,) of float64
+        Metres.
+    """
+    out = np.zeros(len(frame))
+    extent = np.full((len(frame), 2), _NEIGHBOURS_M)
+    lower, higher, age_s = _held(at_ns, frame, number, *_meeting(frame, number, at_m, extent))
+    share = np.clip((_HOLD_S - age_s) / _BACK_S, 0.0, 1.0)
+    for _ in range(_MOST_STEPS if len(lower) else 0):
+        np.maximum.at(out, higher, share * np.minimum(out[lower] + _STEP_M, _MOST_STEPS * _STEP_M))
+    return out
 
 
 def _meeting(frame: Ints, number: Ints, corner_px: Floats, extent_px: Floats) -> tuple[Ints, Ints]:
