@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
+from dataclasses import replace
 from html import escape, unescape
 from importlib import import_module
 from pathlib import Path
@@ -29,7 +30,6 @@ from mcaptrack.viewing.report.doubts import find_doubts
 from mcaptrack.viewing.report.identity_events import summarize_events
 from mcaptrack.viewing.report.identity_timeline import counts_over_time, identity_timeline, pieces
 from mcaptrack.viewing.report.scene_map import heat_map
-from mcaptrack.viewing.report.statistics import rows_by_track
 from tests.worlds import crossing_tracks, ns, tracks_at, walk, write_eventful
 
 
@@ -237,14 +237,17 @@ def test_people_over_time_keep_their_mean(counts):
 
 
 def test_those_who_stay_longest_have_a_bar(told, monkeypatch):
+    """Person 50 leaves half way; there is room for one."""
     monkeypatch.setattr(import_module("mcaptrack.viewing.report.identity_timeline"), "_MOST", 1)
-    rows, t_ns = rows_by_track(told.track_sets["truth"].frames)
-    stays = {int(one): int(np.ptp(t_ns[rows["track_id"] == one])) for one in np.unique(rows["track_id"])}
-    longest = max(stays.values())
-    assert min(stays.values()) < longest
-    found = identity_timeline(told)
-    assert [stays[int(row["name"])] for row in found["rows"]] == [longest]
-    assert found["left_out"] == len(stays) - 1
+    truth = told.track_sets["truth"]
+    half = truth.frames[len(truth.frames) // 2].t_ns
+    kept = [
+        Frame(one.t_ns, one.index, one.rows[(one.rows["track_id"] != 50) | (one.t_ns < half)]) for one in truth.frames
+    ]
+    sets = told.track_sets | {"truth": TrackSet(truth.topic, truth.role, truth.name, kept)}
+    found = identity_timeline(replace(told, track_sets=sets))
+    assert [int(row["name"]) for row in found["rows"]] == [90]
+    assert found["left_out"] == 1
 
 
 # Maps and doubts
