@@ -82,7 +82,7 @@ ONLY_PARAMETERS = {
     "retrack": {"stages"},
 }
 #: Defaults that a command line writes in another way.
-OTHER_DEFAULTS = {("evaluate", "gate_m")}
+OTHER_DEFAULTS = {("evaluate", "gate_m"), ("run", "follows")}
 
 
 def sections_of(function) -> tuple[list[str], list[str]]:

@@ -143,6 +143,14 @@ class Scene:
         self.path.with_suffix(".report.html").write_text("of another log")
         return self
 
+    def followed(self) -> str:
+        """A log without tracks, and one that follows it."""
+        shutil.copy(self.path, "next.mcap")
+        self.untracked()
+        with pytest.raises(McaptrackError) as refused:
+            mcaptrack.run("next.mcap", follows=self.path)
+        return with_flags(str(refused.value))
+
     def untracked(self) -> Scene:
         return self.ingested("clip.mp4", "--truth", "truth.txt", "--ground-plane", "plane.txt")
 
@@ -155,6 +163,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "cli/running.py:_next:*": lambda s: s.says("run", "LOG", "--no-tables"),
     "api/scoring.py:_smoothed:run": lambda s: s.without("/camera/predictions*").says("evaluate", "LOG", "--smoothed"),
     "cli/running.py:_next:run": lambda s: s.says("fuse", "LOG"),
+    "pipeline/following.py:_check_camera:run": Scene.followed,
     "pipeline/fusing.py:_lack:detect": lambda s: s.without("/camera/[!vg]*").says("fuse", "LOG"),
     "api/running.py:warn_stale:run": lambda s: s.says("detect", "LOG", "--detector", "mog2"),
     "api/ingesting.py:_changes:run": lambda s: s.says("ingest", "truth.txt", "--as", "corrections", "--into", "LOG"),

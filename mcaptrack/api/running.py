@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import Literal, NamedTuple
@@ -109,6 +110,8 @@ class RunResult:
         The cameras that were left out, each with the reason.
     not_fused : str
         Why the cameras were not fused to a scene; "" if they were, and for one camera.
+    continued : mcaptrack.pipeline.Continued or None
+        How ids go on from those of the log before, if one was named.
 
     """
 
@@ -132,6 +135,7 @@ class RunResult:
     cameras: Mapping[str, CameraResult] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     not_fused: str = ""
+    continued: pipeline.Continued | None = None
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -145,8 +149,8 @@ class RunResult:
 
 
 #: Plans the jobs for a log; takes the open log, the prefix of its camera, a function that takes notes, and the topics
-#: that were made again already.
-Plan = Callable[[logs.Log, str, Callable[[str], None], Collection[str]], list[Job]]
+#: that were made again already, and those that are to be made again.
+Plan = Callable[[logs.Log, str, Callable[[str], None], Collection[str], Collection[str]], list[Job]]
 
 
 @dataclass(frozen=True)
@@ -177,12 +181,15 @@ def work(
     plane: PlaneChoice = AS_BEFORE,
     zones: ZoneWatch | None = None,
     fuses: Fusing | None = None,
+    follows: Location | None = None,
 ) -> RunResult:
     """Plan and run on one log. ``tables`` is None where a single stage runs, which neither exports nor summarises.
 
-    With ``fuses`` all cameras are run, if none is named, and a scene of several is made again if it is out of date.
+    With ``fuses`` all cameras are run, if none is named, and a scene of several is made again if it is out of date. Ids
+    go on from those of the log that this one ``follows``.
     """
     force = where.force
+    continued: list[pipeline.Continued] = []
 
     def run_at(prefix: str, progress: Progress) -> Act:
         """Run a camera; without a prefix the only one."""
@@ -193,8 +200,17 @@ def work(
             fused = {}
             if fuses is not None:
                 fused = pipeline.fuse_again(opened, at, force, notes.say, progress, adds=not fuses.names)
-            jobs = plan(opened, at, notes.say, fused)
-            return at, pipeline.run(opened, at, jobs, output, progress, watch, plane, boxes, zones, fused)
+            run = partial(pipeline.run, opened, at, output=output, progress=progress, watch=watch, plane=plane)
+            run = partial(run, boxes=boxes, zones=zones, fused=fused)
+            if follows is None:
+                return at, run(plan(opened, at, notes.say, fused, ()))
+            with logs.read(follows) as earlier:
+                before = pipeline.Before(earlier, opened, at)
+                report = run(plan(opened, at, notes.say, fused, before.renewed(opened)), before=before)
+            continued.append(before.result)
+            for words in before.result.words():
+                notes.say(words)
+            return at, report
 
         return act
 
@@ -208,7 +224,8 @@ def work(
     each = None
     if fuses is not None and where.topic is None and (where.camera is None or len(fuses.names) > 1):
         each = EveryCamera(fuses.names, fuses.is_on, run_at, fuse_to)
-    return change(where, run_at("", progress), progress, tables, each)
+    result = change(where, run_at("", progress), progress, tables, each)
+    return replace(result, continued=pipeline.Continued.joined(continued)) if continued else result
 
 
 def change(
@@ -382,7 +399,7 @@ def run_stage(
     keep = modes[mode or "both"] if modes else None
     before = transforms_of(stages)
 
-    def plan(opened: logs.Log, prefix: str, say: Callable[[str], None], _: Collection[str]) -> list[Job]:
+    def plan(opened: logs.Log, prefix: str, say: Callable[[str], None], *_: Collection[str]) -> list[Job]:
         return pipeline.plan_stage(opened, prefix, stage, transform, topic, to, keep, say, before, frame or "", make)
 
     where = Where(log, camera, topic, output, sidecar, force)

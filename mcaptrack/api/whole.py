@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import PathLike, Progress, names_of, no_progress, split_names, warn_unused
+from mcaptrack.api.common import PathLike, Progress, as_location, names_of, no_progress, split_names, warn_unused
 from mcaptrack.api.running import Fusing, RunResult, Where, transform_of, transforms_of, work
 from mcaptrack.api.several import unfitting
 from mcaptrack.api.zoning import ZonesLike, zones_of
@@ -15,6 +16,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.aligned import Similarity
 from mcaptrack.evaluation.events import EventOptions
 from mcaptrack.evaluation.zones import ZoneOptions
+from mcaptrack.location import Location
 from mcaptrack.pipeline import Job, PlaneChoice, Watch, ZoneWatch
 from mcaptrack.transforms import STAGES, Transform
 from mcaptrack.transforms.sort.tracker import CameraMotionUse
@@ -45,6 +47,7 @@ def run(
     person_height_m: float | None = None,
     ground_frame: str | None = None,
     stages: Mapping[str, str | Transform] | None = None,
+    follows: PathLike | Sequence[PathLike] | None = None,
     progress: Progress = no_progress,
 ) -> RunResult:
     """Run all stages that are missing or out of date, then write events, views, layouts and tables.
@@ -106,6 +109,9 @@ def run(
         default as before, or the fixed frame.
     stages : mapping of str to str or Transform, optional
         Transforms, or their names, by stage, for channels that are missing; with ``force`` also for those that exist.
+    follows : path or sequence of path, optional
+        The log before this one, of the same camera: people who are in the picture at the cut keep their ids, and others
+        get ids that it doesn't have. Of several logs, in order, it is the one before this one.
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
 
@@ -140,18 +146,42 @@ def run(
     given = {"camera_motion": camera_motion, "across_classes": across_classes, "class_limits": class_limits}
     shared = {name: value for name, value in given.items() if value is not None}
 
-    def plan(opened: logs.Log, prefix: str, say: Callable[[str], None], changed: Collection[str]) -> list[Job]:
+    def plan(
+        opened: logs.Log,
+        prefix: str,
+        say: Callable[[str], None],
+        changed: Collection[str],
+        renewed: Collection[str],
+    ) -> list[Job]:
         others = unfitting(opened, prefix, transforms, say) if len(names) != 1 and topic is None else set()
         kept = {stage: one for stage, one in transforms.items() if stage not in others}
         options = chosen.keys() - {STAGES[stage].option for stage in others}
-        return pipeline.plan_all(opened, prefix, say, topic, kept, force, options, shared, plane, frame or "", changed)
+        return pipeline.plan_all(
+            opened, prefix, say, topic, kept, force, options, shared, plane, frame or "", changed, renewed
+        )
 
     options = events if isinstance(events, EventOptions) else EventOptions()
     watch = Watch(options, force=force) if events else None
     given_zones = zones_of(zones)
     counted = ZoneWatch(given_zones, options=ZoneOptions() if given_zones else None, force=force)
     where = Where(log, names[0] if len(names) == 1 else None, topic, output, sidecar, force)
-    return work(where, plan, watch, progress, tables, plane, counted, fuses=Fusing(names, fuse))
+    earlier = _log_before(as_location(log), follows)
+    return work(where, plan, watch, progress, tables, plane, counted, fuses=Fusing(names, fuse), follows=earlier)
+
+
+def _log_before(log: Location, follows: PathLike | Sequence[PathLike] | None) -> Location | None:
+    """Return the log that a log follows; of several the one before it, None if it is the first."""
+    if follows is None or isinstance(follows, str | os.PathLike):
+        found = None if follows is None else as_location(follows)
+    else:
+        order = [as_location(one) for one in follows]
+        if log not in order:
+            raise McaptrackError(f"{log} is not one of the logs of `follows=`; their order says which one it follows")
+        at = order.index(log)
+        found = order[at - 1] if at else None
+    if found is not None and found == log:
+        raise McaptrackError(f"{log} can't follow itself; `follows=` is the log before it")
+    return found
 
 
 @checked(gate_m=(0.001, 1e6), min_iou=(0.001, 1))

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mcaptrack.cli import common
 from mcaptrack.cli.flags import with_flags
-from mcaptrack.cli.many import LogWork, process
+from mcaptrack.cli.many import LogWork, many_options, process
 from mcaptrack.cli.zones import zones_in_short
-from mcaptrack.errors import command
+from mcaptrack.errors import McaptrackError, command
+from mcaptrack.location import Location
 
 if TYPE_CHECKING:
     from mcaptrack import RunResult
@@ -46,6 +47,30 @@ def run_on_logs(given: Mapping[str, Any], name: str, function: Run, options: Map
         common.print_json({"results": [_as_json(result) for result in results], **totals})
 
 
+def in_order(logs: Sequence[Path], output: Path | None) -> list[Location]:
+    """Return logs that follow one another, as they were named.
+
+    Raises McaptrackError for one log alone, and for options that don't go with an order.
+    """
+    from mcaptrack.fleet import find_logs
+
+    many, found = many_options(), [one.path for one in find_logs(logs)]
+    order, place = "one log is done after the other", "ids go on in the logs themselves"
+    given: dict[str, tuple[object, str]] = {
+        "--jobs": ((many.jobs or 1) > 1, order),
+        "--scheduler": (many.scheduler, order),
+        "--ledger": (many.ledger, "it judges each log by itself, and a second run does only what is missing, anyway"),
+        "--output-dir": (many.output_dir, place),
+        "--output": (output, place),
+    }
+    for name, (is_given, why) in given.items():
+        if is_given:
+            raise McaptrackError(f"--continue doesn't go with {name}: {why}; leave {name} out")
+    if len(found) < 2:
+        raise McaptrackError("--continue needs several logs, in the order of their times; name the one before, too")
+    return found
+
+
 def _as_json(result: RunResult) -> dict[str, Any]:
     """Return the result of one log as values of JSON."""
     data: dict[str, Any] = {
@@ -71,6 +96,7 @@ def _as_json(result: RunResult) -> dict[str, Any]:
         data |= {"tables": result.tables, "summary": result.summary.to_json()}
     else:
         data |= {"rows": result.rows, "tracks": result.tracks}
+    data |= {"continued": result.continued.to_json()} if result.continued else {}
     data |= {"seconds": result.seconds, "seconds_by_part": dict(result.seconds_by_part)}
     if result.cameras or result.left_out:
         data |= {"left_out": dict(result.left_out), "not_fused": with_flags(result.not_fused) or None}
@@ -142,6 +168,8 @@ def _line_of(result: RunResult, shows_events: bool) -> str:
     summary = result.summary
     if summary is not None and summary.tracks is not None:
         words.append(f"{summary.tracks:,} {'track' if summary.tracks == 1 else 'tracks'}")
+    if result.continued is not None:
+        words.append(result.continued.words()[-1])
     if codes := dict.fromkeys(notice.code for notice in result.warnings):
         words.append(f"warnings: {', '.join(codes)}")
     return "; ".join(words)
@@ -161,6 +189,8 @@ def _lines_of_run(result: RunResult) -> Iterator[tuple[str, str]]:
         yield from _lines_of_summary(result.summary)
     if result.zones:
         yield "zones", f"{zones_in_short(result)}; {command('zones', result.log)} prints them"
+    for line in result.continued.words() if result.continued else ():
+        yield "goes on", line
     codes = [notice.code for notice in result.warnings]
     if codes:
         yield "warnings", f"{len(codes)}, see above: {', '.join(dict.fromkeys(codes))}"

@@ -18,8 +18,8 @@ import typer
 from mcaptrack.cli import common
 from mcaptrack.cli.chosen import Maker, configured, is_open, listed, options_of
 from mcaptrack.cli.command import settings_of
-from mcaptrack.cli.many import NAMES, takes_many
-from mcaptrack.cli.running import run_on_logs
+from mcaptrack.cli.many import NAMES, PANEL, takes_many
+from mcaptrack.cli.running import in_order, run_on_logs
 from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, Kind, names
@@ -279,6 +279,15 @@ def run_all(
             help="Fuse several cameras with measured ground planes to a scene, as `mcaptrack fuse` does.",
         ),
     ] = True,
+    follows: Annotated[
+        bool,
+        common.option(
+            "--continue",
+            panel=PANEL,
+            help="The logs follow one another, in this order, and are of one camera: people who are in the picture at "
+            "a cut keep their ids. One log is done after the other.",
+        ),
+    ] = False,
     force: Annotated[
         bool,
         common.option("--force", panel=common.FILES, help="Run everything again, and replace the file that -o names."),
@@ -388,6 +397,8 @@ def run_all(
     for stage in STAGES.values():
         if stage.option in chosen:
             options[stage.option] = stages.pop(stage.name)
+    if follows:
+        options["follows"] = in_order(logs, output)
     watched = EventOptions(*(settings.get(name) for name in ("similarity", "gate_m", "min_iou")))
     options |= {"events": watched if events else False, "stages": stages}
     run_on_logs(given, "run", mcaptrack.run, options)

@@ -6,6 +6,7 @@ transform and its parameters.
 
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.pipeline.events import Watch
+from mcaptrack.pipeline.following import Before, Continued
 from mcaptrack.pipeline.fusing import fusable, fuse_again, fuse_cameras
 from mcaptrack.pipeline.plan import plan_all, plan_stage
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, read_planes
@@ -21,7 +22,9 @@ from mcaptrack.sources.cameras import Camera, camera_at, camera_to_name, find_ca
 __all__ = [
     "AS_BEFORE",
     "LAYOUTS",
+    "Before",
     "Camera",
+    "Continued",
     "CountedZones",
     "Job",
     "PlaneChoice",

@@ -78,6 +78,7 @@ def plan_all(
     plane: PlaneChoice = AS_BEFORE,
     frame_id: str = "",
     changed: Collection[str] = (),
+    renewed: Collection[str] = (),
 ) -> list[Job]:
     """Plan the jobs that bring all results of a camera up to date; empty if they are.
 
@@ -86,13 +87,13 @@ def plan_all(
     ``shared`` are options of several stages that the user gave ("camera_motion"), where they differ from before.
     ``plane`` says how to make a ground plane where none is given; where it was made otherwise, it is made again.
     ``chosen`` are options that the user gave for ``defaults`` ("tracker"): a channel that was made with another choice
-    is made again; so are tracks of 3D boxes in another frame than ``frame_id``. ``changed`` are topics that were made
-    again already, and are not written yet. Raises McaptrackError as ``plan_stage`` does, and if the class that made a
-    channel is not installed.
+    is made again; so are tracks of 3D boxes in another frame than ``frame_id``, and topics in ``renewed``.
+    ``changed`` are topics that were made again already, and are not written yet. Raises McaptrackError as
+    ``plan_stage`` does, and if the class that made a channel is not installed.
     """
     sources = {_stage_from(opened, source): source} if source else {}
     planner = _Planner(opened, prefix, sources, defaults, force, chosen, shared, plane, frame_id)
-    planner.take_as_changed(changed)
+    planner.take_as_changed(changed, renewed)
     warn_unused(opened, prefix, plane)
     read = {stage.input_topic for stage in STAGES.values()}
     for stage in STAGES.values():
@@ -140,13 +141,15 @@ class _Planner:
         self._sources, self._defaults, self._force, self._chosen = sources, defaults, force, chosen
         self._shared, self._plane, self._frame_id = shared, plane, frame_id
         self._changes: dict[str, bool] = {}
+        self._renewed: Collection[str] = ()
         self._notes: list[str] = []
         self._unnamed: dict[str, MissingPluginError] = {}
         self._differing: set[str] = set()
 
-    def take_as_changed(self, topics: Collection[str]) -> None:
-        """Plan all that is made from these topics."""
+    def take_as_changed(self, topics: Collection[str], renewed: Collection[str]) -> None:
+        """Plan all that is made from these topics, and those in ``renewed``."""
         self._changes |= dict.fromkeys(topics, True)
+        self._renewed = renewed
 
     def checked(self, say: Say) -> list[Job]:
         """Check the jobs and return them; only after that report which run and why."""
@@ -268,6 +271,7 @@ class _Planner:
         source = self._sources.get(stage, had)
         is_changed = [self.ensure(one) for one in (source, *made.references)]
         is_due = any(is_changed) or is_missing or is_stale(self._opened, topic) or source != had
+        is_due = is_due or topic in self._renewed
         before, why_not = self._before(stage, made)
         main = _main(self._opened, stage, topic)
         # A result at another topic keeps the parameters that it was requested with.
@@ -305,6 +309,8 @@ class _Planner:
             self._notes.append(f"{topic} was made {by}: running {stage} again")
         elif is_projected:
             self._notes.append(f"{topic} was made with another ground plane: running {stage} again, as before")
+        elif topic in self._renewed:
+            self._notes.append(f"{topic} goes on from another log: running {stage} again")
         elif is_due and not self._force:
             is_corrected = is_of_corrections(self._opened, self._prefix, made)
             why = f"{topic} was made from an earlier {source}"

@@ -17,15 +17,17 @@ from mcaptrack.geometry.plane import Planes, scene_planes
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline.checks import Job, check_inputs, read_named_frames
 from mcaptrack.pipeline.context import in_context
-from mcaptrack.pipeline.corrections import corrected_input, corrected_tracks, fixed_in, without_filled_in
+from mcaptrack.pipeline.corrections import corrected_input, fixed_in
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.findings import warn_findings, warn_memory, warn_no_rows
+from mcaptrack.pipeline.following import Before, led, numbers_of, warn_unfollowed
 from mcaptrack.pipeline.motion import path_with, side_inputs
 from mcaptrack.pipeline.pictures import pictures_of
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, planes_for, read_planes, recorded_planes
 from mcaptrack.pipeline.rebuild import plugins_of
 from mcaptrack.pipeline.timing import Stopwatch
+from mcaptrack.pipeline.video_rate import at_video_rate
 from mcaptrack.pipeline.visible import Channels, picture_size, without_unseen
 from mcaptrack.pipeline.write import Made, digest_of, write
 from mcaptrack.pipeline.zones import STAGE as ZONES_STAGE
@@ -38,7 +40,7 @@ from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import row_ends, unique_values
 from mcaptrack.schema.provenance import FUSE, Provenance
 from mcaptrack.sources.camera_motion import tracks_topic
-from mcaptrack.sources.cameras import camera_at, provenance_of
+from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.transforms import FULL, STAGES, Transform
 from mcaptrack.transforms.guarded import guarded
@@ -88,18 +90,19 @@ def run(
     boxes: BoxesRead | None = None,
     zones: ZoneWatch | None = None,
     fused: Mapping[str, Made] = {},
+    before: Before | None = None,
 ) -> Report:
     """Run the jobs, and write their channels and views into the log, or into a copy of it at ``output``.
 
     With ``watch`` the last stage finds events of tracks, if they are missing or out of date. ``plane`` says how to make
     a ground plane where none is given. ``boxes`` keeps boxes of other software that are read. With ``zones`` these are
     counted, or those that were counted before. ``fused`` are channels that were made again from those of several
-    cameras, to begin with.
+    cameras, to begin with. Ids go on from the log ``before``.
 
     The log is replaced as a whole, after everything was computed.
     """
     with collected() as warnings:
-        report = _run(opened, prefix, jobs, output, progress, watch, plane, boxes or BoxesRead(), zones, fused)
+        report = _run(opened, prefix, jobs, output, progress, watch, plane, boxes or BoxesRead(), zones, fused, before)
     report.warnings = list(dict.fromkeys(warnings))
     return report
 
@@ -115,6 +118,7 @@ def _run(
     boxes: BoxesRead,
     zones: ZoneWatch | None,
     fused: Mapping[str, Made],
+    before: Before | None,
 ) -> Report:
     made: dict[str, Made] = dict(fused)
     stamps: dict[str, list[int]] = {}
@@ -134,7 +138,7 @@ def _run(
             warn_memory(given.frames)
         try:
             with part(job.stage):
-                made |= _run_job(opened, prefix, job, given, made, planes or ())
+                made |= _run_job(opened, prefix, job, given, made, planes or (), before)
         except McaptrackError as error:
             if not job.is_optional:
                 raise
@@ -214,7 +218,13 @@ class _Input(NamedTuple):
 
 
 def _run_job(
-    opened: log.Log, prefix: str, job: Job, given: _Input, made: Mapping[str, Made], planes: Planes
+    opened: log.Log,
+    prefix: str,
+    job: Job,
+    given: _Input,
+    made: Mapping[str, Made],
+    planes: Planes,
+    before: Before | None,
 ) -> dict[str, Made]:
     """Run a job, and return its channels by topic. ``made`` are the channels of earlier jobs."""
     known = side_inputs(opened, prefix, job, made)
@@ -222,9 +232,16 @@ def _run_job(
     path, motion = path_with(opened, prefix, job.source, made) if job.transform.reads is TRACKS else (None, {})
     if path is not None:  # boxes of pictures that the camera moved between can't be joined as they are
         given, planes = given.in_scene(path), scene_planes(planes, path)
+    if before is None:
+        warn_unfollowed(opened, job)
+    lead = before.lead(job, numbers_of(given.frames), planes) if before and path is None else ()
+    if lead:
+        frames = led(lead, given.frames, job.transform.reads)
+        given = given._replace(stream=frames, frames=frames)
     context = in_context(opened, prefix, job, given.frames, planes, given.classes)
     fixed = fixed_in(opened, prefix, job.source, made) if hasattr(context, "fixed_ids") else ()
     transform = replace(context, **known.values, **({"fixed_ids": fixed} if fixed else {}))
+    transform = before.in_context(transform) if before and lead else transform
     collectors = [FrameCollector(schema) for schema in transform.writes.values()]
     taken = [0]
     try:
@@ -239,6 +256,7 @@ def _run_job(
             outputs: list[Sequence[Frame]] = [collector.done() for collector in collectors]
             if job.transform.reads is DETECTIONS and job.transform.writes[""] is TRACKS:
                 outputs[0] = settle_classes(outputs[0])
+            outputs, continued = before.own(job, outputs) if before else (outputs, {})
             if not warnings:  # otherwise a warning has given the reason
                 warn_no_rows(job.stage, job.source, transform, given.frames, outputs[0])
     except McaptrackError as error:
@@ -252,13 +270,14 @@ def _run_job(
             "left-out",
         )
     provenance = _provenance_of(job, transform, given, warnings, {**known.references, **motion, **corrections})
+    provenance = replace(provenance, continued=continued)
     channels: dict[str, tuple[Schema, Sequence[Frame]]] = {
         topic: (schema, to_pictures(channel, path) if schema is TRACKS else channel)
         for (topic, schema), channel in zip(job.outputs().items(), outputs, strict=True)
     }
     if job.target + FULL in job.kept():
         carry = linked_tracks if traits_of(transform).leaves_unchanged else to_video_rate
-        frames = _at_video_rate(opened, prefix, job, made, outputs[0], planes, path, carry)
+        frames = at_video_rate(opened, prefix, job, made, outputs[0], planes, path, carry)
         channels |= {job.target + FULL: (TRACKS, frames)} if frames else {}
     seen: Channels = channels
     if not traits_of(transform).keeps_unseen:
@@ -302,33 +321,6 @@ def _provenance_of(
         model=card.facts,
         warnings=[(notice.code, notice.message) for notice in warnings],
     )
-
-
-def _at_video_rate(
-    opened: log.Log,
-    prefix: str,
-    job: Job,
-    made: Mapping[str, Made],
-    retracked: Sequence[Frame],
-    planes: Planes,
-    path: CameraPath | None,
-    carry: Callable[[Sequence[Frame], Sequence[Frame], Planes], Sequence[Frame]],
-) -> Sequence[Frame]:
-    """Return re-tracked tracks at the rate of the tracks that were sampled; no frames if there are no such tracks.
-
-    ``carry`` gives these tracks the re-tracked ids. Where the camera moves by ``path``, ``planes`` and the boxes of
-    ``retracked`` are those of reference pictures.
-    """
-    samples = made[job.source].provenance if job.source in made else provenance_of(opened, job.source)
-    source = samples.input if samples else ""
-    if source in made:
-        tracks = made[source].frames if made[source].schema is TRACKS else ()
-    else:
-        there = source in opened.channels and opened.channels[source].schema_name == TRACKS.name
-        tracks = opened.frame_columns(source, TRACKS) if there else ()
-    tracks = corrected_tracks(opened, prefix, source, tracks) if len(tracks) else tracks
-    carried = without_filled_in(opened, prefix, source, carry(to_scene(tracks, path), retracked, planes))
-    return to_pictures(carried, path)
 
 
 def _input(

@@ -41,7 +41,8 @@ class Provenance:
     its ``predictor``. ``classes`` are the names of the classes in its rows by ``class_id``; ``class_id`` is the class
     of all rows, where these state none (see ``schema.classes``). ``frame_id`` is the frame of its metres, where the log
     has frames. ``zones`` are the names of the zones in its rows by ``zone_id``. ``model`` is what its network turned
-    out to be. ``warnings`` are the warnings when it was made, with code and message.
+    out to be. ``warnings`` are the warnings when it was made, with code and message. ``continued`` says from which
+    channel of the log before its ids go on (``after``, a digest), and the largest id so far (``last_id``).
     """
 
     transform: str
@@ -59,6 +60,7 @@ class Provenance:
     warnings: Sequence[Sequence[str]] = ()
     version: str = __version__
     zones: Mapping[str, str] = field(default_factory=dict)
+    continued: Mapping[str, str] = field(default_factory=dict)
 
     def made_from(self) -> dict[str, str]:
         """The topics that it was made from and compared with, and their digests."""
@@ -82,8 +84,9 @@ class Provenance:
             "zones": json.dumps(dict(self.zones), ensure_ascii=False),
             "model": json.dumps(dict(self.model), sort_keys=True),
             "warnings": json.dumps(self.warnings, separators=(",", ":")),
+            "continued": json.dumps(dict(self.continued), sort_keys=True),
         }
-        for name in ("warnings", "references", "plugins", "classes", "zones", "model"):
+        for name in ("continued", "warnings", "references", "plugins", "classes", "zones", "model"):
             if not getattr(self, name):
                 del values[name]
         return {_PREFIX + key: value for key, value in values.items() if value}
@@ -95,12 +98,13 @@ class Provenance:
         if "transform" not in values:
             return None
         parameters, references = (_read(values.pop(key, ""), dict) for key in ("parameters", "references"))
-        classes, zones, model = (read_texts(values.pop(key, "")) for key in ("classes", "zones", "model"))
+        names = ("classes", "zones", "model", "continued")
+        classes, zones, model, continued = (read_texts(values.pop(key, "")) for key in names)
         plugins = _plugins(values)
         warnings = [one for one in _read(values.pop("warnings", ""), list) if _is_warning(one)]
         known: dict[str, Any] = {key: value for key, value in values.items() if key in cls.__dataclass_fields__}
         known |= {"references": references, "warnings": warnings, "plugins": plugins, "classes": classes}
-        known["zones"] = zones
+        known |= {"zones": zones, "continued": continued}
         return cls(parameters=parameters, model=model, **known)
 
 

@@ -111,6 +111,7 @@ CASES: dict[str, dict[str, Case]] = {
         fit_plane="--no-fit-plane",
         person_height_m="--person-height-m 1.5",
         ground_frame="--ground-frame base_link",
+        **{"continue": "--continue"},
     ),
     "fuse": common(
         "fuse two.mcap",

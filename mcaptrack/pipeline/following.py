@@ -1,0 +1,384 @@
+"""Continue the ids of one recording in the next one: of the same camera, when a recording was split into several logs.
+
+Stages that track people begin with the last seconds of the log before, as if both were one, and what they make of these
+is left out. There the same people have ids in both logs, by which those of the second one are renumbered.
+
+Letters: N rows, T tracks of the log before, U tracks of this one.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
+from itertools import chain
+from typing import Any, Final
+
+import numpy as np
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError, call
+from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.boxes import columns_to_boxes
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.plane import Planes, plane_at
+from mcaptrack.notices import warn
+from mcaptrack.pipeline.checks import Job, read_named_frames
+from mcaptrack.pipeline.planes import read_planes
+from mcaptrack.pipeline.staleness import is_stale
+from mcaptrack.pipeline.visible import picture_size
+from mcaptrack.pipeline.write import digest_of
+from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, VIDEO, Frame, Rows, Schema
+from mcaptrack.schema.frame_columns import FrameCollector
+from mcaptrack.schema.framing import frame_numbers, frame_times, unique_values
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.cameras import camera_at, cameras, provenance_of
+from mcaptrack.transforms import STAGES, Transform
+
+#: How much of the log before they begin with, and the longest gap over which people can be the same.
+LEAD_S, BRIDGED_S = 30.0, 10.0
+#: People of the log before count as being in the picture at the cut if they were there so many seconds before its end.
+_AT_CUT_S: Final = 1.0
+#: Boxes of two logs at one time are of one person if their middles are so near, in heights, or in metres without boxes.
+_NEAR_HEIGHTS, _NEAR_M = 0.35, 0.5
+#: Votes of a frame count half if it is so many seconds before the cut.
+_HALF_S: Final = 1.0
+#: The vote of a re-tracked id that begins with a track that had one in the log before: it counts where no place does.
+_OF_SOURCE: Final = 1e-12
+#: The digest of the channel that ids go on from, and the largest id so far, in the provenance.
+AFTER, LAST_ID = "after", "last_id"
+
+
+@dataclass
+class Continued:
+    """The outcome of continuing a log: the log before, the gap in seconds, and people at the cut by topic.
+
+    ``at_cut`` counts the ids in the last second of the log before, ``kept`` those of them that this log has, too.
+    """
+
+    log: str
+    gap_s: float
+    at_cut: dict[str, int] = field(default_factory=dict)
+    kept: dict[str, int] = field(default_factory=dict)
+
+    @classmethod
+    def joined(cls, each: Sequence[Continued]) -> Continued:
+        """Return the outcomes of several cameras as one, with the longest of their gaps."""
+        out = cls(each[0].log, max(one.gap_s for one in each))
+        for one in each:
+            out.at_cut |= one.at_cut
+            out.kept |= one.kept
+        return out
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as values of JSON."""
+        return {"log": self.log, "gap_s": round(self.gap_s, 6), "at_cut": self.at_cut, "kept": self.kept}
+
+    def words(self) -> list[str]:
+        """Return it as lines of text."""
+        lines = [
+            f"{topic} goes on from {self.log}: {self.kept[topic]} of {count} people at the cut keep their ids"
+            for topic, count in self.at_cut.items()
+        ]
+        return lines or [f"ids go on from {self.log}, as before"]
+
+
+class Before:
+    """The log before another one: its last seconds, and its ids.
+
+    Raises McaptrackError if ``opened`` doesn't follow it: if they overlap, or are of other cameras.
+    """
+
+    def __init__(self, before: log.Log, opened: log.Log, prefix: str) -> None:
+        self._log, self._prefix = before, prefix
+        self.tracks = f"{prefix}/{STAGES['track'].output_topic}"
+        self._check_camera(opened)
+        times, start_ns = before.times(self.tracks), _start_ns(opened, prefix)
+        self._end_ns, self.start_ns = int(times[-1]), start_ns
+        self._period_ns = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+        self._check_times(opened, int(times[0]))
+        self.result = Continued(str(before.path), (start_ns - self._end_ns) / NS_PER_S)
+        self.is_bridged = self.result.gap_s <= BRIDGED_S
+        if not self.is_bridged:
+            warn(
+                f"{opened.path} begins {self.result.gap_s:,.1f} s after the end of {before.path}, as if a recording in "
+                f"between were missing: no id is taken over, and new ones go on after those before (at most "
+                f"{BRIDGED_S:g} s are bridged)",
+                "clock",
+            )
+        self._lead_ns = self._first_of_lead()
+
+    def _check_camera(self, opened: log.Log) -> None:
+        before, prefix = self._log, self._prefix
+        there = [one.prefix[1:] for one in cameras(before)]
+        if prefix[1:] not in there:
+            raise McaptrackError(
+                f"{opened.path} is of the camera {prefix[1:]}, and {before.path} is of "
+                f"{', '.join(sorted(there)) or 'none'}; ids go on from one recording of a camera to the next"
+            )
+        made = provenance_of(before, self.tracks)
+        if made is None or not _is_tracker(made) or not before.channels[self.tracks].messages:
+            again = call("run", before.path)
+            raise McaptrackError(f"{before.path} has no tracks that ids could go on from; {again} makes them")
+        if is_stale(before, self.tracks):
+            again = call("run", before.path)
+            raise McaptrackError(f"{before.path}: {self.tracks} is out of date; {again} brings it up to date")
+        own = provenance_of(opened, self.tracks)
+        if self.tracks in opened.channels and (own is None or not _is_tracker(own)):
+            raise McaptrackError(
+                f"{opened.path}: {self.tracks} wasn't made by `track`, so that its ids stay as they are"
+            )
+        sizes = [picture_size(one, camera_at(one, prefix).pictures) for one in (before, opened)]
+        if None not in sizes and sizes[0] != sizes[1]:
+            words = " and ".join("{} x {}".format(*size) for size in sizes if size)
+            raise McaptrackError(
+                f"{before.path} and {opened.path} have pictures of {words} pixels; they are not of one camera"
+            )
+
+    def _check_times(self, opened: log.Log, first_ns: int) -> None:
+        before, start_ns, end_ns = self._log, self.start_ns, self._end_ns
+        if start_ns > end_ns:
+            return
+        said = f"{opened.path} begins at {start_ns / NS_PER_S:.3f} s, and {before.path}"
+        clock = "; if the times are wrong, ingest each with its `start_time=`" if start_ns == first_ns else ""
+        if start_ns <= first_ns:
+            raise McaptrackError(
+                f"{said}, which is to be the one before, at {first_ns / NS_PER_S:.3f} s: name recordings in the order "
+                f"of their times{clock}"
+            )
+        raise McaptrackError(
+            f"{said} ends at {end_ns / NS_PER_S:.3f} s: they overlap by {(end_ns - start_ns) / NS_PER_S:.3f} s, and "
+            "ids go on only from one recording to the next"
+        )
+
+    def _first_of_lead(self) -> int:
+        """The time in ns at which the lead begins: that of a sample, so that samples go on at the same intervals."""
+        wanted = max(self._end_ns - round(LEAD_S * NS_PER_S), 0)
+        samples = f"{self._prefix}/{STAGES['sample'].output_topic}"
+        ticks = self._log.times(samples) if samples in self._log.channels else np.empty(0, np.int64)
+        later = ticks[ticks >= wanted]
+        return int(later[0]) if len(later) else wanted
+
+    def _has(self, topic: str, schema: Schema) -> bool:
+        channel = self._log.channels.get(topic)
+        return channel is not None and channel.schema_name == schema.name and channel.messages > 0
+
+    def _main(self, job: Job) -> str:
+        """The topic of the log before that corresponds to the output of a job; "" if it has none."""
+        return job.target if self._has(job.target, TRACKS) else ""
+
+    def renewed(self, opened: log.Log) -> set[str]:
+        """The channels of ids that were not made as the continuation of this log, and have to be made again."""
+        made = provenance_of(opened, self.tracks)
+        is_new = made is not None and made.continued.get(AFTER) != digest_of(self._log, self.tracks)
+        return {self.tracks} if is_new else set()
+
+    def lead(self, job: Job, numbers: Ints, planes: Planes) -> list[Frame]:
+        """The last frames of the input of a job in the log before, in metres of ``planes``.
+
+        Their numbers are those before ``numbers`` (N,), which are of the frames of this log.
+        """
+        made = provenance_of(self._log, job.target)
+        source = made.input if made and made.transform == job.stage else job.source
+        if not _is_led(job) or not self.is_bridged or source not in self._log.channels:
+            return []
+        found = read_named_frames(self._log, source, job.transform.reads, job.frame_id).frames
+        low = int(np.searchsorted(frame_times(found), self._lead_ns))
+        frames = found[low:]
+        if job.transform.reads is TRACKS and _differ(read_planes(self._log, self._prefix), planes):
+            frames = [one._replace(rows=_in_planes(one, planes)) for one in frames]
+        missing = round(self.result.gap_s * NS_PER_S / self._period_ns) if self._period_ns else 1
+        first = int(numbers[0]) if len(numbers) else 0
+        shift = first - max(missing, 1) - (frames[-1].index if frames else 0)
+        return [one._replace(index=one.index + shift) for one in frames]
+
+    def in_context(self, transform: Transform) -> Transform:
+        """The transform with the clock of the log before, if it samples."""
+        is_clocked = self.is_bridged and "start_ns" in {one.name for one in fields(transform)}
+        return replace(transform, start_ns=self._lead_ns) if is_clocked else transform
+
+    def own(self, job: Job, outputs: Sequence[Sequence[Frame]]) -> tuple[list[Sequence[Frame]], dict[str, str]]:
+        """The outputs of a job without the lead, under ids that go on; and how they go on, for the provenance."""
+        if not _is_led(job):
+            return [*outputs], {}
+        schemas, topics = list(job.transform.writes.values()), list(job.outputs())
+        if not _gives_ids(job) or not self._main(job):
+            return [self._kept(schema, one, None) for schema, one in zip(schemas, outputs, strict=True)], {}
+        last_id = self._last_id(job)
+        maps: dict[str, dict[int, int]] = {}
+        for topic, schema, frames in zip(topics, schemas, outputs, strict=True):
+            if schema is TRACKS:
+                maps[topic] = self._same(topic, frames)
+        of_predictions = maps.get(f"{job.target}/online", maps.get(job.target, {}))
+        out: list[Sequence[Frame]] = []
+        largest = last_id
+        for topic, schema, frames in zip(topics, schemas, outputs, strict=True):
+            if schema not in (TRACKS, PREDICTIONS):
+                out.append(self._kept(schema, frames, None))
+                continue
+            same = maps.get(topic, of_predictions)
+            kept = self._kept(schema, frames, partial(_renumbered, same=same, last_id=last_id))
+            largest = max(largest, int(unique_values(schema, kept, "track_id").max(initial=0)))
+            out.append(kept)
+        self._count(job.target, out[0])
+        return out, {AFTER: digest_of(self._log, job.target), LAST_ID: str(largest)}
+
+    def _last_id(self, job: Job) -> int:
+        """The largest id up to the end of the log before, also in those before it."""
+        made = provenance_of(self._log, job.target)
+        known = made.continued.get(LAST_ID, "") if made else ""
+        largest = int(known) if known.isascii() and known.isdigit() and len(known) < 19 else 0
+        for topic, schema in job.outputs().items():
+            if schema is TRACKS and self._has(topic, TRACKS):
+                ids = unique_values(TRACKS, self._log.frame_columns(topic, TRACKS), "track_id")
+                largest = max(largest, int(ids.max(initial=0)))
+        return largest
+
+    def _same(self, topic: str, frames: Sequence[Frame]) -> dict[int, int]:
+        """The ids of a channel in the log before, by those of the same tracks in this one."""
+        if not self.is_bridged or not self._has(topic, TRACKS):
+            return {}
+        before = self._log.frame_columns(topic, TRACKS)
+        before_ns = frame_times(before)
+        at = {t_ns: number for number, t_ns in enumerate(before_ns.tolist()) if t_ns >= self._lead_ns}
+        votes: defaultdict[tuple[int, int], float] = defaultdict(float)
+        last: dict[int, int] = {}  # the id of each track that was re-tracked, by its own, which goes on already
+        if topic != self.tracks:
+            for number in at.values():
+                rows = before[number].rows
+                last |= dict(zip(rows["source_id"].tolist(), rows["track_id"].tolist(), strict=True))
+        begun: set[int] = set()
+        for frame in frames:
+            if frame.t_ns >= self.start_ns + round(_AT_CUT_S * NS_PER_S):
+                break
+            if frame.t_ns >= self.start_ns:
+                for source, one in zip(frame.rows["source_id"].tolist(), frame.rows["track_id"].tolist(), strict=True):
+                    if source >= 0 and source in last and one not in begun:
+                        votes[one, last[source]] += _OF_SOURCE
+                    begun.add(one)
+            elif frame.t_ns in at:
+                weight = 0.5 ** ((self.start_ns - frame.t_ns) / NS_PER_S / _HALF_S)
+                for pair in _pairs(frame.rows, before[at[frame.t_ns]].rows):
+                    votes[pair] += weight
+        out: dict[int, int] = {}
+        for (mine, theirs), _ in sorted(votes.items(), key=lambda one: (-one[1], one[0])):
+            if mine not in out and theirs not in out.values():
+                out[mine] = theirs
+        return out
+
+    def _kept(self, schema: Schema, frames: Sequence[Frame], number: Callable[[Ints], Ints] | None) -> Sequence[Frame]:
+        """Frames of this log, without those of the lead; ``number`` gives the ids of rows."""
+        collector = FrameCollector(schema)
+        for frame in frames:
+            if frame.t_ns < self.start_ns:
+                continue
+            rows = frame.rows
+            if number is not None and len(rows):
+                rows = rows.copy()
+                rows["track_id"] = number(rows["track_id"])
+            collector.append(frame._replace(rows=rows))
+        return collector.done()
+
+    def _count(self, topic: str, frames: Sequence[Frame]) -> None:
+        """Count the ids at the cut, and those of them that go on."""
+        before = self._log.frame_columns(topic, TRACKS)
+        low = int(np.searchsorted(frame_times(before), self._end_ns - round(_AT_CUT_S * NS_PER_S)))
+        there = set(np.unique(before.rows(low)["track_id"]).tolist())
+        self.result.at_cut[topic] = len(there)
+        self.result.kept[topic] = len(there & set(unique_values(TRACKS, frames, "track_id").tolist()))
+
+
+def _is_led(job: Job) -> bool:
+    """Return whether a job begins with the last seconds of the log before: if it reads rows, and not pictures."""
+    return job.transform.reads is not VIDEO
+
+
+def _gives_ids(job: Job) -> bool:
+    """Return whether the output of a job has ids of its own."""
+    return job.transform.reads is DETECTIONS or STAGES[job.stage].repairs_tracks
+
+
+def _is_tracker(made: Provenance) -> bool:
+    """Return whether a stage made tracks of detections."""
+    return made.transform in STAGES and STAGES[made.transform].default.reads is DETECTIONS
+
+
+def _start_ns(opened: log.Log, prefix: str) -> int:
+    """The time in ns at which a camera begins: that of its first picture, or of its first detections."""
+    camera = camera_at(opened, prefix)
+    for topic in (camera.pictures, f"{prefix}/{STAGES['detect'].output_topic}", camera.boxes):
+        if topic and topic in opened.channels and opened.channels[topic].messages:
+            return int(opened.times(topic)[0])
+    raise McaptrackError(f"{opened.path} has no pictures and no detections of {prefix[1:]} that could be tracked")
+
+
+def warn_unfollowed(opened: log.Log, job: Job) -> None:
+    """Warn of ids that went on from another log, and begin at 1 again, since no log before is named."""
+    made = provenance_of(opened, job.target)
+    if _gives_ids(job) and made is not None and made.continued:
+        warn(
+            f"{job.target} went on from another log, and its ids are made without it now; name both, in order, with "
+            "`follows=` to go on again",
+            "other-settings",
+        )
+
+
+def led(lead: Sequence[Frame], frames: Sequence[Frame], schema: Schema) -> Sequence[Frame]:
+    """Frames after those of a lead."""
+    collector = FrameCollector(schema)
+    for frame in chain(lead, frames):
+        collector.append(frame)
+    return collector.done()
+
+
+def numbers_of(frames: Sequence[Frame]) -> Ints:
+    """The number of the first frame, (1,), or none."""
+    return frame_numbers(frames[:1])
+
+
+def _renumbered(ids: Ints, same: Mapping[int, int], last_id: int) -> Ints:
+    """Ids (N,): those of the log before for tracks that go on, and others after ``last_id``."""
+    out = ids + last_id
+    for mine, theirs in same.items():
+        out[ids == mine] = theirs
+    return out
+
+
+def _pairs(mine: Rows, theirs: Rows) -> list[tuple[int, int]]:
+    """Pairs of ids of rows at one time that are at the same place: each is the nearest of the other."""
+    if not len(mine) or not len(theirs):
+        return []
+    away = _distances(mine, theirs)
+    nearest = away.argmin(axis=1)
+    is_pair = (away.min(axis=1) <= 1.0) & (away.argmin(axis=0)[nearest] == np.arange(len(mine)))
+    pairs = zip(mine["track_id"][is_pair].tolist(), theirs["track_id"][nearest[is_pair]].tolist(), strict=True)
+    return [*pairs]
+
+
+def _distances(mine: Rows, theirs: Rows) -> Floats:
+    """Distances (T, U) of rows, as shares of those at which they are of one person."""
+    boxes, others = columns_to_boxes(mine), columns_to_boxes(theirs)
+    middle, other = (one[:, :2] + one[:, 2:] / 2 for one in (boxes, others))
+    apart = np.hypot(*(middle[:, None] - other).transpose(2, 0, 1))
+    away = apart / np.maximum(_NEAR_HEIGHTS * others[:, 3], 1e-9)
+    on_ground = [np.stack([one["x_m"], one["y_m"]], axis=-1) for one in (mine, theirs)]
+    metres = np.hypot(*(on_ground[0][:, None] - on_ground[1]).transpose(2, 0, 1)) / _NEAR_M
+    out: Floats = np.nan_to_num(np.where(np.isfinite(away), away, metres), nan=np.inf)
+    return out
+
+
+def _differ(before: Planes | None, planes: Planes) -> bool:
+    return [plane for _, plane in before or ()] != [plane for _, plane in planes]
+
+
+def _in_planes(frame: Frame, planes: Planes) -> Rows:
+    """Rows with positions by these planes, where they have boxes."""
+    plane, boxes = plane_at(planes, frame.t_ns), columns_to_boxes(frame.rows)
+    at = np.flatnonzero(np.isfinite(boxes).all(axis=1))
+    if plane is None or not len(at):
+        return frame.rows
+    rows = frame.rows.copy()
+    rows["x_m"][at], rows["y_m"][at] = plane.boxes_to_metres(boxes[at]).T
+    on_ground: Rows = rows[np.isfinite(rows["x_m"])]
+    return on_ground
