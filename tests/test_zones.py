@@ -16,12 +16,13 @@ from hypothesis import strategies as st
 import mcaptrack
 from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.zones import ZoneOptions, find_zone_events, place_zone, positions_of, zone_totals
+from mcaptrack.evaluation.zone_places import ground_height_m, place_zone, positions_of
+from mcaptrack.evaluation.zones import ZoneOptions, find_zone_events, zone_totals
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.geometry.zones import Paths, Shape, crossings, visits
 from mcaptrack.schema import TRACKS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS, Frame
 from mcaptrack.schema.framing import join_frames
-from mcaptrack.sources.zones import parse_zones, read_zones, to_geojson
+from mcaptrack.sources.zones import parse_zones, read_zones, to_geojson, zones_from_json, zones_to_json
 from tests.commands import call, done
 from tests.worlds import ns, tracks_at, walk
 
@@ -398,11 +399,53 @@ WRONG = {
         feature("a", "Polygon", [*HOLED, [[0, 10.5], [0.5, 10.5], [0.5, 11], [0, 10.5]]])
     ),
     "a list as its name": collection(feature(["a"], "Polygon", [SQUARE])),
+    "classes that are no list of names": collection(feature("a", "Polygon", [SQUARE], classes=["car", 3])),
     "1 to 100 printable characters": collection(feature("a\nb", "Polygon", [SQUARE])),
     "not valid JSON": "{",
     "is not a text file": b"\xff\xfe\x00",
     "zones take at most": b" " * (8 * 2**20 + 1),
 }
+
+
+class TestClasses:
+    """A car drives through the square beside a person and a child; classes by number, and their names."""
+
+    NAMES = {1: "pedestrian", 2: "car", 4: "person"}
+
+    def tracks(self) -> list[Frame]:
+        frames = walk(lambda tick: {n: (tick - 4.0, 10.0 + n / 2) for n in (1, 2, 4)}, 9, 1)
+        for frame in frames:
+            frame.rows["class_id"] = frame.rows["track_id"]
+            frame.rows["z_m"], frame.rows["height_m"] = -20.0 + frame.rows["x_m"], 2.0
+        return frames
+
+    @pytest.mark.parametrize(
+        ("classes", "wanted"), [(None, [1, 2, 4]), ("Car", [2]), (["person"], [1, 4]), (["car", "person"], [1, 2, 4])]
+    )
+    def test_a_zone_counts_the_classes_that_it_names(self, classes, wanted):
+        frames = self.tracks()
+        zones = parse_zones(
+            collection(feature("a", "Polygon", [SQUARE]), feature("b", "LineString", LINE), classes=classes)
+        )
+        found = positions_of(frames, (), None, self.NAMES)
+        events = find_zone_events(frames, found, [place_zone(one, ()) for one in zones], ZoneOptions(), "tracks")
+        for some in (events.visits, events.crossings):
+            assert sorted(int(row["track_id"]) for frame in some for row in frame.rows) == wanted
+        assert not events.notes
+        assert zones_from_json(json.loads(json.dumps(zones_to_json(zones)))) == parse_zones(to_geojson(zones)) == zones
+
+    def test_a_class_that_no_track_has_is_said(self):
+        frames = self.tracks()
+        (zone,) = parse_zones(collection(feature("a", "Polygon", [SQUARE], classes=["bus"])))
+        found = positions_of(frames, (), None, self.NAMES)
+        events = find_zone_events(frames, found, [place_zone(zone, ())], ZoneOptions(), "/t")
+        assert events.notes == ["zone a counts bus; /t has none of these, but pedestrian, car, person"]
+
+    def test_the_ground_is_where_objects_stand(self):
+        found = positions_of(self.tracks(), (), None)
+        (zone,) = parse_zones(collection(feature("a", "Polygon", [[[1, 9], [3, 9], [3, 14], [1, 14]]])))
+        assert ground_height_m(found, zone.shape()) == -20.0 + 2.0 - 1.0
+        assert ground_height_m(positions_of(wandering(1), (), None), zone.shape()) == 0.0
 
 
 class TestFiles:
@@ -537,7 +580,9 @@ class TestDrawing:
     def test_a_page_in_pixels_begins_with_the_zones_of_the_log(self, finished, tmp_path):
         box = [[10, 100], [60, 100], [60, 160], [10, 100]]
         content = collection(
-            feature("</script>", "Polygon", [box]), feature("b", "LineString", [[5, 105], [9, 159]]), units="px"
+            feature("</script>", "Polygon", [box], classes="person"),
+            feature("b", "LineString", [[5, 105], [9, 159]]),
+            units="px",
         )
         mcaptrack.zones(finished, zones=content, output=tmp_path / "a.mcap")
         said = done("zones", "draw", tmp_path / "a.mcap").err
@@ -547,6 +592,7 @@ class TestDrawing:
         assert [(one["name"], one["line"], one["points"]) for one in data["zones"]] == [
             ("</script>", False, [[10, 100], [60, 100], [60, 160]]), ("b", True, [[5, 105], [9, 159]])
         ]  # fmt: skip
+        assert [one.get("classes") for one in data["zones"]] == [["person"], None]
         again = call("zones", "draw", tmp_path / "a.mcap")
         assert (again.code, len(again.err.splitlines())) == (1, 1)
         done("zones", "draw", tmp_path / "a.mcap", "--force", "-q")

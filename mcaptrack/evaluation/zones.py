@@ -1,34 +1,28 @@
 """Visits of zones, crossings of lines, and counts over time: rows of ZoneVisits, ZoneCrossings and ZoneCounts.
 
-A zone in metres is compared with positions on the ground. A zone in pixels is brought to the ground by the plane of its
-camera; where there is none, or several, it is compared with the points in the picture at which boxes touch the ground.
-
 Letters: F frames, N rows, V visits, C crossings, Z zones and lines.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation.zone_places import PlacedZone, TrackPositions, is_counted, missing_classes
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.boxes import columns_to_boxes
-from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
-from mcaptrack.geometry.plane import PERSON_HEIGHT_M, GroundPlane, Planes
-from mcaptrack.geometry.zones import Paths, Shape, Units, Visits, Zone, crossings, visits
-from mcaptrack.schema import TRACKS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS, Frame, Rows
+from mcaptrack.geometry.plane import PERSON_HEIGHT_M
+from mcaptrack.geometry.zones import Paths, Units, Visits, Zone, crossings, visits
+from mcaptrack.schema import ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.framing import frame_numbers, frame_times, joined_parts, split_rows
 
 #: Frames of counts that are made at once.
 _FRAMES_AT_ONCE: Final = 4096
-#: Edges of a picture are curved on the ground where it has a lens: they are drawn with so many pieces.
-_PIECES: Final = 16
 _SIZES: Final = {"metres": "m", "pixels": "px"}
 
 
@@ -41,31 +35,6 @@ class ZoneOptions:
 
     margin_m: float = 0.25
     max_gap_s: float = 4.0
-
-
-class PlacedZone(NamedTuple):
-    """A zone in the units that it is compared in; ``forward`` is the sign of crossings from its left to its right."""
-
-    zone: Zone
-    shape: Shape
-    units: Units
-    forward: int = 1
-
-
-class TrackPositions(NamedTuple):
-    """The rows of tracks that have a position, in order of track and time (N,).
-
-    ``at`` are positions by units, (N, 2), NaN where not known: on the ground, and in the (reference) picture.
-    ``picture_px`` are those in the picture of that time. ``frame`` is the index of the frame of each row.
-    ``height_px`` is the usual height of boxes, NaN without boxes.
-    """
-
-    at: Mapping[str, Floats]
-    picture_px: Floats
-    track: Ints
-    frame: Ints
-    t_ns: Ints
-    height_px: float
 
 
 @dataclass(frozen=True)
@@ -109,84 +78,6 @@ class ZoneEvents(NamedTuple):
     notes: list[str]
 
 
-def place_zone(zone: Zone, planes: Planes) -> PlacedZone:
-    """Bring a zone in pixels to the ground, where one plane holds for all its pictures.
-
-    Raises McaptrackError for a zone that reaches above the horizon.
-    """
-    shape = zone.shape()
-    if zone.units == "metres":
-        return PlacedZone(zone, shape, "metres")
-    if len(planes) != 1:
-        return PlacedZone(zone, shape, "pixels", -1)
-    plane = planes[0][1]
-    if plane.lens is not None:
-        shape = _in_pieces(shape)
-    parts = tuple(tuple(_on_ground(ring, plane, zone.name) for ring in part) for part in shape.parts)
-    middle = np.concatenate([ring for part in shape.parts for ring in part]).mean(axis=0)
-    corner = plane.pixels_to_metres(middle + np.array([[0.0, 0], [1, 0], [0, 1]]))
-    (a, b), (c, d) = corner[1:] - corner[0]
-    return PlacedZone(zone, Shape(parts, zone.is_line), "metres", 1 if a * d - b * c < 0 else -1)
-
-
-def _in_pieces(shape: Shape) -> Shape:
-    """The same shape with more points on each edge."""
-    share = np.arange(_PIECES)[:, None] / _PIECES
-
-    def cut(ring: Floats) -> Floats:
-        start = ring[:-1] if shape.is_line else ring
-        end = ring[1:] if shape.is_line else np.roll(ring, -1, axis=0)
-        points = (start[:, None] + share * (end - start)[:, None]).reshape(-1, 2)
-        return np.concatenate([points, ring[-1:]]) if shape.is_line else points
-
-    return Shape(tuple(tuple(cut(ring) for ring in part) for part in shape.parts), shape.is_line)
-
-
-def _on_ground(ring: Floats, plane: GroundPlane, name: str) -> Floats:
-    found = plane.pixels_to_metres(ring)
-    above = np.flatnonzero(~np.isfinite(found).all(axis=1))
-    if len(above):
-        x, y = ring[above[0]]
-        raise McaptrackError(f"zone {name} reaches above the horizon, at ({x:g}, {y:g}) px: there is no ground")
-    return found
-
-
-def positions_of(frames: Sequence[Frame], planes: Planes, path: CameraPath | None) -> TrackPositions:
-    """Find where tracks are, on the ground and in the picture.
-
-    ``planes`` are those of the reference picture where the camera moves by ``path``, otherwise those of all pictures.
-    """
-    parts: list[tuple[Ints, ...]] = []
-    places: list[tuple[Floats, ...]] = []
-    since = np.array([start for start, _ in planes[1:]], np.int64)
-    heights: list[Floats] = []
-    for first, _, joined in joined_parts(TRACKS, frames):
-        rows, t_ns = joined.rows, joined.row_ns
-        boxes = columns_to_boxes(rows)
-        in_scene = boxes if path is None else path.to_scene(boxes, t_ns)
-        which = np.searchsorted(since, t_ns, "right")
-        feet, seen = (np.stack([b[:, 0] + b[:, 2] / 2, b[:, 1] + b[:, 3]], axis=1) for b in (in_scene, boxes))
-        metres = np.stack([rows["x_m"], rows["y_m"]], axis=1)
-        for number, (_, plane) in enumerate(planes):
-            of = which == number
-            feet[of], seen[of] = plane.feet(in_scene[of]), plane.feet(boxes[of])
-            unknown = of & ~np.isfinite(metres).all(axis=1) & np.isfinite(feet).all(axis=1)
-            metres[unknown] = plane.pixels_to_metres(feet[unknown])
-        parts.append((rows["track_id"].astype(np.int64), joined.frame + first, t_ns))
-        places.append((metres, feet, seen))
-        heights.append(boxes[:, 3])
-    if not parts:
-        none, nowhere = np.zeros(0, np.int64), np.zeros((0, 2))
-        return TrackPositions({"metres": nowhere, "pixels": nowhere}, nowhere, none, none, none, np.nan)
-    track, frame, t_ns = (np.concatenate(column) for column in zip(*parts, strict=True))
-    order = np.lexsort((frame, track))
-    metres, feet, seen = (np.concatenate(column)[order] for column in zip(*places, strict=True))
-    high = np.concatenate(heights)
-    high = high[np.isfinite(high)]
-    height_px = float(np.median(high)) if len(high) else np.nan
-    return TrackPositions({"metres": metres, "pixels": feet}, seen, track[order], frame[order], t_ns[order], height_px)
-
-
 def find_zone_events(
     frames: Sequence[Frame], found: TrackPositions, zones: Sequence[PlacedZone], options: ZoneOptions, name: str
 ) -> ZoneEvents:
@@ -226,6 +117,7 @@ def find_zone_events(
             some = visits(paths, depth, margin)
             stays.append(_Stays.of(placed.zone.number, some, rows, found, paths))
         notes += _far_away(placed, paths.points, name)
+        notes += missing_classes(found, placed.zone, name)
     t_ns, numbers = frame_times(frames), frame_numbers(frames)
     return ZoneEvents(
         _visit_frames(stays, found, t_ns, numbers),
@@ -247,6 +139,7 @@ def _paths(found: TrackPositions, placed: PlacedZone, options: ZoneOptions, name
     if len(points) and not len(rows):
         where = "positions in metres" if placed.units == "metres" else "boxes in the picture"
         raise McaptrackError(f"{name} has no {where}, which zone {placed.zone.name} in {placed.zone.units} needs")
+    rows = rows[is_counted(found, placed.zone)[rows]]
     gap_ns = seconds_to_ns(options.max_gap_s)
     return Paths.of(points[rows], found.t_ns[rows], found.track[rows], gap_ns), rows
 

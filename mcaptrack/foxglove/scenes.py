@@ -168,12 +168,13 @@ class SceneMessages:
 
     def zone(
         self, frame: Ints, name: str, rings: Sequence[Floats], is_closed: bool, label_m: Floats, labels: Sequence[str],
-        rgba: tuple[float, float, float, float],
+        rgba: tuple[float, float, float, float], height_m: float = 0.0,
     ) -> None:  # fmt: skip
         """Draw the rings (P, 2) of a zone, or a line, at each of N instants, with labels (N,) at a point (2,)."""
+        height_m = round(height_m * PER_M) / PER_M
         points = tuple(tuple(map(tuple, _short(ring).tolist())) for ring in rings)
         for length, chosen, words in by_length(np.array(labels, object)):
-            template = _zone(self._frame_id, self._lifetime_ns, name, points, is_closed, length, rgba)
+            template = _zone(self._frame_id, self._lifetime_ns, name, points, is_closed, length, rgba, height_m)
             at = {f"text_{axis}": np.full(len(chosen), _short(label_m)[place]) for place, axis in enumerate("xy")}
             shades = _shades("text_", np.broadcast_to(rgba[:3], (len(chosen), 3)))
             self._add(frame[chosen], template, label=words, **at, **shades)
@@ -323,11 +324,13 @@ def _zone(
     is_closed: bool,
     length: int,
     rgba: tuple[float, float, float, float],
+    height_m: float,
 ) -> Template:
+    up = {"z": height_m} if height_m else {}
     lines = [
         {
             "type": _LINE_LOOP if is_closed else _LINE_STRIP,
-            "pose": {"position": {}, "orientation": _UPRIGHT},
+            "pose": {"position": up, "orientation": _UPRIGHT},
             "thickness": 3.0,
             "scale_invariant": True,
             "points": [{"x": x, "y": y} for x, y in ring],
@@ -335,7 +338,7 @@ def _zone(
         }
         for ring in rings
     ]
-    return _entity(frame_id, lifetime_ns, name, lines=lines, texts=[_label(length, _DISC_M)])
+    return _entity(frame_id, lifetime_ns, name, lines=lines, texts=[_label(length, _DISC_M + height_m)])
 
 
 @cache

@@ -32,7 +32,8 @@ class Zone:
 
     ``parts`` are polygons, each a tuple of rings (the first is its outline, others are holes), each ring a tuple of
     points without the first one again; a line has one part with one ring, its points. ``camera`` is the name of the
-    camera that it belongs to, "" for any. ``number`` is its id in rows, from 1.
+    camera that it belongs to, "" for any; ``classes`` are the names of the classes that it counts, none for all.
+    ``number`` is its id in rows, from 1.
     """
 
     number: int
@@ -41,6 +42,7 @@ class Zone:
     parts: tuple[tuple[tuple[tuple[float, float], ...], ...], ...]
     is_line: bool = False
     camera: str = ""
+    classes: tuple[str, ...] = ()
 
     def shape(self) -> Shape:
         """Its geometry, in its own units."""

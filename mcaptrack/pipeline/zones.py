@@ -19,16 +19,9 @@ from typing import Any, Final, NamedTuple
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation.event_text import SUFFIX
+from mcaptrack.evaluation.zone_places import PlacedZone, ground_height_m, place_zone, positions_of
 from mcaptrack.evaluation.zone_text import zone_messages
-from mcaptrack.evaluation.zones import (
-    PlacedZone,
-    ZoneOptions,
-    ZoneTotals,
-    find_zone_events,
-    place_zone,
-    positions_of,
-    zone_totals,
-)
+from mcaptrack.evaluation.zones import ZoneOptions, ZoneTotals, find_zone_events, zone_totals
 from mcaptrack.foxglove import views
 from mcaptrack.foxglove.views import zones as drawn_zones
 from mcaptrack.foxglove.views.image import PictureTimes
@@ -42,6 +35,7 @@ from mcaptrack.pipeline.planes import planes_to_json
 from mcaptrack.pipeline.staleness import is_stale
 from mcaptrack.pipeline.write import DrawnMessages, Made, digest_of
 from mcaptrack.schema import TRACKS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS, Frame, Schema
+from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import VIEW, Provenance, frame_id_of
 from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.sources.zones import zones_from_json, zones_to_json
@@ -159,7 +153,8 @@ def _counted(
     path, motion = path_with(opened, prefix, topic, made)
     still = scene_planes(planes, path)
     placed: list[PlacedZone] = [place_zone(zone, still) for zone in zones]
-    found = find_zone_events(frames, positions_of(frames, still, path), placed, options, topic)
+    positions = positions_of(frames, still, path, _class_names(opened, topic, made))
+    found = find_zone_events(frames, positions, placed, options, topic)
     for note in found.notes:
         warn(note, "not-compared")
     names = {str(zone.number): zone.name for zone in zones}
@@ -177,7 +172,13 @@ def _counted(
     view = Provenance(VIEW, {}, visited, out[visited].provenance.digest, references=crossings)
     out[topic + _BELOW + SUFFIX] = Made(ZONE_VISITS, [], view, text, foxglove.LOG)
     shapes = [
-        drawn_zones.ZoneShape(one.zone, one.zone.shape(), one.shape if one.units == "metres" else None, one.forward)
+        drawn_zones.ZoneShape(
+            one.zone,
+            one.zone.shape(),
+            one.shape if one.units == "metres" else None,
+            one.forward,
+            ground_height_m(positions, one.shape) if one.units == "metres" else 0.0,
+        )
         for one in placed
     ]
     view = replace(view, input=(counts := topic + _BELOW + "/counts"), input_digest=out[counts].provenance.digest)
@@ -290,6 +291,13 @@ def _is_same(before: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
     known = zones_from_json(before.get("zones"))
     rest = [{key: value for key, value in one.items() if key != "zones"} for one in (before, wanted)]
     return zones_to_json(known) == wanted["zones"] and rest[0] == rest[1]
+
+
+def _class_names(opened: log.Log, topic: str, made: Mapping[str, Made]) -> dict[int, str]:
+    """The names of the classes of tracks."""
+    if topic in made:
+        return {int(number): name for number, name in made[topic].provenance.classes.items()}
+    return class_names(opened.channel(topic).metadata)
 
 
 def _frame_id(opened: log.Log, topic: str, made: Mapping[str, Made]) -> str:

@@ -146,7 +146,7 @@ def _zone(feature: Any, top: Mapping[str, Any], place: int, number: int, taken: 
     if sum(len(ring) for part in flat for ring in part) > _MAX_POINTS:
         raise McaptrackError(f"{called} has more than {_MAX_POINTS} points; simplify it")
     flat = tuple(tuple(_distinct(ring, is_line) for ring in part) for part in flat)
-    zone = Zone(number, name, units, flat, is_line, camera)
+    zone = Zone(number, name, units, flat, is_line, camera, _classes(own, top, called))
     _check(zone, called)
     return zone
 
@@ -174,6 +174,15 @@ def _camera(own: Mapping[str, Any], top: Mapping[str, Any], called: str) -> str:
                     raise McaptrackError(f"{called} has the {key} {holder[key]!r:.40}; it needs a name")
                 return str(holder[key]).strip("/")
     return ""
+
+
+def _classes(own: Mapping[str, Any], top: Mapping[str, Any], called: str) -> tuple[str, ...]:
+    """Return the names of the classes that a zone counts; none for all."""
+    given: Any = next((holder["classes"] for holder in (own, top) if holder.get("classes") is not None), [])
+    names = given if isinstance(given, list) else [given]
+    if not all(isinstance(name, str) and 0 < len(name) <= _MAX_NAME and name.isprintable() for name in names):
+        raise McaptrackError(f"{called} has classes that are no list of names: {given!r:.60}")
+    return tuple(dict.fromkeys(name.strip() for name in names))
 
 
 def _list(value: Any, called: str) -> list[Any]:
@@ -233,6 +242,7 @@ def zones_to_json(zones: Sequence[Zone]) -> list[dict[str, Any]]:
     """Return zones as values of JSON, for the provenance of channels."""
     return [
         {"name": one.name, "units": one.units, "line": one.is_line, "camera": one.camera, "parts": one.parts}
+        | ({"classes": list(one.classes)} if one.classes else {})
         for one in zones
     ]
 
@@ -250,6 +260,7 @@ def zones_from_json(values: object) -> tuple[Zone, ...]:
                 tuple(tuple(tuple((float(x), float(y)) for x, y in ring) for ring in part) for part in one["parts"]),
                 bool(one["line"]),
                 str(one["camera"]),
+                tuple(map(str, one.get("classes", ()))),
             )
             for number, one in enumerate(values, start=1)
         )
@@ -267,7 +278,8 @@ def to_geojson(zones: Sequence[Zone]) -> dict[str, Any]:
             geometry = {"type": "LineString", "coordinates": parts[0][0]}
         elif len(parts) == 1:
             geometry = {"type": "Polygon", "coordinates": parts[0]}
-        own = {"name": one.name, "units": one.units} | ({"camera": one.camera} if one.camera else {})
+        own: dict[str, Any] = {"name": one.name, "units": one.units}
+        own |= ({"camera": one.camera} if one.camera else {}) | ({"classes": list(one.classes)} if one.classes else {})
         features.append({"type": "Feature", "properties": own, "geometry": geometry})
     return {"type": "FeatureCollection", "features": features}
 

@@ -14,6 +14,7 @@ from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.zones import Units, Zone
 from mcaptrack.notices import warn
+from mcaptrack.pipeline.motion import moves
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.framing import join_frames, thinned
 from mcaptrack.sources.pictures import Pictures
@@ -36,7 +37,9 @@ def zones_page(opened: log.Log, prefix: str, file: str) -> str:
     places of tracks.
     """
     topic = pipeline.camera_at(opened, prefix).pictures
-    background = background_picture(Pictures(opened, topic)) if topic else None
+    # Where the camera moves, zones in pixels are those of its first picture.
+    is_still = not moves(opened, prefix, {})
+    background = background_picture(Pictures(opened, topic), is_still) if topic else None
     if background is not None:
         units: Units = "pixels"
         width, height, scale, low = background.width, background.height, background.scale, (0.0, 0.0)
@@ -90,7 +93,8 @@ def _is_simple(zone: Zone) -> bool:
 
 
 def _drawn(zones: Sequence[Zone]) -> list[dict[str, Any]]:
-    return [{"name": zone.name, "line": zone.is_line, "points": zone.parts[0][0]} for zone in zones]
+    drawn = ({"name": zone.name, "line": zone.is_line, "points": zone.parts[0][0]} for zone in zones)
+    return [one | ({"classes": zone.classes} if zone.classes else {}) for one, zone in zip(drawn, zones, strict=True)]
 
 
 def _places(opened: log.Log, prefix: str) -> Floats:

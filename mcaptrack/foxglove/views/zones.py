@@ -64,12 +64,14 @@ class ZoneShape(NamedTuple):
     """A zone to draw: its shape, and the same on the ground, None if it is not known there.
 
     ``forward`` is 1 if forward is to the right of a line on the ground, with the second axis upwards, otherwise -1.
+    ``height_m`` is that of the ground there.
     """
 
     zone: Zone
     shape: Shape
     ground: Shape | None
     forward: int
+    height_m: float = 0.0
 
     def rings_px(self, height_px: float) -> list[Floats]:
         """The rings in a picture of this height, of a zone in pixels; of a line the line and its arrow."""
@@ -100,7 +102,7 @@ def on_ground(zones: Sequence[ZoneShape], captions: ZoneCaptions, frame_id: str)
             rgb = _LINE if one.zone.is_line else _ZONE
             label = rings[0].mean(axis=0)
             texts = captions.texts[place][span]
-            scene.zone(frame, one.zone.name, rings, not one.zone.is_line, label, texts, (*rgb, _ALPHA))
+            scene.zone(frame, one.zone.name, rings, not one.zone.is_line, label, texts, (*rgb, _ALPHA), one.height_m)
         yield from zip(t_ns[span].tolist(), range(span.start, span.stop), scene.messages(), strict=True)
 
 

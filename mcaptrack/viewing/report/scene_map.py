@@ -58,11 +58,14 @@ class TrackPath(NamedTuple):
     last_s: float
 
 
-def background_picture(pictures: Pictures) -> SceneBackground | None:
-    """The scene without moving people; None without pictures. Raises McaptrackError for damaged pictures."""
+def background_picture(pictures: Pictures, is_still: bool = True) -> SceneBackground | None:
+    """The scene without moving people, or the first picture if the camera isn't still; None without pictures.
+
+    Raises McaptrackError for damaged pictures.
+    """
     import cv2
 
-    count = len(pictures.t_ns)
+    count = len(pictures.t_ns) if is_still else min(len(pictures.t_ns), 1)
     numbers = np.unique(np.linspace(0, count - 1, min(count, _PICTURES)).round().astype(int)).tolist() if count else []
     seen: list[Image] = []
     scale = 1.0
