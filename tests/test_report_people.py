@@ -25,8 +25,10 @@ from mcaptrack.evaluation.people import LEAST_PEOPLE, PersonScores, intervals, p
 from mcaptrack.schema import Frame
 from mcaptrack.viewing.linked_report import is_about, with_links
 from mcaptrack.viewing.report import LogReport, gather, page
+from mcaptrack.viewing.report import _comparison as comparison
 from mcaptrack.viewing.report.contents import TrackSet
 from mcaptrack.viewing.report.doubts import find_doubts
+from mcaptrack.viewing.report.figures import identity_events
 from mcaptrack.viewing.report.identity_events import summarize_events
 from mcaptrack.viewing.report.identity_timeline import counts_over_time, identity_timeline, pieces
 from mcaptrack.viewing.report.scene_map import heat_map
@@ -234,6 +236,20 @@ def test_people_over_time_keep_their_mean(counts):
     assert 0 <= found.min() <= found.max() <= max(counts)
     if len(counts) <= 160:
         assert found.tolist() == counts
+
+
+def test_all_logs_together_have_the_people_of_all(told):
+    rows = comparison([told, replace(told, file="other.mcap")])["rows"]
+    assert [row["cells"][1] for row in rows] == ["unknown: 2 people", "unknown: 2 people", "unknown: 4 people"]
+    assert [row["cells"][2] for row in rows] == ["2 → 1", "2 → 1", "4 → 2"]
+
+
+def test_every_event_has_a_mark_and_those_that_are_shown_a_long_one(told):
+    shown = [part[:1] for part in told.highlights]
+    found = identity_events(replace(told, highlights=shown))["timelines"]
+    assert [len(one["highlights"]) for one in found] == [1, 1]
+    assert [len(one["marks"]) for one in found] == [len(one.events) for one in told.channel_events]
+    assert all(one["highlights"][0][0] in one["marks"] for one in found)
 
 
 def test_those_who_stay_longest_have_a_bar(told, monkeypatch):
