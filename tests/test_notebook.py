@@ -20,6 +20,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 import mcaptrack
 from mcaptrack.errors import McaptrackError
+from mcaptrack.viewing.moments import LinkedEvent
 from tests.commands import done
 
 CLOSED, PAIRS = 0, 2
@@ -144,6 +145,30 @@ class TestPlayer:
             at_s = server.at_s
         assert [text for _, text in data["events"]] == [one.text for one in events]
         assert abs(data["seconds"][data["open"]] - at_s) <= 0.1
+
+    def test_it_opens_where_viewers_do_and_names_events_of_its_period_and_tracks(self, finished, monkeypatch):
+        start_ns = start_of(finished)
+        at = [("retracks", 1.0), ("retracks", 3.0), ("tracks", 3.1), ("retracks", 5.0)]
+        moments = [
+            LinkedEvent(k, start_ns + round(s * 1e9), f"/camera/{name}", "joined", f"{name} {s}")
+            for k, (name, s) in enumerate(at)
+        ]
+        monkeypatch.setattr("mcaptrack.api.notebook.find_moments", lambda _: moments)
+        monkeypatch.setattr("mcaptrack.api.notebook.opening_moment", lambda *_: (start_ns + 2_960_000_000, ""))
+        with mcaptrack.open(finished) as log:
+            data = shown(log.show(start_s=2.0, end_s=4.0, width=64)).data
+        assert data["events"] == [[3.0, "retracks 3.0"]]
+        assert data["seconds"][data["open"]] == 2.9
+
+    def test_pictures_are_left_out_evenly_where_their_size_was_estimated_too_small(self, finished, monkeypatch):
+        monkeypatch.setattr("mcaptrack.viewing.notebook.pictures.PictureSource.step", lambda *_: 1)
+        with mcaptrack.open(finished) as log:
+            small = log.show(max_mb=0.2)
+        data = shown(small).data
+        assert small.every in (2, 4, 8)
+        assert data["numbers"] == list(range(0, 60, small.every))
+        assert data["seconds"] == [round(number / 10, 3) for number in data["numbers"]]
+        assert len(shown(small).pictures) == len(data["drawn"]) == small.pictures
 
     def test_it_opens_no_connection_and_runs_only_its_own_script(self, player):
         page = shown(player).page
@@ -362,6 +387,13 @@ class TestReport:
         made.page.unlink()
         assert Elements(made._repr_html_()).of("iframe") == []
         assert "can&#39;t be read: No such file" in made._repr_html_()
+
+
+def test_the_result_of_a_run_is_a_line_in_a_notebook(finished, tmp_path):
+    path = Path(shutil.copy(finished, tmp_path / "walk.mcap"))
+    result = mcaptrack.run(path, tables=False)
+    tracks, repaired = result.summary.tracks, result.summary.repair.tracks
+    assert repr(result).startswith(f"RunResult('{path}': up to date; {tracks} tracks, {repaired} after re-tracking; ")
 
 
 def test_the_strokes_of_any_annotations_can_be_written_as_json():

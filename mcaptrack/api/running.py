@@ -137,6 +137,12 @@ class RunResult:
     not_fused: str = ""
     continued: pipeline.Continued | None = None
 
+    def __repr__(self) -> str:
+        did, found = ", ".join(self.stages) or "up to date", self.summary
+        counts = "" if found is None or found.tracks is None else f"; {found.tracks} tracks"
+        counts += f", {found.repair.tracks} after re-tracking" if counts and found and found.repair else ""
+        return f"RunResult({str(self.log)!r}: {did}{counts}; {self.seconds:.1f} s, {len(self.warnings)} warnings)"
+
     @property
     def channels(self) -> tuple[str, ...]:
         """The topics of the channels that were made."""
