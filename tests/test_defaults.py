@@ -164,6 +164,7 @@ COMMANDS: dict[str, dict[str, Any]] = {
     "evaluate": {"gate_m": "0.5,1,2", "min_iou": 0.5, "rules": "trackeval", "point": "foot"},
     "export": {"form": "parquet"},
     "fuse": {
+        "fuser": "feet",
         "to": "world",
         "max_sigma": 3.0,
         "max_distance_m": 1.2,

@@ -10,12 +10,15 @@ from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.checked import checked
 from mcaptrack.api.common import Notes, PathLike, Progress, no_progress
-from mcaptrack.api.running import RunResult, Where, change
+from mcaptrack.api.running import RunResult, Where, change, transform_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.fixed_frame import BoxesRead
+from mcaptrack.transforms import FUSION, Transform
 from mcaptrack.transforms.fuse import FootFuser
 from mcaptrack.transforms.protocol import LARGEST
 
+#: The parameters of the usual fuser.
+_OPTIONS: Final = ("max_sigma", "max_distance_m", "min_score", "noise", "noise_m")
 #: The largest offset of a clock, a day: more is no offset, but another recording.
 _MOST_OFFSET_S: Final = 86_400.0
 
@@ -32,6 +35,7 @@ def fuse(
     *,
     cameras: str | Sequence[str] | None = None,
     to: str = "world",
+    fuser: str | Transform = "feet",
     max_sigma: float = FootFuser.max_sigma,
     max_distance_m: float = FootFuser.max_distance_m,
     min_score: float = FootFuser.min_score,
@@ -56,6 +60,9 @@ def fuse(
         Names of the cameras to fuse, also with commas between them; by default all that have what is needed.
     to : str, default "world"
         Name of the scene: results are written as those of a camera with this name.
+    fuser : str or Transform, default "feet"
+        The fuser: a built-in name, the name of an installed one, "module:Class", or a transform of sightings to
+        detections, with own parameters. The parameters below are those of "feet".
     max_sigma : float, default 3.0
         Boxes are joined if their feet are at most so many standard deviations apart.
     max_distance_m : float, default 1.2
@@ -98,9 +105,9 @@ def fuse(
     """
     names = cameras.split(",") if isinstance(cameras, str) else list(cameras or ())
     names = [name.strip() for name in names]
-    fuser = FootFuser(
-        max_sigma=max_sigma, max_distance_m=max_distance_m, min_score=min_score, noise=noise, noise_m=noise_m
-    )
+    values = dict(zip(_OPTIONS, (max_sigma, max_distance_m, min_score, noise, noise_m), strict=True))
+    changed = {name: value for name, value in values.items() if value != getattr(FootFuser, name)}
+    chosen = transform_of(FUSION.name, fuser, changed)
     offsets = {name.strip("/"): float(value) for name, value in (clock_offset_s or {}).items()}
     for name, value in offsets.items():
         if not abs(value) <= _MOST_OFFSET_S:
@@ -109,6 +116,6 @@ def fuse(
         raise McaptrackError(f"`to={to}` is no name of a scene; give one such as world")
 
     def act(opened: logs.Log, target: Path | None, notes: Notes, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
-        return pipeline.fuse_cameras(opened, names, to.strip("/"), fuser, offsets, target, progress)
+        return pipeline.fuse_cameras(opened, names, to.strip("/"), chosen, offsets, target, progress)
 
     return change(Where(log, None, None, output, sidecar, force), act, progress, None)

@@ -27,8 +27,7 @@ from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.sources.ingest.bags.metadata_update import update_metadata
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
 from mcaptrack.tables.export import default_folder, export
-from mcaptrack.transforms import STAGES, Transform
-from mcaptrack.transforms.fuse import FootFuser
+from mcaptrack.transforms import FUSION, STAGES, Transform
 
 #: The value of a transform's option.
 Option = float | int | bool | str | None
@@ -172,10 +171,11 @@ class Where:
 
 
 class Fusing(NamedTuple):
-    """The cameras to run, all without names, and whether they are fused to a scene."""
+    """The cameras to run, all without names; whether they are fused to a scene; and by which fuser, if it is named."""
 
     names: tuple[str, ...] = ()
     is_on: bool = True
+    fuser: Transform | None = None
 
 
 def work(
@@ -205,7 +205,7 @@ def work(
             at = prefix or pipeline.find_camera(opened, where.camera, where.topic or next(iter(topics), None))
             fused = {}
             if fuses is not None:
-                fused = pipeline.fuse_again(opened, at, force, notes.say, progress, adds=not fuses.names)
+                fused = pipeline.fuse_again(opened, at, force, notes.say, progress, not fuses.names, fuses.fuser)
             run = partial(pipeline.run, opened, at, output=output, progress=progress, watch=watch, plane=plane)
             run = partial(run, boxes=boxes, zones=zones, fused=fused)
             if follows is None:
@@ -223,7 +223,8 @@ def work(
     def fuse_to(scene: str, names: Sequence[str], progress: Progress) -> Act:
         def act(opened: logs.Log, output: Path | None, notes: Notes, _: BoxesRead) -> tuple[str, pipeline.Report]:
             notes.say(f"fusing {', '.join(names)} to /{scene}")
-            return pipeline.fuse_cameras(opened, names, scene, FootFuser(), {}, output, progress, is_asked=False)
+            fuser = (fuses.fuser if fuses is not None else None) or FUSION.make()
+            return pipeline.fuse_cameras(opened, names, scene, fuser, {}, output, progress, is_asked=False)
 
         return act
 
@@ -346,7 +347,7 @@ def transform_of(stage: str, chosen: str | Transform | None, options: Mapping[st
     """
     options = {name: value.item() if isinstance(value, np.generic) else value for name, value in options.items()}
     if chosen is None or isinstance(chosen, str):
-        step = STAGES[stage]
+        step = FUSION if stage == FUSION.name else STAGES[stage]
         if chosen and step.parameter:
             return step.make(**{step.parameter: chosen, **options})
         return step.make(chosen or "", **options)

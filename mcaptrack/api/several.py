@@ -92,7 +92,10 @@ class EveryCamera:
             joined: list[str] = []
             if self.is_fused and not scenes:
                 given = [prefix[1:] for prefix in self.prefixes]
-                joined, self.not_fused = pipeline.fusable(opened, given)
+                joined, why = pipeline.fusable(opened, given)
+                self.not_fused = "" if joined else why
+                if joined and why:
+                    steps.notes.say(f"not in the scene: {why}")
         if joined:
             scenes, name = (SCENE,), SCENE[1:]
             if not steps.take(name, self.fuse_to(name, joined, _named(steps.progress, name)), is_scene=True):

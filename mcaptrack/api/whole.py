@@ -18,7 +18,7 @@ from mcaptrack.evaluation.events import EventOptions
 from mcaptrack.evaluation.zones import ZoneOptions
 from mcaptrack.location import Location
 from mcaptrack.pipeline import Job, PlaneChoice, Watch, ZoneWatch
-from mcaptrack.transforms import STAGES, Transform
+from mcaptrack.transforms import FUSION, STAGES, Transform
 from mcaptrack.transforms.sort.tracker import CameraMotionUse
 
 
@@ -36,6 +36,7 @@ def run(
     zones: ZonesLike | None = None,
     fuse: bool = True,
     force: bool = False,
+    fuser: str | Transform | None = None,
     detector: str | Transform | None = None,
     tracker: str | Transform | None = None,
     retracker: str | Transform | None = None,
@@ -87,6 +88,8 @@ def run(
         before are brought up to date.
     force : bool, default False
         Run everything again, and overwrite ``output`` if it exists.
+    fuser : str or Transform, optional
+        Fuse cameras by this one, also where another one was used before: a name, or a transform, as for ``fuse``.
     detector, tracker, retracker, predictor : str or Transform, optional
         Use this one, also where another one was used before: a built-in name, the name of an installed one,
         "module:Class", or a transform.
@@ -142,6 +145,8 @@ def run(
     transforms = transforms_of(stages)
     transforms |= {s.name: transform_of(s.name, chosen[s.option], {}) for s in STAGES.values() if s.option in chosen}
 
+    joins = None if fuser is None else transform_of(FUSION.name, fuser, {})
+
     plane = PlaneChoice(fit_plane, person_height_m, frame, ground_frame)
     given = {"camera_motion": camera_motion, "across_classes": across_classes, "class_limits": class_limits}
     shared = {name: value for name, value in given.items() if value is not None}
@@ -166,7 +171,7 @@ def run(
     counted = ZoneWatch(given_zones, options=ZoneOptions() if given_zones else None, force=force)
     where = Where(log, names[0] if len(names) == 1 else None, topic, output, sidecar, force)
     earlier = _log_before(as_location(log), follows)
-    return work(where, plan, watch, progress, tables, plane, counted, fuses=Fusing(names, fuse), follows=earlier)
+    return work(where, plan, watch, progress, tables, plane, counted, fuses=Fusing(names, fuse, joins), follows=earlier)
 
 
 def _log_before(log: Location, follows: PathLike | Sequence[PathLike] | None) -> Location | None:

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Final
 from mcaptrack.cli import common
 from mcaptrack.cli.many import takes_many
 from mcaptrack.cli.running import run_on_logs
+from mcaptrack.cli.stages import chooser, option_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms.fuse import FootFuser
 
@@ -18,16 +19,7 @@ _JOINING: Final = "Joining of boxes"
 
 def _number(name: str) -> Any:
     """Return the option for a parameter of the fuser."""
-    field = _FIELDS[name]
-    words = str(field.metadata["help"])
-    return common.option(
-        f"--{name.replace('_', '-')}",
-        panel=_JOINING,
-        tuning=True,
-        help=f"{words[:1].upper()}{words[1:]}.",
-        least=field.metadata.get("least", -math.inf),
-        most=field.metadata.get("most", math.inf),
-    )
+    return option_of(_FIELDS[name], f"--{name.replace('_', '-')}", _JOINING)
 
 
 @common.one_line
@@ -47,6 +39,7 @@ def fuse(
             show_default="estimated from people who walk",
         ),
     ] = None,
+    fuser: Annotated[str, chooser("fuser")] = "feet",
     max_sigma: Annotated[float, _number("max_sigma")] = FootFuser.max_sigma,
     max_distance_m: Annotated[float, _number("max_distance_m")] = FootFuser.max_distance_m,
     min_score: Annotated[float, _number("min_score")] = FootFuser.min_score,
@@ -81,6 +74,7 @@ def fuse(
     options = {
         "cameras": cameras,
         "to": to,
+        "fuser": fuser,
         "clock_offset_s": _offsets(clock_offset_s or ()),
         "max_sigma": max_sigma,
         "max_distance_m": max_distance_m,

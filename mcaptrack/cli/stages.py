@@ -68,6 +68,7 @@ def chooser(
 RESERVED: Final = ("help", *(name.replace("_", "-") for name in NAMES))
 _AFTER: Final = "After the stages"
 _CLASSES: Final = "Classes of objects"
+_SEVERAL: Final = "Several cameras"
 _AGAIN: Final = "Use this {kind}, also where another one was used before"
 
 
@@ -109,20 +110,30 @@ def _option(field: Field[Any], annotation: Any, of: Sequence[str] = ()) -> inspe
     (kind, is_tuple), about = member_type(annotation), field.metadata
     flag = "--" + field.name.replace("_", "-")
     switch = f"{flag}/--no-{flag[2:]}" if kind is bool and not is_tuple else flag
-    default = default_of(field)
-    words = about.get("help", "") or f"parameter {field.name} of {' and '.join(of)}"
-    info = common.option(
+    tuning = _NAME if about.get("kind") else about.get("pattern") or bool(choices(kind)) or kind is not str
+    words = f"parameter {field.name} of {' and '.join(of)}"
+    info = option_of(field, switch, _panel(about.get("theme", ""), of), tuning, words)
+    values: Any = list[kind] if is_tuple else kind  # type: ignore[valid-type]
+    return _parameter(field.name, Annotated[values | None, info], None)
+
+
+def option_of(field: Field[Any], switch: str, panel: str, tuning: Any = True, otherwise: str = "") -> Any:
+    """Return the option for a parameter of a transform, with its help, range and default.
+
+    ``otherwise`` is the help of a parameter without any.
+    """
+    about = field.metadata
+    words = str(about.get("help", "") or otherwise)
+    return common.option(
         switch,
-        panel=_panel(about.get("theme", ""), of),
-        tuning=_NAME if about.get("kind") else about.get("pattern") or bool(choices(kind)) or kind is not str,
+        panel=panel,
+        tuning=tuning,
         help=f"{words[:1].upper()}{words[1:]}.",
         least=about.get("least", -math.inf),
         most=about.get("most", math.inf),
-        show_default=shown_default(default),
+        show_default=shown_default(default_of(field)),
         was=about.get("was", "").replace("_", "-"),
     )
-    values: Any = list[kind] if is_tuple else kind  # type: ignore[valid-type]
-    return _parameter(field.name, Annotated[values | None, info], None)
 
 
 def default_of(field: Field[Any]) -> Any:
@@ -275,6 +286,7 @@ def run_all(
         bool,
         common.option(
             "--fuse/--no-fuse",
+            panel=_SEVERAL,
             tuning=True,
             help="Fuse several cameras with measured ground planes to a scene, as `mcaptrack fuse` does.",
         ),
@@ -296,6 +308,7 @@ def run_all(
     quiet: common.Quiet = False,
     verbose: common.Verbose = False,
     config: common.Config = None,
+    fuser: Annotated[str | None, chooser("fuser", words=_AGAIN, panel=_SEVERAL, shown="as before, or feet")] = None,
     detector: Annotated[str | None, chooser("detector", words=_AGAIN, shown="as before, or median")] = None,
     tracker: Annotated[
         str | None, chooser("tracker", words=_AGAIN, shown="as before, or one that suits the detections")
@@ -387,6 +400,7 @@ def run_all(
     options: dict[str, Any] = {
         "camera": camera,
         "fuse": fuse,
+        "fuser": fuser,
         "topic": topic,
         "tables": tables,
         "frame": frame,

@@ -18,16 +18,15 @@ from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, fits
 from mcaptrack.pipeline.corrections import is_of_corrections
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, read_planes, warn_unused
-from mcaptrack.pipeline.rebuild import MissingPluginError, differing, rebuild
+from mcaptrack.pipeline.rebuild import MissingPluginError, differing, fuser_of, rebuild
 from mcaptrack.pipeline.spaces import check_spaces, suited_tracker
 from mcaptrack.pipeline.staleness import is_stale
-from mcaptrack.schema import DETECTIONS, VIDEO
+from mcaptrack.schema import DETECTIONS, SIGHTINGS, VIDEO
 from mcaptrack.schema.provenance import FUSE, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.camera_motion import motion_topic
 from mcaptrack.sources.cameras import USUAL, camera_at, provenance_of
-from mcaptrack.transforms import STAGES, Stage, Transform
-from mcaptrack.transforms.fuse import FootFuser
+from mcaptrack.transforms import FUSION, STAGES, Stage, Transform
 from mcaptrack.transforms.protocol import traits_of
 
 Say = Callable[[str], None]
@@ -230,16 +229,17 @@ class _Planner:
             name = self.suited_tracker(stage, source)
             return STAGES[stage].make(name) if name else None
         made_by = next(one for one in STAGES.values() if f"{self._prefix}/{one.output_topic}" == source)
-        is_fused = isinstance(maker, FootFuser)
-        named = "fuser feet" if is_fused else f"{made_by.option} {made_by.choice(maker)}"
+        made_by = FUSION if maker.reads is SIGHTINGS else made_by
+        named = f"{made_by.option} {made_by.choice(maker)}"
         parameters, planes = dict(found.parameters), read_planes(self._opened, self._prefix)
         if planes and not is_assumed(planes):
             parameters |= found.on_ground
         try:
             transform = STAGES[stage].make(found.name, **parameters)
         except McaptrackError as error:
-            entry = named if is_fused else made_by.entry(type(maker))
-            raise McaptrackError(f"{entry} suits {found.name}, but {error}; `{option}=` chooses another") from None
+            raise McaptrackError(
+                f"{made_by.entry(type(maker))} suits {found.name}, but {error}; `{option}=` chooses another"
+            ) from None
         values = ", ".join(f"{key} {value}" for key, value in parameters.items())
         by = found.name + (f" ({values})" if values else "")
         self._notes.append(f"{stage} by {by}, which suits the {named}; `{option}=` chooses")
@@ -252,7 +252,7 @@ class _Planner:
                 return job.transform
         made = provenance_of(self._opened, topic)
         if made and made.transform == FUSE:
-            return FootFuser()
+            return fuser_of(made)[0]
         return self._before(made.transform, made)[0] if made and made.transform in STAGES else None
 
     def _is_made_by_another(self, topic: str) -> bool:

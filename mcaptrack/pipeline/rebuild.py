@@ -7,7 +7,7 @@ the user, too: a log must not be able to run code.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, Final, get_type_hints
 
 from mcaptrack.errors import McaptrackError
@@ -16,11 +16,14 @@ from mcaptrack.predictors import entry_of as predictor_entry
 from mcaptrack.predictors import weights_sha256
 from mcaptrack.registry import Entry, find, is_installed
 from mcaptrack.schema.provenance import Plugin, Provenance
-from mcaptrack.transforms import Stage, Transform
+from mcaptrack.transforms import FUSION, Stage, Transform
 from mcaptrack.transforms.protocol import member_type
 
 #: The maximum number of differing parameters in a message.
 _NAMED: Final = 3
+
+#: Entries of the provenance of a scene beside the parameters of its fuser.
+_FINDINGS: Final = ("cameras", "clock_offset_s", "clock_offsets_given", "cameras_given", "detects", "false_share")
 
 
 class MissingPluginError(McaptrackError):
@@ -84,6 +87,20 @@ def rebuild(stage: Stage, made: Provenance, known: Mapping[str, Transform]) -> T
     if own not in (None, made.weights_sha256):
         raise McaptrackError(f"{stage.choice(transform)} holds other weights than those it was made with")
     return transform
+
+
+def fuser_of(made: Provenance, known: Transform | None = None) -> tuple[Transform | None, McaptrackError | None]:
+    """Return the fuser that made a scene, with the same parameters; or None, and the reason why not.
+
+    ``known`` is the one that the user names, if any.
+    """
+    parameters = {name: value for name, value in made.parameters.items() if name not in _FINDINGS}
+    try:
+        return rebuild(
+            FUSION, replace(made, parameters=parameters), {} if known is None else {FUSION.name: known}
+        ), None
+    except McaptrackError as error:
+        return None, error
 
 
 def _is_of_a_module(predictor: str) -> bool:

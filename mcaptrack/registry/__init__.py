@@ -84,7 +84,9 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "likelihood": "mcaptrack.transforms.retrack:Retrack",
             "consistency": "mcaptrack.transforms.retrack:RetrackByConsistency",
         },
-        "fuser": {},
+        "fuser": {
+            "feet": "mcaptrack.transforms.fuse.fuser:FootFuser",
+        },
     }
 )
 

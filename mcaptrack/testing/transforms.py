@@ -16,7 +16,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.registry import Entry
-from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, TRACKS, VIDEO, Frame, Schema
+from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SIGHTINGS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.testing.error import LawError
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.protocol import Colour, Transform, check_options, traits_of
@@ -69,7 +69,8 @@ def sample_frames(schema: Schema, seed: int = 0, step_s: float = 0.0, colour: Co
     ----------
     schema : Schema
         ``VIDEO`` gives pictures on which a block moves; ``DETECTIONS`` gives boxes of people who
-        are missed now and then, and false positives, at uneven times; ``TRACKS`` gives tracks in pixels and metres with
+        are missed now and then, and false positives, at uneven times; ``SIGHTINGS`` gives boxes
+        of three cameras, on the ground; ``TRACKS`` gives tracks in pixels and metres with
         gaps, births, ends and changing ids.
     seed : int, default 0
         Random seed.
@@ -81,7 +82,7 @@ def sample_frames(schema: Schema, seed: int = 0, step_s: float = 0.0, colour: Co
     Returns
     -------
     list of mcaptrack.schema.Frame
-        12 pictures, 30 frames of detections or 40 frames of tracks.
+        12 pictures, 30 frames of detections or sightings, or 40 frames of tracks.
 
     Examples
     --------
@@ -98,6 +99,8 @@ def sample_frames(schema: Schema, seed: int = 0, step_s: float = 0.0, colour: Co
         return _detections(rng)
     if schema is TRACKS:
         return _tracks(rng, step_s or 0.4)
+    if schema is SIGHTINGS:
+        return _sightings(rng)
     raise LawError(f"declares: there is no sample of {schema.name}; give frames")
 
 
@@ -135,6 +138,31 @@ def _detections(rng: np.random.Generator) -> list[Frame]:
             class_id=np.ones(count, np.uint32),
         )
         frames.append(Frame(seconds_to_ns(now), number, rows))
+    return frames
+
+
+def _sightings(rng: np.random.Generator) -> list[Frame]:
+    start, speed = rng.uniform(-5, 5, (4, 2)), rng.normal(0, 0.3, (4, 2))
+    frames = []
+    for number in range(30):
+        t_ns, at = seconds_to_ns(0.5 * number), start + 0.5 * speed * number
+        person, camera = np.nonzero(rng.random((4, 3)) > (1.0 if number == 3 else 0.25))
+        order = np.lexsort((person, camera))
+        person, camera = person[order], camera[order]
+        x_m, y_m = (at[person] + rng.normal(0, 0.1, (len(person), 2))).T
+        rows = SIGHTINGS.rows(
+            camera=camera,
+            picture_ns=np.full(len(person), t_ns),
+            box_row=person,
+            x_m=x_m,
+            y_m=y_m,
+            cov_xx_m2=np.full(len(person), 0.02),
+            cov_xy_m2=np.zeros(len(person)),
+            cov_yy_m2=np.full(len(person), 0.02),
+            score=rng.uniform(0.2, 1.0, len(person)),
+            class_id=np.ones(len(person), np.uint32),
+        )
+        frames.append(Frame(t_ns, number, rows))
     return frames
 
 

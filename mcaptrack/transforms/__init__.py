@@ -25,10 +25,11 @@ from mcaptrack.transforms.protocol import Transform
 from mcaptrack.transforms.retrack import PROFILES, Retrack, RetrackByConsistency
 from mcaptrack.transforms.sample import Sample
 from mcaptrack.transforms.sort import ByteTrack, OcSort, Sort
-from mcaptrack.transforms.stages import FULL, STAGES, Stage
+from mcaptrack.transforms.stages import FULL, FUSION, STAGES, Stage
 
 __all__ = [
     "FULL",
+    "FUSION",
     "PROFILES",
     "STAGES",
     "TRACKERS",

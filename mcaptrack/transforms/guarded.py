@@ -16,7 +16,7 @@ from mcaptrack.schema.impossible import first_impossible
 from mcaptrack.transforms.protocol import Transform, traits_of
 
 #: Kinds with a main output of one frame for each frame that is read, at its time and with its number.
-_ONE_FOR_EACH: Final = ("detector", "tracker")
+_ONE_FOR_EACH: Final = ("detector", "tracker", "fuser")
 #: Above the largest time in nanoseconds, and above the largest frame number, that a log can hold.
 _END_NS, _END_INDEX = 2**63, 2**32
 

@@ -18,6 +18,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, entry_of, find
 from mcaptrack.schema import SCHEMAS
 from mcaptrack.transforms.detect import MedianDetector
+from mcaptrack.transforms.fuse import FootFuser
 from mcaptrack.transforms.motion import EstimateMotion
 from mcaptrack.transforms.predict import Predict, predict_with
 from mcaptrack.transforms.protocol import Transform, check_options, option_problem, trait_problem
@@ -223,6 +224,9 @@ class Stage:
                     f"{entry} has writes with {suffix!r}: {schema!r}; it maps ends of topics to schemas of rows, as in "
                     "writes = {'': TRACKS, 'debug': DETECTIONS}"
                 )
+        for suffix, schema in wanted.writes.items():
+            if self.kind == "fuser" and outputs.get(suffix) is not schema:
+                raise McaptrackError(f"{entry} has no output {suffix!r}; a fuser also writes which boxes it joined")
         if "__call__" not in dir(cls):
             raise McaptrackError(f"{entry} can't be called with frames; it needs a method __call__")
         if any(one.name == self.kind for one in fields(cls)):
@@ -297,3 +301,13 @@ _STAGES: Final = (
 )
 #: All stages by name, in the order in which they run.
 STAGES: Final[Mapping[str, Stage]] = MappingProxyType({stage.name: stage for stage in _STAGES})
+
+#: The fusion of several cameras: not a stage of one camera, but its transforms are found and checked like those of one.
+FUSION: Final = Stage(
+    name="fuse",
+    default=FootFuser,
+    kind="fuser",
+    input_topic="detections/sightings",
+    output_topic="detections",
+    rows="detections",
+)

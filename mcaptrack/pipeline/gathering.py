@@ -1,0 +1,221 @@
+"""Gather the boxes of the cameras of a log at one time, and compare the cameras.
+
+Letters: C cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import islice
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.boxes import columns_to_boxes
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.notices import warn
+from mcaptrack.pipeline.checks import read_named_frames
+from mcaptrack.pipeline.planes import read_planes
+from mcaptrack.pipeline.write import digest_of
+from mcaptrack.schema import BOX_PX, DETECTIONS, SIGHTINGS, Frame
+from mcaptrack.schema.framing import frame_times
+from mcaptrack.schema.provenance import frame_id_of
+from mcaptrack.sources.cameras import Camera
+from mcaptrack.transforms import STAGES
+from mcaptrack.transforms.fuse import CameraView, FootFuser, Offset, Shared, compare
+
+#: The frame of the metres, if the ground planes name none.
+_FRAME: Final = "map"
+#: Pictures of other cameras count up to this share of the time between those of the slowest camera away from it.
+_WITHIN: Final = 0.5
+_MOST_WITHIN_S: Final = 0.5
+#: How far people walk, in metres per second: what a box of another time says less precisely.
+_PACE_M_PER_S: Final = 1.0
+#: Cameras are compared by at most so many frames.
+_COMPARED: Final = 3000
+#: Offsets of a camera that are named: in metres, and in seconds.
+_FAR_M, _LATE_S = 0.3, 0.12
+#: Fewer comparisons say nothing about a camera.
+_LEAST: Final = 50
+
+
+class Source(NamedTuple):
+    """The detections of a camera."""
+
+    topic: str
+    frames: Sequence[Frame]
+    t_ns: Ints  # (frames,) with the offset of its clock taken off
+    view: CameraView
+
+
+class Gathered:
+    """The boxes of all cameras at the times of the slowest one, as frames of sightings; read at each iteration."""
+
+    def __init__(self, sources: Sequence[Source], fuser: FootFuser) -> None:
+        self._sources, self._noise, self._noise_m = sources, fuser.noise, fuser.noise_m
+        self.at = min(sources, key=lambda one: len(one.frames) / max(float(np.ptp(one.t_ns)), 1.0))
+        step_s = float(np.median(np.diff(self.at.t_ns))) / NS_PER_S if len(self.at.t_ns) > 1 else _MOST_WITHIN_S
+        self._within_ns = round(min(_WITHIN * step_s, _MOST_WITHIN_S) * NS_PER_S)
+        #: Frames before time 0, where the clock of the slowest camera is late by more than the beginning of the log.
+        self.left_out = int(np.searchsorted(self.at.t_ns, 0))
+
+    def __len__(self) -> int:
+        return len(self.at.t_ns) - self.left_out
+
+    def __iter__(self) -> Iterator[Frame]:
+        nearest = [_nearest(one.t_ns, self.at.t_ns) for one in self._sources]
+        for number, t_ns in enumerate(self.at.t_ns.tolist()):
+            if number < self.left_out:
+                continue
+            parts = []
+            for camera, source in enumerate(self._sources):
+                index = int(nearest[camera][number])
+                away_ns = int(source.t_ns[index]) - t_ns
+                if abs(away_ns) <= self._within_ns:
+                    parts.append(self._seen(camera, source, source.frames[index], away_ns / NS_PER_S))
+            rows = SIGHTINGS.joined(parts) if parts else SIGHTINGS.empty()
+            yield Frame(t_ns, self.at.frames[number].index, rows)
+
+    def _seen(self, camera: int, source: Source, frame: Frame, away_s: float) -> Any:
+        """The sightings of one camera."""
+        rows, noise_m = frame.rows, float(np.hypot(self._noise_m, _PACE_M_PER_S * away_s))
+        xy_m, cov = source.view.places(columns_to_boxes(rows), frame.t_ns, self._noise, noise_m)
+        at = np.flatnonzero(np.isfinite(xy_m[:, 0]))
+        out = SIGHTINGS.empty(len(at))
+        out["camera"], out["picture_ns"], out["box_row"] = camera, frame.t_ns, at
+        out["x_m"], out["y_m"] = xy_m[at].T
+        out["cov_xx_m2"], out["cov_xy_m2"], out["cov_yy_m2"] = cov[at].T
+        out["score"], out["class_id"] = rows["score"][at], rows["class_id"][at]
+        return out
+
+
+def _nearest(t_ns: Ints, at_ns: Ints) -> Ints:
+    """The index of the time in ``t_ns`` that is nearest to each of ``at_ns``; the earlier one of two."""
+    after = np.clip(np.searchsorted(t_ns, at_ns), 1, max(len(t_ns) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(t_ns) - 1)
+    out: Ints = np.where(at_ns - t_ns[before] <= t_ns[after] - at_ns, before, after)
+    return out
+
+
+def detections_of(opened: log.Log, camera: Camera) -> str | None:
+    """The topic of a camera's detections; None if it has none, or no unique one."""
+    usual = f"{camera.prefix}/{STAGES['detect'].output_topic}"
+    return usual if usual in opened.channels else camera.boxes
+
+
+def frame_of_plane(opened: log.Log, camera: Camera) -> str:
+    """The frame of the metres of a camera's ground plane."""
+    return frame_id_of(opened.channels[camera.ground_plane].metadata) or _FRAME
+
+
+def frames_in_words(frames: Mapping[str, str]) -> str:
+    """Describe the frames of reference of cameras, by name."""
+    return ", ".join(f"{name} in {frame}" for name, frame in frames.items())
+
+
+def read_sources(
+    opened: log.Log, chosen: Sequence[Camera], clock_offset_s: Mapping[str, float]
+) -> tuple[list[Source], dict[str, str], dict[str, str], str]:
+    """The detections of the cameras; the digests of what they were read from; the classes, and the frame of metres."""
+    names = [camera.prefix[1:] for camera in chosen]
+    for name in clock_offset_s:
+        if name not in names:
+            raise McaptrackError(f"`clock_offset_s=` has {name}, which is not fused; {', '.join(names)} are")
+    sources: list[Source] = []
+    references: dict[str, str] = {}
+    classes: dict[str, str] = {}
+    frames_of: dict[str, str] = {}
+    for camera in chosen:
+        name, topic = camera.prefix[1:], detections_of(opened, camera)
+        assert topic is not None
+        found = read_named_frames(opened, topic, DETECTIONS)
+        if not len(found.frames):
+            warn(f"{name} is left out: {topic} has no messages", "left-out")
+            continue
+        references |= {topic: digest_of(opened, topic), camera.ground_plane: digest_of(opened, camera.ground_plane)}
+        for number, word in found.classes.items():
+            if classes.setdefault(str(number), word) != word:
+                raise McaptrackError(
+                    f"{opened.path}: class {number} is {classes[str(number)]} in one camera and {word} in {topic}; "
+                    "detect them by the same detector"
+                )
+        frames_of[name] = frame_of_plane(opened, camera)
+        view = CameraView(name=name, planes=tuple(read_planes(opened, camera.prefix) or ()))
+        boxes = [columns_to_boxes(frame.rows) for frame in islice(iter(found.frames), _COMPARED)]
+        joined = np.concatenate([part for part in boxes if len(part)] or [np.empty((0, len(BOX_PX)))])
+        view = view.with_heights(joined[np.isfinite(joined).all(axis=1)])
+        t_ns = frame_times(found.frames)
+        offset_ns = round(clock_offset_s.get(name, 0.0) * NS_PER_S)
+        sources.append(Source(topic, found.frames, t_ns - offset_ns, view))
+    if not sources:
+        raise McaptrackError(f"{opened.path} has no detections to fuse: all channels are empty")
+    if len(set(frames_of.values())) > 1:
+        raise McaptrackError(f"{opened.path}: the ground planes are in different frames: {frames_in_words(frames_of)}")
+    return sources, references, classes, next(iter(frames_of.values()))
+
+
+def compared_cameras(
+    sources: list[Source], fuser: FootFuser, given: Mapping[str, float]
+) -> tuple[Gathered, FootFuser, tuple[Offset, ...], dict[str, float], Shared]:
+    """Estimate how well the cameras agree, and the offsets of clocks that are not given."""
+    offset_s = {one.view.name: given.get(one.view.name, 0.0) for one in sources}
+    for _ in range(3):
+        gathered = Gathered(sources, fuser)
+        fuser = replace(fuser, views=tuple(one.view for one in sources))
+        every = max(len(gathered) // _COMPARED, 1)
+        part = (frame for number, frame in enumerate(gathered) if number // 2 % every == 0)
+        taken_ns = [round(offset_s[one.view.name] * NS_PER_S) for one in sources]
+        views, offsets, shared = compare(part, fuser, taken_ns)
+        late = {
+            view.name: round(offset.late_s, 3)
+            for view, offset in zip(views, offsets, strict=True)
+            if np.isfinite(offset.late_s)
+        }
+        worst = max(late, key=lambda name: abs(late[name]), default="")
+        if not worst or worst in given or abs(late[worst]) < _LATE_S:
+            break
+        # One camera at a time, the worst first, because those that are right look late beside it.
+        offset_s[worst] = round(offset_s[worst] + late[worst], 3)
+        shift_ns = round(late[worst] * NS_PER_S)
+        sources = [one._replace(t_ns=one.t_ns - shift_ns) if one.view.name == worst else one for one in sources]
+    return gathered, replace(fuser, views=views), offsets, offset_s, shared
+
+
+def warn_disagreeing(
+    views: Sequence[CameraView],
+    offsets: Sequence[Offset],
+    offset_s: Mapping[str, float],
+    given: Mapping[str, float],
+) -> None:
+    """Warn of cameras that disagree with the others."""
+    for view, offset in zip(views, offsets, strict=True):
+        name, taken_s = view.name, offset_s[view.name]
+        if offset.compared >= _LEAST and offset.distance_m > _FAR_M:
+            warn(
+                f"{name}: feet stand {offset.distance_m:.2f} m from where the other cameras see them (median of "
+                f"{offset.compared}); its ground plane, or theirs, is not right",
+                "cameras-disagree",
+            )
+        if taken_s and name not in given:
+            warn(
+                f"{name}: its times are {abs(taken_s):.2f} s {'late' if taken_s > 0 else 'early'}, as people who walk "
+                f"show; this is taken off (`clock_offset_s=` sets it, with 0 for none)",
+                "clock",
+            )
+        elif offset.late_s > _LATE_S or offset.late_s < -_LATE_S:
+            warn(
+                f"{name}: its times seem {abs(offset.late_s):.2f} s {'late' if offset.late_s > 0 else 'early'}, as "
+                "people who walk show",
+                "clock",
+            )
+        if len(views) > 1 and offset.compared < _LEAST:
+            warn(
+                f"{name}: only {offset.compared} of its boxes are near people seen by two other cameras, too few to "
+                "compare it with the others",
+                "other",
+            )
