@@ -130,7 +130,7 @@ def fake_runs(monkeypatch: pytest.MonkeyPatch, bad: str, error: BaseException) -
     """Let runs do nothing, but raise an error for one camera; returns the prefixes of those that are run."""
     seen: list[str] = []
 
-    def run(opened: object, prefix: str, *_: object) -> pipeline.Report:
+    def run(opened: object, prefix: str, *_: object, **__: object) -> pipeline.Report:
         seen.append(prefix)
         if prefix == bad:
             raise error
