@@ -7,7 +7,8 @@ predictor predicts.
 
 A folder has either a folder for each scene with detections (det.txt: frame,-1,x,y,w,h,score,... in pixels) and truth
 (gt.txt: frame id x y in metres), or folders world/ and gt/ with a file for each scene, both in metres. Homographies
-(SCENE.txt, with or without its underscores) bring detections to metres. Writes table.csv, curve.csv and curve.svg.
+(SCENE.txt, with or without its underscores) bring detections to metres. A folder with views of WILDTRACK gives two
+tables: each view by itself, and all of them fused (tools/wildtrack.py). Writes table.csv, curve.csv and curve.svg.
 Scores are motmetrics', by distance; ADE is the paper's: squared, in m^2.
 """
 
@@ -16,12 +17,17 @@ from __future__ import annotations
 import argparse
 import csv
 import itertools
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+import wildtrack
 
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, EvaluationResult, evaluate
 from mcaptrack.evaluation.metrics import summary
@@ -94,10 +100,11 @@ def _tracked(path: Path, homographies: Path, fps: float) -> list[Frame]:
     return [frame for (frame,) in Sample(start_ns=0, ground_planes=planes)(tracks)]
 
 
-def methods(predictor: str, profile: str) -> dict[str, Callable[[list[Frame]], Candidate]]:
-    """What is compared: from samples to tracks and forecasts."""
+def methods(predictor: str, profile: str, **protocol: float) -> dict[str, Callable[[list[Frame]], Candidate]]:
+    """What is compared: from samples to tracks and forecasts; ``protocol`` has options of predictions."""
 
-    predict = Predict(predictor=predictor)
+    given: dict[str, Any] = dict(protocol)
+    predict = Predict(predictor=predictor, **given)
 
     def sort(samples: list[Frame]) -> Candidate:
         return Candidate("SORT", None, samples, [frame for (frame,) in predict(samples)], "SORT")
@@ -115,7 +122,8 @@ def methods(predictor: str, profile: str) -> dict[str, Callable[[list[Frame]], C
 
     out = {"SORT": sort, "SORT + smoothing": smoothed}
     for name in ("paper", "authors", "default") if profile == "all" else (profile,):
-        options = replace(PROFILES[name], predictor=predictor) if name != "default" else PROFILES[name]
+        options = replace(PROFILES[name], **given)
+        options = replace(options, predictor=predictor) if name != "default" else options
         out[f"re-tracking, {name}, online"] = retrack(f"re-tracking, {name}, online", options, online=True)
         out[f"re-tracking, {name}"] = retrack(f"re-tracking, {name}", options, online=False)
     return out
@@ -148,32 +156,40 @@ def main() -> None:
     parser.add_argument("--profile", default="all", choices=("all", *PROFILES), help="whose re-tracking")
     parser.add_argument("-o", "--output", type=Path, default=Path("reproduced"))
     given = parser.parse_args()
-    members = list(scenes(given.folder, given.homographies, given.fps))
-    if not members:
-        parser.error(f"{given.folder} has neither world/ and gt/ nor SCENE/det.txt")
+    if wildtrack.is_wildtrack(given.folder):
+        print(wildtrack.NOTE)
+        groups, protocol = wildtrack.groups(given.folder), wildtrack.PROTOCOL
+    else:
+        groups, protocol = {"": list(scenes(given.folder, given.homographies, given.fps))}, {}
+    if not any(groups.values()):
+        parser.error(f"{given.folder} has neither world/ and gt/ nor SCENE/det.txt, nor views of WILDTRACK")
     given.output.mkdir(parents=True, exist_ok=True)
     curves: dict[str, Displacement] = {}
     table = [
         ["method", "gate_m", "IDF1", "MOTA", "IDSW", "FP", "FN", "recall_at_tau", "ADE_m2_at_tau", "ADE_m2_at_0.5"]
     ]
     print(
-        f"{'':30}{'gate':>6}{'IDF1':>7}{'MOTA':>7}{'IDSW':>7}{'FP':>7}{'FN':>7}{'recall':>8}{'ADE m²':>8}{'at 0.5':>8}"
+        f"{'':40}{'gate':>6}{'IDF1':>7}{'MOTA':>7}{'IDSW':>7}{'FP':>7}{'FN':>7}{'recall':>8}{'ADE m²':>8}{'at 0.5':>8}"
     )
-    for name, method in methods(given.predictor, given.profile).items():
-        began = time.process_time()
-        results = of_all(score(members, method))
-        for result in results:
-            forecast: list[object] = ["", "", ""]
-            if result.displacement is not None:
-                curves[name] = result.displacement
-                one = result.displacement.summary()
-                values = (one["recall"], one["ADE_squared_m2"], result.displacement.squared_at(0.5))
-                forecast = ["" if value is None else f"{value:.3f}" for value in values]
-            row = [name, result.gate, *line(result), *forecast]
-            table.append(row)
-            widths = (30, 6, 7, 7, 7, 7, 7, 8, 8, 8)
-            print(f"{name:30}" + "".join(f"{v!s:>{w}}" for v, w in zip(row[1:], widths[1:], strict=True)), flush=True)
-        print(f"{'':30}{time.process_time() - began:.1f} s with scoring")
+    for group, members in groups.items():
+        for method_name, method in methods(given.predictor, given.profile, **protocol).items():
+            began = time.process_time()
+            outcome = score(members, method)
+            for result in of_all(outcome) if not group else outcome.results:
+                name = method_name.replace("SORT", "ground") if result.sequence == wildtrack.FUSED else method_name
+                name = f"{result.sequence}: {name}" if group and result.sequence != "COMBINED" else name
+                forecast: list[object] = ["", "", ""]
+                if result.displacement is not None:
+                    curves[name] = result.displacement
+                    one = result.displacement.summary()
+                    values = (one["recall"], one["ADE_squared_m2"], result.displacement.squared_at(0.5))
+                    forecast = ["" if value is None else f"{value:.3f}" for value in values]
+                row = [name, result.gate, *line(result), *forecast]
+                table.append(row)
+                widths = (6, 7, 7, 7, 7, 7, 8, 8, 8)
+                cells = [f"{name:40}", *(f"{v!s:>{w}}" for v, w in zip(row[1:], widths, strict=True))]
+                print("".join(cells))
+            print(f"{'':40}{time.process_time() - began:.1f} s with scoring", flush=True)
     with (given.output / "table.csv").open("w", newline="") as file:
         csv.writer(file).writerows(table)
     with (given.output / "curve.csv").open("w", newline="") as file:
