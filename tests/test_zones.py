@@ -567,6 +567,22 @@ class TestRun:
         assert "zone moon, (900, 900) to (901, 901) m, is beyond all of /camera/tracks" in result.warnings[0].message
 
 
+def test_labels_of_zones_in_one_place_stand_below_each_other(finished, tmp_path):
+    from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+
+    box = [[10, 20], [50, 20], [50, 40], [10, 20]]
+    features = [feature(str(n), "Polygon", [box]) for n in range(3)] + [
+        feature("far", "Polygon", [[[10, 60], [50, 60], [50, 80]]])
+    ]
+    mcaptrack.zones(finished, zones=collection(*features, units="px"), output=tmp_path / "a.mcap")
+    with log.read(tmp_path / "a.mcap") as opened:
+        drawn = ImageAnnotations.FromString(next(iter(opened.messages("/camera/tracks/zones/view/image"))).payload)
+    texts = sorted((one.text[:3], one.position.x, one.position.y) for one in drawn.texts)
+    assert len({x for _, x, _ in texts[:3]}) == 1
+    assert np.diff([y for *_, y in texts[:3]]).tolist() == [15.0, 15.0]
+    assert texts[3][2] > texts[2][2]
+
+
 class TestDrawing:
     """The page itself was looked at in a browser; here are the numbers that it begins with."""
 

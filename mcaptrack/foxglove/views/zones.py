@@ -28,6 +28,10 @@ _ALPHA, _FILL = 0.875, 0.125
 _TEXT_PX: Final = 12.0
 #: The length of the arrow that points forward, as a share of the height of the picture, or of the line.
 _ARROW: Final = 0.04
+#: The width of a letter, and the distance of lines, in sizes of the text.
+_ASPECT, _SPACING = 0.55, 1.25
+#: A label is moved down by so many lines at most.
+_MOST_DOWN: Final = 12
 #: Zones with a point farther than this from the picture are not drawn.
 _FAR_PX: Final = 1e4
 
@@ -123,10 +127,15 @@ def on_pictures(
     for span, drawn in pictures.batches():
         t_ns = pictures.t_ns[span]
         which = np.searchsorted(since, t_ns, "right")
+        taken: list[Floats] = []
         for place, one in enumerate(zones):
             texts = np.array(captions.at(place, t_ns), object)
+            down_px: float | None = None  # the same in all pictures of a batch, so that labels don't jump
             for frame, rings in _seen(one, t_ns, which, planes, path, height_px):
-                _draw(drawn, frame, rings, one, texts, height_px)
+                if _is_drawn(rings):
+                    size, corner = _label_of(rings[0], height_px)
+                    down_px = _free_place(taken, corner, size, texts[frame]) if down_px is None else down_px
+                    _draw(drawn, frame, rings, one, texts, height_px, corner + np.array([0.0, down_px]), size)
         yield from pictures.numbered(span, drawn)
 
 
@@ -147,13 +156,48 @@ def _seen(
         yield np.array([frame]), [path.to_pictures(some, np.repeat(at, len(some)))[:, :2] for some in points]
 
 
-def _draw(
-    drawn: Annotations, frame: Ints, rings: Sequence[Floats], one: ZoneShape, texts: NDArray[Any], height_px: float
-) -> None:
-    """Draw a zone in some pictures; not where a part of it is behind the camera or far away."""
+def _is_drawn(rings: Sequence[Floats]) -> bool:
+    """Whether no part of a zone is behind the camera or far away."""
     points = np.concatenate(rings)
-    if not np.isfinite(points).all() or (np.abs(points) > _FAR_PX).any():
-        return
+    return bool(np.isfinite(points).all() and (np.abs(points) <= _FAR_PX).all())
+
+
+def _label_of(ring: Floats, height_px: float) -> tuple[float, Floats]:
+    """The size of the label of a zone, and where it begins (2,)."""
+    size = _TEXT_PX * max(1.0, height_px / 480)
+    within = np.clip(ring, 0.0, [2 * height_px, height_px])
+    return size, np.maximum(within.mean(axis=0) - [2.5 * size, 0.0], [2.0, size + 2.0])
+
+
+def _free_place(taken: list[Floats], corner: Floats, size: float, texts: NDArray[Any]) -> float:
+    """The distance in px by which a label is moved down, so that it doesn't cover others.
+
+    ``taken`` has where these begin and their widths, (3,) each; those of this label are added.
+    """
+    width = _ASPECT * size * max(map(len, texts.tolist()), default=1)
+    down, step = 0.0, _SPACING * size
+
+    def is_hidden() -> bool:
+        x, y = corner[0], corner[1] + down
+        return any(abs(y - b) < step and x < a + wide and a < x + width for a, b, wide in taken)
+
+    while is_hidden() and down < _MOST_DOWN * step:
+        down += step
+    taken.append(np.array([corner[0], corner[1] + down, width]))
+    return down
+
+
+def _draw(
+    drawn: Annotations,
+    frame: Ints,
+    rings: Sequence[Floats],
+    one: ZoneShape,
+    texts: NDArray[Any],
+    height_px: float,
+    corner: Floats,
+    size: float,
+) -> None:
+    """Draw a zone in some pictures, with a label of this size that begins at ``corner`` (2,)."""
     count = len(frame)
     rgb = np.broadcast_to(_LINE if one.zone.is_line else _ZONE, (count, 3))
     thickness = max(1.5, height_px / 240)
@@ -166,9 +210,6 @@ def _draw(
     fill = _FILL if len(rings) == 1 else 0.0
     for ring in () if one.zone.is_line else rings:
         drawn.loops(frame, np.broadcast_to(ring, (count, *ring.shape)), rgb, alpha, thickness, fill)
-    size = _TEXT_PX * max(1.0, height_px / 480)
-    within = np.clip(rings[0], 0.0, [2 * height_px, height_px])
-    corner = np.maximum(within.mean(axis=0) - [2.5 * size, 0.0], [2.0, size + 2.0])
     drawn.labels(frame, np.broadcast_to(corner, (count, 2)), texts[frame], rgb, size)
 
 
