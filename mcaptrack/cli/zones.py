@@ -88,7 +88,7 @@ def zones(
     from mcaptrack.fleet import find_logs
 
     if str(logs[0]) == _DRAW and len(logs) == 1 and not Path(_DRAW).exists():
-        raise McaptrackError("`zones draw` needs a log, as in: mcaptrack zones draw log.mcap")
+        raise McaptrackError("`zones draw` needs a log: name it after draw")
     if str(logs[0]) == _DRAW and len(logs) > 1:
         given = {"--zones": zones, "--topic": topic, "--margin-m": margin_m, "--max-gap-s": max_gap_s}
         given |= {"--sidecar": sidecar}

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack import log, pipeline
-from mcaptrack.errors import McaptrackError, call, list_names
+from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.foxglove import ANNOTATIONS, SCENE, views
 from mcaptrack.foxglove.messages import message_class
 from mcaptrack.geometry.arrays import Ints
@@ -150,7 +150,7 @@ def _drawing(opened: log.Log, prefix: str, topic: str, is_above: bool) -> ShownV
     if is_above and schema is not PREDICTIONS and not has_any(schema, frames, lambda rows: np.isfinite(rows["x_m"])):
         raise McaptrackError(
             f"{opened.path} has no pictures of {prefix}, and {topic} no positions in metres to show from above; "
-            f"{call('run', opened.path)} estimates them"
+            "with a ground plane, it has"
         )
     names = class_names(opened.channel(topic).metadata)
     path, _ = path_of(opened, prefix, tracks_topic(prefix))
