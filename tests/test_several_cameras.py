@@ -82,7 +82,9 @@ class TestAllCameras:
 
     def test_commands_take_the_scene_and_say_so(self, ran: tuple[Path, RunResult], tmp_path: Path) -> None:
         told = done("report", ran[0], "-o", tmp_path / "r.html").err
-        assert "/east, /labelled, /north, /south, /world: taking /world; --camera chooses another" in told
+        assert (
+            "several cameras, /east, /labelled, /north, /south, /world: taking /world; --camera chooses another" in told
+        )
 
     def test_the_command_prints_a_line_for_each_camera(self, ran: tuple[Path, RunResult]) -> None:
         told = done("run", ran[0], "--no-tables").err

@@ -16,7 +16,7 @@ import numpy as np
 from mcaptrack import log as logs
 from mcaptrack import notices, pipeline
 from mcaptrack.api.common import Notes, PathLike, Progress, as_location, log_output, no_progress, warnings_about
-from mcaptrack.api.several import Act, Done, EveryCamera, refuse_failed, together
+from mcaptrack.api.several import Act, CameraResult, Done, EveryCamera, refuse_failed, together
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation.zones import ZoneTotals
 from mcaptrack.files import is_same_file, publish_bytes, refuse_overwrite
@@ -32,37 +32,6 @@ from mcaptrack.transforms import FUSION, STAGES, Transform
 #: The value of a transform's option.
 Option = float | int | bool | str | None
 Mode = Literal["both", "offline", "online"]
-
-
-@dataclass(frozen=True)
-class CameraResult:
-    """The result for one of several cameras of a log, or for the scene that they are fused to.
-
-    Attributes
-    ----------
-    stages : tuple of str
-        The stages that ran, in order; empty if everything was up to date.
-    frames, rows, tracks : dict of str to int
-        Number of frames, rows and track ids by topic, of the channels that were made.
-    summary : mcaptrack.pipeline.Summary
-        What the log holds of it now, in numbers.
-    is_scene : bool
-        Whether it is a scene.
-
-    """
-
-    stages: tuple[str, ...]
-    frames: Mapping[str, int]
-    rows: Mapping[str, int]
-    tracks: Mapping[str, int]
-    summary: Summary
-    is_scene: bool
-
-    @classmethod
-    def of(cls, done: Done, summary: Summary) -> CameraResult:
-        """Return the result of what was done."""
-        report = done.report
-        return cls(tuple(report.stages), report.frames, report.rows, report.tracks, summary, done.is_scene)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish
 from mcaptrack.location import Location
 from mcaptrack.notices import warn
-from mcaptrack.pipeline import Report
+from mcaptrack.pipeline import Report, Summary
 from mcaptrack.pipeline.several import SCENE
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.sources.fixed_frame import BoxesRead
@@ -35,6 +35,37 @@ class Done:
     report: Report
     is_scene: bool = False
     failure: str = ""
+
+
+@dataclass(frozen=True)
+class CameraResult:
+    """The result for one of several cameras of a log, or for the scene that they are fused to.
+
+    Attributes
+    ----------
+    stages : tuple of str
+        The stages that ran, in order; empty if everything was up to date.
+    frames, rows, tracks : dict of str to int
+        Number of frames, rows and track ids by topic, of the channels that were made.
+    summary : mcaptrack.pipeline.Summary
+        What the log holds of it now, in numbers.
+    is_scene : bool
+        Whether it is a scene.
+
+    """
+
+    stages: tuple[str, ...]
+    frames: Mapping[str, int]
+    rows: Mapping[str, int]
+    tracks: Mapping[str, int]
+    summary: Summary
+    is_scene: bool
+
+    @classmethod
+    def of(cls, done: Done, summary: Summary) -> CameraResult:
+        """Return the result of what was done."""
+        report = done.report
+        return cls(tuple(report.stages), report.frames, report.rows, report.tracks, summary, done.is_scene)
 
 
 @dataclass

@@ -16,7 +16,7 @@ from mcaptrack.location import Location
 
 if TYPE_CHECKING:
     from mcaptrack import RunResult
-    from mcaptrack.api.running import CameraResult
+    from mcaptrack.api.several import CameraResult
     from mcaptrack.pipeline import Summary
 
 #: Runs stages on a log; takes the keywords output, sidecar, force and camera, and may take progress.

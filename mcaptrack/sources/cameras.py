@@ -90,8 +90,8 @@ def find_camera(opened: log.Log, name: str | None = None, topic: str | None = No
     if len(chosen) == 1:
         return chosen[0].prefix
     names = ", ".join(camera.prefix for camera in chosen)
-    kind = "cameras" if not any(camera.in_space for camera in chosen) else "sensors"
     scenes = list(scenes_of(opened))
+    kind = "sensors" if any(camera.in_space and camera.prefix not in scenes for camera in chosen) else "cameras"
     usual = scenes if len(scenes) == 1 else [one.prefix for one in chosen if f"/{DEFAULT_CAMERA}" in one.names]
     if not usual:
         raise McaptrackError(f"{opened.path} has several {kind}, {names}; choose one with `camera=`")
