@@ -18,7 +18,7 @@ import typer
 from mcaptrack.cli import common
 from mcaptrack.cli.chosen import Maker, configured, is_open, listed, options_of
 from mcaptrack.cli.command import settings_of
-from mcaptrack.cli.many import NAMES, PANEL, takes_many
+from mcaptrack.cli.many import NAMES, takes_many
 from mcaptrack.cli.running import in_order, run_on_logs
 from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.errors import McaptrackError
@@ -295,7 +295,6 @@ def run_all(
         bool,
         common.option(
             "--continue",
-            panel=PANEL,
             help="The logs follow one another, in this order, and are of one camera: people who are in the picture at "
             "a cut keep their ids. One log is done after the other.",
         ),
