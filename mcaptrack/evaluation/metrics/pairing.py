@@ -137,6 +137,17 @@ def pair_forecasts(ground_truth: Positions, tracks: Positions, forecasts: Foreca
     Returns
     -------
     PairedForecasts
+
+    Examples
+    --------
+    A person walks 0.4 m at each step; the forecast made at step 4 says that they stop:
+
+    >>> import numpy as np
+    >>> walk = Positions(np.arange(8), np.ones(8, int), np.stack([0.4 * np.arange(8), np.zeros(8)], axis=1))
+    >>> stop = Forecasts(np.array([4]), np.array([1]), np.full((1, 3, 2), [1.6, 0.0]), np.tile(np.eye(2), (1, 3, 1, 1)))
+    >>> found = pair_forecasts(walk, walk, stop)
+    >>> found.forecast.tolist(), found.person.tolist(), found.offset_m[0, :, 0].round(1).tolist()
+    ([0], [1], [-0.4, -0.8, -1.2])
     """
     horizon = forecasts.mean_m.shape[1]
     people, paths = _sorted_positions(ground_truth, fill=False), _sorted_positions(tracks, fill=True)
