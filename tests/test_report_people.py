@@ -26,11 +26,12 @@ from mcaptrack.schema import Frame
 from mcaptrack.viewing.linked_report import is_about, with_links
 from mcaptrack.viewing.report import LogReport, gather, page
 from mcaptrack.viewing.report import _comparison as comparison
+from mcaptrack.viewing.report.charts import Line
 from mcaptrack.viewing.report.contents import TrackSet
 from mcaptrack.viewing.report.doubts import find_doubts
 from mcaptrack.viewing.report.figures import identity_events
 from mcaptrack.viewing.report.identity_events import summarize_events
-from mcaptrack.viewing.report.identity_timeline import counts_over_time, identity_timeline, pieces
+from mcaptrack.viewing.report.identity_timeline import counts_over_time, identity_timeline, mean_numbers, pieces
 from mcaptrack.viewing.report.scene_map import heat_map
 from tests.worlds import crossing_tracks, ns, tracks_at, walk, write_eventful
 
@@ -236,6 +237,25 @@ def test_people_over_time_keep_their_mean(counts):
     assert 0 <= found.min() <= found.max() <= max(counts)
     if len(counts) <= 160:
         assert found.tolist() == counts
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "words"),
+    [
+        (0, 9, "On average: tracker 4.0, ground truth 8.0."),
+        (
+            5,
+            9,
+            "On average, from 5.0 to 9.0 seconds: tracker 8.0, ground truth 8.0.",
+        ),  # nobody is counted as missing before
+        (0, 4, "On average, from 0.0 to 4.0 seconds: tracker 0.0, ground truth 8.0."),
+        (20, 30, "On average, each while it is there: tracker 4.0, ground truth 8.0."),
+    ],
+)
+def test_mean_numbers_are_of_the_time_that_both_have(first, last, words):
+    tracker = Line("tracker", "tracks", np.arange(10.0), np.repeat([0.0, 8.0], 5))
+    truth = Line("ground truth", "truth", np.arange(first, last + 1.0), np.full(last + 1 - first, 8.0))
+    assert mean_numbers([tracker, truth], "seconds") == words
 
 
 def test_all_logs_together_have_the_people_of_all(told):

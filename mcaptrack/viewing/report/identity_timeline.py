@@ -182,12 +182,25 @@ def people_over_time(report: LogReport) -> dict[str, Any] | None:
         Axis(f"{unit} since the start", span_s / scale),
         Axis(f"{noun} at a time", round_most(line.y for line in lines)),
     )
-    means = ", ".join(f"{line.name} {number(float(line.y.mean()), 1)}" for line in lines)
     return {
         "chart": line_chart(f"{noun} over time".capitalize(), lines, *axes),
         "title": f"{noun.capitalize()} over time.",
-        "caption": f"On average {means}.",
+        "caption": mean_numbers(lines, unit),
     }
+
+
+def mean_numbers(lines: Sequence[Line], unit: str) -> str:
+    """Mean numbers over the time that all lines cover: ground truth may begin later or end earlier than tracks."""
+    low, high = max(float(line.x[0]) for line in lines), min(float(line.x[-1]) for line in lines)
+    inside = [line.y[(low <= line.x) & (line.x <= high)] for line in lines]
+    if not all(map(len, inside)):
+        inside, when = [line.y for line in lines], ", each while it is there"
+    else:
+        least = 0.02 * (high - low)
+        is_whole = all(low - line.x[0] <= least and line.x[-1] - high <= least for line in lines)
+        when = "" if is_whole else f", from {number(low, 1)} to {number(high, 1)} {unit}"
+    means = ", ".join(f"{line.name} {number(float(y.mean()), 1)}" for line, y in zip(lines, inside, strict=True))
+    return f"On average{when}: {means}."
 
 
 def counts_over_time(frames: Sequence[Frame], start_ns: int, span_s: float) -> tuple[Floats, Floats]:
