@@ -404,8 +404,8 @@ def test_the_layout_plots_what_is_known(tmp_path):
         panels = json.loads(opened.attachment("mcaptrack.predictions.layout.json"))["configById"]
     assert panels["Plot!errors"]["foxglovePanelTitle"] == "Prediction errors (m), against ground truth"
     assert {curve["value"]: curve["label"] for curve in panels["Plot!errors"]["paths"]} == {
-        "/camera/predictions/scores.rows[:].ade_m": "ADE, SORT",
-        "/camera/predictions/scores.rows[:].fde_m": "FDE, SORT",
+        "/camera/predictions/scores.rows[:].ade_m": "ADE, tracker",
+        "/camera/predictions/scores.rows[:].fde_m": "FDE, tracker",
     }
     assert {curve["value"]: curve["label"] for curve in panels["Plot!spread"]["paths"]} == {
         "/camera/predictions/scores.rows[:].spread_mean_m": "mean (m)",

@@ -24,7 +24,7 @@ FILES: Final[Mapping[str, str]] = {
 _BEST: Final = ("retracks/full", "retracks", "tracks", "detections")
 #: The kinds of tracks that are compared: title, and channels of which the first that exists is shown.
 _KINDS: Final = (
-    ("SORT", ("tracks",)),
+    ("Tracker", ("tracks",)),
     ("Re-tracked", ("retracks/full", "retracks")),
     ("Truth", ("truth",)),
 )
@@ -187,7 +187,7 @@ def limit_of(highest: float | None, is_count: bool = False) -> float | None:
 def _errors(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
     """Errors of forecasts: against ground truth, or without it against the later tracks."""
     front = "" if camera.is_truth_known else "later_"
-    labels = {"retracks/predictions": "re-tracked", "predictions": "SORT"}
+    labels = {"retracks/predictions": "re-tracked", "predictions": "tracker"}
     paths = {
         f"{camera.prefix}/{name}/scores.rows[:].{front}{measure.lower()}_m": f"{measure}, {label}"
         for measure in ("ADE", "FDE")
@@ -239,8 +239,7 @@ def _recorded(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
 
 def _plots(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
     """The number of people, or of objects, if it is counted; otherwise their positions."""
-    tracked = "tracker" if camera.recorded else "SORT"
-    labels = {"tracks": tracked, "retracks": "re-tracked", "retracks/full": "re-tracked", "truth": "truth"}
+    labels = {"tracks": "tracker", "retracks": "re-tracked", "retracks/full": "re-tracked", "truth": "truth"}
     counted = {
         f"{camera.prefix}/{name}/counts.rows[:].tracked": label
         for name, label in labels.items()
