@@ -167,6 +167,15 @@ def is_same_file(one: Location, other: Location) -> bool:
     return one.exists() and other.exists() and one.samefile(other)
 
 
+def read_beginning(path: Path, count: int) -> bytes:
+    """Return the first bytes of a file, at most ``count``. Raises McaptrackError if it can't be read."""
+    try:
+        with path.open("rb") as stream:
+            return stream.read(count)
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+
+
 def refuse_special(path: Path) -> None:
     """Raise McaptrackError for a pipe, a device or a socket: reading one may never end."""
     try:

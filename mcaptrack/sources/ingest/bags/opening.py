@@ -7,7 +7,7 @@ from typing import Final
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import refuse_special
+from mcaptrack.files import read_beginning, refuse_special
 from mcaptrack.sources.ingest.bags.metadata_yaml import METADATA, holds_metadata
 from mcaptrack.sources.ingest.bags.recording import RecordingReader
 from mcaptrack.sources.ingest.bags.rosbag1 import Bag1
@@ -26,11 +26,7 @@ def open_recording(path: Path) -> RecordingReader | None:
     if path.is_dir():
         return _open_folder(path)
     refuse_special(path)
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(16)
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+    head = read_beginning(path, 16)
     if head.startswith(_ROS1):
         return Bag1(path)
     if head.startswith((_ZSTD, _MCAP, _SQLITE)):

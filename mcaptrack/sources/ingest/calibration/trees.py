@@ -12,7 +12,7 @@ from typing import Any, Final, NoReturn
 from xml.parsers import expat
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import refuse_special
+from mcaptrack.files import read_beginning, refuse_special
 from mcaptrack.sources.ingest.bags.plain_yaml import Scalar, UnsupportedYamlError, load
 
 #: The root of OpenCV's XML.
@@ -37,11 +37,7 @@ def is_calibration(path: Path) -> bool:
     refuse_special(path)
     if path.is_dir() or path.suffix.lower() not in (".xml", ".yaml", ".yml", ".json", ".txt", ""):
         return False
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(_BEGIN)
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+    head = read_beginning(path, _BEGIN)
     return b"\0" not in head and _WORDS.search(head) is not None
 
 
@@ -51,11 +47,7 @@ def read_tree(path: Path) -> dict[str, Any]:
     Raises McaptrackError if it is none, or too large.
     """
     refuse_special(path)
-    try:
-        with path.open("rb") as stream:
-            data = stream.read(_MAX_BYTES + 1)
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+    data = read_beginning(path, _MAX_BYTES + 1)
     if len(data) > _MAX_BYTES:
         raise McaptrackError(f"{path} has more than {_MAX_BYTES} bytes; a calibration is a small file")
     if not data.strip():

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import IO, Final
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import refuse_special
+from mcaptrack.files import read_beginning, refuse_special
 
 _ZIP: Final = b"PK\x03\x04"
 #: A zip file without members.
@@ -25,11 +25,7 @@ _SHOWN: Final = 5
 def is_cvat(path: Path) -> bool:
     """Whether a file is XML, or a zip file: of label files, only those of CVAT are."""
     refuse_special(path)
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(4096)
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+    head = read_beginning(path, 4096)
     return head.startswith((_ZIP, _EMPTY_ZIP)) or head.removeprefix(b"\xef\xbb\xbf").lstrip()[:1] == b"<"
 
 

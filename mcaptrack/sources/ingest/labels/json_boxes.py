@@ -16,7 +16,7 @@ from typing import Any, Final, NoReturn
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import refuse_special
+from mcaptrack.files import read_beginning, refuse_special
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows, FrameNames, numbers_of_names
 from mcaptrack.sources.ingest.labels.delimited import read_rows
@@ -39,11 +39,7 @@ _COLUMNS: Final = 10
 def is_json(path: Path) -> bool:
     """Whether the first character of a file is that of a JSON list or object."""
     refuse_special(path)
-    try:
-        with path.open("rb") as stream:
-            return stream.read(4096).removeprefix(b"\xef\xbb\xbf").lstrip()[:1] in (b"{", b"[")
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+    return read_beginning(path, 4096).removeprefix(b"\xef\xbb\xbf").lstrip()[:1] in (b"{", b"[")
 
 
 def load_json(path: Path) -> Any:
