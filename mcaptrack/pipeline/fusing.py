@@ -16,7 +16,6 @@ from mcaptrack.notices import collected, warn
 from mcaptrack.pipeline.checks import describe_origin, may_replace
 from mcaptrack.pipeline.gathering import (
     compared_cameras,
-    detections_of,
     frame_of_plane,
     frames_in_words,
     read_sources,
@@ -30,7 +29,7 @@ from mcaptrack.pipeline.write import Made, write
 from mcaptrack.schema import DETECTIONS, SIGHTINGS, Schema
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.provenance import FUSE, Provenance
-from mcaptrack.sources.cameras import Camera, cameras, provenance_of, scenes_of
+from mcaptrack.sources.cameras import Camera, cameras, detections_of, provenance_of, scenes_of
 from mcaptrack.transforms import FUSION, STAGES, Transform
 from mcaptrack.transforms.fuse import FootFuser
 from mcaptrack.transforms.guarded import guarded

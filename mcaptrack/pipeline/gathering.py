@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import islice
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -21,11 +20,10 @@ from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import read_named_frames
 from mcaptrack.pipeline.planes import read_planes
 from mcaptrack.pipeline.write import digest_of
-from mcaptrack.schema import BOX_PX, DETECTIONS, SIGHTINGS, Frame
+from mcaptrack.schema import DETECTIONS, SIGHTINGS, Frame
 from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import frame_id_of
-from mcaptrack.sources.cameras import Camera
-from mcaptrack.transforms import STAGES
+from mcaptrack.sources.cameras import Camera, detections_of
 from mcaptrack.transforms.fuse import CameraView, FootFuser, Offset, Shared, compare
 
 #: The frame of the metres, if the ground planes name none.
@@ -102,12 +100,6 @@ def _nearest(t_ns: Ints, at_ns: Ints) -> Ints:
     return out
 
 
-def detections_of(opened: log.Log, camera: Camera) -> str | None:
-    """The topic of a camera's detections; None if it has none, or no unique one."""
-    usual = f"{camera.prefix}/{STAGES['detect'].output_topic}"
-    return usual if usual in opened.channels else camera.boxes
-
-
 def frame_of_plane(opened: log.Log, camera: Camera) -> str:
     """The frame of the metres of a camera's ground plane."""
     return frame_id_of(opened.channels[camera.ground_plane].metadata) or _FRAME
@@ -146,9 +138,7 @@ def read_sources(
                 )
         frames_of[name] = frame_of_plane(opened, camera)
         view = CameraView(name=name, planes=tuple(read_planes(opened, camera.prefix) or ()))
-        boxes = [columns_to_boxes(frame.rows) for frame in islice(iter(found.frames), _COMPARED)]
-        joined = np.concatenate([part for part in boxes if len(part)] or [np.empty((0, len(BOX_PX)))])
-        view = view.with_heights(joined[np.isfinite(joined).all(axis=1)])
+        view = view.with_heights_in(found.frames)
         t_ns = frame_times(found.frames)
         offset_ns = round(clock_offset_s.get(name, 0.0) * NS_PER_S)
         sources.append(Source(topic, found.frames, t_ns - offset_ns, view))

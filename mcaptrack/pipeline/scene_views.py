@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from typing import Final
 
 import numpy as np
@@ -27,14 +26,12 @@ from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.framing import JoinedFrames, frame_numbers, frame_times, joined_parts
 from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.schema.provenance import FUSE, Provenance
-from mcaptrack.sources.cameras import camera_at, provenance_of
+from mcaptrack.sources.cameras import camera_at, detections_of, provenance_of
 from mcaptrack.transforms import STAGES
 from mcaptrack.transforms.fuse import CameraView
 
 #: A track is at a detection of its time if it is at most so far away.
 _AT_M: Final = 1.0
-#: The height of boxes at a place follows from those of so many frames.
-_HEIGHTS: Final = 3000
 #: Boxes that a camera doesn't have are drawn if so much of their height and width is in the picture.
 _INSIDE: Final = 0.5
 
@@ -162,15 +159,12 @@ def scene_on_pictures(
     for number, (name, late_s) in enumerate(offsets.items()):
         camera = camera_at(opened, f"/{name}")
         clock = picture_clock(opened, camera.prefix, {})
-        topic = f"{camera.prefix}/{STAGES['detect'].output_topic}"
-        topic = topic if topic in opened.channels else camera.boxes or ""
-        if clock.topic is None or not {topic, camera.ground_plane} <= opened.channels.keys():
+        topic = detections_of(opened, camera)
+        if clock.topic is None or topic is None or camera.ground_plane not in opened.channels:
             continue
         planes = [(one.t_ns, rows_to_plane(one.rows)) for one in opened.frames(camera.ground_plane, GROUND_PLANE)]
         boxes = read_frames(opened, topic, DETECTIONS)
-        some = [columns_to_boxes(frame.rows) for frame in islice(iter(boxes), _HEIGHTS)]
-        joined = np.concatenate([np.empty((0, 4)), *some])
-        view = CameraView(name=name, planes=tuple(planes)).with_heights(joined[np.isfinite(joined).all(axis=1)])
+        view = CameraView(name=name, planes=tuple(planes)).with_heights_in(boxes)
         found.append(SceneCamera(number, clock, view, boxes, seconds_to_ns(late_s)))
     if not found:
         return SceneOnPictures((), (), ())

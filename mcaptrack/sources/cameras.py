@@ -137,6 +137,12 @@ def has_own_channels(opened: log.Log, camera: Camera) -> bool:
     return any(Provenance.from_metadata(opened.channels[topic].metadata) for topic in camera.topics)
 
 
+def detections_of(opened: log.Log, camera: Camera) -> str | None:
+    """Return the topic of a camera's detections; None if it has none, or no unique one."""
+    usual = f"{camera.prefix}/{STAGES['detect'].output_topic}"
+    return usual if usual in opened.channels else camera.boxes
+
+
 def scenes_of(opened: log.Log) -> tuple[str, ...]:
     """Return the prefixes of the scenes that several cameras were fused to."""
     target = STAGES["detect"].output_topic

@@ -30,13 +30,13 @@ from mcaptrack.sources.foreign.flatten import message_decoder
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import write_clip
 from mcaptrack.transforms import FULL
-from mcaptrack.viewing import from_above
 from mcaptrack.viewing.names import tracker_name
 from mcaptrack.viewing.rendering import (
     RenderOptions,
     SceneDrawing,
     at_times,
     draw,
+    empty_ground,
     pictures_of_video,
     rate_of,
     scaled,
@@ -188,9 +188,7 @@ def _from_above(
     width = _panel_width(options, _WIDTH_PX // 2, len(panels))
     seen = sights(scenes_of(opened, panels[1].view, span), width, path, len(times))
     for number, (t_ns, sight) in enumerate(zip(times.tolist(), seen, strict=True)):
-        plain = draw(from_above.ground(sight), from_above.grid(sight))
-        if path is not None:
-            plain = draw(plain, from_above.robot(sight, path.at_m[number], float(path.heading_rad[number])))
+        plain = empty_ground(sight, path, number)
         yield t_ns, [one.drawn(plain.copy(), t_ns, sight) for one in drawn]
 
 
@@ -208,8 +206,7 @@ class _Ground:
 
     def at(self, t_ns: int) -> Image:
         """The picture at a time, for rising times."""
-        plain = draw(from_above.ground(self._sight), from_above.grid(self._sight))
-        return self._drawing.drawn(plain, t_ns, self._sight)
+        return self._drawing.drawn(empty_ground(self._sight), t_ns, self._sight)
 
 
 def _happened(opened: log.Log, panel: Panel, start_ns: int) -> _Happened:

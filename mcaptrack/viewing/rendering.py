@@ -163,10 +163,7 @@ def render_from_above(
     def drawn() -> Iterator[tuple[int, Image]]:
         drawing = SceneDrawing(opened, view_topics, span)
         for done, (t_ns, sight) in enumerate(zip(chosen.tolist(), seen, strict=True), 1):
-            image = draw(from_above.ground(sight), from_above.grid(sight))
-            if path is not None:
-                image = draw(image, from_above.robot(sight, path.at_m[done - 1], float(path.heading_rad[done - 1])))
-            yield t_ns, drawing.drawn(image, t_ns, sight)
+            yield t_ns, drawing.drawn(empty_ground(sight, path, done - 1), t_ns, sight)
             progress("render", done, len(chosen))
 
     return write_clip(output, drawn(), rate_of(chosen))
@@ -179,6 +176,14 @@ def scene_times(opened: log.Log, topic: str, output: Path, options: RenderOption
     if not len(times):
         raise McaptrackError(f"{opened.path}: {topic} has no scenes")
     return times[chosen_pictures(opened, times, "scenes", output, options)]
+
+
+def empty_ground(sight: Sight, path: RobotPath | None = None, number: int = 0) -> Image:
+    """The ground seen from above, with its grid, and with the robot at the time of a picture of its path."""
+    image = draw(from_above.ground(sight), from_above.grid(sight))
+    if path is None:
+        return image
+    return draw(image, from_above.robot(sight, path.at_m[number], float(path.heading_rad[number])))
 
 
 def scenes_of(opened: log.Log, topic: str, span: tuple[int, int]) -> Iterator[Any]:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import ClassVar, Final, Self
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats
+from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.plane import GroundPlane, Planes, plane_at
+from mcaptrack.schema import BOX_PX, Frame
 from mcaptrack.transforms.fuse.grouping import Places
 
-#: Heights of boxes are modelled if there are so many.
+#: Heights of boxes are modelled by those of so many frames, if there are so many boxes.
+_MOST_FRAMES: Final = 3000
 _LEAST_BOXES: Final = 20
 #: Steps of the robust fit of heights, and the relative error above which boxes count less.
 _STEPS, _ERROR = 8, 0.05
@@ -46,6 +50,12 @@ class CameraView:
 
     #: The usual width of a standing person, as a share of the height.
     width: ClassVar[float] = 0.4
+
+    def with_heights_in(self, frames: Iterable[Frame]) -> Self:
+        """The same camera with heights as in the boxes of the first of its frames of detections."""
+        boxes = [columns_to_boxes(frame.rows) for frame in islice(frames, _MOST_FRAMES)]
+        joined = np.concatenate([np.empty((0, len(BOX_PX))), *boxes])
+        return self.with_heights(joined[np.isfinite(joined).all(axis=1)])
 
     def with_heights(self, xywh: Floats) -> Self:
         """The same camera with heights as in these boxes (N, 4)."""
