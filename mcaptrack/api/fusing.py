@@ -9,7 +9,7 @@ from typing import Final
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import Notes, PathLike, Progress, no_progress
+from mcaptrack.api.common import Notes, PathLike, Progress, no_progress, split_names
 from mcaptrack.api.running import RunResult, Where, change, transform_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.fixed_frame import BoxesRead
@@ -103,8 +103,7 @@ def fuse(
     ('/world/detections', '/world/detections/sightings')
 
     """
-    names = cameras.split(",") if isinstance(cameras, str) else list(cameras or ())
-    names = [name.strip() for name in names]
+    names = split_names("cameras", cameras if isinstance(cameras, str) else cameras or None)
     values = dict(zip(_OPTIONS, (max_sigma, max_distance_m, min_score, noise, noise_m), strict=True))
     changed = {name: value for name, value in values.items() if value != getattr(FootFuser, name)}
     chosen = transform_of(FUSION.name, fuser, changed)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime as dt
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -19,6 +18,7 @@ from mcaptrack.api.common import (
     log_output,
     no_progress,
     optional_path,
+    paths_of,
     warn_unused,
     warnings_about,
 )
@@ -214,7 +214,7 @@ def ingest(
         quality=quality,
         keyframe_interval_s=keyframe_interval_s,
         ground_plane=optional_path(ground_plane),
-        calibration=tuple(as_path(one) for one in _each(calibration)),
+        calibration=() if calibration is None else tuple(paths_of(calibration)),
         calibration_name=calibration_name,
         calibration_unit=calibration_unit,
         point=point,
@@ -287,13 +287,6 @@ def _changes(path: Path, report: IngestReport) -> dict[str, Any] | None:
         return None
     report.remarks.append(f"{topic}: {found.words}; {call('run', path)} takes it over")
     return found.to_json()
-
-
-def _each(paths: PathLike | Sequence[PathLike] | None) -> Sequence[PathLike]:
-    """Return a path, or several, as a sequence."""
-    if paths is None:
-        return ()
-    return (paths,) if isinstance(paths, str | os.PathLike) else tuple(paths)
 
 
 def default_log(source: Path) -> Path:

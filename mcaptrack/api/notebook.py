@@ -99,7 +99,13 @@ class Player:
     @property
     def caption(self) -> str:
         """The pictures and their number, in a line."""
-        return _caption(self)
+        shown = f"{self.topic.removesuffix(SCENE_SUFFIX)} from above" if self.is_above else self.topic
+        if self.pictures == self.of == 1:
+            return f"{shown} at {self.first_s:.2f} s"
+        step = "" if self.every == 1 else f" (every {_ordinal(self.every)})"
+        count = f"all {self.of:,}" if self.pictures == self.of else f"{self.pictures:,} of {self.of:,}"
+        what = "scenes" if self.is_above else "pictures"
+        return f"{shown}, {self.first_s:.1f} to {self.last_s:.1f} s: {count} {what}{step}"
 
     def save(self, path: PathLike, *, force: bool = False) -> Path:
         """Write it as a page that needs no other file.
@@ -245,18 +251,6 @@ def _player(opened: logs.Log, source: PictureSource, choice: Choice, max_mb: flo
                 f"`max_mb={max_mb:g}` is the limit; give a larger `every=`, a smaller `width=` or a shorter period"
             )
         taken, every = taken.half(), 2 * every
-
-
-def _caption(player: Player) -> str:
-    """Describe the contents of a player in a line."""
-    shown = f"{player.topic.removesuffix(SCENE_SUFFIX)} from above" if player.is_above else player.topic
-    if player.pictures == player.of == 1:
-        return f"{shown} at {player.first_s:.2f} s"
-    step = "" if player.every == 1 else f" (every {_ordinal(player.every)})"
-    is_all = player.pictures == player.of
-    count = f"all {player.of:,}" if is_all else f"{player.pictures:,} of {player.of:,}"
-    what = "scenes" if player.is_above else "pictures"
-    return f"{shown}, {player.first_s:.1f} to {player.last_s:.1f} s: {count} {what}{step}"
 
 
 def _ordinal(number: int) -> str:

@@ -134,8 +134,7 @@ def _print(result: RunResult, shows_events: bool, talk: common.Talk) -> None:
         (talk.say if shows_events else talk.detail)(f"{topic}: {words}")
     if result.tables:
         talk.detail(f"{result.log}: {', '.join(f'{name} {rows}' for name, rows in result.tables.items())}")
-    did = f"{', '.join(dict.fromkeys(result.stages))} in {result.seconds:.1f} s" if result.stages else _UP_TO_DATE
-    talk.say(f"{result.log}: {did}")
+    talk.say(f"{result.log}: {_did(result)}")
     is_run = result.summary is not None or result.cameras
     lines = [*_lines_of_run(result)] if is_run else [*_lines_of_stage(result)]
     if result.stages and (slow := _slow_parts(result)):
@@ -148,6 +147,11 @@ def _print(result: RunResult, shows_events: bool, talk: common.Talk) -> None:
         talk.say(f"  {name:<{width}}  {words}")
 
 
+def _did(result: RunResult) -> str:
+    """Return the stages that ran, and how long they took."""
+    return f"{', '.join(dict.fromkeys(result.stages))} in {result.seconds:.1f} s" if result.stages else _UP_TO_DATE
+
+
 def _slow_parts(result: RunResult) -> str:
     """Return how long the slow parts of a run took, the slowest first; "" for a run of less than a second."""
     if result.seconds < 1:
@@ -158,8 +162,7 @@ def _slow_parts(result: RunResult) -> str:
 
 def _line_of(result: RunResult, shows_events: bool) -> str:
     """Return the result for one of many logs in one line."""
-    did = f"{', '.join(dict.fromkeys(result.stages))} in {result.seconds:.1f} s"
-    words = [did if result.stages else _UP_TO_DATE]
+    words = [_did(result)]
     if result.cameras:
         words.append(f"{sum(not one.is_scene for one in result.cameras.values())} cameras")
     if shows_events:

@@ -143,15 +143,11 @@ def default_of(field: Field[Any]) -> Any:
 
 def shown_default(default: Any) -> str:
     """Return a default as text for the help."""
+    if default is None or default in ("", ()):
+        return "none"
     if isinstance(default, tuple):
-        return " ".join(map(str, default)) or "none"
-    return (
-        "none"
-        if default is None or default == ""
-        else str(default).lower()
-        if isinstance(default, bool)
-        else f"{default}"
-    )
+        return " ".join(map(str, default))
+    return str(default).lower() if isinstance(default, bool) else f"{default}"
 
 
 def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:

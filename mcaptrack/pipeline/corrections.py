@@ -47,11 +47,12 @@ def without_filled_in(opened: log.Log, prefix: str, source: str, frames: Sequenc
 
 def is_of_corrections(opened: log.Log, prefix: str, made: Provenance) -> bool:
     """Whether samples are out of date because corrections of their tracks are new, changed or gone."""
+    if made.transform != _STAGE:
+        return False
     ending = f"/{CORRECTED}"
     then = {topic: digest for topic, digest in made.references.items() if topic.endswith(ending)}
-    found = corrections_of(opened, camera_at(opened, prefix).prefix, made.input) if made.transform == _STAGE else None
-    now = {found: digest_of(opened, found)} if found is not None else {}
-    return made.transform == _STAGE and then != now
+    found = corrections_of(opened, camera_at(opened, prefix).prefix, made.input)
+    return then != ({} if found is None else {found: digest_of(opened, found)})
 
 
 def fixed_in(opened: log.Log, prefix: str, source: str, made: Mapping[str, Made]) -> tuple[int, ...]:

@@ -117,12 +117,10 @@ class Before:
                 f"{opened.path} is of the camera {prefix[1:]}, and {before.path} is of "
                 f"{', '.join(sorted(there)) or 'none'}; ids go on from one recording of a camera to the next"
             )
-        made = provenance_of(before, self.tracks)
+        made, again = provenance_of(before, self.tracks), call("run", before.path)
         if made is None or not _is_tracker(made) or not before.channels[self.tracks].messages:
-            again = call("run", before.path)
             raise McaptrackError(f"{before.path} has no tracks that ids could go on from; {again} makes them")
         if is_stale(before, self.tracks):
-            again = call("run", before.path)
             raise McaptrackError(f"{before.path}: {self.tracks} is out of date; {again} brings it up to date")
         own = provenance_of(opened, self.tracks)
         if self.tracks in opened.channels and (own is None or not _is_tracker(own)):
@@ -164,10 +162,6 @@ class Before:
         channel = self._log.channels.get(topic)
         return channel is not None and channel.schema_name == schema.name and channel.messages > 0
 
-    def _main(self, job: Job) -> str:
-        """The topic of the log before that corresponds to the output of a job; "" if it has none."""
-        return job.target if self._has(job.target, TRACKS) else ""
-
     def renewed(self, opened: log.Log) -> set[str]:
         """The channels of ids that were not made as the continuation of this log, and have to be made again."""
         made = provenance_of(opened, self.tracks)
@@ -203,7 +197,7 @@ class Before:
         if not _is_led(job):
             return [*outputs], {}
         schemas, topics = list(job.transform.writes.values()), list(job.outputs())
-        if not _gives_ids(job) or not self._main(job):
+        if not _gives_ids(job) or not self._has(job.target, TRACKS):
             return [self._kept(schema, one, None) for schema, one in zip(schemas, outputs, strict=True)], {}
         last_id = self._last_id(job)
         maps: dict[str, dict[int, int]] = {}

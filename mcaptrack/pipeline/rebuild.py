@@ -95,10 +95,9 @@ def fuser_of(made: Provenance, known: Transform | None = None) -> tuple[Transfor
     ``known`` is the one that the user names, if any.
     """
     parameters = {name: value for name, value in made.parameters.items() if name not in _FINDINGS}
+    named = {} if known is None else {FUSION.name: known}
     try:
-        return rebuild(
-            FUSION, replace(made, parameters=parameters), {} if known is None else {FUSION.name: known}
-        ), None
+        return rebuild(FUSION, replace(made, parameters=parameters), named), None
     except McaptrackError as error:
         return None, error
 

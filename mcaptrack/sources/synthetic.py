@@ -192,18 +192,18 @@ class SyntheticScene:
         shade = 150 + self.contrast * rough
         tinted = np.repeat(shade[:, :, None], 3, axis=2) + np.array([-6, 0, 4])
         image: Image = np.clip(tinted, 0, 255).astype(np.uint8)
+        if self.pose is not None:
+            self._lines(image, self.pose)
+            return image
         lines = [((x, 2.0), (x, 40.0)) for x in np.arange(-20, 21, 2.0)] + [
             ((-20.0, y), (20.0, y)) for y in np.arange(2, 40, 2.0)
         ]
-        if self.pose is not None:
-            self._lines(image)
-            return image
         for (x0, y0), (x1, y1) in lines:
             start, end = self._project(np.array([[x0, y0, 0.0], [x1, y1, 0.0]])).round().astype(int).tolist()
             cv2.line(image, start, end, (128, 134, 136), 1, cv2.LINE_AA)
         return image
 
-    def _lines(self, image: Image) -> None:
+    def _lines(self, image: Image, pose: Pose) -> None:
         """Draw the lines of the paving that are before a camera that stands anywhere."""
         import cv2
 
@@ -214,8 +214,7 @@ class SyntheticScene:
                 np.column_stack([np.full_like(along, at), along]),
             ):
                 points = np.column_stack([line, np.zeros(len(line))])
-                ahead = points if self.pose is None else self.pose.seen(points)
-                pixels = self._project(points[ahead[:, 1] > 2.0]).round().astype(np.int32)
+                pixels = self._project(points[pose.seen(points)[:, 1] > 2.0]).round().astype(np.int32)
                 if len(pixels) > 1:
                     cv2.polylines(image, [pixels[:, None]], False, (128, 134, 136), 1, cv2.LINE_AA)
 

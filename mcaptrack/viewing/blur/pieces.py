@@ -36,7 +36,7 @@ class Pieces(NamedTuple):
     def at(self, at_ns: Ints) -> tuple[Ints, Floats, Floats]:
         """The states at rising times (M,): the index of the time of each, (N, D), and for how long nothing was seen, s.
 
-        They are in the order of the times.
+        They are in the order of the pieces.
         """
         if not len(at_ns):
             return np.empty(0, np.int64), self.first[:0], np.empty(0)
@@ -49,8 +49,7 @@ class Pieces(NamedTuple):
         states = start[of] + share[:, None] * (stop - start)[of]
         since = np.where(self.is_row[0][near][of], t_ns - begin[of], np.inf)
         until = np.where(self.is_row[1][near][of], end[of] - t_ns, np.inf)
-        order = np.argsort(place, kind="stable")
-        return place[order], states[order], (np.minimum(since, until) / NS_PER_S)[order]
+        return place, states, np.minimum(since, until) / NS_PER_S
 
 
 def joined(parts: Sequence[Pieces], width: int) -> Pieces:
