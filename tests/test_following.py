@@ -38,23 +38,30 @@ def places() -> np.ndarray:
 PLACES = places()
 
 
-def lines(first: int, last: int) -> str:
+def lines(first: int, last: int, places: np.ndarray) -> str:
     """Detections of these frames as a label file, each of a person."""
     rng = np.random.default_rng(3)
-    shake = rng.normal(0, 0.4, PLACES.shape)
+    shake = rng.normal(0, 0.4, places.shape)
     rows = [
         f"{frame - first + 1},-1,{x - 12:.2f},{y - 60:.2f},24,60,0.9,-1,-1,-1"
         for frame in range(first, last)
-        for x, y in (PLACES[frame] + shake[frame]).tolist()
+        for x, y in (places[frame] + shake[frame]).tolist()
         if np.isfinite(x)
     ]
     return "\n".join(rows) + "\n"
 
 
-def part(path: Path, first: int, last: int, start_s: float | None = None, camera: str = "camera") -> Path:
+def part(
+    path: Path,
+    first: int,
+    last: int,
+    start_s: float | None = None,
+    camera: str = "camera",
+    places: np.ndarray = PLACES,
+) -> Path:
     """A log of the detections of these frames, at their times in the whole recording."""
     label = path.with_suffix(".txt")
-    label.write_text(lines(first, last))
+    label.write_text(lines(first, last, places))
     plane = path.with_name("plane.csv")
     plane.write_text(PLANE)
     mcaptrack.ingest(
@@ -206,3 +213,21 @@ def test_over_a_missing_recording_no_id_is_taken_over_and_none_is_used_twice(par
             ids = after.rows(f"/camera/{name}", TRACKS).rows["track_id"]
             known = before.rows(f"/camera/{name}", TRACKS).rows["track_id"].max()
         assert ids.min() > (known if name == "tracks" else largest)
+
+
+def test_an_id_of_a_log_further_back_is_not_used_again(tmp_path):
+    """Of four people one is in all recordings, two leave in the first, and one comes in the third."""
+    there = np.full((150, 4, 2), np.nan)
+    there[:, 0] = np.column_stack([np.linspace(100, 500, 150), np.full(150, 200.0)])
+    there[5:40, 1] = np.column_stack([np.linspace(500, 300, 35), np.full(35, 300.0)])
+    there[7:40, 3] = np.column_stack([np.linspace(200, 300, 33), np.full(33, 460.0)])
+    there[110:, 2] = np.column_stack([np.linspace(100, 300, 40), np.full(40, 400.0)])
+    paths = [part(tmp_path / f"{n}.mcap", 50 * n, 50 * n + 50, places=there) for n in range(3)]
+    ids = []
+    for path in paths:
+        mcaptrack.run(path, follows=paths, tables=False, events=False)
+        with log.read(path) as opened:
+            ids.append(set(opened.rows("/camera/tracks", TRACKS).rows["track_id"].tolist()))
+    assert [len(one) for one in ids] == [3, 1, 2]
+    assert ids[0] & ids[1] & ids[2] == ids[1]
+    assert not (ids[2] - ids[1]) & ids[0]

@@ -65,20 +65,18 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-def drawn(path: Path, topic: str) -> dict[int, dict[str, np.ndarray]]:
-    """The boxes (4,) of a view by label, for each picture."""
+def drawn(path: Path, topic: str) -> dict[int, dict[str, tuple[np.ndarray, float]]]:
+    """The boxes (4,) of a view and the opacity of their lines by label, for each picture."""
     found = {}
     with log.read(path) as opened:
         for message in opened.messages(topic):
             read = ImageAnnotations.FromString(message.payload)
-            boxes = [
-                np.array([[point.x, point.y] for point in one.points])
-                for one in read.points
-                if one.type == one.LINE_LOOP
-            ]
+            loops = [one for one in read.points if one.type == one.LINE_LOOP]
+            boxes = [np.array([[point.x, point.y] for point in one.points]) for one in loops]
             ends = [np.concatenate([one.min(axis=0), one.max(axis=0) - one.min(axis=0)]) for one in boxes]
+            solid = [one.outline_color.a for one in loops]
             labels = [one.text for one in read.texts]
-            found[round(message.t_ns * FPS / NS)] = dict(zip(labels, ends, strict=True))
+            found[round(message.t_ns * FPS / NS)] = dict(zip(labels, zip(ends, solid, strict=True), strict=True))
     return found
 
 
@@ -105,16 +103,24 @@ def test_who_goes_out_of_one_picture_and_comes_into_the_next_keeps_the_id(path: 
 def test_each_picture_has_the_boxes_of_its_camera_with_the_ids_of_the_scene(path: Path) -> None:
     with mcaptrack.open(path) as opened:
         rows = opened.array("tracks", "/world/retracks/full")
+    detected, others = set(), set()
     for name, pictures in TRUTH.items():
         views = drawn(path, f"/world/retracks/full/view/image/{name}/video")
         assert len(views) == len(pictures)
         for number, people in enumerate(pictures):
             now = rows[rows["t_ns"] == round(number * NS / FPS)]
+            own = set()
             for box, at in people.values():
                 away = np.hypot(now["x_m"] - at[0], now["y_m"] - at[1])
                 if len(away) and away.min() < 0.5:
                     label = str(now["track_id"][away.argmin()])
-                    assert views[number][label] == pytest.approx(box, abs=PX), (name, number, label)
+                    assert views[number][label][0] == pytest.approx(box, abs=PX), (name, number, label)
+                    own.add(label)
+            for label, (_, opacity) in views[number].items():
+                (detected if label in own else others).add(round(opacity, 3))
+    # Boxes that a camera doesn't have itself are fainter.
+    assert len(detected) == len(others) == 1
+    assert max(others) < min(detected)
 
 
 def test_layouts_and_videos_show_the_scene_on_the_pictures(path: Path, tmp_path: Path) -> None:

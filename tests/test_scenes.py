@@ -291,6 +291,8 @@ def test_labels_without_pictures_have_scenes_too(footage, tmp_path):
         layout = json.loads(opened.attachment("mcaptrack.layout.json"))
         assert topics_in(layout) <= set(opened.channels)
         assert {"3D!ground", "Plot!people"} <= set(layout["configById"])
+        curves = [curve["label"] for curve in layout["configById"]["Plot!people"]["paths"]]
+        assert curves == ["tracker", "re-tracked"]
 
 
 def test_a_stage_that_is_run_again_replaces_its_views(finished, tmp_path):

@@ -129,13 +129,15 @@ class TestChoice:
 
 
 def fake_runs(monkeypatch: pytest.MonkeyPatch, bad: str, error: BaseException) -> list[str]:
-    """Let runs do nothing, but raise an error for one camera; returns the prefixes of those that are run."""
+    """Let runs write the log as it is, but raise an error for one camera; returns the prefixes of those that are run."""
     seen: list[str] = []
 
-    def run(opened: object, prefix: str, *_: object, **__: object) -> pipeline.Report:
+    def run(opened: log.Log, prefix: str, *_: object, output: Path | None, **__: object) -> pipeline.Report:
         seen.append(prefix)
         if prefix == bad:
             raise error
+        if output is not None:
+            shutil.copy(str(opened.path), output)
         return pipeline.Report()
 
     monkeypatch.setattr(pipeline, "run", run)
