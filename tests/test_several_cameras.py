@@ -120,6 +120,11 @@ class TestChoice:
         assert (outcome.code, path.read_bytes()) == (1, before)
         assert words in outcome.err
 
+    def test_a_channel_is_of_one_camera(self, path: Path) -> None:
+        told = call("run", path, "--camera", "east,north", "--topic", "/east/detections")
+        words = "--topic /east/detections is of one camera, and --camera names 2; leave one out"
+        assert (told.code, told.err) == (1, f"mcaptrack: {words}\n")
+
     def test_a_tracker_of_boxes_is_for_the_cameras(self, path: Path) -> None:
         with collected():
             result = mcaptrack.run(path, camera="east,south", tracker="ocsort", predictor="cv", tables=False)

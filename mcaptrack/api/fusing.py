@@ -112,7 +112,7 @@ def fuse(
         if not abs(value) <= _MOST_OFFSET_S:
             raise McaptrackError(f"`clock_offset_s=` has {value:g} s for {name}; a clock is late by a day at most")
     if not to.strip("/") or not to.isprintable() or "/" in to.strip("/"):
-        raise McaptrackError(f"`to={to}` is no name of a scene; give one such as world")
+        raise McaptrackError(f"`to={to!r}` is no name of a scene; give one such as world")
 
     def act(opened: logs.Log, target: Path | None, notes: Notes, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
         return pipeline.fuse_cameras(opened, names, to.strip("/"), chosen, offsets, target, progress)

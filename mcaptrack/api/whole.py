@@ -139,7 +139,7 @@ def run(
     """
     names = tuple(dict.fromkeys(split_names("camera", camera)))
     if len(names) > 1 and topic is not None:
-        raise McaptrackError(f"`topic={topic}` is of one camera, and `camera=` names {len(names)}; leave one out")
+        raise McaptrackError(f"`topic={topic!r}` is of one camera, and `camera=` names {len(names)}; leave one out")
     named = {"detector": detector, "tracker": tracker, "retracker": retracker, "predictor": predictor}
     chosen = {kind: one for kind, one in named.items() if one is not None}
     transforms = transforms_of(stages)
