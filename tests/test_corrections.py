@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.corrections import compare
+from mcaptrack.evaluation.corrections import Changes, compare
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.framing import join_frames
 from mcaptrack.sources.corrections import fixed_ids, with_corrections, without_filled
@@ -251,3 +251,96 @@ def test_corrections_need_a_log_and_ids(template, tmp_path):
         mcaptrack.ingest(tmp_path / "a.txt", tmp_path / "b.mcap", role="corrections")
     with pytest.raises(McaptrackError, match="corrections need ids"):
         mcaptrack.ingest(tmp_path / "b.txt", role="corrections", into=path)
+
+
+class TestWords:
+    """What changed, in one line: of many things of a kind, five and how many more."""
+
+    @staticmethod
+    def changes(**values: object) -> Changes:
+        none = {"same": 9, "moved": 0, "added": 0, "removed": 0, "joined": {}, "split": {}, "new_tracks": []}
+        return Changes(of="/a", frames=3, **(none | {"removed_tracks": [], "relabelled": {}} | values))  # type: ignore[arg-type]
+
+    @pytest.mark.parametrize(
+        ("values", "words"),
+        [
+            ({}, "9 boxes as they were"),
+            ({"moved": 1, "removed": 2}, "9 boxes as they were, 1 moved, 2 removed"),
+            ({"added": 3}, "9 boxes as they were, 3 added"),
+            ({"new_tracks": [1, 2, 3, 4, 5]}, "9 boxes as they were, new tracks 1, 2, 3, 4, 5"),
+            ({"new_tracks": [*range(6)]}, "9 boxes as they were, new tracks 0, 1, 2, 3, 4 and 1 more"),
+            ({"removed_tracks": [*range(8)]}, "9 boxes as they were, tracks 0, 1, 2, 3, 4 and 3 more removed"),
+            (
+                {"relabelled": {3: ("car", "bus"), 4: ("van", "bus"), 7: ("car", "bus")}},
+                "9 boxes as they were, tracks 3, 7 from car to bus, track 4 from van to bus",
+            ),
+        ],
+    )
+    def test_what_there_is_is_said_and_nothing_else(self, values, words):
+        assert self.changes(**values).words == f"of /a, in 3 frames: {words}"
+
+    @pytest.mark.parametrize(("joined", "split", "more"), [(5, 5, 0), (6, 5, 1), (5, 7, 2), (7, 8, 5), (0, 6, 1)])
+    def test_five_of_those_that_were_joined_and_of_those_that_were_split(self, joined, split, more):
+        words = self.changes(
+            joined={k: [k, 90 + k] for k in range(joined)}, split={k: [k, 70 + k] for k in range(split)}
+        ).words
+        assert words.count(" joined to ") == min(joined, 5)
+        assert words.count(" split into ") == min(split, 5)
+        assert ("more joined or split" in words) == (more > 0)
+        assert not more or f", {more} more joined or split" in words
+
+    @pytest.mark.parametrize(("count", "end"), [(5, "from 4 to x"), (6, "1 more changes of class")])
+    def test_five_changes_of_class(self, count, end):
+        assert self.changes(relabelled={k: (str(k), "x") for k in range(count)}).words.endswith(end)
+
+
+class TestPairs:
+    """Which boxes are the same object, by hand."""
+
+    @pytest.mark.parametrize(
+        ("moved", "same"),
+        [((2.0, 0.0), 1), ((2.01, 0.0), 0), ((0.0, 2.0), 1), ((0.0, -2.01), 0)],
+    )
+    def test_boxes_are_moved_if_a_corner_is_beyond_two_pixels(self, moved, same):
+        before, after = ([frame(k, {1: (10, 10)}) for k in range(3)] for _ in range(2))
+        for one in after:
+            one.rows["x_px"] += moved[0]
+            one.rows["y_px"] += moved[1]
+        found, kept = compare("/a", before, after)
+        assert (found.same, found.moved, found.added, found.removed, kept) == (3 * same, 3 - 3 * same, 0, 0, 3)
+
+    def test_a_box_that_grows_at_its_far_corner_is_moved(self):
+        before, after = ([frame(k, {1: (10, 10)}) for k in range(3)] for _ in range(2))
+        for one in after:
+            one.rows["w_px"] += 3.0
+        assert compare("/a", before, after)[0].moved == 3
+
+    @pytest.mark.parametrize(("boxes", "joined"), [(1, {}), (2, {5: [1, 2]})])
+    def test_a_single_box_joins_nothing(self, boxes, joined):
+        before = [frame(k, {1: (10, 10)} if k >= boxes else {2: (10, 10)}) for k in range(6)]
+        after = [frame(k, {5: (10, 10)}) for k in range(6)]
+        found, kept = compare("/a", before, after)
+        assert (found.joined, found.new_tracks, found.removed_tracks, kept) == (joined, [], [], 0)
+
+    @pytest.mark.parametrize(("apart", "same"), [(5.3, True), (5.5, False)])
+    def test_boxes_of_other_ids_are_the_same_object_from_an_overlap_of_three_tenths(self, apart, same):
+        """Boxes of 10 px that are d px apart have an overlap of (10 - d) / (10 + d)."""
+        before, after = [frame(0, {1: (10, 10)})], [frame(0, {2: (10 + apart / 10, 10)})]
+        found, _ = compare("/a", before, after)
+        assert (found.moved, found.added, found.removed) == ((1, 0, 0) if same else (0, 1, 1))
+
+    def test_of_two_alike_the_box_with_the_same_id_is_preferred_by_a_tenth(self):
+        """Overlaps of 7/13 = 0.54 with the own id at 3 px, and of 0.6 (2.5 px) or 0.74 (1.5 px) with another one."""
+        before = [frame(0, {1: (10, 10)})]
+        for near, own in ((0.25, True), (0.15, False)):
+            after = [frame(0, {1: (10.3, 10), 2: (10 - near, 10)})]
+            found, kept = compare("/a", before, after)
+            assert (found.new_tracks, kept) == (([2], 1) if own else ([1], 0))
+
+    def test_frames_that_one_side_lacks_and_rows_without_a_box_are_not_compared(self):
+        before = [frame(k, {1: (k, 0), 2: (k, 9)}) for k in (1, 2, 4, 5)]
+        after = [frame(k, {1: (k, 0), 2: (k, 9)}) for k in (0, 2, 3, 5, 6)]
+        after[1].rows["x_px"][1] = np.nan
+        found, kept = compare("/a", before, after)
+        assert (found.frames, found.same, found.removed, found.added, kept) == (2, 3, 1, 0, 3)
+        assert compare("/a", [], after)[0].frames == compare("/a", before, [])[0].frames == 0

@@ -13,8 +13,19 @@ import pytest
 import mcaptrack
 from mcaptrack import log, pipeline
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
-from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, make_plane
+from mcaptrack.pipeline.planes import (
+    AS_BEFORE,
+    PlaneChoice,
+    _boxes,
+    fit_in_words,
+    fit_of,
+    is_poor,
+    make_plane,
+    plane_in_words,
+    planes_to_json,
+)
 from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
@@ -282,3 +293,140 @@ def test_tracks_of_other_trackers_give_a_plane_too(tmp_path):
     result = mcaptrack.run(path, tables=False, fit_plane=False)
     assert "sample" in result.stages
     assert result.summary.ground_plane == "assumed"
+
+
+def how(name: str, **parameters: Any) -> Provenance:
+    return Provenance(f"{name}-ground-plane", parameters, "/camera/detections")
+
+
+class TestChoice:
+    """What a user chooses, beside how the plane of the log was made."""
+
+    @pytest.mark.parametrize(
+        ("choice", "made", "settled"),
+        [
+            ({}, None, (True, 1.7)),
+            ({}, how("estimate"), (True, 1.7)),
+            ({}, how("assume", fit_plane=False), (False, 1.7)),
+            ({}, how("assume", refused="too few", person_height_m=2), (True, 2.0)),
+            ({}, how("estimate", person_height_m="tall"), (True, 1.7)),
+            ({}, how("estimate", person_height_m=0), (True, 1.7)),
+            ({}, how("calibrate", fit_plane=False, person_height_m=1.5), (True, 1.7)),
+            ({"estimate": True}, how("assume", fit_plane=False), (True, 1.7)),
+            ({"estimate": False}, None, (False, 1.7)),
+            ({"person_height_m": 1.6}, how("estimate", person_height_m=1.5), (True, 1.6)),
+        ],
+    )
+    def test_what_is_not_said_is_as_before(self, choice, made, settled):
+        assert PlaneChoice(**choice).settled(made) == settled
+
+    @pytest.mark.parametrize(
+        ("choice", "made", "is_another"),
+        [
+            ({}, how("estimate"), False),
+            ({"estimate": False}, None, False),
+            ({"estimate": False}, Provenance("ingest", {}), False),
+            ({"estimate": False}, how("estimate"), True),
+            ({"estimate": True}, how("estimate"), False),
+            ({"estimate": True}, how("assume"), True),  # it was not tried
+            ({"estimate": True}, how("assume", refused="too few"), False),
+            ({"estimate": True}, how("assume", fit_plane=False), True),
+            ({"estimate": False}, how("assume", fit_plane=False), False),
+            ({"person_height_m": 1.7}, how("estimate"), False),
+            ({"person_height_m": 1.6}, how("estimate"), True),
+            ({"person_height_m": 1.6}, how("calibrate"), False),
+            ({"frame": "map"}, how("estimate"), False),
+            ({"frame": "map"}, how("calibrate"), True),
+            ({"frame": "map"}, how("calibrate", frame="map"), False),
+            ({"frame": ""}, how("calibrate", frame="map"), True),
+            ({"ground_frame": "base"}, how("calibrate", ground_frame="base"), False),
+            ({"ground_frame": "floor"}, how("calibrate", ground_frame="base"), True),
+            ({"estimate": True}, how("calibrate", frame="map"), False),
+        ],
+    )
+    def test_a_plane_is_made_again_for_another_choice(self, choice, made, is_another):
+        assert PlaneChoice(**choice).is_another(made) is is_another
+
+    def test_frames_are_those_of_a_calibrated_plane(self):
+        made = how("calibrate", frame="map", ground_frame="base")
+        assert AS_BEFORE.frames(made) == ("map", "base")
+        assert AS_BEFORE.frames(how("estimate", frame="map")) == AS_BEFORE.frames(None) == ("", "")
+        assert PlaneChoice(frame="odom").frames(made) == ("odom", "base")
+        assert PlaneChoice(ground_frame="").frames(made) == ("map", "")
+
+
+class TestWords:
+    FIT = {
+        "boxes": 1234, "nearest_m": 3.4, "farthest_m": 21.6, "camera_height_m": 4.26, "pitch_deg": -12.4,
+        "residual": 0.123, "depth_sd": 0.05,
+    }  # fmt: skip
+    PLANE = GroundPlane((0.02, 0, 0, 0, 0.02, 0, 0, 0, 1), 640, 480)
+
+    def test_a_fit(self):
+        assert fit_in_words(self.FIT) == (
+            "1,234 boxes 3 to 22 m away (camera 4.3 m high, looking up by 12 degrees; heights fit within 12%, metres "
+            "along the view are uncertain by 5%)"
+        )
+        assert "looking down by 0 degrees" in fit_in_words(self.FIT | {"pitch_deg": 0})
+        assert fit_in_words({"boxes": "many"}).startswith("nan boxes nan to nan m away")
+
+    def test_only_an_estimated_plane_has_a_fit(self):
+        assert fit_of(how("estimate", fit=self.FIT)) == self.FIT
+        assert [
+            fit_of(one) for one in (None, how("assume", fit=self.FIT), how("estimate", fit=3), how("estimate"))
+        ] == [None] * 4
+
+    def test_a_plane(self):
+        planes = [(0, self.PLANE)]
+        fitted = plane_in_words(planes, how("estimate", fit=self.FIT, person_height_m=1.6))
+        assert fitted.startswith("no ground plane is known: one was estimated from 1,234 boxes 3 to 22 m away")
+        assert ", with people 1.6 m high. Give one with " in fitted
+        for made, why in ((None, ""), (how("assume", refused="no"), ", and boxes don't tell it (no)")):
+            assert plane_in_words(planes, made).startswith(
+                f"no ground plane is known{why}: taking 50 px for a metre, since people are 1.7 m high; distances"
+            )
+
+    @pytest.mark.parametrize(("count", "kept"), [(100, 100), (101, 2)])
+    def test_many_planes_are_recorded_by_their_digest(self, count, kept):
+        made = planes_to_json([(number, self.PLANE) for number in range(count)])
+        assert len(made) == kept
+        if kept == 2:
+            assert (made[0], len(made[1])) == (101, 64)
+            other = planes_to_json([(number, self.PLANE) for number in range(1, count + 1)])
+            assert other[1] != made[1]
+        else:
+            assert made[3][0] == 3
+            assert made[3][1]["homography"] == list(self.PLANE.homography)
+            assert None not in made[3][1].values()
+
+
+@pytest.mark.parametrize(("deep_px", "poor"), [(199.0, True), (201.0, False), (0.0, True)])
+def test_a_scale_is_poor_where_the_ground_has_less_than_two_heights(deep_px, poor):
+    """Boxes of 100 px with lower edges spread evenly: nine tenths of that is the extent of the ground, 1.8 heights."""
+    down = np.append(np.linspace(0, deep_px, 41), np.nan)  # a row without a box doesn't count
+    rows = TRACKS.rows(
+        track_id=np.arange(42), x_px=down, y_px=down + 200, w_px=down * 0 + 40, h_px=down * 0 + 100,
+        x_m=np.ones(42), y_m=np.ones(42), observed=[True] * 42, source_id=[-1] * 42,
+    )  # fmt: skip
+    assert is_poor([Frame(0, 0, rows[:20]), Frame(1, 1, rows[20:])]) == poor
+
+
+@pytest.mark.parametrize(
+    ("classes", "names", "which"),
+    [
+        ([1, 2, 0], {}, [0]),
+        ([2, 0, 0], {}, [1, 2]),  # unknown ones, where none is a person
+        ([2, 3, 7], {}, []),
+        ([1, 2, 7], {"2": "Pedestrian", "7": "person", "1": "car"}, [1, 2]),
+        ([1, 2, 7], {"x": "person"}, [0]),
+    ],
+)
+def test_which_boxes_are_of_people(classes, names, which):
+    rows = DETECTIONS.rows(
+        x_px=[1.0, 2, 3, np.nan], y_px=[5.0, 5, 5, np.nan], w_px=[6.0, 6, 6, np.nan], h_px=[7.0, 8, 9, np.nan],
+        x_m=[0.0] * 4, y_m=[0.0] * 4, score=[0.5] * 4, class_id=[*classes, 1],
+    )  # fmt: skip
+    boxes, number, score, are_people = _boxes([Frame(0, 0, rows[:1]), Frame(1, 1, rows[1:])], names)
+    assert boxes.tolist() == [[1, 5, 6, 7], [2, 5, 6, 8], [3, 5, 6, 9]]  # the last one is none
+    assert (number.tolist(), score.tolist()) == ([0, 1, 1], [0.5] * 3)
+    assert np.flatnonzero(are_people).tolist() == which

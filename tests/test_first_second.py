@@ -237,3 +237,5 @@ def test_radii_are_the_longer_half_axes(long, short, turn):
     (found,) = radii_m(cov[None], normal_tails(1))
     assert found == pytest.approx(math.sqrt(max(long, short) * chi2.ppf(0.95, 2)), rel=1e-6)
     assert np.isnan(radii_m(np.full((1, 2, 2), np.nan), normal_tails(1)))
+    assert np.isnan(radii_m(np.array([[[1.0, 2.0], [2.0, 1.0]]]), normal_tails(1)))  # its determinant is negative
+    assert radii_m(np.zeros((1, 2, 2)), normal_tails(1)).tolist() == [0.0]  # certain

@@ -11,7 +11,9 @@ import pytest
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.schema import PREDICTIONS, TRACKS
+from mcaptrack.geometry.plane import GroundPlane
+from mcaptrack.pipeline import following
+from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from tests.commands import call, done
 
@@ -231,3 +233,82 @@ def test_an_id_of_a_log_further_back_is_not_used_again(tmp_path):
     assert [len(one) for one in ids] == [3, 1, 2]
     assert ids[0] & ids[1] & ids[2] == ids[1]
     assert not (ids[2] - ids[1]) & ids[0]
+
+
+def test_what_went_on_is_said_of_all_cameras():
+    one = following.Continued("a.mcap", 0.25, {"/left/tracks": 3}, {"/left/tracks": 2})
+    two = following.Continued("a.mcap", 1.5, {"/right/tracks": 4}, {"/right/tracks": 0})
+    both = following.Continued.joined([one, two])
+    assert both.to_json() == {
+        "log": "a.mcap",
+        "gap_s": 1.5,
+        "at_cut": {"/left/tracks": 3, "/right/tracks": 4},
+        "kept": {"/left/tracks": 2, "/right/tracks": 0},
+    }
+    assert both.words() == [
+        "/left/tracks goes on from a.mcap: 2 of 3 people at the cut keep their ids",
+        "/right/tracks goes on from a.mcap: 0 of 4 people at the cut keep their ids",
+    ]
+    assert following.Continued("a.mcap", 1 / 3).words() == ["ids go on from a.mcap, as before"]
+    assert following.Continued("a.mcap", 1 / 3).to_json()["gap_s"] == 0.333333
+
+
+def rows_at(places: dict[int, tuple[float, float]], high: float = 100.0, metres: tuple[float, float] | None = None):
+    """Tracks with boxes around these middles, or without boxes at these places in metres."""
+    x, y = np.array(list(places.values()), float).reshape(-1, 2).T
+    count = len(places)
+    boxes = {} if metres else {"x_px": x - 20, "y_px": y - high / 2, "w_px": [40.0] * count, "h_px": [high] * count}
+    return TRACKS.rows(
+        track_id=list(places), observed=[True] * count, source_id=[-1] * count, **boxes,
+        x_m=x * metres[0] if metres else [9.0] * count, y_m=y * metres[1] if metres else [8.0] * count,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("mine", "theirs", "pairs"),
+    [
+        ({1: (100, 100)}, {7: (135, 100)}, [(1, 7)]),  # 0.35 heights
+        ({1: (100, 100)}, {7: (100, 136)}, []),
+        ({1: (100, 100), 2: (110, 100)}, {7: (112, 100)}, [(2, 7)]),  # the nearest of each other
+        ({1: (100, 100), 2: (150, 100)}, {8: (152, 100), 7: (99, 100)}, [(1, 7), (2, 8)]),
+        ({1: (100, 100)}, {7: (120, 100), 8: (108, 100)}, [(1, 8)]),
+        ({}, {7: (100, 100)}, []),
+        ({1: (100, 100)}, {}, []),
+    ],
+)
+def test_rows_of_one_time_are_the_same_person_near_each_other(mine, theirs, pairs):
+    assert following._pairs(rows_at(mine), rows_at(theirs)) == pairs
+
+
+@pytest.mark.parametrize(("x", "count"), [(100.5, 1), (100.51, 0)])
+def test_rows_without_boxes_are_compared_in_metres(x, count):
+    one, other = rows_at({1: (100, 40)}, metres=(1.0, 1.0)), rows_at({7: (x, 40)}, metres=(1.0, 1.0))
+    assert following._pairs(one, other) == [(1, 7)] * count
+    assert following._pairs(rows_at({1: (100, 40)}), other) == []  # 91 m away
+    assert following._distances(one, other)[0, 0] == pytest.approx(2 * (x - 100))
+
+
+def test_ids_that_go_on_keep_their_names_and_others_follow_the_last():
+    ids = np.array([3, 1, 2, 3])
+    assert following._renumbered(ids, {3: 1, 2: 40}, 50).tolist() == [1, 51, 40, 1]
+    assert ids.tolist() == [3, 1, 2, 3]
+
+
+def test_a_lead_is_brought_to_other_planes():
+    one, two = (GroundPlane((scale, 0, 0, 0, scale, 0, 0, 0, 1), 640, 480) for scale in (0.1, 0.2))
+    assert following._differ([(0, one)], [(5, two)])
+    assert not following._differ([(0, one)], [(5, one)])
+    assert following._differ(None, [(5, one)])
+    rows = np.concatenate([rows_at({1: (100, 100)}), rows_at({2: (7, 7)}, metres=(1.0, 1.0))])
+    lead = Frame(9, 4, rows)
+    moved = following._in_planes(lead, [(0, one), (9, two)])
+    assert moved["x_m"].tolist() == [20.0, 7.0]
+    assert moved["y_m"].tolist() == [30.0, 7.0]  # the foot, at 150 px
+    assert rows["x_m"].tolist() == [9.0, 7.0]
+    assert following._in_planes(lead, []) is rows
+    alone = Frame(9, 4, rows[1:])
+    assert following._in_planes(alone, [(0, one)]) is alone.rows
+    frames = [Frame(t_ns, t_ns + 10, rows) for t_ns in (1, 2, 3)]
+    both = following.led(frames[:1], frames[1:], TRACKS)
+    assert [(frame.t_ns, frame.index, len(frame.rows)) for frame in both] == [(1, 11, 2), (2, 12, 2), (3, 13, 2)]
+    assert (following.numbers_of(frames[1:]).tolist(), following.numbers_of([]).tolist()) == ([12], [])

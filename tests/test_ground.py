@@ -309,7 +309,7 @@ def test_the_documentation_has_the_table_of_limits():
     lines = text.partition("<!-- limits: begin -->")[2].partition("<!-- limits: end -->")[0].split("\n")[3:-1]
     made = [
         f"| {row.name} | {row.speed_m_per_s:g} | {row.max_speed_m_per_s:g} | {row.drift_m_per_s:g} | {row.noise_m:g} "
-        f"| {row.gate_m:g} | {'yes' if row.turns else 'no'} |"
+        f"| {row.gate_m:g} | {'yes' if row.turns else 'no'} | {', '.join(f'{side:g}' for side in row.size_m)} |"
         for row in LIMITS.values()
     ]
     assert lines == made
@@ -341,7 +341,20 @@ def test_limits_of_users_replace_those_of_the_table():
     assert limits_of("car", own) == LIMITS["car"]._replace(max_speed_m_per_s=40.0)
     assert limits_of("pedestrian", own) == LIMITS["person"]._replace(max_speed_m_per_s=4.0, noise_m=0.1)
     assert limits_of("bus", own) == LIMITS["bus"]
-    for wrong in ("car", "car=", "=4", "car=fast", "car=1:2:3:4:5", "car=-1"):
+    all_four = read_limits(" Car = 5 : 0 : 0.3 : 2 ,, bus=::0.4:, forklift=:1::3")
+    assert all_four["car"] == LIMITS["car"]._replace(
+        max_speed_m_per_s=5.0, speed_m_per_s=5.0, drift_m_per_s=0.0, noise_m=0.3, gate_m=2.0
+    )
+    assert all_four["bus"] == LIMITS["bus"]._replace(noise_m=0.4)
+    assert all_four["forklift"] == LIMITS["unknown"]._replace(name="forklift", drift_m_per_s=1.0, gate_m=3.0)
+    assert limits_of("Forklift", all_four).gate_m == 3.0
+    assert (read_limits(""), read_limits("car=999999")["car"].max_speed_m_per_s) == ({}, 999999.0)
+    for zero in ("car=0", "car=1::0", "car=1:::0"):
+        with pytest.raises(McaptrackError, match="have to be more than 0"):
+            read_limits(zero)
+    with pytest.raises(McaptrackError, match="names car twice"):
+        read_limits("car=1,CAR=2")
+    for wrong in ("car", "car=", "=4", "car=fast", "car=1:2:3:4:5", "car=-1", "car=1e6", "car=nan", "car=:::"):
         with pytest.raises(McaptrackError, match="NAME=SPEED"):
             GroundTracker(class_limits=wrong)
     zeros = (("car=0", "SPEED, NOISE"), ("car=::0", "NOISE and GATE"), ("car=:::0", "GATE have to be more than 0"))

@@ -8,13 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import expon, multivariate_normal, norm
 
 from mcaptrack.evaluation.aligned import make_matchup
 from mcaptrack.evaluation.metrics import combine, score, summary
 from mcaptrack.geometry.plane import assumed_plane
 from mcaptrack.pipeline.planes import is_poor
 from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema.frame_columns import collect
 from mcaptrack.transforms import PROFILES, Retrack, Sample
+from mcaptrack.transforms.retrack.in_pictures import link_in_picture
 from mcaptrack.transforms.to_video_rate import linked_tracks
 from tests.worlds import assert_same_rows, ns
 
@@ -259,3 +262,96 @@ def test_cameras_at_the_height_of_people_gain_and_none_loses():
         assert has["MOTA"] > had["MOTA"], name
     had, has = summary(combine(before)), summary(combine(after))
     assert has["IDF1"] > had["IDF1"] + 0.025
+
+
+def odds_by_the_model(boxes: dict[int, list[tuple[float, ...]]]) -> float:
+    """The log odds that the second of two tracks continues the first, as the room explains it, by general means.
+
+    ``boxes`` has for each track rows of time, middle (x, y) and height; those after the second only count as births.
+    The state at an end is that of a Bayesian linear regression in heights of the box.
+    """
+    ends = []
+    for rows, last in ((np.array(boxes[1]), -1), (np.array(boxes[2]), 0)):
+        near = rows[np.abs(rows[:, 0] - rows[last, 0]) <= 1.3]
+        line = np.column_stack([np.ones(len(near)), near[:, 0] - rows[last, 0]])
+        height = near[:, 3].mean()
+        cov = np.linalg.inv(line.T @ line / 0.06**2 + np.diag([0, 1 / 0.6**2]))
+        place, speed = cov @ line.T @ (near[:, 1:3] / height) / 0.06**2
+        tall = np.linalg.inv(line.T @ line / 0.06**2 + np.diag([0, 1 / 0.2**2])) @ line.T @ np.log(near[:, 3]) / 0.06**2
+        ends.append((rows[last, 0], place * height, speed * height, height, tall[0], cov[0, 0], cov[1, 1]))
+    (t0, xy0, v0, h0, tall0, at0, way0), (t1, xy1, v1, h1, tall1, at1, way1) = ends
+    gap = t1 - t0
+    off = (xy1 - xy0 - (v0 + v1) / 2 * gap) / np.sqrt(h0 * h1)
+    spread = at0 + at1 + 0.08**2 + 0.25**2 * gap**3 / 12 + (gap / 2) ** 2 * (way0 + way1)
+    moved = multivariate_normal.logpdf(off, cov=spread * np.eye(2))
+    grown = norm.logpdf(tall1 - tall0, scale=np.hypot(0.12, 0.15 * gap)) - norm.logpdf(0, scale=0.5)
+    rows = np.concatenate([np.array(one) for one in boxes.values()])
+    corners = [rows[:, 1:3] + sign * rows[:, 3:] * [0.2, 0.5] for sign in (-1, 1)]
+    heights = (corners[1].max(axis=0) - corners[0].min(axis=0)).prod() / np.median(rows[:, 3]) ** 2
+    births = len(boxes) / (max(np.ptp(rows[:, 0]), 1.0) * max(heights, 1.0))
+    return float(moved + grown + expon.logpdf(gap) + np.log(0.5 / births))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_links_are_as_probable_as_the_model_says(seed):
+    """A link is made up to its probability, and not beyond it."""
+    rng = np.random.default_rng(seed)
+    lengths, gap = rng.integers(1, 7, 2), int(rng.integers(1, 9))
+    boxes: dict[int, list[tuple[float, ...]]] = {1: [], 2: []}
+    if seed % 2:  # somebody else is there all the time
+        boxes[3] = [(n / 2.5, 900.0, 700.0, 60.0) for n in range(lengths.sum() + gap - 1)]
+    speed = rng.normal(0, 30, 2)
+    for which, begin, count in ((1, 0, lengths[0]), (2, lengths[0] + gap - 1, lengths[1])):
+        for n in range(begin, begin + count):
+            x, y = (300, 400) + speed * n / 2.5 + rng.normal(0, 5, 2)
+            boxes[which].append((n / 2.5, x, y, 100 * np.exp(rng.normal(0, 0.08))))
+    odds = odds_by_the_model(boxes)
+    frames = collect(
+        TRACKS,
+        (
+            frame(n, {i: (x, y + h / 2, h) for i, rows in boxes.items() for t, x, y, h in rows if round(t * 2.5) == n})
+            for n in range(lengths.sum() + gap - 1)
+        ),
+    )
+    made = []
+    for nudge in (-1e-5, 1e-5):
+        least = 1 / (1 + np.exp(-odds - nudge))
+        found = np.concatenate(list(link_in_picture(frames, 9.0, least, False)))
+        made.append(2 not in found["track_id"])
+    assert made == [True, False]
+
+
+def test_the_longest_gaps_are_linked_and_no_longer_ones():
+    for missed, joined in ((10, True), (11, False)):  # 4.0 and 4.4 s between the samples before and after
+        frames = collect(TRACKS, with_gap(100.0, range(4, 3 + missed)))
+        found = np.concatenate(list(link_in_picture(frames, 9.0, 1e-9, False)))
+        assert (2 not in found["track_id"]) == joined
+        found = np.concatenate(list(link_in_picture(frames, (missed - 1) * 0.4, 1e-9, False)))
+        assert 2 in found["track_id"]
+
+
+def test_tracks_of_people_who_said_so_are_not_joined():
+    frames = collect(TRACKS, with_gap(100.0, range(8, 10)))
+    for fixed, count in (((), 1), ((1,), 1), ((2,), 1), ((1, 2), 2)):
+        found = np.concatenate(list(link_in_picture(frames, 4.0, 0.5, False, fixed)))
+        assert len(np.unique(found["track_id"])) == count
+    assert list(link_in_picture(collect(TRACKS, []), 4.0, 0.5, False)) == []
+
+
+def test_a_track_of_three_parts_has_one_id_also_in_its_gaps_and_rows_are_in_order_of_ids():
+    """Somebody else is there all the time, and a row without a box."""
+    nowhere = TRACKS.rows(track_id=[7], x_m=[1.0], y_m=[1.0], observed=[True], source_id=[7])
+
+    def boxes(n: int) -> dict[int, Box]:
+        own = {} if n in (6, 7, 13, 14) else {9 if n < 6 else 2 if n < 13 else 3: walking(n, 100.0)}
+        return dict(sorted((own | {4: (100.0, 900.0, 100.0)}).items()))
+
+    frames = [frame(n, boxes(n)) for n in range(20)]
+    both = [np.concatenate([one.rows, nowhere]) for one in frames]
+    frames = [one._replace(rows=rows[np.argsort(rows["track_id"])]) for one, rows in zip(frames, both, strict=True)]
+    for n, rows in enumerate(link_in_picture(collect(TRACKS, frames), 4.0, 0.5, False)):
+        assert rows["track_id"].tolist() == [4, 7, 9]
+        assert rows["x_px"][2] == pytest.approx(walking(n, 100.0)[0] - 20)
+        source = -1 if n in (6, 7, 13, 14) else 9 if n < 6 else 2 if n < 13 else 3
+        assert rows["source_id"].tolist() == [4, 7, source]
+        assert rows["observed"].tolist() == [True, True, source > 0]

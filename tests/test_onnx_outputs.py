@@ -11,6 +11,7 @@ from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import OnnxDetector
+from mcaptrack.transforms.detect.onnx import outputs
 from mcaptrack.transforms.detect.onnx.classes import names_of, numbers_of
 from tests.onnx_graphs import INT64, cells, giving, value
 
@@ -233,3 +234,66 @@ def test_classes_that_name_nothing_are_refused_and_all_may_be_written_large(tmp_
 def test_channels_last_are_refused(shape, tmp_path):
     data = giving({"output0": suppressed()}, shape=shape)
     assert "it needs pictures B x 3 x H x W" in refused(data, tmp_path, input_size="160x128")
+
+
+@pytest.mark.parametrize(
+    ("read", "given"),
+    [
+        ("ultralytics", {"o": grid(3, scores=np.eye(len(PLACES))[:, [100]] / 2)}),
+        ("ultralytics", {"o": suppressed()[:, :1] * [1, 1, 1, 1, 0.5 / 0.9, 1]}),
+        ("yolox", {"o": grid(3, scores=np.eye(len(PLACES))[:, [100, 100]] * [0.5, 1])}),
+        ("detr", {"labels": LABELS[:, :1], "boxes": CORNERS[None, :1], "scores": np.array([[0.5]])}),
+        ("rfdetr", {"dets": (SOME / WIDE)[None, :1], "labels": np.array([[[0.0, -9.0]]])}),
+    ],
+)
+def test_a_score_at_the_bound_is_enough_and_one_below_it_is_not(read, given):
+    reader = getattr(outputs, f"read_{read}")
+    for least, count in ((0.5, 1), (0.5 + 1e-6, 0)):
+        (found,) = reader(given, SIZE, least)
+        assert (len(found.xyxy), found.score.tolist()) == (count, [0.5] * count)
+        if count:
+            np.testing.assert_allclose(found.xyxy[0], CORNERS[0])
+
+
+def test_a_score_of_nanodet_at_the_bound_is_enough():
+    rows = np.zeros((1, len(PLACES), 2 + 32))
+    rows[0, 3, 1] = 0.5
+    assert [len(outputs.read_nanodet({"o": rows}, SIZE, least)[0].xyxy) for least in (0.5, 0.500001)] == [1, 0]
+
+
+@pytest.mark.parametrize(("value", "fits"), [(-0.0009, True), (1.0009, True), (-0.001, False), (1.001, False)])
+def test_likelihoods_may_be_rounded(value: float, fits: bool):
+    if fits:
+        assert outputs.likelihoods(np.array([0.5, value])).tolist() == [0.5, value]
+        (found,) = outputs.read_detr(
+            {"labels": LABELS, "boxes": CORNERS[None], "scores": np.array([[value, 0.9]])}, SIZE, -1
+        )
+        assert found.score[0] == float(value > 0)
+        return
+    with pytest.raises(outputs.MisreadError, match="no likelihoods"):
+        outputs.likelihoods(np.array([0.5, value]))
+
+
+@pytest.mark.parametrize(
+    ("boxes", "labels", "words"),
+    [
+        ([[0, 0, 2, 2]], [1], "shares of the input"),
+        ([[0, 0, 2, 2.001]], [1], ""),
+        ([[9, 9, 5, 20], [9, 9, 20, 20]], [1, 1], ""),  # one of two may be odd
+        ([[9, 9, 5, 20], [9, 9, 20, 5], [9, 9, 20, 20]], [1, 1, 1], "end before they begin"),
+        ([[9, 9, 9, 9]], [1], ""),  # without a size
+        ([[9, 9, 20, 20], [9, 9, 20, 20]], [1, 1.5], "not whole numbers"),
+    ],
+)
+@pytest.mark.parametrize("score", [0.4, 0.39])
+def test_only_sure_boxes_are_evidence(boxes, labels, words, score):
+    given = {
+        "labels": np.array([labels], float),
+        "boxes": np.array([boxes], float),
+        "scores": np.full((1, len(boxes)), score),
+    }
+    if words and score == 0.4:
+        with pytest.raises(outputs.MisreadError, match=words):
+            outputs.read_detr(given, SIZE, 0.1)
+    else:
+        assert len(outputs.read_detr(given, SIZE, 0.1)[0].xyxy) == len(boxes)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 import mcaptrack
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
+from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, aligned, evaluate
 from mcaptrack.evaluation.by_class import of_class
 from mcaptrack.evaluation.event_text import PEOPLE, log_messages, nouns_of
 from mcaptrack.evaluation.events import EventOptions, default_rule, find_events
@@ -342,3 +342,30 @@ def test_a_report_on_cars_does_not_call_them_people(tmp_path):
     assert "How objects move" in text
     assert "Counted within 2 m on the ground" in text
     assert re.search(r"Car \d: track \d became track \d", text)
+
+
+@pytest.mark.parametrize(("similarity", "gate", "by_class"), [("metres", 3.0, True), ("bev-iou", 0.1, False)])
+def test_it_makes_no_difference_how_many_pairs_are_compared_at_once(similarity, gate, by_class, monkeypatch):
+    """Each frame beside distances or overlaps of all its pairs; in one go, some frames at a time, and frame by frame."""
+    truth, tracks = drawn(3)
+    tracks[4] = frame(4, [], [], [])
+    truth[7].rows["x_m"][2] = np.nan  # a row without a position is compared with nothing
+    sides = [(a.rows[np.isfinite(a.rows["x_m"])], b.rows) for a, b in zip(truth, tracks, strict=True)]
+    wanted = []
+    for one, other in sides:
+        i, j = (part.ravel() for part in np.indices((len(one), len(other))))
+        if similarity == "metres":
+            apart = np.hypot(one["x_m"][i] - other["x_m"][j], one["y_m"][i] - other["y_m"][j])
+            alike = np.maximum(1 - apart / (2 * gate), 0)
+        else:
+            alike = bev_iou_of_pairs(columns_to_oriented_boxes(one)[i], columns_to_oriented_boxes(other)[j])
+        same = one["class_id"][i] == other["class_id"][j]
+        wanted.append(np.where(same | (not by_class), alike, 0).reshape(len(one), len(other)))
+    for most in (1_000_000, 200, 1):
+        monkeypatch.setattr(aligned, "_PAIRS_AT_ONCE", most)
+        compared = aligned.compare_rows(truth, tracks, similarity, gate, by_class)
+        for number, (one, other) in enumerate(sides):
+            np.testing.assert_allclose(compared.matchup.similarity[number], wanted[number], atol=1e-9)
+            assert compared.ground_truth.ids[compared.matchup.ground_truth[number]].tolist() == one["track_id"].tolist()
+            assert compared.tracks.ids[compared.matchup.tracks[number]].tolist() == other["track_id"].tolist()
+        assert compared.matchup.threshold == (0.5 if similarity == "metres" else gate)

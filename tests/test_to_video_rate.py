@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcaptrack.geometry.plane import GroundPlane
-from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema import TRACKS, Frame, framing
 from mcaptrack.transforms.to_video_rate import linked_tracks, to_video_rate
 from tests.commands import printed
 from tests.worlds import ns
@@ -91,6 +92,13 @@ def test_boxes_of_a_false_track_are_left_out():
 def test_without_re_tracked_tracks_every_frame_is_there_without_rows():
     assert full([{7: 0.0}] * 4, [{}]) == [{}] * 4
     assert list(to_video_rate([], [], ())) == []
+    tracks = [Frame(ns(n / 10), n, boxes({7: 0.1 * n})) for n in range(3)]
+    found = [(one.t_ns, one.index, len(one.rows)) for one in to_video_rate(tracks, [], ())]
+    assert found == [(0, 0, 0), (ns(0.1), 1, 0), (ns(0.2), 2, 0)]
+    # one sample says nothing about other times, not even those of the nanosecond beside it
+    near = [tracks[0], *(tracks[0]._replace(t_ns=t_ns, index=t_ns) for t_ns in (1, 2))]
+    found = to_video_rate(near, [Frame(0, 0, named({1: (7, 0.0)}))], ())
+    assert [one.rows["track_id"].tolist() for one in found] == [[1], [1], []]
 
 
 @given(seed=st.integers(0, 2**32 - 1))
@@ -155,3 +163,132 @@ def test_of_two_boxes_with_one_id_the_nearer_to_its_sample_is_taken():
     out = full(tracks, [{1: (7, 0.0)}, {1: (8, 0.4)}])
     assert [frame[1][0] for frame in out] == [7, 7, out[2][1][0], 8, 8]
     assert [len(frame) for frame in out] == [1] * 5
+
+
+class TestRowByRow:
+    """Both functions beside their definitions, read row by row, on random tracks; also a few rows at a time."""
+
+    @staticmethod
+    def tracks(rng: np.random.Generator) -> list[Frame]:
+        """Four tracks at 10 Hz with gaps, numbered from 12; the last begins late."""
+        frames = []
+        for n in range(40):
+            there = {i: 10.0 * i + 0.1 * n + rng.random() for i in (15, 12, 14, 13) if rng.random() < 0.7}
+            rows = boxes({i: x for i, x in there.items() if i != 15 or n > 20})
+            rows["class_id"], rows["score"] = 1, rng.random(len(rows)).round(2)
+            frames.append(Frame(ns(n / 10) + 5, n + 100, rows))
+        return frames
+
+    @staticmethod
+    def samples(rng: np.random.Generator) -> list[Frame]:
+        """Ids from 30 on, each of a random track or of none, in three of four samples."""
+        out = []
+        for n in range(10):
+            sources = rng.permutation([12, 13, 14, 15, -1])
+            some = {30 + k: (int(source), 5.0 * k + n) for k, source in enumerate(sources[:4]) if rng.random() < 0.75}
+            rows = named(some)
+            rows["class_id"] = rows["track_id"] % 3 + n // 5
+            out.append(Frame(ns(0.4 * n) + 5, n, rows))
+        return out
+
+    @staticmethod
+    def named_slowly(tracks: list[Frame], samples: list[Frame]) -> list[dict[int, tuple]]:
+        reach_ns, out = ns(0.6), []
+        first_class = {}
+        for sample in reversed(samples):
+            first_class |= dict(zip(sample.rows["track_id"].tolist(), sample.rows["class_id"].tolist(), strict=True))
+        for t_ns, _, rows in tracks:
+            best: dict[int, tuple[int, np.void]] = {}
+            for row in rows:
+                own = [
+                    (abs(sample.t_ns - t_ns), sample.t_ns, int(one["track_id"]))
+                    for sample in samples
+                    for one in sample.rows
+                    if one["source_id"] == row["track_id"]
+                ]
+                away, _, who = min(own, default=(reach_ns + 1, 0, 0))
+                if away <= reach_ns and away < best.get(who, (reach_ns + 1,))[0]:
+                    best[who] = away, row
+            here = {who: (float(row["x_px"]), int(row["track_id"]), True) for who, (_, row) in best.items()}
+            for who in {one for sample in samples for one in sample.rows["track_id"].tolist()} - set(here):
+                x = at_time(samples, who, t_ns, reach_ns)
+                if x is not None:
+                    here[who] = x, -1, False
+            out.append({who: (*here[who], first_class[who]) for who in sorted(here)})
+        return out
+
+    @staticmethod
+    def linked_slowly(tracks: list[Frame], roots: dict[int, int]) -> list[dict[int, tuple]]:
+        spans: dict[int, list[int]] = {}
+        for frame in tracks:
+            for one in frame.rows["track_id"].tolist():
+                spans.setdefault(one, []).append(frame.t_ns)
+        parts: dict[int, list[tuple[int, int]]] = {}
+        for one, times in sorted(spans.items(), key=lambda pair: pair[1]):
+            parts.setdefault(roots.get(one, one), []).append((times[0], times[-1]))
+        linked = {root: both for root, both in parts.items() if len(both) > 1}
+        gap_ns = max([b[0] - a[1] for both in linked.values() for a, b in itertools.pairwise(both)] + [0])
+        out: list[dict[int, tuple]] = []
+        for frame in tracks:
+            here = {} if linked else dict.fromkeys(frame.rows["track_id"].tolist())
+            for row in sorted(frame.rows, key=lambda row: spans[row["track_id"]][0], reverse=True):
+                here[roots.get(int(row["track_id"]), int(row["track_id"]))] = row
+            out.append({who: (float(row["x_px"]), int(row["track_id"]), True) for who, row in here.items()})
+        kept = [
+            Frame(frame.t_ns, frame.index, boxes({who: (x + 5) / 20 for who, (x, *_) in here.items()}))
+            for frame, here in zip(tracks, out, strict=True)
+        ]
+        for frame, here in zip(tracks, out, strict=True):
+            for who in set(linked) - set(here):
+                x = at_time(kept, who, frame.t_ns, gap_ns)
+                if x is not None:
+                    here[who] = x, -1, False
+        return [dict(sorted(here.items())) for here in out] if linked else out
+
+    @staticmethod
+    def assert_same(found: list[Frame], wanted: list[dict[int, tuple]], tracks: list[Frame]) -> None:
+        assert [(frame.t_ns, frame.index) for frame in found] == [(frame.t_ns, frame.index) for frame in tracks]
+        for frame, rows in zip(found, wanted, strict=True):
+            assert frame.rows["track_id"].tolist() == list(rows)
+            x, source, observed, *others = zip(*rows.values(), strict=True) if rows else ([], [], [])
+            np.testing.assert_allclose(frame.rows["x_px"], x, atol=1e-6)
+            assert frame.rows["source_id"].tolist() == list(source)
+            assert frame.rows["observed"].tolist() == list(observed)
+            for classes in others:
+                assert frame.rows["class_id"].tolist() == list(classes)
+
+    @pytest.mark.parametrize("part_rows", [1 << 16, 9])
+    def test_ids_are_those_of_the_nearest_sample(self, part_rows: int, monkeypatch):
+        monkeypatch.setattr(framing, "PART_ROWS", part_rows)
+        for seed in range(4):
+            rng = np.random.default_rng(seed)
+            tracks, samples = self.tracks(rng), self.samples(rng)
+            self.assert_same(to_video_rate(tracks, samples, ()), self.named_slowly(tracks, samples), tracks)
+
+    @pytest.mark.parametrize("part_rows", [1 << 16, 9])
+    def test_linked_tracks_are_whole_and_keep_their_boxes(self, part_rows: int, monkeypatch):
+        monkeypatch.setattr(framing, "PART_ROWS", part_rows)
+        for seed in range(4):
+            rng = np.random.default_rng(seed)
+            spans = {11: (2, 9), 12: (0, 8), 13: (12 + seed, 20), 14: (5, 30), 15: (18, 39), 16: (33, 38)}
+            tracks = []
+            for n in range(40):
+                here = [
+                    i for i, (low, high) in spans.items() if n in (low, high) or (low < n < high and n % 7 != i % 7)
+                ]
+                tracks.append(
+                    Frame(ns(n / 10) + 5, n, boxes({i: 10.0 * i + rng.random() for i in rng.permutation(here)}))
+                )
+            roots = {12: 12, 13: 12, 15: 12, 14: 14, 16: 14} if seed < 3 else {12: 12, 14: 14}
+            samples = [Frame(ns(0.4) * n, n, named({who: (one, 0.0)})) for n, (one, who) in enumerate(roots.items())]
+            samples.append(Frame(ns(9.0), 9, named({40: (-1, 0.0)})))
+            self.assert_same(linked_tracks(tracks, samples, ()), self.linked_slowly(tracks, roots), tracks)
+
+
+def at_time(frames: list[Frame], who: int, t_ns: int, most_ns: int) -> float | None:
+    """The place of a track at a time, between two of its rows that are near enough to each other."""
+    own = [(frame.t_ns, float(row["x_px"])) for frame in frames for row in frame.rows if row["track_id"] == who]
+    for (low, start), (high, end) in zip(own, [*own[1:], own[-1]] if own else [], strict=True):
+        if t_ns == low or (low < t_ns < high and high - low <= most_ns):
+            return start + (t_ns - low) / max(high - low, 1) * (end - start)
+    return None

@@ -244,6 +244,9 @@ class TestGeometry:
         assert (np.diff(counts["entered"].astype(int), axis=0) >= 0).all()
         assert counts["inside"].max(axis=0)[:2].tolist() == [one.most_inside for one in totals[:2]]
         assert [one.visits for one in totals[:2]] == counts["entered"][-1][:2].tolist()
+        assert [(one.forward, one.backward) for one in totals[:2]] == [(0, 0)] * 2
+        of_line = totals[2].visits, totals[2].entered, totals[2].left, totals[2].dwell_s, totals[2].most_inside
+        assert of_line == (0, 0, 0, 0.0, 0)
         # a line that runs the other way
         other = collection(feature("gate", "LineString", LINE[::-1]))
         (turned,) = count(frames, other, margin, 0.5)[1]
