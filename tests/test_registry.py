@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import sys
+from importlib.metadata import packages_distributions, version
 from pathlib import Path
 
 import pytest
@@ -120,6 +121,15 @@ def test_a_package_that_is_installed_later_is_known(installed):
     assert registry.distribution_of("fresh") == ("", "")
     package(installed, "fresh", "3", "mcaptrack.trackers", {})
     assert registry.distribution_of("fresh.part") == ("fresh", "3")
+
+
+def test_modules_of_installed_packages_are_of_what_importlib_says():
+    wanted = {top: owners for top, owners in packages_distributions().items() if top.isidentifier()}
+    some = sorted(wanted)[::7]
+    assert {top: registry.distribution_of(f"{top}.part") for top in some} == {
+        top: (wanted[top][0], version(wanted[top][0])) for top in some
+    }
+    assert registry.distribution_of(f"{some[0]}_of_nobody") == ("", "")
 
 
 @pytest.mark.parametrize("layout", ["", "src"])

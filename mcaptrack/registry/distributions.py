@@ -5,20 +5,16 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Mapping
 from functools import lru_cache
-from importlib.metadata import Distribution, EntryPoint, PackageNotFoundError, distributions, packages_distributions
+from importlib.metadata import Distribution, EntryPoint, distributions
 from pathlib import Path
 from urllib.parse import urlsplit
 
 
 def distribution_of(module: str) -> tuple[str, str]:
     """Name and version of the distribution of a module; "" and "" if unknown."""
-    found = [name for name in _distributions(_places()).get(module.partition(".")[0], []) if name]
-    try:
-        return _name_and_version(Distribution.from_name(found[0]) if found else _editable(module))
-    except PackageNotFoundError:
-        return "", ""
+    found = _installed(_places(), module.partition(".")[0])
+    return _name_and_version(_editable(module) if found is None else found)
 
 
 def _editable(module: str) -> Distribution | None:
@@ -60,13 +56,23 @@ def _changed_ns(place: str) -> int:
         return 0
 
 
-@lru_cache(maxsize=2)
-def _distributions(_places: tuple[tuple[str, int], ...]) -> Mapping[str, list[str]]:
-    """The distributions of top-level modules; kept as long as nothing is installed, because all files are searched."""
+@lru_cache(maxsize=32)
+def _installed(_places: tuple[tuple[str, int], ...], top: str) -> Distribution | None:
+    """The distribution that installed a top-level module, by its metadata; kept until something is installed.
+
+    ``importlib.metadata.packages_distributions`` would parse the metadata and all files of every distribution.
+    """
+    return next((one for one in distributions() if _has_module(one, top) and _name(one)), None)
+
+
+def _has_module(distribution: Distribution, top: str) -> bool:
+    """Whether a distribution installed a top-level module, by what it declares, or else by its list of files."""
     try:
-        return packages_distributions()
+        declared = (distribution.read_text("top_level.txt") or "").split()
+        files = distribution.read_text("RECORD") or ""
     except Exception:  # metadata of another package that can't be read
-        return {}
+        return False
+    return top in declared if declared else bool(re.search(rf"^{re.escape(top)}(/[^,\n]*)?\.py,", files, re.MULTILINE))
 
 
 def _name_and_version(distribution: Distribution | None) -> tuple[str, str]:

@@ -9,6 +9,8 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from copy import copy
+from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any, Final, NamedTuple
 
@@ -99,11 +101,16 @@ def ros_types(kind: MessageType) -> tuple[Any, str]:
     if not found:
         raise McaptrackError(f"{kind.name!r} is not the name of a ROS message; those are like sensor_msgs/Image")
     name = "{}/msg/{}".format(*found.groups())
-    return _typestore(name, kind, Stores.ROS1_NOETIC if kind.encoding == "ros1" else Stores.LATEST), name
+    # Each reader sets the longest sequence of its own store; what was compiled for the type is shared.
+    return copy(_typestore(name, kind, Stores.ROS1_NOETIC if kind.encoding == "ros1" else Stores.LATEST)), name
 
 
+@lru_cache(maxsize=64)
 def _typestore(name: str, kind: MessageType, known: Any) -> Any:
-    """The types of a channel: from its definition, supplemented by the standard types of ROS if necessary."""
+    """The types of a channel: from its definition, supplemented by the standard types of ROS if necessary.
+
+    Kept, because the code that reads a type is compiled when it is first used, which takes longer than a short log.
+    """
     from rosbags.typesys import Stores, get_typestore
 
     why = "the log has no definition of it, and it is not a standard type of ROS"
