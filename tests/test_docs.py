@@ -24,6 +24,7 @@ import pytest
 
 from mcaptrack import __version__
 from tests.commands import GROUP, call, done
+from tests.tiers import thorough
 from tools import options_doc, pages, readme
 from tools.pages import NOT_RUN, ROOT, Block
 
@@ -67,7 +68,12 @@ def prepared(tmp_path_factory) -> Path:
     return making.rename(folder)
 
 
-@EVERY_PAGE
+@pytest.mark.parametrize(
+    "page",
+    # tools/readme.py runs the commands of README.md in an environment of its own.
+    [pytest.param(path, marks=thorough) if path == README else path for path in PAGES],
+    ids=[path.relative_to(ROOT).as_posix() for path in PAGES],
+)
 def test_every_block_of_a_page_runs_and_prints_what_stands_below_it(page, prepared, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run_page(pages.blocks(page), prepared)

@@ -10,6 +10,8 @@ from typing import Any
 import nbformat
 import pytest
 
+from tests.tiers import one_in
+
 ROOT = Path(__file__).parent.parent
 NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
 
@@ -35,7 +37,7 @@ def own_jupyter(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", one_in(2, NOTEBOOKS), ids=lambda path: path.stem)
 def test_a_notebook_prints_what_stands_in_it(path, tmp_path, own_jupyter):
     notebook = nbformat.read(path, as_version=4)
     kept = printed(notebook)

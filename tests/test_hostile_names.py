@@ -20,6 +20,7 @@ from mcaptrack.sources import synthetic
 from mcaptrack.viewing.serving import Server
 from tests.commands import GROUP, Outcome, call, done
 from tests.effects.commands import CASES
+from tests.tiers import one_in
 from tests.worlds import small_scene
 
 #: A line end, a sequence that clears the screen, one in a single character, writing from right to left, markup.
@@ -117,7 +118,7 @@ def check(text: str) -> None:
         assert not line.lstrip().startswith("PWNED"), ascii(text)
 
 
-@pytest.mark.parametrize(("command", "line"), LINES, ids=[line for _, line in LINES])
+@pytest.mark.parametrize(("command", "line"), one_in(2, LINES), ids=[line for _, line in LINES])
 def test_no_name_reaches_the_terminal_as_it_is(command, line, run):
     for outcome in (run(f"{line} -v"), run(f"{line} --json") if "--json" not in line else run(line)):
         check(outcome.err)

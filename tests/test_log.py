@@ -274,7 +274,7 @@ def test_damage_is_said_in_a_line(tmp_path, kind):
 
 
 @given(at=st.integers(0, 10_000), bit=st.integers(0, 7))
-@settings(max_examples=300)
+@settings(max_examples=150)
 def test_a_flipped_bit_is_never_a_wrong_message(tmp_path_factory, at, bit):
     path = tmp_path_factory.mktemp("log") / "a.mcap"
     messages = [("abc"[n % 3], n * 10, n, bytes([n]) * 40) for n in range(40)]

@@ -7,6 +7,7 @@ import random
 import subprocess
 import sys
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.log import byte_source
 from mcaptrack.schema import TRACKS
 from tests.logs import write_stock
-from tests.tiers import thorough
+from tests.tiers import one_in, thorough
 from tests.worlds import tracks_at
 
 KINDS = {
@@ -73,9 +74,9 @@ def facts(path: Path) -> object:
         return opened.metadata("about"), opened.attachment("notes.txt"), opened.fingerprint(), places
 
 
-@pytest.mark.parametrize("look", [all_messages, all_streamed, facts])
-@pytest.mark.parametrize("change", CHANGES)
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("kind", "change", "look"), one_in(4, product(KINDS, CHANGES, [all_messages, all_streamed, facts]))
+)
 def test_a_change_before_any_read_gives_the_old_content_the_new_one_or_an_error(
     tmp_path, monkeypatch, kind, change, look
 ):

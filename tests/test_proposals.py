@@ -25,6 +25,7 @@ from tests.interrupted import interrupt
 from tests.models import stocked
 from tests.robots import write_log
 from tests.stores import Store, only_in
+from tests.tiers import one_in
 
 PACKAGE = Path(mcaptrack.__file__).parent
 #: A name that is difficult for a shell, an option parser and a parser of messages.
@@ -315,7 +316,7 @@ def words_of(line: str) -> list[str]:
     return shown.decode().split("\0")[:-1]
 
 
-@pytest.mark.parametrize("where", SCENES)
+@pytest.mark.parametrize("where", one_in(2, SCENES))
 def test_a_proposed_command_works(where, template, tmp_path, monkeypatch, request):
     if where.startswith("cli/train"):
         pytest.importorskip("torch", reason="training needs torch")

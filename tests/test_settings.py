@@ -19,11 +19,12 @@ from mcaptrack import environment
 from mcaptrack.cli.config import MAX_BYTES, user_file
 from mcaptrack.cli.settings import CALL_ONLY, Setting
 from tests.commands import GROUP, call, toml_value
+from tests.tiers import one_in
 
 COMMANDS = GROUP.commands
 #: Arguments of commands, as far as they need any.
 ARGUMENTS = {"drop": ["x.mcap", "/a"], "demo": [], "doctor": []}
-EVERY_COMMAND = pytest.mark.parametrize("command", sorted(COMMANDS))
+EVERY_COMMAND = pytest.mark.parametrize("command", one_in(2, sorted(COMMANDS)))
 
 
 @pytest.fixture(autouse=True)

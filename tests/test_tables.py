@@ -32,6 +32,7 @@ from mcaptrack.schema import EVENTS, PREDICTIONS, SCHEMAS, TRACKS, Frame
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.tables import TABLES, Pointers
 from tests.strategies import columns
+from tests.tiers import one_in
 from tests.worlds import ns, tracks_at
 
 ROOT = Path(__file__).parent.parent
@@ -353,7 +354,7 @@ def same(path, form, table):
     return read.column("track_id").to_pylist() == table.column("track_id").to_pylist()
 
 
-@pytest.mark.parametrize("form", tables.FORMATS)
+@pytest.mark.parametrize("form", one_in(2, tables.FORMATS))
 def test_killed_at_any_byte_or_call_the_file_is_the_old_one_or_the_new_one(tmp_path, monkeypatch, form):
     path, (old, new) = tmp_path / "t", two_tables()
     tables.write(path, new, {}, (), form)

@@ -114,7 +114,7 @@ def ends_of_ranges(kind) -> dict[str, list]:
 
 @pytest.mark.parametrize("name", KINDS)
 @given(data=st.data(), seed=SEEDS)
-@settings(max_examples=12)
+@settings(max_examples=8)
 def test_options_at_the_ends_of_their_ranges_run_without_warnings(name, data, seed):
     """Any options at the least or greatest value that they accept: rows conform to the schema, and no warnings."""
     kind = KINDS[name]
