@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from itertools import count
 
 import numpy as np
@@ -36,6 +37,7 @@ def refused(read, values: dict, said: str) -> None:
     with pytest.raises(McaptrackError) as error:
         read(values)
     assert said in str(error.value)
+    assert re.match(r"\S*\d+\.yaml\b", str(error.value))
 
 
 def entry(place: int, value: float) -> list[float]:
@@ -48,13 +50,13 @@ def entry(place: int, value: float) -> list[float]:
     [
         ({"extrinsic": POSE}, TURN, PLACE),
         ({"RT": [*POSE, [0, 0, 0, 1]]}, TURN, PLACE),
-        ({"T_cam_world": sum(POSE, [])}, TURN, PLACE),
+        ({"T_cam_world": np.ravel(POSE).tolist()}, TURN, PLACE),
         ({"tvec": [4, 5, 6], "RT": POSE}, TURN, PLACE),
         ({"R": TURN, "t": PLACE, "RT": POSE}, TURN, PLACE),
         ({"rotation_matrix": EYE, "translation": [[4], [5], [6]], "RT": POSE}, EYE, [4, 5, 6]),
         ({"rvec": [0, 0, np.pi / 2], "tvec": PLACE, "RT": [*POSE[:2], [0, 0, 1, 9]]}, TURN, PLACE),
         ({"rvec": [0, 0, np.pi / 2], "R": EYE, "tvec": PLACE}, TURN, PLACE),
-        ({"rvec": sum(TURN, []), "tvec": PLACE}, TURN, PLACE),
+        ({"rvec": np.ravel(TURN).tolist(), "tvec": PLACE}, TURN, PLACE),
         ({"K": K}, None, None),
     ],
 )
@@ -92,7 +94,8 @@ def test_poses(read, values, turn, place):
         ({"K": entry(2, -100_001)}, "is not fx 0 cx, 0 fy cy, 0 0 1"),
         ({"K": entry(1, 0.91)}, "has a skew of 0.91"),
         ({"K": entry(1, -0.91)}, "has a skew of -0.91"),
-        ({"K": [*K, 1]}, "k has 10 numbers, and needs 3 x 3"),
+        ({"K": [*K, 1]}, "yaml: k has 10 numbers, and needs 3 x 3"),
+        ({"K": ["x", *K[1:]]}, "yaml: k holds something else than finite numbers"),
         ({"K": K, "D1": [1], "M2": K}, "holds two cameras (K, D1, M2), of which m2 is one"),
         ({"rms": 1, "boards": 2}, "holds rms, boards; a calibration has"),
         ({f"a{n}": 1 for n in range(12)}, "a10, a11; a calibration has"),

@@ -112,7 +112,9 @@ def test_rows_get_the_columns_of_the_table():
         }
     )
     own = columns_of(batch.schema)
-    table = pa.schema([("t", US), ("word", TEXT), ("old", F32), ("recording", TEXT), ("more", pa.decimal128(20, 0)), ("n", F64)])
+    table = pa.schema(
+        [("t", US), ("word", TEXT), ("old", F32), ("recording", TEXT), ("more", pa.decimal128(20, 0)), ("n", F64)]
+    )
     made = converted(batch, "night", own, table)
     assert made.schema == table
     assert made.to_pylist() == [
