@@ -601,6 +601,8 @@ def test_pictures_by_times_have_limits():
         assert len(made.index) == count
     with pytest.raises(McaptrackError) as error:
         Timeline.of_times(Path("a"), np.array([0.0, 0.63]), Fraction(2))
+    with pytest.raises(McaptrackError, match="its times are no multiples of 1/2 s"):  # two in one frame
+        Timeline.of_times(Path("a"), np.array([0.0, 0.1, 1.0]), Fraction(2))
     assert str(error.value) == "a: its times are no multiples of 1/2 s; leave `fps=` out"
     with pytest.raises(McaptrackError, match="its times are less than a nanosecond apart"):
         Timeline.of_times(Path("a"), np.array([1.0, 1.0 + 4e-10]), None)
@@ -634,6 +636,9 @@ def test_times_between_pictures_that_are_far_apart_belong_to_none(tmp_path):
     ):
         made.place(tmp_path / "a", late, [])
     one = Timeline(np.array([0]), np.array([5 * 10**9]), "the pictures")
-    assert one.place(tmp_path / "a", read(tmp_path, table("0.4,1,2,3,4", header="t,x,y,w,h")), []).number.tolist() == [
-        0
-    ]
+    for seconds in ("0.4", "0.5", "5.5", "4.5"):  # in the log, or since the only picture
+        found = one.place(tmp_path / "a", read(tmp_path, table(f"{seconds},1,2,3,4", header="t,x,y,w,h")), [])
+        assert found.number.tolist() == [0]
+    for seconds in ("0.51", "5.51"):
+        with pytest.raises(McaptrackError, match=rf"from {seconds} to {seconds} s, the pictures from 5.000 to 5.000 s"):
+            one.place(tmp_path / "a", read(tmp_path, table(f"{seconds},1,2,3,4", header="t,x,y,w,h")), [])

@@ -16,7 +16,7 @@ from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import in_place, journal
 from mcaptrack.log.byte_source import OpenFile
-from mcaptrack.log.journal import journal_of
+from mcaptrack.log.journal import _read_version_1, journal_of
 from tests.interrupted import add_results, everything, first_journal, interrupt
 from tests.logs import SCHEMA, write_log
 
@@ -240,6 +240,31 @@ def test_the_first_versions_journal_saves_a_log_to_another_file_and_is_not_put_b
     journal_of(path).write_bytes(first_journal(8, 8, whole[:8], b""))
     with notices.collected(), notices.listening(lambda _: None):
         assert log.recover(path, saved).messages == len(SOME)
+
+
+def test_a_journal_of_the_first_version_is_used_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_log(path, SOME, "media")
+    whole = path.read_bytes()
+    with log.read(path) as opened:
+        start = opened.index.data_end
+    path.write_bytes(whole[:start] + b"half of something")
+    good = first_journal(start, len(whole), whole[:start], whole[start:])
+
+    def content(journal: bytes) -> bytes | None:
+        journal_of(path).write_bytes(journal)
+        found = _read_version_1(OpenFile.at(journal_of(path)), OpenFile.at(path))
+        return None if found is None else bytes(found[0 : len(found)])
+
+    assert content(good) == whole
+    begin, head = good.index(b"\n") + 1, len(good) - (len(whole) - start)
+    for at in range(begin, head + 1):
+        assert content(good[:at]) is None
+    for at in [*range(begin, head), head, len(good) - 1]:
+        assert content(good[:at] + bytes([good[at] ^ 1]) + good[at + 1 :]) is None, at
+    assert content(good + b"x") is None
+    path.write_bytes(whole[: start - 1] + b"!" + whole[start:])
+    assert content(good) is None
 
 
 def test_a_log_that_replaces_another_is_not_held_up_by_its_journal(path):

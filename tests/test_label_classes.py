@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import mcaptrack
 from mcaptrack.errors import McaptrackError
+from mcaptrack.sources.ingest.labels.reading import read_labels
+from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
 MOT = "".join(f"{t},{who},{10 * who},20,30,60,{flag},{kind},1\n" for t in (1, 2)
               for who, flag, kind in ((1, 1, 1), (2, 0, 3), (3, 0, 4), (4, 0, 1)))  # fmt: skip
@@ -137,3 +140,74 @@ def test_text_in_other_encodings_is_refused_by_name(tmp_path, encoding, words):
     rows = "".join(f"{t},{10 * t},20,30,60,Fußgänger\n" for t in range(30))
     with pytest.raises(McaptrackError, match=words):
         ingest(tmp_path, "a.csv", ("frame,x,y,w,h,class\n" + rows).encode(encoding))
+
+
+@pytest.mark.parametrize(
+    ("form", "numbers"),
+    [
+        ("sdd", {"Pedestrian": 1, "Biker": 2, "Skater": 3, "Cart": 4, "Car": 5, "Bus": 6, "Dog": 7, "Tram": 8}),
+        (
+            "kitti",
+            {"Pedestrian": 1, "Cyclist": 2, "Car": 3, "Van": 4, "Truck": 5, "Tram": 6, "Person_sitting": 7, "Misc": 8,
+             "Cow": 9},
+        ),
+        ("kitti", {"Person": 7, "Bus": 9}),
+    ],
+)  # fmt: skip
+def test_classes_have_their_numbers_and_others_the_next_ones(form, numbers, tmp_path):
+    write = {
+        "sdd": lambda n, name: f'{n} {10 * n} 20 {10 * n + 9} 40 0 0 0 0 "{name}"\n',
+        "kitti": lambda n, name: f"0 {n} {name} 0 0 0 {10 * n} 20 {10 * n + 9} 40 1 1 1 1 1 1 0\n",
+    }[form]
+    (tmp_path / "a.txt").write_text("".join(write(n, name) for n, name in enumerate(numbers)))
+    labels = read_labels(tmp_path / "a.txt", form, "tracks", wanted=WantedClasses("all"))
+    assert labels.class_id.tolist() == list(numbers.values())
+    assert labels.classes == {number: name for name, number in numbers.items()}
+
+
+MOT_NAMES = [
+    "pedestrian", "person on vehicle", "car", "bicycle", "motorbike", "non motorized vehicle", "static person",
+    "distractor", "occluder", "occluder on the ground", "occluder full", "reflection", "crowd",
+]  # fmt: skip
+
+
+def test_classes_of_the_motchallenge_that_are_scored_forgiven_or_false(tmp_path):
+    rows = [f"1,{n},{10 * n},20,9,20,1,{n},1\n" for n in range(1, 14)] + ["1,14,5,20,9,20,0,1,1\n"]
+    (tmp_path / "a.txt").write_text("".join(rows))
+    truth = read_labels(tmp_path / "a.txt", "mot", "truth", wanted=WantedClasses("person"))
+    assert (truth.id.tolist(), truth.class_id.tolist(), truth.classes) == ([1], [1], {})
+    assert truth.left_out == "13 boxes that don't count (score 0 or a class but 1)"
+    assert truth.ignored.boxes_px[:, 0].tolist() == [*range(20, 140, 10), 5]
+    assert np.flatnonzero(truth.ignored.forgiven).tolist() == [n - 2 for n in (2, 7, 8, 12)]
+    assert not truth.ignored.region.any()
+    every = read_labels(tmp_path / "a.txt", "mot", "truth", wanted=WantedClasses("all"))
+    assert (every.id.tolist(), every.class_id.tolist()) == (list(range(1, 14)), list(range(1, 14)))
+    assert every.classes == dict(enumerate(MOT_NAMES, start=1))
+    assert every.left_out == "1 boxes of other classes (column 8), or with a score of 0"
+    tracks = read_labels(tmp_path / "a.txt", "mot", "tracks", wanted=WantedClasses("person"))
+    assert (len(tracks.id), set(tracks.class_id.tolist())) == (14, {1})
+    assert tracks.left_out == "the classes of 12 boxes that aren't people (column 8)"
+
+
+def test_people_of_kitti_that_are_scored_forgiven_or_false(tmp_path):
+    """Truncated, occluded; the left edge says which."""
+    rows = {
+        10: ("Pedestrian", 0, 2), 20: ("Pedestrian", 0, 3), 30: ("Pedestrian", 1, 0), 40: ("Person_sitting", 0, 0),
+        50: ("Car", 0, 0), 60: ("DontCare", -1, -1), 70: ("Pedestrian", 0, 0), 80: ("Person", 0, 0),
+    }  # fmt: skip
+    (tmp_path / "a.txt").write_text("".join(
+        f"0 {x} {kind} {cut} {hidden} 0 {x} 20 {x + 9} 40 1 1 1 1 1 1 0\n" for x, (kind, cut, hidden) in rows.items()
+    ))  # fmt: skip
+    truth = read_labels(tmp_path / "a.txt", "kitti", "truth", wanted=WantedClasses("person"))
+    assert truth.id.tolist() == [10, 70]
+    assert truth.left_out == "1 Person_sitting, 1 Car, 1 DontCare, 1 Person and 2 Pedestrian, hidden or cut off"
+    ignored = truth.ignored
+    assert ignored.boxes_px[:, 0].tolist() == [20, 30, 40, 60, 80]
+    assert ignored.region.tolist() == [False, False, False, True, False]
+    assert ignored.forgiven.tolist() == [True, True, True, False, True]
+    tracks = read_labels(tmp_path / "a.txt", "kitti", "tracks", wanted=WantedClasses("person"))
+    assert (tracks.id.tolist(), tracks.ignored) == ([10, 20, 30, 70], None)
+    every = read_labels(tmp_path / "a.txt", "kitti", "truth", wanted=WantedClasses("all"))
+    assert every.id.tolist() == [10, 40, 50, 70, 80]
+    assert every.left_out == "1 DontCare and 2 boxes, hidden or cut off"
+    assert every.ignored.boxes_px[:, 0].tolist() == [20, 30, 60]

@@ -247,10 +247,13 @@ def test_no_changed_byte_of_a_summary_goes_unnoticed(tmp_path):
     assert unnoticed == []
 
 
-def summarised(path: Path, *records: bytes) -> int:
-    """Write a log with a schema, a channel and a chunk, and a summary of these records; returns where that begins."""
+def summarised(path: Path, *records: bytes, offsets: int | None = None) -> int:
+    """Write a log with a schema, a channel and a chunk, and a summary of these records; returns where that begins.
+
+    The footer places the summary offsets at so many bytes from there.
+    """
     data = MAGIC + b"".join([HEADER, A, B, *WHOLE, END])
-    footer = struct.pack("<BQQQ", 0x02, 20, len(data), 0)
+    footer = struct.pack("<BQQQ", 0x02, 20, len(data), 0 if offsets is None else len(data) + offsets)
     crc = zlib.crc32(b"".join(records) + footer)
     path.write_bytes(data + b"".join(records) + footer + crc.to_bytes(4, "little") + MAGIC)
     return len(data)
@@ -311,3 +314,37 @@ def test_what_a_summary_lacks_is_a_warning_where_it_costs_time_and_an_error_wher
 ):
     start = summarised(tmp_path / "a.mcap", *records)
     assert findings(tmp_path / "a.mcap") == [(kind, start, level, words) for kind, level, words in found]
+
+
+def test_summary_offsets_are_in_the_summary_and_name_its_groups(tmp_path):
+    path, records = tmp_path / "a.mcap", [A, B, CHUNK_INDEX, STATISTICS]
+    size, start = sum(map(len, records)), summarised(path, *records)
+    for offsets in (-1, size + 1, -start + 3):
+        summarised(path, *records, offsets=offsets)
+        words = f"the footer places the summary offsets at byte {start + offsets}"
+        assert findings(path) == [("footer", start + size, "error", words)]
+
+    def offset(place: int, of: int | None = None, longer: int = 0) -> bytes:
+        low = start + sum(map(len, records[:place]))
+        whole = len(records[place]) if of is None else of
+        return record(0x0E, struct.pack("<BQQ", records[place][0], low, whole + longer))
+
+    groups = [offset(place) for place in range(4)]
+    at = start + size
+    for listed, found in (
+        (groups, []),
+        (groups[:3], [("no-summary-offset", at, "warning", "the statistics records have no summary offset")]),
+        ([*groups[1:], A], [
+            ("summary-offset", at + 3 * len(groups[0]), "error", "a schema among summary offsets"),
+            ("no-summary-offset", at, "warning", "the schema records have no summary offset"),
+        ]),
+        ([offset(0, longer=1), *groups[1:]], [
+            ("summary-offset", at, "error", "the schema records are not at their summary offset")
+        ]),
+        ([*groups[:2], offset(2, of=0), groups[3]], [
+            ("empty-group", at + 2 * len(groups[0]), "warning", "a summary offset of an empty group of chunk-index "
+             "records; some readers report it as damage")
+        ]),
+    ):  # fmt: skip
+        summarised(path, *records, *listed, offsets=size)
+        assert findings(path) == found

@@ -31,6 +31,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import EVENTS, PREDICTIONS, SCHEMAS, TRACKS, Frame
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.tables import TABLES, Pointers
+from mcaptrack.tables import files as tables_files
 from tests.strategies import columns
 from tests.tiers import one_in
 from tests.worlds import ns, tracks_at
@@ -51,6 +52,44 @@ def pointers(frames):
 def some_tracks(people):
     """A table of tracks, a frame a dictionary of people."""
     return tables.rows_table(TRACKS, {"/a": [Frame(n, n, tracks_at(who)) for n, who in enumerate(people)]})
+
+
+#: Columns, each of which differs from the first of its line in one value, or in which rows are null.
+DIGESTED = [
+    [pa.array(values, kind) for values in lines]
+    for kind, *lines in [
+        (pa.int64(), [1, 2, 0], [1, 3, 0], [1, 2, None], [1, None, 0], [2, 1, 0]),
+        (pa.float64(), [0.5, 0.0, -1.0], [0.5, -0.0, -1.0], [0.5, None, -1.0], [0.25, 0.0, -1.0]),
+        (pa.bool_(), [True, False, False], [True, True, False], [True, None, False], [True, False, None]),
+        (pa.string(), ["ab", "c", ""], ["a", "bc", ""], ["ab", "c", None], ["ab", "d", ""], ["ab", "", "c"]),
+        (pa.large_string(), ["ab", "c", ""], ["a", "bc", ""], ["ab", "c", None]),
+        (pa.binary(), [b"ab", b"c", b""], [b"a", b"bc", b""], [b"ab", b"c", None]),
+        (pa.timestamp("ns"), [1, 2, 0], [1, 3, 0], [1, 2, None]),
+        (pa.list_(pa.int32()), [[1, 2], [], [3]], [[1], [2], [3]], [[1, 2], None, [3]], [[1, 2], [], [4]]),
+        (pa.list_(pa.string()), [["a", "b"], [], []], [["ab"], [], []], [["a", "c"], [], []]),
+        (pa.dictionary(pa.int8(), pa.string()), ["a", "b", "a"], ["a", "b", "b"], ["a", "b", None]),
+        (pa.null(), [None, None, None]),
+    ]
+]
+
+
+def test_a_digest_is_of_names_types_and_values_and_not_of_pieces():
+    def digest(name: str, *pieces: pa.Array) -> str:
+        parts = [pa.table({"id": pa.array([7] * len(one), pa.int8()), name: one}) for one in pieces]
+        return tables_files.digest(parts[0].schema, parts)
+
+    found = {digest("other", DIGESTED[0][0])}
+    for same in DIGESTED:
+        for one in same:
+            whole = digest("x", one)
+            assert digest("x", one[:0], one[:1], one[1:]) == digest("x", one[:2], one[2:]) == whole
+            assert whole not in found
+            found.add(whole)
+    # Names in other places of a dictionary are the same names; rows are counted where all values are null.
+    words = DIGESTED[-2][0]
+    turned = pa.DictionaryArray.from_arrays(pa.array([1, 0, 1], pa.int8()), ["b", "a"])
+    assert digest("x", turned) == digest("x", words)
+    assert digest("x", DIGESTED[-1][0][:2]) not in found
 
 
 @given(st.data())
