@@ -16,8 +16,8 @@ import mcaptrack
 from mcaptrack import McaptrackError, log, pipeline
 from mcaptrack.api import demonstration
 from mcaptrack.notices import collected
-from mcaptrack.sources import synthetic
-from mcaptrack.sources.synthetic import Pedestrian, Pose, SyntheticScene, three_cameras
+from mcaptrack.sources.scenes import PLACES, three_cameras
+from mcaptrack.sources.synthetic import Pedestrian, Pose, SyntheticScene
 from mcaptrack.sources.video import write_mp4
 from tests.commands import done
 
@@ -162,7 +162,7 @@ def test_the_demonstration_of_three_cameras_draws_and_ingests_all(
     def stop(*_: object, **__: object) -> None:
         raise McaptrackError("it is drawn")
 
-    monkeypatch.setitem(synthetic.PLACES, "three-cameras", short)
+    monkeypatch.setitem(PLACES, "three-cameras", short)
     monkeypatch.setattr(demonstration, "run", stop)
     with collected(), pytest.raises(McaptrackError, match="it is drawn"):
         mcaptrack.demo(tmp_path, scene="three-cameras", seed=4)

@@ -25,6 +25,7 @@ from mcaptrack.cli.models import models
 from mcaptrack.cli.query import query
 from mcaptrack.cli.render import render
 from mcaptrack.cli.report import report
+from mcaptrack.cli.run import run
 from mcaptrack.cli.show import export, info
 from mcaptrack.cli.stages import add_stages
 from mcaptrack.cli.text import show
@@ -66,6 +67,7 @@ _MAKE, _RUN, _LOOK = "Make a log", "Detect, track, predict", "Look at results"
 _MEASURE, _KEEP = "Measure and improve", "Check and repair logs"
 register(app, _MAKE, "ingest", ingest)
 register(app, _MAKE, "demo", demo)
+register(app, _RUN, "run", run)
 add_stages(app, _RUN)
 register(app, _RUN, "fuse", fuse)
 register(app, _RUN, "models", models)

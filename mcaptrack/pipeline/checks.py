@@ -166,3 +166,15 @@ def _making(opened: log.Log, topic: str) -> list[tuple[Provenance | None, str]]:
         if channel.topic == topic
         for schema in [part.index.schemas.get(channel.schema_id)]
     ]
+
+
+def first_stage(opened: log.Log, source: str) -> str:
+    """Return the first stage of a run that begins with this topic. Raises McaptrackError if no stage reads it."""
+    channel = opened.channel(source)
+    for stage in STAGES.values():
+        if stage.default.reads in (VIDEO, DETECTIONS) and fits(channel, stage.default.reads)[1]:
+            return stage.name
+    wanted = ", ".join((*foreign.PICTURES_READ, DETECTIONS.name, *foreign.BOXES_READ))
+    raise McaptrackError(
+        f"{opened.path}: {source} holds {channel.schema_name or 'no schema'}; run begins with one of {wanted}"
+    )

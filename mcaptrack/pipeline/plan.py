@@ -15,7 +15,7 @@ from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.plane import is_assumed
 from mcaptrack.notices import warn
 from mcaptrack.pipeline import motion
-from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, fits
+from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, first_stage
 from mcaptrack.pipeline.corrections import is_of_corrections
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, read_planes, warn_unused
 from mcaptrack.pipeline.rebuild import MissingPluginError, differing, fuser_of, rebuild
@@ -23,7 +23,6 @@ from mcaptrack.pipeline.spaces import check_spaces, suited_tracker
 from mcaptrack.pipeline.staleness import is_stale
 from mcaptrack.schema import DETECTIONS, SIGHTINGS, VIDEO
 from mcaptrack.schema.provenance import FUSE, Provenance
-from mcaptrack.sources import foreign
 from mcaptrack.sources.camera_motion import motion_topic
 from mcaptrack.sources.cameras import USUAL, camera_at, provenance_of
 from mcaptrack.transforms import FUSION, STAGES, Stage, Transform
@@ -90,7 +89,7 @@ def plan_all(
     ``changed`` are topics that were made again already, and are not written yet. Raises McaptrackError as
     ``plan_stage`` does, and if the class that made a channel is not installed.
     """
-    sources = {_stage_from(opened, source): source} if source else {}
+    sources = {first_stage(opened, source): source} if source else {}
     planner = _Planner(opened, prefix, sources, defaults, force, chosen, shared, plane, frame_id)
     planner.take_as_changed(changed, renewed)
     warn_unused(opened, prefix, plane)
@@ -101,18 +100,6 @@ def plan_all(
     for topic in sorted(camera_at(opened, prefix).topics):  # including results at other topics than the usual ones
         planner.ensure(topic)
     return planner.checked(say)
-
-
-def _stage_from(opened: log.Log, source: str) -> str:
-    """Return the first stage of a run that begins with this topic. Raises McaptrackError if no stage reads it."""
-    channel = opened.channel(source)
-    for stage in STAGES.values():
-        if stage.default.reads in (VIDEO, DETECTIONS) and fits(channel, stage.default.reads)[1]:
-            return stage.name
-    wanted = ", ".join((*foreign.PICTURES_READ, DETECTIONS.name, *foreign.BOXES_READ))
-    raise McaptrackError(
-        f"{opened.path}: {source} holds {channel.schema_name or 'no schema'}; run begins with one of {wanted}"
-    )
 
 
 class _Planner:
