@@ -21,7 +21,7 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
 from mcaptrack.schema import SIGHTINGS, Frame
 from mcaptrack.testing import check_transform
-from mcaptrack.transforms.fuse import CameraView, FootFuser
+from mcaptrack.transforms.fuse import CameraView, FootFuser, agreement
 from mcaptrack.transforms.fuse.grouping import Places, distances, group, means
 from tests.places import CAMERAS, HEIGHT, NS, PEOPLE, SECONDS, WIDTH, errors, fused, said, write_log
 
@@ -347,3 +347,139 @@ def test_a_fuser_obeys_the_laws_of_transforms(
 ) -> None:
     frames = [Frame(number * NS, number, sightings(part)) for number, part in enumerate(drawn)]
     check_transform(FootFuser(min_score=0.0), frames)
+
+
+class TestAgreement:
+    """What cameras are compared by, beside the same said box by box."""
+
+    CAMERAS: Final = 4
+
+    @staticmethod
+    def frames(seed: int) -> list[Frame]:
+        """Six people who walk or stand; cameras miss some, see false ones, and the third one is late and off."""
+        rng = np.random.default_rng(seed)
+        begin, pace = rng.uniform(60, 700, (6, 2)), rng.normal(0, 1.0, (6, 2)) * (np.arange(6) < 4)[:, None]
+        frames = []
+        for n in range(9):
+            drawn = []
+            for camera in range(TestAgreement.CAMERAS):
+                for at, speed in zip(begin, pace, strict=True):
+                    if rng.random() < 0.8:
+                        x, y = at + speed * (n / 2) + rng.normal(0, 0.1, 2) + (camera == 2) * np.array([0.3, 0.1])
+                        drawn.append((camera, x, y, 0.3, 0.3, 0.1))
+                if rng.random() < 0.3:
+                    drawn.append((camera, *rng.uniform(60, 700, 2), 0.3, 0.3, 0.0))
+            rows = sightings(drawn) if n != 5 else sightings([])
+            rows["picture_ns"] = n * NS // 2 + 4 * NS + rows["camera"].astype(np.int64) * 10_000_000
+            frames.append(Frame(n * NS // 2 + 4 * NS, n, rows))
+        return frames
+
+    @staticmethod
+    def fuser() -> FootFuser:
+        views = [
+            camera_of(np.eye(3), heights=(0.0, 0.0, 100.0), detects=(0.2, 0.5, 0.6, 0.8), false_share=0.1 * k)
+            for k in range(1, TestAgreement.CAMERAS + 1)
+        ]
+        return FootFuser(min_score=0.0, views=tuple(views))
+
+    @staticmethod
+    def slowly(frames: Sequence[Frame], fuser: FootFuser, offset_ns: Sequence[int]):
+        count = len(fuser.views)
+        hits = [[5.0 * rate for rate in view.detects] for view in fuser.views]
+        tries, boxes = [[5.0] * 4 for _ in range(count)], [5.0] * count
+        false = [5.0 * view.false_share for view in fuser.views]
+        expected = both = 0
+        off, late = ([[] for _ in range(count)] for _ in range(2))
+        before: tuple[int, list] | None = None
+        for frame in frames:
+            rows = frame.rows
+            if not len(rows):
+                before = None
+                continue
+            of, centre, seen = fuser.groups(rows)
+            share = np.array([view.visible(centre.xy_m, frame.t_ns) for view in fuser.views]).T
+            rate = np.array([view.rate(part) for view, part in zip(fuser.views, share.T, strict=True)]).T
+            sure = [g for g in range(len(seen)) if seen[g].sum() >= 3]
+            pace = {}
+            if before:
+                pairs = mutual([centre.xy_m[g] for g in sure], before[1])
+                pace = {
+                    sure[i]: (centre.xy_m[sure[i]] - before[1][j]) / ((frame.t_ns - before[0]) / NS) for i, j in pairs
+                }
+            before = frame.t_ns, [centre.xy_m[g] for g in sure]
+            for g in range(len(seen)):
+                expected += sum(bool(share[g, c] >= 0.5 or seen[g, c]) for c in range(count)) >= 2
+                both += seen[g].sum() >= 2
+                for c in range(count):
+                    others = [o for o in range(count) if o != c]
+                    if sum(seen[g, o] for o in others) >= 2 and share[g, c] > 0:
+                        place = next((k for k, end in enumerate((0.25, 0.5, 0.75)) if share[g, c] < end), 3)
+                        tries[c][place] += 1
+                        hits[c][place] += seen[g, c]
+                    if seen[g, c] and sum(rate[g, o] for o in others) >= 1.5:
+                        boxes[c] += 1
+                        false[c] += not any(seen[g, o] for o in others)
+            for c in range(count):
+                mine = [k for k in range(len(rows)) if rows["camera"][k] == c]
+                places = {}
+                for g in sure:
+                    rest = [k for k in range(len(rows)) if of[k] == g and rows["camera"][k] != c]
+                    cov = [
+                        np.array([[r["cov_xx_m2"], r["cov_xy_m2"]], [r["cov_xy_m2"], r["cov_yy_m2"]]])
+                        for r in rows[rest]
+                    ]
+                    total = sum(map(np.linalg.inv, cov))
+                    at = [np.array([r["x_m"], r["y_m"]]) for r in rows[rest]]
+                    places[g] = np.linalg.solve(total, sum(np.linalg.inv(m) @ p for m, p in zip(cov, at, strict=True)))
+                own = [np.array([rows["x_m"][k], rows["y_m"][k]]) for k in mine]
+                for i, j in mutual(own, list(places.values())):
+                    g = list(places)[j]
+                    apart = own[i] - places[g]
+                    off[c].append(apart)
+                    if g in pace and pace[g] @ pace[g] > 0.25:
+                        away_s = (int(rows["picture_ns"][mine[i]]) - offset_ns[c] - frame.t_ns) / NS
+                        late[c].append(away_s - apart @ pace[g] / (pace[g] @ pace[g]))
+        rates = [[h / t for h, t in zip(*pair, strict=True)] for pair in zip(hits, tries, strict=True)]
+        return rates, [f / b for f, b in zip(false, boxes, strict=True)], (expected, both), off, late
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_rates_and_offsets(self, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(agreement, "LEAST_COMPARED", 5)  # fewer say nothing of a clock
+        frames, fuser, offset_ns = self.frames(seed), self.fuser(), [0, 30_000_000, 0, 10_000_000]
+        for taken_ns in (offset_ns, ()):
+            rates, false, shared, off, late = self.slowly(frames, fuser, taken_ns or [0] * 4)
+            views, offsets, found = agreement.compare(frames, fuser, taken_ns)
+            assert tuple(found) == shared
+            for c, (view, offset) in enumerate(zip(views, offsets, strict=True)):
+                assert view.detects == pytest.approx(rates[c])
+                assert view.false_share == pytest.approx(false[c])
+                assert offset.compared == len(off[c]) > 10
+                assert (offset.x_m, offset.y_m) == pytest.approx(np.median(off[c], axis=0))
+                assert len(late[c]) > 5
+                assert offset.late_s == pytest.approx(np.median(late[c]))
+                assert offset.distance_m == pytest.approx(np.hypot(offset.x_m, offset.y_m))
+
+    @pytest.mark.parametrize(
+        ("expected", "seen", "strangers"), [(50, 12, True), (50, 13, False), (49, 0, False), (100, 25, False)]
+    )
+    def test_cameras_of_other_places(self, expected: int, seen: int, strangers: bool) -> None:
+        shared = agreement.Shared(expected, seen)
+        assert shared.are_strangers is strangers
+        assert f"of {expected} people that two cameras should see, two see {seen}; " in str(shared)
+
+    def test_nothing_says_nothing(self) -> None:
+        views, offsets, shared = agreement.compare([], self.fuser())
+        assert shared == (0, 0)
+        assert [view.false_share for view in views] == pytest.approx([0.1, 0.2, 0.3, 0.4])
+        assert views[0].detects == pytest.approx((0.2, 0.5, 0.6, 0.8))
+        assert all(np.isnan([one.x_m, one.y_m, one.late_s]).all() and one.compared == 0 for one in offsets)
+
+
+def mutual(some: Sequence[np.ndarray], others: Sequence[np.ndarray]) -> list[tuple[int, int]]:
+    """Places that are the nearest of each other, and less than 1.5 m apart."""
+    away = np.array([[np.linalg.norm(a - b) for b in others] for a in some]).reshape(len(some), len(others))
+    return [
+        (i, j)
+        for i, j in np.ndindex(*away.shape)
+        if away[i, j] < 1.5 and away[i].argmin() == j and away[:, j].argmin() == i
+    ]

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import mcaptrack
 from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.zone_places import ground_height_m, place_zone, positions_of
+from mcaptrack.evaluation.zone_places import _in_pieces, ground_height_m, place_zone, positions_of
 from mcaptrack.evaluation.zones import ZoneOptions, find_zone_events, zone_totals
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.geometry.zones import Paths, Shape, crossings, visits
@@ -642,3 +642,68 @@ class TestDrawing:
             outcome = call("zones", "draw", finished, *words)
             assert (outcome.code, len(outcome.err.splitlines())) == (1, 1)
             assert "takes one log" in outcome.err
+
+
+class TestPlaces:
+    """Where tracks and zones are, by hand: two ground planes, of 0.1 and then 0.2 m to a pixel."""
+
+    PLANES = tuple((ns(start), GroundPlane((s, 0, 0, 0, s, 0, 0, 0, 1), 640, 480)) for start, s in ((0, 0.1), (3, 0.2)))
+
+    def test_positions_are_those_that_are_known_or_those_of_the_plane_of_their_time(self, monkeypatch):
+        nan, frames = np.nan, []
+        for n in range(6):
+            rows = TRACKS.rows(
+                track_id=[7, 3, 5], class_id=[1, 2, 3], observed=[True] * 3, source_id=[-1] * 3,
+                x_px=[10.0 * n, nan, 100.0], y_px=[20.0, nan, 100.0], w_px=[4.0, nan, 10.0], h_px=[30.0, nan, 40.0],
+                x_m=[nan, 1.0, 8.0], y_m=[nan, 2.0, 9.0], z_m=[nan, 1.5, 0.5], height_m=[nan, 2.0, nan],
+            )  # fmt: skip
+            frames.append(Frame(ns(n), n, rows))
+        for part_rows in (1 << 16, 3):
+            monkeypatch.setattr("mcaptrack.schema.framing.PART_ROWS", part_rows)
+            found = positions_of(frames, self.PLANES, None, {1: "person"})
+            assert found.track.tolist() == [3] * 6 + [5] * 6 + [7] * 6
+            assert found.frame.tolist() == [*range(6)] * 3
+            assert found.t_ns.tolist() == [ns(n) for n in range(6)] * 3
+            assert found.class_id.tolist() == [2] * 6 + [3] * 6 + [1] * 6
+            feet = [[10 * n + 2, 50] for n in range(6)]
+            scale = [0.1] * 3 + [0.2] * 3
+            on_ground = [[x * s, y * s] for (x, y), s in zip(feet, scale, strict=True)]
+            np.testing.assert_allclose(found.at["metres"], [[1, 2]] * 6 + [[8, 9]] * 6 + on_ground)
+            np.testing.assert_allclose(found.at["pixels"], [[nan, nan]] * 6 + [[105, 140]] * 6 + feet)
+            np.testing.assert_allclose(found.picture_px, found.at["pixels"])
+            np.testing.assert_allclose(found.low_m, [0.5] * 12 + [nan] * 6)  # a height that isn't known is none
+            assert found.height_px == 35.0
+        without = positions_of(frames, (), None)
+        assert np.isnan(without.at["metres"][12:]).all()
+        np.testing.assert_allclose(without.at["pixels"][12:], feet)
+        nothing = positions_of([], self.PLANES, None, {4: "car"})
+        assert (nothing.at["metres"].shape, nothing.picture_px.shape, nothing.low_m.shape) == ((0, 2), (0, 2), (0,))
+        assert (len(nothing.track), nothing.classes) == (0, {4: "car"})
+        assert np.isnan(nothing.height_px)
+
+    @pytest.mark.parametrize("is_line", [False, True])
+    def test_edges_below_a_lens_are_in_sixteen_pieces(self, is_line):
+        """Of a triangle all three edges; of a line of three points two, and its end."""
+        corners = np.array([[0.0, 0.0], [32.0, 0.0], [32.0, 16.0]])
+        (part,) = _in_pieces(Shape(((corners,),), is_line)).parts
+        (ring,) = part
+        assert len(ring) == (33 if is_line else 48)
+        np.testing.assert_allclose(ring[:17], np.stack([np.arange(17) * 2.0, np.zeros(17)], axis=1))
+        np.testing.assert_allclose(ring[16:33], np.stack([np.full(17, 32.0), np.arange(17.0)], axis=1))
+        if not is_line:
+            np.testing.assert_allclose(ring[32:], np.stack([32 - np.arange(16) * 2.0, 16 - np.arange(16.0)], axis=1))
+
+    def test_a_zone_in_pixels_is_compared_on_the_ground_where_one_plane_holds(self):
+        (zone,) = parse_zones(
+            collection(feature("a", "Polygon", [[[0, 0], [10, 0], [10, 20], [0, 0]]]), units="pixels")
+        )
+        placed = place_zone(zone, self.PLANES[1:])
+        assert (placed.units, placed.forward) == ("metres", -1)
+        assert {tuple(point) for point in placed.shape.parts[0][0].tolist()} == {(0, 0), (2, 0), (2, 4)}
+        assert (place_zone(zone, self.PLANES).units, place_zone(zone, self.PLANES).forward) == ("pixels", -1)
+        mirrored = GroundPlane((0.1, 0, 0, 0, -0.1, 48, 0, 0, 1), 640, 480)  # y grows away from the camera
+        assert place_zone(zone, ((0, mirrored),)).forward == 1
+        (own,) = parse_zones(collection(feature("a", "LineString", LINE)))
+        placed = place_zone(own, self.PLANES[1:])
+        assert (placed.zone, placed.units, placed.forward) == (own, "metres", 1)
+        assert placed.shape.parts[0][0].tolist() == LINE
