@@ -1,0 +1,269 @@
+"""Chunks, message indexes and heads of messages, just inside and outside of what they declare; damage that is moved."""
+
+from __future__ import annotations
+
+import sys
+import zlib
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+from mcap.reader import make_reader
+
+from mcaptrack import log
+from mcaptrack.log import located, records
+from mcaptrack.log.byte_source import ByteSource, OpenFile
+from mcaptrack.log.chunks import checksum_at, message_heads_at, open_chunk, read_index_entries
+from mcaptrack.log.records import Damaged, Opcode, pack, pack_chunk, pack_message_index, record_at
+from tests.logs import stock_messages, write_stock
+
+SOME = [(topic, 10 * n, n, topic.encode() * (n + 1)) for n in range(20) for topic in "ab"]
+CONTENT = bytes(range(250)) * 40
+STREAMED = zstandard.ZstdCompressor().compressobj()
+COMPRESSED = {
+    "": [CONTENT],
+    # The second one doesn't declare its size.
+    "zstd": [zstandard.compress(CONTENT), STREAMED.compress(CONTENT) + STREAMED.flush()],
+    "lz4": [lz4.frame.compress(CONTENT)],
+}
+recovering = sys.modules["mcaptrack.log.recover"]
+ALL = [(name, data) for name, several in COMPRESSED.items() for data in several]
+
+
+def opened(compression: str, data: bytes, size: int, crc: int = 0) -> bytes:
+    buffer = memoryview(pack_chunk((0, 0, size, crc), compression, data))
+    content = open_chunk(buffer, record_at(buffer, 0))
+    return bytes(content[0 : len(content)])
+
+
+@pytest.mark.parametrize(("compression", "data"), ALL)
+def test_a_chunk_has_the_size_and_the_checksum_that_it_declares(compression, data):
+    crc, size = zlib.crc32(CONTENT), len(CONTENT)
+    assert opened(compression, data, size) == opened(compression, data, size, crc) == CONTENT
+    with pytest.raises(Damaged, match="byte 0: the checksum of a chunk is wrong"):
+        opened(compression, data, size, crc ^ 1)
+    for wrong in (size - 1, size + 1, 0):
+        with pytest.raises(Damaged, match=rf"a chunk of \d+ bytes that says {wrong}|can't be decompressed"):
+            opened(compression, data, wrong, crc)
+    if compression:
+        for cut in (data[:-1], data[:-20], b""):
+            with pytest.raises(Damaged):
+                opened(compression, cut, size)
+
+
+def test_the_largest_chunk_that_is_opened(monkeypatch):
+    monkeypatch.setenv("MCAPTRACK_MAX_CHUNK_MIB", "1")
+    whole = bytes(2**20 + 1)
+    assert len(opened("zstd", zstandard.compress(whole[1:]), 2**20)) == 2**20
+    with pytest.raises(Damaged, match="byte 0: a chunk of 1048577 bytes, of at most 1 MiB that are opened"):
+        opened("zstd", zstandard.compress(whole), 2**20 + 1)
+    assert len(opened("", whole, 2**20 + 1)) == 2**20 + 1  # nothing is made larger
+    with pytest.raises(Damaged, match="is compressed with 'snappy', which is not known here"):
+        opened("snappy", b"", 0)
+
+
+def test_a_chunk_is_identified_by_its_checksum_or_that_of_its_bytes():
+    buffer = b"beside" + pack_chunk((1, 2, 3, 77), "", b"abc") + pack_chunk((1, 2, 3, 0), "zstd", b"xyz")
+    second = buffer.rindex(bytes([Opcode.CHUNK, 8 + 8 + 8 + 4 + 4 + 4 + 8 + 3]))
+    assert checksum_at(memoryview(buffer), 6) == 77
+    assert checksum_at(memoryview(buffer), second) == zlib.crc32(b"xyz")
+    for at in (0, 7):
+        with pytest.raises(Damaged):
+            checksum_at(memoryview(pack(Opcode.METADATA, bytes(40)) + buffer), at)
+
+
+def entries(*pairs: tuple[int, int]) -> bytes:
+    return np.array(pairs, "<u8").tobytes()
+
+
+def test_entries_of_a_message_index():
+    def read(data: bytes, channel: int = 3) -> list:
+        buffer = memoryview(b"???" + pack_message_index(3, data))
+        return read_index_entries(buffer, 3, channel).tolist()
+
+    most = 2**63 - 1
+    assert read(entries((9, 0), (2**64 - 1, most), (9, 40))) == [[9, 0], [2**64 - 1, most], [9, 40]]
+    assert read(b"") == []
+    for data, channel, said in (
+        (entries((9, 0)), 4, "byte 3: there is no message index of channel 4 where the chunk index says"),
+        (entries((9, 0)) + b"?", 3, "byte 3: a message index of 17 bytes"),
+        (entries((9, 0), (9, most + 1)), 3, "byte 3: a message index points beyond any chunk"),
+        (entries((9, 5), (8, 6), (7, 5)), 3, "byte 3: a message index lists a message twice"),
+    ):
+        with pytest.raises(Damaged, match=said):
+            read(data, channel)
+
+
+def message(channel: int, t_ns: int, data: bytes, grown: int = 0) -> bytes:
+    size = records.MESSAGE_HEAD.size + len(data) + grown
+    return bytes([Opcode.MESSAGE]) + size.to_bytes(8, "little") + records.MESSAGE_HEAD.pack(channel, 5, t_ns, 6) + data
+
+
+@pytest.mark.parametrize("count", [1, 16, 17, 40])
+def test_heads_of_messages_are_where_the_index_says(count):
+    """Few heads are read one by one, many at once."""
+    parts = [message(2, 100 + n, b"x" * (n % 4)) for n in range(count)]
+    offset = np.cumsum([0, *map(len, parts)])[:-1]
+    t_ns = np.arange(100, 100 + count).astype(np.uint64)
+    content = memoryview(b"".join(parts))
+    found = message_heads_at(content, 2, t_ns, offset)
+    assert (found.end - found.start).tolist() == [n % 4 for n in range(count)]
+    assert (found.start - offset).tolist() == [9 + 22] * count
+    assert set(found.head["sequence"].tolist()) == {5}
+
+    def refused(said: str, parts=parts, t_ns=t_ns, offset=offset, channel=2) -> None:
+        with pytest.raises(Damaged, match=said):
+            message_heads_at(memoryview(b"".join(parts)), channel, t_ns, offset)
+
+    last, room = offset[-1], len(content) - 31
+    nothing = f"there is no message of channel 2 at {99 + count} ns where the index says"
+    refused("there is no message of channel 3 at 100 ns", channel=3)
+    refused(nothing, parts=[*parts[:-1], message(9, 99 + count, b"abc")])
+    refused(nothing, parts=[*parts[:-1], message(2, 7, b"abc")])
+    refused(nothing, parts=[*parts[:-1], message(2, 99 + count, b"abc", grown=1)])
+    refused(nothing, parts=[*parts[:-1], message(2, 99 + count, b"", grown=-1) + b"abc"])
+    refused(nothing, parts=[*parts[:-1], b"\x06" + message(2, 99 + count, b"abc")[1:]])
+    message_heads_at(memoryview(b"".join([*parts[:-1], message(2, 99 + count, b"abc", grown=-3)])), 2, t_ns, offset)
+    for at in (-1, room + 1, len(content) + 50):
+        refused(
+            f"an index places a message at byte {at} of a chunk of {len(content)} bytes",
+            offset=np.append(offset[:-1], at),
+        )
+    assert room >= last
+    none = message_heads_at(content, 2, t_ns[:0], offset[:0])
+    assert [len(part) for part in none] == [0, 0, 0]
+
+
+def test_damage_in_a_part_is_at_its_place_in_the_whole():
+    assert str(Damaged("a hole", 12).moved(30)) == "byte 42: a hole"
+    assert str(Damaged("a hole", 0).moved(30)) == "byte 30: a hole"
+    assert str(Damaged("a hole").moved(30)) == "a hole"
+
+
+def test_messages_outside_of_chunks_are_read_in_batches_of_a_block(tmp_path, monkeypatch):
+    path = tmp_path / "a.mcap"
+    write_stock(path, SOME, use_chunking=False)
+    whole = path.read_bytes()
+    places = {topic: [] for topic in "ab"}
+    for topic, t_ns, sequence, data in SOME:
+        head = records.MESSAGE_HEAD.pack(1, sequence, t_ns, t_ns // 2)[2:]
+        places[topic].append(whole.index(head + data) - 11)
+    monkeypatch.setattr(located, "BLOCK", 300)
+    with log.read(path) as one:
+        for topic, at in places.items():
+            number = next(n for n, channel in one.index.channels.items() if channel.topic == topic)
+            source = ByteSource.of(OpenFile.at(path))
+            batches = located.MessageBatches(source, one.index, [number], (None, None))
+            by_block: dict[int, list[int]] = {}
+            for place in at:
+                by_block.setdefault(place // 300, []).append(place)
+            assert [batch.offset.tolist() for batch in batches] == list(by_block.values())
+            assert 2 < len(by_block) < len(at)
+            assert [batch.is_direct for batch in batches] == [True] * len(by_block)
+            assert batches.offset.tolist() == at
+            assert batches.batch.tolist() == [n for n, some in enumerate(by_block.values()) for _ in some]
+            assert set(batches.chunk_offset.tolist()) == {-1}
+
+
+HEADER = pack(Opcode.HEADER, records.text(""), records.text(""))
+END = pack(Opcode.DATA_END, bytes(4))
+SCHEMA = pack(Opcode.SCHEMA, (1).to_bytes(2, "little"), *[records.text("name")] * 2, records.raw(b"{}"))
+
+
+def channel(number: int) -> bytes:
+    topic = records.text(f"/{number}")
+    fields = [number.to_bytes(2, "little"), (1).to_bytes(2, "little"), topic, records.text("json")]
+    return pack(Opcode.CHANNEL, *fields, records.text_map({}))
+
+
+def test_progress_of_a_check_is_told_at_each_block(tmp_path, monkeypatch):
+    data = records.MAGIC + HEADER + SCHEMA * 5 + END + pack(Opcode.FOOTER, bytes(20)) + records.MAGIC
+    (tmp_path / "a.mcap").write_bytes(data)
+    first = 8 + len(HEADER)
+    monkeypatch.setattr(records, "BLOCK", first)
+    assert len(SCHEMA) == 33
+    told = []
+    log.check(tmp_path / "a.mcap", lambda *step: told.append(step))
+    assert told == [
+        ("check", at, len(data)) for at in (first, first + 33, first + 66, first + 99, first + 132, first + 165)
+    ]
+    told.clear()
+    monkeypatch.setattr(records, "BLOCK", 66)
+    log.check(tmp_path / "a.mcap", lambda *step: told.append(step))
+    assert [at for _, at, _ in told] == [first + 66, first + 132]
+
+
+def recovered(folder: Path, *body: bytes) -> tuple[list[str], list[int], bytes]:
+    """What is lost of a log of these records, the times of the messages that are saved, and the saved log."""
+    path, saved = folder / "a.mcap", folder / "saved.mcap"
+    path.write_bytes(records.MAGIC + b"".join([HEADER, *body, END, pack(Opcode.FOOTER, bytes(20))]) + records.MAGIC)
+    report = log.recover(path, saved)
+    assert log.check(saved).is_sound
+    times = [m[1] for m in stock_messages(saved)]
+    assert report.messages == len(times)
+    return report.lost, times, saved.read_bytes()
+
+
+@pytest.mark.parametrize("step", [16, 64, 64 * 2**10])
+@pytest.mark.parametrize(
+    ("hole", "behind", "saved"),
+    [
+        ((5, 8), 8, [*range(5), *range(8, 20)]),
+        ((5, 17), 17, [*range(5), 17, 18, 19]),
+        ((5, 18), 18, [*range(5), 18, 19]),  # two messages, and the end behind them
+        ((5, 19), 19, [*range(5), 19]),
+        ((0, 1), 1, list(range(1, 20))),
+    ],
+)
+def test_reading_goes_on_where_messages_follow_one_another(tmp_path, monkeypatch, step, hole, behind, saved):
+    """A hole in a log without chunks, looked through in steps."""
+    monkeypatch.setattr(recovering, "_FIRST_STEP", step)
+    about = [SCHEMA, channel(2), channel(3)]
+    messages = [message(2 + n % 2, n, bytes([n]) * n) for n in range(20)]
+    at = np.cumsum([8 + len(HEADER) + sum(map(len, about)), *map(len, messages)]).tolist()
+    first, last = hole
+    # What looks like a message in it is of no channel that is known, or alone.
+    noise = [b"\xff" * len(one) for one in messages[first:last]]
+    noise[0] = (b"\xff" * 3 + message(9, 7, b"") + b"\xff" * 400)[: len(noise[0])]
+    lost, times, whole = recovered(tmp_path, *about, *messages[:first], *noise, *messages[last:])
+    assert lost == [f"byte {at[first]} to {at[behind]}: no record can be read here"]
+    assert times == saved
+    # Each channel is described in the data once, and in the summary.
+    assert [whole.count(channel(number)) for number in (2, 3)] == [2, 2]
+
+
+def test_records_of_applications_are_kept_and_unknown_ones_are_not(tmp_path):
+    about = [SCHEMA, channel(2), message(2, 1, b"x")]
+    lost, times, whole = recovered(tmp_path, *about, pack(0x80, b"private"), pack(0xFF, b"secret"), message(2, 2, b"y"))
+    assert (lost, times, b"private" in whole, b"secret" in whole) == ([], [1, 2], True, True)
+    lost, times, whole = recovered(tmp_path, *about, pack(0x7F, b"unknown"), *[message(2, n, b"y") for n in (2, 3, 4)])
+    assert (len(lost), times, b"unknown" in whole) == (1, [1, 2, 3, 4], False)
+
+
+@pytest.mark.parametrize(
+    ("behind", "covered", "lost"),
+    [
+        (b"", 0, 0),
+        (bytes(40), 40, 0),  # padding
+        (b"\x00" * 3, 3, 0),
+        (bytes(40), 0, 1),  # no record can be read there
+        ("metadata", "metadata", 0),  # a record that stands behind the chunk is read
+        ("metadata", 5, 0),
+    ],
+)
+def test_a_chunk_whose_record_is_longer_than_it_hides_nothing(tmp_path, behind, covered, lost):
+    note = pack(Opcode.METADATA, records.text("about"), records.text_map({"robot": "r2"}))
+    chunks = []
+    for t_ns in (5, 9):
+        content = b"".join([SCHEMA, channel(2), message(2, t_ns, b"{}")])
+        chunks.append(pack_chunk((t_ns, t_ns, len(content), zlib.crc32(content)), "", content))
+    between = note if behind == "metadata" else behind
+    size = len(chunks[0]) - 9 + (len(between) if covered == "metadata" else covered)
+    first = chunks[0][:1] + size.to_bytes(8, "little") + chunks[0][9:]
+    found_lost, times, _ = recovered(tmp_path, first, between, chunks[1])
+    assert (len(found_lost), times) == (lost, [5, 9])
+    with (tmp_path / "saved.mcap").open("rb") as stream:
+        found = [(one.name, one.metadata) for one in make_reader(stream).iter_metadata()]
+    assert found == ([("about", {"robot": "r2"})] if behind == "metadata" else [])
