@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import chain, groupby, pairwise
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcaptrack.evaluation.aligned import make_matchup
 from mcaptrack.evaluation.events import find_events
 from mcaptrack.evaluation.metrics.clear import matches
-from mcaptrack.schema import EventKind, Frame
+from mcaptrack.schema import EventKind, Frame, framing
 from tests.worlds import ns, tracks_at
 
 
@@ -101,3 +102,87 @@ def test_misses_false_tracks_and_switches_equal_the_reference(seed):
     ]
     assert [event[:-1] for event in sorted(found)] == [event[:-1] for event in sorted(wanted)]
     np.testing.assert_allclose([e[-1] for e in sorted(found)], [e[-1] for e in sorted(wanted)], atol=1e-9)
+
+
+def repaired_world(rng: np.random.Generator) -> list[Frame]:
+    """Tracks that come and go, of sources that change now and then, for a moment or for longer; some rows have none."""
+    frames, now, source = [], 0.0, {one: int(rng.integers(0, 4)) for one in (3, 5, 8, 11)}
+    until = dict.fromkeys(source, 0)
+    for number in range(40):
+        now += float(rng.choice([0.25, 0.25, 0.25, 0.5, 1.25]))
+        rows = []
+        for one in rng.permutation(list(source)).tolist():
+            if rng.random() < 0.1:
+                until[one] = number + int(rng.integers(1, 12))
+            if until[one] > number:
+                continue
+            if rng.random() < 0.2:
+                source[one] = int(rng.integers(0, 4))
+            rows.append((one, -1 if rng.random() < 0.15 else source[one]))
+        ids = [one for one, _ in rows]
+        made = tracks_at({one: (number / 7, one / 3) for one in ids})
+        made["source_id"] = [from_ for _, from_ in rows]
+        frames.append(Frame(ns(now) + 9, number, made))
+    return frames
+
+
+def lives(frames: list[Frame]) -> list[Event]:
+    """Births, ends and repairs, track by track."""
+    times = [frame.t_ns for frame in frames]
+    usual = int(np.median(np.diff(times)))
+    rows: dict[int, list[tuple[int, int]]] = {}
+    for frame in frames:
+        for row in frame.rows:
+            rows.setdefault(int(row["track_id"]), []).append((frame.t_ns, int(row["source_id"])))
+    out: list[Event] = []
+    runs: list[tuple[int, int, int, int]] = []  # time, track, source and last time of each run
+    joined = set()
+    for track, own in sorted(rows.items()):
+        out.append((own[0][0], EventKind.BIRTH, track, -1, -1, 0, np.nan))
+        if own[-1][0] < times[-1]:
+            lasted = (own[-1][0] - own[0][0] + usual) / 1e9
+            out.append((own[-1][0], EventKind.END, track, -1, -1, len(own), lasted))
+        known = [row for row in own if row[1] >= 0]
+        parts = [list(group) for _, group in groupby(known, key=lambda row: row[1])]
+        brief = [
+            0 < k < len(parts) - 1
+            and parts[k - 1][0][1] == parts[k + 1][0][1]
+            and parts[k + 1][0][0] - parts[k][0][0] < 1_000_000_000
+            for k in range(len(parts))
+        ]
+        parts = [part for part, is_brief in zip(parts, brief, strict=True) if not is_brief]
+        parts = [[*chain(*group)] for _, group in groupby(parts, key=lambda part: part[0][1])]
+        for before, part in pairwise(parts):
+            after = next(t for t in times if t > before[-1][0])
+            unseen = max(part[0][0] - after, 0) / 1e9
+            out.append((part[0][0], EventKind.JOINED, track, before[0][1], part[0][1], 0, unseen))
+            joined.add((part[0][0], track))
+        runs += [(part[0][0], track, part[0][1], part[-1][0]) for part in parts]
+    for t_ns, track, source, _ in runs:
+        before = [run for run in runs if run[2] == source and run[:2] < (t_ns, track)]
+        if before and max(before)[1] != track and (t_ns, track) not in joined:
+            out.append((t_ns, EventKind.PARTED, track, max(before)[1], source, 0, np.nan))
+    return sorted(out, key=lambda event: event[:-1])
+
+
+@pytest.mark.parametrize("part_rows", [1 << 16, 11])
+@pytest.mark.parametrize("seed", range(6))
+def test_births_ends_and_repairs_equal_the_reference(seed, part_rows, monkeypatch):
+    monkeypatch.setattr(framing, "PART_ROWS", part_rows)
+    frames = repaired_world(np.random.default_rng(seed))
+    columns = ("kind", "track_id", "previous_id", "source_id", "frames", "duration_s")
+    found = sorted(
+        (
+            (frame.t_ns, *(row[name].item() for name in columns))
+            for frame in find_events(frames, None).events
+            for row in frame.rows
+        ),
+        key=lambda event: event[:-1],
+    )
+    wanted = lives(frames)
+    assert {event[1] for event in wanted} == {EventKind.BIRTH, EventKind.END, EventKind.JOINED, EventKind.PARTED}
+    assert [event[:-1] for event in found] == [event[:-1] for event in wanted]
+    np.testing.assert_allclose([e[-1] for e in found], [e[-1] for e in wanted], atol=1e-9)
+    for frame in find_events(frames, None).events:
+        assert all(row["x_m"] == pytest.approx(frame.index / 7) for row in frame.rows)
+        assert all(row["y_m"] == pytest.approx(row["track_id"] / 3) for row in frame.rows)
