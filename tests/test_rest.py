@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mcaptrack.predictors import Forecast
 from mcaptrack.predictors.tails import TailCalibration
 from mcaptrack.schema import TRACKS, Frame, Rows
-from mcaptrack.transforms import Predict
+from mcaptrack.transforms import Predict, forecasts
 from tests.worlds import ns
 
 NAMES = ((1, "pedestrian"), (3, "car"))
@@ -58,3 +59,76 @@ def test_a_car_that_has_just_stopped_may_go_on():
     """Its history still has the way that it went."""
     stopped, stands = (axis_m(last_forecast(3, speed, True, stops=3)) for speed in (8.0, 0.0))
     assert stopped > 3 * stands
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_stands_by_hand(seed: int):
+    """Objects with different pasts: their speed over up to seven steps; a single step says nothing."""
+    rng = np.random.default_rng(seed)
+    past, unit_m = np.cumsum(rng.normal(0, 0.05, (8, 10, 2)), axis=1), rng.choice([1.0, 4.0], 8)
+    known_from = [0, 1, 2, 3, 5, 7, 8, 9]
+    for one, first in zip(past, known_from, strict=True):
+        one[:first] = np.nan
+    found = forecasts._standing(past, unit_m, 0.4)
+    for one, unit, first, stays in zip(past, unit_m, known_from, found, strict=True):
+        begin = max(first, 2)  # seven steps back at most
+        steps = 9 - begin
+        if steps < 2:
+            assert stays == 0
+        else:
+            speed = np.linalg.norm(one[-1] - one[begin]) / (0.4 * steps * unit)
+            assert stays == pytest.approx(0.95 * np.exp(-((speed / 0.15) ** 2)))
+
+
+def test_a_forecast_with_rest_has_the_mean_and_covariance_of_both():
+    """Each step is a mixture of two distributions, whose moments are added up."""
+    rng = np.random.default_rng(1)
+    now, stay, noise_m, unit_m = (
+        rng.normal(size=(3, 2)),
+        np.array([0.0, 0.3, 0.95]),
+        rng.uniform(0.1, 0.4, 3),
+        np.array([4.0, 1.0, 2.0]),
+    )
+    half = rng.normal(size=(3, 5, 2, 2))
+    forecast = Forecast(rng.normal(size=(3, 5, 2)), half @ half.transpose(0, 1, 3, 2))
+    found = forecasts._with_rest(forecast, now, stay, noise_m, unit_m, 0.4)
+    for one in range(3):
+        for step in range(5):
+            creep = 0.03 * unit_m[one] * 0.4 * (step + 1)
+            parts = (
+                (stay[one], now[one], (noise_m[one] ** 2 + creep**2) * np.eye(2)),
+                (1 - stay[one], forecast.mean[one, step], forecast.cov[one, step]),
+            )
+            mean = sum(share * at for share, at, _ in parts)
+            cov = sum(share * (spread + np.outer(at - mean, at - mean)) for share, at, spread in parts)
+            np.testing.assert_allclose(found.mean[one, step], mean)
+            np.testing.assert_allclose(found.cov[one, step], cov)
+
+
+def test_a_predictor_sees_the_people_of_a_frame_each_in_the_unit_of_its_class(monkeypatch: pytest.MonkeyPatch):
+    """Two people, a car, one who is interpolated, and one who is new."""
+    seen: list[tuple] = []
+
+    def predict_among(predictor, past, known, people):
+        seen.append((past.copy(), known.copy(), people))
+        return Forecast(np.zeros((len(past), 12, 2)), np.tile(np.eye(2), (len(past), 12, 1, 1)))
+
+    monkeypatch.setattr(forecasts, "predict_among", predict_among)
+    monkeypatch.setattr(forecasts, "uses_people", lambda _: True)
+    forecaster = forecasts.Forecaster("cv", 4.8, 3, 2.5, NAMES)
+    for tick in range(4):
+        ids = [9, 2, 7, 5, *([4] if tick == 3 else [])]
+        rows = TRACKS.rows(
+            track_id=ids, class_id=[1, 3, 1, 1, 1][: len(ids)], x_m=[8.0 * k + tick for k in range(len(ids))],
+            y_m=[1.0] * len(ids), observed=[True, True, True, tick != 3, True][: len(ids)], source_id=[-1] * len(ids),
+        )  # fmt: skip
+        made = forecaster.predict(Frame(ns(tick / 2.5), tick, rows))
+    past, known, people = seen[-1]
+    assert np.unique(made["track_id"]).tolist() == [2, 7, 9]  # not the interpolated one, and not the new one
+    assert past[:, -1].tolist() == [[3.0, 1.0], [11.0 / 4, 0.25], [19.0, 1.0]]  # in units of 1 and 4 m
+    assert people.xy_m[:, -1].tolist() == [[3.0, 1.0], [11.0 / 4, 0.25], [19.0, 1.0], [35.0, 1.0]]
+    assert people.valid[:, -3:].tolist() == [[True] * 3] * 3 + [[False, False, True]]
+    assert people.moment.tolist() == [0, 1, 0, 0]
+    assert people.row.tolist() == [0, 1, 2]
+    assert known[:, -3:].all()
+    assert [len(one[0]) for one in seen] == [0, 0, 4, 3]
