@@ -23,7 +23,9 @@ from mcaptrack.schema import SIGHTINGS, Frame
 from mcaptrack.testing import check_transform
 from mcaptrack.transforms.fuse import CameraView, FootFuser, agreement
 from mcaptrack.transforms.fuse.grouping import Places, distances, group, means
+from mcaptrack.transforms.fuse.joined import places_of
 from tests.places import CAMERAS, HEIGHT, NS, PEOPLE, SECONDS, WIDTH, errors, fused, said, write_log
+from tests.references.joining import joined
 
 
 class TestScene:
@@ -251,6 +253,51 @@ def test_groups_have_each_camera_once_and_can_not_be_joined_further(
         assert centre.cov[one] == pytest.approx([total[0, 0], total[0, 1], total[1, 1]], abs=1e-6)
 
 
+@settings(max_examples=40, deadline=None)
+@given(st.lists(places, min_size=1, max_size=3))
+def test_boxes_are_joined_as_by_matrices_whatever_frames_are_beside(
+    drawn: list[list[tuple[int, float, float, float, float, float]]],
+) -> None:
+    parts = [sightings(one) for one in drawn]
+    rows, part = np.concatenate(parts), np.repeat(np.arange(len(parts)), [len(one) for one in parts])
+    of = group(rows["camera"].astype(np.int64), places_of(rows), 9.0, 1.2, part)
+    found = [set(np.flatnonzero(of == number).tolist()) for number in range(int(of.max(initial=-1)) + 1)]
+    expected, before = [], 0
+    for one in parts:
+        boxes = [
+            (int(row["camera"]), np.array([row["x_m"], row["y_m"]]), np.array([[xx, xy], [xy, yy]]))
+            for row in one
+            for xx, xy, yy in [(row["cov_xx_m2"], row["cov_xy_m2"], row["cov_yy_m2"])]
+        ]
+        expected += [{before + number for number in members} for members in joined(boxes, 9.0, 1.2)]
+        before += len(one)
+    assert found == expected
+
+
+def test_classes_are_joined_by_themselves_in_each_frame() -> None:
+    """Two cameras see an object of class 2, and one of class 1 at the same place in the second frame."""
+    rows = sightings([(camera, x, 0.0, 0.1, 0.1, 0.0) for camera, x in [(0, 1.0), (0, 5.0), (1, 5.0), (1, 1.02)]])
+    rows["class_id"] = [2, 1, 1, 2]
+    first, second = FootFuser(min_score=0.0)([Frame(0, 0, rows[3:]), Frame(NS, 1, rows)])
+    assert first[0].rows["class_id"].tolist() == [2]
+    assert second[0].rows["x_m"].tolist() == pytest.approx([1.01, 5.0])
+    assert second[0].rows["class_id"].tolist() == [2, 1]
+    assert second[1].rows["detection"].tolist() == [0, 1, 1, 0]
+
+
+def test_what_is_kept_of_comparing_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_log(tmp_path / "scene.mcap", CAMERAS[:3], people=0.8)
+    mcaptrack.fuse(path)
+    kept = fused(path)
+    monkeypatch.setattr("mcaptrack.pipeline.gathering._KEPT_BYTES", 1500)  # some frames only
+    monkeypatch.setattr("mcaptrack.transforms.fuse.joined._BLOCK", 40)
+    monkeypatch.setattr("mcaptrack.pipeline.gathering._TOGETHER", 3)
+    mcaptrack.fuse(path)
+    for t_ns, rows in fused(path).items():
+        for name in ("x_m", "y_m", "cov_xx_m2", "score", "seen_by", "expected_by"):
+            assert rows[name] == pytest.approx(kept[t_ns][name], rel=1e-9)
+
+
 def test_a_person_made_of_boxes_of_two_others_is_dissolved() -> None:
     """Cameras 0 and 1 see two people 0.8 m apart. Cameras 2 and 3 see both, too, and place one of them between."""
     drawn = [(0, 0.0), (1, 0.02), (2, 0.04), (0, 0.8), (1, 0.78), (3, 0.76), (2, 0.42), (3, 0.38)]
@@ -292,6 +339,9 @@ class TestOneView:
         feet = np.array([[200.0, 300.0], [220.0, 320.0], [0.0, 400.0], [500.0, HEIGHT + 50], [700.0, 200.0]])
         # The second one hides 20 x 80 px of the first; the third is cut at the left, the fourth below.
         assert view.visible(feet, 0) == pytest.approx([0.6, 1.0, 0.5, 0.5, 1.0])
+        # The same in two frames: those of one hide nobody in the other.
+        several = view.visible(np.concatenate([feet[1:2], feet, feet[:1]]), 0, (1, 0, 5, 1))
+        assert several == pytest.approx([1.0, 0.6, 1.0, 0.5, 0.5, 1.0, 1.0])
         assert camera_of(np.eye(3)).visible(feet[:2], 0) == pytest.approx([1.0, 1.0])  # heights that aren't known
 
     def test_rates_are_those_of_the_share_that_is_visible(self) -> None:

@@ -145,3 +145,26 @@ def cross_pairs(a_counts: ArrayLike, b_counts: ArrayLike) -> tuple[Ints, Ints, I
     a = (np.cumsum(a_sizes) - a_sizes)[group] + local
     b = (np.cumsum(b_sizes) - b_sizes)[group] + within - local * b_sizes[group]
     return group, a, b
+
+
+def table_of(counts: ArrayLike) -> Ints:
+    """The members of each group as the rows of a table.
+
+    Parameters
+    ----------
+    counts : (G,) of int
+        Number of members of each group, 0 or more.
+
+    Returns
+    -------
+    (G, M) of int64
+        Numbers of members, and -1 after those of a group that has fewer than M.
+
+    Examples
+    --------
+    >>> table_of([2, 0, 3]).tolist()
+    [[0, 1, -1], [-1, -1, -1], [2, 3, 4]]
+    """
+    sizes = np.asarray(counts, np.int64)
+    within = np.arange(int(sizes.max(initial=0)))
+    return np.where(within < sizes[:, None], (np.cumsum(sizes) - sizes)[:, None] + within, -1)

@@ -5,7 +5,7 @@ Letters: C cameras.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -26,7 +26,7 @@ from mcaptrack.pipeline.rebuild import fuser_of, plugins_of
 from mcaptrack.pipeline.run import Report, outdated_by
 from mcaptrack.pipeline.staleness import is_stale
 from mcaptrack.pipeline.write import Made, write
-from mcaptrack.schema import DETECTIONS, SIGHTINGS, Schema
+from mcaptrack.schema import DETECTIONS, SIGHTINGS, Frame, Schema
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.provenance import FUSE, Provenance
 from mcaptrack.sources.cameras import Camera, cameras, detections_of, provenance_of, scenes_of
@@ -184,8 +184,11 @@ def _fuse(
         if shared.are_strangers and not is_asked and not is_again:
             raise McaptrackError(f"{shared}; `mcaptrack.fuse` fuses them nevertheless")
         collectors = [FrameCollector(schema) for schema in topics.values()]
-        is_own = FUSION.is_built_in(type(fuser))
-        results = fuser(gathered) if is_own else guarded(FUSION.entry(type(fuser)), fuser, gathered)
+        results: Iterator[tuple[Frame, ...]]
+        if FUSION.is_built_in(type(fuser)):
+            results = (frames for block in gathered.joined(feet) for frames in feet.fused(block))
+        else:
+            results = guarded(FUSION.entry(type(fuser)), fuser, gathered)
         for count, made in enumerate(results, start=1):
             progress(FUSE, count, len(gathered))
             by_suffix = dict(zip(fuser.writes, made, strict=True))

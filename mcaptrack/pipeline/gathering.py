@@ -7,30 +7,36 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.plane import plane_at
+from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import read_named_frames
 from mcaptrack.pipeline.planes import read_planes
 from mcaptrack.pipeline.write import digest_of
-from mcaptrack.schema import DETECTIONS, SIGHTINGS, Frame
-from mcaptrack.schema.framing import frame_times
+from mcaptrack.schema import DETECTIONS, SIGHTINGS, Frame, Rows
+from mcaptrack.schema.framing import frame_times, split_rows
 from mcaptrack.schema.provenance import frame_id_of
 from mcaptrack.sources.cameras import Camera, detections_of
-from mcaptrack.transforms.fuse import CameraView, FootFuser, Offset, Shared, compare
+from mcaptrack.transforms.fuse import CameraView, FootFuser, Joined, Offset, Shared, compare_joined
 
 #: The frame of the metres, if the ground planes name none.
 _FRAME: Final = "map"
 #: Pictures of other cameras count up to this share of the time between those of the slowest camera away from it.
 _WITHIN: Final = 0.5
 _MOST_WITHIN_S: Final = 0.5
+#: Frames are gathered so many at once: for few boxes, calls take longer than computing.
+_TOGETHER: Final = 64
+#: Sightings that are kept with their groups, so that they are joined once for comparing cameras and for fusing.
+_KEPT_BYTES: Final = 2**25
 #: How far people walk, in metres per second: what a box of another time says less precisely.
 _PACE_M_PER_S: Final = 1.0
 #: Cameras are compared by at most so many frames.
@@ -60,35 +66,70 @@ class Gathered:
         self._within_ns = round(min(_WITHIN * step_s, _MOST_WITHIN_S) * NS_PER_S)
         #: Frames before time 0, where the clock of the slowest camera is late by more than the beginning of the log.
         self.left_out = int(np.searchsorted(self.at.t_ns, 0))
+        self._joined: list[Joined] = []
 
     def __len__(self) -> int:
         return len(self.at.t_ns) - self.left_out
 
     def __iter__(self) -> Iterator[Frame]:
-        nearest = [_nearest(one.t_ns, self.at.t_ns) for one in self._sources]
-        for number, t_ns in enumerate(self.at.t_ns.tolist()):
-            if number < self.left_out:
-                continue
-            parts = []
-            for camera, source in enumerate(self._sources):
-                index = int(nearest[camera][number])
-                away_ns = int(source.t_ns[index]) - t_ns
-                if abs(away_ns) <= self._within_ns:
-                    parts.append(self._seen(camera, source, source.frames[index], away_ns / NS_PER_S))
-            rows = SIGHTINGS.joined(parts) if parts else SIGHTINGS.empty()
-            yield Frame(t_ns, self.at.frames[number].index, rows)
+        return self._from(self.left_out)
 
-    def _seen(self, camera: int, source: Source, frame: Frame, away_s: float) -> Any:
-        """The sightings of one camera."""
-        rows, noise_m = frame.rows, float(np.hypot(self._noise_m, _PACE_M_PER_S * away_s))
-        xy_m, cov = source.view.places(columns_to_boxes(rows), frame.t_ns, self._noise, noise_m)
+    def joined(self, fuser: FootFuser, keeps: bool = False) -> Iterator[Joined]:
+        """The same frames with their boxes joined; with ``keeps`` the first ones are kept for the next time."""
+        yield from self._joined
+        taken = sum(len(block.frames) for block in self._joined)
+        room = _KEPT_BYTES - sum(block.rows.nbytes for block in self._joined)
+        for block in fuser.joined(self._from(self.left_out + taken)):
+            room -= block.rows.nbytes
+            if keeps and room >= 0:
+                self._joined.append(block)
+            yield block
+
+    def _from(self, begin: int) -> Iterator[Frame]:
+        nearest = [_nearest(one.t_ns, self.at.t_ns) for one in self._sources]
+        for first in range(begin, len(self.at.t_ns), _TOGETHER):
+            yield from self._frames(range(first, min(first + _TOGETHER, len(self.at.t_ns))), nearest)
+
+    def _frames(self, numbers: range, nearest: Sequence[Ints]) -> list[Frame]:
+        """The frames of these numbers; ``nearest`` are the frames of each camera at all times."""
+        times = self.at.t_ns[numbers.start : numbers.stop]
+        parts, counts = [], []
+        for camera, source in enumerate(self._sources):
+            index = nearest[camera][numbers.start : numbers.stop]
+            away_ns = source.t_ns[index] - times
+            near = np.abs(away_ns) <= self._within_ns
+            frames = [source.frames[one] for one in index[near].tolist()]
+            rows, frame = self._seen(camera, source, frames, away_ns[near] / NS_PER_S)
+            parts.append(rows)
+            counts.append(np.flatnonzero(near)[frame])
+        rows, frame = SIGHTINGS.joined(parts), np.concatenate(counts)
+        rows = rows[np.argsort(frame, kind="stable")]
+        ends = np.cumsum(np.bincount(frame, minlength=len(times)))
+        return split_rows(times.tolist(), [self.at.frames[number].index for number in numbers], rows, ends)
+
+    def _seen(self, camera: int, source: Source, frames: Sequence[Frame], away_s: Floats) -> tuple[Rows, Ints]:
+        """The sightings of a camera in its frames, each so far away in time, and the frame of each."""
+        if not frames:
+            return SIGHTINGS.empty(), np.empty(0, np.int64)
+        counts = [len(frame.rows) for frame in frames]
+        frame, rows = group_index(counts), DETECTIONS.joined([one.rows for one in frames])
+        noise_m, xywh = np.hypot(self._noise_m, _PACE_M_PER_S * away_s)[frame], columns_to_boxes(rows)
+        times, ends = np.array([one.t_ns for one in frames]), np.cumsum(counts).tolist()
+        planes = np.array([id(plane_at(source.view.planes, one.t_ns)) for one in frames])
+        first = np.flatnonzero(run_starts(planes)).tolist()
+        places = [
+            source.view.places(xywh[part], int(times[low]), self._noise, noise_m[part])
+            for low, high in zip(first, [*first[1:], len(frames)], strict=True)
+            for part in [slice(ends[low] - counts[low], ends[high - 1])]
+        ]
+        xy_m, cov = (np.concatenate(columns) for columns in zip(*places, strict=True))
         at = np.flatnonzero(np.isfinite(xy_m[:, 0]))
         out = SIGHTINGS.empty(len(at))
-        out["camera"], out["picture_ns"], out["box_row"] = camera, frame.t_ns, at
+        out["camera"], out["picture_ns"], out["box_row"] = camera, times[frame[at]], ragged_range(0, counts)[at]
         out["x_m"], out["y_m"] = xy_m[at].T
         out["cov_xx_m2"], out["cov_xy_m2"], out["cov_yy_m2"] = cov[at].T
         out["score"], out["class_id"] = rows["score"][at], rows["class_id"][at]
-        return out
+        return out, frame[at]
 
 
 def _nearest(t_ns: Ints, at_ns: Ints) -> Ints:
@@ -159,8 +200,9 @@ def compared_cameras(
         fuser = replace(fuser, views=tuple(one.view for one in sources))
         every = max(len(gathered) // _COMPARED, 1)
         part = (frame for number, frame in enumerate(gathered) if number // 2 % every == 0)
+        blocks = gathered.joined(fuser, keeps=True) if every == 1 else fuser.joined(part)
         taken_ns = [round(offset_s[one.view.name] * NS_PER_S) for one in sources]
-        views, offsets, shared = compare(part, fuser, taken_ns)
+        views, offsets, shared = compare_joined(blocks, fuser.views, taken_ns)
         late = {
             view.name: round(offset.late_s, 3)
             for view, offset in zip(views, offsets, strict=True)

@@ -1,6 +1,6 @@
 """Compare the cameras of a scene by the people that they see together.
 
-Letters: N boxes, G groups, C cameras.
+Letters: F frames, N boxes, G groups, C cameras.
 """
 
 from __future__ import annotations
@@ -11,12 +11,14 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Floats, Indices
+from mcaptrack.geometry.arrays import Floats, Indices, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.ragged import group_index, table_of
 from mcaptrack.schema import Frame
-from mcaptrack.transforms.fuse.fuser import FootFuser, places_of
+from mcaptrack.transforms.fuse.fuser import FootFuser
 from mcaptrack.transforms.fuse.grouping import Places, means
-from mcaptrack.transforms.fuse.view import SHARES, CameraView
+from mcaptrack.transforms.fuse.joined import Joined, places_of
+from mcaptrack.transforms.fuse.view import SHARES, CameraView, Views
 
 #: A place that so many other cameras see is taken for true; others are false if so many should see them.
 _OTHERS, _EXPECTED = 2, 1.5
@@ -95,31 +97,33 @@ def compare(
     shared : Shared
         How many people two cameras should see, and do see.
     """
-    count = len(fuser.views)
+    return compare_joined(fuser.joined(frames), fuser.views, offset_ns)
+
+
+def compare_joined(
+    blocks: Iterable[Joined], views: Views, offset_ns: Sequence[int] = ()
+) -> tuple[tuple[CameraView, ...], tuple[Offset, ...], Shared]:
+    """Compare cameras as ``compare`` does, by boxes that are joined already (F frames in a block)."""
+    count = len(views)
     offset_ns = offset_ns or [0] * count
-    hits = np.array([view.detects for view in fuser.views]).reshape(count, -1) * _PRIOR
+    hits = np.array([view.detects for view in views]).reshape(count, -1) * _PRIOR
     tries = np.full(hits.shape, _PRIOR)
-    false = np.array([view.false_share for view in fuser.views]) * _PRIOR
+    false = np.array([view.false_share for view in views]) * _PRIOR
     boxes = np.full(count, _PRIOR)
     off: list[list[Floats]] = [[] for _ in range(count)]
     late: list[list[Floats]] = [[] for _ in range(count)]
     last: tuple[int, Floats] | None = None
     shared = Shared(0, 0)
-    for frame in frames:
-        if not len(frame.rows):
-            last = None
-            continue
-        of, centre, seen = fuser.groups(frame.rows)
-        places, camera = places_of(frame.rows), frame.rows["camera"].astype(np.int64)
-        visible = np.stack([view.visible(centre.xy_m, frame.t_ns) for view in fuser.views], axis=1)
-        rate = np.stack([view.rate(part) for view, part in zip(fuser.views, visible.T, strict=True)], axis=1)
+    for block in blocks:
+        seen, visible, by = block.seen, block.visible, block.seen.sum(axis=1)
+        rate = np.stack([view.rate(part) for view, part in zip(views, visible.T, strict=True)], axis=1)
         by_two = ((visible >= _VISIBLE) | seen).sum(axis=1) > 1
-        shared = Shared(shared.expected + int(by_two.sum()), shared.seen + int((seen.sum(axis=1) > 1).sum()))
-        sure = seen.sum(axis=1) > _OTHERS
-        speed = _velocities(last, frame.t_ns, centre.xy_m[sure])
-        last = frame.t_ns, centre.xy_m[sure]
+        shared = Shared(shared.expected + int(by_two.sum()), shared.seen + int((by > 1).sum()))
+        sure = np.flatnonzero(by > _OTHERS)
+        sizes = np.bincount(block.frame[sure], minlength=len(block.frames))
+        speed, last = _velocities(last, block, block.centre.xy_m[sure], sizes)
         for number in range(count):
-            others = seen.sum(axis=1) - seen[:, number]
+            others = by - seen[:, number]
             there = (others >= _OTHERS) & (visible[:, number] > 0)
             at = np.minimum(np.searchsorted(SHARES, visible[there, number], "right"), len(SHARES) - 1)
             tries[number] += np.bincount(at, minlength=len(SHARES))
@@ -127,45 +131,68 @@ def compare(
             is_tested = seen[:, number] & (rate.sum(axis=1) - rate[:, number] >= _EXPECTED)
             boxes[number] += is_tested.sum()
             false[number] += (is_tested & (others == 0)).sum()
+        if not len(sure):
+            continue
+        place = np.full(len(seen), -1)
+        place[sure] = np.arange(len(sure))
+        where, camera, frame = places_of(block.rows), block.rows["camera"], group_index(block.counts)
+        for number in range(count):
             # Where the others alone see the people, compared with the nearest box of this camera.
             mine = np.flatnonzero(camera == number)
-            rest = np.flatnonzero((camera != number) & sure[of])
-            if not len(mine) or not len(rest):
-                continue
-            names, inner = np.unique(of[rest], return_inverse=True)
-            seen_at = means(Places(places.xy_m[rest], places.cov[rest]), inner, len(names)).xy_m
-            which, nearest = _pairs(places.xy_m[mine], seen_at)
-            difference = places.xy_m[mine[which]] - seen_at[nearest]
+            rest = np.flatnonzero((camera != number) & (place[block.of] >= 0))
+            seen_at = means(Places(where.xy_m[rest], where.cov[rest]), place[block.of[rest]], len(sure)).xy_m
+            counts = np.bincount(frame[mine], minlength=len(block.frames))
+            which, nearest = _pairs(where.xy_m[mine], counts, seen_at, sizes)
+            difference = where.xy_m[mine[which]] - seen_at[nearest]
             off[number].append(difference)
-            moving = speed[np.searchsorted(np.flatnonzero(sure), names[nearest])]
+            moving = speed[nearest]
             pace = (moving**2).sum(axis=1)
             fast = pace > _MOVES_M_PER_S**2  # False where it isn't known
-            away_s = (frame.rows["picture_ns"][mine[which][fast]] - offset_ns[number] - frame.t_ns) / NS_PER_S
+            box = mine[which[fast]]
+            times = np.array([one.t_ns for one in block.frames])[frame[box]]
+            away_s = (block.rows["picture_ns"][box] - offset_ns[number] - times) / NS_PER_S
             late[number].append(away_s - (difference[fast] * moving[fast]).sum(axis=1) / pace[fast])
-    views = tuple(
+    compared = tuple(
         replace(view, detects=tuple((hits[i] / tries[i]).tolist()), false_share=float(false[i] / boxes[i]))
-        for i, view in enumerate(fuser.views)
+        for i, view in enumerate(views)
     )
-    return views, tuple(_offset(*pair) for pair in zip(off, late, strict=True)), shared
+    return compared, tuple(_offset(*pair) for pair in zip(off, late, strict=True)), shared
 
 
-def _velocities(last: tuple[int, Floats] | None, t_ns: int, now: Floats) -> Floats:
-    """The velocity (G, 2) of each place since the last frame; NaN where none was near."""
-    out = np.full(now.shape, np.nan)
-    if last is None or not len(last[1]) or not len(now) or t_ns <= last[0]:
-        return out
-    which, nearest = _pairs(now, last[1])
-    out[which] = (now[which] - last[1][nearest]) / ((t_ns - last[0]) / NS_PER_S)
-    return out
+def _velocities(
+    last: tuple[int, Floats] | None, block: Joined, xy_m: Floats, sizes: Ints
+) -> tuple[Floats, tuple[int, Floats] | None]:
+    """The velocity (G, 2) of each place, of ``sizes`` (F,) in each frame, since the frame before; NaN where none is.
+
+    ``last`` is the time of the frame before the block, with the places there; the same of its last frame is returned.
+    """
+    out = np.full(xy_m.shape, np.nan)
+    before = np.empty((0, 2)) if last is None else last[1]
+    times = np.array([block.frames[0].t_ns if last is None else last[0], *(one.t_ns for one in block.frames)])
+    which, nearest = _pairs(xy_m, sizes, np.concatenate([before, xy_m]), np.append(len(before), sizes[:-1]))
+    step_s = (np.diff(times) / NS_PER_S)[group_index(sizes)[which]]
+    rises = step_s > 0
+    which, nearest = which[rises], nearest[rises]
+    out[which] = (xy_m[which] - np.concatenate([before, xy_m])[nearest]) / step_s[rises, None]
+    end = block.frames[-1]
+    return out, (end.t_ns, xy_m[len(xy_m) - sizes[-1] :]) if len(end.rows) else None
 
 
-def _pairs(some: Floats, others: Floats) -> tuple[Indices, Indices]:
-    """The places in (M, 2) and (N, 2) that are nearest to each other, and near."""
-    apart = some[:, None] - others
+def _pairs(some: Floats, counts: Ints, others: Floats, sizes: Ints) -> tuple[Indices, Indices]:
+    """The places in (M, 2) and (N, 2) of one frame that are nearest to each other, and near.
+
+    Each of F frames has ``counts`` (F,) and ``sizes`` (F,) of them.
+    """
+    rows, columns = table_of(counts), table_of(sizes)
+    if not rows.size or not columns.size:
+        return np.empty(0, np.intp), np.empty(0, np.intp)
+    apart = some[rows][:, :, None] - others[columns][:, None]
     distance = np.hypot(apart[..., 0], apart[..., 1])
-    nearest = distance.argmin(axis=1)
-    is_pair = (distance.min(axis=1) < _NEAR_M) & (distance.argmin(axis=0)[nearest] == np.arange(len(some)))
-    return np.flatnonzero(is_pair), nearest[is_pair]
+    distance[(rows < 0)[:, :, None] | (columns < 0)[:, None]] = np.inf
+    nearest = distance.argmin(axis=2)
+    back = np.take_along_axis(distance.argmin(axis=1), nearest, axis=1)
+    is_pair = (distance.min(axis=2) < _NEAR_M) & (back == np.arange(rows.shape[1]))
+    return rows[is_pair], np.take_along_axis(columns, nearest, axis=1)[is_pair]
 
 
 def _offset(off: list[Floats], late: list[Floats]) -> Offset:

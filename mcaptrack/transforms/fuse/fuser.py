@@ -1,4 +1,4 @@
-"""Fuse the boxes of several cameras on the ground. Letters: N boxes, G groups, C cameras."""
+"""Fuse the boxes of several cameras on the ground. Letters: N boxes, G groups."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.schema import COVARIANCE_M2, DETECTIONS, SIGHTINGS, Frame, Rows, Schema
-from mcaptrack.transforms.fuse.grouping import Places, group, means
+from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.ragged import ragged_range
+from mcaptrack.schema import DETECTIONS, SIGHTINGS, Frame, Schema
+from mcaptrack.schema.framing import split_rows
+from mcaptrack.transforms.fuse.joined import Joined, joined
 from mcaptrack.transforms.fuse.view import Views
 from mcaptrack.transforms.protocol import Suited, check_options, context, option
 
@@ -21,12 +23,6 @@ _LEAST, _MOST = 0.02, 0.98
 #: Limits of people's motion for a tracker of the result (see ``motion_limits``).
 _WALKS: Final = "person=:0.4::1.2"
 _TRACKED: Final = MappingProxyType({"birth_score": 0.8, "confirm_score": 2.0, "max_age_s": 1.0, "class_limits": _WALKS})
-
-
-def places_of(rows: Rows) -> Places:
-    """The places of sightings (N,)."""
-    xy_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
-    return Places(xy_m, np.stack([rows[name] for name in COVARIANCE_M2], axis=-1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,23 +75,26 @@ class FootFuser:
         return MappingProxyType({"": 0.0, "sightings": 0.0})
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        for frame in frames:
-            yield self._fuse(frame)
+        for block in self.joined(frames):
+            yield from self.fused(block)
 
-    def _fuse(self, frame: Frame) -> tuple[Frame, Frame]:
-        rows = frame.rows[np.lexsort((frame.rows["box_row"], frame.rows["camera"]))]
-        if not len(rows):
-            return frame._replace(rows=DETECTIONS.empty()), frame
-        of, centre, seen = self.groups(rows)
-        begun = len(seen)
-        expected, odds = self._evidence(frame.t_ns, centre, seen)
+    def joined(self, frames: Iterable[Frame]) -> Iterator[Joined]:
+        """Join the boxes of sightings, block by block; how well the cameras detect people has no influence."""
+        return joined(frames, self.views, self.max_sigma, self.max_distance_m)
+
+    def fused(self, block: Joined) -> list[tuple[Frame, Frame]]:
+        """The detections of each frame of a block, and the sightings with the number of their detections."""
+        centre, seen, of = block.centre, block.seen, block.of
+        expected, odds = self._evidence(block)
         certainty = 1 / (1 + np.exp(-odds))
         kept = np.flatnonzero(certainty >= self.min_score)
-        kept = kept[np.lexsort((centre.xy_m[kept, 1], centre.xy_m[kept, 0]))]  # whatever the order of the cameras
-        number = np.full(begun, -1, np.int64)
-        number[kept] = np.arange(len(kept))
-        classes = np.zeros(begun, np.int64)
-        classes[of] = rows["class_id"]
+        x, y = centre.xy_m[kept].T
+        kept = kept[np.lexsort((y, x, block.frame[kept]))]  # whatever the order of the cameras
+        sizes = np.bincount(block.frame[kept], minlength=len(block.frames))
+        number = np.full(len(seen), -1, np.int64)
+        number[kept] = ragged_range(0, sizes)
+        classes = np.zeros(len(seen), np.int64)
+        classes[of] = block.rows["class_id"]
         found = DETECTIONS.rows(
             x_m=centre.xy_m[kept, 0],
             y_m=centre.xy_m[kept, 1],
@@ -107,30 +106,24 @@ class FootFuser:
             seen_by=seen[kept].sum(axis=1),
             expected_by=expected[kept],
         )
-        members = rows.copy()
+        members = block.rows.copy()
         members["detection"] = number[of]
-        return frame._replace(rows=found), frame._replace(rows=members)
+        when, index = [one.t_ns for one in block.frames], [one.index for one in block.frames]
+        return list(
+            zip(
+                split_rows(when, index, found, np.cumsum(sizes)),
+                split_rows(when, index, members, np.cumsum(block.counts)),
+                strict=True,
+            )
+        )
 
-    def groups(self, rows: Rows) -> tuple[Ints, Places, Bools]:
-        """The group of each sighting (N,), the place of each group (G,), and which cameras see it (G, C)."""
-        camera, places = rows["camera"].astype(np.int64), places_of(rows)
-        of = np.full(len(rows), -1, np.int64)
-        begun = 0
-        for class_id in np.unique(rows["class_id"]).tolist():  # objects of different classes are never joined
-            mine = np.flatnonzero(rows["class_id"] == class_id)
-            part = Places(places.xy_m[mine], places.cov[mine])
-            of[mine] = begun + group(camera[mine], part, self.max_sigma**2, self.max_distance_m)
-            begun = int(of.max()) + 1
-        seen = np.zeros((begun, max(len(self.views), int(camera.max()) + 1)), bool)
-        seen[of, camera] = True
-        return of, means(places, of, begun), seen
-
-    def _evidence(self, t_ns: int, centre: Places, seen: Bools) -> tuple[Ints, Floats]:
+    def _evidence(self, block: Joined) -> tuple[Ints, Floats]:
         """The number of cameras that should see each place (G,), and the log-odds (G,) that a person is there."""
+        seen = block.seen
         rate = np.full(seen.shape, np.nan)
         false = np.full(seen.shape[1], 0.5)
         for number, view in enumerate(self.views):
-            rate[:, number] = view.rate(view.visible(centre.xy_m, t_ns))
+            rate[:, number] = view.rate(block.visible[:, number])
             false[number] = view.false_share
         expected = np.where(np.isnan(rate), seen, seen | (rate >= 0.5)).sum(axis=1)
         is_known = ~np.isnan(rate)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.ragged import group_index, ragged_range
+
+#: Pairs are looked for within a little more than their largest distance, which is compared exactly afterwards: this
+#: share of the numbers that are compared.
+_MARGIN: Final = 1e-12
 
 
 class Places(NamedTuple):
@@ -30,12 +35,12 @@ def distances(x: Floats, y: Floats, xx: Floats, xy: Floats, yy: Floats) -> Float
     return out
 
 
-def group(camera: Ints, places: Places, gate: float, farthest_m: float) -> Ints:
+def group(camera: Ints, places: Places, gate: float, farthest_m: float, part: Ints | None = None) -> Ints:
     """Join boxes that fit together, until as few groups are left as there can be; returns the group of each box (N,).
 
     Pairs are joined in order of their distance, if the groups that they are in by then still fit: no camera is twice in
     a group, and the means of the two are within the gate. A box that fits no other is a group of its own. Then a
-    group is dissolved if all its boxes fit others (``_dissolved``).
+    group is dissolved if all its boxes fit others (``_dissolved``). Groups are numbered by their first boxes.
 
     Parameters
     ----------
@@ -47,33 +52,61 @@ def group(camera: Ints, places: Places, gate: float, farthest_m: float) -> Ints:
         Largest squared Mahalanobis distance of two groups.
     farthest_m : float
         Largest distance of two boxes in metres.
+    part : (N,) int, optional
+        Boxes of different parts, as of different frames, are never joined.
     """
     count = len(camera)
-    first, second = np.triu_indices(count, 1)
+    part = np.zeros(count, np.int64) if part is None else part
+    first, second = _near(places.xy_m, part, farthest_m)
     x, y = (places.xy_m[first] - places.xy_m[second]).T
     may = (camera[first] != camera[second]) & (x * x + y * y <= farthest_m**2)
     first, second, x, y = first[may], second[may], x[may], y[may]
     distance = distances(x, y, *(places.cov[first] + places.cov[second]).T)
-    near = distance <= gate
-    order = np.flatnonzero(near)[np.argsort(distance[near], kind="stable")]
-    owner = list(range(count))
+    fits = np.flatnonzero(distance <= gate)
+    order = fits[np.lexsort((second[fits], first[fits], distance[fits]))]
     # Numbers of Python, because a step concerns two groups and NumPy takes longer for so few.
-    inverse, weighted = (part.tolist() for part in places.information())
+    owner, members = list(range(count)), [[one] for one in range(count)]
     seen = [1 << one for one in camera.tolist()]
+    known = list(zip(*(column.tolist() for part_ in places.information() for column in part_.T), strict=True))
+    at = _mean(*np.array(known, float).reshape(-1, 5).T)
+    x_, y_, xx_, xy_, yy_ = (column.tolist() for column in at)
     for one, other in zip(first[order].tolist(), second[order].tolist(), strict=True):
-        i, j = _root(owner, one), _root(owner, other)
-        if i == j or seen[i] & seen[j] or _apart(inverse[i], weighted[i], inverse[j], weighted[j]) > gate:
+        i, j = owner[one], owner[other]
+        if i == j or seen[i] & seen[j]:
             continue
-        low, high = min(i, j), max(i, j)
-        owner[high] = low
+        dx, dy = x_[i] - x_[j], y_[i] - y_[j]
+        xx, xy, yy = xx_[i] + xx_[j], xy_[i] + xy_[j], yy_[i] + yy_[j]
+        if (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy) > gate:
+            continue
+        low, high = (i, j) if i < j else (j, i)
         seen[low] |= seen[high]
-        inverse[low] = [a + b for a, b in zip(inverse[low], inverse[high], strict=True)]
-        weighted[low] = [a + b for a, b in zip(weighted[low], weighted[high], strict=True)]
-    of = np.unique([_root(owner, one) for one in range(count)], return_inverse=True)[1].astype(np.int64)
-    return _dissolved(camera, places, of, gate, farthest_m)
+        (a, b, c, u, v), (d, e, f, w, z) = known[low], known[high]
+        known[low] = joint = (a + d, b + e, c + f, u + w, v + z)
+        x_[low], y_[low], xx_[low], xy_[low], yy_[low] = _mean(*joint)
+        for member in members[high]:
+            owner[member] = low
+        members[low] += members[high]
+    of = np.unique(owner, return_inverse=True)[1].astype(np.int64)
+    return _dissolved(camera, places, of, gate, farthest_m, part)
 
 
-def _dissolved(camera: Ints, places: Places, of: Ints, gate: float, farthest_m: float) -> Ints:
+def _near(xy_m: Floats, part: Ints, farthest_m: float) -> tuple[Ints, Ints]:
+    """Pairs (P,) of places of one part that are at most so far apart along the first axis, the lower number first."""
+    order = np.lexsort((xy_m[:, 0], part))
+    x, part = xy_m[order, 0], part[order]
+    low, high = float(x.min(initial=0.0)), float(x.max(initial=0.0))
+    # Parts follow one another along the axis.
+    along = x - low + part * (high - low + 2 * farthest_m + 1.0)
+    reach = farthest_m + _MARGIN * float(along.max(initial=0.0))
+    after = np.arange(1, len(x) + 1)
+    count = np.searchsorted(along, along + reach, "right") - after
+    one, other = group_index(count), ragged_range(after, count)
+    same = part[one] == part[other]
+    one, other = order[one[same]], order[other[same]]
+    return np.minimum(one, other), np.maximum(one, other)
+
+
+def _dissolved(camera: Ints, places: Places, of: Ints, gate: float, farthest_m: float, part: Ints) -> Ints:
     """Give the boxes of a group to others near it, where all of them fit there; returns the group of each box (N,).
 
     Where people stand close together, boxes of two of them may have been joined to a third person. Then the two lack
@@ -82,35 +115,43 @@ def _dissolved(camera: Ints, places: Places, of: Ints, gate: float, farthest_m: 
     """
     count = int(of.max(initial=-1)) + 1
     centre = means(places, of, count)
-    x, y = (centre.xy_m[:, None] - centre.xy_m).transpose(2, 0, 1)
+    part_of = np.zeros(count, np.int64)
+    part_of[of] = part
+    one, other = _near(centre.xy_m, part_of, 2 * farthest_m)
+    x, y = (centre.xy_m[one] - centre.xy_m[other]).T
     near = x * x + y * y <= (2 * farthest_m) ** 2
-    np.fill_diagonal(near, False)
-    size = np.bincount(of, minlength=count)
-    tried = np.flatnonzero(near.any(axis=1))
-    if not len(tried):
+    one, other = np.concatenate([one[near], other[near]]), np.concatenate([other[near], one[near]])
+    if not len(one):
         return of
-    box, to = np.nonzero(near[of])
+    # Each box with each group near its own one.
+    size = np.bincount(of, minlength=count)
+    by_group = np.argsort(of, kind="stable")
+    begins = np.cumsum(size) - size
+    box, to = by_group[ragged_range(begins[one], size[one])], np.repeat(other, size[one])
     apart = places.xy_m[box] - centre.xy_m[to]
     away = distances(*apart.T, *(places.cov[box] + centre.cov[to]).T)
     fits = (away <= gate) & ((apart**2).sum(axis=1) <= farthest_m**2)
+    box, to, away = box[fits], to[fits], away[fits]
+    order = np.lexsort((to, away, box))
     choices: dict[int, list[tuple[float, int]]] = {}
-    for one, group_, value in zip(box[fits].tolist(), to[fits].tolist(), away[fits].tolist(), strict=True):
-        choices.setdefault(one, []).append((value, group_))
-    for options in choices.values():
-        options.sort()
+    for number, group_, value in zip(box[order].tolist(), to[order].tolist(), away[order].tolist(), strict=True):
+        choices.setdefault(number, []).append((value, group_))
+    # Only groups all of whose boxes fit another one can go.
+    may_go = np.bincount(of[np.unique(box)], minlength=count) == size
+    tried = np.flatnonzero(may_go)
     owner, cameras = of.tolist(), camera.tolist()
     slots = [dict[int, int]() for _ in range(count)]
-    for one, (group_, of_camera) in enumerate(zip(owner, cameras, strict=True)):
-        slots[group_][of_camera] = one
+    for number, (group_, of_camera) in enumerate(zip(owner, cameras, strict=True)):
+        slots[group_][of_camera] = number
     for group_ in tried[np.argsort(size[tried], kind="stable")].tolist():
         moves = _moves(group_, slots, cameras, choices)
         if moves is None:
             continue
-        for one, _ in moves:
-            slots[owner[one]].pop(cameras[one])
-        for one, new in moves:
-            slots[new][cameras[one]] = one
-            owner[one] = new
+        for number, _ in moves:
+            slots[owner[number]].pop(cameras[number])
+        for number, new in moves:
+            slots[new][cameras[number]] = number
+            owner[number] = new
     return np.unique(owner, return_inverse=True)[1].astype(np.int64)
 
 
@@ -139,20 +180,13 @@ def _moves(
     return moves
 
 
-def _root(owner: list[int], one: int) -> int:
-    while owner[one] != one:
-        owner[one] = owner[owner[one]]
-        one = owner[one]
-    return one
+def _mean(a: Any, b: Any, c: Any, u: Any, v: Any) -> tuple[Any, ...]:
+    """The mean of a group and its covariance, x, y, xx, xy, yy, by its information: xx, xy, yy, and that times x, y.
 
-
-def _apart(a: list[float], u: list[float], b: list[float], v: list[float]) -> float:
-    """Squared Mahalanobis distance of the means of two groups, by their summed information."""
-    det_a, det_b = a[0] * a[2] - a[1] * a[1], b[0] * b[2] - b[1] * b[1]
-    x = (a[2] * u[0] - a[1] * u[1]) / det_a - (b[2] * v[0] - b[1] * v[1]) / det_b
-    y = (a[0] * u[1] - a[1] * u[0]) / det_a - (b[0] * v[1] - b[1] * v[0]) / det_b
-    xx, xy, yy = a[2] / det_a + b[2] / det_b, -a[1] / det_a - b[1] / det_b, a[0] / det_a + b[0] / det_b
-    return (yy * x * x - 2 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
+    Each is a number, or an array for as many groups.
+    """
+    det = a * c - b * b
+    return (c * u - b * v) / det, (a * v - b * u) / det, c / det, -b / det, a / det
 
 
 def means(places: Places, of: Ints, count: int) -> Places:
@@ -160,6 +194,5 @@ def means(places: Places, of: Ints, count: int) -> Places:
     inverse, weighted = places.information()
     a, b, c = (np.bincount(of, part, count) for part in inverse.T)
     u, v = (np.bincount(of, part, count) for part in weighted.T)
-    det = a * c - b * b
-    xy_m = np.stack([c * u - b * v, a * v - b * u], axis=-1) / det[:, None]
-    return Places(xy_m, np.stack([c, -b, a], axis=-1) / det[:, None])
+    x, y, xx, xy, yy = _mean(a, b, c, u, v)
+    return Places(np.stack([x, y], axis=-1), np.stack([xx, xy, yy], axis=-1))

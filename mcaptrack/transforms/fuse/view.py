@@ -9,9 +9,10 @@ from typing import ClassVar, Final, Self
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.plane import GroundPlane, Planes, plane_at
+from mcaptrack.geometry.ragged import table_of
 from mcaptrack.schema import BOX_PX, Frame
 from mcaptrack.transforms.fuse.grouping import Places
 
@@ -70,10 +71,11 @@ class CameraView:
             weight = 1 / np.maximum(error, _ERROR)
         return replace(self, heights=(float(fit[0]), float(fit[1]), float(fit[2])))
 
-    def places(self, xywh: Floats, t_ns: int, noise: float, noise_m: float) -> Places:
+    def places(self, xywh: Floats, t_ns: int, noise: float, noise_m: float | Floats) -> Places:
         """Where boxes (N, 4) stand, NaN beyond the horizon.
 
-        ``noise`` is the noise of their lower edges as a share of their heights, ``noise_m`` that of the plane in m.
+        ``noise`` is the noise of their lower edges as a share of their heights, ``noise_m`` that of the plane in m, of
+        all boxes or of each (N,).
         """
         plane = plane_at(self.planes, t_ns)
         if plane is None or not len(xywh):
@@ -83,20 +85,17 @@ class CameraView:
         at, right, left, below, above = plane.pixels_to_metres(np.concatenate([foot + step for step in steps])).reshape(
             5, -1, 2
         )
-        u, v = (right - left) * (noise * xywh[:, 3:]), (below - above) * (noise * xywh[:, 3:])
-        cov = np.stack(
-            [
-                u[:, 0] ** 2 + v[:, 0] ** 2 + noise_m**2,
-                u[:, 0] * u[:, 1] + v[:, 0] * v[:, 1],
-                u[:, 1] ** 2 + v[:, 1] ** 2 + noise_m**2,
-            ],
-            axis=-1,
-        )
+        (ux, uy), (vx, vy) = ((step * (noise * xywh[:, 3:])).T for step in (right - left, below - above))
+        more = noise_m**2
+        cov = np.stack([ux**2 + vx**2 + more, ux * uy + vx * vy, uy**2 + vy**2 + more], axis=-1)
         is_placed = np.isfinite(np.concatenate([at, cov], axis=1)).all(axis=1, keepdims=True)
         return Places(np.where(is_placed, at, np.nan), np.where(is_placed, cov, np.nan))
 
-    def visible(self, xy_m: Floats, t_ns: int) -> Floats:
-        """The share (G,) of a person at each place that is in the picture and not hidden by people at the others."""
+    def visible(self, xy_m: Floats, t_ns: int, counts: Sequence[int] | Ints | None = None) -> Floats:
+        """The share (G,) of a person at each place that is in the picture and not hidden by people at the others.
+
+        With ``counts`` (F,) the places are those of so many in each of F frames, with the ground plane at ``t_ns``.
+        """
         plane = plane_at(self.planes, t_ns)
         if plane is None:
             return np.zeros(len(xy_m))
@@ -109,14 +108,20 @@ class CameraView:
         inside = _overlap(left, right, 0, plane.width_px) * _overlap(top, y, 0, plane.height_px)
         area = np.maximum(2 * half * height, 1e-9)
         seen = np.where(is_there, np.nan_to_num(inside) / area, 0.0)
-        if self.heights is None:
+        if self.heights is None or not len(xy_m):
             return np.minimum(seen, 1.0)
-        # How much of each (rows) is covered by each that stands nearer (columns).
-        covered = np.maximum(np.minimum(right[:, None], right) - np.maximum(left[:, None], left), 0)
-        covered *= np.maximum(np.minimum(y[:, None], y) - np.maximum(top[:, None], top), 0)
-        is_nearer: Bools = (y > y[:, None]) & is_there & is_there[:, None]
-        hidden = np.where(is_nearer, covered / area[:, None], 0.0)
-        out: Floats = np.minimum(seen, 1.0) * np.prod(1 - np.clip(hidden, 0, 1), axis=1)
+        # How much of each (rows) is covered by each that stands nearer (columns), frame by frame.
+        table = table_of([len(xy_m)] if counts is None else counts)
+        here = is_there[table] & (table >= 0)
+        left, right, top, bottom, area = np.where(is_there, np.stack([left, right, top, y, area]), 1.0)[:, table]
+        covered = np.minimum(right[:, :, None], right[:, None]) - np.maximum(left[:, :, None], left[:, None])
+        np.maximum(covered, 0, out=covered)
+        high = np.minimum(bottom[:, :, None], bottom[:, None]) - np.maximum(top[:, :, None], top[:, None])
+        covered *= np.maximum(high, 0, out=high)
+        covered /= area[:, :, None]
+        is_nearer = (bottom[:, None] > bottom[:, :, None]) & here[:, None] & here[:, :, None]
+        hidden = np.where(is_nearer, covered, 0.0)
+        out: Floats = np.minimum(seen, 1.0) * np.prod(1 - np.clip(hidden, 0, 1, out=hidden), axis=2)[table >= 0]
         return out
 
     def heights_at(self, plane: GroundPlane, foot: Floats) -> Floats:
