@@ -446,7 +446,8 @@ class TestAgreement:
             if not len(rows):
                 before = None
                 continue
-            of, centre, seen = fuser.groups(rows)
+            (block,) = fuser.joined([frame])
+            of, centre, seen = block.of, block.centre, block.seen
             share = np.array([view.visible(centre.xy_m, frame.t_ns) for view in fuser.views]).T
             rate = np.array([view.rate(part) for view, part in zip(fuser.views, share.T, strict=True)]).T
             sure = [g for g in range(len(seen)) if seen[g].sum() >= 3]

@@ -136,7 +136,7 @@ def _dissolved(camera: Ints, places: Places, of: Ints, gate: float, farthest_m: 
     choices: dict[int, list[tuple[float, int]]] = {}
     for number, group_, value in zip(box[order].tolist(), to[order].tolist(), away[order].tolist(), strict=True):
         choices.setdefault(number, []).append((value, group_))
-    # Only groups all of whose boxes fit another one can go.
+    # A group can go only if each of its boxes fits another one.
     may_go = np.bincount(of[np.unique(box)], minlength=count) == size
     tried = np.flatnonzero(may_go)
     owner, cameras = of.tolist(), camera.tolist()
