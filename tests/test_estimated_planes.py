@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from mcaptrack import log, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
+from mcaptrack.pipeline.motion import detects_motion, side_inputs
 from mcaptrack.pipeline.planes import (
     AS_BEFORE,
     PlaneChoice,
@@ -29,6 +31,8 @@ from mcaptrack.pipeline.planes import (
 from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
+from mcaptrack.transforms import Sort
+from mcaptrack.transforms.motion import EstimateMotion
 from tests.commands import done
 from tests.worlds import assert_same_rows, ns
 
@@ -430,3 +434,64 @@ def test_which_boxes_are_of_people(classes, names, which):
     assert boxes.tolist() == [[1, 5, 6, 7], [2, 5, 6, 8], [3, 5, 6, 9]]  # the last one is none
     assert (number.tolist(), score.tolist()) == ([0, 1, 1], [0.5] * 3)
     assert np.flatnonzero(are_people).tolist() == which
+
+
+class TestBesideThePictures:
+    """The boxes of people that the estimate of the camera's motion leaves out."""
+
+    MOTION = SimpleNamespace(transform=EstimateMotion())
+
+    @staticmethod
+    def found(path: Path, provenance: Provenance, job: Any = MOTION, made: dict[str, Made] = {}) -> Any:  # noqa: B006
+        with log.read(written(path, provenance, detections())) as opened:
+            return side_inputs(opened, "/camera", job, made)
+
+    def test_they_are_those_of_the_log_by_the_time_of_their_picture(self, tmp_path):
+        values, references = self.found(tmp_path / "a.mcap", LEARNED)
+        boxes = {t_ns: some.tolist() for t_ns, some in values["known_boxes"].items()}
+        assert boxes == {frame.t_ns: BOXES[frame.index].tolist() for frame in detections()}
+        assert [*references] == ["/camera/detections"]
+        assert len(references["/camera/detections"]) == 64
+
+    def test_they_are_those_of_this_run_if_it_makes_some(self, tmp_path):
+        frames = [frame._replace(rows=frame.rows[:3]) for frame in detections()[:4]]
+        frames.append(Frame(ns(9), 90, frames[0].rows[:0]))
+        made = {"/camera/detections": Made.of(DETECTIONS, frames, LEARNED)}
+        values, references = self.found(tmp_path / "a.mcap", LEARNED, made=made)
+        assert {t_ns: len(some) for t_ns, some in values["known_boxes"].items()} == {ns(n / 10): 3 for n in range(4)}
+        assert references == {"/camera/detections": made["/camera/detections"].provenance.digest}
+
+    @pytest.mark.parametrize("detector", ["knn", "median"])
+    def test_a_detector_that_needs_a_still_camera_says_nothing(self, tmp_path, detector):
+        still = Provenance("detect", {"detector": detector}, "/camera/video")
+        assert self.found(tmp_path / "a.mcap", still) == ({}, {})
+
+    def test_they_are_not_asked_for(self, tmp_path):
+        for transform in (EstimateMotion(mask_boxes=False), Sort(camera_motion="off")):
+            job = SimpleNamespace(transform=transform)
+            assert self.found(tmp_path / f"{type(transform).__name__}.mcap", LEARNED, job) == ({}, {})
+
+    def test_a_tracker_that_is_to_use_a_motion_that_is_not_known_says_so(self, tmp_path):
+        for choice, said in (("auto", 0), ("on", 1)):
+            job = SimpleNamespace(transform=Sort(camera_motion=choice))
+            with collected() as notices:
+                assert self.found(tmp_path / f"{choice}.mcap", LEARNED, job) == ({}, {})
+            assert len(notices) == said
+            if said:
+                assert notices[0].message.startswith("the motion of the camera is not known: /camera/motion needs")
+
+    @pytest.mark.parametrize(
+        ("made", "is_of_motion"),
+        [
+            (None, False),
+            (Provenance("ingest", {}), False),
+            (Provenance("track", {"detector": "knn"}), False),
+            (LEARNED, False),
+            (Provenance("detect", {}), True),  # the usual one
+            (Provenance("detect", {"detector": "of another package"}), True),
+            (Provenance("detect", {"method": "mog2"}), True),
+            (Provenance("detect", {"detector": "knn"}, plugins={"transform": None}), False),  # type: ignore[dict-item]
+        ],
+    )
+    def test_which_boxes_come_from_motion(self, made, is_of_motion):
+        assert detects_motion(made) is is_of_motion

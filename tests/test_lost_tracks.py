@@ -12,6 +12,7 @@ from mcaptrack.schema import Frame
 from mcaptrack.transforms import GroundTracker
 from mcaptrack.transforms.ground import state
 from mcaptrack.transforms.ground.lost_tracks import LostTracks, continuations
+from mcaptrack.transforms.ground.tracker import _Run
 from tests.effects.ground import NAMES, Box, boxes
 
 GAP = range(20, 50)
@@ -144,3 +145,64 @@ def test_lost_tracks_are_remembered_until_their_time_is_over():
     lost.wait(0.25)
     assert lost.table[state.ID].tolist() == [4]
     assert lost.table[state.MISSED_S].tolist() == [1.75]
+
+
+def test_a_track_that_still_coasts_may_be_continued_too_and_lost_ones_stay_lost():
+    """Boxes have to overlap here: a narrow car that is seen 0.7 m aside after half a second begins a track, which continues it.
+
+    Another one was lost before, far away, and comes back where it stood.
+    """
+
+    def found(n: int) -> list[Box]:
+        narrow = {"width_m": 0.4}
+        first = [(0.0, 0.0, narrow)] if n < 40 else [(0.0, 0.7, narrow)] if n >= 45 else []
+        return first + ([(60.0, 0.0)] if n < 15 or n >= 60 else [])
+
+    frames = tracked(found, 80, cost="iou", max_age_s=1.0)
+    assert last_id(frames) == 2
+    assert sorted(frames[5].rows["track_id"].tolist()) == sorted(frames[-1].rows["track_id"].tolist())
+    assert [len(one.rows) for one in (frames[30], frames[50], frames[-1])] == [1, 1, 2]
+    assert frames[50].rows["y_m"][0] == pytest.approx(0.7, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("what", "kept"),
+    [
+        ({"xx": 0.1, "xy": 0.0, "yy": 0.1}, True),
+        ({"xx": 0.0, "xy": 0.0, "yy": 0.1}, False),
+        ({"xx": 0.1, "xy": 0.0, "yy": 0.0}, False),
+        ({"xx": 0.1, "xy": 0.1, "yy": 0.1}, False),  # singular
+        ({"xx": 0.1, "xy": np.nan, "yy": 0.1}, False),
+        ({"xx": np.inf, "xy": 0.0, "yy": 0.1}, False),
+    ],
+)
+def test_covariances_that_are_none_are_not_used(what: dict[str, float], kept: bool):
+    run = _Run(GroundTracker(class_names=NAMES))
+    (frame,) = boxes(lambda _: [(3.0, 1.0), (1.0, 2.0)], 1)
+    for name, value in what.items():
+        frame.rows[f"cov_{name}_m2"][0] = value
+    table = run._detections(frame)
+    assert len(table) == state.DETECTION_ROWS + 3 * kept
+    assert table[state.X].tolist() == [1.0, 3.0]  # in an order of their own
+    if kept:
+        assert table[state.COVARIANCE, 1].tolist() == [what["xx"], what["xy"], what["yy"]]
+        assert np.isnan(table[state.COVARIANCE, 0]).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "left"),
+    [
+        ({}, [1, 2, 3]),
+        ({"min_score": 0.5}, [2, 3]),
+        ({"class_id": 3}, [1, 3]),
+        ({"min_score": 0.6, "class_id": 3}, [3]),
+    ],
+)
+def test_detections_that_are_used(options: dict[str, float], left: list[int]):
+    """Scores of 0.4, 0.5, none, and one without a position."""
+    (frame,) = boxes(lambda _: [(1.0, 0.0), (2.0, 0.0), (3.0, 0.0), (4.0, 0.0)], 1)
+    frame.rows["score"], frame.rows["class_id"] = [0.4, 0.5, np.nan, 0.9], [3, 1, 3, 3]
+    frame.rows["y_m"][3] = np.nan
+    run = _Run(GroundTracker(class_names=NAMES, **options))
+    assert run._detections(frame)[state.X].tolist() == left
+    assert run._left_out == 1

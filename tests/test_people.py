@@ -177,6 +177,20 @@ class TestLearning:
         wide = self.learned([(20 + n, 40, 8, 24) for n in range(10)] + [(20, 40, 10, 24)] * 10, person_px=24.0)
         np.testing.assert_allclose(wide.template[:, middle - 5], 0.5)
 
+    def test_what_is_closed_between_two_parts_is_no_part_of_the_shape(self):
+        """Of bodies in two parts, two rows of 24 apart; six of the eight columns of the first row are empty, too."""
+        learner = Learner()
+        for n in range(10):
+            mask = drawn((120, 120), (20 + n, 40, 8, 10), (20 + n, 52, 8, 12))
+            mask[40, 20 + n : 26 + n] = 0
+            learner.add([mask], 24.0)
+        shape = learner.person().template
+        middle = shape.shape[1] // 2
+        assert shape[10:12].max() == 0
+        assert shape[12:, middle - 4 : middle + 4].min() == 1
+        assert shape[1:10, middle - 4 : middle + 4].min() == 1
+        assert shape[0, middle - 4 : middle + 4].tolist() == [0.5] * 2 + [0.0] * 4 + [0.5] * 2
+
     @pytest.mark.parametrize(("box", "is_known"), [((20, 40, 6, 8), False), ((20, 40, 5, 10), True)])
     def test_regions_to_learn_from_have_two_percent_of_the_squared_height(self, box, is_known):
         """Of a person of 50 pixels."""

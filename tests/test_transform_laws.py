@@ -157,3 +157,11 @@ def test_every_parameter_says_what_it_is_and_refuses_what_it_can_not_be(kind):
     with pytest.raises(AttributeError):
         kind().reads = None
     assert replace(kind()) == kind()
+
+
+def test_each_output_has_a_latency_and_what_is_online_has_none():
+    for name, transform in variants():
+        assert set(transform.latency_s) == set(transform.writes), name
+        assert all(latency >= 0 for latency in transform.latency_s.values()), name
+    for profile in PROFILES.values():
+        assert profile.latency_s == {"": float("inf"), "online": 0.0, "predictions": 0.0}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import tomllib
 from dataclasses import dataclass, fields
@@ -81,6 +82,10 @@ def test_an_interrupted_search_continues(with_optuna, tmp_path, monkeypatch):
     tune(Sort(), [task], ranges, IOU, trials=6, study=path, on_trial=lambda trial, *_: told.append(trial.number))
     assert told == [0, 1, 2, 3, 3, 4, 5]
     assert [json.loads(line).get("number") for line in path.read_text().splitlines()] == [None, 0, 1, 2, 3, 4, 5]
+    made = path.read_bytes()
+    os.utime(path, ns=(5, 5))
+    first, _ = tune(Sort(), [task], ranges, IOU, trials=6, study=path)  # nothing is left to try
+    assert (first.number, path.stat().st_mtime_ns, path.read_bytes()) == (0, 5, made)
     if not with_optuna:  # chance draws the same whenever it is asked
         whole_way = tmp_path / "other.jsonl"
         tune(Sort(), [task], ranges, IOU, trials=6, study=whole_way)

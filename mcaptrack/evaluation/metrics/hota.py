@@ -69,7 +69,7 @@ def hota(matchup: Matchup) -> dict[str, NDArray[np.float64]]:
     counts = np.bincount(at * levels + passed, minlength=levels * len(cells)).reshape(len(cells), levels)
     matches = _at_least(counts)  # (M, A)
     there = (truth_count[cells // n_tracks] + track_count[cells % n_tracks])[:, None] if n_tracks else matches
-    association = matches / np.maximum(1, there - matches)
+    association = matches / (there - matches)  # a match counts twice in ``there``, so that this is 1 at least
     return {
         "HOTA_TP": tp,
         "HOTA_FN": len(matchup.all_ground_truth) - tp,
