@@ -8,11 +8,12 @@ import sys
 from collections.abc import Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 from typer.main import get_command
 
+from mcaptrack.api.running import RunResult
 from mcaptrack.cli import app
 from tests.worlds import write_clip
 
@@ -106,3 +107,11 @@ def made_log(folder: Path, frames: int = 30) -> Path:
     done("ingest", folder / "clip.mp4", *labels, "-o", path)
     done("run", path)
     return path
+
+
+def run_result(**changed: Any) -> RunResult:
+    """The result of a run that did nothing in 1.26 s, but for what is given."""
+    names = ("frames", "rows", "tracks", "events", "zones", "tables", "seconds_by_part")
+    plain = dict.fromkeys(("stages", "stale", "layouts", "warnings", "notes"), ()) | {name: {} for name in names}
+    plain |= {"log": Path("a b.mcap"), "written_to": Path("a b.mcap"), "written_because": "", "seconds": 1.26}
+    return RunResult(**{"summary": None} | plain | changed)

@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from mcaptrack.api.running import RunResult
 from mcaptrack.api.several import CameraResult
 from mcaptrack.cli import common, live, many, running, text
 from mcaptrack.cli.many import LogWork, ManyOptions, _Printer, _seconds, _summarise
@@ -20,8 +19,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import FleetResult, FleetStatus, LogOutcome, Running
 from mcaptrack.notices import Notice
 from mcaptrack.pipeline.summary import Corrected, Repair, Summary, SummaryScores
+from tests.commands import run_result as result
 
-LOG = Path("a b.mcap")
 A, B, C = Path("a.mcap"), Path("b.mcap"), Path("c.mcap")
 
 
@@ -51,13 +50,6 @@ def lines_of_json(text: str) -> list[dict[str, Any]]:
 
 
 # Several cameras
-
-
-def result(**changed: Any) -> RunResult:
-    names = ("frames", "rows", "tracks", "events", "zones", "tables", "seconds_by_part")
-    plain = dict.fromkeys(("stages", "stale", "layouts", "warnings", "notes"), ()) | {name: {} for name in names}
-    plain |= {"log": LOG, "written_to": LOG, "written_because": "", "seconds": 1.26, "summary": None}
-    return RunResult(**plain | changed)
 
 
 def camera(is_scene: bool = False, **counts: Any) -> CameraResult:
