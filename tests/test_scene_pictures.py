@@ -15,10 +15,15 @@ from hypothesis import strategies as st
 import mcaptrack
 from mcaptrack import McaptrackError, log, pipeline
 from mcaptrack.api import demonstration
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
+from mcaptrack.pipeline.picture_times import PictureClock
+from mcaptrack.pipeline.scene_views import SceneCamera, SceneOnPictures
+from mcaptrack.schema import DETECTIONS, PREDICTIONS, SIGHTINGS, TRACKS, Frame
 from mcaptrack.sources.scenes import PLACES, three_cameras
 from mcaptrack.sources.synthetic import Pedestrian, Pose, SyntheticScene
 from mcaptrack.sources.video import write_mp4
+from mcaptrack.transforms.fuse import CameraView
 from tests.commands import done
 
 FPS, NS = 2, 1_000_000_000
@@ -173,3 +178,120 @@ def test_the_demonstration_of_three_cameras_draws_and_ingests_all(
         chosen = pipeline.choose_cameras(opened)
     assert chosen is not None
     assert (chosen.prefixes, dict(chosen.left_out)) == (("/back", "/left", "/right"), {})
+
+
+class TestOnOnePicture:
+    """Tracks of a scene on the pictures of one camera, row by row; 1 px is 1 cm, and people are 100 px high there."""
+
+    PLANE = GroundPlane((0.01, 0, 0, 0, 0.01, 0, 0, 0, 1), 640, 480)
+    VIEW = CameraView(name="b", planes=((0, PLANE),), heights=(0.0, 0.0, 100.0))
+    #: In metres; three are at an edge, of which a little more than half, and less, is in the picture; one is far away.
+    PLACES = np.array(
+        [[1.0, 2.0], [3.0, 2.0], [5.0, 3.0], [0.01, 4.0], [-0.01, 0.7], [2.0, 0.51], [3.0, 5.31], [90.0, 2.0]]
+    )
+
+    @classmethod
+    def scene(cls, seed: int) -> tuple[list[Frame], SceneOnPictures, SceneCamera]:
+        rng = np.random.default_rng(seed)
+        tracks, detections, sightings, boxes = [], [], [], []
+        for n in range(8):
+            t_ns, picture_ns = n * NS, n * NS + (40_000_000 if n != 4 else -1_200_000_000)
+            ids = rng.permutation(len(cls.PLACES))
+            x, y = cls.PLACES[ids].T
+            rows = TRACKS.rows(
+                track_id=ids, class_id=np.where(ids == 2, 3, 1), x_m=x, y_m=y, observed=ids != 1,
+                source_id=[-1] * len(ids),
+            )  # fmt: skip
+            tracks.append(Frame(t_ns, n + 7, rows))
+            if n == 6:
+                continue  # nothing was fused at that time
+            there = rng.permutation([0, 1, 2, 3, 5])
+            at = cls.PLACES[there] + rng.uniform(-0.3, 0.3, (len(there), 2))
+            found = DETECTIONS.rows(x_m=at[:, 0], y_m=at[:, 1], score=[0.9] * len(there), class_id=[1] * len(there))
+            detections.append(Frame(t_ns, n, found))
+            count = len(there) + 1
+            own = SIGHTINGS.empty(2 * count)
+            own["camera"] = np.repeat([0, 1], count) if n != 2 else 0  # nothing of this camera in one of them
+            own["picture_ns"] = np.where(own["camera"] == 1, picture_ns, t_ns)
+            own["box_row"] = np.tile(rng.permutation(count), 2)
+            own["detection"] = np.tile([-1, *range(len(there))], 2)
+            own["detection"][count + 1] = -1  # the first detection has no box of this camera
+            sightings.append(Frame(t_ns, n, own))
+            px = rng.uniform(10, 90, (4, count))
+            names = ("x_px", "y_px", "w_px", "h_px")
+            boxes.append(
+                Frame(
+                    picture_ns,
+                    n,
+                    DETECTIONS.rows(**dict(zip(names, px, strict=True)), score=[0.5] * count, class_id=[1] * count),
+                )
+            )
+        boxes.sort(key=lambda frame: frame.t_ns)
+        clock = PictureClock("/b/video", np.arange(8) * NS, np.arange(8) * NS)
+        camera = SceneCamera(1, clock, cls.VIEW, boxes, 40_000_000)
+        return tracks, SceneOnPictures(detections, sightings, [camera]), camera
+
+    @classmethod
+    def slowly(cls, tracks: list[Frame], scene: SceneOnPictures, camera: SceneCamera, is_true: bool) -> list[tuple]:
+        out, last_ns = [], -1
+        for frame in tracks:
+            t_ns, own = frame.t_ns + camera.late_ns, {}
+            for number, found in enumerate(scene._detections if not is_true else ()):
+                seen = scene._sightings[number].rows
+                seen = seen[seen["camera"] == 1]
+                if found.t_ns != frame.t_ns or not len(seen):
+                    continue
+                t_ns = int(seen["picture_ns"][0])
+                picture = next(one for one in camera.boxes if one.t_ns == t_ns).rows
+                for row in frame.rows:
+                    away = np.hypot(found.rows["x_m"] - row["x_m"], found.rows["y_m"] - row["y_m"])
+                    used = seen[seen["detection"] == away.argmin()]
+                    if row["observed"] and row["class_id"] == 1 and away.min() <= 1 and len(used):
+                        box = picture[used["box_row"][0]]
+                        own[int(row["track_id"])] = [float(box[name]) for name in ("x_px", "y_px", "w_px", "h_px")]
+            if t_ns <= last_ns:
+                continue
+            last_ns, rows = t_ns, []
+            for row in frame.rows:
+                one = int(row["track_id"])
+                x, y = 100 * row["x_m"], 100 * row["y_m"]
+                wide, high = min(x + 20, 640) - max(x - 20, 0), min(y, 480) - max(y - 100, 0)
+                observed = bool(row["observed"]) if is_true else one in own
+                if one in own or (wide > 20 and high > 50):
+                    rows.append((one, observed, own.get(one, [x - 20, y - 100, 40.0, 100.0])))
+            out.append((t_ns, frame.index, rows))
+        return out
+
+    @pytest.mark.parametrize("part_rows", [1 << 16, 9])
+    @pytest.mark.parametrize("is_true", [False, True])
+    def test_boxes_are_those_of_the_camera_or_of_who_stands_there(
+        self, is_true: bool, part_rows: int, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("mcaptrack.schema.framing.PART_ROWS", part_rows)
+        for seed in range(3):
+            tracks, scene, camera = self.scene(seed)
+            frames, planes = scene.on_camera(camera, TRACKS, tracks, is_true)
+            assert planes == self.VIEW.planes
+            wanted = self.slowly(tracks, scene, camera, is_true)
+            assert [(frame.t_ns, frame.index) for frame in frames] == [one[:2] for one in wanted]
+            assert len(wanted) == (8 if is_true else 7)  # one picture is older than the one before it
+            for frame, (_, _, rows) in zip(frames, wanted, strict=True):
+                assert [(int(row["track_id"]), bool(row["observed"])) for row in frame.rows] == [
+                    one[:2] for one in rows
+                ]
+                px = np.array([frame.rows[name] for name in ("x_px", "y_px", "w_px", "h_px")]).T
+                np.testing.assert_allclose(px, [box for *_, box in rows], atol=1e-4)
+
+    def test_forecasts_are_at_the_times_of_its_pictures(self) -> None:
+        _, scene, camera = self.scene(0)
+        frames, planes = scene.on_camera(camera, PREDICTIONS, [Frame(5, 2, PREDICTIONS.empty())], is_true=False)
+        assert [(frame.t_ns, frame.index) for frame in frames] == [(40_000_005, 2)]
+        assert planes == self.VIEW.planes
+        assert camera.pictures == "/b/video"
+
+    def test_without_heights_nobody_is_drawn_where_the_camera_has_no_box(self) -> None:
+        tracks, scene, camera = self.scene(1)
+        view = replace(self.VIEW, heights=None)
+        frames, _ = scene.on_camera(replace(camera, view=view), TRACKS, tracks, is_true=False)
+        assert all(frame.rows["observed"].all() for frame in frames)
+        assert sum(len(frame.rows) for frame in frames) > 5
