@@ -94,12 +94,25 @@ def test_misses_false_tracks_and_switches_equal_the_reference(seed):
     wanted += spells(EventKind.FALSE_TRACK, here[1], by_track, times, usual)
     kinds = (EventKind.SWITCH, EventKind.MISS, EventKind.FALSE_TRACK)
     columns = ("kind", "track_id", "truth_id", "previous_id", "frames", "duration_s")
+    made = find_events(tracks, truth)
     found = [
         (frame.t_ns, *(row[name].item() for name in columns))
-        for frame in find_events(tracks, truth).events
+        for frame in made.events
         for row in frame.rows
         if row["kind"] in kinds
     ]
+    right = people_so_far = 0
+    counts = made.counts
+    assert [(frame.t_ns, frame.index) for frame in counts] == [(frame.t_ns, frame.index) for frame in truth]
+    for number, frame in enumerate(counts):
+        (row,) = frame.rows
+        there, here, hits = len(truth[number].rows), len(tracks[number].rows), int((pairs.frame == number).sum())
+        switches = sum(event[1] == EventKind.SWITCH and event[0] <= frame.t_ns for event in wanted)
+        right, people_so_far = right + 2 * hits - here, people_so_far + there
+        names = ("people", "matches", "misses", "false_tracks", "switches", "tracked")
+        assert [row[name] for name in names] == [there, hits, there - hits, here - hits, switches, here]
+        mota = (right - switches) / people_so_far if people_so_far else np.nan
+        assert row["mota"] == pytest.approx(mota, nan_ok=True)
     assert [event[:-1] for event in sorted(found)] == [event[:-1] for event in sorted(wanted)]
     np.testing.assert_allclose([e[-1] for e in sorted(found)], [e[-1] for e in sorted(wanted)], atol=1e-9)
 
@@ -122,6 +135,7 @@ def repaired_world(rng: np.random.Generator) -> list[Frame]:
         ids = [one for one, _ in rows]
         made = tracks_at({one: (number / 7, one / 3) for one in ids})
         made["source_id"] = [from_ for _, from_ in rows]
+        made["observed"] = rng.random(len(rows)) < 0.8
         frames.append(Frame(ns(now) + 9, number, made))
     return frames
 
@@ -183,6 +197,14 @@ def test_births_ends_and_repairs_equal_the_reference(seed, part_rows, monkeypatc
     assert {event[1] for event in wanted} == {EventKind.BIRTH, EventKind.END, EventKind.JOINED, EventKind.PARTED}
     assert [event[:-1] for event in found] == [event[:-1] for event in wanted]
     np.testing.assert_allclose([e[-1] for e in found], [e[-1] for e in wanted], atol=1e-9)
+    for frame, counts in zip(frames, find_events(frames, None).counts, strict=True):
+        (row,) = counts.rows
+        past = [event[1] for event in wanted if event[0] <= frame.t_ns]
+        repaired = past.count(EventKind.JOINED) + past.count(EventKind.PARTED)
+        names, ends = ("born", "ended", "repaired"), (past.count(EventKind.BIRTH), past.count(EventKind.END), repaired)
+        assert (counts.t_ns, tuple(row[name] for name in names)) == (frame.t_ns, ends)
+        assert (row["tracked"], row["observed"]) == (len(frame.rows), frame.rows["observed"].sum())
+        assert np.isnan([row["people"], row["matches"], row["mota"]]).all()
     for frame in find_events(frames, None).events:
         assert all(row["x_m"] == pytest.approx(frame.index / 7) for row in frame.rows)
         assert all(row["y_m"] == pytest.approx(row["track_id"] / 3) for row in frame.rows)

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms.detect.onnx import graph, outputs
+from mcaptrack.transforms.detect.onnx.convention import Contest, refuse_if_misread
+from mcaptrack.transforms.detect.onnx.layouts import LAYOUTS
+from mcaptrack.transforms.detect.onnx.nms import Boxes
 from mcaptrack.transforms.detect.onnx.outputs import MisreadError
 from tests.onnx_graphs import FLOAT, INT64, field, model, node, tensor, value
 
@@ -318,3 +323,83 @@ def test_weights_in_other_files_are_seen_in_constants_too():
     assert not graph.is_split(graph.parse(model(plain, [], [], {"w": tensor([1.0], "w")})))
     assert graph.is_split(graph.parse(model(plain, [], [], {"w": tensor([1.0], "w"), "far": far})))
     assert graph.is_split(graph.parse(model([*plain, node("Constant", [], ["c"], value=far)], [], [])))
+
+
+class TestContest:
+    """Which of two layouts is meant, by the sums of their high scores in pictures."""
+
+    @staticmethod
+    def found(*scores: float) -> Boxes:
+        return Boxes(np.zeros((len(scores), 4)), np.array(scores), np.zeros(len(scores), np.int64))
+
+    def contest(self, *names: str) -> Contest:
+        return Contest(Path("net.onnx"), [LAYOUTS[name] for name in names])
+
+    def left(self, contest: Contest) -> list[str]:
+        return [layout.name for layout in contest.layouts]
+
+    @pytest.mark.parametrize(
+        ("one", "other", "left"),
+        [
+            ((0.8,), (0.41,), ["yolox", "rtdetr"]),
+            ((0.8,), (0.4,), ["yolox"]),  # twice as much
+            ((0.41,), (0.9,), ["rtdetr"]),
+            ((0.8, 0.39), (0.4, 0.39, 0.39), ["yolox"]),  # low scores don't count
+            ((0.39,), (), ["yolox", "rtdetr"]),
+            ((0.4,), (0.39,), ["yolox"]),
+            ((), (), ["yolox", "rtdetr"]),
+        ],
+    )
+    def test_one_is_meant_that_has_twice_the_evidence_of_the_other(self, one, other, left):
+        contest = self.contest("yolox", "rtdetr")
+        contest.see({"yolox": self.found(*one), "rtdetr": self.found(*other)})
+        assert self.left(contest) == left
+        assert contest.is_settled == (len(left) == 1)
+
+    def test_evidence_is_summed_over_pictures(self):
+        contest = self.contest("yolox", "rtdetr", "rfdetr")
+        for scores, settled in (((0.9, 0.5, 0.9), False), ((0.9, 0.45, 0.41), False), ((0.9, 0.4, 0.0), True)):
+            names = ("yolox", "rtdetr", "rfdetr")
+            contest.see({name: self.found(score) for name, score in zip(names, scores, strict=True)})
+            assert contest.is_settled == settled
+        assert self.left(contest) == ["yolox"]
+        contest.see({})  # nothing is asked any more
+
+    def test_what_cannot_be_told_in_25_pictures_from_the_first_box_on_is_refused(self):
+        contest = self.contest("yolox", "rtdetr")
+        for _ in range(30):
+            contest.see({"yolox": self.found(), "rtdetr": self.found()})
+        for number in range(24):
+            scores = (0.9,) if number % 2 == 0 else ()
+            contest.see({"yolox": self.found(*scores), "rtdetr": self.found(*scores)})
+        with pytest.raises(McaptrackError, match="much the same read as yolox and rtdetr; choose"):
+            contest.see({"yolox": self.found(0.9), "rtdetr": self.found(0.9)})
+
+    def test_a_layout_that_cannot_be_meant_is_out(self):
+        contest = self.contest("yolox", "rtdetr")
+        contest.see({"yolox": self.found(), "rtdetr": MisreadError("no boxes")})
+        assert self.left(contest) == ["yolox"]
+        contest = self.contest("yolox", "rtdetr")
+        with pytest.raises(McaptrackError, match="fits no layout: read as yolox, one; read as rtdetr, two"):
+            contest.see({"yolox": MisreadError("one"), "rtdetr": MisreadError("two")})
+
+    def test_at_the_end_the_first_is_taken_if_nothing_was_seen_and_refused_otherwise(self):
+        contest = self.contest("rtdetr", "yolox")
+        contest.see({"yolox": self.found(), "rtdetr": self.found(0.3)})
+        contest.end()
+        assert self.left(contest) == ["rtdetr"]
+        contest = self.contest("rtdetr", "yolox")
+        contest.see({"yolox": self.found(0.9), "rtdetr": self.found(0.8)})
+        with pytest.raises(McaptrackError, match="much the same read as rtdetr and yolox"):
+            contest.end()
+
+    @pytest.mark.parametrize("is_chosen", [True, False])
+    def test_a_network_that_another_layout_would_read_is_refused(self, is_chosen):
+        found = {
+            "rtdetr": [MisreadError("x"), self.found(0.3)],
+            "rfdetr": [self.found(0.9, 0.4, 0.3), self.found(0.5), self.found()],
+        }
+        words = "read as yolox, finds nothing in 7 pictures, and read as rfdetr finds 3 boxes in 2 of 3; choose "
+        with pytest.raises(McaptrackError, match=words + ("`layout=rfdetr`" if is_chosen else "with `layout=`")):
+            refuse_if_misread(Path("net.onnx"), LAYOUTS["yolox"], 7, found, is_chosen)
+        refuse_if_misread(Path("net.onnx"), LAYOUTS["yolox"], 7, {"rtdetr": found["rtdetr"]}, is_chosen)
