@@ -51,7 +51,9 @@ def test_the_nearest_of_times_is_the_earlier_one_of_two(seed: int):
     ("steps_s", "late_s", "within_s"),
     [((0.5, 0.2), 0.0, 0.25), ((0.5, 0.2), 0.13, 0.25), ((4.0, 0.7), 0.3, 0.5), ((1.0, 1.0), 1.6, 0.5)],
 )
-def test_boxes_of_all_cameras_are_at_the_times_of_the_slowest(steps_s, late_s, within_s):
+@pytest.mark.parametrize("together", [64, 3])
+def test_boxes_of_all_cameras_are_at_the_times_of_the_slowest(steps_s, late_s, within_s, together, monkeypatch):
+    monkeypatch.setattr(gathering, "_TOGETHER", together)
     sources = [
         source("fast", np.arange(0.0, 8.0, steps_s[1]) + 0.03, plane=PLANES[1], seed=1),
         source("slow", np.arange(0.0, 8.0, steps_s[0]), late_s, seed=2),
@@ -65,6 +67,9 @@ def test_boxes_of_all_cameras_are_at_the_times_of_the_slowest(steps_s, late_s, w
     assert len(found) == len(at) - found.left_out
     frames = list(found)
     assert [(frame.t_ns, frame.index) for frame in frames] == [one for one in at if one[0] >= 0]
+    for _ in range(2):  # what is kept of the first time is the same the second time
+        joined = [frame for block in found.joined(fuser, keeps=True) for frame in block.frames]
+        assert [(frame.t_ns, frame.index) for frame in joined] == [(frame.t_ns, frame.index) for frame in frames]
     assert found._within_ns == round(within_s * S)
     for frame in frames:
         wanted = []
@@ -126,12 +131,12 @@ def test_clocks_are_set_one_at_a_time_the_worst_first(late, given, offset_s, cal
     taken: list[list[int]] = []
     starts: list[list[int]] = []
 
-    def compare(frames, fuser, taken_ns):
+    def compare(blocks, views, taken_ns):
         taken.append(list(taken_ns))
-        starts.append([len(list(frames))])
-        return fuser.views, offsets_of(*((one, 99) for one in late[len(taken) - 1])), Shared(9, 9)
+        starts.append([sum(len(block.frames) for block in blocks)])
+        return views, offsets_of(*((one, 99) for one in late[len(taken) - 1])), Shared(9, 9)
 
-    monkeypatch.setattr(gathering, "compare", compare)
+    monkeypatch.setattr(gathering, "compare_joined", compare)
     sources = [source("a", np.arange(2, 8, 0.5)), source("b", np.arange(2, 8, 0.5), plane=PLANES[1])]
     gathered, fuser, offsets, found, shared = gathering.compared_cameras(sources, FootFuser(), given)
     assert found == pytest.approx(offset_s)
