@@ -382,6 +382,57 @@ class TestEvidence:
         assert (len(found.rows), members.rows["detection"].tolist()) == (0, [-1, -1])
 
 
+class TestPersistence:
+    """A person whom one of three cameras sees, again and again; scores by hand."""
+
+    #: A true box for each false one (4), and two cameras that see nobody; what a frame adds that has nobody near.
+    ALONE: Final = 4 * (0.2 / 0.9) ** 2
+    GONE: Final = 0.15 / 0.7
+
+    @staticmethod
+    def scores(drawn: Sequence[Sequence[float]], step_s: float = 0.5, cameras: int = 3) -> list[list[float]]:
+        """The odds of each detection, by the places along the first axis in each frame."""
+        view = camera_of(np.eye(3), heights=(0.0, 0.0, 100.0), detects=(0.8,) * 4, false_share=0.2)
+        frames = [
+            Frame(round(n * step_s * NS), n, sightings([(0, 300 + x, 300.0, 0.1, 0.1, 0.0) for x in part]))
+            for n, part in enumerate(drawn)
+        ]
+        made = FootFuser(min_score=0.0, views=(view,) * cameras)(frames)
+        return [(found.rows["score"] / (1 - found.rows["score"])).tolist() for found, _ in made]
+
+    def stays(self, before: float = ALONE) -> float:
+        """What a frame adds in which somebody is near, with these odds."""
+        there = before / (1 + before)
+        return there * 0.85 / 0.3 + (1 - there) * self.GONE
+
+    def test_somebody_who_was_near_is_more_probable_and_others_less(self) -> None:
+        first, second, third = self.scores([[0.0], [0.6], [0.6, 50.0]])
+        assert first == pytest.approx([self.ALONE], rel=1e-4)
+        assert second == pytest.approx([self.ALONE * self.stays()], rel=1e-4)
+        assert third == pytest.approx([self.ALONE * self.stays(), self.ALONE * self.GONE], rel=1e-4)
+
+    def test_one_place_confirms_one_other_the_nearest(self) -> None:
+        _, second = self.scores([[0.0], [0.2, 0.9]])
+        assert second == pytest.approx([self.ALONE * self.stays(), self.ALONE * self.GONE], rel=1e-4)
+
+    def test_nobody_walks_farther_than_a_person_can(self) -> None:
+        # 3 standard deviations of .1 m for each frame, and .5 m for the walk: 1.56 m
+        (_, near), (_, far) = self.scores([[0.0], [1.55]]), self.scores([[0.0], [1.57]])
+        assert near == pytest.approx([self.ALONE * self.stays()], rel=1e-4)
+        assert far == pytest.approx([self.ALONE * self.GONE], rel=1e-4)
+
+    def test_a_frame_without_boxes_or_long_ago_or_of_one_camera_says_nothing(self) -> None:
+        assert self.scores([[0.0], [], [0.0]])[2] == pytest.approx([self.ALONE], rel=1e-4)
+        assert self.scores([[0.0], [0.0]], step_s=1.1)[1] == pytest.approx([self.ALONE], rel=1e-4)
+        assert self.scores([[0.0], [50.0]], cameras=1)[1] == pytest.approx([4.0], rel=1e-4)
+
+    def test_blocks_of_frames_are_seamless(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        drawn = [[0.0, 9.0], [0.4], [0.9, 9.3, 30.0], [], [1.0], [1.1, 9.0]]
+        together = self.scores(drawn)
+        monkeypatch.setattr("mcaptrack.transforms.fuse.joined._BLOCK", 1)
+        assert self.scores(drawn) == together
+
+
 def test_distances_are_those_of_mahalanobis() -> None:
     cov = np.array([[0.5, 0.2], [0.2, 0.3]])
     for x, y in itertools.product((-1.0, 0.0, 0.4), (0.0, 2.0)):

@@ -186,7 +186,7 @@ def _fuse(
         collectors = [FrameCollector(schema) for schema in topics.values()]
         results: Iterator[tuple[Frame, ...]]
         if FUSION.is_built_in(type(fuser)):
-            results = (frames for block in gathered.joined(feet) for frames in feet.fused(block))
+            results = feet.fused(gathered.joined(feet))
         else:
             results = guarded(FUSION.entry(type(fuser)), fuser, gathered)
         for count, made in enumerate(results, start=1):

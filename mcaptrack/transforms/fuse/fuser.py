@@ -14,6 +14,7 @@ from mcaptrack.geometry.ragged import ragged_range
 from mcaptrack.schema import DETECTIONS, SIGHTINGS, Frame, Schema
 from mcaptrack.schema.framing import split_rows
 from mcaptrack.transforms.fuse.joined import Joined, joined
+from mcaptrack.transforms.fuse.persistence import LastFrame, persistence
 from mcaptrack.transforms.fuse.view import Views
 from mcaptrack.transforms.protocol import Suited, check_options, context, option
 
@@ -33,7 +34,7 @@ class FootFuser:
     ground plane. Writes detections of the scene: positions in metres, each the mean of the boxes that are joined,
     weighted by their certainty. No camera is twice in one. Their score is the probability that a person is there: a
     camera that should see the place, and has no box there, counts against it, as far as the place is in its picture and
-    not hidden by others.
+    not hidden by others. With several cameras, a detection near it in the frame before counts for it, and none against.
 
     Examples
     --------
@@ -71,22 +72,29 @@ class FootFuser:
 
     @property
     def latency_s(self) -> Mapping[str, float]:
-        """Each frame is fused by itself."""
+        """Each frame is fused by itself and the one before."""
         return MappingProxyType({"": 0.0, "sightings": 0.0})
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        for block in self.joined(frames):
-            yield from self.fused(block)
+        yield from self.fused(self.joined(frames))
 
     def joined(self, frames: Iterable[Frame]) -> Iterator[Joined]:
         """Join the boxes of sightings, block by block; how well the cameras detect people has no influence."""
         return joined(frames, self.views, self.max_sigma, self.max_distance_m)
 
-    def fused(self, block: Joined) -> list[tuple[Frame, Frame]]:
-        """The detections of each frame of a block, and the sightings with the number of their detections."""
+    def fused(self, blocks: Iterable[Joined]) -> Iterator[tuple[Frame, ...]]:
+        """The detections of each frame of blocks, and its sightings with the number of their detections."""
+        before: LastFrame | None = None
+        for block in blocks:
+            expected, odds = self._evidence(block)
+            if len(self.views) > 1:  # there is nothing that could confirm the boxes of one camera alone
+                more, before = persistence(block, _probability(odds), before, self.max_sigma)
+                odds += more
+            yield from self._detections(block, expected, _probability(odds))
+
+    def _detections(self, block: Joined, expected: Ints, certainty: Floats) -> Iterator[tuple[Frame, ...]]:
+        """Detections and sightings of a block, with how many cameras should see each group, and its score (G,)."""
         centre, seen, of = block.centre, block.seen, block.of
-        expected, odds = self._evidence(block)
-        certainty = 1 / (1 + np.exp(-odds))
         kept = np.flatnonzero(certainty >= self.min_score)
         x, y = centre.xy_m[kept].T
         kept = kept[np.lexsort((y, x, block.frame[kept]))]  # whatever the order of the cameras
@@ -109,12 +117,10 @@ class FootFuser:
         members = block.rows.copy()
         members["detection"] = number[of]
         when, index = [one.t_ns for one in block.frames], [one.index for one in block.frames]
-        return list(
-            zip(
-                split_rows(when, index, found, np.cumsum(sizes)),
-                split_rows(when, index, members, np.cumsum(block.counts)),
-                strict=True,
-            )
+        yield from zip(
+            split_rows(when, index, found, np.cumsum(sizes)),
+            split_rows(when, index, members, np.cumsum(block.counts)),
+            strict=True,
         )
 
     def _evidence(self, block: Joined) -> tuple[Ints, Floats]:
@@ -136,3 +142,8 @@ class FootFuser:
         odds += np.where(seen, agrees, np.where(is_known, np.minimum(lacks, 0.0), 0.0)).sum(axis=1)
         odds -= np.where(seen, agrees, np.inf).min(axis=1)  # the first one
         return expected, odds
+
+
+def _probability(odds: Floats) -> Floats:
+    out: Floats = 1 / (1 + np.exp(-odds))
+    return out

@@ -57,7 +57,7 @@ def group(camera: Ints, places: Places, gate: float, farthest_m: float, part: In
     """
     count = len(camera)
     part = np.zeros(count, np.int64) if part is None else part
-    first, second = _near(places.xy_m, part, farthest_m)
+    first, second = near_pairs(places.xy_m, part, farthest_m)
     x, y = (places.xy_m[first] - places.xy_m[second]).T
     may = (camera[first] != camera[second]) & (x * x + y * y <= farthest_m**2)
     first, second, x, y = first[may], second[may], x[may], y[may]
@@ -90,7 +90,7 @@ def group(camera: Ints, places: Places, gate: float, farthest_m: float, part: In
     return _dissolved(camera, places, of, gate, farthest_m, part)
 
 
-def _near(xy_m: Floats, part: Ints, farthest_m: float) -> tuple[Ints, Ints]:
+def near_pairs(xy_m: Floats, part: Ints, farthest_m: float) -> tuple[Ints, Ints]:
     """Pairs (P,) of places of one part that are at most so far apart along the first axis, the lower number first."""
     order = np.lexsort((xy_m[:, 0], part))
     x, part = xy_m[order, 0], part[order]
@@ -117,7 +117,7 @@ def _dissolved(camera: Ints, places: Places, of: Ints, gate: float, farthest_m: 
     centre = means(places, of, count)
     part_of = np.zeros(count, np.int64)
     part_of[of] = part
-    one, other = _near(centre.xy_m, part_of, 2 * farthest_m)
+    one, other = near_pairs(centre.xy_m, part_of, 2 * farthest_m)
     x, y = (centre.xy_m[one] - centre.xy_m[other]).T
     near = x * x + y * y <= (2 * farthest_m) ** 2
     one, other = np.concatenate([one[near], other[near]]), np.concatenate([other[near], one[near]])
