@@ -19,7 +19,7 @@ from mcaptrack import log, notices, pipeline
 from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate, sequence_of_log
-from mcaptrack.evaluation.event_text import log_messages
+from mcaptrack.evaluation.event_text import describe, log_messages
 from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events
 from mcaptrack.evaluation.track_lifecycle import lifecycle_of
 from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind, Frame
@@ -612,3 +612,32 @@ def test_of_the_life_of_tracks_only_ends_of_tracks_and_of_sources_are_kept():
     life = lifecycle_of([Frame(ns(n / 10), n, rows(n)) for n in range(50)])
     found = sorted(zip(life.rows["track_id"].tolist(), life.rows["x_m"].tolist(), strict=True))
     assert found == [(1, 0), (1, 19), (1, 20), (1, 49), (2, 0), (2, 49)]
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ({"kind": EventKind.BIRTH}, "track 7 begins here"),
+        ({"kind": EventKind.END, "duration_s": 0.1}, "track 7 ends here, after 0.1 s"),
+        ({"kind": EventKind.END, "duration_s": 0.09}, "track 7 ends here, after 0.09 s"),
+        (
+            {"kind": EventKind.MISS, "frames": 5, "duration_s": 0.5},
+            "person 9 is missed for 0.5 s here, last tracked as 0",
+        ),
+        (
+            {"kind": EventKind.MISS, "frames": 4, "duration_s": 0.5, "previous_id": -1},
+            "person 9 is missed in 4 of 5 frames over 0.5 s here",
+        ),
+        ({"kind": EventKind.SWITCH, "duration_s": 0.0}, "person 9: track 0 became track 7 here"),
+        ({"kind": EventKind.SWITCH, "duration_s": 1.25}, "person 9: track 0 became track 7 here, 1.2 s unseen"),
+        (
+            {"kind": EventKind.FALSE_TRACK, "frames": 1, "duration_s": 0.1},
+            "track 7 matches no person for 0.1 s here, before it was person 0",
+        ),
+        ({"kind": EventKind.JOINED, "duration_s": 0.0}, "track 7 joins the tracker's 0 and 3 here"),
+        ({"kind": EventKind.PARTED}, "track 7 takes over the tracker's 3, which was track 0, here"),
+    ],
+)
+def test_events_as_text(values, text):
+    event = {"track_id": 7, "previous_id": 0, "truth_id": 9, "source_id": 3, "frames": 0, "duration_s": 0.0} | values
+    assert describe(event, "here", 0.1) == text

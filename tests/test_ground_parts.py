@@ -138,6 +138,28 @@ class TestAssociation:
         assert is_same.tolist() == [True] * len(track) == [True] * (x < 0.4)
 
     @pytest.mark.parametrize(
+        ("gate_m", "missed_s", "x", "is_near"),
+        [
+            (5.0, 0.0, 1.99, 1),  # two fifths of the gate between classes
+            (5.0, 0.0, 2.01, 0),
+            (5.0, 1.0, 3.99, 1),
+            (5.0, 1.0, 4.01, 0),
+            (1.0, 0.0, 0.89, 1),  # but three times the noise
+            (1.0, 0.0, 0.91, 0),
+        ],
+    )
+    def test_the_gate_in_metres_is_smaller_between_classes(self, gate_m, missed_s, x, is_near):
+        table, rows = np.zeros((len(state.no_tracks()), 1)), np.zeros((state.DETECTION_ROWS, 1))
+        table[state._PP], table[state.NOISE], table[state.GATE_M], table[state.HITS] = 4.0, 0.3, gate_m, 5
+        table[state.CLASS], table[state.MISSED_S], rows[state.X], rows[state.CLASS] = 2, missed_s, x, 3
+        assert len(associate(table, rows, "metres", 0.1, across_classes=False)[0]) == is_near
+
+    def test_nothing_is_associated_with_nothing(self):
+        table, rows = np.zeros((len(state.no_tracks()), 2)), np.zeros((state.DETECTION_ROWS, 3))
+        for pair in ((table[:, :0], rows), (table, rows[:, :0])):
+            assert [len(part) for part in associate(*pair, "metres", 0.1, across_classes=False)] == [0, 0, 0]
+
+    @pytest.mark.parametrize(
         ("missed_s", "x", "is_near"), [(0.0, 0.99, 1), (0.0, 1.01, 0), (1.0, 1.99, 1), (1.0, 2.01, 0)]
     )
     def test_the_gate_in_metres_grows_with_the_time_without_a_detection(self, missed_s, x, is_near):
