@@ -5,6 +5,7 @@ __version__ = "0.3.0.dev0"
 SCHEMA_VERSION = 1
 
 _PARTS = {
+    "calibrating": ["CalibrateResult", "CameraCorrection", "calibrate"],
     "catalogue": ["Model", "get_model", "models"],
     "contents": ["ChannelInfo", "FrameInfo", "LogInfo", "info"],
     "delta": ["DeltaState", "DeltaTableInfo", "delta"],

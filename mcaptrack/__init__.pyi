@@ -1,3 +1,6 @@
+from mcaptrack.api.calibrating import CalibrateResult as CalibrateResult
+from mcaptrack.api.calibrating import CameraCorrection as CameraCorrection
+from mcaptrack.api.calibrating import calibrate as calibrate
 from mcaptrack.api.catalogue import Model as Model
 from mcaptrack.api.catalogue import get_model as get_model
 from mcaptrack.api.catalogue import models as models
@@ -61,6 +64,8 @@ from mcaptrack.notices import McaptrackWarning as McaptrackWarning
 from mcaptrack.notices import Notice as Notice
 
 __all__ = [
+    "CalibrateResult",
+    "CameraCorrection",
     "ChannelInfo",
     "ColumnInfo",
     "DeltaState",
@@ -90,6 +95,7 @@ __all__ = [
     "TableList",
     "TrainResult",
     "TuneResult",
+    "calibrate",
     "check",
     "delta",
     "demo",

@@ -121,7 +121,7 @@ class TestHelp:
         known = many("run")
         assert len(known) == 9
         printing = [one for one in known if one[0] != ["--output-dir"]]
-        each = {*STAGES, "run", "fuse", "events", "zones", "ingest", "render", "export", "recover", "drop"}
+        each = {*STAGES, "run", "fuse", "calibrate", "events", "zones", "ingest", "render", "export", "recover", "drop"}
         for command in COMMANDS:
             assert many(command) == (known if command in each else printing if command in ("info", "check") else [])
 

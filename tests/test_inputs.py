@@ -63,7 +63,10 @@ def test_a_url_is_refused_as_a_url(tmp_path, monkeypatch, name, parameter):
 #: Arguments that are logs, which may be in a store.
 LOGS = {
     (name, "logs")
-    for name in (*STAGES, "run", "fuse", "events", "zones", "recover", "render", "info", "check", "export", "report")
+    for name in (
+        *STAGES,
+        *["run", "fuse", "calibrate", "events", "zones", "recover", "render", "info", "check", "export", "report"],
+    )
 }
 LOGS |= {("query", "words"), ("evaluate", "inputs")}
 #: Arguments that are Delta tables, which may be in a store.

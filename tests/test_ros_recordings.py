@@ -112,6 +112,7 @@ def on_recording(path: Path, elsewhere: Path) -> dict[str, list[object]]:
         "demo": [],  # takes no log
         "models": [],  # takes no log
         "delta": [],  # takes no log
+        "calibrate": [],  # takes several cameras
         "fuse": [],  # takes several cameras
         "docs": [],
         "doctor": [],

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from mcaptrack import __version__
+from mcaptrack.cli.calibrate import calibrate
 from mcaptrack.cli.command import Group
 from mcaptrack.cli.common import register
 from mcaptrack.cli.delta import delta
@@ -82,6 +83,7 @@ register(app, _LOOK, "docs", docs, reads=True)
 register(app, _MEASURE, "evaluate", evaluate, reads=True)
 register(app, _MEASURE, "events", events)
 register(app, _MEASURE, "zones", zones)
+register(app, _MEASURE, "calibrate", calibrate)
 register(app, _MEASURE, "tune", tune)
 register(app, _MEASURE, "train", train)
 register(app, _KEEP, "check", check, reads=True)

@@ -75,7 +75,7 @@ def fuse(
         "cameras": cameras,
         "to": to,
         "fuser": fuser,
-        "clock_offset_s": _offsets(clock_offset_s or ()),
+        "clock_offset_s": offsets_of(clock_offset_s or ()),
         "max_sigma": max_sigma,
         "max_distance_m": max_distance_m,
         "min_score": min_score,
@@ -85,7 +85,7 @@ def fuse(
     run_on_logs(given | {"json": json, "quiet": quiet, "verbose": verbose}, "fuse", mcaptrack.fuse, options)
 
 
-def _offsets(given: Any) -> dict[str, float]:
+def offsets_of(given: Any) -> dict[str, float]:
     """Return the offsets of clocks by camera. Raises McaptrackError for others than CAMERA=SECONDS."""
     out: dict[str, float] = {}
     for text in given:

@@ -26,6 +26,7 @@ MOST_USED: Final[Mapping[str, tuple[str, ...]]] = {
     "predict": ("predictor", "horizon_s", "min_history", "output", "topic", "to", "camera", "force"),
     "events": ("topic", "similarity", "gate_m", "output", "force"),
     "fuse": ("to", "cameras", "clock_offset_s", "min_score", "output", "force"),
+    "calibrate": ("reference", "cameras", "dry_run", "clock_offset_s", "output", "force"),
     "zones": ("zones", "topic", "camera", "output", "force"),
     "evaluate": ("truth", "topic", "similarity", "gate_m", "rules", "fail_under", "csv", "output", "force"),
     "render": ("output", "topic", "compare", "heatmap", "blur", "width", "start_s", "end_s", "force"),

@@ -15,8 +15,8 @@ from mcaptrack import __version__
 
 T = TypeVar("T", dict[str, Any], list[Any])
 _PREFIX: Final = "mcaptrack."
-#: ``transform`` of channels that were ingested, and of views.
-INGEST, VIEW, FUSE = "ingest", "view", "fuse"
+#: ``transform`` of channels that were ingested, of views, of scenes, and of corrected ground planes.
+INGEST, VIEW, FUSE, REFINE = "ingest", "view", "fuse", "calibrate"
 #: The metadata record with the start time of a log's cameras, ``start_ns``.
 CLOCK: Final = "mcaptrack.clock"
 

@@ -19,7 +19,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SCHEMAS, TRACKS, Frame, Rows
 from mcaptrack.schema.framing import JoinedFrames, has_any, mapped_rows
-from mcaptrack.schema.provenance import FUSE, Provenance, frame_id_of, input_of
+from mcaptrack.schema.provenance import FUSE, REFINE, Provenance, frame_id_of, input_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.fixed_frame import holds_boxes, holds_boxes_3d
 from mcaptrack.transforms import STAGES
@@ -28,6 +28,8 @@ from mcaptrack.transforms import STAGES
 DEFAULT_CAMERA: Final = "camera"
 #: The topics of ingested channels, below the name of their camera.
 VIDEO, TRUTH, GROUND_PLANE = "video", "truth", "ground_plane"
+#: The last part of the topic of a corrected ground plane, below the one that was given.
+_REFINED: Final = "refined"
 #: The usual topics below the name of a camera, and the stage that makes each; "" for ingested channels.
 USUAL: Final[Mapping[str, str]] = {VIDEO: "", TRUTH: "", GROUND_PLANE: ""} | {
     topic: stage.name for stage in STAGES.values() for topic in stage.outputs(stage.output_topic)
@@ -57,6 +59,7 @@ class Camera(NamedTuple):
 def name_above(topic: str) -> str:
     """Return the name of the camera that a recorded channel belongs to: "/front" for "/front/image"."""
     bare = topic.strip("/")
+    bare = bare.removesuffix(f"/{_REFINED}") if is_plane(bare) else bare
     usual = max((name for name in USUAL if bare.endswith("/" + name)), key=len, default=bare.rpartition("/")[2])
     return "/" + (bare.removesuffix(usual).strip("/") or DEFAULT_CAMERA)
 
@@ -141,6 +144,26 @@ def detections_of(opened: log.Log, camera: Camera) -> str | None:
     """Return the topic of a camera's detections; None if it has none, or no unique one."""
     usual = f"{camera.prefix}/{STAGES['detect'].output_topic}"
     return usual if usual in opened.channels else camera.boxes
+
+
+def given_plane(camera: Camera) -> str:
+    """Return the topic of the ground plane that a camera was given, whether or not it was corrected."""
+    return camera.ground_plane.removesuffix(f"/{_REFINED}")
+
+
+def is_plane(topic: str) -> bool:
+    """Return whether this is the topic of a ground plane, by its name."""
+    return topic.removesuffix(f"/{_REFINED}").endswith(f"/{GROUND_PLANE}")
+
+
+def refined_plane(camera: Camera) -> str:
+    """Return the topic of the corrected ground plane of a camera, whether or not the log has it."""
+    return corrected_plane(given_plane(camera))
+
+
+def corrected_plane(topic: str) -> str:
+    """Return the topic of the correction of a ground plane, by the topic of this."""
+    return f"{topic}/{_REFINED}"
 
 
 def scenes_of(opened: log.Log) -> tuple[str, ...]:
@@ -265,7 +288,7 @@ class _Channels:
             self._default_pictures(names) or _only(pictures or (self._picture_topics([nearest]) if nearest else [])),
             _only(self._detection_topics(names) or self._space_topics(names)),
             self._label_topic(names, TRUTH) or f"{prefix}/{TRUTH}",
-            self._label_topic(names, GROUND_PLANE) or f"{prefix}/{GROUND_PLANE}",
+            self._corrected(self._label_topic(names, GROUND_PLANE) or f"{prefix}/{GROUND_PLANE}"),
             frozenset(topic for name in names for topic in self._topics.get(name, ())),
             tuple(self._space_topics(names)) if is_in_space else (),
         )
@@ -301,6 +324,15 @@ class _Channels:
         topics = [f"{name}/{label}" for name in names]
         there = [self._opened.channels[topic] for topic in topics if topic in self._opened.channels]
         return next((channel.topic for channel in there if not is_made_by_stage(channel)), None)
+
+    def _corrected(self, given: str) -> str:
+        """Return the topic of the ground plane that was corrected, if it was this one; or else this one."""
+        topic = corrected_plane(given)
+        made, before = self._provenance.get(topic), self._provenance.get(given)
+        if made is None or made.transform != REFINE or made.input != given or given not in self._opened.channels:
+            return given
+        is_same = before is None or not before.digest or before.digest == made.input_digest
+        return topic if is_same else given
 
     def _select(self, names: list[str], wanted: Callable[[log.Channel], bool]) -> list[str]:
         topics = sorted(topic for name in names for topic in self._topics.get(name, ()))

@@ -129,6 +129,16 @@ CASES: dict[str, dict[str, Case]] = {
         sidecar="--sidecar",
         force=("fuse two.mcap -o fresh.mcap", "--force"),
     ),
+    "calibrate": common(
+        "calibrate two.mcap --reference left",
+        cameras="--cameras left",
+        reference=("calibrate two.mcap", "--reference left"),
+        clock_offset_s="--clock-offset-s left=2",
+        dry_run="--dry-run",
+        output="-o b.mcap",
+        sidecar=("calibrate two.mcap --reference left --dry-run", "--sidecar"),  # a correction: test_calibrate
+        force=("calibrate two.mcap --reference left -o fresh.mcap", "--force"),
+    ),
     "events": common(
         "events a.mcap",
         topic="--topic /camera/tracks",

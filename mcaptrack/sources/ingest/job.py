@@ -23,6 +23,7 @@ from mcaptrack.schema.classes import classes_beside_rows, only_class, without_cl
 from mcaptrack.schema.encodings import PROTOBUF, Encoding, encoded, record_of
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance, digest
+from mcaptrack.sources.cameras import corrected_plane
 from mcaptrack.sources.corrections import CORRECTED
 from mcaptrack.sources.ingest.calibration import GivenCalibration, LengthUnit
 from mcaptrack.sources.ingest.ground import PLANE, GivenGround
@@ -268,7 +269,10 @@ class IngestJob:
             raise McaptrackError(
                 f"{into.path} has {', '.join(sorted(topics_to_replace))} already; `force=True` replaces them"
             )
-        return topics_to_replace
+        corrected = {one for one in map(corrected_plane, topics_to_replace) if into and one in into.channels}
+        for topic in sorted(corrected):
+            warn(f"{topic} is dropped: it corrected the ground plane that is replaced", "left-out")
+        return topics_to_replace | corrected
 
     def hint_other_topic(self, topics: Collection[str]) -> str:
         """A hint for topics that exist already: the option that chooses others."""

@@ -1,0 +1,171 @@
+"""``mcaptrack calibrate``: correct the ground planes of cameras by the people that they see together."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+from mcaptrack.cli import common
+from mcaptrack.cli.flags import with_flags
+from mcaptrack.cli.fuse import offsets_of
+from mcaptrack.cli.many import LogWork, process, takes_many
+
+if TYPE_CHECKING:
+    from mcaptrack import CalibrateResult, CameraCorrection
+
+#: Kinds of corrections in words.
+_IN_WORDS: Final = {
+    "shift": "a shift",
+    "rigid": "a shift and a rotation",
+    "similarity": "a shift, a rotation and a scale",
+    "affine": "an affine map",
+    "full": "a homography",
+    "pose": "another pose of the camera",
+}
+
+
+@common.one_line
+@takes_many()
+def calibrate(
+    logs: common.Logs,
+    cameras: Annotated[
+        str | None,
+        common.option("--cameras", metavar="A,B", help="Cameras to compare.", show_default="all with a ground plane"),
+    ] = None,
+    reference: Annotated[
+        str | None,
+        common.option(
+            "--reference",
+            metavar="A,B",
+            help="Cameras that are right: the others are brought to them.",
+            show_default="what most cameras agree on",
+        ),
+    ] = None,
+    clock_offset_s: Annotated[
+        list[str] | None,
+        common.option(
+            "--clock-offset-s",
+            metavar="CAMERA=SECONDS",
+            help="How many seconds the times of a camera are late, as in front=0.3; 0 for none.",
+            show_default="estimated from people who walk",
+        ),
+    ] = None,
+    dry_run: Annotated[bool, common.option("--dry-run", help="Only compare; write nothing.")] = False,
+    output: common.Output = None,
+    sidecar: common.Sidecar = None,
+    force: common.Force = False,
+    json: common.Json = False,
+    quiet: common.Quiet = False,
+    verbose: common.Verbose = False,
+    config: common.Config = None,
+) -> None:
+    """Correct the ground planes of cameras that disagree with the others, by the people that they see together.
+
+    Each camera is compared with what the others agree on. If its feet stand elsewhere, its plane is corrected by a
+    shift, a rotation, a scale, or more, as far as that also holds at other times; those that agree stay as they are.
+
+    /CAMERA/ground_plane stays in the log, and the corrected plane in /CAMERA/ground_plane/refined is used instead:
+    `run` and `fuse` make again what was made before. `mcaptrack drop log.mcap /CAMERA/ground_plane/refined` takes it
+    back.
+
+    The log needs detections and a measured ground plane of each camera. Of two cameras --reference names the right one.
+
+    Example: mcaptrack calibrate log.mcap --dry-run
+    """
+    import mcaptrack
+    from mcaptrack.fleet import find_logs
+
+    options: dict[str, Any] = {
+        "cameras": cameras,
+        "reference": reference,
+        "clock_offset_s": offsets_of(clock_offset_s or ()),
+        "dry_run": dry_run,
+        "sidecar": sidecar,
+        "force": force,
+    }
+    with common.Talk(quiet, verbose).open() as talk:
+        work: LogWork[CalibrateResult] = LogWork(
+            "calibrate",
+            mcaptrack.calibrate,
+            options,
+            show=lambda _, result: _print(result, talk),
+            data=_as_json,
+            line=_in_short,
+        )
+        results, totals = process(find_logs(logs), work, talk, output)
+    if json:
+        common.print_json({"results": [_as_json(result) for result in results], **totals})
+
+
+def _in_short(result: CalibrateResult) -> str:
+    would = "would be corrected" if result.is_dry_run else "corrected"
+    count = f"{len(result.corrected)} of {len(result.cameras)} cameras"
+    names = f": {', '.join(result.corrected)}" if result.corrected else ""
+    return f"{count} {would}{names}"
+
+
+def _print(result: CalibrateResult, talk: common.Talk) -> None:
+    took = f" in {result.seconds:.1f} s" if result.seconds else ""
+    talk.say(f"{result.log}: {_in_short(result)}{took}")
+    lines = [(name, _words(one)) for name, one in result.cameras.items()]
+    lines += [("dropped", f"{topic}: the camera agrees without it") for topic in result.dropped]
+    if result.written_because and result.written_to:
+        lines.append(("written", f"the planes are in {result.written_to}: {result.written_because}"))
+    width = max(len(name) for name, _ in lines)
+    for name, words in lines:
+        talk.say(f"  {name:<{width}}  {words}")
+
+
+def _words(one: CameraCorrection) -> str:
+    """Describe what was found about a camera."""
+    before = _distances(one.median_before_m, one.p90_before_m)
+    if not one.correction:
+        compared = f"; feet are {before} from those of the others ({one.pairs:,} compared)" if one.pairs else ""
+        words = f"as it was: {with_flags(one.why)}{compared}"
+    else:
+        after = _distances(one.median_after_m, one.p90_after_m)
+        words = (
+            f"corrected by {_IN_WORDS[one.correction]}, which moves feet by {one.moved_m:.2f} m: they are {after} from "
+            f"those of the others, and were {before} ({one.pairs:,} compared)"
+        )
+        words += f"; {one.limit}" if one.limit else ""
+    if one.clock_offset_s:
+        late = "late" if one.clock_offset_s > 0 else "early"
+        words += f"; its times are {abs(one.clock_offset_s):.2f} s {late}"
+    return words
+
+
+def _distances(median_m: float | None, p90_m: float | None) -> str:
+    if median_m is None or p90_m is None:
+        return "-"
+    return f"{median_m:.2f} m (90 %: {p90_m:.2f} m)"
+
+
+def _as_json(result: CalibrateResult) -> dict[str, Any]:
+    """Return the result as values of JSON."""
+    return {
+        "log": str(result.log),
+        "cameras": {name: _camera_as_json(one) for name, one in result.cameras.items()},
+        "corrected": dict(result.corrected),
+        "dropped": list(result.dropped),
+        "is_dry_run": result.is_dry_run,
+        "stale": list(result.stale),
+        "written_to": str(result.written_to) if result.written_to else None,
+        "written_there_because": with_flags(result.written_because) or None,
+        "seconds": result.seconds,
+    }
+
+
+def _camera_as_json(one: CameraCorrection) -> dict[str, Any]:
+    return {
+        "correction": one.correction or None,
+        "moved_m": one.moved_m,
+        "pairs": one.pairs,
+        "median_before_m": one.median_before_m,
+        "p90_before_m": one.p90_before_m,
+        "median_after_m": one.median_after_m,
+        "p90_after_m": one.p90_after_m,
+        "why": with_flags(one.why) or None,
+        "limit": one.limit or None,
+        "clock_offset_s": one.clock_offset_s,
+        "homography": list(one.homography) if one.homography else None,
+    }

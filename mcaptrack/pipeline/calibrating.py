@@ -1,0 +1,295 @@
+"""Correct the ground planes of cameras by the people that they see together, and write the corrected ones into the log.
+
+The plane that was given stays as it is, in its own channel. The corrected one stands below it, and is used instead
+(``sources.cameras``) until the given one is replaced.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.foxglove import views
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.ground_correction import Feet
+from mcaptrack.geometry.plane import GroundPlane, Planes
+from mcaptrack.notices import collected, warn
+from mcaptrack.pipeline.checks import describe_origin, may_replace
+from mcaptrack.pipeline.fusing import fusable
+from mcaptrack.pipeline.gathering import Gathered, Source, compared_cameras, read_sources
+from mcaptrack.pipeline.refining import Refined, Refiner, Watched
+from mcaptrack.pipeline.write import Made, digest_of
+from mcaptrack.schema import GROUND_PLANE, Frame
+from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
+from mcaptrack.schema.provenance import REFINE, Provenance, frame_id_of
+from mcaptrack.sources.cameras import Camera, camera_at, given_plane, provenance_of, refined_plane, scenes_of
+from mcaptrack.sources.cameras import cameras as cameras_of
+from mcaptrack.sources.ingest.sidecar import check_topics, encoding_for
+from mcaptrack.transforms.fuse import FootFuser
+
+#: Cameras are compared by at most so many frames.
+_COMPARED: Final = 200
+#: The end of the reason why cameras can't be compared, if there is but one.
+_SINCE: Final = "since "
+#: The reason why a reference stays as it is.
+REFERENCE: Final = "it is the reference"
+#: How often clocks and planes are estimated in turn.
+_TURNS: Final = 2
+
+
+def calibrate_cameras(
+    opened: log.Log,
+    names: Sequence[str],
+    reference: Sequence[str],
+    clock_offset_s: Mapping[str, float],
+    progress: Callable[[int, int], None],
+) -> tuple[list[Refined], dict[str, float], dict[str, GroundPlane]]:
+    """Compare cameras, and return what was found about each, their clocks' offsets, and planes that are corrected.
+
+    Parameters
+    ----------
+    opened : Log
+    names : sequence of str
+        The cameras; without any, all that have detections and a measured ground plane.
+    reference : sequence of str
+        Cameras that are right; without any, what most cameras agree on is.
+    clock_offset_s : mapping of str to float
+        How much later than the others the times of a camera are; others are estimated.
+    progress : callable
+        Called as ``progress(done, total)``.
+
+    Raises
+    ------
+    McaptrackError
+        If there are fewer than two cameras to compare, or if two are and none is a reference.
+    """
+    found, names_of = _compared(opened, names)
+    reference = [names_of.get(name.strip("/"), name.strip("/")) for name in reference]
+    chosen = [camera.prefix[1:] for camera in found]
+    for name in reference:
+        if name not in chosen:
+            raise McaptrackError(f"`reference=` has {name}, which is not compared; {', '.join(chosen)} are")
+    if len(chosen) < 3 and not reference:
+        raise McaptrackError(
+            f"{opened.path}: of two cameras, {' and '.join(chosen)}, the log doesn't say which is right; name that one "
+            "with `reference=`"
+        )
+    with collected():  # what `fuse` says about cameras that disagree is report here in another way
+        sources, _, _, _ = read_sources(opened, found, clock_offset_s)
+    cameras = {camera.prefix[1:]: camera for camera in found}
+    sources = [_given(opened, source, cameras[source.view.name], reference) for source in sources]
+    lacking = sorted(set(chosen) - {one.view.name for one in sources})
+    for name in lacking:
+        warn(f"{name} is left out: its detections have no messages", "left-out")
+    if len(sources) < 2:
+        raise McaptrackError(f"{opened.path}: only {sources[0].view.name} has boxes; two cameras are compared at least")
+    held = {one.view.name: _why_held(opened, cameras[one.view.name], one.view.planes, reference) for one in sources}
+    return _in_turns(sources, held, frozenset(reference), clock_offset_s, progress)
+
+
+def _compared(opened: log.Log, names: Sequence[str]) -> tuple[list[Camera], dict[str, str]]:
+    """The cameras to compare, and the names in the results of all cameras by each of their names."""
+    scenes = scenes_of(opened)
+    names_of = {
+        name.strip("/"): one.prefix[1:] for one in cameras_of(opened) if one.prefix not in scenes for name in one.names
+    }
+    for name in names:
+        if name.strip("/") not in names_of:
+            raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(names_of)) or 'none'}")
+    wanted = [names_of[name.strip("/")] for name in names]
+    chosen, why = fusable(opened, wanted)
+    if not chosen:
+        if not why or why.endswith(_SINCE):
+            why = f"it has {', '.join(sorted(set(names_of.values()))) or 'no camera'} alone"
+        raise McaptrackError(
+            f"{opened.path}: two cameras with detections and measured ground planes are compared at least: {why}"
+        )
+    if why and names:
+        raise McaptrackError(f"{opened.path}: {why}; leave that out of `cameras=`")
+    if why:
+        warn(f"left out: {why}", "left-out")
+    return [camera_at(opened, f"/{name}") for name in chosen], names_of
+
+
+def _given(opened: log.Log, source: Source, camera: Camera, reference: Sequence[str]) -> Source:
+    """A camera with the plane that was given, not with the one that was corrected before, unless it is a reference."""
+    topic = given_plane(camera)
+    if source.view.name in reference or topic == camera.ground_plane:
+        return source
+    planes = tuple((frame.t_ns, rows_to_plane(frame.rows)) for frame in opened.frames(topic, GROUND_PLANE))
+    return source._replace(view=replace(source.view, planes=planes))
+
+
+def _why_held(opened: log.Log, camera: Camera, planes: Planes, reference: Sequence[str]) -> str:
+    """The reason why a plane stays as it is; "" if it may be corrected."""
+    if camera.prefix[1:] in reference:
+        return REFERENCE
+    made = provenance_of(opened, given_plane(camera))
+    if made is not None and made.transform not in ("ingest",):
+        return "its plane follows from the transforms of the recording, which stay as they are"
+    if len(planes) > 1:
+        return "its ground plane changes over time"
+    return ""
+
+
+def _in_turns(
+    sources: list[Source],
+    held: Mapping[str, str],
+    reference: frozenset[str],
+    given: Mapping[str, float],
+    progress: Callable[[int, int], None],
+) -> tuple[list[Refined], dict[str, float], dict[str, GroundPlane]]:
+    """Correct planes, estimate the offsets of clocks with them, and correct them again at the right times."""
+    fuser = FootFuser()
+    offset_s = {one.view.name: given.get(one.view.name, 0.0) for one in sources}
+    refined: list[Refined] = []
+    planes = {one.view.name: one.view.planes[0][1] for one in sources}
+    for turn in range(_TURNS):
+        gathered = Gathered(sources, fuser)
+
+        def report(done: int, total: int, turn: int = turn) -> None:
+            progress(turn * total + done, _TURNS * total)
+
+        refined = _refiner(gathered, sources, held, reference, fuser, report).refine()
+        planes = {one.name: corrected(one, sources) for one in refined}
+        right = [
+            one._replace(view=replace(one.view, planes=((one.view.planes[0][0], planes[one.view.name]),)))
+            if len(one.view.planes) == 1
+            else one
+            for one in sources
+        ]
+        if turn == _TURNS - 1:
+            break
+        _, _, _, late_s, _ = compared_cameras(right, fuser, given)
+        late = {name: seconds for name, seconds in late_s.items() if name not in given and seconds}
+        if not late:
+            progress(1, 1)
+            break
+        offset_s |= late
+        sources = [one._replace(t_ns=one.t_ns - round(late.get(one.view.name, 0.0) * NS_PER_S)) for one in sources]
+    return refined, offset_s, {one.name: planes[one.name] for one in refined if one.model}
+
+
+def corrected(one: Refined, sources: Sequence[Source]) -> GroundPlane:
+    """The plane of a camera with its correction."""
+    plane = next(source.view.planes[0][1] for source in sources if source.view.name == one.name)
+    if not one.model:
+        return plane
+    matrix = one.matrix @ plane.matrix
+    if plane.lens is None:
+        # Any scale is the same plane; that of the one before is kept, so that numbers stay comparable.
+        matrix *= np.linalg.norm(plane.matrix) / np.linalg.norm(matrix)
+    return replace(plane, homography=tuple(matrix.ravel().tolist()))
+
+
+def _refiner(
+    gathered: Gathered,
+    sources: Sequence[Source],
+    held: Mapping[str, str],
+    reference: frozenset[str],
+    fuser: FootFuser,
+    progress: Callable[[int, int], None],
+) -> Refiner:
+    """The feet that each camera sees at the times of the slowest one, ready to be compared."""
+    every = -(-len(gathered) // _COMPARED)
+    frames = [frame for number, frame in enumerate(gathered) if number % every == 0]
+    size = [len(frame.rows) for frame in frames]
+    rows = np.concatenate([frame.rows for frame in frames])
+    number = np.repeat(np.arange(len(frames)), size)
+    cameras = []
+    for index, source in enumerate(sources):
+        mine = np.flatnonzero(rows["camera"] == index)
+        part = rows[mine]
+        xy_m = np.stack([part["x_m"], part["y_m"]], axis=-1)
+        cov = np.stack([part[name] for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2")], axis=-1)
+        feet = Feet(xy_m, cov, number[mine])
+        view = source.view
+        cameras.append(Watched(view.name, feet, part["class_id"].astype(np.int64), view.planes[0][1], held[view.name]))
+    seconds = float(np.ptp([frame.t_ns for frame in frames])) / NS_PER_S if len(frames) > 1 else 1.0
+    reach = (fuser.max_sigma, fuser.max_distance_m)
+    return Refiner(cameras, len(frames), len(frames) / max(seconds, 1e-9), reference, reach, progress)
+
+
+def kept_clear(opened: log.Log, refined: Sequence[Refined]) -> dict[str, str]:
+    """The topics of corrected planes by camera. Raises McaptrackError if other software recorded one of them."""
+    topics = {one.name: refined_plane(camera_at(opened, f"/{one.name}")) for one in refined if one.model}
+    for topic in topics.values():
+        if not may_replace(opened, topic, REFINE):
+            raise McaptrackError(f"{opened.path}: {topic} {describe_origin(opened, topic)}, and is not replaced")
+    return topics
+
+
+def write_corrected(
+    opened: log.Log, refined: Sequence[Refined], planes: Mapping[str, GroundPlane], output: Path | None
+) -> tuple[dict[str, str], list[str], bool]:
+    """Write corrected planes into the log, or into a copy, and drop corrections that no longer hold.
+
+    Returns the topics of corrected planes by camera, those that were dropped, and whether the log has changed.
+
+    Raises McaptrackError if other software recorded a channel of that name.
+    """
+    cameras = {one.name: camera_at(opened, f"/{one.name}") for one in refined}
+    made: dict[str, Made] = {}
+    topics = kept_clear(opened, refined)
+    compared = sorted(one.name for one in refined if one.before is not None)
+    for one in refined:
+        if not one.model:
+            continue
+        base, topic = given_plane(cameras[one.name]), topics[one.name]
+        before = opened.frames(base, GROUND_PLANE)[0]
+        parameters = {**as_json(one), "compared_with": [name for name in compared if name != one.name]}
+        frame_id = frame_id_of(opened.channels[base].metadata)
+        how = Provenance(REFINE, parameters, base, digest_of(opened, base), frame_id=frame_id)
+        frame = Frame(before.t_ns, before.index, plane_to_rows(planes[one.name]))
+        made[topic] = Made.of(GROUND_PLANE, [frame], how)
+    dropped = [
+        topic
+        for one in refined
+        if not one.model
+        and one.before is not None
+        and one.why != REFERENCE
+        and (topic := refined_plane(cameras[one.name])) in opened.channels
+        and may_replace(opened, topic, REFINE)
+    ]
+    same = {topic for topic, one in made.items() if _is_there(opened, topic, one)}
+    new = {topic: one for topic, one in made.items() if topic not in same}
+    if new or dropped or output is not None:
+        outlines = {given_plane(cameras[name]) + views.SCENE_SUFFIX for name, topic in topics.items() if topic in new}
+        drop = {*new, *dropped, *(one for one in outlines if one in opened.channels)}
+        encoding = encoding_for(opened)
+        check_topics({*new}, encoding)
+        with log.extend(opened, output, drop=drop) as writer:
+            for topic, plane in new.items():
+                channel = writer.add_channel(topic, plane.record_in(encoding), encoding, plane.provenance.to_metadata())
+                for message in plane.messages_in(encoding):
+                    writer.add_message(channel, *message)
+    return topics, dropped, bool(new or dropped)
+
+
+def _is_there(opened: log.Log, topic: str, made: Made) -> bool:
+    known = provenance_of(opened, topic)
+    return known is not None and known.to_metadata() == made.provenance.to_metadata()
+
+
+def as_json(one: Refined) -> dict[str, Any]:
+    """The findings about a camera, as values of JSON."""
+
+    def residual(found: Any) -> dict[str, Any] | None:
+        if found is None:
+            return None
+        median, p90 = (None if np.isnan(value) else round(value, 4) for value in found[:2])
+        return {"median_m": median, "p90_m": p90, "pairs": found.pairs}
+
+    return {
+        "correction": one.model or None,
+        "matrix": [round(value, 12) for value in one.matrix.ravel().tolist()] if one.model else None,
+        "moved_m": round(one.moved_m, 4),
+        "before": residual(one.before),
+        "after": residual(one.after),
+    }
