@@ -1,0 +1,225 @@
+"""What a job of `ingest` says and decides before it writes: topics, names, sizes, parameters; and errors of stores."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import deltalake
+import pytest
+
+from mcaptrack import log
+from mcaptrack.cli.inputs import expand, only_one_output
+from mcaptrack.errors import McaptrackError
+from mcaptrack.location import parse
+from mcaptrack.notices import collected
+from mcaptrack.sources.ingest.job import IngestJob, IngestOptions
+from mcaptrack.sources.ingest.labels.motions import read_motions
+from mcaptrack.sources.ingest.labels.timeline import Timeline
+from mcaptrack.sources.ingest.labels.wanted import WantedClasses
+from mcaptrack.tables.compared import pair_files
+from mcaptrack.tables.delta.opening import DeltaFolder, reporting
+from tests.logs import some_log
+
+MOT = "".join(
+    f"{frame},{who},{10 * who},20,9,30,1,{kind},1\n" for frame in (1, 7, 13) for who, kind in ((1, 1), (2, 3))
+)
+ZERO = "".join(f"{frame},3,10,20,9,30,1,1,1\n" for frame in (0, 1, 2))
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    for name, text in (("gt.txt", MOT), ("zero.txt", ZERO)):
+        Path(name).write_text(text)
+    Path("motion.txt").write_text("".join(f"{n},1,0,{n},0,1,0\n" for n in range(3)))
+    return tmp_path
+
+
+def job(*, source: str = "a.mp4", **options) -> IngestJob:
+    labels = {role: Path(name) for role, name in options.pop("labels", {}).items()}
+    return IngestJob(Path(source), IngestOptions(labels=labels, **options))
+
+
+def test_topics_are_below_the_name_of_the_camera(place):
+    made = job(labels={"truth": "gt.txt", "tracks": "zero.txt"}, camera="/left/", motion=Path("motion.txt"))
+    assert list(made.topics()) == ["/left/truth", "/left/tracks", "/left/motion"]
+    assert (made.has_labels, set(made.roles)) == (True, {"truth", "tracks"})
+    assert made.hint_other_topic(["/left/truth"]) == "`camera='left/labels'` puts these beside them"
+    taken = ["/left/labels/tracks", "/left/labels2/motion", "/left/labels3/other"]
+    assert made.hint_other_topic(taken) == "`camera='left/labels3'` puts these beside them"
+    bare = job()
+    assert (list(bare.topics()), bare.has_labels) == ([], False)
+
+
+def test_channels_of_a_log_are_replaced_when_told(place):
+    made = job(labels={"truth": "gt.txt"}, camera="camera")
+    path = some_log(place / "a.mcap")
+    assert made.topics_to_replace(None, False) == set()
+    with log.read(path) as opened:
+        assert made.topics_to_replace(opened, True) == {"/camera/truth"}
+        with pytest.raises(McaptrackError, match=r"a.mcap has /camera/truth already; `force=True` replaces them"):
+            made.topics_to_replace(opened, False)
+        assert job(labels={"truth": "gt.txt"}, camera="other").topics_to_replace(opened, False) == set()
+
+
+def test_what_is_assumed_and_left_out_is_said(place):
+    made = job(labels={"truth": "gt.txt", "tracks": "zero.txt"})
+    with collected() as warnings:
+        made.report_assumptions()
+    assert [one.message for one in warnings] == [
+        "frame 1 of gt.txt and frame 0 of zero.txt are assumed to be the same picture; `first_frame=` sets the number",
+        "gt.txt also holds 3 boxes that don't count (score 0 or a class but 1); left out of truth",
+    ]
+    assert "gt.txt has labels every 6 frames, from 1 on; the frames in between are left out" in made.report.remarks
+    assert not any("zero.txt" in one for one in made.report.remarks)
+    every = job(labels={"truth": "gt.txt"}, classes=WantedClasses("all"))
+    with collected() as warnings:
+        every.report_assumptions()
+    assert [one.message for one in warnings] == []
+    assert any("gt.txt has several classes; class_id is" in one for one in every.report.remarks)
+
+
+def test_roles_that_labels_do_not_suit(place):
+    Path("none.txt").write_text(MOT.replace(",1,10,", ",-1,10,").replace(",2,20,", ",-1,20,"))
+    with pytest.raises(McaptrackError, match=r"none.txt has no ids \(all are -1\); truth need ids"):
+        job(labels={"truth": "none.txt"})
+    assert job(labels={"detections": "none.txt"}).has_labels
+    Path("places.txt").write_text("0\t1\t1.5\t2.5\n12\t1\t1.6\t2.5\n24\t1\t1.7\t2.5\n")
+    with pytest.raises(McaptrackError, match=r"places.txt holds positions, not boxes; detections are boxes"):
+        job(labels={"detections": "places.txt"})
+
+
+def test_parameters_of_labels(place):
+    one = job(labels={"truth": "gt.txt"})
+    labels = one.labels["truth"][1]
+    assert one.label_parameters("truth", labels) == {}
+    other = job(labels={"truth": "gt.txt"}, first_frame=1, classes=WantedClasses("all"), size=(640, 480))
+    assert other.label_parameters("truth", labels) == {"first_frame": 1, "classes": "all"}
+    assert other.label_parameters("detections", labels) == {"first_frame": 1}
+    Path("a.csv").write_text("frame,id,x,y,w,h\n1,1,1,2,3,4\n2,1,1,2,3,4\n3,1,1,2,3,4\n")
+    table = job(
+        labels={"tracks": "a.csv"}, size=(640, 480), columns={"x": "x", "y": "y"}, classes=WantedClasses("person")
+    )
+    found = table.label_parameters("tracks", table.labels["tracks"][1])
+    assert (found["columns"], found.get("size", "640x480")) == ("x=x,y=y", "640x480")
+    assert "classes" not in found
+
+
+def test_boxes_in_shares_of_the_picture_need_its_size(place):
+    Path("yolo").mkdir()
+    for n in range(2):
+        Path(f"yolo/{n:06}.txt").write_text("0 0.5 0.5 0.25 0.5 0.9\n")
+    made = job(labels={"detections": "yolo"}, size=(640, 480))
+    made.fit_to_pictures(lambda: (640, 480))
+    assert made.labels["detections"][1].boxes_px[0].tolist() == [240, 120, 160, 240]
+    again = job(labels={"detections": "yolo"}, size=(100, 200))
+    again.fit_to_pictures(None)
+    assert again.labels["detections"][1].boxes_px[0].tolist() == [37.5, 50, 25, 100]
+    with pytest.raises(McaptrackError, match=r"a.mp4: the pictures are 640x480, not 100x200; leave `size=` out"):
+        job(labels={"detections": "yolo"}, size=(100, 200)).fit_to_pictures(lambda: (640, 480))
+    with pytest.raises(McaptrackError, match=r"has boxes in shares of the picture's size; give it with `size="):
+        job(labels={"detections": "yolo"}).fit_to_pictures(None)
+    # Labels of trackers state pixels: no size is asked for.
+    job(labels={"truth": "gt.txt"}).fit_to_pictures(lambda: pytest.fail("it asks"))
+
+
+def test_options_of_videos_are_named():
+    assert IngestOptions().for_videos() == ""
+    for name, value in (("image_format", "jpeg"), ("quality", 0), ("keyframe_interval_s", 0.0)):
+        assert IngestOptions(**{name: value}).for_videos() == f"`{name}=`"
+    assert IngestOptions(fps=Fraction(5), quality=3).video_options.quality == 3
+
+
+@pytest.mark.parametrize(
+    ("pictures", "said"), [(3, ""), (2, "the rest is left out"), (5, "it is taken as none in the rest")]
+)
+def test_the_motion_of_a_camera_is_of_its_pictures(place, pictures, said):
+    made = job(motion=Path("motion.txt"))
+    assert len(made.motions) == len(read_motions(Path("motion.txt"))) == 3
+    line, written = Timeline.spaced(pictures, Fraction(10), 0, "the pictures"), []
+    made.write_rows = lambda _, suffix, schema, frames, parameters: written.append((suffix, list(frames()), parameters))
+    with collected() as warnings:
+        made.write_motion(None, line, (640, 480))
+    assert [one.message for one in warnings] == [
+        f"motion.txt has the motion of 3 frames, and the pictures are {pictures}; {said}"
+    ] * bool(said)
+    ((suffix, frames, parameters),) = written
+    assert (suffix, len(frames), parameters) == ("motion", pictures, {"file": "motion.txt"})
+    assert {(int(one.rows["width_px"][0]), int(one.rows["height_px"][0])) for one in frames} == {(640, 480)}
+    job().write_motion(None, line, (640, 480))
+
+
+def test_frames_of_labels_have_their_rows(place):
+    made = job(labels={"tracks": "gt.txt"})
+    line = Timeline.spaced(14, Fraction(10), 0, "the pictures")
+    placed = line.place(Path("gt.txt"), made.labels["tracks"][1], [])
+    found = list(made.frames("tracks", None, placed)())
+    assert [(frame.index, frame.t_ns, frame.rows["track_id"].tolist()) for frame in found] == [
+        (0, 0, [1, 2]), (6, 600_000_000, [1, 2]), (12, 1_200_000_000, [1, 2]),
+    ]  # fmt: skip
+
+
+# Other places where an input is taken, paired or refused
+
+
+def test_a_log_is_no_file_of_labels(place):
+    some_log(place / "a.mcap")
+    for truths, words in ((["gt.txt"], "'gt.txt'"), (["gt.txt", "zero.txt"], "'LABELS'")):
+        with pytest.raises(McaptrackError, match=rf"a.mcap is a log, not a file of labels; .* add it with .*{words}"):
+            pair_files([Path("a.mcap")], [Path(name) for name in truths])
+    assert pair_files([Path("zero.txt")], [Path("gt.txt")]) == ([("zero", Path("zero.txt"), Path("gt.txt"))], "")
+
+
+def test_folders_are_taken_as_logs_or_as_a_whole(place):
+    Path("logs").mkdir()
+    for name in "ba":
+        some_log(Path("logs") / f"{name}.mcap")
+    assert [str(one) for one in expand([Path("logs")])] == ["logs"]
+    assert [str(one) for one in expand([Path("logs")], folders=True)] == ["logs/a.mcap", "logs/b.mcap"]
+    Path("logs/a.results.mcap").write_bytes(Path("logs/b.mcap").read_bytes())
+    assert [str(one) for one in expand([Path("logs/*.mcap")])] == ["logs/a.mcap", "logs/b.mcap"]
+    assert len(expand([Path("logs/*.mcap")], each=True)) == 3
+    only_one_output([Path("a")], Path("b"))
+    only_one_output([Path("a"), Path("b")], None)
+    with pytest.raises(McaptrackError, match=r"2 inputs can't all be written to b; give one input, or no name"):
+        only_one_output([Path("a"), Path("c")], Path("b"))
+
+
+def test_errors_of_tables_are_one_line(tmp_path):
+    exceptions = deltalake.exceptions
+    for where in (tmp_path, parse("s3://bucket/lake")):
+        for error, words in (
+            (OSError("Permission denied (os error 13)"), "it may not be written here (permission denied)"),
+            (exceptions.DeltaError("No space left on device"), "the disk is full"),
+            (ValueError("Read-only file system"), "the file system is read-only"),
+            (exceptions.DeltaError("broken   log\n 3: <unknown> trace Help: call"), "broken log"),
+            (OSError(""), "OSError"),
+            (Exception("odd Debug source: x"), "odd"),
+            (
+                exceptions.DeltaProtocolError("version 99"),
+                "it uses features that this version of deltalake doesn't know",
+            ),
+        ):
+            with pytest.raises(McaptrackError) as said, reporting(where, "written"):
+                raise error
+            assert f"the Delta table {where} can't be written: " in str(said.value)
+            assert words in str(said.value)
+            assert "unknown>" not in str(said.value)
+            assert "Help" not in str(said.value)
+            assert len(str(said.value).splitlines()) == 1
+        for kept in (
+            exceptions.CommitFailedError("x"),
+            exceptions.TableNotFoundError("x"),
+            McaptrackError("x"),
+            KeyError("x"),
+        ):
+            with pytest.raises(type(kept)), reporting(where, "written"):
+                raise kept
+    long = "x" * 400
+    with pytest.raises(McaptrackError) as said, reporting(tmp_path, "read"):
+        raise OSError(long)
+    assert str(said.value) == f"the Delta table {tmp_path} can't be read: {long[:300]}"
+    assert str(DeltaFolder(tmp_path).location("topics/50%/a")) == str(tmp_path / "topics" / "50+" / "a")
+    with pytest.raises(McaptrackError, match="their paths are URLs, in which % has a meaning"):
+        DeltaFolder(tmp_path / "a%20b")
