@@ -88,7 +88,7 @@ def test_limits_are_those_that_were_decided(module):
 #: What is held in memory, read or written at once: more costs memory, less costs time.
 AT_ONCE = {
     "mcaptrack.log.byte_source": {
-        "_MIN_AHEAD": 4 * KIB, "_MAX_AHEAD": 256 * KIB, "GAP_BYTES": 512 * KIB, "_MIN_SUMMED": 64 * KIB, "_TICK_S": 0.05,
+        "MIN_AHEAD": 4 * KIB, "_MAX_AHEAD": 256 * KIB, "GAP_BYTES": 512 * KIB, "_MIN_SUMMED": 64 * KIB, "_TICK_S": 0.05,
     },
     "mcaptrack.log.checksums": {"_CRC_BLOCK": MIB},
     "mcaptrack.log.chunks": {"_FEW": 16},
@@ -102,7 +102,7 @@ AT_ONCE = {
     "mcaptrack.log.recover": {"_FIRST_STEP": 64 * KIB, "_CHAIN": 3},
     "mcaptrack.log.remote": {
         "_END_BYTES": 128 * KIB, "_MIN_AHEAD": 16 * KIB, "_MAX_AHEAD": 16 * MIB, "_KEPT_BYTES": 64 * MIB,
-        "_MARGIN": 2 * KIB,
+        "_MARGIN": 4 * KIB,
     },
     "mcaptrack.schema.encodings": {"_BATCH": 256},
     "mcaptrack.schema.frame_columns": {"BLOCK_BYTES": MIB, "_IN_MEMORY": 1, "_CACHED": 8, "_MOST_PARTS": 4096},

@@ -80,7 +80,7 @@ def facts(path: Path) -> object:
 def test_a_change_before_any_read_gives_the_old_content_the_new_one_or_an_error(
     tmp_path, monkeypatch, kind, change, look
 ):
-    for name in ("BLOCK", "_MIN_AHEAD", "_MAX_AHEAD"):
+    for name in ("BLOCK", "MIN_AHEAD", "_MAX_AHEAD"):
         monkeypatch.setattr(
             byte_source, name, 150
         )  # many small reads, so that the change comes between any two records

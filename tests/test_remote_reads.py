@@ -8,16 +8,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import CompressionType
 
+from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import parse
-from mcaptrack.log import remote
+from mcaptrack.log import chunks, messages, remote
 from mcaptrack.log.records import Damaged
 from mcaptrack.log.remote import RemoteFile
+from tests.logs import write_stock
 
 KIB = 2**10
 #: The end that is read when an object is opened, and what expected ranges are made longer by.
-END, MARGIN = 128 * KIB, 2 * KIB
+END, MARGIN = 128 * KIB, 4 * KIB
 SIZE = 4 * 2**20 + 17
 CONTENT = np.random.default_rng(3).bytes(SIZE)
 
@@ -129,14 +132,14 @@ def test_a_range_is_read_from_its_start_or_from_what_is_there(monkeypatch):
 def test_announced_ranges_are_read_up_to_a_limit(monkeypatch):
     monkeypatch.setattr(remote, "_MAX_AHEAD", 64 * KIB)
     file, store = opened(monkeypatch)
-    ranges = [(100 * KIB, 400 * KIB), (1000 * KIB, 1030 * KIB), (1100 * KIB, 1130 * KIB), (1200 * KIB, 1201 * KIB)]
+    ranges = [(100 * KIB, 400 * KIB), (1000 * KIB, 1026 * KIB), (1100 * KIB, 1126 * KIB), (1200 * KIB, 1201 * KIB)]
     file.expect(ranges, 0)
     reads(file, 150 * KIB, KIB)
     assert store.asked.pop() == [(100 * KIB, 164 * KIB)]
     reads(file, 300 * KIB, KIB)  # what lies between is more than the limit
     assert store.asked.pop() == [(300 * KIB, 364 * KIB)]
     reads(file, 1000 * KIB, KIB)
-    assert store.asked.pop() == [(1000 * KIB, 1032 * KIB), (1100 * KIB, 1132 * KIB)]
+    assert store.asked.pop() == [(1000 * KIB, 1030 * KIB), (1100 * KIB, 1130 * KIB)]
     file.expect(ranges, 0)
     reads(file, 1200 * KIB, 70 * KIB)
     assert store.asked.pop() == [(1200 * KIB, 1270 * KIB)]
@@ -165,7 +168,7 @@ def test_the_oldest_is_forgotten_first(monkeypatch):
 @settings(max_examples=30, deadline=None)
 @given(st.data())
 def test_bytes_are_those_of_the_object(data):
-    """Whatever is announced and asked for; nothing is asked for twice while all fits."""
+    """Whatever is announced and asked for, and however much is kept."""
     places = st.integers(0, SIZE)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(remote, "_KEPT_BYTES", data.draw(st.sampled_from([200 * KIB, 64 * 2**20])))
@@ -176,3 +179,61 @@ def test_bytes_are_those_of_the_object(data):
             at = data.draw(places)
             reads(file, at, data.draw(st.integers(0, min(SIZE - at, 300 * KIB))))
     assert all(len(one) > 0 for one in store.asked)
+
+
+def messages_log(path, compressed: bool = False):
+    """A log of 60 chunks, one of each channel after the other, of 30 kB each: the index is in its end."""
+    payload = np.random.default_rng(5).bytes(30_000)
+    some = [("abc"[n % 3], 10 * n, n, bytes([n]) + payload) for n in range(60)]
+    write_stock(path, some, chunk_size=100, compression=CompressionType.LZ4 if compressed else CompressionType.NONE)
+    return {topic: [(t_ns, n, data) for name, t_ns, n, data in some if name == topic] for topic in "abc"}
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_a_channel_of_a_log_takes_few_requests(monkeypatch, tmp_path, compressed):
+    path = tmp_path / "a.mcap"
+    there = messages_log(path, compressed)
+    store = Store(path.read_bytes())
+    monkeypatch.setattr(remote.objects, "read_end", store.read_end)
+    monkeypatch.setattr(remote.objects, "read_ranges", store.read_ranges)
+    monkeypatch.setattr(messages, "GAP_BYTES", 1000)
+
+    def read(topic: str, span: tuple = (None, None), only_times: bool = False) -> tuple[list, int, int]:
+        store.asked.clear()
+        with log.read(parse("s3://bucket/a.mcap"), sidecar=False) as opened:
+            store.asked.clear()
+            if only_times:
+                found = opened.times(topic).tolist()
+            else:
+                found = [(m.t_ns, m.sequence, m.payload) for m in opened.messages(topic, *span)]
+        return found, len(store.asked), sum(high - low for one in store.asked for low, high in one)
+
+    whole = 20 * 30_000
+    found, requests, size = read("b")
+    assert (found, requests) == (there["b"], 1)
+    assert whole - 150_000 < size < whole + 20 * 5000
+    found, requests, size = read("b", (200, 310))
+    assert (found, requests) == ([one for one in there["b"] if 200 <= one[0] < 310], 1)
+    assert size < 4 * 36_000
+    found, requests, size = read("c", only_times=True)
+    assert (found, requests) == ([t_ns for t_ns, *_ in there["c"]], 1)
+    assert size < 20 * 4000
+    # Larger ones: first their indexes, then the chunks, as they are needed.
+    monkeypatch.setattr(messages, "_READ_AT_ONCE_BYTES", whole // 2)
+    monkeypatch.setattr(messages, "_MIN_GAP_BYTES", 1000)
+    found, requests, size = read("b")
+    assert (found, requests) == (there["b"], 2)
+    assert size < path.stat().st_size + 20 * 9000  # with what is between them, which is less than another request
+
+
+def test_an_uncompressed_chunk_that_is_too_large_for_memory_stays_in_the_store(monkeypatch, tmp_path):
+    path = tmp_path / "a.mcap"
+    there = messages_log(path)
+    monkeypatch.setattr(chunks, "_MAX_PLAIN_BYTES", 10_000)
+    store = Store(path.read_bytes())
+    monkeypatch.setattr(remote.objects, "read_end", store.read_end)
+    monkeypatch.setattr(remote.objects, "read_ranges", store.read_ranges)
+    for place in (path, parse("s3://bucket/a.mcap")):
+        with log.read(place, sidecar=False) as opened:
+            for topic, wanted in there.items():
+                assert [(m.t_ns, m.sequence, m.payload) for m in opened.messages(topic)] == wanted

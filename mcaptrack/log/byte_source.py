@@ -21,7 +21,7 @@ from mcaptrack.log.recording_files import refuse_non_mcap
 from mcaptrack.log.records import BLOCK, Damaged
 
 #: Read-ahead of small reads in bytes: it starts with the minimum and doubles with every sequential read.
-_MIN_AHEAD: Final = 4 * 2**10
+MIN_AHEAD: Final = 4 * 2**10
 _MAX_AHEAD: Final = 256 * 2**10
 #: Ranges of an object with a smaller gap between them are read as one: that is as quick as another request.
 GAP_BYTES: Final = 512 * 2**10
@@ -171,7 +171,7 @@ class ByteSource:
         self.pieces: tuple[Piece, ...] = tuple(pieces)
         self._size = sum(piece.size for piece in pieces)
         self._ahead = ahead or int(self.is_remote)  # what is read of a store, reads ahead itself
-        self._next_ahead = ahead or _MIN_AHEAD
+        self._next_ahead = ahead or MIN_AHEAD
         self._window: tuple[int, memoryview] = (0, memoryview(b""))
         #: Offset from which bytes stay in the read-ahead window, because they will be read again.
         self.anchor: int | None = None
@@ -218,8 +218,8 @@ class ByteSource:
         at, window = self._window
         if not self._ahead:
             behind = at + len(window)
-            is_next = behind - _MIN_AHEAD <= start <= behind + _MIN_AHEAD
-            self._next_ahead = min(self._next_ahead * 2, _MAX_AHEAD) if is_next else _MIN_AHEAD
+            is_next = behind - MIN_AHEAD <= start <= behind + MIN_AHEAD
+            self._next_ahead = min(self._next_ahead * 2, _MAX_AHEAD) if is_next else MIN_AHEAD
         low = start
         if self.anchor is not None and 0 <= start - self.anchor < self._next_ahead:
             low = self.anchor

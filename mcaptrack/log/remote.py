@@ -17,7 +17,7 @@ from typing import IO, Final
 from mcaptrack import objects
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Url
-from mcaptrack.log.byte_source import GAP_BYTES, Signature
+from mcaptrack.log.byte_source import GAP_BYTES, MIN_AHEAD, Signature
 from mcaptrack.log.paths import RESULTS_SUFFIX
 from mcaptrack.log.records import Damaged
 from mcaptrack.objects import AbsentError, Version
@@ -29,8 +29,8 @@ _END_BYTES: Final = 128 * 2**10
 _MIN_AHEAD: Final = 16 * 2**10
 _MAX_AHEAD: Final = 16 * 2**20
 _KEPT_BYTES: Final = 64 * 2**20
-#: Expected ranges are made longer by this, because heads of records are read with some bytes behind them.
-_MARGIN: Final = 2 * 2**10
+#: Expected ranges are made longer by this, because a small read, as of the head of a record, takes as many bytes.
+_MARGIN: Final = MIN_AHEAD
 
 Range = tuple[int, int]
 
@@ -122,6 +122,10 @@ class RemoteFile:
         self._next = wanted[-1][1]
         for (start, _), data in zip(wanted, objects.read_ranges(self.url, self.version, wanted), strict=True):
             self._forget(start)
+            until = start + len(data)
+            for inner in self._starts[bisect_right(self._starts, start) : bisect_right(self._starts, until)]:
+                if inner + len(self._kept[inner]) <= until:
+                    self._forget(inner)  # ``_find`` would see it instead of what holds it
             self._kept[start] = memoryview(data)
             self._kept_bytes += len(data)
             insort(self._starts, start)
