@@ -13,13 +13,16 @@ from mcaptrack.cli.inputs import expand, only_one_output
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import parse
 from mcaptrack.notices import collected
+from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.sources.ingest.job import IngestJob, IngestOptions
+from mcaptrack.sources.ingest.labels.camera import boxes_extent
 from mcaptrack.sources.ingest.labels.motions import read_motions
 from mcaptrack.sources.ingest.labels.timeline import Timeline
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 from mcaptrack.tables.compared import pair_files
 from mcaptrack.tables.delta.opening import DeltaFolder, reporting
-from tests.logs import some_log
+from tests.logs import add_rows, some_log
+from tests.worlds import boxes_at, tracks_at
 
 MOT = "".join(
     f"{frame},{who},{10 * who},20,9,30,1,{kind},1\n" for frame in (1, 7, 13) for who, kind in ((1, 1), (2, 3))
@@ -148,6 +151,21 @@ def test_the_motion_of_a_camera_is_of_its_pictures(place, pictures, said):
     assert (suffix, len(frames), parameters) == ("motion", pictures, {"file": "motion.txt"})
     assert {(int(one.rows["width_px"][0]), int(one.rows["height_px"][0])) for one in frames} == {(640, 480)}
     job().write_motion(None, line, (640, 480))
+
+
+def test_pictures_are_as_large_as_what_their_boxes_reach(place):
+    with log.create(place / "a.mcap") as writer:
+        boxes = [boxes_at([(30, 40)], (20.5, 10)), boxes_at([(5, 90), (7, 3)], (2, 4.2))]
+        add_rows(writer, "/a/detections", DETECTIONS, [Frame(n, n, rows) for n, rows in enumerate(boxes)])
+        add_rows(writer, "/b/detections", DETECTIONS, [Frame(0, 0, boxes_at([(-50, -60)]))])
+        add_rows(writer, "/c/detections", DETECTIONS, [])
+        add_rows(writer, "/d/tracks", TRACKS, [Frame(0, 0, tracks_at({1: (2, 3)}))])
+    with log.read(place / "a.mcap") as opened:
+        found = [
+            boxes_extent(opened, f"/{name}")
+            for name in ("a/detections", "b/detections", "c/detections", "d/tracks", "e")
+        ]
+    assert found == [(41, 93), (1, 1), (0, 0), (0, 0), (0, 0)]
 
 
 def test_frames_of_labels_have_their_rows(place):

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 import zstandard
 from mcap.reader import make_reader
+from mcap.writer import CompressionType
 
 from mcaptrack import log
-from mcaptrack.log import located, records
+from mcaptrack.log import chunks, located, records
 from mcaptrack.log.byte_source import ByteSource, OpenFile
 from mcaptrack.log.chunks import checksum_at, message_heads_at, open_chunk, read_index_entries
+from mcaptrack.log.messages import Messages
 from mcaptrack.log.records import Damaged, Opcode, pack, pack_chunk, pack_message_index, record_at
 from tests.logs import stock_messages, write_stock
 
@@ -176,6 +178,22 @@ def channel(number: int) -> bytes:
     topic = records.text(f"/{number}")
     fields = [number.to_bytes(2, "little"), (1).to_bytes(2, "little"), topic, records.text("json")]
     return pack(Opcode.CHANNEL, *fields, records.text_map({}))
+
+
+def test_a_chunk_that_is_larger_than_its_index_says_is_not_read(tmp_path, monkeypatch):
+    path = tmp_path / "a.mcap"
+    write_stock(path, SOME, compression=CompressionType.NONE, chunk_size=10_000)
+    monkeypatch.setattr(chunks, "_MAX_PLAIN_BYTES", 50)
+    with log.read(path) as one:
+        number = next(n for n, channel in one.index.channels.items() if channel.topic == "b")
+        source = ByteSource.of(OpenFile.at(path))
+        (batch,) = located.MessageBatches(source, one.index, [number], (None, None))
+        content, offset = Messages(source, one.index)._open(batch)
+        heads = message_heads_at(content, number, batch.t_ns, offset)
+        payloads = [bytes(content[a:b]) for a, b in zip(heads.start.tolist(), heads.end.tolist(), strict=True)]
+        assert payloads == [data for topic, *_, data in SOME if topic == "b"]
+        with pytest.raises(Damaged, match=f"byte {batch.chunk.offset}: a chunk is larger than its index says"):
+            Messages(source, one.index)._open(batch._replace(is_direct=False))
 
 
 def test_progress_of_a_check_is_told_at_each_block(tmp_path, monkeypatch):
