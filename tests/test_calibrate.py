@@ -22,6 +22,7 @@ from mcaptrack.notices import collected
 from mcaptrack.pipeline.refining import Refined, Refiner, Watched
 from tests.commands import call, done
 from tests.places import CAMERAS, errors, fused, said, write_log
+from tests.tiers import thorough
 
 RATE_HZ, FRAMES, PEOPLE = 2.0, 60, 6
 SHIFT, TURN = np.array([[1, 0, 0.5], [0, 1, -0.3], [0, 0, 1.0]]), np.deg2rad(5)
@@ -71,9 +72,9 @@ class TestCorrections:
     @pytest.mark.parametrize(
         ("off", "kinds"),
         [
-            (SHIFT, {"shift"}),
+            pytest.param(SHIFT, {"shift"}, marks=thorough),
             (SHIFT @ [[1, 0, 2.4], [0, 1, 1.7], [0, 0, 1]], {"shift"}),  # 3 m, farther than people are from each other
-            (ROTATION, {"rigid"}),
+            pytest.param(ROTATION, {"rigid"}, marks=thorough),
             (np.linalg.inv(TILT), {"full"}),
         ],
         ids=["0.6 m", "3 m", "rotated", "tilted"],
@@ -89,6 +90,7 @@ class TestCorrections:
         assert found["b"].after.pairs == found["b"].before.pairs > 200
         assert {name for name, one in found.items() if one.model} == {"b"}
 
+    @thorough
     def test_two_planes_that_are_off_at_once(self) -> None:
         at = walks(4)
         off = {"b": SHIFT, "d": ROTATION}

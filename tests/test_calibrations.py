@@ -182,6 +182,33 @@ def test_a_run_ends_in_the_map_and_is_up_to_date(tmp_path):
         made.close()
 
 
+def test_a_calibration_that_a_user_gives_replaces_the_recorded_one(tmp_path):
+    """Recorded is a focal length that is off; planes follow from it until a better one is given, and from that then."""
+    wrong = np.array([[400.0, 0, 640], [0, 400, 360], [0, 0, 1]])
+    path = robot(tmp_path / "robot.mcap", "", k=wrong.ravel(), p=np.column_stack([wrong, np.zeros(3)]).ravel())
+    where = {"topic": "/front/boxes", "to": "/front/tracks", "sidecar": False}
+    mcaptrack.track(path, **where)
+    assert np.nanmedian(errors_m(path, "/front/tracks")) > 0.8
+    recorded = messages(path, "/front/camera_info")
+    for number, (focal, least, most) in enumerate([(700.0, 0.0, 0.35), (500.0, 0.5, 50.0)]):
+        given = tmp_path / f"given{number}.yml"
+        lens = [focal, 0, 640, 0, focal, 360, 0, 0, 1]
+        given.write_text(f"%YAML:1.0\n---\nimage_width: {SIZE[0]}\nimage_height: {SIZE[1]}\nK: {lens}\n")
+        with collected():
+            mcaptrack.ingest(given, into=path, camera="front", force=True)
+            mcaptrack.track(path, **where)
+        assert least < np.nanmedian(errors_m(path, "/front/tracks")) < most
+        with log.read(path) as opened:
+            assert read_planes(opened, "/front")[0][1].lens.focal_px == (focal, focal)
+            assert opened.channels["/front/ground_plane"].metadata["mcaptrack.input"] == "/front/calibration"
+    assert messages(path, "/front/camera_info") == recorded
+
+
+def messages(path: Path, topic: str) -> list[bytes]:
+    with log.read(path) as opened:
+        return [one.payload for one in opened.messages(topic)]
+
+
 @pytest.fixture(scope="module")
 def straight(tmp_path_factory) -> Path:
     """The log of a robot with a lens without distortion. Tests must not change it."""

@@ -180,6 +180,9 @@ def work(
             if follows is None:
                 return at, run(plan(opened, at, notes.say, fused, ()))
             with logs.read(follows) as earlier:
+                if prefix and (why := pipeline.begins_here(earlier, opened, at)):
+                    warn(why, "left-out")
+                    return at, run(plan(opened, at, notes.say, fused, ()))
                 before = pipeline.Before(earlier, opened, at)
                 report = run(plan(opened, at, notes.say, fused, before.renewed(opened)), before=before)
             continued.append(before.result)

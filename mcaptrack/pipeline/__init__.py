@@ -6,7 +6,7 @@ transform and its parameters.
 
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.pipeline.events import Watch
-from mcaptrack.pipeline.following import Before, Continued
+from mcaptrack.pipeline.following import Before, Continued, begins_here
 from mcaptrack.pipeline.fusing import fusable, fuse_again, fuse_cameras
 from mcaptrack.pipeline.plan import plan_all, plan_stage
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, read_planes
@@ -35,6 +35,7 @@ __all__ = [
     "Watch",
     "ZoneWatch",
     "attachment_of",
+    "begins_here",
     "begins_with",
     "camera_at",
     "camera_to_name",

@@ -80,7 +80,7 @@ def calibrate_cameras(
             f"{opened.path}: of two cameras, {' and '.join(chosen)}, the log doesn't say which is right; name that one "
             "with `reference=`"
         )
-    with collected():  # what `fuse` says about cameras that disagree is report here in another way
+    with collected():  # what `fuse` says about cameras that disagree is said here in another way
         sources, _, _, _ = read_sources(opened, found, clock_offset_s)
     cameras = {camera.prefix[1:]: camera for camera in found}
     sources = [_given(opened, source, cameras[source.view.name], reference) for source in sources]

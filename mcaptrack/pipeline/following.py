@@ -84,6 +84,14 @@ class Continued:
         return lines or [f"ids go on from {self.log}, as before"]
 
 
+def begins_here(before: log.Log, opened: log.Log, prefix: str) -> str:
+    """Return why the ids of one of several cameras go on from none, where the log before has others of them; or ""."""
+    there, here = ({one.prefix for one in cameras(each)} for each in (before, opened))
+    if prefix in there or not there & here:
+        return ""
+    return f"{before.path} has no camera {prefix[1:]}: its ids begin with {opened.path}"
+
+
 class Before:
     """The log before another one: its last seconds, and its ids.
 

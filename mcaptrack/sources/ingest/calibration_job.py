@@ -8,6 +8,7 @@ from pathlib import Path
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.calibrations import frame_of
+from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.ingest.job import IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.camera import boxes_extent, camera_of, picture_size
 
@@ -34,7 +35,9 @@ class CalibrationJob(IngestJob):
                 f"{into.path} has no camera {self.prefix[1:]} that {source} could be of (`camera=`); its topics begin "
                 f"with {', '.join(names) or 'nothing'}"
             )
-        self.frame_id = frame_of(into, self.pictures) if self.pictures else ""
+        # In the frame of what the camera recorded, as the transforms name it, the calibration replaces a recorded one.
+        recorded = self.pictures or camera_at(into, self.prefix).boxes
+        self.frame_id = frame_of(into, recorded) if recorded else ""
         size = picture_size(into, self.pictures) if self.pictures else options.size
         extent = size or boxes_extent(into, f"{self.prefix}/detections")
         self._plane = self.plane(*extent, is_stated=size is not None)
