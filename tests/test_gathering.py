@@ -163,12 +163,12 @@ def said(
 
 
 class TestDisagreeing:
-    @pytest.mark.parametrize(("x_m", "compared", "is_said"), [(0.3, 50, False), (0.31, 50, True), (9.0, 49, False)])
+    @pytest.mark.parametrize(("x_m", "compared", "is_said"), [(0.25, 50, False), (0.26, 50, True), (9.0, 49, False)])
     def test_planes_that_are_off(self, x_m, compared, is_said):
         found = [message for code, message in said(Offset(0.0, x_m, 0.0, compared)) if code == "cameras-disagree"]
         assert len(found) == is_said
         if is_said:
-            assert found[0].startswith("a: feet stand 0.31 m from where the other cameras see them (median of 50); ")
+            assert found[0].startswith("a: feet stand 0.26 m from where the other cameras see them (median of 50); ")
 
     @pytest.mark.parametrize(
         ("late_s", "word"), [(0.12, ""), (-0.12, ""), (0.125, "late"), (-0.5, "early"), (np.nan, "")]

@@ -42,7 +42,7 @@ _PACE_M_PER_S: Final = 1.0
 #: Cameras are compared by at most so many frames.
 _COMPARED: Final = 3000
 #: Offsets of a camera that are named: in metres, and in seconds.
-_FAR_M, _LATE_S = 0.3, 0.12
+_FAR_M, _LATE_S = 0.25, 0.12
 #: Fewer comparisons say nothing about a camera.
 _LEAST: Final = 50
 
