@@ -52,6 +52,25 @@ class TestAllCameras:
         assert result.summary.tracks == PEOPLE
         assert result.not_fused == ""
 
+    def test_info_shows_the_channels_of_each_camera_together(
+        self, ran: tuple[Path, RunResult], boxes: Path, tmp_path: Path
+    ) -> None:
+        path, _ = ran
+        owners = {channel.topic: channel.camera for channel in mcaptrack.info(path).channels}
+        assert all(topic.startswith(f"/{name}/") for topic, name in owners.items())
+        lines = [line.strip() for line in call("info", path, environment={"COLUMNS": "200"}).out.splitlines()]
+        first = [lines.index(f"/{name}") for name in ("east", "labelled", "north", "south", "world")]
+        ends = [*first[1:], lines.index("lineage")]
+        assert first == sorted(first)
+        for begin, end in zip(first, ends, strict=True):
+            shown = [line.split()[0] for line in lines[begin + 1 : end]]
+            assert shown == sorted(topic for topic, name in owners.items() if f"/{name}" == lines[begin])
+        alone = tmp_path / "alone.mcap"
+        mcaptrack.drop(boxes, ["/east*", "/south*", "/labelled*"], output=alone)
+        with mcaptrack.open(alone) as opened:
+            opened.write("/north/more", [mcaptrack.detections([[1, 2, 3, 4]], [0.5], [1], 1, box_format="xywh")])
+        assert "/north" not in [line.strip() for line in call("info", alone).out.splitlines()]
+
     def test_a_camera_with_labels_alone_is_left_out_and_named(self, ran: tuple[Path, RunResult]) -> None:
         path, result = ran
         assert dict(result.left_out) == {"labelled": "has neither pictures nor boxes, but /labelled/truth"}

@@ -15,6 +15,7 @@ from mcaptrack.geometry.transform_series import TransformSeries
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice, warn
 from mcaptrack.schema.provenance import Provenance, frame_id_of
+from mcaptrack.sources.cameras import names_by_topic
 from mcaptrack.sources.frames import read_frames
 
 
@@ -51,6 +52,8 @@ class ChannelInfo:
         The frame of reference of its metres, for channels of mcaptrack that have one.
     stale : bool
         Whether it is out of date, because what it was made from has changed.
+    camera : str or None
+        The name of the camera, or of the scene of several cameras, that its pictures, boxes, tracks or views belong to.
 
     """
 
@@ -70,6 +73,7 @@ class ChannelInfo:
     parameters: Mapping[str, Any] | None
     frame: str | None
     stale: bool
+    camera: str | None = None
 
 
 @dataclass(frozen=True)
@@ -207,7 +211,8 @@ def info(log: PathLike, *, frames: bool = False) -> LogInfo:
     with warnings_about(path) as warnings, logs.read(path) as opened:
         every = [(channel, part) for part in opened.parts for channel in part.recorded]
         every.sort(key=lambda found: (found[0].topic, found[1] is opened, found[0].id))
-        channels = tuple(_channel(opened, part, channel) for channel, part in every)
+        names = names_by_topic(opened)
+        channels = tuple(_channel(opened, part, channel, names.get(channel.topic)) for channel, part in every)
         return LogInfo(
             log=path,
             bytes=opened.size,
@@ -222,7 +227,7 @@ def info(log: PathLike, *, frames: bool = False) -> LogInfo:
         )
 
 
-def _channel(opened: logs.Log, part: logs.Log, channel: logs.Channel) -> ChannelInfo:
+def _channel(opened: logs.Log, part: logs.Log, channel: logs.Channel, camera: str | None) -> ChannelInfo:
     made = Provenance.from_metadata(channel.metadata)
     replaced = opened.part(channel.topic) is not part
     return ChannelInfo(
@@ -242,6 +247,7 @@ def _channel(opened: logs.Log, part: logs.Log, channel: logs.Channel) -> Channel
         parameters=dict(made.parameters) if made else None,
         frame=frame_id_of(channel.metadata) or None,
         stale=not replaced and pipeline.is_stale(opened, channel.topic),
+        camera=camera,
     )
 
 

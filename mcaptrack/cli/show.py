@@ -13,6 +13,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from rich.tree import Tree
 
     from mcaptrack import ExportResult, LogInfo
@@ -36,6 +38,8 @@ def info(
     config: common.Config = None,
 ) -> None:
     """Show the channels of a log, their number of messages, and what was made from what.
+
+    Those of each camera are together, if there are several, under its name.
 
     Reads the summary only, unless --frames is given. With -v also the parameters that channels were made with.
 
@@ -74,7 +78,9 @@ def _print(data: dict[str, Any], verbose: bool) -> None:
     for column in ("topic", "schema", "messages", "per second"):
         is_number = column in ("messages", "per second")
         table.add_column(column, justify="right" if is_number else "left", overflow="fold")
-    for channel in data["channels"]:
+    for camera, channel in _by_camera(data["channels"]):
+        if camera is not None:
+            table.add_row(Text(camera, "bold"))
         topic = channel["topic"] + ("  (replaced by the results)" if channel["replaced"] else "")
         rate = "" if channel["rate_hz"] is None else f"{channel['rate_hz']:.1f}"
         table.add_row(topic, channel["schema"], f"{channel['messages']:,}", rate)
@@ -83,6 +89,20 @@ def _print(data: dict[str, Any], verbose: bool) -> None:
     out.print(_lineage([*reversed(shown.values())], verbose))
     if data["frames"] is not None:
         out.print(_frames(data["frames"], data["start_ns"]) if data["frames"] else "no transforms")
+
+
+def _by_camera(channels: list[dict[str, Any]]) -> Iterator[tuple[str | None, dict[str, Any]]]:
+    """Yield the channels of each camera after one another, if there are several, each first one with a heading."""
+    names = sorted({channel["camera"] for channel in channels if channel.get("camera")})
+    if len(names) < 2:
+        yield from ((None, channel) for channel in channels)
+        return
+    for name in (*names, None):
+        heading: str | None = f"/{printable(name)}" if name else "other channels"
+        for channel in channels:
+            if (channel.get("camera") or None) == name:
+                yield heading, channel
+                heading = None
 
 
 def _when(t_ns: int) -> str:

@@ -240,6 +240,15 @@ def cameras(opened: log.Log) -> list[Camera]:
     return _CACHE[opened]
 
 
+def names_by_topic(opened: log.Log) -> dict[str, str]:
+    """Return the name above the source of each channel of pictures, rows and views, without reading a message."""
+    return {
+        topic: name_above(chain_of(opened, topic)[-1])[1:]
+        for topic, channel in opened.channels.items()
+        if channel.schema_name in SCHEMAS or provenance_of(opened, topic) or foreign.holds_pictures(channel)
+    }
+
+
 class _Channels:
     """The channels of a log that belong to cameras, grouped by the name above the source of their chain of inputs."""
 
