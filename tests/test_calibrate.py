@@ -90,6 +90,12 @@ class TestCorrections:
         assert found["b"].after.pairs == found["b"].before.pairs > 200
         assert {name for name, one in found.items() if one.model} == {"b"}
 
+    def test_a_plane_that_is_off_by_less_than_a_step_stays(self) -> None:
+        at, off = walks(9), np.array([[1, 0, 0.12], [0, 1, -0.1], [0, 0, 1.0]])
+        found = refined([watched("a", at), watched("b", at, off), watched("c", at)])
+        assert [one.why for one in found.values()] == ["it agrees with the others"] * 3
+        assert np.array_equal(found["b"].matrix, np.eye(3))
+
     @thorough
     def test_two_planes_that_are_off_at_once(self) -> None:
         at = walks(4)
@@ -222,7 +228,10 @@ class TestLogs:
         assert (again.written_to, path.read_bytes()) == (None, before)
         assert again.cameras == right[1].cameras
         with collected():
-            mcaptrack.drop(path, "/east/ground_plane/refined")
+            mcaptrack.track(path, camera="east")
+            drawn = "/east/ground_plane/view/scene"
+            gone = mcaptrack.drop(path, "/east/ground_plane/refined").dropped
+            assert gone == ("/east/ground_plane/refined", drawn)  # the outline was that of the corrected plane
             assert said(mcaptrack.fuse(path), "cameras-disagree")  # type: ignore[arg-type]
 
     def test_a_new_plane_ends_a_correction(self, right: tuple[Path, mcaptrack.CalibrateResult], tmp_path: Path) -> None:
@@ -234,6 +243,8 @@ class TestLogs:
             mcaptrack.ingest(labels, fps=2, role="truth", camera="east", ground_plane=plane, into=path, force=True)
         (line,) = (one.message for one in notices if "refined" in one.message)
         assert line == "/east/ground_plane/refined is dropped: it corrected the ground plane that is replaced"
+        with log.read(path) as opened:
+            assert "/east/ground_plane/refined" not in opened.channels
         with collected():
             assert not said(mcaptrack.fuse(path), "cameras-disagree")  # type: ignore[arg-type]
 

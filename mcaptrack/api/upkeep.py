@@ -24,7 +24,7 @@ from mcaptrack.files import is_same_file, refuse_overwrite
 from mcaptrack.location import Location, local_name
 from mcaptrack.log import CheckResult, Finding
 from mcaptrack.notices import Notice
-from mcaptrack.schema.provenance import Provenance
+from mcaptrack.schema.provenance import REFINE, Provenance
 from mcaptrack.sources.ingest.bags.metadata_update import update_metadata
 from mcaptrack.sources.ingest.sidecar import recording_of
 
@@ -290,6 +290,13 @@ def _chosen(opened: logs.Log, patterns: Sequence[str]) -> set[str]:
             opened.channel(pattern)  # raises, with the channels that there are
         chosen |= found
     made = {topic: Provenance.from_metadata(channel.metadata) for topic, channel in opened.channels.items()}
+    # The outline of a corrected plane is drawn as the view of the plane that was given.
+    outlines = {
+        f"{provenance.input}/view/scene"
+        for topic in chosen
+        if (provenance := made[topic]) and provenance.transform == REFINE
+    }
+    chosen |= outlines & made.keys()
     for transform in ("events", "view"):  # in this order: events have views
         chosen |= {
             topic
