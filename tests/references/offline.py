@@ -1,12 +1,14 @@
 """Offline re-tracking: a slow reference that uses nothing of the package.
 
 A path is a dictionary of positions by step. The constants of the models stand here a second time: change them here, too,
-when the package changes. Weights and biases are those that tools/choose_retrack.py printed.
+when the package changes. Only the weights and biases that tools/fit_retrack.py fitted are read from their file.
 """
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
+from importlib.resources import files
 from itertools import combinations
 from math import exp, hypot, inf, log
 
@@ -16,10 +18,12 @@ Point = tuple[float, float]
 Path = dict[int, Point]
 
 REACH_M_PER_S, NEAR_M, SPEED_M_PER_S = 2.5, 0.3, 0.15
-LINK_WEIGHTS = (-0.996, -0.798, -0.205, -0.304, 0.247, 0.482, -0.324)
-LINK_BIAS, LINK_USUAL, LINK_LEAST = 3.702, 0.666, -2.52
-PERSON_WEIGHTS = (1.58, -0.58, 1.736, -1.126, -0.559, 0.59, -1.993)
-PERSON_BIAS, BESIDE_M = -3.342, 1.2
+FITTED = json.loads((files("mcaptrack") / "transforms/retrack/weights.json").read_text())
+LINKS, PEOPLE = FITTED["links"]["weights"], FITTED["people"]["weights"]
+LINK_NAMES = ("miss", "misfit", "gap", "misfit or stay", "turn", "distance and speed", "misfit and speed")
+LINK_WEIGHTS = [LINKS[name] for name in LINK_NAMES]
+LINK_BIAS, LINK_USUAL, LINK_LEAST = (FITTED["links"][name] for name in ("bias", "usual", "least"))
+PERSON_BIAS, BESIDE_M = FITTED["people"]["bias"], 1.2
 MEET_M, MARGIN, EXCHANGE_COST, SAME_ID, LEAST_GAIN = 2.0, 10, 4.0, 1.0, 1.0
 DRIFTS = (0.05, 0.15, 0.4)
 
@@ -268,6 +272,8 @@ def exchanged(motion: Motion, paths: dict[int, Path], ids: dict[int, dict[int, i
 def person_log_odds(motion: Motion, paths: dict[int, Path]) -> dict[int, float]:
     """For each track the log odds that it is a person."""
     where = {name: motion.smoothed(path) for name, path in paths.items()}
+    counts = sorted(len(path) for path in paths.values() for _ in path)
+    usual = log(min(max(counts[(len(counts) - 1) // 2], 5), 100))
     out = {}
     for name, path in paths.items():
         states = where[name]
@@ -275,16 +281,21 @@ def person_log_odds(motion: Motion, paths: dict[int, Path]) -> dict[int, float]:
         places = np.array([state.mean[:, 0] for state in states.values()])
         off = sum(((np.array(at) - states[step].mean[:, 0]) ** 2).sum() for step, at in path.items())
         speed = sum(hypot(*state.mean[:, 1]) for state in states.values()) / length
-        features = [
-            log(length * motion.step_s),
-            log(count),
-            log(hypot(*(places.max(axis=0) - places.min(axis=0))) + 0.3),
-            log(speed + 0.1),
-            log(off / count / (2 * motion.noise_m**2) + 0.1),
-            count / length,
-            max((beside(states, other) for who, other in where.items() if who != name), default=0.0),
-        ]
-        out[name] = float(np.dot(PERSON_WEIGHTS, features) + PERSON_BIAS)
+        extent = hypot(*(places.max(axis=0) - places.min(axis=0)))
+        features = {
+            "log length": log(length * motion.step_s),
+            "log count": log(count),
+            "log extent": log(extent + 0.3),
+            "log speed": log(speed + 0.1),
+            "log roughness": log(off / count / (2 * motion.noise_m**2) + 0.1),
+            "observed": count / length,
+            "duplicate": max((beside(states, other) for who, other in where.items() if who != name), default=0.0),
+            "log usual count": usual,
+            "count and usual count": log(count) * usual,
+            "log short extent": log(min(extent, 2.0) + 0.3),
+            "short extent and count": log(min(extent, 2.0) + 0.3) * log(count),
+        }
+        out[name] = sum(PEOPLE[one] * value for one, value in features.items()) + PERSON_BIAS
     return out
 
 

@@ -13,16 +13,34 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.neighbours import near_pairs
 from mcaptrack.geometry.ragged import group_index
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
+from mcaptrack.transforms.retrack.weights import weights_of
 
 #: A duplicate of a track is nearer to it than this.
 _DUPLICATE_M: Final = 1.2
 #: A track lies inside another if it begins more than so many steps after it and ends as many before it.
 _INSIDE_STEPS: Final = 3
 
-FEATURES: Final = ("log length", "log count", "log extent", "log speed", "log roughness", "observed", "duplicate")
-#: Weight of each feature as a log odds ratio, and the log odds without any (tools/choose_retrack.py).
-_WEIGHTS: Final = (1.58, -0.58, 1.736, -1.126, -0.559, 0.59, -1.993)
-_BIAS: Final = -3.342
+#: The usual number of rows of the tracks of a log is at least and at most so large, and an extent beyond so many metres
+#: is that of a person in motion.
+_USUAL_COUNT: Final = (5.0, 100.0)
+_WALKED_M: Final = 2.0
+
+FEATURES: Final = (
+    "log length",
+    "log count",
+    "log extent",
+    "log speed",
+    "log roughness",
+    "observed",
+    "duplicate",
+    "log usual count",
+    "count and usual count",
+    "log short extent",
+    "short extent and count",
+)
+#: Weight of each feature as a log odds ratio, and the log odds without any.
+_WEIGHTS, _FITTED = weights_of("people", FEATURES)
+_BIAS: Final = float(_FITTED["bias"])
 #: The same for detections with scores: log odds without any; of the mean score, as a ratio to the usual one, above
 #: ``_LOW``, times the number of rows up to ``_ENOUGH``; of log seconds; of the share that was observed; of log extent.
 SCORED: Final = (-3.1, 0.8, 1.1, 5.1, 1.6)
@@ -37,11 +55,15 @@ def track_confidence(model: MotionModel, trajectories: Trajectories, smoothed: S
 
 def track_log_odds(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
     """The log odds that each track is a person, (K,)."""
-    return np.asarray(features(model, trajectories, smoothed, step_s) @ np.array(_WEIGHTS) + _BIAS)
+    return np.asarray(features(model, trajectories, smoothed, step_s) @ _WEIGHTS + _BIAS)
 
 
 def features(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
-    """The features that distinguish people from false tracks, (K, F): see ``FEATURES``."""
+    """The features that distinguish people from false tracks, (K, F): see ``FEATURES``.
+
+    Where most tracks of a log are long, a short one is more likely false than where a tracker loses everybody: the
+    usual number of rows is that of the track to which the median row belongs.
+    """
     first, last = trajectories.first[:-1], trajectories.first[1:] - 1
     length = last - first + 1
     observed = np.isfinite(trajectories.xy_m[:, 0])
@@ -53,18 +75,30 @@ def features(model: MotionModel, trajectories: Trajectories, smoothed: State, st
     roughness = np.add.reduceat((residual**2).sum(axis=1), first) / count / (2 * model.noise_m**2)
     speed = np.hypot(smoothed.mean[:, 2], smoothed.mean[:, 3])
     mean_speed = np.add.reduceat(speed, first) / length
+    log_count, log_short = np.log(count), np.log(np.minimum(extent, _WALKED_M) + 0.3)
+    usual = np.full(len(count), np.log(np.clip(_usual(count), *_USUAL_COUNT)))
     return np.stack(
         [
             np.log(length * step_s),
-            np.log(count),
+            log_count,
             np.log(extent + 0.3),
             np.log(mean_speed + 0.1),
             np.log(roughness + 0.1),
             count / length,
             _duplicate_share(trajectories, xy),
+            usual,
+            log_count * usual,
+            log_short,
+            log_short * log_count,
         ],
         axis=1,
     )
+
+
+def _usual(count: Floats) -> float:
+    """The number of rows of the track to which the median row belongs, of tracks with ``count`` (K,) rows."""
+    ordered = np.sort(count)
+    return float(ordered[np.searchsorted(np.cumsum(ordered), ordered.sum() / 2)])
 
 
 def scored_confidence(xy_m: Floats, first: Ints, score: Floats, observed: Bools, usual: float, step_s: float) -> Floats:

@@ -17,23 +17,22 @@ from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.assignment import Pairs, assign_by_gain, assign_pairs_by_gain
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
+from mcaptrack.transforms.retrack.weights import weights_of
 
 #: Gate on the mean speed between the end of a tracklet and the beginning of the next.
 _MAX_SPEED_M_PER_S: Final = 2.5
 #: The features of a link, see ``features``.
 FEATURES: Final = ("miss", "misfit", "gap", "misfit or stay", "turn", "distance and speed", "misfit and speed")
-#: Weight of each feature as a log odds ratio; and the log odds without any, in logs where a share of
-#: ``_PRIOR`` of the best links is right (tools/choose_retrack.py).
-_WEIGHTS: Final = (-0.996, -0.798, -0.205, -0.304, 0.247, 0.482, -0.324)
-_BIAS, _PRIOR = 3.702, 0.666
+#: Weight of each feature as a log odds ratio; and the log odds without any, in logs where a share of ``_PRIOR`` of the
+#: best links is right. Links with log odds below ``_MIN_LOG_ODDS`` are not considered.
+_WEIGHTS, _FITTED = weights_of("links", FEATURES)
+_BIAS, _PRIOR, _MIN_LOG_ODDS = (float(_FITTED[name]) for name in ("bias", "usual", "least"))
 #: Added to distances and speeds before taking logarithms: differences below these mean nothing.
 _NEAR_M, _SPEED_M_PER_S = 0.3, 0.15
 #: The number of pairs that are examined at once.
 _BATCH: Final = 1_000_000
 #: The largest table of ends and beginnings that is made: 16 MB.
 _TABLE_CELLS: Final = 2_000_000
-#: Links with lower log odds are not considered.
-_MIN_LOG_ODDS: Final = -2.52
 
 
 def link_tracks(
@@ -61,7 +60,7 @@ def link_tracks(
     if len(i) == 0:
         return continued_by
     found = features(model, forward.take(last[i]), backward.take(first[j]), gap_s)
-    gain = found @ np.array(_WEIGHTS) + _BIAS - _MIN_LOG_ODDS
+    gain = found @ _WEIGHTS + _BIAS - _MIN_LOG_ODDS
     good = gain > 0
     i, j, gain = i[good], j[good], gain[good]
     log_odds = np.full(len(first), -np.inf)

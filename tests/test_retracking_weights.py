@@ -1,0 +1,144 @@
+"""The weights of links and of false tracks: what they were fitted on, the scenes, and the fit itself."""
+
+from __future__ import annotations
+
+import json
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mcaptrack
+from mcaptrack.predictors.weights import load
+from mcaptrack.transforms.retrack import false_tracks, linking
+from mcaptrack.transforms.retrack.motion_model import to_trajectories
+from mcaptrack.transforms.retrack.weights import WEIGHTS, weights_of
+from tools import crowds
+from tools.corruptions import STEP_S
+from tools.fit_retrack import Pairs, logistic, owners, prepare
+
+STEPS = 60
+PACKAGE = Path(mcaptrack.__file__).parent
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return crowds.scenes(5, STEPS)
+
+
+def by_person(rows: np.ndarray) -> np.ndarray:
+    return rows[np.lexsort((rows[:, 0], rows[:, 1]))]
+
+
+def test_everything_that_was_fitted_says_that_it_was_fitted_on_synthetic_data():
+    cards = {
+        path: json.loads(path.read_text())["card"] for path in (WEIGHTS, PACKAGE / "predictors/trained/tails.json")
+    }
+    cards |= {path: load(path).card for path in (PACKAGE / "predictors/trained").glob("*.safetensors")}
+    assert len(cards) == 5
+    for path, card in cards.items():
+        assert "synthetic" in card["data"], path
+        assert card["licence"] == "Apache-2.0", path
+
+
+def test_weights_go_by_the_names_of_features_in_any_order():
+    names = ("gap", "miss")
+    found = json.loads(WEIGHTS.read_text())["links"]["weights"]
+    assert weights_of("links", names)[0].tolist() == [found["gap"], found["miss"]]
+    for model, features in (("links", linking.FEATURES), ("people", false_tracks.FEATURES)):
+        assert set(json.loads(WEIGHTS.read_text())[model]["weights"]) == set(features)
+
+
+def test_a_seed_gives_the_same_scenes_again_and_another_one_others(scenes):
+    crowds.scenes.cache_clear()
+    again = crowds.scenes(5, STEPS)
+    assert all(np.array_equal(one, two) for one, two in zip(scenes, again, strict=True))
+    first = scenes[0][scenes[0][:, 0] < 2]
+    assert not np.array_equal(first[:, 2:], crowds.scenes(6, 2)[0][:, 2:])
+
+
+def test_people_walk_come_in_and_leave_at_borders(scenes):
+    """Nobody appears in the middle; nobody jumps; a step is not faster than a bicycle that is given way to."""
+    inside = moves = 0
+    for rows in map(by_person, scenes):
+        low, high = rows[:, 2:].min(axis=0), rows[:, 2:].max(axis=0)
+        assert len(np.unique(rows[:, :2], axis=0)) == len(rows)
+        same = rows[1:, 1] == rows[:-1, 1]
+        assert (np.diff(rows[:, 0])[same] == 1).all()
+        speed = np.hypot(*np.diff(rows[:, 2:], axis=0)[same].T) / STEP_S
+        assert speed.max() < 12
+        moves += len(speed)
+        begins = np.flatnonzero(np.append(True, ~same))
+        begins = begins[rows[begins, 0] > 0]
+        far = np.minimum(rows[begins, 2:] - low, high - rows[begins, 2:]).min(axis=1)
+        assert (far < 6).all()  # a cyclist has gone that far within a step
+        inside += len(begins)
+    assert inside > 200
+    assert moves > 20_000
+
+
+def test_some_stand_some_walk_and_some_ride(scenes):
+    parts = [np.split(rows[:, 2:], np.flatnonzero(np.diff(rows[:, 1])) + 1) for rows in map(by_person, scenes)]
+    speeds = np.array([np.hypot(*(path[-1] - path[0])) / (len(path) * STEP_S) for paths in parts for path in paths])
+    still, walk, ride = (((low <= speeds) & (speeds < high)).mean() for low, high in ((0, 0.3), (0.8, 1.8), (2, 9)))
+    assert still > 0.03
+    assert walk > 0.3
+    assert ride > 0.05
+
+
+def test_no_two_scenes_have_the_same_faults():
+    found = [crowds.faults(np.random.default_rng([seed, 1])) for seed in range(200)]
+    assert len(set(found)) == 200
+    for name in ("merge_m", "doubles", "clutter", "lit", "beside", "breaks_per_min", "swap"):
+        share = np.mean([getattr(how, name) > 0 for how in found])
+        assert 0.03 < share < 0.9, name
+
+
+def test_the_fit_finds_the_weights_that_drew_the_data():
+    rng = np.random.default_rng(1)
+    features = rng.normal([1.0, -2.0], [1.0, 3.0], (40_000, 2))
+    odds = features @ [1.5, -0.4] + 0.7
+    right = rng.random(len(odds)) < 1 / (1 + np.exp(-odds))
+    assert logistic(features, right * 1.0, np.ones(len(odds))) == pytest.approx([1.5, -0.4, 0.7], abs=0.06)
+
+
+def test_what_differs_from_scene_to_scene_is_not_put_down_to_features():
+    """In one scene most links are right and gaps long, in the other few and short: gaps say nothing within either."""
+    rng = np.random.default_rng(2)
+    scene = np.repeat([0, 1], 20_000)
+    gap = rng.normal(np.where(scene == 0, 3.0, 1.0), 1.0)
+    right = rng.random(len(gap)) < np.where(scene == 0, 0.8, 0.2)
+    together = logistic(gap[:, None], right * 1.0, np.ones(len(gap)))
+    apart = logistic(gap[:, None], right * 1.0, np.ones(len(gap)), scene)
+    assert together[0] > 0.5
+    assert abs(apart[0]) < 0.15
+
+
+def test_the_best_set_of_links_is_that_of_all_permutations():
+    rng = np.random.default_rng(3)
+    ends, begins = (side.ravel() for side in np.indices((5, 5)))
+    gain = rng.uniform(-3.5, 4, 25)
+    right = (ends == begins) * 1.0
+    found, is_right = Pairs(5, ends, begins, np.empty((25, 0)), right).best(gain)
+    table = gain.reshape(5, 5) + 4.0
+    best = max(permutations(range(5)), key=lambda order: table[range(5), order].sum())
+    assert found.sum() == pytest.approx((table[range(5), best] - 4.0).sum())
+    assert is_right.sum() == sum(a == b for a, b in enumerate(best))
+
+
+def test_tracks_belong_to_the_person_they_follow_and_doubles_and_clutter_to_nobody():
+    steps = np.arange(40)
+    walk = np.column_stack([steps, np.full(40, 3), steps * 0.4, np.zeros(40)])
+    double = walk[10:25] + [0, 4, 0, 0.6]
+    clutter = np.column_stack([steps[:20], np.full(20, 9), np.full(20, 8.0), np.full(20, 30.0)])
+    run = prepare(walk, np.concatenate([walk, double, clutter]))
+    step, track, source, _ = run.args[2].of(run.args[3], run.args[4])
+    truth = {3: walk, 7: double, 9: clutter}
+    xy = np.array(
+        [truth[who][np.flatnonzero(truth[who][:, 0] == at)[0], 2:] for at, who in zip(step, source, strict=True)]
+    )
+    _, row, paths = to_trajectories(step, track, xy, 0.2)
+    found = owners(run, paths)[row]
+    assert (found[source == 3] == 3).mean() > 0.95
+    assert (found[np.isin(source, (7, 9))] == -1).all()
