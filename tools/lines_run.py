@@ -12,6 +12,7 @@ from typing import Any
 
 import coverage
 import pytest
+from coverage.exceptions import DataError
 
 #: Python imports this before all else, where PYTHONPATH names its folder.
 SITECUSTOMIZE = "import coverage\n\ncoverage.process_startup()\n"
@@ -94,7 +95,10 @@ class LinesRun:
         lines: dict[str, dict[str, set[int]]] = defaultdict(lambda: defaultdict(set))
         for path in [self._folder / "own", *self._folder.glob("lines.*")]:
             data = coverage.CoverageData(str(path))
-            data.read()
+            try:
+                data.read()
+            except DataError:  # of a process that was killed while it wrote them
+                continue
             for file in filter(lambda name: name.endswith(".py"), data.measured_files()):
                 for line, contexts in data.contexts_by_lineno(file).items():
                     for context in contexts:
