@@ -20,6 +20,9 @@ from mcaptrack.geometry.pinhole import Lens, ground_homography
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
 from mcaptrack.pipeline.refining import Refined, Refiner, Watched
+from mcaptrack.schema import GROUND_PLANE
+from mcaptrack.schema.encodings import PROTOBUF, record_of
+from mcaptrack.sources.cameras import camera_at
 from tests.commands import call, done
 from tests.places import CAMERAS, errors, fused, said, write_log
 from tests.tiers import thorough
@@ -227,12 +230,17 @@ class TestLogs:
             again = mcaptrack.calibrate(path)
         assert (again.written_to, path.read_bytes()) == (None, before)
         assert again.cameras == right[1].cameras
+        assert (right[1].unchanged, again.unchanged, dict(again.corrected)) == ((), ("east",), right[1].corrected)
+        told = done("calibrate", path, "--dry-run").err
+        assert "0 of 4 cameras would be corrected, 1 already: east\n" in told
+        assert "east   corrected already by a shift" in told
         with collected():
             mcaptrack.track(path, camera="east")
             drawn = "/east/ground_plane/view/scene"
             gone = mcaptrack.drop(path, "/east/ground_plane/refined").dropped
             assert gone == ("/east/ground_plane/refined", drawn)  # the outline was that of the corrected plane
-            assert said(mcaptrack.fuse(path), "cameras-disagree")  # type: ignore[arg-type]
+            (line,) = said(mcaptrack.fuse(path), "cameras-disagree")  # type: ignore[arg-type]
+            assert line.endswith(f"is not right; `mcaptrack.calibrate('{path}')` corrects it")
 
     def test_a_new_plane_ends_a_correction(self, right: tuple[Path, mcaptrack.CalibrateResult], tmp_path: Path) -> None:
         path = Path(shutil.copy(right[0], tmp_path / "log.mcap"))
@@ -266,9 +274,15 @@ class TestLogs:
                 "of two cameras, east and north, the log doesn't say which is right; name that",
             ),
             (("--cameras", "east,nowhere"), "has no camera nowhere; it has east, north, south, west"),
-            (("--cameras", "east"), "two cameras with detections and measured ground planes are compared"),
+            (
+                ("--cameras", "east"),
+                "--cameras has east alone; two cameras with detections and measured ground planes are",
+            ),
             (("--reference", "up"), "--reference has up, which is not compared; east, north, south, west are"),
-            (("--clock-offset-s", "up=1"), "--clock-offset-s has up, which is not fused"),
+            (
+                ("--clock-offset-s", "up=1"),
+                "--clock-offset-s has up, which is not compared; east, north, south, west are",
+            ),
             (("--clock-offset-s", "east=1e300"), "a clock is late by a day at most"),
         ],
     )
@@ -278,6 +292,67 @@ class TestLogs:
         assert (told.code, wrong.read_bytes()) == (1, before)
         assert message in told.err
         assert told.err.count("\n") == 1
+
+    def test_a_plane_that_was_replaced_elsewhere_is_used_without_its_old_correction(
+        self, right: tuple[Path, mcaptrack.CalibrateResult], tmp_path: Path
+    ) -> None:
+        """Other software may replace the plane that was given, and leave the correction of the one before."""
+        path = Path(shutil.copy(right[0], tmp_path / "log.mcap"))
+        with log.read(path) as opened:
+            assert camera_at(opened, "/east").ground_plane == "/east/ground_plane/refined"
+            plane, other = (opened.channels[f"/{name}/ground_plane"] for name in ("east", "north"))
+            assert plane.metadata["mcaptrack.digest"] != other.metadata["mcaptrack.digest"]
+            (message,) = opened.messages("/north/ground_plane")
+            with log.extend(opened, drop={plane.topic}) as writer:
+                channel = writer.add_channel(plane.topic, record_of(GROUND_PLANE, PROTOBUF), PROTOBUF, other.metadata)
+                writer.add_message(channel, message.t_ns, message.sequence, message.payload)
+        with log.read(path) as opened:
+            assert "/east/ground_plane/refined" in opened.channels
+            assert camera_at(opened, "/east").ground_plane == "/east/ground_plane"
+
+    def test_a_correction_that_no_longer_holds_is_dropped_and_a_dry_run_says_so(
+        self, right: tuple[Path, mcaptrack.CalibrateResult], tmp_path: Path
+    ) -> None:
+        path = Path(shutil.copy(right[0], tmp_path / "log.mcap"))
+        topic = "/north/ground_plane/refined"
+        with log.read(path) as opened:
+            made, (message,) = opened.channels[right[1].corrected["east"]], opened.messages("/north/ground_plane")
+            how = {**made.metadata, "mcaptrack.input": "/north/ground_plane"}
+            how["mcaptrack.input_digest"] = opened.channels["/north/ground_plane"].metadata["mcaptrack.digest"]
+            with log.extend(opened) as writer:
+                channel = writer.add_channel(topic, record_of(GROUND_PLANE, PROTOBUF), PROTOBUF, how)
+                writer.add_message(channel, message.t_ns, message.sequence, message.payload)
+        before = path.read_bytes()
+        told = done("calibrate", path, "--dry-run").err
+        assert f"would be dropped  {topic}: the camera agrees without it" in told
+        assert path.read_bytes() == before
+        with collected():
+            assert mcaptrack.calibrate(path, dry_run=True).dropped == mcaptrack.calibrate(path).dropped == (topic,)
+        with log.read(path) as opened:
+            assert topic not in opened.channels
+
+    def test_fuse_proposes_to_calibrate_where_a_plane_is_too_far_off_to_compare(self, tmp_path: Path) -> None:
+        path = write_log(tmp_path / "far.mcap", CAMERAS[:3], moved_m={"east": 3.0})
+        told = done("fuse", path).err
+        assert told.count(f"too few to compare it with the others; `mcaptrack calibrate {path} --dry-run` finds") == 3
+        with collected():
+            assert list(mcaptrack.calibrate(path, dry_run=True).corrected) == ["east"]
+
+    def test_cameras_without_boxes_are_left_out_once_and_are_no_reference(self, wrong: Path, tmp_path: Path) -> None:
+        path = Path(shutil.copy(wrong, tmp_path / "log.mcap"))
+        with collected():
+            mcaptrack.drop(path, ["/south/*"])
+            with mcaptrack.open(path) as opened:
+                opened.write("/west/detections", [], replace=True)
+        told = call("calibrate", path)
+        assert told.code == 1
+        assert told.err.count("west is left out") == 1
+        assert "of two cameras, east and north, the log doesn't say which is right" in told.err
+        assert (
+            "--reference has west without any box; east, north have some"
+            in call("calibrate", path, "--reference", "west").err
+        )
+        assert done("calibrate", path, "--reference", "north", "--dry-run").err.count("west is left out") == 1
 
     def test_a_log_of_one_camera_is_refused(self, tmp_path: Path) -> None:
         path = write_log(tmp_path / "one.mcap", CAMERAS[:1])

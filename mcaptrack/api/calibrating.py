@@ -24,7 +24,7 @@ from mcaptrack.api.running import Where, change, warn_stale
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice
-from mcaptrack.pipeline.calibrating import calibrate_cameras, kept_clear, write_corrected
+from mcaptrack.pipeline.calibrating import Changes, calibrate_cameras, changes_of, write_changes
 from mcaptrack.pipeline.refining import Refined
 from mcaptrack.schema.provenance import REFINE
 from mcaptrack.sources.fixed_frame import BoxesRead
@@ -89,8 +89,11 @@ class CalibrateResult:
         What was found about each camera, by name.
     corrected : dict of str to str
         The topics of corrected planes by camera; those that would be written, in a dry run.
+    unchanged : tuple of str
+        Those of the corrected cameras whose planes were in the log already, and so are not written again.
     dropped : tuple of str
-        Topics of earlier corrections that were removed, because the cameras agree without them.
+        Topics of earlier corrections that were removed, because the cameras agree without them; those that would be
+        removed, in a dry run.
     is_dry_run : bool
         Whether nothing was to be written.
     stale : tuple of str
@@ -109,6 +112,7 @@ class CalibrateResult:
     log: Location
     cameras: Mapping[str, CameraCorrection]
     corrected: Mapping[str, str]
+    unchanged: tuple[str, ...]
     dropped: tuple[str, ...]
     is_dry_run: bool
     stale: tuple[str, ...]
@@ -198,8 +202,9 @@ def calibrate(
     def act(opened: logs.Log, target: Path | None, notes: Notes, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
         refined, offset_s, planes = compare(opened)
         before = {topic for topic in opened.channels if pipeline.is_stale(opened, topic)}
-        topics, dropped, is_new = write_corrected(opened, refined, planes, target)
-        found.extend((refined, offset_s, planes, topics, dropped, before))
+        changes = changes_of(opened, refined, planes)
+        is_new = write_changes(opened, changes, target)
+        found.extend((refined, offset_s, planes, changes, before))
         stages = [REFINE] if is_new or target is not None else []
         return "", pipeline.Report(stages=stages)
 
@@ -210,10 +215,10 @@ def calibrate(
             path = as_location(log)
             with logs.read(path) as opened:
                 refined, offset_s, planes = compare(opened)
-                topics = kept_clear(opened, refined)
-            return _result(path, refined, offset_s, planes, topics, is_dry_run=True, warnings=warnings)
+                changes = changes_of(opened, refined, planes)
+            return _result(path, refined, offset_s, planes, changes, is_dry_run=True, warnings=warnings)
         done = change(Where(log, None, None, output, sidecar, force), act, progress, None)
-        refined, offset_s, planes, topics, dropped, before = found
+        refined, offset_s, planes, changes, before = found
         with logs.read(done.log) as opened:
             stale = sorted(
                 topic for topic in opened.channels if topic not in before and pipeline.is_stale(opened, topic)
@@ -222,8 +227,8 @@ def calibrate(
         for topic in stale:
             warn_stale(topic, done.log, named)
     return _result(
-        done.log, refined, offset_s, planes, topics, tuple(dropped), tuple(stale), done.written_to,
-        done.written_because, warnings, done.seconds,
+        done.log, refined, offset_s, planes, changes, tuple(stale), done.written_to, done.written_because, warnings,
+        done.seconds,
     )  # fmt: skip
 
 
@@ -232,8 +237,7 @@ def _result(
     refined: Sequence[Refined],
     offset_s: Mapping[str, float],
     planes: Mapping[str, Any],
-    topics: Mapping[str, str],
-    dropped: tuple[str, ...] = (),
+    changes: Changes,
     stale: tuple[str, ...] = (),
     written_to: Location | None = None,
     written_because: str = "",
@@ -260,8 +264,9 @@ def _result(
     return CalibrateResult(
         log=path,
         cameras={one.name: of(one) for one in refined},
-        corrected=dict(topics),
-        dropped=dropped,
+        corrected=dict(changes.topics),
+        unchanged=changes.unchanged,
+        dropped=changes.dropped,
         is_dry_run=is_dry_run,
         stale=stale,
         written_to=written_to,

@@ -98,16 +98,18 @@ def calibrate(
 
 def _in_short(result: CalibrateResult) -> str:
     would = "would be corrected" if result.is_dry_run else "corrected"
-    count = f"{len(result.corrected)} of {len(result.cameras)} cameras"
-    names = f": {', '.join(result.corrected)}" if result.corrected else ""
-    return f"{count} {would}{names}"
+    new = [name for name in result.corrected if name not in result.unchanged]
+    names = f": {', '.join(new)}" if new else ""
+    before = f", {len(result.unchanged)} already: {', '.join(result.unchanged)}" if result.unchanged else ""
+    return f"{len(new)} of {len(result.cameras)} cameras {would}{names}{before}"
 
 
 def _print(result: CalibrateResult, talk: common.Talk) -> None:
     took = f" in {result.seconds:.1f} s" if result.seconds else ""
     talk.say(f"{result.log}: {_in_short(result)}{took}")
-    lines = [(name, _words(one)) for name, one in result.cameras.items()]
-    lines += [("dropped", f"{topic}: the camera agrees without it") for topic in result.dropped]
+    lines = [(name, _words(one, name in result.unchanged)) for name, one in result.cameras.items()]
+    dropped = "would be dropped" if result.is_dry_run else "dropped"
+    lines += [(dropped, f"{topic}: the camera agrees without it") for topic in result.dropped]
     if result.written_because and result.written_to:
         lines.append(("written", f"the planes are in {result.written_to}: {result.written_because}"))
     width = max(len(name) for name, _ in lines)
@@ -115,7 +117,7 @@ def _print(result: CalibrateResult, talk: common.Talk) -> None:
         talk.say(f"  {name:<{width}}  {words}")
 
 
-def _words(one: CameraCorrection) -> str:
+def _words(one: CameraCorrection, is_unchanged: bool) -> str:
     """Describe what was found about a camera."""
     before = _distances(one.median_before_m, one.p90_before_m)
     if not one.correction:
@@ -123,8 +125,9 @@ def _words(one: CameraCorrection) -> str:
         words = f"as it was: {with_flags(one.why)}{compared}"
     else:
         after = _distances(one.median_after_m, one.p90_after_m)
+        corrected = "corrected already by" if is_unchanged else "corrected by"
         words = (
-            f"corrected by {_IN_WORDS[one.correction]}, which moves feet by {one.moved_m:.2f} m: they are {after} from "
+            f"{corrected} {_IN_WORDS[one.correction]}, which moves feet by {one.moved_m:.2f} m: they are {after} from "
             f"those of the others, and were {before} ({one.pairs:,} compared)"
         )
         words += f"; {one.limit}" if one.limit else ""
@@ -146,6 +149,7 @@ def _as_json(result: CalibrateResult) -> dict[str, Any]:
         "log": str(result.log),
         "cameras": {name: _camera_as_json(one) for name, one in result.cameras.items()},
         "corrected": dict(result.corrected),
+        "unchanged": list(result.unchanged),
         "dropped": list(result.dropped),
         "is_dry_run": result.is_dry_run,
         "stale": list(result.stale),

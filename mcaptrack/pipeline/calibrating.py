@@ -7,7 +7,7 @@ The plane that was given stays as it is, in its own channel. The corrected one s
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,7 +19,7 @@ from mcaptrack.foxglove import views
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.ground_correction import Feet
 from mcaptrack.geometry.plane import GroundPlane, Planes
-from mcaptrack.notices import collected, warn
+from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import describe_origin, may_replace
 from mcaptrack.pipeline.fusing import fusable
 from mcaptrack.pipeline.gathering import Gathered, Source, compared_cameras, read_sources
@@ -75,20 +75,22 @@ def calibrate_cameras(
     for name in reference:
         if name not in chosen:
             raise McaptrackError(f"`reference=` has {name}, which is not compared; {', '.join(chosen)} are")
+    for name in clock_offset_s:
+        if name not in chosen:
+            raise McaptrackError(f"`clock_offset_s=` has {name}, which is not compared; {', '.join(chosen)} are")
+    sources, _, _, _ = read_sources(opened, found, clock_offset_s)
+    cameras = {camera.prefix[1:]: camera for camera in found}
+    sources = [_given(opened, source, cameras[source.view.name], reference) for source in sources]
+    chosen = [one.view.name for one in sources]  # without those that have no messages, which was said
+    if len(chosen) < 2:
+        raise McaptrackError(f"{opened.path}: only {chosen[0]} has boxes; two cameras are compared at least")
+    if lacking := sorted(set(reference) - set(chosen)):
+        raise McaptrackError(f"`reference=` has {', '.join(lacking)} without any box; {', '.join(chosen)} have some")
     if len(chosen) < 3 and not reference:
         raise McaptrackError(
             f"{opened.path}: of two cameras, {' and '.join(chosen)}, the log doesn't say which is right; name that one "
             "with `reference=`"
         )
-    with collected():  # what `fuse` says about cameras that disagree is said here in another way
-        sources, _, _, _ = read_sources(opened, found, clock_offset_s)
-    cameras = {camera.prefix[1:]: camera for camera in found}
-    sources = [_given(opened, source, cameras[source.view.name], reference) for source in sources]
-    lacking = sorted(set(chosen) - {one.view.name for one in sources})
-    for name in lacking:
-        warn(f"{name} is left out: its detections have no messages", "left-out")
-    if len(sources) < 2:
-        raise McaptrackError(f"{opened.path}: only {sources[0].view.name} has boxes; two cameras are compared at least")
     held = {one.view.name: _why_held(opened, cameras[one.view.name], one.view.planes, reference) for one in sources}
     return _in_turns(sources, held, frozenset(reference), clock_offset_s, progress)
 
@@ -103,6 +105,11 @@ def _compared(opened: log.Log, names: Sequence[str]) -> tuple[list[Camera], dict
         if name.strip("/") not in names_of:
             raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(names_of)) or 'none'}")
     wanted = [names_of[name.strip("/")] for name in names]
+    if len(set(wanted)) == 1:
+        raise McaptrackError(
+            f"`cameras=` has {wanted[0]} alone; two cameras with detections and measured ground planes are compared at "
+            "least"
+        )
     chosen, why = fusable(opened, wanted)
     if not chosen:
         if not why or why.endswith(_SINCE):
@@ -216,27 +223,39 @@ def _refiner(
     return Refiner(cameras, len(frames), len(frames) / max(seconds, 1e-9), reference, reach, progress)
 
 
-def kept_clear(opened: log.Log, refined: Sequence[Refined]) -> dict[str, str]:
-    """The topics of corrected planes by camera. Raises McaptrackError if other software recorded one of them."""
-    topics = {one.name: refined_plane(camera_at(opened, f"/{one.name}")) for one in refined if one.model}
+@dataclass(frozen=True)
+class Changes:
+    """The changes of a log that calibrating makes.
+
+    Attributes
+    ----------
+    topics : dict of str to str
+        The topics of corrected planes by camera.
+    new : dict of str to Made
+        The planes that the log does not have yet, by topic.
+    unchanged : tuple of str
+        Cameras whose corrected planes the log has already.
+    dropped : tuple of str
+        Topics of corrections that no longer hold.
+    """
+
+    topics: Mapping[str, str]
+    new: Mapping[str, Made]
+    unchanged: tuple[str, ...]
+    dropped: tuple[str, ...]
+
+
+def changes_of(opened: log.Log, refined: Sequence[Refined], planes: Mapping[str, GroundPlane]) -> Changes:
+    """Return what is to be written and dropped.
+
+    Raises McaptrackError if other software recorded a channel with the name of a corrected plane.
+    """
+    cameras = {one.name: camera_at(opened, f"/{one.name}") for one in refined}
+    topics = {one.name: refined_plane(cameras[one.name]) for one in refined if one.model}
     for topic in topics.values():
         if not may_replace(opened, topic, REFINE):
             raise McaptrackError(f"{opened.path}: {topic} {describe_origin(opened, topic)}, and is not replaced")
-    return topics
-
-
-def write_corrected(
-    opened: log.Log, refined: Sequence[Refined], planes: Mapping[str, GroundPlane], output: Path | None
-) -> tuple[dict[str, str], list[str], bool]:
-    """Write corrected planes into the log, or into a copy, and drop corrections that no longer hold.
-
-    Returns the topics of corrected planes by camera, those that were dropped, and whether the log has changed.
-
-    Raises McaptrackError if other software recorded a channel of that name.
-    """
-    cameras = {one.name: camera_at(opened, f"/{one.name}") for one in refined}
     made: dict[str, Made] = {}
-    topics = kept_clear(opened, refined)
     compared = sorted(one.name for one in refined if one.before is not None)
     for one in refined:
         if not one.model:
@@ -257,19 +276,25 @@ def write_corrected(
         and (topic := refined_plane(cameras[one.name])) in opened.channels
         and may_replace(opened, topic, REFINE)
     ]
-    same = {topic for topic, one in made.items() if _is_there(opened, topic, one)}
-    new = {topic: one for topic, one in made.items() if topic not in same}
-    if new or dropped or output is not None:
-        outlines = {given_plane(cameras[name]) + views.SCENE_SUFFIX for name, topic in topics.items() if topic in new}
-        drop = {*new, *dropped, *(one for one in outlines if one in opened.channels)}
+    unchanged = tuple(name for name, topic in topics.items() if _is_there(opened, topic, made[topic]))
+    new = {topic: made[topic] for name, topic in topics.items() if name not in unchanged}
+    return Changes(topics, new, unchanged, tuple(dropped))
+
+
+def write_changes(opened: log.Log, changes: Changes, output: Path | None) -> bool:
+    """Write corrected planes into the log, or into a copy, and drop those that no longer hold; return if it changed."""
+    is_changed = bool(changes.new or changes.dropped)
+    if is_changed or output is not None:
+        outlines = {plane.provenance.input + views.SCENE_SUFFIX for plane in changes.new.values()}
+        drop = {*changes.new, *changes.dropped, *(one for one in outlines if one in opened.channels)}
         encoding = encoding_for(opened)
-        check_topics({*new}, encoding)
+        check_topics({*changes.new}, encoding)
         with log.extend(opened, output, drop=drop) as writer:
-            for topic, plane in new.items():
+            for topic, plane in changes.new.items():
                 channel = writer.add_channel(topic, plane.record_in(encoding), encoding, plane.provenance.to_metadata())
                 for message in plane.messages_in(encoding):
                     writer.add_message(channel, *message)
-    return topics, dropped, bool(new or dropped)
+    return is_changed
 
 
 def _is_there(opened: log.Log, topic: str, made: Made) -> bool:

@@ -12,12 +12,13 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from mcaptrack import log
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import plane_at
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
+from mcaptrack.location import Location
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import read_named_frames
 from mcaptrack.pipeline.planes import read_planes
@@ -219,18 +220,21 @@ def compared_cameras(
 
 
 def warn_disagreeing(
+    path: Location,
     views: Sequence[CameraView],
     offsets: Sequence[Offset],
     offset_s: Mapping[str, float],
     given: Mapping[str, float],
 ) -> None:
-    """Warn of cameras that disagree with the others."""
+    """Warn of cameras that disagree with the others; ``path`` is that of the log."""
+    correct = call("calibrate", path)
+    farther = f"; {call('calibrate', path, dry_run=True)} finds planes that are farther off" if len(views) > 2 else ""
     for view, offset in zip(views, offsets, strict=True):
         name, taken_s = view.name, offset_s[view.name]
         if offset.compared >= _LEAST and offset.distance_m > _FAR_M:
             warn(
                 f"{name}: feet stand {offset.distance_m:.2f} m from where the other cameras see them (median of "
-                f"{offset.compared}); its ground plane, or theirs, is not right",
+                f"{offset.compared}); its ground plane, or theirs, is not right; {correct} corrects it",
                 "cameras-disagree",
             )
         if taken_s and name not in given:
@@ -248,6 +252,6 @@ def warn_disagreeing(
         if len(views) > 1 and offset.compared < _LEAST:
             warn(
                 f"{name}: only {offset.compared} of its boxes are near people seen by two other cameras, too few to "
-                "compare it with the others",
+                f"compare it with the others{farther}",
                 "other",
             )
