@@ -242,6 +242,18 @@ class TestLogs:
             (line,) = said(mcaptrack.fuse(path), "cameras-disagree")  # type: ignore[arg-type]
             assert line.endswith(f"is not right; `mcaptrack.calibrate('{path}')` corrects it")
 
+    def test_labels_that_are_added_stand_where_the_corrected_plane_has_them(
+        self, right: tuple[Path, mcaptrack.CalibrateResult], tmp_path: Path
+    ) -> None:
+        path, labels = Path(shutil.copy(right[0], tmp_path / "log.mcap")), tmp_path / "labels.txt"
+        labels.write_text("1,1,450,300,100,100,1,-1,-1,-1\n")
+        with collected():
+            mcaptrack.ingest(labels, fps=2, role="truth", camera="east", into=path)
+        with mcaptrack.open(path) as opened:
+            row = opened.array("tracks", "/east/truth")[0]
+        there = homography(path, "/east/ground_plane/refined") @ [499.0, 399.0, 1.0]  # labels count pixels from 1
+        assert (row["x_m"], row["y_m"]) == pytest.approx(there[:2] / there[2], abs=0.05)
+
     def test_a_new_plane_ends_a_correction(self, right: tuple[Path, mcaptrack.CalibrateResult], tmp_path: Path) -> None:
         path = Path(shutil.copy(right[0], tmp_path / "log.mcap"))
         labels, plane = tmp_path / "labels.txt", tmp_path / "plane.txt"
@@ -353,6 +365,23 @@ class TestLogs:
             in call("calibrate", path, "--reference", "west").err
         )
         assert done("calibrate", path, "--reference", "north", "--dry-run").err.count("west is left out") == 1
+
+    @pytest.mark.parametrize("command", ["calibrate", "fuse"])
+    @pytest.mark.parametrize("rows", [0, 1])
+    def test_a_damaged_plane_is_named(self, wrong: Path, tmp_path: Path, rows: int, command: str) -> None:
+        path, topic = Path(shutil.copy(wrong, tmp_path / "log.mcap")), "/east/ground_plane"
+        with log.read(path) as opened:
+            (frame,) = opened.frames(topic, GROUND_PLANE)
+            bad = frame.rows[:rows].copy()
+            bad["h11"] = np.nan
+            channel = opened.channels[topic]
+            with log.extend(opened, drop={topic}) as writer:
+                new = writer.add_channel(topic, record_of(GROUND_PLANE, PROTOBUF), PROTOBUF, channel.metadata)
+                writer.add_message(new, frame.t_ns, 0, GROUND_PLANE.codec.encode(bad))
+        told = call(command, path)
+        assert told.code == 1
+        what = "a homography is 9 finite numbers" if rows else "a ground plane message holds one row, not 0"
+        assert f"{path}: {topic}: {what}" in told.err
 
     def test_a_log_of_one_camera_is_refused(self, tmp_path: Path) -> None:
         path = write_log(tmp_path / "one.mcap", CAMERAS[:1])

@@ -24,7 +24,7 @@ from mcaptrack.api.running import Where, change, warn_stale
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice
-from mcaptrack.pipeline.calibrating import Changes, calibrate_cameras, changes_of, write_changes
+from mcaptrack.pipeline.calibrating import CorrectedPlanes, calibrate_cameras, changes_of, write_changes
 from mcaptrack.pipeline.refining import Refined
 from mcaptrack.schema.provenance import REFINE
 from mcaptrack.sources.fixed_frame import BoxesRead
@@ -90,7 +90,7 @@ class CalibrateResult:
     corrected : dict of str to str
         The topics of corrected planes by camera; those that would be written, in a dry run.
     unchanged : tuple of str
-        Those of the corrected cameras whose planes were in the log already, and so are not written again.
+        Corrected cameras with a plane that the log had already; it is not written again.
     dropped : tuple of str
         Topics of earlier corrections that were removed, because the cameras agree without them; those that would be
         removed, in a dry run.
@@ -237,7 +237,7 @@ def _result(
     refined: Sequence[Refined],
     offset_s: Mapping[str, float],
     planes: Mapping[str, Any],
-    changes: Changes,
+    changes: CorrectedPlanes,
     stale: tuple[str, ...] = (),
     written_to: Location | None = None,
     written_because: str = "",

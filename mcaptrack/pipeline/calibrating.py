@@ -26,11 +26,12 @@ from mcaptrack.pipeline.gathering import Gathered, Source, compared_cameras, rea
 from mcaptrack.pipeline.refining import Refined, Refiner, Watched
 from mcaptrack.pipeline.write import Made, digest_of
 from mcaptrack.schema import GROUND_PLANE, Frame
-from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
+from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import REFINE, Provenance, frame_id_of
 from mcaptrack.sources.cameras import Camera, camera_at, given_plane, provenance_of, refined_plane, scenes_of
 from mcaptrack.sources.cameras import cameras as cameras_of
 from mcaptrack.sources.ingest.sidecar import check_topics, encoding_for
+from mcaptrack.sources.planes import planes_in
 from mcaptrack.transforms.fuse import FootFuser
 
 #: Cameras are compared by at most so many frames.
@@ -129,7 +130,7 @@ def _given(opened: log.Log, source: Source, camera: Camera, reference: Sequence[
     topic = given_plane(camera)
     if source.view.name in reference or topic == camera.ground_plane:
         return source
-    planes = tuple((frame.t_ns, rows_to_plane(frame.rows)) for frame in opened.frames(topic, GROUND_PLANE))
+    planes = tuple(planes_in(opened, topic))
     return source._replace(view=replace(source.view, planes=planes))
 
 
@@ -224,7 +225,7 @@ def _refiner(
 
 
 @dataclass(frozen=True)
-class Changes:
+class CorrectedPlanes:
     """The changes of a log that calibrating makes.
 
     Attributes
@@ -234,7 +235,7 @@ class Changes:
     new : dict of str to Made
         The planes that the log does not have yet, by topic.
     unchanged : tuple of str
-        Cameras whose corrected planes the log has already.
+        Cameras with a corrected plane that the log has already.
     dropped : tuple of str
         Topics of corrections that no longer hold.
     """
@@ -245,7 +246,7 @@ class Changes:
     dropped: tuple[str, ...]
 
 
-def changes_of(opened: log.Log, refined: Sequence[Refined], planes: Mapping[str, GroundPlane]) -> Changes:
+def changes_of(opened: log.Log, refined: Sequence[Refined], planes: Mapping[str, GroundPlane]) -> CorrectedPlanes:
     """Return what is to be written and dropped.
 
     Raises McaptrackError if other software recorded a channel with the name of a corrected plane.
@@ -278,10 +279,10 @@ def changes_of(opened: log.Log, refined: Sequence[Refined], planes: Mapping[str,
     ]
     unchanged = tuple(name for name, topic in topics.items() if _is_there(opened, topic, made[topic]))
     new = {topic: made[topic] for name, topic in topics.items() if name not in unchanged}
-    return Changes(topics, new, unchanged, tuple(dropped))
+    return CorrectedPlanes(topics, new, unchanged, tuple(dropped))
 
 
-def write_changes(opened: log.Log, changes: Changes, output: Path | None) -> bool:
+def write_changes(opened: log.Log, changes: CorrectedPlanes, output: Path | None) -> bool:
     """Write corrected planes into the log, or into a copy, and drop those that no longer hold; return if it changed."""
     is_changed = bool(changes.new or changes.dropped)
     if is_changed or output is not None:

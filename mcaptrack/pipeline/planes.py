@@ -36,11 +36,12 @@ from mcaptrack.pipeline.write import Made, digest_of
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS, Frame, Rows
 from mcaptrack.schema.classes import PERSON, UNKNOWN, is_person
 from mcaptrack.schema.framing import join_frames, thinned
-from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
+from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.calibrations import holds_calibrations, see_ground
 from mcaptrack.sources.cameras import camera_at, lineage, provenance_of
+from mcaptrack.sources.planes import planes_in
 from mcaptrack.transforms import STAGES, Transform
 
 _ASSUME, _ESTIMATE, _CALIBRATE = "assume-ground-plane", "estimate-ground-plane", "calibrate-ground-plane"
@@ -103,8 +104,7 @@ def read_planes(opened: log.Log, prefix: str) -> Planes | None:
     topic = camera_at(opened, prefix).ground_plane
     known = _READ.setdefault(opened, {})
     if topic not in known:
-        frames = opened.frames(topic, GROUND_PLANE) if topic in opened.channels else []
-        known[topic] = [(frame.t_ns, rows_to_plane(frame.rows)) for frame in frames] or None
+        known[topic] = (planes_in(opened, topic) if topic in opened.channels else []) or None
     return known[topic]
 
 

@@ -21,12 +21,12 @@ from mcaptrack.geometry.clocks import seconds_to_ns
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.pipeline.checks import read_frames
 from mcaptrack.pipeline.picture_times import PictureClock, picture_clock
-from mcaptrack.schema import BOX_PX, DETECTIONS, GROUND_PLANE, SIGHTINGS, TRACKS, Frame, Schema
+from mcaptrack.schema import BOX_PX, DETECTIONS, SIGHTINGS, TRACKS, Frame, Schema
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.framing import JoinedFrames, frame_numbers, frame_times, joined_parts
-from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.schema.provenance import FUSE, Provenance
 from mcaptrack.sources.cameras import camera_at, detections_of, provenance_of
+from mcaptrack.sources.planes import planes_in
 from mcaptrack.transforms import STAGES
 from mcaptrack.transforms.fuse import CameraView
 
@@ -162,7 +162,7 @@ def scene_on_pictures(
         topic = detections_of(opened, camera)
         if clock.topic is None or topic is None or camera.ground_plane not in opened.channels:
             continue
-        planes = [(one.t_ns, rows_to_plane(one.rows)) for one in opened.frames(camera.ground_plane, GROUND_PLANE)]
+        planes = planes_in(opened, camera.ground_plane)
         boxes = read_frames(opened, topic, DETECTIONS)
         view = CameraView(name=name, planes=tuple(planes)).with_heights_in(boxes)
         found.append(SceneCamera(number, clock, view, boxes, seconds_to_ns(late_s)))

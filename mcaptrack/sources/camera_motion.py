@@ -12,13 +12,13 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes, scene_planes
-from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, TRACKS, Frame
+from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.camera_motion import frames_to_path
 from mcaptrack.schema.framing import join_frames, split_rows
-from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.schema.provenance import Provenance, frame_id_of
 from mcaptrack.sources.cameras import camera_at, lineage, provenance_of
 from mcaptrack.sources.moved_tracks import in_frame
+from mcaptrack.sources.planes import planes_in
 from mcaptrack.transforms import STAGES
 from mcaptrack.transforms.sort.tracker import used_path
 
@@ -87,7 +87,7 @@ def read_ground_truth(
     path, _ = path_of(opened, prefix, tracks_topic(prefix), provenances, frames)
     if path is None or camera.ground_plane not in opened.channels:
         return truth
-    planes = [(frame.t_ns, rows_to_plane(frame.rows)) for frame in opened.frames(camera.ground_plane, GROUND_PLANE)]
+    planes = planes_in(opened, camera.ground_plane)
     return in_metres(truth, planes, path)
 
 

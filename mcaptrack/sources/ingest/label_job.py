@@ -19,10 +19,10 @@ from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
 from mcaptrack.geometry.plane import GroundPlane, Point
 from mcaptrack.notices import warn
-from mcaptrack.schema import GROUND_PLANE, Frame
-from mcaptrack.schema.ground_plane import rows_to_plane
+from mcaptrack.schema import Frame
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.calibrations import frame_of
+from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.corrections import CORRECTED
 from mcaptrack.sources.foreign import holds_pictures
 from mcaptrack.sources.ingest.correcting import warn_uncovered, with_new_ids
@@ -37,6 +37,7 @@ from mcaptrack.sources.ingest.labels.camera import (
 )
 from mcaptrack.sources.ingest.labels.formats import Format, Labels, Role
 from mcaptrack.sources.ingest.labels.timeline import MAX_FRAMES, Timeline, count_frames
+from mcaptrack.sources.planes import planes_in
 from mcaptrack.sources.video import SEQINFO, find_seqinfo
 
 _SDD_FPS: Final = Fraction(30)
@@ -138,10 +139,10 @@ class LabelJob(IngestJob):
 
     def _measured_plane(self) -> GroundPlane | None:
         """The ground plane of the camera in the log, if it was measured and doesn't change."""
-        topic = f"{self.prefix}/ground_plane"
+        topic = "" if self.into is None else camera_at(self.into, self.prefix).ground_plane
         if self.into is None or topic not in self.into.channels:
             return None
-        planes = [rows_to_plane(frame.rows) for frame in self.into.frames(topic, GROUND_PLANE)]
+        planes = [plane for _, plane in planes_in(self.into, topic)]
         return planes[0] if len(planes) == 1 and not planes[0].assumed else None
 
     def _of_pictures(self, into: log.Log, topic: str) -> Timeline:
