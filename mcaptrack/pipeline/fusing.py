@@ -182,7 +182,7 @@ def _fuse(
         gathered, feet, offsets, offset_s, shared = compared_cameras(sources, _feet_of(fuser), clock_offset_s)
         fuser = _with_views(fuser, feet)
         if shared.are_strangers and not is_asked and not is_again:
-            raise McaptrackError(f"{shared}; {call('fuse', opened.path)} fuses them nevertheless")
+            raise McaptrackError(f"{shared}; `mcaptrack.fuse` fuses them nevertheless")
         collectors = [FrameCollector(schema) for schema in topics.values()]
         results: Iterator[tuple[Frame, ...]]
         if FUSION.is_built_in(type(fuser)):
