@@ -362,7 +362,7 @@ class TestFailuresOfThePaper:
 
     @every_profile
     def test_spurious_track(self, profile):
-        """A gust in a tree: for 2.4 s false detections jump about under one id. At most half remain; by likelihood one in twenty."""
+        """A gust in a tree: for 2.4 s false detections jump about under one id. At most half remain; by likelihood none."""
         kept = 0
         for seed in range(20):
             leaps = np.random.default_rng(seed).uniform(-2.5, 2.5, (60, 2))
@@ -376,7 +376,7 @@ class TestFailuresOfThePaper:
             kept += sum(len(path) for path in found if next(iter(path.values()))[1] > 15)
             walker = {tick: (0.4 * tick, 0.0) for tick in range(40)}
             assert any(along(path, walker) for path in found)
-        assert kept <= (0.05 if profile == DEFAULT else 0.5) * 20 * 6
+        assert kept <= (0 if profile == DEFAULT else 0.5 * 20 * 6)
 
     def test_noisy_track(self):
         """A shaking camera: predictions from the re-tracked path jump less from step to step than those from the raw one."""

@@ -17,7 +17,7 @@ from mcaptrack.transforms.retrack.false_tracks import track_log_odds
 from mcaptrack.transforms.retrack.identity_swaps import find_encounters, resolve_swaps
 from mcaptrack.transforms.retrack.linking import candidates, link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
-from tests.references.offline import Motion, Path, encounters, exchanged, links, person_log_odds
+from tests.references.offline import PEOPLE, Motion, Path, encounters, exchanged, links, person_log_odds
 from tests.references.online import OnlineTracker
 from tests.tiers import one_in
 from tests.worlds import walk
@@ -163,7 +163,7 @@ def test_the_distance_within_which_a_track_is_a_duplicate():
         return float(track_log_odds(MODEL, out, smoothed, 0.4)[1]), person_log_odds(MOTION, paths)[2]
 
     near, far = odds(1.1), odds(1.3)
-    assert far[0] - near[0] == pytest.approx(1.993)  # the log odds of a track beside a person
+    assert far[0] - near[0] == pytest.approx(-PEOPLE["duplicate"])  # the log odds of a track beside a person
     assert near == pytest.approx(near[::-1])
     for side in (0, 1):
         compare(lambda more, s=side: odds(1.0 + more)[s] < sum(near + far) / 4, lambda more: more < 0.2, 0.0, 1.0)

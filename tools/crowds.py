@@ -161,7 +161,7 @@ def faults(rng: np.random.Generator) -> Corruption:
     longest = float(np.exp(rng.uniform(np.log(0.8), np.log(10.0))))
     merge_m = maybe(0.2, 0.5, 1.2)
     return Corruption(
-        noise_m=float(rng.uniform(0.04, 0.35)),
+        noise_m=float(np.exp(rng.uniform(np.log(0.01), np.log(0.4)))),
         noise_s=maybe(0.3, 0.4, 2.0),
         seen_s=float(np.exp(rng.uniform(np.log(1.8), np.log(30.0)))),
         hidden_s=(0.4, longest),

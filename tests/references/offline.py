@@ -272,8 +272,6 @@ def exchanged(motion: Motion, paths: dict[int, Path], ids: dict[int, dict[int, i
 def person_log_odds(motion: Motion, paths: dict[int, Path]) -> dict[int, float]:
     """For each track the log odds that it is a person."""
     where = {name: motion.smoothed(path) for name, path in paths.items()}
-    counts = sorted(len(path) for path in paths.values() for _ in path)
-    usual = log(min(max(counts[(len(counts) - 1) // 2], 5), 100))
     out = {}
     for name, path in paths.items():
         states = where[name]
@@ -290,10 +288,6 @@ def person_log_odds(motion: Motion, paths: dict[int, Path]) -> dict[int, float]:
             "log roughness": log(off / count / (2 * motion.noise_m**2) + 0.1),
             "observed": count / length,
             "duplicate": max((beside(states, other) for who, other in where.items() if who != name), default=0.0),
-            "log usual count": usual,
-            "count and usual count": log(count) * usual,
-            "log short extent": log(min(extent, 2.0) + 0.3),
-            "short extent and count": log(min(extent, 2.0) + 0.3) * log(count),
         }
         out[name] = sum(PEOPLE[one] * value for one, value in features.items()) + PERSON_BIAS
     return out

@@ -20,24 +20,7 @@ _DUPLICATE_M: Final = 1.2
 #: A track lies inside another if it begins more than so many steps after it and ends as many before it.
 _INSIDE_STEPS: Final = 3
 
-#: The usual number of rows of the tracks of a log is at least and at most so large, and an extent beyond so many metres
-#: is that of a person in motion.
-_USUAL_COUNT: Final = (5.0, 100.0)
-_WALKED_M: Final = 2.0
-
-FEATURES: Final = (
-    "log length",
-    "log count",
-    "log extent",
-    "log speed",
-    "log roughness",
-    "observed",
-    "duplicate",
-    "log usual count",
-    "count and usual count",
-    "log short extent",
-    "short extent and count",
-)
+FEATURES: Final = ("log length", "log count", "log extent", "log speed", "log roughness", "observed", "duplicate")
 #: Weight of each feature as a log odds ratio, and the log odds without any.
 _WEIGHTS, _FITTED = weights_of("people", FEATURES)
 _BIAS: Final = float(_FITTED["bias"])
@@ -59,11 +42,7 @@ def track_log_odds(model: MotionModel, trajectories: Trajectories, smoothed: Sta
 
 
 def features(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
-    """The features that distinguish people from false tracks, (K, F): see ``FEATURES``.
-
-    Where most tracks of a log are long, a short one is more likely false than where a tracker loses everybody: the
-    usual number of rows is that of the track to which the median row belongs.
-    """
+    """The features that distinguish people from false tracks, (K, F): see ``FEATURES``."""
     first, last = trajectories.first[:-1], trajectories.first[1:] - 1
     length = last - first + 1
     observed = np.isfinite(trajectories.xy_m[:, 0])
@@ -75,30 +54,18 @@ def features(model: MotionModel, trajectories: Trajectories, smoothed: State, st
     roughness = np.add.reduceat((residual**2).sum(axis=1), first) / count / (2 * model.noise_m**2)
     speed = np.hypot(smoothed.mean[:, 2], smoothed.mean[:, 3])
     mean_speed = np.add.reduceat(speed, first) / length
-    log_count, log_short = np.log(count), np.log(np.minimum(extent, _WALKED_M) + 0.3)
-    usual = np.full(len(count), np.log(np.clip(_usual(count), *_USUAL_COUNT)))
     return np.stack(
         [
             np.log(length * step_s),
-            log_count,
+            np.log(count),
             np.log(extent + 0.3),
             np.log(mean_speed + 0.1),
             np.log(roughness + 0.1),
             count / length,
             _duplicate_share(trajectories, xy),
-            usual,
-            log_count * usual,
-            log_short,
-            log_short * log_count,
         ],
         axis=1,
     )
-
-
-def _usual(count: Floats) -> float:
-    """The number of rows of the track to which the median row belongs, of tracks with ``count`` (K,) rows."""
-    ordered = np.sort(count)
-    return float(ordered[np.searchsorted(np.cumsum(ordered), ordered.sum() / 2)])
 
 
 def scored_confidence(xy_m: Floats, first: Ints, score: Floats, observed: Bools, usual: float, step_s: float) -> Floats:
