@@ -157,7 +157,7 @@ def said(
     views = [CameraView(name="a", planes=()), *[CameraView(name="b", planes=())] * others]
     with collected() as notices:
         gathering.warn_disagreeing(
-            views, [offset, *offsets_of((0.0, 60)) * others], {"a": taken_s, "b": 0.0}, given or {}
+            "a.mcap", views, [offset, *offsets_of((0.0, 60)) * others], {"a": taken_s, "b": 0.0}, given or {}
         )
     return [(notice.code, notice.message) for notice in notices]
 
