@@ -17,12 +17,13 @@ from hypothesis import strategies as st
 
 import mcaptrack
 from mcaptrack import McaptrackError
+from mcaptrack.geometry.neighbours import squared_sigmas
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
 from mcaptrack.schema import SIGHTINGS, Frame
 from mcaptrack.testing import check_transform
 from mcaptrack.transforms.fuse import CameraView, FootFuser, agreement
-from mcaptrack.transforms.fuse.grouping import Places, distances, group, means
+from mcaptrack.transforms.fuse.grouping import Places, group, means
 from mcaptrack.transforms.fuse.joined import places_of
 from tests.places import CAMERAS, HEIGHT, NS, PEOPLE, SECONDS, WIDTH, errors, fused, said, write_log
 from tests.references.joining import joined
@@ -437,7 +438,7 @@ def test_distances_are_those_of_mahalanobis() -> None:
     cov = np.array([[0.5, 0.2], [0.2, 0.3]])
     for x, y in itertools.product((-1.0, 0.0, 0.4), (0.0, 2.0)):
         way = np.array([x, y])
-        found = distances(*(np.array([value]) for value in (x, y, 0.5, 0.2, 0.3)))
+        found = squared_sigmas(*(np.array([value]) for value in (x, y, 0.5, 0.2, 0.3)))
         assert found[0] == pytest.approx(way @ np.linalg.inv(cov) @ way)
 
 
@@ -550,7 +551,7 @@ class TestAgreement:
         frames, fuser, offset_ns = self.frames(seed), self.fuser(), [0, 30_000_000, 0, 10_000_000]
         for taken_ns in (offset_ns, ()):
             rates, false, shared, off, late = self.slowly(frames, fuser, taken_ns or [0] * 4)
-            views, offsets, found = agreement.compare(frames, fuser, taken_ns)
+            views, offsets, found = agreement.compare(fuser.joined(frames), fuser.views, taken_ns)
             assert tuple(found) == shared
             for c, (view, offset) in enumerate(zip(views, offsets, strict=True)):
                 assert view.detects == pytest.approx(rates[c])
@@ -570,7 +571,7 @@ class TestAgreement:
         assert f"of {expected} people that two cameras should see, two see {seen}; " in str(shared)
 
     def test_nothing_says_nothing(self) -> None:
-        views, offsets, shared = agreement.compare([], self.fuser())
+        views, offsets, shared = agreement.compare([], self.fuser().views)
         assert shared == (0, 0)
         assert [view.false_share for view in views] == pytest.approx([0.1, 0.2, 0.3, 0.4])
         assert views[0].detects == pytest.approx((0.2, 0.5, 0.6, 0.8))

@@ -136,7 +136,7 @@ def test_clocks_are_set_one_at_a_time_the_worst_first(late, given, offset_s, cal
         starts.append([sum(len(block.frames) for block in blocks)])
         return views, offsets_of(*((one, 99) for one in late[len(taken) - 1])), Shared(9, 9)
 
-    monkeypatch.setattr(gathering, "compare_joined", compare)
+    monkeypatch.setattr(gathering, "compare", compare)
     sources = [source("a", np.arange(2, 8, 0.5)), source("b", np.arange(2, 8, 0.5), plane=PLANES[1])]
     gathered, fuser, offsets, found, shared = gathering.compared_cameras(sources, FootFuser(), given)
     assert found == pytest.approx(offset_s)

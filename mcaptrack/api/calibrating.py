@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
@@ -15,22 +15,19 @@ from mcaptrack.api.common import (
     PathLike,
     Progress,
     as_location,
+    clock_offsets,
     no_progress,
     split_names,
     warn_unused,
     warnings_about,
 )
 from mcaptrack.api.running import Where, change, warn_stale
-from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice
 from mcaptrack.pipeline.calibrating import CorrectedPlanes, calibrate_cameras, changes_of, write_changes
 from mcaptrack.pipeline.refining import Refined
 from mcaptrack.schema.provenance import REFINE
 from mcaptrack.sources.fixed_frame import BoxesRead
-
-#: The largest offset of a clock, a day: more is no offset, but another recording.
-_MOST_OFFSET_S: Final = 86_400.0
 
 
 @dataclass(frozen=True)
@@ -186,10 +183,7 @@ def calibrate(
     """
     names = split_names("cameras", cameras if isinstance(cameras, str) else cameras or None)
     right = split_names("reference", reference if isinstance(reference, str) else reference or None)
-    offsets = {name.strip("/"): float(value) for name, value in (clock_offset_s or {}).items()}
-    for name, value in offsets.items():
-        if not abs(value) <= _MOST_OFFSET_S:
-            raise McaptrackError(f"`clock_offset_s=` has {value:g} s for {name}; a clock is late by a day at most")
+    offsets = clock_offsets(clock_offset_s)
 
     def compare(opened: logs.Log) -> Any:
         def report(done: int, total: int) -> None:

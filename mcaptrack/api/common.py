@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
@@ -22,6 +22,8 @@ Progress = Callable[[str, float, float | None], None]
 
 #: Where routine notes go ("/camera/tracks is missing: running track"): INFO, and DEBUG for details.
 _LOGGER: Final = logging.getLogger("mcaptrack")
+#: The largest offset of a clock, a day: more is no offset, but another recording.
+_MOST_OFFSET_S: Final = 86_400.0
 
 
 def no_progress(stage: str, done: float, total: float | None) -> None:
@@ -99,6 +101,18 @@ def split_names(parameter: str, given: str | Sequence[str] | None) -> tuple[str,
     if not names or not all(name.strip("/") for name in names):
         raise McaptrackError(f"`{parameter}=` has an empty name, in {given!r:.40}")
     return names
+
+
+def clock_offsets(given: Mapping[str, float] | None) -> dict[str, float]:
+    """Return the offsets of clocks in seconds, by the bare names of cameras.
+
+    Raises McaptrackError for more than a day, and for NaN.
+    """
+    offsets = {name.strip("/"): float(value) for name, value in (given or {}).items()}
+    for name, value in offsets.items():
+        if not abs(value) <= _MOST_OFFSET_S:
+            raise McaptrackError(f"`clock_offset_s=` has {value:g} s for {name}; a clock is late by a day at most")
+    return offsets
 
 
 def log_output(path: PathLike, source: Location) -> Path:

@@ -9,7 +9,7 @@ from typing import Final
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import Notes, PathLike, Progress, no_progress, split_names
+from mcaptrack.api.common import Notes, PathLike, Progress, clock_offsets, no_progress, split_names
 from mcaptrack.api.running import RunResult, Where, change, transform_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.fixed_frame import BoxesRead
@@ -19,8 +19,6 @@ from mcaptrack.transforms.protocol import LARGEST
 
 #: The parameters of the usual fuser.
 _OPTIONS: Final = ("max_sigma", "max_distance_m", "min_score", "noise", "noise_m")
-#: The largest offset of a clock, a day: more is no offset, but another recording.
-_MOST_OFFSET_S: Final = 86_400.0
 
 
 @checked(
@@ -107,10 +105,7 @@ def fuse(
     values = dict(zip(_OPTIONS, (max_sigma, max_distance_m, min_score, noise, noise_m), strict=True))
     changed = {name: value for name, value in values.items() if value != getattr(FootFuser, name)}
     chosen = transform_of(FUSION.name, fuser, changed)
-    offsets = {name.strip("/"): float(value) for name, value in (clock_offset_s or {}).items()}
-    for name, value in offsets.items():
-        if not abs(value) <= _MOST_OFFSET_S:
-            raise McaptrackError(f"`clock_offset_s=` has {value:g} s for {name}; a clock is late by a day at most")
+    offsets = clock_offsets(clock_offset_s)
     if not to.strip("/") or not to.isprintable() or "/" in to.strip("/"):
         raise McaptrackError(f"`to={to!r}` is no name of a scene; give one such as world")
 

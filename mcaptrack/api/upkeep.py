@@ -21,6 +21,7 @@ from mcaptrack.api.common import (
 )
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_overwrite
+from mcaptrack.foxglove.views import SCENE_SUFFIX
 from mcaptrack.location import Location, local_name
 from mcaptrack.log import CheckResult, Finding
 from mcaptrack.notices import Notice
@@ -292,7 +293,7 @@ def _chosen(opened: logs.Log, patterns: Sequence[str]) -> set[str]:
     made = {topic: Provenance.from_metadata(channel.metadata) for topic, channel in opened.channels.items()}
     # The outline of a corrected plane is drawn as the view of the plane that was given.
     outlines = {
-        f"{provenance.input}/view/scene"
+        provenance.input + SCENE_SUFFIX
         for topic in chosen
         if (provenance := made[topic]) and provenance.transform == REFINE
     }

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from mcaptrack.cli import common
 from mcaptrack.cli.flags import with_flags
-from mcaptrack.cli.fuse import offsets_of
+from mcaptrack.cli.fuse import ClockOffsets, offsets_of
 from mcaptrack.cli.many import LogWork, process, takes_many
 
 if TYPE_CHECKING:
@@ -40,15 +40,7 @@ def calibrate(
             show_default="what most cameras agree on",
         ),
     ] = None,
-    clock_offset_s: Annotated[
-        list[str] | None,
-        common.option(
-            "--clock-offset-s",
-            metavar="CAMERA=SECONDS",
-            help="How many seconds the times of a camera are late, as in front=0.3; 0 for none.",
-            show_default="estimated from people who walk",
-        ),
-    ] = None,
+    clock_offset_s: ClockOffsets = None,
     dry_run: Annotated[bool, common.option("--dry-run", help="Only compare; write nothing.")] = False,
     output: common.Output = None,
     sidecar: common.Sidecar = None,

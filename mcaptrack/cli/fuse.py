@@ -17,6 +17,17 @@ _FIELDS: Final = {field.name: field for field in fields(FootFuser)}
 _JOINING: Final = "Joining of boxes"
 
 
+ClockOffsets = Annotated[
+    list[str] | None,
+    common.option(
+        "--clock-offset-s",
+        metavar="CAMERA=SECONDS",
+        help="How many seconds the times of a camera are late, as in front=0.3; 0 for none.",
+        show_default="estimated from people who walk",
+    ),
+]
+
+
 def _number(name: str) -> Any:
     """Return the option for a parameter of the fuser."""
     return option_of(_FIELDS[name], f"--{name.replace('_', '-')}", _JOINING)
@@ -30,15 +41,7 @@ def fuse(
         str | None,
         common.option("--cameras", metavar="A,B", help="Cameras to fuse.", show_default="all with a ground plane"),
     ] = None,
-    clock_offset_s: Annotated[
-        list[str] | None,
-        common.option(
-            "--clock-offset-s",
-            metavar="CAMERA=SECONDS",
-            help="How many seconds the times of a camera are late, as in front=0.3; 0 for none.",
-            show_default="estimated from people who walk",
-        ),
-    ] = None,
+    clock_offset_s: ClockOffsets = None,
     fuser: Annotated[str, chooser("fuser")] = "feet",
     max_sigma: Annotated[float, _number("max_sigma")] = FootFuser.max_sigma,
     max_distance_m: Annotated[float, _number("max_distance_m")] = FootFuser.max_distance_m,

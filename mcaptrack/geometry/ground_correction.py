@@ -14,6 +14,7 @@ from typing import Final, NamedTuple, Self
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Indices, Ints
+from mcaptrack.geometry.neighbours import squared_sigmas
 from mcaptrack.geometry.pinhole import Lens, ground_homography
 
 #: Corrections by name, with how many of the generators below each uses: a later one contains the earlier ones.
@@ -117,16 +118,10 @@ def pair(feet: Feet, places: Feet, reach_m: float, gate: float = np.inf) -> Pair
     at = np.flatnonzero(np.isfinite(distance))
     at = at[back[nearest[at]] == at]
     to = nearest[at]
-    sigmas = np.sqrt(_squared(feet.xy_m[at] - places.xy_m[to], feet.cov[at] + places.cov[to]))
+    apart, cov = feet.xy_m[at] - places.xy_m[to], feet.cov[at] + places.cov[to]
+    sigmas = np.sqrt(squared_sigmas(*apart.T, *cov.T))
     fits = sigmas <= gate
     return Paired(at[fits], to[fits], distance[at][fits], sigmas[fits])
-
-
-def _squared(apart: Floats, cov: Floats) -> Floats:
-    x, y = apart.T
-    xx, xy, yy = cov.T
-    out: Floats = (yy * x * x - 2 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
-    return out
 
 
 def loss(feet: Feet, places: Feet, frames: int) -> Floats:

@@ -1,4 +1,4 @@
-"""Pairs of points that are near each other. Letters: N points, P pairs."""
+"""Pairs of points that are near each other, and how far apart they are. Letters: N points, P pairs."""
 
 from __future__ import annotations
 
@@ -45,3 +45,9 @@ def near_pairs(group: Ints, xy: Floats, distance: float) -> tuple[Ints, Ints]:
         first.append(a[near])
         second.append(b[near])
     return np.concatenate(first), np.concatenate(second)
+
+
+def squared_sigmas(x: Floats, y: Floats, xx: Floats, xy: Floats, yy: Floats) -> Floats:
+    """Squared Mahalanobis distances (P,) of differences x and y, each with its covariance xx, xy, yy, (P,) each."""
+    out: Floats = (yy * x * x - 2 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
+    return out

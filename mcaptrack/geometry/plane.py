@@ -15,6 +15,7 @@ from mcaptrack.geometry.affine import IDENTITY, compose, invert
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.pinhole import Lens
+from mcaptrack.geometry.ragged import run_starts
 
 Point = Literal["foot", "center"]
 
@@ -127,6 +128,13 @@ def plane_at(planes: Planes, t_ns: int) -> GroundPlane | None:
     if not planes:
         return None
     return planes[max(bisect_right(planes, t_ns, key=lambda one: one[0]) - 1, 0)][1]
+
+
+def runs_of_planes(planes: Planes, times: Sequence[int]) -> list[tuple[int, int]]:
+    """The first of each run of rising times (F,) with one plane, and the one after its last."""
+    valid = np.array([id(plane_at(planes, t_ns)) for t_ns in times])
+    first = np.flatnonzero(run_starts(valid)).tolist()
+    return list(zip(first, [*first[1:], len(times)], strict=True))
 
 
 def moved_planes(planes: Planes, path: CameraPath | None) -> Planes:

@@ -16,8 +16,8 @@ from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.geometry.plane import plane_at
-from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
+from mcaptrack.geometry.plane import runs_of_planes
+from mcaptrack.geometry.ragged import group_index, ragged_range
 from mcaptrack.location import Location
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import read_named_frames
@@ -27,7 +27,7 @@ from mcaptrack.schema import DETECTIONS, SIGHTINGS, Frame, Rows
 from mcaptrack.schema.framing import frame_times, split_rows
 from mcaptrack.schema.provenance import frame_id_of
 from mcaptrack.sources.cameras import Camera, detections_of
-from mcaptrack.transforms.fuse import CameraView, FootFuser, Joined, Offset, Shared, compare_joined
+from mcaptrack.transforms.fuse import CameraView, FootFuser, Joined, Offset, Shared, compare
 
 #: The frame of the metres, if the ground planes name none.
 _FRAME: Final = "map"
@@ -116,11 +116,9 @@ class Gathered:
         frame, rows = group_index(counts), DETECTIONS.joined([one.rows for one in frames])
         noise_m, xywh = np.hypot(self._noise_m, _PACE_M_PER_S * away_s)[frame], columns_to_boxes(rows)
         times, ends = np.array([one.t_ns for one in frames]), np.cumsum(counts).tolist()
-        planes = np.array([id(plane_at(source.view.planes, one.t_ns)) for one in frames])
-        first = np.flatnonzero(run_starts(planes)).tolist()
         places = [
             source.view.places(xywh[part], int(times[low]), self._noise, noise_m[part])
-            for low, high in zip(first, [*first[1:], len(frames)], strict=True)
+            for low, high in runs_of_planes(source.view.planes, times.tolist())
             for part in [slice(ends[low] - counts[low], ends[high - 1])]
         ]
         xy_m, cov = (np.concatenate(columns) for columns in zip(*places, strict=True))
@@ -203,7 +201,7 @@ def compared_cameras(
         part = (frame for number, frame in enumerate(gathered) if number // 2 % every == 0)
         blocks = gathered.joined(fuser, keeps=True) if every == 1 else fuser.joined(part)
         taken_ns = [round(offset_s[one.view.name] * NS_PER_S) for one in sources]
-        views, offsets, shared = compare_joined(blocks, fuser.views, taken_ns)
+        views, offsets, shared = compare(blocks, fuser.views, taken_ns)
         late = {
             view.name: round(offset.late_s, 3)
             for view, offset in zip(views, offsets, strict=True)

@@ -1,8 +1,8 @@
 """Detections of one scene from those of several cameras."""
 
-from mcaptrack.transforms.fuse.agreement import Offset, Shared, compare, compare_joined
+from mcaptrack.transforms.fuse.agreement import Offset, Shared, compare
 from mcaptrack.transforms.fuse.fuser import FootFuser
 from mcaptrack.transforms.fuse.joined import Joined
 from mcaptrack.transforms.fuse.view import CameraView
 
-__all__ = ["CameraView", "FootFuser", "Joined", "Offset", "Shared", "compare", "compare_joined"]
+__all__ = ["CameraView", "FootFuser", "Joined", "Offset", "Shared", "compare"]

@@ -14,8 +14,6 @@ import numpy as np
 from mcaptrack.geometry.arrays import Floats, Indices, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.ragged import group_index, table_of
-from mcaptrack.schema import Frame
-from mcaptrack.transforms.fuse.fuser import FootFuser
 from mcaptrack.transforms.fuse.grouping import Places, means
 from mcaptrack.transforms.fuse.joined import Joined, places_of
 from mcaptrack.transforms.fuse.view import SHARES, CameraView, Views
@@ -75,16 +73,16 @@ class Offset(NamedTuple):
 
 
 def compare(
-    frames: Iterable[Frame], fuser: FootFuser, offset_ns: Sequence[int] = ()
+    blocks: Iterable[Joined], views: Views, offset_ns: Sequence[int] = ()
 ) -> tuple[tuple[CameraView, ...], tuple[Offset, ...], Shared]:
     """Estimate how often each camera detects people and how often its boxes are false, and its offset.
 
     Parameters
     ----------
-    frames : iterable of Frame
-        Sightings, in order of time.
-    fuser : FootFuser
-        What groups them, with the views of the cameras.
+    blocks : iterable of Joined
+        Sightings with their groups, in order of time (``FootFuser.joined``).
+    views : sequence of CameraView
+        The cameras.
     offset_ns : sequence of int
         What was taken off the times of each camera already, in ns; nothing by default.
 
@@ -97,13 +95,6 @@ def compare(
     shared : Shared
         How many people two cameras should see, and do see.
     """
-    return compare_joined(fuser.joined(frames), fuser.views, offset_ns)
-
-
-def compare_joined(
-    blocks: Iterable[Joined], views: Views, offset_ns: Sequence[int] = ()
-) -> tuple[tuple[CameraView, ...], tuple[Offset, ...], Shared]:
-    """Compare cameras as ``compare`` does, by boxes that are joined already (F frames in a block)."""
     count = len(views)
     offset_ns = offset_ns or [0] * count
     hits = np.array([view.detects for view in views]).reshape(count, -1) * _PRIOR

@@ -7,6 +7,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.neighbours import squared_sigmas
 from mcaptrack.geometry.ragged import group_index, ragged_range
 
 #: Pairs are looked for within a little more than their largest distance, which is compared exactly afterwards: this
@@ -27,12 +28,6 @@ class Places(NamedTuple):
         a, b, c = inverse.T
         x, y = self.xy_m.T
         return inverse, np.stack([a * x + b * y, b * x + c * y], axis=-1)
-
-
-def distances(x: Floats, y: Floats, xx: Floats, xy: Floats, yy: Floats) -> Floats:
-    """Squared Mahalanobis distances of differences, each with its covariance."""
-    out: Floats = (yy * x * x - 2 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
-    return out
 
 
 def group(camera: Ints, places: Places, gate: float, farthest_m: float, part: Ints | None = None) -> Ints:
@@ -57,11 +52,11 @@ def group(camera: Ints, places: Places, gate: float, farthest_m: float, part: In
     """
     count = len(camera)
     part = np.zeros(count, np.int64) if part is None else part
-    first, second = near_pairs(places.xy_m, part, farthest_m)
+    first, second = pairs_along_x(places.xy_m, part, farthest_m)
     x, y = (places.xy_m[first] - places.xy_m[second]).T
     may = (camera[first] != camera[second]) & (x * x + y * y <= farthest_m**2)
     first, second, x, y = first[may], second[may], x[may], y[may]
-    distance = distances(x, y, *(places.cov[first] + places.cov[second]).T)
+    distance = squared_sigmas(x, y, *(places.cov[first] + places.cov[second]).T)
     fits = np.flatnonzero(distance <= gate)
     order = fits[np.lexsort((second[fits], first[fits], distance[fits]))]
     # Numbers of Python, because a step concerns two groups and NumPy takes longer for so few.
@@ -90,7 +85,7 @@ def group(camera: Ints, places: Places, gate: float, farthest_m: float, part: In
     return _dissolved(camera, places, of, gate, farthest_m, part)
 
 
-def near_pairs(xy_m: Floats, part: Ints, farthest_m: float) -> tuple[Ints, Ints]:
+def pairs_along_x(xy_m: Floats, part: Ints, farthest_m: float) -> tuple[Ints, Ints]:
     """Pairs (P,) of places of one part that are at most so far apart along the first axis, the lower number first."""
     order = np.lexsort((xy_m[:, 0], part))
     x, part = xy_m[order, 0], part[order]
@@ -117,7 +112,7 @@ def _dissolved(camera: Ints, places: Places, of: Ints, gate: float, farthest_m: 
     centre = means(places, of, count)
     part_of = np.zeros(count, np.int64)
     part_of[of] = part
-    one, other = near_pairs(centre.xy_m, part_of, 2 * farthest_m)
+    one, other = pairs_along_x(centre.xy_m, part_of, 2 * farthest_m)
     x, y = (centre.xy_m[one] - centre.xy_m[other]).T
     near = x * x + y * y <= (2 * farthest_m) ** 2
     one, other = np.concatenate([one[near], other[near]]), np.concatenate([other[near], one[near]])
@@ -129,7 +124,7 @@ def _dissolved(camera: Ints, places: Places, of: Ints, gate: float, farthest_m: 
     begins = np.cumsum(size) - size
     box, to = by_group[ragged_range(begins[one], size[one])], np.repeat(other, size[one])
     apart = places.xy_m[box] - centre.xy_m[to]
-    away = distances(*apart.T, *(places.cov[box] + centre.cov[to]).T)
+    away = squared_sigmas(*apart.T, *(places.cov[box] + centre.cov[to]).T)
     fits = (away <= gate) & ((apart**2).sum(axis=1) <= farthest_m**2)
     box, to, away = box[fits], to[fits], away[fits]
     order = np.lexsort((to, away, box))

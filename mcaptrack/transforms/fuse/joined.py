@@ -11,8 +11,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.plane import plane_at
-from mcaptrack.geometry.ragged import group_index, run_starts
+from mcaptrack.geometry.plane import runs_of_planes
+from mcaptrack.geometry.ragged import group_index
 from mcaptrack.schema import COVARIANCE_M2, SIGHTINGS, Frame, Rows
 from mcaptrack.transforms.fuse.grouping import Places, group, means
 from mcaptrack.transforms.fuse.view import CameraView, Views
@@ -93,11 +93,9 @@ def _visible(view: CameraView, xy_m: Floats, sizes: Ints, times: Sequence[int]) 
     """The share of a person at each place (G, 2) that a camera sees; places are of frames with ``sizes`` (F,)."""
     if len(view.planes) < 2:
         return view.visible(xy_m, times[0], sizes)
-    planes = np.array([id(plane_at(view.planes, t_ns)) for t_ns in times])
-    first = np.flatnonzero(run_starts(planes)).tolist()
     ends = np.cumsum(sizes)
     out = np.empty(len(xy_m))
-    for low, high in zip(first, [*first[1:], len(times)], strict=True):
+    for low, high in runs_of_planes(view.planes, times):
         part = slice(int(ends[low] - sizes[low]), int(ends[high - 1]))
         out[part] = view.visible(xy_m[part], times[low], sizes[low:high])
     return out

@@ -11,7 +11,8 @@ import numpy as np
 
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.transforms.fuse.grouping import Places, distances, near_pairs
+from mcaptrack.geometry.neighbours import squared_sigmas
+from mcaptrack.transforms.fuse.grouping import Places, pairs_along_x
 from mcaptrack.transforms.fuse.joined import Joined
 
 #: How often a person was detected in the frame before, and how often something was detected near a false box.
@@ -73,13 +74,15 @@ def persistence(
     counts = np.append([begun.is_known], block.counts > 0)[:-1] & (step_s > 0) & (step_s <= _MOST_S)
     # Each group is looked for with those of its own frame, and again with those of the next one.
     likely = np.flatnonzero(probable >= _LEAST)
-    first, second = near_pairs(np.tile(xy_m[likely], (2, 1)), np.append(frame[likely], frame[likely] + 1), _FARTHEST_M)
+    first, second = pairs_along_x(
+        np.tile(xy_m[likely], (2, 1)), np.append(frame[likely], frame[likely] + 1), _FARTHEST_M
+    )
     is_now, was = first < len(likely), second >= len(likely)
     now, then = likely[first[is_now & was]], likely[second[is_now & was] - len(likely)]
     of = frame[now] - 1
     x, y = (xy_m[now] - xy_m[then]).T
     walked = np.array([1.0, 0.0, 1.0]) * ((_PACE_M_PER_S * step_s[of]) ** 2)[:, None]
-    apart = distances(x, y, *(cov[now] + cov[then] + walked).T)
+    apart = squared_sigmas(x, y, *(cov[now] + cov[then] + walked).T)
     fits = (apart <= max_sigma**2) & (x * x + y * y <= _FARTHEST_M**2)
     now, then, apart = now[fits], then[fits], apart[fits]
     order = np.lexsort((then, now, apart - 2 * np.log(probable[now]) - 2 * np.log(probable[then])))
