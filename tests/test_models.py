@@ -119,7 +119,22 @@ class TestFetching:
     def test_another_file_of_the_user_is_refused(self, model, tmp_path):
         (tmp_path / "own.onnx").write_bytes(b"own")
         assert "own.onnx is not the file of yolox-nano: it has 3 bytes" in refused("--from", tmp_path / "own.onnx")
+        (tmp_path / "own.onnx").write_bytes(bytes(len(DATA)))
+        assert re.search(
+            "own.onnx is not the file .* it has SHA-256 [0-9a-f]{12}..., not ", refused("--from", tmp_path / "own.onnx")
+        )
         assert "can't be read: No such file" in refused("--from", tmp_path / "none")
+
+    def test_a_file_is_read_once_and_no_further_than_it_may_be_long(self, model, tmp_path, monkeypatch):
+        with (tmp_path / "own.onnx").open("wb") as file:
+            file.truncate(10**12)
+        assert "it has 1,000,000,000,000 bytes, not" in refused("--from", tmp_path / "own.onnx")
+        opened, own = [], Path.open
+        monkeypatch.setattr(
+            Path, "open", lambda path, *mode, **more: (opened.append(path), own(path, *mode, **more))[1]
+        )
+        mcaptrack.get_model(NAME, source=tmp_path / "known.onnx")
+        assert opened.count(tmp_path / "known.onnx") == 1
 
     def test_folders_that_can_not_be_written_and_a_missing_package_are_one_line(self, model, tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, "pooch", None)

@@ -193,7 +193,21 @@ BAD = {
     "no frame": ("left,top,width,height\n1,2,3,4\n", "no column for the frame or the time"),
     "two lefts": ("frame,x,left,top,w,h\n1,1,1,2,3,4\n", r"x and left could both be x; choose with `columns='x=x'`"),
     "a short row": (f"{HEAD}\n1,2,3\n", r"a:2: .*3 columns, and the header has 5"),
-    "a word": (f"{HEAD}\n1,2,x,3,4\n", "a:2: .*not all are numbers"),
+    "a word": (f"{HEAD}\n1,2,x,3,4\n", "a:2: .*the column top holds 'x', which is no number: 1,2,x"),
+    "a decimal comma between commas": (
+        f'{HEAD}\n1,2,"3,5",3,4\n',
+        "'3,5', which is no number; decimal commas are read",
+    ),
+    "a header twice": ("frame,x,x,y,w,h\n1,1,1,2,3,4\n", "several columns are named x; its columns are frame, x, x, y"),
+    "a header of blanks": (
+        "frame x y w h\n1 1 2 3 4\n",
+        "fits no label format|separated by commas, semicolons or tabs",
+    ),
+    "an empty object": ("{}", "an object with nothing"),
+    "an image without a number": (
+        '[{"image_id":"","bbox":[1,2,3,4]}]',
+        "result 0 has a wrong image_id: .* without a num",
+    ),
     "not a number": (f"{HEAD}\n1,2,nan,3,4\n", "a:2: a number of the box is missing or not finite"),
     "infinite": (f"{HEAD}\n1,2,3,4,1e999\n", "a:2: a number of the box is missing"),
     "huge": (f"{HEAD}\n1,2,3,4,1e9\n", r"a:2: a coordinate can't be 1e\+09"),
@@ -237,6 +251,41 @@ def test_a_wrong_row_of_yolo_is_named(line, words, tmp_path):
     written(tmp_path / "y", "1.txt", f"0 0.5 0.5 0.1 0.1\n{line}\n")
     with pytest.raises(McaptrackError, match=rf"1\.txt:2: .*{words}"):
         read_labels(tmp_path / "y")
+
+
+@pytest.mark.parametrize("kind", ["csv", "coco"])
+def test_ids_that_are_texts_are_numbered_as_they_come(kind, tmp_path):
+    ids = ["b-7", "a-2", "", "b-7", "31"]
+    if kind == "csv":
+        lines = [f"{frame},{one},{10 * frame},2,3,4" for frame, one in enumerate(ids)]
+        path = written(tmp_path, "i.csv", "\n".join(["frame,id,left,top,width,height", *lines]))
+    else:
+        boxes = [{"image_id": k, "bbox": [10 * k, 2, 3, 4], "track_id": one or None} for k, one in enumerate(ids)]
+        path = written(tmp_path, "i.json", json.dumps({"images": [{"id": k} for k in range(5)], "annotations": boxes}))
+    labels = read_labels(path, role="detections")
+    assert dict(zip(labels.frame.tolist(), labels.id.tolist(), strict=True)) == {0: 1, 1: 2, 2: -1, 3: 1, 4: 3}
+    (said,) = [words for words in labels.remarks if "its ids are texts" in words]
+    assert said.endswith("numbered from 1 on as they come: 'b-7' is 1, 'a-2' is 2")
+    assert read_labels(path, role="tracks").id.tolist() == [1, 2, 1, 3]
+
+
+def test_more_texts_than_ids_can_be_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("mcaptrack.sources.ingest.labels.box_rows._MAX_TEXTS", 2)
+    path = written(tmp_path, "i.csv", f"{HEAD},id\n" + "".join(f"{k},1,2,3,4,t{k}\n" for k in range(3)))
+    with pytest.raises(McaptrackError, match=r"i\.csv:4: .*the column of ids has more than 2 texts"):
+        read_labels(path)
+
+
+def test_commas_are_decimal_between_tabs_too(tmp_path):
+    path = written(tmp_path, "t.tsv", f"{HEAD}\n1,1,5,2,3,4\n".replace(",", "\t").replace("1\t5", "1,5"))
+    assert read_labels(path, role="detections").boxes_px.tolist() == [[1.5, 2, 3, 4]]
+
+
+def test_a_damaged_table_is_not_taken_for_a_video(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_bytes(f"{HEAD}\n1,2,3,4,5\n".encode() + bytes(20))
+    with pytest.raises(McaptrackError, match=r"a\.csv:3: not a row of .*1 columns, and the header has 5"):
+        mcaptrack.ingest(path, tmp_path / "a.mcap", fps=10)
 
 
 def test_shares_of_the_picture_need_its_size(tmp_path):

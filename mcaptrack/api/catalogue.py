@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import re
 from pathlib import Path
@@ -86,11 +87,9 @@ def get_model(name: str, *, source: PathLike | None = None) -> Path:
     model = catalogue.find(name)
     text = "" if source is None else str(source)
     if text and not text.startswith(("http://", "https://")):
-        path = Path(text)
-        refuse_special(path)
-        catalogue.check(model, digest_of(path), path.stat().st_size, path)
+        data = _read(model, Path(text))
         _make_folder(model)
-        publish_bytes(model.path, path.read_bytes())
+        publish_bytes(model.path, data)
         return model.path
     if not text and model.path.is_file():
         if digest_of(model.path) == model.sha256:
@@ -108,6 +107,21 @@ def get_model(name: str, *, source: PathLike | None = None) -> Path:
         f"{name} can't be fetched: {'; '.join(failures)}. Get its file from {model.source} on another machine, and "
         f"hand it over with {by_hand}"
     )
+
+
+def _read(model: Model, path: Path) -> bytes:
+    """The bytes of a file of the user, which is read once and no further than it may be long.
+
+    Raises McaptrackError if it can't be read, or is not the model's.
+    """
+    refuse_special(path)
+    try:
+        with path.open("rb") as file:
+            data, size = file.read(model.size_bytes + 1), path.stat().st_size
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+    catalogue.check(model, hashlib.sha256(data).hexdigest(), max(size, len(data)), path)
+    return data
 
 
 def _make_folder(model: Model) -> None:

@@ -25,7 +25,7 @@ from mcaptrack.api.common import (
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation.corrections import changes_in
 from mcaptrack.files import is_same_file, refuse_overwrite
-from mcaptrack.geometry import clocks
+from mcaptrack.geometry import boxes, clocks
 from mcaptrack.geometry.plane import Point
 from mcaptrack.notices import Notice, warn
 from mcaptrack.sources.corrections import CORRECTED
@@ -308,10 +308,10 @@ def parse_size(size: str | tuple[int, int] | None) -> tuple[int, int] | None:
     """Return width and height from "1920x1080" or two numbers."""
     if size is None:
         return None
-    parts = size.lower().split("x") if isinstance(size, str) else [str(part) for part in size]
-    if len(parts) != 2 or not all(p.isascii() and p.isdigit() and len(p) < 7 and int(p) for p in parts):
+    found = boxes.parse_size(size if isinstance(size, str) else "x".join(map(str, size)))
+    if found is None:
         raise McaptrackError(f"`size=` is the width and height of pictures in pixels, like 1920x1080, not {size!r:.40}")
-    return int(parts[0]), int(parts[1])
+    return found
 
 
 def parse_start_time(time: float | str | dt.datetime | None) -> int | None:

@@ -17,6 +17,15 @@ def columns_to_boxes(rows: NDArray[np.void]) -> Floats:
     return np.stack([rows["x_px"], rows["y_px"], rows["w_px"], rows["h_px"]], axis=-1)
 
 
+def parse_size(text: str) -> tuple[int, int] | None:
+    """Two whole numbers from 1 to 999999 with an x between them, as in 1920x1080; None for anything else."""
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isascii() and part.isdecimal() and 0 < len(part) < 7 for part in parts):
+        return None
+    first, second = map(int, parts)
+    return (first, second) if first and second else None
+
+
 def iou(a: Floats, b: Floats) -> Floats:
     """Intersection over union (M, N) of all boxes of ``a`` (M, 4) with all of ``b`` (N, 4); 0 for empty boxes."""
     low = np.maximum(a[:, None, :2], b[None, :, :2])

@@ -47,6 +47,8 @@ VIDEO_SUFFIXES: Final = (
     ".ivf",
     ".obu",
 )
+#: What such a file holds is text, whatever its first bytes are.
+_TEXT_SUFFIXES: Final = (".csv", ".tsv", ".txt", ".json", ".xml")
 
 
 def ingest(
@@ -137,4 +139,4 @@ def _is_binary(source: Path) -> bool:
         head = stream.read(4096)
     if head.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
         raise McaptrackError(f"{source} is text in UTF-16; save it as UTF-8, in which labels are read")
-    return b"\0" in head
+    return b"\0" in head and source.suffix.lower() not in _TEXT_SUFFIXES

@@ -43,6 +43,10 @@ _HASHED: Final = re.compile(r"(_(jpe?g|png|bmp|webp))?\.rf\.[0-9A-Za-z]{8,64}$",
 _SHOWN: Final = 8
 #: Boxes that are cut off at the edge of the picture reach a little beyond its whole size.
 _MOST_SHARE: Final = 2.0
+#: So many texts are read as ids of tracks, at most; the number that stands for the first; so many are listed.
+_MAX_TEXTS: Final = 1_000_000
+_TEXTS: Final = -(2**40)
+_TEXTS_SHOWN: Final = 3
 _FRAME: Final = "the frame (a count of pictures, no time)"
 
 
@@ -297,6 +301,34 @@ def _unnamed(rows: BoxRows, number: Ints, stated: Bools) -> ClassIds:
         words += ", and class_id is one higher than the file's numbers"
     rows.doubts.append((words, "classes"))
     return np.where(stated, number + begins_with_0, UNKNOWN).astype(np.uint32)
+
+
+class TrackIds:
+    """Track ids of a file: as they are if all are numbers, otherwise numbered from 1 on as they come."""
+
+    def __init__(self) -> None:
+        self._texts: dict[str, int] = {}
+
+    def number(self, text: str) -> float:
+        """What stands for a text that is no number until all are known. Raises ValueError if there are too many."""
+        if text not in self._texts and len(self._texts) == _MAX_TEXTS:
+            raise ValueError(f"the column of ids has more than {_MAX_TEXTS:,} texts")
+        return float(_TEXTS - self._texts.setdefault(text, len(self._texts)))
+
+    def of(self, path: Path, values: Floats) -> tuple[Floats, list[str]]:
+        """The ids of rows (N,), and remarks, from numbers (N,) of the file and of ``number``; NaN is no id."""
+        ids = np.nan_to_num(values, nan=NO_ID)
+        if not self._texts:
+            return ids, []
+        known = ids != NO_ID
+        _, first, which = np.unique(ids[known], return_index=True, return_inverse=True)
+        rank = np.empty(len(first), np.int64)
+        rank[np.argsort(first)] = np.arange(1, len(first) + 1)
+        ids[known] = rank[which]
+        shown = list(self._texts)[:_TEXTS_SHOWN]
+        shown = [f"{text!r:.40} is {int(ids[(values == self.number(text)).argmax()])}" for text in shown]
+        more = ", ..." if len(self._texts) > len(shown) else ""
+        return ids, [f"{path}: its ids are texts; tracks are numbered from 1 on as they come: {', '.join(shown)}{more}"]
 
 
 class FrameNames:

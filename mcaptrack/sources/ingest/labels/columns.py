@@ -82,6 +82,8 @@ def choose_columns(where: str, header: Sequence[str], given: Mapping[str, str]) 
         # In headers of MOTChallenge (bb_left, ..., conf, x, y, z), x and y are a place in the world.
         fits = [at for at in fits if plain[at].startswith("bb")] or fits
         if len(fits) > 1 and key not in _RANKED:
+            if len({header[at] for at in fits}) < len(fits):
+                raise McaptrackError(f"{where}: several columns are named {header[fits[0]]}; {shown}")
             words = " and ".join(header[at] for at in fits)
             raise McaptrackError(
                 f"{where}: {words} could both be {key}; choose with `columns={key + '=' + header[fits[0]]!r}`"

@@ -18,7 +18,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.schema.classes import PERSON, is_person
-from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows, FrameNames
+from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows, FrameNames, TrackIds
 from mcaptrack.sources.ingest.labels.columns import choose_columns
 from mcaptrack.sources.ingest.labels.formats import NO_ID, ClassNames, Format, Labels, Role
 from mcaptrack.sources.ingest.labels.number_table import Lines, NumberTable, lines_of
@@ -27,6 +27,8 @@ from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 #: Columns that supervision writes before those of the user.
 SUPERVISION: Final = ("x_min", "y_min", "x_max", "y_max", "class_id", "confidence", "tracker_id")
 _DELIMITERS: Final = ",;\t"
+#: Where one of these separates cells, a comma in a number is a decimal comma.
+_NOT_COMMAS: Final = (";", "\t")
 #: The largest number of characters of a row.
 MAX_LINE: Final = 65536
 _MAX_COLUMNS: Final = 1024
@@ -97,10 +99,13 @@ def read_csv(path: Path, role: Role, given: Mapping[str, str], name: Format, wan
     if not header and (header := comment_header(path, first)):
         lines = chain([(number, first)], lines)
     if not header:
-        raise McaptrackError(f"{path}:{number}: a table needs a header that names its columns: {first.strip()[:60]}")
+        raise McaptrackError(
+            f"{path}:{number}: a table needs a header that names its columns, separated by commas, semicolons or tabs: "
+            f"{first.strip()[:60]}"
+        )
     delimiter = delimiter_of(first)
     split = partial(split_row, path, delimiter)
-    return _read_table(path, number, header, lines, split, role, given, name, wanted, delimiter == ";")
+    return _read_table(path, number, header, lines, split, role, given, name, wanted, delimiter)
 
 
 def read_rows(path: Path, content: list[Any], role: Role, given: Mapping[str, str], wanted: WantedClasses) -> Labels:
@@ -129,38 +134,56 @@ def _read_table(
     given: Mapping[str, str],
     name: Format,
     wanted: WantedClasses,
-    has_decimal_commas: bool = False,
+    delimiter: str = "",
 ) -> Labels:
     if len(header) > _MAX_COLUMNS:
         raise McaptrackError(f"{path}:{number}: more than {_MAX_COLUMNS} columns")
     at = choose_columns(f"{path}:{number}", header, given)
-    classes, names, frames = ClassNames(), ClassNames(), FrameNames()
+    classes, names, frames, ids = ClassNames(), ClassNames(), FrameNames(), TrackIds()
 
     def number_of(text: str) -> float:
         text = text.strip()
-        return math.nan if is_empty(text) else float(text.replace(",", ".") if has_decimal_commas else text)
+        return math.nan if is_empty(text) else float(text.replace(",", ".") if delimiter in _NOT_COMMAS else text)
+
+    def id_of(text: str) -> float:
+        try:
+            return number_of(text)
+        except ValueError:
+            return ids.number(text.strip())
 
     def frame_of(text: str) -> float:
         return float(text) if _is_number(text) else frames.number(text.strip())
 
-    readers: dict[str, Callable[[str], float]] = {"frame": frame_of}
+    readers: dict[str, Callable[[str], float]] = {"frame": frame_of, "id": id_of}
     readers |= {key: _class_reader(numbers) for key, numbers in (("class", classes), ("name", names))}
     keys = sorted(at, key=at.__getitem__)
 
     def parse(parts: list[str]) -> list[float]:
         if len(parts) != len(header):
             raise ValueError(f"{len(parts)} columns, and the header has {len(header)}")
-        return [readers.get(key, number_of)(parts[at[key]]) for key in keys]
+        return [cell(key, parts[at[key]]) for key in keys]
+
+    def cell(key: str, text: str) -> float:
+        try:
+            return readers.get(key, number_of)(text)
+        except ValueError as error:
+            if "column" in str(error):
+                raise
+            words = f"the column {header[at[key]]} holds {text.strip()[:40]!r}, which is no number"
+            if delimiter == "," in text:
+                words += "; decimal commas are read where semicolons or tabs separate the columns"
+            raise ValueError(words) from None
 
     what = f"a row of {', '.join(header[at[key]] for key in keys)}"
     table = NumberTable(path, lines, what, len(keys), parse, split)
     columns = {key: table.values[:, place] for place, key in enumerate(keys)}
     none = np.full(len(table.values), np.nan)
-    track_id = np.nan_to_num(columns.get("id", none), nan=NO_ID)
     unit = f" in {unit_of(header[at['t']])[0]}" if "t" in at else ""
     used = ", ".join(f"{key}={header[at[key]]}{unit * (key == 't')}" for key in keys)
     unused = [name for place, name in enumerate(header) if name and place not in at.values()]
     remarks = [f"{path}: columns {used}" + (f"; not read: {', '.join(unused)}"[:300] if unused else "")]
+    track_id, said = ids.of(path, columns.get("id", none))
+    remarks += said
     if "id" in at and header[at["id"]].lower() == "id" and "id" not in given and _are_row_numbers(track_id):
         remarks.append(f"{path}: every box has another {header[at['id']]}, so it numbers rows, not tracks")
         track_id = np.full(len(none), float(NO_ID))

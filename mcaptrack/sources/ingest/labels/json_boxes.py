@@ -18,7 +18,13 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import read_beginning, refuse_special
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows, FrameNames, numbers_of_names
+from mcaptrack.sources.ingest.labels.box_rows import (
+    NO_CLASS,
+    BoxRows,
+    FrameNames,
+    TrackIds,
+    numbers_of_names,
+)
 from mcaptrack.sources.ingest.labels.delimited import read_rows
 from mcaptrack.sources.ingest.labels.formats import NO_ID, Format, Labels, Role
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses
@@ -81,7 +87,7 @@ def _read_content(path: Path, content: Any, role: Role, given: Mapping[str, str]
         return _results(path, content).labels(role, wanted)
     if "x_min" in first:
         return read_rows(path, content, role, given, wanted)
-    found = f"an object with {', '.join(content)}"[:100] if isinstance(content, dict) else "a list"
+    found = f"an object with {', '.join(content) or 'nothing'}"[:100] if isinstance(content, dict) else "a list"
     raise McaptrackError(
         f"{path} is JSON ({found}{' of ' + ', '.join(first) if first else ''}"[:300]
         + "), but neither annotations (images, annotations, categories) nor results (image_id, category_id, bbox, "
@@ -94,6 +100,7 @@ class _Rows:
 
     def __init__(self, path: Path, kind: str) -> None:
         self._path, self._kind, self._values = path, kind, array("d")
+        self._texts = TrackIds()
         self.outlined = 0
 
     def add(self, number: int, entry: Any, frame_of: Callable[[Any], float]) -> None:
@@ -108,7 +115,10 @@ class _Rows:
         inner = entry.get("attributes")
         track_id = next((d[key] for d in (entry, inner) if isinstance(d, dict) for key in _TRACK_IDS if key in d), None)
         category_id = _whole_of_text(entry.get("category_id"))
-        values = [entry.get("score"), category_id, _whole_of_text(track_id), entry.get("iscrowd", 0)]
+        track_id = _whole_of_text(track_id)
+        if isinstance(track_id, str) and track_id:
+            track_id = self._texts.number(track_id[:_MAX_NAME])
+        values = [entry.get("score"), category_id, track_id, entry.get("iscrowd", 0)]
         for value, key in zip(values, ("score", "category_id", "track_id", "iscrowd"), strict=True):
             if value is not None and not isinstance(value, bool) and not _is_number(value):
                 self.refuse(number, f"has a {key} that isn't a number, {value!r:.40}")
@@ -116,7 +126,8 @@ class _Rows:
         try:
             frame = frame_of(entry.get("image_id"))
         except (ValueError, KeyError, TypeError) as error:
-            self.refuse(number, str(error).strip('"'))
+            words = str(error).strip('"')
+            self.refuse(number, f"has a wrong image_id: {words}" if "column" in words else words)
         self._values.extend(
             (
                 frame,
@@ -152,8 +163,10 @@ class _Rows:
         values: Floats = np.frombuffer(self._values, np.float64).reshape(-1, _COLUMNS)
         frame, score, number, track_id, crowd, unseen = (values[:, at] for at in (0, 5, 6, 7, 8, 9))
         boxes, is_crowd = values[:, 1:5], crowd != 0
+        track_id, said = self._texts.of(self._path, track_id)
         rows = BoxRows(self._path, "coco", self.at, frame, boxes, track_id, score, number, names, is_crowd)
         rows.observed = unseen == 0
+        rows.remarks += said
         if self.outlined:
             rows.remarks.append(f"{self._path}: {self.outlined} boxes are those around polygons, which have no bbox")
         rows.take_shares()

@@ -113,10 +113,10 @@ def check(model: Model, sha256: str, size: int, where: Path) -> None:
     """Raise McaptrackError if a file with this digest and size, in bytes, is not a model's file."""
     if sha256 != model.sha256:
         again = f"; {call('get_model', model.name)} fetches it again" if where == model.path else ""
-        raise McaptrackError(
-            f"{where} is not the file of {model.name}: it has {size:,} bytes and SHA-256 {sha256[:12]}..., not "
-            f"{model.size_bytes:,} and {model.sha256[:12]}...{again}"
-        )
+        is_other = size != model.size_bytes
+        found = f"{size:,} bytes, not {model.size_bytes:,}" if is_other else f"SHA-256 {sha256[:12]}..."
+        known = "" if is_other else f", not {model.sha256[:12]}..."
+        raise McaptrackError(f"{where} is not the file of {model.name}: it has {found}{known}{again}")
 
 
 def stored(model: Model) -> Path:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Image
+from mcaptrack.geometry.boxes import parse_size
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.transforms.detect.onnx import classes as known_classes
@@ -114,10 +115,10 @@ class OnnxDetector:
 
     def __post_init__(self) -> None:
         check_options(self)
-        tiles = _numbers(self.tiles)
+        tiles = parse_size(self.tiles)
         if tiles is None or not 0 < tiles[0] * tiles[1] <= _MOST_TILES:
             raise McaptrackError(f"tiles takes columns x rows, as in 3x2, {_MOST_TILES} at most, not {self.tiles}")
-        if self.input_size not in ("", _AS_PICTURE) and _numbers(self.input_size) is None:
+        if self.input_size not in ("", _AS_PICTURE) and parse_size(self.input_size) is None:
             raise McaptrackError(f"input_size takes width x height, as in 960x736, or picture, not {self.input_size}")
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
@@ -172,7 +173,7 @@ class _Run:
         most_bytes = options.max_memory_mb * 1_000_000
         file = read_file(options.weights(), most_bytes, options.check_weights)
         self._options, self._path = options, file.path
-        self._grid = _numbers(options.tiles) or (1, 1)
+        self._grid = parse_size(options.tiles) or (1, 1)
         self._network = DetectorNetwork(file, self._input_size(first), options.device, most_bytes)
         self._sha256 = file.sha256
         seen = self._network.signature
@@ -326,7 +327,7 @@ class _Run:
 
     def _input_size(self, first: Image) -> Size | None:
         if self._options.input_size != _AS_PICTURE:
-            return _numbers(self._options.input_size)
+            return parse_size(self._options.input_size)
         height, width = first.shape[:2]
         x1, y1, x2, y2 = tiles_of(width, height, *self._grid, self._options.overlap)[0]
         return size_for(x2 - x1, y2 - y1)
@@ -340,12 +341,3 @@ def size_for(width: int, height: int) -> Size:
     scale = min(2.0, sqrt(_LEAST_PIXELS / pixels)) if pixels < _LEAST_PIXELS else min(1.0, sqrt(_MOST_PIXELS / pixels))
     wide, high = (max(32, -(-round(side * scale) // 32) * 32) for side in (width, height))
     return wide, high
-
-
-def _numbers(text: str) -> tuple[int, int] | None:
-    """Two whole numbers from 1 to 99999 with an x between them; None for anything else."""
-    parts = text.split("x")
-    if len(parts) != 2 or not all(part.isascii() and part.isdecimal() and 0 < len(part) < 6 for part in parts):
-        return None
-    first, second = map(int, parts)
-    return (first, second) if first and second else None
