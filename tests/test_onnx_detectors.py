@@ -197,7 +197,7 @@ class TestConvention:
         assert words.startswith(
             f"{path}, read as {layout}, finds nothing in 3 pictures, and read as {file} finds 1 boxes"
         )
-        assert words.endswith(f"choose `layout={file}`")
+        assert words.endswith(f"choose `layout={file!r}`")
 
     def test_nothing_in_empty_pictures_is_no_fault(self, network):
         assert boxes(OnnxDetector(file=str(network())), blue_blocks(SIZE), blue_blocks(SIZE)) == [[], []]

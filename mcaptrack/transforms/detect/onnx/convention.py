@@ -120,7 +120,7 @@ def refuse_if_misread(
         with_boxes = [one for one in boxes if isinstance(one, Boxes) and evidence(one) > 0]
         if with_boxes:
             count = sum(int((one.score >= SURE).sum()) for one in with_boxes)
-            instead = f"choose `layout={name}`" if is_chosen else "choose with `layout=`"
+            instead = f"choose `layout={name!r}`" if is_chosen else "choose with `layout=`"
             raise McaptrackError(
                 f"{path}, read as {layout.name}, finds nothing in {pictures} pictures, and read as {name} finds "
                 f"{count} boxes in {len(with_boxes)} of {len(boxes)}; {instead}"

@@ -105,7 +105,7 @@ class DetectorNetwork:
         own = graph.input_size(graph.parse(file.data), self._image.name)
         wanted = size or _known(own)
         if wanted is None:
-            raise McaptrackError(f"{file.path} takes pictures of any size; choose one with `input_size=WxH`")
+            raise McaptrackError(f"{file.path} takes pictures of any size; choose one with `input_size='WxH'`")
         #: Width and height of the input.
         self.size: Size = wanted
         is_other = any(one is not None and one != two for one, two in zip(own, wanted, strict=True))
