@@ -376,7 +376,7 @@ class TestSizes:
             "for that size"
         )
         assert "multiples of 32, as in 320x192" in refused(OnnxDetector(file=str(network()), input_size="310x190"))
-        assert "choose one with `input_size=WxH`" in refused(OnnxDetector(file=str(network(is_open=True))))
+        assert "choose one with `input_size='WxH'`" in refused(OnnxDetector(file=str(network(is_open=True))))
 
     @pytest.mark.parametrize(
         ("picture", "expected"),

@@ -310,7 +310,7 @@ class TrackIds:
         self._texts: dict[str, int] = {}
 
     def number(self, text: str) -> float:
-        """What stands for a text that is no number until all are known. Raises ValueError if there are too many."""
+        """A negative number for a text, until all are known. Raises ValueError if there are too many."""
         if text not in self._texts and len(self._texts) == _MAX_TEXTS:
             raise ValueError(f"the column of ids has more than {_MAX_TEXTS:,} texts")
         return float(_TEXTS - self._texts.setdefault(text, len(self._texts)))
