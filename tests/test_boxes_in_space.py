@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from mcaptrack import log
+from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.transform_tree import Poses, PoseSamples, Recorded, TransformTree
 from mcaptrack.notices import collected
 from mcaptrack.schema import TRACKS, Frame
@@ -31,6 +33,7 @@ from tests.space_logs import (
     marker,
     ros,
     scene_update,
+    scene_update_json,
     write,
 )
 
@@ -233,6 +236,18 @@ def test_cubes_of_one_entity_have_no_id_and_metadata_has_several_names():
     }
 
 
+def test_ids_and_values_of_metadata_may_be_numbers_in_json():
+    update = json.loads(scene_update_json(START_NS, [SEEN]))
+    (entity,) = update["entities"]
+    entity["id"], entity["metadata"] = 42, [{"key": "score", "value": 0.25}, {"key": "class", "value": 3}]
+    decode = boxes_3d_decoder(MessageType("foxglove.SceneUpdate", "jsonschema", b"{}", "json"))
+    (box,) = decode(json.dumps(update).encode()).boxes
+    assert (box.source_id, box.score, box.class_name) == ("42", 0.25, "3")
+    entity["id"] = [42]
+    with pytest.raises(McaptrackError, match="a list where text belongs"):
+        decode(json.dumps(update).encode())
+
+
 def test_numbers_that_can_not_be_are_counted_once():
     nan, inf = float("nan"), float("inf")
     turn, size = (0.0, 0.0, 0.0, 2.0), (4.0, 2.0, 1.0)
@@ -304,6 +319,9 @@ def message(*stamps_ms: int | None, is_measured: bool = True) -> Message3d:
         ({40: message(-70_000), 140: message(-69_900)}, [40, 140], [0, 1]),  # of another clock
         ({40: message()}, [40], []),
         ({}, [], []),
+        # every other message is empty: no sweeps of two
+        ({40 + 100 * k: message(*[100 * k] * (k % 2)) for k in range(9)}, [100 * k for k in range(9)], [1, 3, 5, 7]),
+        ({40 + 100 * k: message(100 * k, 100 * k + 7) if k % 3 else message() for k in range(9)}, [100 * k for k in range(9)], [1, 1, 2, 2, 4, 4, 5, 5, 7, 7, 8, 8]),
     ],
 )  # fmt: skip
 def test_messages_are_frames_at_their_stamps(messages, times, frames):
@@ -379,6 +397,18 @@ def test_boxes_without_a_frame_are_in_that_of_the_others(tmp_path):
     found, warnings = read(log_of(tmp_path, lambda _: ""))
     assert found.frame_id == ""
     assert "/lidar/boxes: boxes name no frame: they stay as they are, in a frame without a name" in warnings
+
+
+def test_boxes_in_another_frame_that_is_not_known_are_said(tmp_path):
+    def made(t_ns, boxes):
+        update = scene_update(t_ns, boxes)
+        update.entities[1].frame_id = "roof"
+        return update.SerializeToString()
+
+    found, said = read(write(tmp_path / "a.mcap", Robot(shots=2), by_foxglove(made)))
+    assert [len(frame.rows) for frame in found.frames] == [2, 2]
+    why = "since the pose of roof in map isn't known: 2 no transform connects roof with map"
+    assert f"/lidar/boxes: 2 of 2 messages have boxes in roof that are left out, {why}" in said
 
 
 def test_boxes_without_a_stamp_are_counted(tmp_path):

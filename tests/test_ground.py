@@ -287,6 +287,72 @@ def test_other_rates_of_boxes(rate_hz: float):
     assert switches <= 15
 
 
+CAR_BOX = {"z_m": 0.8, "length_m": 4.5, "width_m": 1.9, "height_m": 1.6, "heading_rad": 0.0}
+
+
+@pytest.mark.parametrize(("speed", "rate_hz"), [(36.0, 10.0), (55.0, 10.0), (12.0, 2.0), (33.0, 2.0), (20.0, 1.0)])
+@pytest.mark.parametrize("box", [CAR_BOX, {}], ids=["box", "point"])
+def test_cars_of_any_speed_have_tracks(speed: float, rate_hz: float, box: dict[str, float]):
+    found = {t: {"x_m": speed * t / rate_hz, "y_m": 0.0, **box} for t in range(12)}
+    frames = tracked(frames_of(found, rate_hz=rate_hz))
+    assert ids(frames)[1:] == [[1]] * 11
+    assert frames[-1].rows["vx_m_per_s"] == pytest.approx(speed, rel=0.02)
+
+
+def test_cars_behind_one_another_are_not_taken_for_each_other():
+    """At two frames a second each is as near to where the one ahead was as to where it was itself."""
+    cars = [{t: {**CAR_BOX, "x_m": 15.0 * k + 7.5 * t, "y_m": 0.0} for t in range(8)} for k in range(4)]
+    ahead = frames_of(*cars, rate_hz=2.0)
+    oncoming = [
+        {t: {**CAR_BOX, "x_m": 15.0 * k - 7.5 * t, "y_m": 3.5, "heading_rad": 3.1} for t in range(8)} for k in range(4)
+    ]
+    for frames in (ahead, frames_of(*cars, *oncoming, rate_hz=2.0)):
+        speeds = np.concatenate([np.abs(frame.rows["vx_m_per_s"]) for frame in tracked(frames)[2:]])
+        assert len(speeds) == 6 * len(frames[0].rows)
+        assert speeds == pytest.approx(15.0, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("second", "third", "count"),
+    [
+        ({"x_m": 5.0}, {"x_m": 10.0}, 3),
+        ({"x_m": 5.0}, None, 0),  # two false boxes
+        ({"x_m": 5.0}, {"x_m": 5.0}, 0),  # the third one is behind
+        ({"y_m": 5.0}, {"y_m": 10.0}, 0),  # sideways
+        ({"x_m": 5.0, "heading_rad": 0.6}, {"x_m": 10.0}, 0),
+        ({"x_m": 5.0, "length_m": 12.0}, {"x_m": 10.0}, 0),
+        ({"x_m": 8.0}, {"x_m": 16.0}, 0),  # 80 m/s
+        ({"x_m": 5.0, "class_id": PEDESTRIAN}, {"x_m": 10.0}, 0),
+    ],
+)
+def test_fast_tracks_need_a_third_detection_where_the_velocity_says(second, third, count):
+    base = {**CAR_BOX, "x_m": 0.0, "y_m": 0.0}
+    track = {0: base, 1: base | second} | ({2: base | third} if third else {})
+    assert sum(len(frame.rows) for frame in tracked(frames_of(track, count=8))) == count
+
+
+@pytest.mark.parametrize("has_covariances", [False, True])
+def test_any_speed_is_a_wider_filter_from_the_beginning(has_covariances: bool):
+    """Widening later is the same as having begun with a wider distribution of velocities."""
+    tables = []
+    for is_late in (True, False):
+        limits = LIMITS["car"]
+        wide = float(np.hypot(limits.speed_m_per_s, limits.max_speed_m_per_s))
+        tracks = GroundTracks()
+        if has_covariances:
+            tracks.expect_covariances()
+        found = np.full((15 if has_covariances else 12, 1), np.nan)
+        found[[X, Y]], found[9:12, 0], found[12:, 0] = 1.0, (0.5, CAR, -1), (0.1, 0.05, 0.2)[: len(found) - 12]
+        limits = limits if is_late else limits._replace(speed_m_per_s=wide)
+        tracks.initiate(1, found, {CAR: limits}, 0)
+        for _ in range(3):
+            tracks.predict(0.2)
+        if is_late:
+            tracks.allow_speed(np.array([0]))
+        tables.append(tracks.table[14:20, 0] if tracks.covariances is None else tracks.covariances.values[0])
+    assert tables[0] == pytest.approx(tables[1])
+
+
 def test_boxes_are_compared_by_overlap_on_request():
     sizes = {"z_m": 1.0, "length_m": 4.0, "width_m": 2.0, "height_m": 1.5, "heading_rad": 0.0}
     near, beside = drive(12, 5.0, **sizes), {t: {"x_m": 0.5 * t, "y_m": 2.4, **sizes} for t in range(12)}

@@ -196,7 +196,8 @@ def _poses(opened: log.Log, topic: str, found: Recorded3d, fixed: str) -> tuple[
         # Boxes of a message have the same pose, mostly.
         stamps = np.where(found.stamp_ns > 0, found.stamp_ns, found.log_ns)[mine]
         times, place = np.unique(np.stack([stamps, found.log_ns[mine]]), axis=1, return_inverse=True)
-        poses = poses_at(opened, topic, fixed, name, *_rows_of(times))
+        what = "messages" if len(found.names) == 1 else f"messages have boxes in {name} that"
+        poses = poses_at(opened, topic, fixed, name, *_rows_of(times), what)
         place = place.reshape(-1)
         is_known[mine] = poses.is_known[place]
         rotation[mine], shift[mine] = poses.rotation[place], poses.translation[place]

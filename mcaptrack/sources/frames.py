@@ -75,11 +75,19 @@ def warn_of_remarks(opened: log.Log, tree: TransformTree | None, target: str, so
         warn(f"{opened.path}: transforms: {remark.text}", "transforms")
 
 
-def poses_at(opened: log.Log, topic: str, target: str, source: str, stamps_ns: Ints, log_ns: Ints) -> Poses:
+def poses_at(
+    opened: log.Log,
+    topic: str,
+    target: str,
+    source: str,
+    stamps_ns: Ints,
+    log_ns: Ints,
+    what: str = "messages",
+) -> Poses:
     """Return the poses of a frame in another for messages (N,) of a topic, by their stamps, and warn of gaps.
 
     If no stamp is within the transforms, and log times are, the stamps are of another clock than those of the
-    transforms: poses are looked up by log time. Poses that aren't known are counted in a warning.
+    transforms: poses are looked up by log time. Poses that aren't known are counted in a warning, as those of ``what``.
     """
     tree, _, unread = read_frames(opened)
     tree = tree or TransformTree([])
@@ -96,7 +104,7 @@ def poses_at(opened: log.Log, topic: str, target: str, source: str, stamps_ns: I
     if poses.unknown:
         why = "; ".join(f"{count:,} {where}" for where, count in poses.unknown.items())
         count = f"{sum(poses.unknown.values()):,} of {len(stamps_ns):,}"
-        words = f"{count} messages are left out, since the pose of {source} in {target} isn't known: {why}"
+        words = f"{count} {what} are left out, since the pose of {source} in {target} isn't known: {why}"
         warn(f"{opened.path}: {topic}: {words}", "transforms")
     return poses
 

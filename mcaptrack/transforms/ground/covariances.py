@@ -39,6 +39,14 @@ class Covariances:
         p = self.values
         return np.stack([p[:, 0, 0], p[:, 0, 3], p[:, 3, 3]])
 
+    def widen(self, track: Indices, more: Floats, passed_s: Floats) -> None:
+        """Add ``more`` (N,) to the variance that the velocities of tracks (N,) had ``passed_s`` seconds (N,) ago."""
+        for place, velocity in zip(_PLACE, _VELOCITY, strict=True):
+            self.values[track, place, place] += more * passed_s**2
+            self.values[track, place, velocity] += more * passed_s
+            self.values[track, velocity, place] += more * passed_s
+            self.values[track, velocity, velocity] += more
+
     def predict(self, transition: Floats, drift: Floats) -> None:
         """Predict with the transition (3, 3) of one axis and what is added for each track, (K, 3, 3), to each axis."""
         both = np.zeros((_SIZE, _SIZE))

@@ -34,7 +34,7 @@ _SIZE: Final = slice(LENGTH, HEIGHT + 1)
 (
     _AX, _AY, _PP, _PV, _PA, _VV, _VA, _AA, _COS, _SIN, _FACING, _SIZED,
     ID, SCORES, HITS, MISSED_S, LAST_FRAME, IS_CONFIRMED,
-    NOISE, GATE_M, _MAX_SPEED, _DRIFT, _TURNS, SPEED, AGE_S, LAST_SPREAD,
+    NOISE, GATE_M, MAX_SPEED, _DRIFT, TURNS, SPEED, AGE_S, LAST_SPREAD,
 ) = range(DETECTION_ROWS, DETECTION_ROWS + 26)  # fmt: skip
 #: The box at the last detection, the velocity then, and the position of the first.
 LAST: Final = slice(LAST_SPREAD + 1, LAST_SPREAD + 8)
@@ -102,14 +102,14 @@ class GroundTracks:
         if dt <= 0 or not len(self):
             return
         if self.covariances:
-            self.covariances.predict(*_transition(t[_DRIFT], t[_TURNS], dt))
+            self.covariances.predict(*_transition(t[_DRIFT], t[TURNS], dt))
             t[_COVARIANCE] = self.covariances.means()
         else:
-            _predict_covariance(t[_COVARIANCE], t[_DRIFT], t[_TURNS], dt)
+            _predict_covariance(t[_COVARIANCE], t[_DRIFT], t[TURNS], dt)
         fade = np.exp(-dt / _FADES_S)
         g, f = _FADES_S * (1 - fade), _FADES_S * (dt - _FADES_S * (1 - fade))
         vx, vy, ax, ay = t[VX], t[VY], t[_AX], t[_AY]
-        if t[_TURNS].any():
+        if t[TURNS].any():
             squared = vx * vx + vy * vy
             turn = (vx * ay - vy * ax) / (squared + _ARC_SPEED**2)
             np.clip(turn, -_MAX_TURN, _MAX_TURN, out=turn)
@@ -129,6 +129,16 @@ class GroundTracks:
             t[PLACE] += dt * t[_VELOCITY]
         t[MISSED_S] += dt
         t[AGE_S] += dt
+
+    def allow_speed(self, track: Indices) -> None:
+        """Let tracks (N,) with one detection have any velocity that their class can have, not only usual ones."""
+        t = self.table
+        more, passed_s = t[MAX_SPEED, track] ** 2, t[MISSED_S, track]
+        t[_PP, track] += more * passed_s**2
+        t[_PV, track] += more * passed_s
+        t[_VV, track] += more
+        if self.covariances:
+            self.covariances.widen(track, more, passed_s)
 
     @staticmethod
     def _rotate(t: Floats, cos: Floats, sin: Floats) -> None:
@@ -168,15 +178,15 @@ class GroundTracks:
         rows = [limits[int(one)] for one in found[CLASS].tolist()]
         t[NOISE] = [row.noise_m for row in rows]
         t[GATE_M] = [row.gate_m for row in rows]
-        t[_MAX_SPEED] = [row.max_speed_m_per_s for row in rows]
+        t[MAX_SPEED] = [row.max_speed_m_per_s for row in rows]
         t[_DRIFT] = [row.drift_m_per_s for row in rows]
-        t[_TURNS] = [row.turns for row in rows]
+        t[TURNS] = [row.turns for row in rows]
         t[SPEED] = [row.speed_m_per_s for row in rows]
         is_given = np.isfinite(found[VX]) & np.isfinite(found[VY])
         t[_VELOCITY] = np.where(is_given, found[_VELOCITY], 0.0)
         t[_PP] = t[NOISE] ** 2
         t[_VV] = np.where(is_given, _GIVEN_SPEED, t[SPEED]) ** 2
-        t[_AA] = (t[_DRIFT] * (1 - _NOISE_SHARE)) ** 2 * t[_TURNS]
+        t[_AA] = (t[_DRIFT] * (1 - _NOISE_SHARE)) ** 2 * t[TURNS]
         has_heading = np.isfinite(found[HEADING])
         angle = np.where(has_heading, found[HEADING], 0.0)
         t[_COS], t[_SIN] = np.cos(2 * angle) * has_heading, np.sin(2 * angle) * has_heading
@@ -274,7 +284,7 @@ def _move(t: Floats, place: Floats, velocity: Floats, acceleration: Floats) -> N
     t[_VELOCITY] += velocity
     t[_ACCELERATION] += acceleration
     speed = np.hypot(t[VX], t[VY])
-    t[_VELOCITY] *= np.minimum(1.0, t[_MAX_SPEED] / np.maximum(speed, 1e-9))
+    t[_VELOCITY] *= np.minimum(1.0, t[MAX_SPEED] / np.maximum(speed, 1e-9))
 
 
 def _follow_box(t: Floats, found: Floats, weight: Floats) -> None:
@@ -302,7 +312,7 @@ def _follow_box(t: Floats, found: Floats, weight: Floats) -> None:
     # The axis is known up to half a turn: the one that is nearer to the heading so far.
     axis = axis + np.pi * np.rint((before_axis - axis) / np.pi)
     speed = np.hypot(t[VX], t[VY])
-    moves = (t[VX] * np.cos(axis) + t[VY] * np.sin(axis)) * t[_TURNS]
+    moves = (t[VX] * np.cos(axis) + t[VY] * np.sin(axis)) * t[TURNS]
     facing = 0.95 * t[_FACING] + turned * np.cos(measured - axis)
     facing += np.where(speed > _FACING_SPEED, 2 * moves / np.maximum(speed, 1e-9), 0.0)
     is_back = facing < 0

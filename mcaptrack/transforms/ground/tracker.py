@@ -18,6 +18,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.schema import COVARIANCE_M2, DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.ground.association import Cost, associate
+from mcaptrack.transforms.ground.fast_starts import fast_starts
 from mcaptrack.transforms.ground.lost_tracks import LostTracks, continuations
 from mcaptrack.transforms.ground.output import Waiting, rows_to_frames
 from mcaptrack.transforms.ground.state import (
@@ -212,9 +213,16 @@ class _Run:
         track, row, is_same = associate(
             tracks.table, found, options.cost, options.min_iou, options.across_classes, tracks.covariances
         )
+        fast, at = fast_starts(tracks.table, found, (track, row), options.across_classes)
+        if len(fast):
+            tracks.allow_speed(fast)
+            track, row = np.concatenate([track, fast]), np.concatenate([row, at])
+            is_same = np.concatenate([is_same, np.ones(len(fast), bool)])
         before = tracks.table[:, track]
         if len(track):
             tracks.update(track, found[:, row], is_same, self._frame)
+            # One more detection has to be where the velocity says before such a track is confirmed.
+            tracks.table[SCORES, fast] = before[SCORES, len(track) - len(fast) :]
             self.waiting.close_gaps(before, tracks.table[:, track], self._frame, frame.t_ns)
         count = found.shape[1]
         if len(row) < count:

@@ -140,7 +140,8 @@ class Recorded3d:
 
     def _gathered(self, starts: Ints, frame: Ints, box_ns: Ints) -> tuple[Ints, Ints, str]:
         """Frames (F,) as ``frames`` returns them, those of one sweep of the sensor as one."""
-        log_ns = starts.copy()
+        # Messages without boxes may have no stamp: they were written as late as others.
+        log_ns = starts + np.int64(np.median(self.log_ns - box_ns) if len(box_ns) else 0)
         log_ns[frame[::-1]] = self.log_ns[::-1]
         sweep = find_sweeps(starts, log_ns, frame, self.centre, self.class_id)
         if sweep is None:

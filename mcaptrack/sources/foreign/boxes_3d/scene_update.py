@@ -39,7 +39,7 @@ def _stamp(entity: Any) -> int:
 
 def _box(entity: Any, cube: Any, is_alone: bool) -> Box3d:
     said = {
-        "".join(filter(str.isalnum, text(pair.key).lower())): text(pair.value)
+        "".join(filter(str.isalnum, text(pair.key).lower())): _words(pair.value)
         for pair in part(entity, "metadata") or ()
     }
     texts = list(part(entity, "texts") or []) if is_alone else []
@@ -55,12 +55,18 @@ def _box(entity: Any, cube: Any, is_alone: bool) -> Box3d:
         _first(said, _CLASS).strip() or word,
         _score(score) if score else share,
         # The id of several cubes is that of none of them.
-        _first(said, _ID) or (text(part(entity, "id") or "") if is_alone else "") or None,
+        _first(said, _ID) or (_words(part(entity, "id")) if is_alone else "") or None,
     )
 
 
 def _first(said: dict[str, str], keys: tuple[str, ...]) -> str:
     return next((said[key] for key in keys if said.get(key)), "")
+
+
+def _words(value: Any) -> str:
+    """A text; numbers count as theirs, since writers of JSON give ids and scores as numbers."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return repr(value) if is_number else text("" if value is None else value)
 
 
 def _score(written: str) -> float:

@@ -79,7 +79,8 @@ def _chains(times: Ints, limit: int) -> Ints:
 def _are_sweeps(sweep: Ints, t_ns: Ints, log_ns: Ints, place: Ints, centre_m: Floats, class_id: Ints) -> bool:
     """Whether groups of T times are sweeps: short, of several times mostly, and without an object twice."""
     count = np.bincount(sweep)
-    if len(count) < _MIN_SWEEPS or (count > 1).mean() < 0.5:
+    with_boxes = np.bincount(sweep[np.unique(place)])
+    if len(count) < _MIN_SWEEPS or not (with_boxes > 1).sum() >= (with_boxes == 1).sum():
         return False
     for times in (t_ns, log_ns):
         first, last = np.full(len(count), np.iinfo(np.int64).max), np.full(len(count), np.iinfo(np.int64).min)
