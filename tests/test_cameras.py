@@ -18,6 +18,7 @@ from mcaptrack.sources.cameras import camera_at, cameras, find_camera, name_abov
 from mcaptrack.transforms import STAGES, TRANSFORMS
 from tests.commands import GROUP, call, done, zones_file
 from tests.robots import write_log
+from tests.tiers import one_in, thorough
 from tests.worlds import tracks_at
 
 #: Where a stage may be told to write: beside its usual channel, below it, elsewhere, and under names that mean something
@@ -69,6 +70,7 @@ def test_all_commands_with_a_camera_option_are_covered():
     assert having - {"ingest"} == set(READING)
 
 
+@thorough
 def test_commands_give_the_same_output_for_results_at_other_topics(path):
     before = {command: answer(command, path) for command in READING}
     for stage, target in PLACES:
@@ -78,7 +80,7 @@ def test_commands_give_the_same_output_for_results_at_other_topics(path):
         assert after[command] == before[command], command
 
 
-@pytest.mark.parametrize(("stage", "target"), PLACES)
+@pytest.mark.parametrize(("stage", "target"), one_in(3, PLACES))
 def test_outputs_belong_to_the_camera_of_their_source(path, stage, target):
     done(stage, path, "--to", target, "-q")
     with log.read(path) as opened:
@@ -209,10 +211,13 @@ def label(path: Path, topic: str) -> None:
 
 @pytest.mark.parametrize(
     ("pictures", "boxes", "truth"),
-    [
-        (*layout, truth)
-        for layout, truth in zip(LAYOUTS, ["beside", "/camera/truth", "beside", "beside", None], strict=True)
-    ],
+    one_in(
+        2,
+        [
+            (*layout, truth)
+            for layout, truth in zip(LAYOUTS, ["beside", "/camera/truth", "beside", "beside", None], strict=True)
+        ],
+    ),
 )
 def test_recorded_detections_and_pictures_are_one_camera(tmp_path, pictures, boxes, truth):
     path = tmp_path / "boxes.mcap"

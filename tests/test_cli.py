@@ -21,6 +21,7 @@ from mcaptrack.schema import COUNTS, EVENTS, EventKind
 from mcaptrack.sources import scenes
 from mcaptrack.sources.demo import read_scores
 from tests.commands import call, printed, start
+from tests.tiers import thorough
 from tests.worlds import small_scene, write_clip
 
 LAYOUTS = [".comparing.layout.json", ".layout.json"]
@@ -109,6 +110,7 @@ class TestCommands:
         assert rows["detections"] > 0
         assert (tmp_path / "tables" / "tracks" / "recording=walk" / "part-0.parquet").is_file()
 
+    @thorough
     def test_several_logs_and_patterns(self, fresh, tmp_path):
         (tmp_path / "other.mcap").write_bytes(fresh.read_bytes())
         _, err = printed("sample", tmp_path / "*.mcap")

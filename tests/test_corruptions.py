@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.tiers import one_in
 from tools.corruptions import CORRUPTIONS, STEP_S, Corruption, corrupt
 
 #: Nothing goes wrong.
@@ -32,7 +33,7 @@ def false_tracks(rows: np.ndarray) -> list[np.ndarray]:
     return [false[false[:, 1] == one] for one in np.unique(false[:, 1])]
 
 
-@pytest.mark.parametrize("kind", CORRUPTIONS)
+@pytest.mark.parametrize("kind", one_in(3, CORRUPTIONS))
 def test_a_seed_gives_the_same_rows_again_and_another_one_others(kind):
     how = CORRUPTIONS[kind]
     first = rows_of(how)

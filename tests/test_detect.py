@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,8 +16,9 @@ from mcaptrack.schema import Frame
 from mcaptrack.sources.synthetic import SyntheticScene
 from mcaptrack.transforms import STAGES, FrameDifferenceDetector, KnnDetector, Mog2Detector, MotionDetector
 from mcaptrack.transforms.detect.background import _PersonHeight, clear_border, halve
-from mcaptrack.transforms.detect.foreground import FrameDifference
+from mcaptrack.transforms.detect.foreground import BackgroundSubtractor, FrameDifference
 from mcaptrack.transforms.detect.registration import Registration
+from tests.tiers import one_in
 from tests.worlds import ns, small_scene
 
 
@@ -74,6 +76,34 @@ def test_the_shift_of_the_camera_is_estimated():
     matrix, _ = camera.register(moved)
     np.testing.assert_allclose(matrix, [[1, 0, 6], [0, 1, -4]], atol=0.15)
     assert np.array_equal(camera.register(still)[0], [[1, 0, 0], [0, 1, 0]])
+
+
+def test_masks_do_not_depend_on_what_else_draws_random_numbers():
+    noise = np.random.default_rng(1).integers(0, 256, (30, 40, 60)).astype(np.uint8)
+
+    def masks(seed: int) -> list[np.ndarray]:
+        model, clock = BackgroundSubtractor("knn", 800.0, 2.0), FrameClock()
+        out = []
+        for n, image in enumerate(noise):
+            clock.tick(ns(n / 10))
+            cv2.setRNGSeed(seed + n)
+            out.append(model.mask(image, clock))
+        return out
+
+    first, second = masks(1), masks(700)
+    assert 0 < np.mean(first) < 255
+    assert np.array_equal(first, second)
+
+
+def test_regions_as_high_as_half_the_picture_are_no_people():
+    """The typical height is that of the region at half of the area."""
+    height = _PersonHeight()
+    mask = np.zeros((80, 400), np.uint8)
+    for n in range(12):
+        mask[10 : 10 + (40 if n < 9 else 30), 10 + 30 * n : 20 + 30 * n] = 255
+    for _ in range(4):
+        found = height.update(mask)
+    assert found == 30
 
 
 def test_another_view_becomes_the_reference_once():
@@ -335,7 +365,7 @@ def test_pictures_are_halved_until_they_are_small_enough_or_narrow(shape, max_pi
 
 
 @pytest.mark.parametrize("stabilise", [True, False])
-@pytest.mark.parametrize("name", ["knn", "mog2", "frame-difference", "median"])
+@pytest.mark.parametrize("name", one_in(3, ["knn", "mog2", "frame-difference", "median"]))
 def test_pictures_of_another_size_begin_another_view(name, stabilise):
     """The detections after the change are those of the pictures after it alone."""
     detector = STAGES["detect"].built_in()[name](stabilise=stabilise)

@@ -33,6 +33,9 @@ PAGES = pages.pages()
 EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=[path.relative_to(ROOT).as_posix() for path in PAGES])
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 COMMANDS = GROUP.commands
+#: Pages that take long, and whose commands other tests run; those of README.md tools/readme.py runs in an environment of
+#: its own.
+LONG = {"README.md", "fleet.md", "python.md", "stages.md", "tuning.md"}
 #: What a page finds where it names it: a copy of a prepared file or folder.
 PREPARED = {
     "log.mcap": "log.mcap",
@@ -70,8 +73,7 @@ def prepared(tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize(
     "page",
-    # tools/readme.py runs the commands of README.md in an environment of its own.
-    [pytest.param(path, marks=thorough) if path == README else path for path in PAGES],
+    [pytest.param(path, marks=thorough) if path.name in LONG else path for path in PAGES],
     ids=[path.relative_to(ROOT).as_posix() for path in PAGES],
 )
 def test_every_block_of_a_page_runs_and_prints_what_stands_below_it(page, prepared, tmp_path, monkeypatch):

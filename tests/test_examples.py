@@ -37,7 +37,7 @@ def own_jupyter(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
 
 
-@pytest.mark.parametrize("path", one_in(2, NOTEBOOKS), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", one_in(3, NOTEBOOKS), ids=lambda path: path.stem)
 def test_a_notebook_prints_what_stands_in_it(path, tmp_path, own_jupyter):
     notebook = nbformat.read(path, as_version=4)
     kept = printed(notebook)

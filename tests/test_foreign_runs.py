@@ -25,6 +25,7 @@ from mcaptrack.transforms import KnnDetector, Sort
 from tests.commands import GROUP, call
 from tests.robots import START_NS, stamp_of, write_log
 from tests.ros_messages import pixels, ros_writer, vision
+from tests.tiers import thorough
 from tests.worlds import ns, small_scene
 
 IMAGES = "/robot/front/image"
@@ -128,6 +129,7 @@ def test_run_takes_the_only_pictures_and_reports_it(robot, capsys):
     assert robot.read_bytes() == before
 
 
+@thorough
 def test_run_with_the_only_topic_equals_run_without_a_topic(robot, tmp_path):
     shutil.copy(robot, tmp_path / "b.mcap")
     mcaptrack("run", robot, "-q", "--topic", IMAGES)

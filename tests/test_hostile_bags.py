@@ -26,6 +26,7 @@ from mcaptrack.sources.ingest.bags import sqlite_tables as bag_database
 from tests import bounded
 from tests.bags import ROS2, STRING1, database
 from tests.commands import start
+from tests.tiers import one_in
 
 TOPICS = [(1, "/a", STRING1, "cdr", "")]
 
@@ -109,7 +110,7 @@ YAML = {
 }
 
 
-@pytest.mark.parametrize("name", YAML)
+@pytest.mark.parametrize("name", one_in(3, YAML))
 def test_metadata_that_is_no_plain_data_is_refused(commands, folder, name):
     database(folder / "a.db3", 3, [(1, 5, b"\0\1\0\0")], TOPICS)
     text, words = YAML[name]
@@ -178,7 +179,7 @@ def special(path: Path, kind: str) -> str:
     return kind
 
 
-@pytest.mark.parametrize("kind", ["pipe", "folder", "device", "socket", "loop"])
+@pytest.mark.parametrize("kind", one_in(2, ["pipe", "folder", "device", "socket", "loop"]))
 @pytest.mark.parametrize("place", ["part", "alone", "metadata"])
 def test_what_is_no_file_is_not_waited_for(commands, folder, kind, place):
     if kind == "socket" and not os.path.isdir("/proc/self/fd"):
@@ -431,7 +432,7 @@ def undeclared(size: int) -> bytes:
     return b"".join([packer.compress(bytes(2**20)) for _ in range(size // 2**20)]) + packer.flush()
 
 
-@pytest.mark.parametrize("pack", [zeros, undeclared])
+@pytest.mark.parametrize("pack", one_in(2, [zeros, undeclared]))
 def test_a_file_that_becomes_huge_is_not_unpacked(commands, folder, pack):
     (folder / "a.db3.zstd").write_bytes(pack(300 * 2**20))
     refused(commands, folder / "a.db3.zstd", "MCAPTRACK_MAX_UNPACKED_MIB sets another limit")
@@ -493,7 +494,7 @@ def packed_zeros(kind: str, size: int) -> bytes:
 
 
 @pytest.mark.parametrize("kind", PACK)
-@pytest.mark.parametrize("said", [None, 1000, 2**32 - 1])
+@pytest.mark.parametrize("said", one_in(3, [None, 1000, 2**32 - 1]))
 def test_a_chunk_that_becomes_huge_is_lost(commands, folder, kind, said):
     size = 100 * 2**20
     unfinished_bag(folder / "a.bag", kind.encode(), packed_zeros(kind, size), size if said is None else said)

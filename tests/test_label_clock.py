@@ -41,6 +41,7 @@ from mcaptrack.sources.video.h264 import inspect
 from mcaptrack.tables.compared import compare_files, detections_and_ground_truth
 from tests.bags import camera_bag
 from tests.robots import FPS, PICTURES, ROBOT_NS, lines, robot_log
+from tests.tiers import one_in
 from tests.worlds import ns, write_clip
 
 #: Corrections belong to tracks of a log: see test_corrections.
@@ -258,7 +259,7 @@ WAYS: dict[str, Way] = {
 
 
 @pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
-@pytest.mark.parametrize(("name", "role"), KINDS, ids=NAMES)
+@pytest.mark.parametrize(("name", "role"), one_in(2, KINDS), ids=NAMES)
 def test_frame_k_of_labels_is_picture_k(tmp_path, stock, way, name, role):
     world = World(tmp_path, name, role)
     path, prefix, times = way(world, stock)

@@ -17,6 +17,7 @@ from tests import bounded
 from tests.commands import made_log
 from tests.log_mutants import KINDS, mutant
 from tests.logs import READING
+from tests.tiers import thorough
 
 FEW = 12
 MUTANTS = int(os.environ.get("LOG_MUTANTS", str(FEW)))
@@ -46,6 +47,7 @@ def fault(commands: bounded.Commands, command: str, path: Path, out: Path) -> st
     return ""
 
 
+@thorough
 def test_mutants_of_logs_are_read_or_refused(whole, commands, tmp_path):
     faults = {}
     for seed in range(FIRST, FIRST + MUTANTS):

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaptrack.evaluation.metrics import Matchup, combine, distances, metres_to_similarity, score, summary
+from mcaptrack.evaluation.metrics import Matchup, clear, combine, distances, metres_to_similarity, score, summary
 from mcaptrack.evaluation.metrics.displacement import combine_displacements, displacement
 from mcaptrack.geometry.boxes import iou
 from tests.forecasts import forecasts, positions, predicted
@@ -109,6 +109,15 @@ def test_the_two_evaluators_differ_where_they_are_known_to():
     tracks = [{5: 0.0}, {7: 90.0}, {5: 0.8, 6: 0.0}]
     assert summary(score(matchup(truth, tracks), "trackeval"))["IDSW"] == 1
     assert summary(score(matchup(truth, tracks), "motmetrics"))["IDSW"] == 0
+    tracks[1] = {}  # TrackEval skips frames without any track, so that the pair before still counts
+    assert summary(score(matchup(truth, tracks), "trackeval"))["IDSW"] == 0
+
+
+def test_people_of_other_parts_of_a_sequence_are_in_no_count():
+    """The ids of a matchup may be those of a whole sequence, of which it has a part."""
+    first = np.array([0])
+    found = clear(Matchup((first,), (first,), (np.ones((1, 1)),), 0.5, n_ground_truth=3, n_tracks=2))
+    assert [int(found[name]) for name in ("MT", "PT", "ML", "GT")] == [1, 0, 0, 1]
 
 
 def test_hota_by_hand():

@@ -21,7 +21,7 @@ from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS
 from mcaptrack.transforms.protocol import bare_type, choices
 from tests.commands import call, done, toml_value
-from tests.tiers import one_in
+from tests.tiers import one_in, thorough
 
 
 @pytest.fixture
@@ -104,7 +104,7 @@ def toml(command: str, values: dict[str, Any]) -> str:
 
 
 @pytest.mark.parametrize("stage", STAGES, ids=lambda stage: "-".join([stage.command, *dict(stage.chosen).values()]))
-@pytest.mark.parametrize("way", ["flag", "environment", "file"])
+@pytest.mark.parametrize("way", one_in(3, ["flag", "environment", "file"]))
 def test_every_parameter_of_a_stage_arrives_in_the_provenance(stage, way, folder, monkeypatch):
     values = stage.others()
     assert len(values) == len(stage.parameters())
@@ -156,6 +156,7 @@ def test_parameters_reach_the_stages_that_run_makes(stage, way, folder, monkeypa
     assert "other-settings" not in [one["code"] for one in after]
 
 
+@thorough
 def test_a_forced_run_makes_the_same_channels(folder):
     """``run --force`` keeps the parameters of each channel, also those that are not the defaults."""
     done("track", "a.mcap", "--tracker", "ocsort", "--max-age-s", 3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +18,7 @@ from mcaptrack.cli.many import LogWork, ManyOptions, _Printer, _seconds, _summar
 from mcaptrack.cli.show import _DeltaWork
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import FleetResult, FleetStatus, LogOutcome, Running
+from mcaptrack.fleet.expansion import NamedLog
 from mcaptrack.notices import Notice
 from mcaptrack.pipeline.summary import Corrected, Repair, Summary, SummaryScores
 from tests.commands import run_result as result
@@ -262,6 +264,36 @@ def test_a_table_is_shown_on_terminals(hidden, stream, is_shown, monkeypatch):
     with live.LiveTable.on_terminal(hidden) as table:
         table.show(FleetStatus(9, {"done": 3}))
     assert ("3 of 9 logs in 0 s: 3 done" in stream.getvalue()) == is_shown
+
+
+@pytest.mark.parametrize(
+    ("options", "words", "line", "is_hidden"),
+    [
+        (ManyOptions(), {}, str, False),
+        (ManyOptions(), {"verbose": True}, str, False),
+        (ManyOptions(), {"quiet": True}, str, True),
+        (ManyOptions(json_lines=True), {}, str, True),
+        (ManyOptions(), {}, None, True),
+    ],
+    ids=["a line a log", "details", "quiet", "lines of JSON", "results on stdout"],
+)
+def test_a_table_is_shown_unless_results_are_printed_or_nothing_is(options, words, line, is_hidden, monkeypatch):
+    asked = []
+
+    @contextmanager
+    def on_terminal(hidden: bool) -> Iterator[None]:
+        asked.append(hidden)
+        raise KeyboardInterrupt
+        yield
+
+    monkeypatch.setattr(live.LiveTable, "on_terminal", on_terminal)
+    monkeypatch.setattr(many, "RUNNING", SimpleNamespace(get=lambda: SimpleNamespace(params={})))
+    token = many._OPTIONS.set(options)
+    work = LogWork("check", print, {}, show=print, data=str, line=line)
+    with pytest.raises(KeyboardInterrupt):
+        many.process([NamedLog(A, A), NamedLog(B, B)], work, talk(**words))
+    many._OPTIONS.reset(token)
+    assert asked == [is_hidden]
 
 
 # Progress, and Delta tables

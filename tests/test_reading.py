@@ -18,6 +18,7 @@ import pytest
 from mcaptrack.viewing.serving import Server
 from tests.commands import GROUP, call, done
 from tests.effects.commands import CASES
+from tests.tiers import one_in
 
 #: What a command is given, where the case without options of the other tests isn't what reads most.
 LINES = {
@@ -115,7 +116,7 @@ def _interrupted(*_: object, **__: object) -> None:
 
 
 @pytest.mark.usefixtures("no_hanging")
-@pytest.mark.parametrize("beside", SURROUNDINGS, ids=lambda one: one.__name__)
+@pytest.mark.parametrize("beside", one_in(2, SURROUNDINGS), ids=lambda one: one.__name__)
 @pytest.mark.parametrize(
     "command", sorted(set(GROUP.commands) - {"calibrate", "delta", "demo", "models", "train"})
 )  # train needs torch, and calibrate several cameras

@@ -8,6 +8,7 @@ import motmetrics as mm
 import numpy as np
 import pytest
 
+from mcaptrack.evaluation.averages import averages
 from mcaptrack.evaluation.metrics import Matchup, ScoredMatchup, average_over_recalls, metres_to_similarity
 
 GATE_M = 2.0
@@ -150,6 +151,11 @@ def test_what_is_never_reached_counts_as_nothing():
     assert found["AMOTP"] == pytest.approx(0.8 * (np.linspace(0.1, 1, 40) <= 0.25).sum() / 40)
     nothing = average_over_recalls([ScoredMatchup(one_frame(4, 0, 2), np.array([0.3, 0.4]))])
     assert nothing == {"AMOTA": 0.0, "AMOTP": 0.5, "sAMOTA": 0.0, "AMOTA_unscaled": 0.0}
+    parts = [ScoredMatchup(one_frame(4, 1, 0), np.array([0.3]))]
+    reached = (np.linspace(0.1, 1, 40) <= 0.25).sum() / 40
+    assert averages(parts, "iou", 0.5, "trackeval")["AMOTP"] == pytest.approx(0.8 * reached)
+    # Pairs are 0.2 of 2 gates apart, and what is not reached is at the gate.
+    assert averages(parts, "metres", 3.0, "trackeval")["AMOTP_m"] == pytest.approx(1.2 * reached + 3.0 * (1 - reached))
     assert np.isnan(list(average_over_recalls([ScoredMatchup(one_frame(0, 0, 1), np.ones(1))]).values())).all()
 
 

@@ -134,6 +134,13 @@ def test_jitter_of_timestamps_changes_no_age():
     assert wanted[-1] == [1]
 
 
+@pytest.mark.parametrize(("least_s", "hits"), [(0.24, 2), (0.26, 3)])
+def test_the_time_to_a_confirmed_track_is_rounded_to_the_nearest_frame(least_s, hits):
+    frames = detections(lambda n: [(50, 60)] if n >= 20 else [(200, 60)], 40)
+    out = [ids(frame) for (frame,) in Sort(max_age_s=0.5, min_hits_s=least_s)(frames)]
+    assert next(n for n, found in enumerate(out) if found == [2]) == 20 + hits
+
+
 def test_ages_are_in_seconds_where_the_frame_rate_changes():
     """A person is missed for 0.9 s: at 10 frames a second, and after the rate has risen to 30."""
     times = [n / 10 for n in range(40)] + [4 + n / 30 for n in range(120)]
