@@ -12,6 +12,7 @@ from mcaptrack import log, notices, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.events import EventOptions
 from mcaptrack.pipeline import events
+from mcaptrack.pipeline.checks import describe_origin
 from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind, Frame
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance
@@ -25,7 +26,8 @@ def written(path: Path, *channels: tuple[str, Provenance | None, list[Frame]], e
     with log.create(path) as writer:
         for topic, made, frames in channels:
             metadata = made.to_metadata() if made else {}
-            number = writer.add_channel(topic, (TRACKS.name, "protobuf", TRACKS.descriptor), encoding, metadata)
+            kind = (TRACKS.name, "protobuf", TRACKS.descriptor)
+            number = writer.add_channel(topic, kind, encoding, metadata, another=True)
             for frame in frames:
                 writer.add_message(number, frame.t_ns, frame.index, TRACKS.codec.encode(frame.rows))
     return path
@@ -60,6 +62,15 @@ def test_events_that_would_replace_something_are_left_out_with_a_warning_or_refu
     with pytest.raises(McaptrackError) as error:
         watched(path, topics=("/camera/tracks",), again=True)
     assert str(error.value) == f"{path}: events {taken}"
+
+
+def test_of_two_channels_of_a_topic_the_recorded_one_is_named(tmp_path):
+    ours, theirs = (("/camera/retracks", made, WALK) for made in (TRACKED[1], None))
+    for number, channels in enumerate([(ours, theirs), (theirs, ours)]):
+        path = written(tmp_path / f"{number}.mcap", TRACKED, *channels)
+        with log.read(path) as opened:
+            assert describe_origin(opened, "/camera/retracks") == "was recorded by others (mcaptrack.Tracks)"
+            assert describe_origin(opened, "/camera/tracks") == "was ingested"
 
 
 def test_a_camera_without_tracks_has_no_events(tmp_path):

@@ -64,6 +64,12 @@ def test_a_track_survives_missed_detections_up_to_its_maximum_age():
     assert [ids(frame) for frame in out[12:]] == [[], *[[1]] * 7]  # the hit streak starts again
 
 
+def test_a_track_at_its_maximum_age_outlives_one_beyond_it():
+    away = {0: (9, 10, 11), 1: (10, 11)}
+    frames = detections(lambda n: [(50, 50 + 100 * who) for who in away if n not in away[who]], 20)
+    assert [ids(run(frames)[n]) for n in (8, 19)] == [[1, 2], [2, 3]]
+
+
 def test_a_track_terminates_after_its_maximum_age():
     out = run(detections(lambda n: [] if 10 <= n <= 12 else [(50, 50)], 20))
     assert ids(out[9]) == [1]
