@@ -13,7 +13,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.events import EventOptions
 from mcaptrack.pipeline import events
 from mcaptrack.pipeline.checks import describe_origin
-from mcaptrack.pipeline.write import Made
+from mcaptrack.pipeline.write import Made, _floor_m
 from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind, Frame
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance
 from tests.worlds import ns, walk
@@ -62,6 +62,15 @@ def test_events_that_would_replace_something_are_left_out_with_a_warning_or_refu
     with pytest.raises(McaptrackError) as error:
         watched(path, topics=("/camera/tracks",), again=True)
     assert str(error.value) == f"{path}: events {taken}"
+
+
+def test_tracks_without_heights_stand_on_a_floor_at_zero(tmp_path):
+    high = [frame._replace(rows=frame.rows.copy()) for frame in WALK]
+    for frame in high:
+        frame.rows["z_m"], frame.rows["height_m"] = 3.0, 1.5
+    for number, (frames, floor_m) in enumerate([(WALK, 0.0), (high, 2.2)]):
+        with log.read(written(tmp_path / f"{number}.mcap", (*TRACKED[:2], frames))) as opened:
+            assert _floor_m(opened, "/camera", {}) == floor_m
 
 
 def test_of_two_channels_of_a_topic_the_recorded_one_is_named(tmp_path):

@@ -89,6 +89,13 @@ def test_motion_belongs_to_pictures_and_no_stage_replaces_it(folder):
     done("ingest", "clip.mp4", "--motion", "motion.txt", "-o", "a.mcap", "-q")
     with log.read(Path("a.mcap")) as opened:
         assert opened.times("/camera/motion").tolist() == opened.times("/camera/video").tolist()
+    done("ingest", "clip.mp4", "-o", "b.mcap", "-q")
+    (folder / "few.txt").write_text("1,-1,5,5,10,20,1,-1,-1,-1\n")
+    done("ingest", "few.txt", "--as", "detections", "--into", "b.mcap", "--motion", "motion.txt", "-q")
+    for path in ("a.mcap", "b.mcap"):
+        with log.read(Path(path)) as opened:
+            rows = opened.rows("/camera/motion", CAMERA_MOTION).rows
+        assert {(row["width_px"], row["height_px"]) for row in rows} == {(64, 48)}
     outcome = call("motion", "a.mcap")
     assert (outcome.code, "was ingested" in outcome.err) == (1, True), outcome.err
     done("motion", "a.mcap", "--to", "/camera/estimated", "-q")
