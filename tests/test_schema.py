@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from mcaptrack.schema import DETECTIONS, EVENTS, PREDICTIONS, SCHEMAS, TRACKS
 from mcaptrack.schema.camera_motion import is_motion
-from mcaptrack.schema.codec import RowCodec
+from mcaptrack.schema.codec import RowCodec, _varint
 from mcaptrack.schema.proto import KINDS, parse
 from mcaptrack.schema.provenance import Plugin, Provenance, digest
 from tests.strategies import columns
@@ -117,6 +117,15 @@ def test_messages_with_and_without_later_columns_are_read_together(order):
     found, counts = DETECTIONS.codec.decode_at(np.frombuffer(b"".join(payloads), np.uint8), start, end)
     assert counts.tolist() == [0, 2, 2, 2]
     assert same(found, np.concatenate(parts))
+
+
+@pytest.mark.parametrize(
+    ("value", "wanted"),
+    [(0, "00"), (1, "01"), (126, "7e"), (127, "7f"), (128, "8001"), (300, "ac02"), (16384, "808001")],
+)
+def test_numbers_are_as_short_as_protobuf_writes_them(value, wanted):
+    """300 is the example of protobuf's own documentation."""
+    assert _varint(value).hex() == wanted
 
 
 def test_a_writer_that_leaves_defaults_out_is_read_between_others():

@@ -74,7 +74,7 @@ def test_a_mixture_is_found_again_from_its_samples():
 
 
 class TestCalibration:
-    def forecasts(self, sd_m: float, steps: int = 60, tracks: int = 40):
+    def forecasts(self, sd_m: float, noise_m: float = 0.0, steps: int = 60, tracks: int = 40):
         """Errors of a known size of a predictor that says 1 m; the levels of the ellipses that hold them, by time."""
         rng = np.random.default_rng(4)
         predictor = make("kalman", 3, 0.4)
@@ -84,7 +84,7 @@ class TestCalibration:
         for step in range(steps):
             mean = np.stack([place[step + k] + sd_m * rng.normal(size=(tracks, 2)) for k in (1, 2, 3)], axis=1)
             cov = np.tile(np.eye(2), (tracks, 3, 1, 1))
-            past = np.zeros((tracks, 8, 2))
+            past = noise_m * rng.normal(size=(tracks, 8, 2))
             made, tails = calibration(step, ids, Forecast(mean, cov), past, np.zeros(tracks, bool))
             truth = np.stack([place[step + k] for k in (1, 2, 3)], axis=1)
             levels.append(ellipse_levels(made.mean - truth, made.cov, tails))
@@ -95,6 +95,10 @@ class TestCalibration:
         levels = self.forecasts(sd_m)[30:]
         for level in (0.5, 0.95):
             assert (levels <= level).mean() == pytest.approx(level, abs=0.04)
+
+    def test_ellipses_are_of_true_positions_though_measured_ones_have_noise(self):
+        levels = self.forecasts(0.3, noise_m=0.3)[40:]
+        assert (levels <= 0.5).mean() == pytest.approx(0.5, abs=0.08)
 
     def test_the_covariance_is_that_of_the_mixture(self):
         predictor = make("red", 12, 0.4)
