@@ -178,3 +178,50 @@ def test_evaluate_gives_a_row_for_each_class_in_python_on_the_terminal_and_in_ta
     mcaptrack.report(path)
     page = (tmp_path / "a.report.html").read_text()
     assert "within 1 m on the ground, cart" in page
+
+
+HEAD = "frame,id,x,y,w,h,class"
+
+
+def table(folder, name, kinds, separator=","):
+    """A table of one object of each class, 90 pixels apart, in ten frames."""
+    rows = [f"{t},{k},{90 * k},{t},40,80,{kind}" for t in range(10) for k, kind in enumerate(kinds)]
+    (folder / name).write_text("\n".join([HEAD, *rows]).replace(",", separator))
+    return folder / name
+
+
+@pytest.mark.parametrize("separator", [",", ";"])
+def test_label_files_are_scored_by_class(separator, tmp_path):
+    truth = table(tmp_path, "t.csv", ["person", "car", "dog"])
+    tracks = table(tmp_path, "k.csv", ["person", "dog", "bus"], separator)  # the car is taken for a dog
+    (people,) = mcaptrack.evaluate(tracks, truth=truth).results
+    assert (people.of_class, people.to_json()["MOTA"]) == (None, 1.0)
+    found = mcaptrack.evaluate(tracks, truth=truth, classes="all").results
+    counts = {row.of_class: tuple(row.to_json()[name] for name in ("GT", "FN", "FP")) for row in found}
+    assert counts == {None: (3, 20, 10), "person": (1, 0, 0), "car": (1, 10, 0), "dog": (1, 10, 10)}
+    found = mcaptrack.evaluate(tracks, truth=truth, classes="person,car").results
+    counts = {row.of_class: tuple(row.to_json()[name] for name in ("GT", "FN", "FP")) for row in found}
+    assert counts == {None: (2, 10, 0), "person": (1, 0, 0), "car": (1, 10, 0)}
+
+
+def test_classes_of_files_that_are_not_there_or_not_used_are_said(tmp_path):
+    truth = table(tmp_path, "t.csv", ["person", "car"])
+    with pytest.raises(McaptrackError, match=r"t\.csv has no class 'horse'; `classes=` takes person, car, or all"):
+        mcaptrack.evaluate(truth, truth=truth, classes="person,horse")
+    with pytest.raises(McaptrackError, match=r"k\.csv holds no boxes, only 10 dog"):
+        mcaptrack.evaluate(table(tmp_path, "k.csv", ["dog"]), truth=truth, classes="car")
+
+
+def test_frames_and_names_of_other_formats_are_scored_by_class(tmp_path):
+    """COCO beside a table: their frames are compared, and their classes by name."""
+    truth = table(tmp_path, "t.csv", ["person", "car"])
+    images = [{"id": t, "file_name": f"{t}.jpg"} for t in range(10)]
+    boxes = [
+        {"image_id": t, "category_id": 9 - k, "bbox": [90 * k, t, 40, 80], "track_id": k}
+        for t in range(10)
+        for k in (0, 1)
+    ]
+    names = [{"id": 9, "name": "person"}, {"id": 8, "name": "car"}]
+    (tmp_path / "k.json").write_text(json.dumps({"images": images, "annotations": boxes, "categories": names}))
+    found = mcaptrack.evaluate(tmp_path / "k.json", truth=truth, classes="all").results
+    assert {row.of_class: row.to_json()["MOTA"] for row in found} == {None: 1.0, "person": 1.0, "car": 1.0}

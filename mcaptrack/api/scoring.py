@@ -71,6 +71,7 @@ def evaluate(
     rules: Rules = "trackeval",
     smoothed: bool = False,
     topic: str | Sequence[str] | None = None,
+    classes: str | None = None,
     camera: str | None = None,
     ground_plane: PathLike | None = None,
     point: Point = "foot",
@@ -99,6 +100,9 @@ def evaluate(
         Of logs: score predictions from smoothed samples, too, as "samples, smoothed" (the paper's SORT + smoothing).
     topic : str or sequence of str, optional
         Score these channels. By default tracks, samples, retracks and retracks/online, and retracks/full of 3D boxes.
+    classes : str, optional
+        Of files: score these classes, by name or number with commas between them, or all. By default people; of 3D
+        boxes all.
     camera : str, optional
         Name of the camera, if a log has several.
     ground_plane : path, optional
@@ -138,7 +142,7 @@ def evaluate(
         else:
             plane = optional_path(ground_plane)
             sequences = _from_files(
-                [as_path(path) for path in paths], paths_of(truth), parse_fps(fps), plane, point, topics, notes
+                [as_path(path) for path in paths], paths_of(truth), parse_fps(fps), plane, point, topics, classes, notes
             )
         total, counter = sum(len(sequence.candidates) for sequence in sequences), count()
 
@@ -154,10 +158,13 @@ def evaluate(
         if truth is None:
             reason = "it is about label files; logs have theirs inside"
             warn_unused(reason, ground_plane=has_plane, point=has_point, fps=fps is not None)
+            warn_unused("logs are scored by all classes that they have", classes=classes is not None)
         else:
             warn_unused("files of tracks are of no camera", camera=camera is not None)
             warn_unused("files hold no samples with predictions", smoothed=smoothed)
             warn_unused("there is no ground plane", point=has_point and not has_plane)
+            is_unused = classes is not None and any(map(holds_tables, [*paths, *paths_of(truth)]))
+            warn_unused("tables are compared as a whole", classes=is_unused)
             warn_unused("only tables hold several channels", topic=bool(topics) and not any(map(holds_tables, paths)))
         compared = {result.similarity for result in outcome.results}
         if "metres" not in compared:
@@ -214,6 +221,7 @@ def _from_files(
     ground_plane: Path | None,
     point: Point,
     topics: tuple[str, ...],
+    classes: str | None,
     notes: Notes,
 ) -> list[EvaluationInput]:
     pairs, words = pair_files(tracks, truths)
@@ -221,7 +229,7 @@ def _from_files(
         notes.say(words)
     sequences = []
     for name, path, labels in pairs:
-        both = compare_files(path, labels, fps, ground_plane, point, topics)
+        both = compare_files(path, labels, fps, ground_plane, point, topics, classes)
         for note in both.notes:
             notes.say(note)
         sequences.append(sequence_of_files(name, path, both.ground_truth, both.tracks, len(pairs), both.classes))

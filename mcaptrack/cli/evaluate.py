@@ -91,6 +91,15 @@ def evaluate(
             show_default="tracks, samples, retracks, retracks/online; of 3D boxes retracks/full, too",
         ),
     ] = None,
+    classes: Annotated[
+        str | None,
+        common.option(
+            "--classes",
+            panel=labels.LABELS,
+            help="Classes of label files to score, by name or number, as in person,car; all for every one.",
+            show_default="person; 3D boxes: all",
+        ),
+    ] = None,
     camera: common.Camera = None,
     ground_plane: labels.GroundPlane = None,
     point: labels.Point = "foot",
@@ -138,6 +147,7 @@ def evaluate(
             rules=rules,
             smoothed=smoothed,
             topic=topic,
+            classes=classes,
             camera=camera,
             ground_plane=ground_plane,
             point=point,

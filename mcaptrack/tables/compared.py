@@ -35,6 +35,7 @@ from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
 from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX, IgnoredBoxes, Labels, Role
 from mcaptrack.sources.ingest.labels.label_rows import label_rows
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
+from mcaptrack.sources.ingest.labels.wanted import ONLY_PEOPLE, WantedClasses
 
 #: Formats that give the frame number of each row.
 _COUNTING: Final = ("mot", "kitti", "parquet")
@@ -103,33 +104,49 @@ def compare_files(
     ground_plane: Path | None = None,
     point: Point = "foot",
     topics: Sequence[str] = (),
+    classes: str | None = None,
 ) -> AlignedFiles:
-    """Tracks and ground truth as frames. Raises McaptrackError if they can't be read or compared."""
+    """Tracks and ground truth as frames.
+
+    ``classes`` are those to compare, see ``WantedClasses``: by default people, and of 3D boxes all. Tables have no
+    classes, and are compared as a whole. Raises McaptrackError if the files can't be read or compared.
+    """
     have_3d = [is_3d(path) for path in (tracks, ground_truth)]
     if all(have_3d):
-        return _boxes_3d(tracks, ground_truth, fps, ground_plane)
+        return _boxes_3d(tracks, ground_truth, fps, ground_plane, classes)
     if any(have_3d):
         words = f"{tracks if have_3d[0] else ground_truth} holds 3D boxes, and {tracks if have_3d[1] else ground_truth}"
         raise McaptrackError(f"{words} does not; they can't be compared")
     both: dict[Role, tuple[Path, Labels]] = {
-        "truth": (ground_truth, _read(ground_truth, "truth", topics)),
-        "tracks": (tracks, _read(tracks, "tracks", topics)),
+        "truth": (ground_truth, _read(ground_truth, "truth", topics, WantedClasses(classes or ONLY_PEOPLE.text))),
+        "tracks": (tracks, _read(tracks, "tracks", topics, WantedClasses(classes or ONLY_PEOPLE.text, may_lack=True))),
     }
     formats = [labels.format for _, labels in both.values()]
     if not all(name in _COUNTING for name in formats) and len(set(formats)) > 1:
         if "parquet" in formats:
             raise McaptrackError(f"{tracks} and {ground_truth} share no clock: one counts frames, the other does not")
-        frames = ingest.label_frames({"tracks": tracks, "truth": ground_truth}, fps, ground_plane, point)
-        return AlignedFiles(frames["truth"], frames["tracks"])
+        wanted = WantedClasses(classes, may_lack=True) if classes else None
+        frames = ingest.label_frames(
+            {"tracks": tracks, "truth": ground_truth}, fps, ground_plane, point, classes=wanted
+        )
+        return AlignedFiles(frames["truth"], frames["tracks"], classes=_names_of(both))
     notes = [f"{path} also holds {labels.left_out}" for path, labels in both.values() if labels.left_out]
     if fps is not None:
         notes.append("frames are compared by their numbers, whatever the frames per second")
     return _by_number(both, ground_plane, point, notes)
 
 
-def _boxes_3d(tracks: Path, ground_truth: Path, fps: Fraction | None, ground_plane: Path | None) -> AlignedFiles:
+def _names_of(both: Mapping[Role, tuple[Path, Labels]]) -> tuple[Mapping[int, str], Mapping[int, str]]:
+    """The names of the classes of ground truth and tracks."""
+    return both["truth"][1].classes, both["tracks"][1].classes
+
+
+def _boxes_3d(
+    tracks: Path, ground_truth: Path, fps: Fraction | None, ground_plane: Path | None, wanted: str | None
+) -> AlignedFiles:
     """3D boxes of two files, taken as being in one frame of reference."""
-    options = IngestOptions(fps=fps, ground_plane=ground_plane, frame_id=FRAME)
+    classes_3d = WantedClasses(wanted, may_lack=True) if wanted else None
+    options = IngestOptions(fps=fps, ground_plane=ground_plane, frame_id=FRAME, classes=classes_3d)
     with Boxes3DJob([("tracks", tracks), ("truth", ground_truth)], options) as job:
         job.report_assumptions()
         classes = (job.classes("truth"), job.classes("tracks"))
@@ -164,15 +181,15 @@ class _PairJob(LabelJob):
     """Labels of detections and of ground truth, which may be a table."""
 
     def read(self, path: Path, role: Role) -> Labels:
-        return _read(path, role, ()) if role == "truth" else super().read(path, role)
+        return _read(path, role, (), ONLY_PEOPLE) if role == "truth" else super().read(path, role)
 
 
-def _read(path: Path, role: Role, topics: Sequence[str]) -> Labels:
+def _read(path: Path, role: Role, topics: Sequence[str], wanted: WantedClasses) -> Labels:
     if path.suffix.lower() in (".parquet", ".pq"):
         return _read_parquet(path, role, topics)
     if role == "tracks" and path.is_file() and _is_blank(path):
         return _no_tracks("mot")
-    labels = read_labels(path, role=role)
+    labels = read_labels(path, role=role, wanted=wanted)
     if labels.times_s is not None or labels.is_normalised:
         what = "times instead of frames" if labels.times_s is not None else "boxes in shares of the picture's size"
         raise McaptrackError(f"{path} has {what}; make a log of it with {call('ingest', path)}, and compare that")
@@ -250,7 +267,7 @@ def _by_number(
         frames["tracks"], gone = _without_ignored(frames["truth"], frames["tracks"], ground_truth)
         if gone:
             notes.append(f"{gone} boxes of {both['tracks'][0]} match labels that don't count; they are ignored")
-    return AlignedFiles(frames["truth"], frames["tracks"], notes)
+    return AlignedFiles(frames["truth"], frames["tracks"], notes, _names_of(both))
 
 
 def _plane(path: Path | None, point: Point, ground_truth: Labels, tracks: Labels) -> GroundPlane | None:

@@ -171,6 +171,7 @@ CASES: dict[str, dict[str, Case]] = {
         curves="--curves curves.svg",
         smoothed="--smoothed",
         topic="--topic /camera/samples",
+        classes=("evaluate kinds.csv --truth kinds.csv", "--classes all"),
         camera="--camera other",
         ground_plane=(SCORED, "--ground-plane plane.txt"),
         point=(f"{SCORED} --ground-plane plane.txt --gate-m 0.1", "--point center"),

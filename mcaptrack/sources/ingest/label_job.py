@@ -37,6 +37,7 @@ from mcaptrack.sources.ingest.labels.camera import (
 )
 from mcaptrack.sources.ingest.labels.formats import Format, Labels, Role
 from mcaptrack.sources.ingest.labels.timeline import MAX_FRAMES, Timeline, count_frames
+from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 from mcaptrack.sources.planes import planes_in
 from mcaptrack.sources.video import SEQINFO, find_seqinfo
 
@@ -302,13 +303,14 @@ def label_frames(
     ground_plane: Path | None,
     point: Point,
     label_format: Format = "auto",
+    classes: WantedClasses | None = None,
 ) -> dict[Role, list[Frame]]:
     """Read label files with a common clock as frames, without writing a log.
 
     Raises McaptrackError as ``ingest`` does. For comparisons only the order and intervals of times matter, so files
     without a frame rate get one frame per second unless ``fps`` is given.
     """
-    options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point, label_format=label_format)
+    options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point, label_format=label_format, classes=classes)
     job = LabelJob([(role, path) for role, path in files.items()], options, default_fps=Fraction(1))
     job.report_assumptions()
     return {role: job.all_frames(role) for role in files}
