@@ -9,8 +9,10 @@ import pytest
 from mcaptrack.geometry.affine import IDENTITY, invert, shift_px
 from mcaptrack.geometry.camera_motion import MotionEstimator
 from mcaptrack.geometry.camera_path import CameraPath, CameraPose, Verdict, poses_of
+from mcaptrack.notices import collected
 from mcaptrack.schema import CAMERA_MOTION, Frame
 from mcaptrack.schema.camera_motion import frames_to_path, pose_to_rows, rows_to_verdict
+from mcaptrack.transforms.motion import EstimateMotion
 from tests.test_camera_motion import HEIGHT, WIDTH, between, corner_error, follow, picture, pose, scene
 
 SCENE = scene(21)
@@ -172,3 +174,38 @@ def test_a_camera_that_has_turned_once_looks_elsewhere_from_then_on():
     assert [one.is_elsewhere for _, one in path.poses_between(None, None)] == [one.is_elsewhere for one in found]
     assert rows_to_verdict(CAMERA_MOTION.joined([frame.rows for frame in frames])) is Verdict.MOVING
     assert rows_to_verdict(CAMERA_MOTION.joined([frame.rows for frame in frames[:100]])) is Verdict.STILL
+
+
+def divided(kind):
+    """Pictures of a scene that pans by 3 px a picture, with something else below, or before it for a while."""
+    below = scene(33)
+    for k in range(34):
+        image = picture(SCENE, pose(3.0 * k))
+        if kind == "vehicle":
+            image[HEIGHT // 2 :] = below[: HEIGHT - HEIGHT // 2, :WIDTH]
+        elif kind == "near":
+            image[HEIGHT // 2 :] = picture(below, pose(7.0 * k))[HEIGHT // 2 :]
+        elif kind == "train" and k < 12:
+            image = picture(SCENE, pose())
+            image[:175, : 30 * k] = np.roll(below[:175, :WIDTH], 15 * k, axis=1)[:, : 30 * k]
+        elif kind == "rolling":  # rows are read one after the other while the camera pans to and fro
+            y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
+            fast = np.float32(8 * np.cos(k / 4))
+            turned = picture(SCENE, pose(32 * np.sin(k / 4)))
+            image = cv2.remap(turned, x + fast * (y / HEIGHT - 0.5), y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        yield Frame(k * 40_000_000, k, image)
+
+
+@pytest.mark.parametrize(
+    ("kind", "is_said"),
+    [("vehicle", True), ("near", True), ("train", False), ("rolling", False)],
+)
+def test_a_part_that_moves_otherwise_is_said(kind, is_said):
+    with collected() as said:
+        motion = [frame.rows for (frame,) in EstimateMotion()(divided(kind))]
+    assert any("one part moves as a whole" in one.message for one in said) == is_said
+    shift = np.array([rows["m02_px"][0] for rows in motion[1:]])
+    if kind == "near":
+        assert abs(np.median(shift) + 3) < 0.2
+    elif kind == "rolling":  # that of one of the rows: the first and the last are 8 px apart at most
+        assert np.abs(shift + 32 * np.diff(np.sin(np.arange(34) / 4))).max() < 8

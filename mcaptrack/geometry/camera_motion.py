@@ -139,7 +139,7 @@ class MotionEstimator:
         CameraPose
 
         """
-        picture, to_small = _reduced(image)
+        picture, to_small = reduced(image)
         hidden = None if boxes is None else move_boxes(to_small, boxes)
         self._size = (image.shape[1], image.shape[0])
         self._to_small, self._from_small = to_small, invert(to_small)
@@ -158,7 +158,7 @@ class MotionEstimator:
         """Begin a new reference with this picture."""
         self._stance, self._misses, self._has_view = Stance(*self._size), 0, verdict is Verdict.LOST
         self._sure = []
-        self._add_key(_Key(picture, *_features(picture.image, hidden), IDENTITY, self._count))
+        self._add_key(_Key(picture, *features(picture.image, hidden), IDENTITY, self._count))
         return CameraPose(IDENTITY, IDENTITY, self._count, 0.0, verdict)
 
     def _add_key(self, key: _Key) -> None:
@@ -168,7 +168,7 @@ class MotionEstimator:
         key, last = self._keys[-1], self._last
         if len(key.points) < _MIN_INLIERS and (
             _correlation(key.picture, picture) >= _CUT_CORRELATION
-            or len(_features(picture.image, hidden)[0]) < _MIN_INLIERS
+            or len(features(picture.image, hidden)[0]) < _MIN_INLIERS
         ):
             return self._posed(last.to_reference, 0)  # pictures without features show no motion
         fit = self._fit_sure(picture, hidden)
@@ -182,7 +182,7 @@ class MotionEstimator:
                 self._is_sudden = is_sudden
                 break
         if fit is None:  # the key picture is too long ago
-            latest = _Key(before, *_features(before.image, hidden), last.to_reference, last.reference)
+            latest = _Key(before, *features(before.image, hidden), last.to_reference, last.reference)
             if (fit := self._fit(latest, picture, IDENTITY, hidden, _WIDE_LEVELS)) is not None:
                 if last.verdict is Verdict.LOST and self._misses and not self._sure:
                     self._sure, self._unsure = self._keys, self._misses + 1
@@ -195,7 +195,7 @@ class MotionEstimator:
         pose = self._posed(compose(key.to_reference, invert(matrix)), inliers)
         is_far = shift_px(matrix, *self._size) > _KEY_SHIFT * np.hypot(*self._size)
         if is_far or inliers < _KEY_SHARE * self._most:
-            self._add_key(_Key(picture, *_features(picture.image, hidden), pose.to_reference, pose.reference))
+            self._add_key(_Key(picture, *features(picture.image, hidden), pose.to_reference, pose.reference))
         return pose
 
     def _fit_sure(self, picture: _Picture, hidden: Floats | None) -> tuple[Floats, int] | None:
@@ -299,7 +299,7 @@ class MotionEstimator:
         return compose(self._from_small, compose(fitted, self._to_small)), int(np.count_nonzero(inliers))
 
 
-def _reduced(image: Image) -> tuple[_Picture, Floats]:
+def reduced(image: Image) -> tuple[_Picture, Floats]:
     """A picture at half its size, or less, and the transform (2, 3) to its pixels."""
     import cv2
 
@@ -317,7 +317,7 @@ def _reduced(image: Image) -> tuple[_Picture, Floats]:
     return picture, np.array([[x, 0.0, (x - 1) / 2], [0.0, y, (y - 1) / 2]])
 
 
-def _features(image: Image, hidden: Floats | None) -> tuple[Points, Floats]:
+def features(image: Image, hidden: Floats | None) -> tuple[Points, Floats]:
     """Points (N, 1, 2) that can be found again, spread over the picture, outside of boxes (N, 4), and weights (N,)."""
     import cv2
 

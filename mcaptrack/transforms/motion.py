@@ -11,6 +11,7 @@ from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.camera_motion import MotionEstimator
 from mcaptrack.geometry.camera_path import Verdict
 from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.second_motion import SecondMotion
 from mcaptrack.notices import warn
 from mcaptrack.schema import CAMERA_MOTION, VIDEO, Frame, Schema
 from mcaptrack.schema.camera_motion import pose_to_rows
@@ -18,6 +19,8 @@ from mcaptrack.transforms.protocol import check_options, context, option
 
 #: From this share of lost pictures on, it is said.
 _LEAST_LOST: Final = 0.02
+#: So is a part of the picture that moves otherwise, from this share and number of the pictures that were looked at.
+_LEAST_DIVIDED, _LEAST_EXAMINED = 0.4, 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,11 +55,13 @@ class EstimateMotion:
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
         camera, boxes = MotionEstimator(), self.known_boxes if self.mask_boxes else {}
+        second = SecondMotion()
         times: list[int] = []
         cuts: list[int] = []
         lost = 0
         for frame in frames:
             pose = camera.step(frame.rows, boxes.get(frame.t_ns))
+            second.step(frame.rows, pose, boxes.get(frame.t_ns))
             times.append(frame.t_ns)
             cuts += [frame.t_ns] if pose.verdict is Verdict.CUT else []
             lost += pose.verdict is Verdict.LOST
@@ -71,6 +76,13 @@ class EstimateMotion:
             warn(
                 f"the motion of the camera is not known in {share:.0%} of the pictures; it is taken as none",
                 "view-lost",
+            )
+
+        if second.examined >= _LEAST_EXAMINED and second.divided >= _LEAST_DIVIDED * second.examined:
+            warn(
+                f"in {second.divided / second.examined:.0%} of the pictures one part moves as a whole, and another one "
+                "otherwise or not at all, such as a vehicle that the camera is in: the motion may be of either",
+                "camera-moves",
             )
 
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
