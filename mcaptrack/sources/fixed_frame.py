@@ -107,6 +107,10 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
     _warn_odd(opened, topic, found)
     rows = rows_of_boxes(found, rotation[is_taken], shift[is_taken], f"{opened.path}: {topic}")
     names = foreign.settle_classes(opened, topic, found.classes, [rows])
+    if nameless := found.classes.nameless(np.unique(rows["class_id"]).tolist()):
+        listed = ", ".join(map(str, nameless[:_LISTED])) + (", ..." if len(nameless) > _LISTED else "")
+        words = "1 counts as people, and others move as objects of unknown class do"
+        warn(f"{opened.path}: classes of {topic} are numbers without names ({listed}): {words}", "classes")
     order = np.argsort(frame, kind="stable")
     parts = np.split(rows[order], np.searchsorted(frame[order], np.arange(1, len(start_ns))))
     kept = np.flatnonzero(~is_left_out).tolist()

@@ -6,7 +6,7 @@ Letters: N boxes.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from itertools import islice
 from math import cos, isfinite, nan, sin
 from typing import Any, Final
@@ -65,6 +65,11 @@ class Classes:
         """The names of all classes by their final id; of people only where all have one name other than "person"."""
         people = {PERSON: min(self._people)} if len(self._people) == 1 and self._people != {_PERSON} else {}
         return people | dict(enumerate(sorted(self._names), start=self._largest + 1))
+
+    def nameless(self, used: Collection[int]) -> list[int]:
+        """Those of the final ids ``used`` that messages state as numbers, without a name; 0 is no class."""
+        named = set(self.numbers().values()) | ({PERSON} if self._people else set()) | {UNKNOWN}
+        return sorted(set(used) - named)
 
     def named(self) -> list[tuple[str, int]]:
         """The first class names in alphabetical order, with their ids."""
