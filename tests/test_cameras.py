@@ -121,7 +121,9 @@ def outputs(path: Path, topic: str) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize(("mode", "made"), [("online", ["/online", "/predictions"]), ("offline", ["", "/full"])])
+@pytest.mark.parametrize(
+    ("mode", "made"), [("online", ["/online", "/predictions"]), ("offline", ["", "/full", "/decisions"])]
+)
 def test_only_existing_outputs_are_made_again(path, mode, made):
     done("retrack", path, "--to", "/again", "--mode", mode, "--max-age-s", 1, "-q")
     done("sample", path, "--rate-hz", 5, "-q")
@@ -135,7 +137,7 @@ def test_missing_outputs_are_made_with_the_parameters_of_existing_ones(path):
     said = done("run", "dropped.mcap", "--no-tables").err
     assert "/camera/retracks is missing: running retrack, as for what it made beside it" in said
     assert outputs(Path("dropped.mcap"), "/camera/retracks") == dict.fromkeys(
-        ["", "/full", "/online", "/predictions"], 1
+        ["", "/full", "/online", "/predictions", "/decisions"], 1
     )
 
 
@@ -161,7 +163,7 @@ def test_stages_do_not_replace_channels_of_other_stages(path, stage):
 @pytest.mark.parametrize(
     ("stage", "below"),
     [*((stage, "") for stage in STAGES), ("track", "/view/image"), ("retrack", "/view/scene")]
-    + [("retrack", f"/{suffix}") for suffix in ("online", "predictions", "full")],
+    + [("retrack", f"/{suffix}") for suffix in ("online", "predictions", "decisions", "full")],
 )
 def test_stages_do_not_replace_recorded_channels(path, stage, below):
     """This holds for all outputs and for their views."""

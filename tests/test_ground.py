@@ -486,7 +486,7 @@ def test_people_that_were_detected_as_seldom_as_samples_are_associated_again(pic
         rows = TRACKS.rows(track_id=ids, x_m=[way, 0.1], y_m=[0.0, way + 0.3], observed=[True] * 2, class_id=[1] * 2,
                            score=[0.9] * 2, source_id=ids, vx_m_per_s=[1.0, 0.0], vy_m_per_s=[0.0, 1.0])  # fmt: skip
         frames.append(Frame(t * 400_000_000, t * pictures, rows))
-    ends = [offline.rows for offline, _, _ in Retrack(class_names=NAMES)(frames)]
+    ends = [offline.rows for offline, *_ in Retrack(class_names=NAMES)(frames)]
     first, last = (
         dict(zip(np.rint(rows["x_m"]).tolist(), rows["track_id"].tolist(), strict=True)) for rows in (ends[5], ends[35])
     )

@@ -256,7 +256,7 @@ class TestOffline:
             return {name: (0.5 * n, 0.0)}
 
         for profile in (DEFAULT, replace(DEFAULT, resolve_swaps=False)):
-            offline, online, _ = (list(part) for part in zip(*profile(walk(crowd, 45)), strict=True))
+            offline, online, *_ = (list(part) for part in zip(*profile(walk(crowd, 45)), strict=True))
             for frames in (offline, online):
                 before, after = ({who: xy[1] > 0 for who, xy in places(frames[n]).items()} for n in (10, 40))
                 assert len(before) == 2
@@ -334,7 +334,7 @@ class TestOffline:
         other = frames[:cut] + walk(lambda n: {k + 90: (n - 30.0, 3.0 * k) for k in range(4)}, 60)[cut:]
         for profile in (DEFAULT, replace(DEFAULT, coast_s=3.0), PROFILES["authors"]):
             runs = [
-                [(online, forecasts) for _, online, forecasts in profile(f)][:cut]
+                [(online, forecasts) for _, online, forecasts, *_ in profile(f)][:cut]
                 for f in (frames, frames[:cut], other)
             ]
             for whole, *others in zip(*runs, strict=True):

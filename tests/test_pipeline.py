@@ -34,7 +34,10 @@ from mcaptrack.transforms import (
 )
 from tests.worlds import small_scene
 
-ROWS = ("detections", "tracks", "samples", "predictions", "retracks", "retracks/online", "retracks/predictions")
+ROWS = (
+    *("detections", "tracks", "samples", "predictions", "retracks"),
+    *(f"retracks/{one}" for one in ("online", "predictions", "decisions")),
+)
 
 
 @pytest.fixture(scope="module")
@@ -320,7 +323,7 @@ class TestCompleteRun:
                 )
             }
         half = frames[: len(frames) // 2]
-        _, online, predictions = zip(*Retrack()(half), strict=True)
+        _, online, predictions, *_ = zip(*Retrack()(half), strict=True)
         plain = [frame for (frame,) in Predict()(half)]
         for name, part in (("retracks/online", online), ("retracks/predictions", predictions), ("predictions", plain)):
             for cut, full in zip(part, whole[name], strict=False):

@@ -19,7 +19,7 @@ from mcaptrack.pipeline import drawing, findings
 from mcaptrack.pipeline import write as writing
 from mcaptrack.pipeline.checks import _lacks
 from mcaptrack.pipeline.spaces import check_spaces
-from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
+from mcaptrack.schema import DECISIONS, DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, INGEST, VIEW, Provenance, digest
 from mcaptrack.transforms import STAGES, KnnDetector, OcSort, Predict, Retrack, Sample, Sort, Transform
@@ -63,6 +63,7 @@ def finished(**changed: Any) -> dict[str, tuple[Schema, Provenance | None, Seque
         "retracks": (TRACKS, made_by("retrack", Retrack(), "samples", "s", "r")),
         "retracks/online": (TRACKS, made_by("retrack", Retrack(), "samples", "s", "o")),
         "retracks/predictions": (PREDICTIONS, made_by("retrack", Retrack(), "samples", "s", "q")),
+        "retracks/decisions": (DECISIONS, made_by("retrack", Retrack(), "samples", "s", "h")),
         "retracks/full": (TRACKS, made_by("retrack", Retrack(), "samples", "s", "f")),
     }
     return {
@@ -265,7 +266,8 @@ def test_another_input_is_taken_and_said(tmp_path):
 
 def test_only_outputs_that_are_there_are_made_again(tmp_path):
     channels = finished(samples={"digest": "S"})
-    for gone, keep in (((), None), (("online",), ("", "predictions")), (("online", "predictions"), ("",))):
+    kept = (((), None), (("online",), ("", "predictions", "decisions")), (("online", "predictions"), ("", "decisions")))
+    for gone, keep in kept:
         left = {topic: one for topic, one in channels.items() if topic.rpartition("retracks/")[2] not in gone}
         jobs, *_ = planned(tmp_path / "a.mcap", left)
         assert jobs[-1].keep == keep

@@ -140,7 +140,7 @@ class TestBranches:
 
     @every_profile
     def test_a_person_who_walks_on_is_one_track(self, profile):
-        offline, online, _ = run(profile, walk(lambda n: {7: (0.5 * n, 0.0)}, 20))
+        offline, online, *_ = run(profile, walk(lambda n: {7: (0.5 * n, 0.0)}, 20))
         assert set(paths(offline)) == {1}
         assert set(paths(online)) == {1}
         assert along(paths(offline)[1], {tick: (0.5 * tick, 0.0) for tick in range(20)})
@@ -148,7 +148,7 @@ class TestBranches:
     @every_profile
     def test_a_new_input_id_on_the_same_path_continues_the_track(self, profile):
         frames = walk(lambda n: {7 if n < 10 else 8: (0.5 * n, 0.0)}, 24)
-        offline, _, _ = run(profile, frames)
+        offline, *_ = run(profile, frames)
         (who,) = paths(offline)
         assert along(paths(offline)[who], {tick: (0.5 * tick, 0.0) for tick in range(24)})
 
@@ -156,7 +156,7 @@ class TestBranches:
     def test_an_unmatched_track_coasts_and_is_matched_again_within_its_maximum_age(self, profile):
         """Occluded for three steps, then under another id; matched once that id has a past. The gap is interpolated."""
         frames = walk(lambda n: {7 if n < 10 else 8: (0.5 * n, 0.0)} if not 10 <= n < 13 else {}, 26)
-        offline, _, _ = run(profile, frames)
+        offline, *_ = run(profile, frames)
         (who,) = paths(offline)
         assert along(paths(offline)[who], {tick: (0.5 * tick, 0.0) for tick in range(26)})
         filled = [tick for tick, frame in enumerate(offline) if not frame.rows["observed"].all()]
@@ -166,7 +166,7 @@ class TestBranches:
     def test_after_the_maximum_age_a_new_track_begins(self, profile):
         gone = range(10, 26)  # 6.4 s
         frames = walk(lambda n: {7 if n < 10 else 8: (0.5 * n, 0.0)} if n not in gone else {}, 40)
-        offline, _, _ = run(replace(profile, link_s=0.0), frames)
+        offline, *_ = run(replace(profile, link_s=0.0), frames)
         assert len(paths(offline)) == 2
         assert all(len(frame.rows) == 0 for frame in offline[10:26])
 
@@ -174,13 +174,13 @@ class TestBranches:
     def test_the_age_is_in_seconds_and_does_not_count_frames(self, profile):
         """The same gap, but the log has no frames there at all."""
         frames = [f for f in walk(lambda n: {7: (0.5 * n, 0.0)}, 40) if not 10 <= f.index < 26]
-        offline, _, _ = run(replace(profile, link_s=0.0), frames)
+        offline, *_ = run(replace(profile, link_s=0.0), frames)
         assert len(paths(offline)) == 2
 
     @every_profile
     def test_an_unmatched_observation_starts_a_track(self, profile):
         frames = walk(lambda n: {7: (0.5 * n, 0.0)} | ({9: (0.0, 20.0 + 0.5 * n)} if n >= 6 else {}), 24)
-        offline, _, predictions = run(profile, frames)
+        offline, _, predictions, *_ = run(profile, frames)
         assert len(paths(offline)) == 2
         assert min(paths(offline)[2]) == 6  # with the past of its first observation
         assert {row["track_id"] for row in predictions[-1].rows} == {1, 2}
@@ -188,26 +188,26 @@ class TestBranches:
     @every_profile
     def test_tracks_shorter_than_the_probation_are_left_out(self, profile):
         frames = walk(lambda n: {7: (0.5 * n, 0.0)} | ({9: (0.0, 20.0)} if n in range(8, 12) else {}), 24)
-        offline, _, _ = run(profile, frames)
+        offline, *_ = run(profile, frames)
         assert len(paths(offline)) == 1
 
     def test_pairs_outside_the_gate_are_not_matched(self):
         def jump(n):
             return {7: (0.5 * n, 0.0 if n < 10 else 40.0)}
 
-        offline, _, _ = run(DEFAULT, walk(jump, 24))
+        offline, *_ = run(DEFAULT, walk(jump, 24))
         assert len(paths(offline)) == 2
 
     def test_the_gate_in_metres_limits_how_far_a_track_jumps(self):
         frames = walk(lambda n: {7 if n < 10 else 8: (0.0, 0.0 if n < 10 else 4.0)} if not 10 <= n < 20 else {}, 32)
-        near, _, _ = run(replace(NOW, gate_m=None), frames)
-        far, _, _ = run(NOW, frames)
+        near, *_ = run(replace(NOW, gate_m=None), frames)
+        far, *_ = run(NOW, frames)
         assert len(paths(near)) == 1
         assert len(paths(far)) == 2
 
     def test_two_people_who_pass_each_other_keep_their_ids(self):
         frames = walk(lambda n: {1: (0.5 * n, 0.0), 2: (10 - 0.5 * n, 0.6)}, 24)
-        offline, _, _ = run(DEFAULT, frames)
+        offline, *_ = run(DEFAULT, frames)
         assert {round(path[23][1], 1): round(path[0][1], 1) for path in paths(offline).values()} == {0.0: 0.0, 0.6: 0.6}
 
     def test_input_ids_decide_where_positions_are_ambiguous(self):
@@ -219,7 +219,7 @@ class TestBranches:
             return {1: (0.5 * n, noise[n, 0]), 2: (0.5 * n, 0.3 + noise[n, 1])}
 
         def switches(profile):
-            _, online, _ = run(profile, walk(pair, 60))
+            _, online, *_ = run(profile, walk(pair, 60))
             sources = [dict(zip(ids(f), f.rows["source_id"].tolist(), strict=True)) for f in online[3:]]
             return sum(a != b for a, b in pairwise(sources))
 
@@ -249,7 +249,7 @@ class TestBranches:
         frames = walk(lambda n: {1: (0.5 * n, 0.0)} if n < 3 else {}, 10)
         for profile, least in ((PAPER, 4), (NOW, 2)):
             assert profile.min_history == least
-            _, online, _ = run(replace(profile, min_track_s=0.0), frames)
+            _, online, *_ = run(replace(profile, min_track_s=0.0), frames)
             assert any(len(frame.rows) for frame in online) == (least <= 3 and profile.min_hits <= 1)
 
     def test_backfill_takes_unclaimed_samples_or_all_or_none(self):
@@ -261,7 +261,7 @@ class TestBranches:
         frames = walk(path, 24)
         rows = {}
         for backfill in ("none", "unclaimed", "all"):
-            offline, _, _ = run(replace(AUTHORS, backfill=backfill), frames)
+            offline, *_ = run(replace(AUTHORS, backfill=backfill), frames)
             rows[backfill] = sum(len(frame.rows) for frame in offline)
         assert rows["none"] < rows["unclaimed"] < rows["all"]
         assert rows["unclaimed"] <= 24
@@ -271,7 +271,7 @@ class TestBranches:
         frames = walk(lambda n: {1: (wild[min(n, 3)] + max(n - 3, 0), 0.0)}, 6)
         first = {}
         for birth in ("raw", "smoothed"):
-            _, _, predictions = run(replace(PAPER, birth=birth, min_hits=0), frames)
+            _, _, predictions, *_ = run(replace(PAPER, birth=birth, min_hits=0), frames)
             first[birth] = predictions[3].rows["x_m"][:2].tolist()
         assert first["raw"] == [4.0, 5.0]  # (3 - 0) / 3 a step
         level, trend = 1.0, 0.0
@@ -284,7 +284,7 @@ class TestBranches:
     @every_profile
     def test_online_tracks_and_predictions_have_the_same_ids_and_times(self, profile):
         frames = walk(lambda n: {7: (0.5 * n, 0.0), 8: (0.0, 15.0 + n)} if n % 7 else {7: (0.5 * n, 0.0)}, 30)
-        _, online, predictions = run(profile, frames)
+        _, online, predictions, *_ = run(profile, frames)
         for now, then in zip(online, predictions, strict=True):
             assert now.t_ns == then.t_ns
             assert sorted(set(then.rows["track_id"].tolist())) == ids(now)
@@ -297,7 +297,7 @@ class TestBranches:
     def test_there_is_one_step_at_least_and_as_many_as_fit_best(self, profile, horizon_s, steps):
         """At 2.5 steps a second."""
         frames = walk(lambda n: {7: (0.5 * n, 0.0)}, 12)
-        _, _, predictions = run(replace(profile, horizon_s=horizon_s, predictor="cv"), frames)
+        _, _, predictions, *_ = run(replace(profile, horizon_s=horizon_s, predictor="cv"), frames)
         assert predictions[-1].rows["step"].tolist() == list(range(1, steps + 1))
         assert predictions[-1].rows["ahead_s"].max() == pytest.approx(0.4 * steps)
 
@@ -313,7 +313,7 @@ class TestBranches:
 
     def test_online_rows_are_at_the_measured_positions(self):
         frames = walk(lambda n: {7: (0.5 * n, np.sin(n))}, 20)
-        _, online, _ = run(DEFAULT, frames)
+        _, online, *_ = run(DEFAULT, frames)
         for tick, frame in enumerate(online[3:], start=3):
             assert places(frame) == {1: (0.5 * tick, round(np.sin(tick), 3))}
             assert frame.rows["source_id"].tolist() == [7]
@@ -334,7 +334,7 @@ class TestFailuresOfThePaper:
                 people[3] = (0.5 * n, 3.0 - 0.25 * n)
             return people
 
-        offline, _, _ = run(profile, walk(crowd, 30))
+        offline, *_ = run(profile, walk(crowd, 30))
         truth = {tick: (0.5 * tick, 3.0 - 0.25 * tick) for tick in range(30)}
         assert any(along(path, truth) for path in paths(offline).values())
         assert len(paths(offline)) == 2
@@ -351,7 +351,7 @@ class TestFailuresOfThePaper:
                 return {1: (0.6 * n, 5.4)}
             return {1: b, 3: a}  # the tracker gives the first id to the wrong person
 
-        offline, _, _ = run(profile, walk(crowd, 30))
+        offline, *_ = run(profile, walk(crowd, 30))
         straight = 0
         for path in paths(offline).values():
             ticks = sorted(path)
@@ -371,7 +371,7 @@ class TestFailuresOfThePaper:
                 tree = {9: (float(leaps[n, 0]), 30 + float(leaps[n, 1]))} if 10 <= n < 16 else {}
                 return {1: (0.4 * n, 0.0)} | tree
 
-            offline, _, _ = run(profile, walk(crowd, 40))
+            offline, *_ = run(profile, walk(crowd, 40))
             found = paths(offline).values()
             kept += sum(len(path) for path in found if next(iter(path.values()))[1] > 15)
             walker = {tick: (0.4 * tick, 0.0) for tick in range(40)}
@@ -385,7 +385,7 @@ class TestFailuresOfThePaper:
         frames = walk(lambda n: {1: (0.5 * n + noise[n, 0], noise[n, 1])}, 60)
 
         def drift(profile) -> float:
-            _, _, predictions = run(profile, frames)
+            _, _, predictions, *_ = run(profile, frames)
             futures = [np.stack([f.rows["x_m"], f.rows["y_m"]], -1) for f in predictions if len(f.rows) == 12]
             steps = [np.hypot(*(a[1:] - b[:-1]).T).mean() for a, b in pairwise(futures)]
             return float(np.mean(steps))
@@ -406,7 +406,7 @@ def test_the_profile_authors_keeps_what_two_matches_in_a_row_confirm():
         return {name: (0.5 * n, 0.0)} if name else {}
 
     def ticks(profile, last) -> list[int]:
-        offline, _, _ = run(profile, walk(lambda n: crowd(n, last), 40))
+        offline, *_ = run(profile, walk(lambda n: crowd(n, last), 40))
         (path,) = paths(offline).values()
         return list(path)
 
@@ -416,6 +416,6 @@ def test_the_profile_authors_keeps_what_two_matches_in_a_row_confirm():
 
 
 def test_a_log_without_people_gives_frames_without_rows():
-    offline, online, predictions = run(DEFAULT, walk(lambda n: {}, 5))
+    offline, online, predictions, *_ = run(DEFAULT, walk(lambda n: {}, 5))
     assert [len(f.rows) for f in (*offline, *online, *predictions)] == [0] * 15
     assert len(tracks_at({})) == 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, framing
+from mcaptrack.schema import DECISIONS, PREDICTIONS, TRACKS, Frame, framing
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.transforms import Retrack
 from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers, join_classes, movers_of, split_classes, usual_score
@@ -54,6 +54,16 @@ def test_frames_of_each_class_hold_its_tracks_whole(seed, part_rows, monkeypatch
 def test_one_class_is_not_split():
     frames = collect(TRACKS, [Frame(0, 0, rows_of([1, 2], [3, 3]))])
     assert split_classes(frames) == [frames]
+
+
+def test_decisions_about_tracks_that_were_left_out_have_no_id_in_any_class():
+    def run(ids: list[int]):
+        rows = DECISIONS.empty(len(ids))
+        rows["track_id"] = ids
+        yield (Frame(0, 0, rows),)
+
+    ((found,),) = join_classes([run([1, -1, 3]), run([2, -1])], (DECISIONS,))
+    assert found.rows["track_id"].tolist() == [1, -1, 3, 5, -1]
 
 
 def test_ids_of_a_class_follow_those_of_the_class_before():

@@ -213,7 +213,8 @@ def test_where_nothing_is_re_tracked_tracks_are_the_input_and_predictions_those_
     )
     seen = [(frame.rows, frame.rows[frame.rows["observed"]]) for frame in frames]
     predicted = [frame.rows for (frame,) in Predict(**options)(frames)]
-    for outputs, wanted, forecasts in zip(passed_on, seen, predicted, strict=True):
+    for (*outputs, decisions), wanted, forecasts in zip(passed_on, seen, predicted, strict=True):
+        assert len(decisions.rows) == 0
         for frame, rows in zip(outputs, (*wanted, forecasts), strict=True):
             assert_same_rows(frame.rows, rows)
     for ours, theirs in zip(insisted, usual, strict=True):

@@ -11,12 +11,12 @@ import pytest
 
 import mcaptrack
 from mcaptrack.predictors.weights import load
-from mcaptrack.transforms.retrack import false_tracks, linking
+from mcaptrack.transforms.retrack import false_tracks, joins, linking
 from mcaptrack.transforms.retrack.motion_model import to_trajectories
 from mcaptrack.transforms.retrack.weights import WEIGHTS, weights_of
 from tools import crowds
 from tools.corruptions import STEP_S
-from tools.fit_retrack import Pairs, logistic, owners, prepare
+from tools.fit_retrack import Pairs, logistic, owners_of, prepare
 
 STEPS = 60
 PACKAGE = Path(mcaptrack.__file__).parent
@@ -46,7 +46,8 @@ def test_weights_go_by_the_names_of_features_in_any_order():
     names = ("gap", "miss")
     found = json.loads(WEIGHTS.read_text())["links"]["weights"]
     assert weights_of("links", names)[0].tolist() == [found["gap"], found["miss"]]
-    for model, features in (("links", linking.FEATURES), ("people", false_tracks.FEATURES)):
+    models = {"links": linking, "people": false_tracks, "cuts": joins, "joins": joins}
+    for model, features in ((name, module.FEATURES) for name, module in models.items()):
         assert set(json.loads(WEIGHTS.read_text())[model]["weights"]) == set(features)
 
 
@@ -139,6 +140,6 @@ def test_tracks_belong_to_the_person_they_follow_and_doubles_and_clutter_to_nobo
         [truth[who][np.flatnonzero(truth[who][:, 0] == at)[0], 2:] for at, who in zip(step, source, strict=True)]
     )
     _, row, paths = to_trajectories(step, track, xy, 0.2)
-    found = owners(run, paths)[row]
+    found = owners_of(run, paths)[row]
     assert (found[source == 3] == 3).mean() > 0.95
     assert (found[np.isin(source, (7, 9))] == -1).all()

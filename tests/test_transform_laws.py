@@ -134,7 +134,7 @@ def test_zero_noise_and_zero_speeds_drop_no_track(kind):
     frames = walk(lambda n: {1: (0.5 * n, 0.0), 2: (10.0 - 0.5 * n, 0.5)}, 30)
     for options in ({}, {"speed_m_per_s": 0.0, "drift_m_per_s": 0.0, "drift_ratio": 0.0}):
         still = walk(lambda n: {1: (0.0, 0.0), 2: (10.0, 0.5)}, 30) if options else frames
-        outputs = [offline for offline, _, _ in kind(noise_m=0.0, link_s=4.0, **options)(still)]
+        outputs = [offline for offline, *_ in kind(noise_m=0.0, link_s=4.0, **options)(still)]
         assert [ids(frame) for frame in outputs] == [[1, 2]] * 30
 
 
@@ -164,4 +164,5 @@ def test_each_output_has_a_latency_and_what_is_online_has_none():
         assert set(transform.latency_s) == set(transform.writes), name
         assert all(latency >= 0 for latency in transform.latency_s.values()), name
     for profile in PROFILES.values():
-        assert profile.latency_s == {"": float("inf"), "online": 0.0, "predictions": 0.0}
+        wanted = {"": float("inf"), "online": 0.0, "predictions": 0.0, "decisions": float("inf")}
+        assert profile.latency_s == {name: wanted[name] for name in profile.writes}

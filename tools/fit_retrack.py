@@ -3,8 +3,10 @@
 Writes mcaptrack/transforms/retrack/weights.json. Scenes are those of `crowds.py`: squares, streets, crossings and open
 places with groups, people who stand, and bicycles; each is corrupted by `corruptions.py` with faults of its own. They
 are sampled and re-tracked, and what re-tracking decides about is compared with who was there: links first, then the
-tracks that come of these links. No recording is used. With --check it says whether the same comes out now. With --held
-nothing is written: scenes of other seeds score the weights of the file. A few minutes of one core.
+tracks that come of these links; and, in other scenes, which joins of online tracks are right, then how likely what is
+decided after cutting wrong ones is right. No recording is used. With --check it says whether the same comes out now.
+With --held nothing is written: scenes of other seeds score the weights of the file, and say how reliable probabilities
+are. A few minutes of one core.
 
     .venv/bin/python tools/fit_retrack.py [--check | --held] [--seeds 101 102] [--steps 300]
 
@@ -16,11 +18,10 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -35,15 +36,19 @@ from mcaptrack.evaluation.metrics import combine, score, summary
 from mcaptrack.geometry.assignment import assign, solve
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES, Sample
-from mcaptrack.transforms.retrack import false_tracks, linking, offline
+from mcaptrack.transforms.retrack import decisions, false_tracks, joins, linking, offline
+from mcaptrack.transforms.retrack.joins import Joins, Tracked, find_joins, tracked_of
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
 from mcaptrack.transforms.retrack.motion_model import Trajectories
 from mcaptrack.transforms.retrack.weights import WEIGHTS
 
 DEFAULT = PROFILES["default"]
+Found = TypeVar("Found")
 #: Who is who at encounters changes neither links nor how likely a track is, and takes longest.
 FITTED = replace(DEFAULT, resolve_swaps=False)
 SEEDS, HELD, STEPS = (101, 102), (201,), 300
+#: Joins are judged in scenes of these seeds and so many steps.
+JUDGED, JUDGED_STEPS = (111,), 100
 #: A track is that of a person who is as near, by most of its first or last so many rows.
 GATE_M, ROWS = 1.0, 8
 #: The longest gap of pairs that weights are fitted on; and the least log odds of the best set of links.
@@ -81,37 +86,49 @@ def prepare(truth: np.ndarray, made: np.ndarray) -> Run:
     )
 
 
-@contextmanager
-def calls(name: str) -> Iterator[list[tuple[Any, ...]]]:
-    """What a function of offline re-tracking is called with."""
+class _Reached(Exception):
+    """A function of offline re-tracking is called."""
+
+
+def reached(name: str, *given: Any) -> tuple[Any, ...]:
+    """What a function of offline re-tracking is called with; re-tracking goes no further."""
     function, seen = getattr(offline, name), []
 
-    def kept(*given: Any) -> Any:
+    def stop(*given: Any) -> Any:
         seen.append(given)
-        return function(*given)
+        raise _Reached
 
-    setattr(offline, name, kept)
+    setattr(offline, name, stop)
     try:
-        yield seen
+        offline.offline_tracks(*given)
+    except _Reached:
+        pass
     finally:
         setattr(offline, name, function)
+    return seen[0]
 
 
-def owners(run: Run, trajectories: Trajectories) -> np.ndarray:
-    """The true id of each row of the trajectories (N,), or -1."""
-    owner = np.full(len(trajectories.step), -1)
-    length = np.diff(trajectories.first)
-    track = np.repeat(np.arange(len(length)), length)
-    seen = np.flatnonzero(np.isfinite(trajectories.xy_m[:, 0]))
-    seen = seen[np.argsort(trajectories.step[seen], kind="stable")]
+def owners(run: Run, step: np.ndarray, xy_m: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """The true id at each of the positions (N, 2), or -1; ``length`` is that of the track of each."""
+    owner = np.full(len(step), -1)
+    order = np.argsort(step, kind="stable")
     where = dict(zip(run.args[4], run.true, strict=True))
-    for here in np.split(seen, np.flatnonzero(np.diff(trajectories.step[seen])) + 1):
-        people = where[int(trajectories.step[here[0]])].rows
-        off = np.hypot(*(trajectories.xy_m[here, None, k] - people[name] for k, name in enumerate(("x_m", "y_m"))))
+    for here in np.split(order, np.flatnonzero(np.diff(step[order])) + 1):
+        people = where[int(step[here[0]])].rows
+        off = np.hypot(*(xy_m[here, None, k] - people[name] for k, name in enumerate(("x_m", "y_m"))))
         # The longer track is the person; one beside it is a double.
-        off = np.where(off < GATE_M, off + 1.5 * (1 - length[track[here]] / length.max())[:, None], np.inf)
+        off = np.where(off < GATE_M, off + 1.5 * (1 - length[here] / length.max())[:, None], np.inf)
         row, column = assign(off, 10.0)
         owner[here[row]] = people["track_id"][column]
+    return owner
+
+
+def owners_of(run: Run, paths: Trajectories) -> np.ndarray:
+    """The true id of each row of the trajectories (N,), or -1."""
+    length = np.diff(paths.first)
+    seen = np.flatnonzero(np.isfinite(paths.xy_m[:, 0]))
+    owner = np.full(len(paths.step), -1)
+    owner[seen] = owners(run, paths.step[seen], paths.xy_m[seen], np.repeat(length, length)[seen])
     return owner
 
 
@@ -148,13 +165,11 @@ class Pairs:
 
 def pairs_of(run: Run) -> Pairs:
     """The candidate links of a scene."""
-    with calls("link_tracks") as seen:
-        next(offline.offline_tracks(FITTED, *run.args[1:]))
-    model, paths, forward, backward, step_s = seen[0][:5]
+    model, paths, forward, backward, step_s = reached("link_tracks", FITTED, *run.args[1:])[:5]
     i, j, gap_s = linking.candidates(paths, forward, backward, step_s, MAX_GAP_S)
     first, last = paths.first[:-1], paths.first[1:] - 1
     found = linking.features(model, forward.take(last[i]), backward.take(first[j]), gap_s)
-    owner = owners(run, paths)
+    owner = owners_of(run, paths)
     ends, begins = usual(owner, paths, -1), usual(owner, paths, 1)
     same = np.flatnonzero((ends[i] >= 0) & (ends[i] == begins[j]))
     nearest = same[np.lexsort((gap_s[same], i[same]))]
@@ -166,13 +181,91 @@ def pairs_of(run: Run) -> Pairs:
 
 def people_of(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The features of the tracks of a scene (K, F), the share of each that is a person, and its number of rows."""
-    with calls("track_confidence") as seen:
-        next(offline.offline_tracks(FITTED, *run.args[1:]))
-    model, paths, smoothed, step_s = seen[0]
+    model, paths, smoothed, step_s = reached("track_log_odds", FITTED, *run.args[1:])
     observed = np.isfinite(paths.xy_m[:, 0])
     count = np.add.reduceat(observed.astype(float), paths.first[:-1])
-    own = np.add.reduceat((owners(run, paths) >= 0).astype(float), paths.first[:-1])
+    own = np.add.reduceat((owners_of(run, paths) >= 0).astype(float), paths.first[:-1])
     return false_tracks.features(model, paths, smoothed, step_s), own / count, count
+
+
+class Judged(NamedTuple):
+    """Features of decisions (D, F), and which of them are right (D,)."""
+
+    features: np.ndarray
+    are_right: np.ndarray
+
+
+def judged_joins(run: Run, tracked: Tracked, found: Joins, xy_m: np.ndarray) -> tuple[Judged, np.ndarray]:
+    """Joins compared with who was there, and the true id of each assignment (C,), or -1.
+
+    Joins of two false tracks are neither right nor wrong.
+    """
+    _, track, count = np.unique(tracked.track, return_inverse=True, return_counts=True)
+    owner = owners(run, tracked.step, xy_m, count[track])
+
+    def who(at: int, way: int) -> int:
+        near = slice(at, at + ROWS) if way > 0 else slice(max(at - ROWS + 1, 0), at + 1)
+        own = (tracked.track[near] == tracked.track[at]) & (tracked.source[near] == tracked.source[at])
+        ids = owner[near][own]
+        return int(np.bincount(ids[ids >= 0]).argmax()) if (ids >= 0).sum() * 2 >= len(ids) else -1
+
+    pairs = [(who(a, -1), who(b, 1)) for a, b in zip(found.before, found.after, strict=True)]
+    sides = np.array(pairs, int).reshape(-1, 2)
+    counts = (sides >= 0).any(axis=1)
+    return Judged(found.features[counts], (sides[:, 0] == sides[:, 1])[counts]), owner
+
+
+def cuts_of(run: Run) -> Judged:
+    """The joins of the online tracks of a scene."""
+    model, step, track, source, xy_m, step_s, _ = reached("cut_joins", *run.args)
+    order = np.lexsort((step, track))
+    tracked = tracked_of(model, step[order], track[order], source[order], xy_m[order], step_s)
+    return judged_joins(run, tracked, find_joins(tracked, model, step_s), xy_m[order])[0]
+
+
+def decisions_of(run: Run) -> tuple[Judged, Judged]:
+    """The joins of the offline tracks of a scene, and which tracks are people."""
+    decided, model, samples, _, step_s = reached("decision_rows", *run.args)
+    xy_m = np.stack([samples.column(name)[decided.sample] for name in ("x_m", "y_m")], axis=-1)
+    made, owner = judged_joins(run, decided.tracked, decisions.find_kept_joins(decided, model, step_s), xy_m)
+    _, track, count = np.unique(decided.tracked.track, return_inverse=True, return_counts=True)
+    return made, Judged(decided.log_odds[:, None], np.bincount(track, owner >= 0) * 2 >= count)
+
+
+def told(find: Callable[[Run], Found], scenes: list[Run], what: str) -> Iterator[Found]:
+    """What is found in each scene; progress goes to stderr."""
+    for number, run in enumerate(scenes, 1):
+        yield find(run)
+        print(f"{what}: {number} of {len(scenes)} scenes", file=sys.stderr, flush=True)
+
+
+def fit_judged(names: tuple[str, ...], parts: Iterable[Judged]) -> dict[str, Any]:
+    """The weights of how likely decisions are right."""
+    features, right = (np.concatenate(members) for members in zip(*parts, strict=True))
+    weights = logistic(features, right, np.ones(len(right)))
+    return {"weights": named(names, weights[:-1]), "bias": round(float(weights[-1]), 3)}
+
+
+def fit_decisions(scenes: list[Run]) -> dict[str, Any]:
+    """The weights of joins that may be cut, then of those that are left and of tracks, with these cut."""
+    cuts = fit_judged(joins.FEATURES, told(cuts_of, scenes, "joins that may be cut"))
+    install(joins, "CUTS_", cuts)
+    of_joins, of_people = zip(*told(decisions_of, scenes, "decisions"), strict=True)
+    return {
+        "cuts": cuts,
+        "joins": fit_judged(joins.FEATURES, of_joins),
+        "decided": fit_judged(("log odds",), of_people),
+    }
+
+
+def show_reliability(name: str, probability: np.ndarray, right: np.ndarray) -> None:
+    """Print how many of the decisions (D,) with a probability are right, by steps of it."""
+    print(f"{name}: {len(right)}, {100 * right.mean():.1f} % right")
+    place = np.minimum((probability * 10).astype(int), 9)
+    for one in np.unique(place).tolist():
+        here = place == one
+        said, were = (100 * values[here].mean() for values in (probability, right))
+        print(f"  {one / 10:.1f} to {one / 10 + 0.1:.1f}: {here.sum():6}, said {said:.1f} %, right {were:.1f} %")
 
 
 def logistic(
@@ -232,23 +325,32 @@ def named(names: tuple[str, ...], weights: np.ndarray) -> dict[str, float]:
     return dict(zip(names, np.round(weights, 3).tolist(), strict=True))
 
 
-def install(links: dict[str, Any]) -> None:
-    """Let links be decided by these weights, in this process."""
-    linking._WEIGHTS = np.array([links["weights"][name] for name in linking.FEATURES])
-    linking._BIAS, linking._PRIOR, linking._MIN_LOG_ODDS = links["bias"], links["usual"], links["least"]
+def install(module: Any, prefix: str, fitted: dict[str, Any]) -> None:
+    """Let a module decide by these weights, in this process; ``prefix`` is that of its names for them."""
+    setattr(module, f"_{prefix}WEIGHTS", np.array(list(fitted["weights"].values())))
+    setattr(module, f"_{prefix}BIAS", fitted["bias"])
 
 
 def held(seeds: list[int], steps: int) -> None:
-    """Print IDF1 / MOTA / switches of scenes, before and after re-tracking by the weights of the file."""
+    """Print IDF1 / MOTA / switches of scenes, before and after re-tracking by the weights of the file, and how many of
+    the decisions are right.
+    """
     parts: tuple[list, list] = ([], [])
+    outcomes = []
     for run in runs(seeds, steps):
-        rows = offline.offline_tracks(*run.args)
+        outcomes.append(decisions_of(run))
+        rows = offline.offline_tracks(*run.args).tracks
         found = [frame._replace(rows=new) for frame, new in zip(run.samples, rows, strict=True)]
         for side, frames in zip(parts, (run.samples, found), strict=True):
             side.append(score(make_matchup(run.true, frames, "metres", GATE_M), "motmetrics"))
     for name, side in zip(("input", "re-tracked"), parts, strict=True):
         row = summary(combine(side))
         print(f"{name:12}{100 * row['IDF1']:.1f} / {100 * row['MOTA']:.1f} / {row['IDSW']}")
+    made, people = ([np.concatenate(both) for both in zip(*one, strict=True)] for one in zip(*outcomes, strict=True))
+    show_reliability("joins", decisions.join_probability(made[0]), made[1])
+    is_person = decisions.person_probability(people[0][:, 0])
+    is_right = np.where(is_person >= 0.5, people[1], ~people[1])
+    show_reliability("people and false tracks", np.maximum(is_person, 1 - is_person), is_right)
 
 
 def main() -> None:
@@ -263,16 +365,15 @@ def main() -> None:
     if given.held:
         held(seeds, given.steps)
         return
-    scenes, pairs = [], []
-    for run in runs(seeds, given.steps):
-        scenes.append(run)
-        pairs.append(pairs_of(run))
-        print(
-            f"{len(scenes)} scenes, {sum(len(one.right) for one in pairs)} possible links", file=sys.stderr, flush=True
-        )
+    joins._CUTS_BIAS = np.inf  # links and people don't depend on what is cut
+    scenes = list(runs(seeds, given.steps))
+    pairs = list(told(pairs_of, scenes, "links"))
     links = fit_links(pairs)
-    install(links)
-    people = fit_people([people_of(run) for run in scenes])
+    install(linking, "", links)
+    linking._PRIOR, linking._MIN_LOG_ODDS = links["usual"], links["least"]
+    people = fit_people(list(told(people_of, scenes, "people")))
+    install(false_tracks, "", people)
+    judged = fit_decisions(list(runs(JUDGED, JUDGED_STEPS)))
     card = {
         "made_by": f"tools/fit_retrack.py --seeds {' '.join(map(str, seeds))} --steps {given.steps}, "
         f"mcaptrack {__version__}",
@@ -280,7 +381,8 @@ def main() -> None:
         "licence": "Apache-2.0",
         "links": str(sum(int(one.right.sum()) for one in pairs)),
     }
-    text = json.dumps({"card": card, "links": links, "people": people}, indent=1) + "\n"
+    fitted = {"card": card, "links": links, "people": people} | judged
+    text = json.dumps(fitted, indent=1) + "\n"
     if given.check:
         print("the same" if WEIGHTS.read_text(encoding="utf-8") == text else text)
         return

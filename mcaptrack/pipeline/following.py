@@ -29,7 +29,7 @@ from mcaptrack.pipeline.planes import read_planes
 from mcaptrack.pipeline.staleness import is_stale
 from mcaptrack.pipeline.visible import picture_size
 from mcaptrack.pipeline.write import digest_of
-from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, VIDEO, Frame, Rows, Schema
+from mcaptrack.schema import DECISIONS, DETECTIONS, PREDICTIONS, TRACKS, VIDEO, Frame, Rows, Schema
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_numbers, frame_times, unique_values
 from mcaptrack.schema.provenance import Provenance
@@ -216,10 +216,11 @@ class Before:
         out: list[Sequence[Frame]] = []
         largest = last_id
         for topic, schema, frames in zip(topics, schemas, outputs, strict=True):
-            if schema not in (TRACKS, PREDICTIONS):
+            if schema not in (TRACKS, PREDICTIONS, DECISIONS):
                 out.append(self._kept(schema, frames, None))
                 continue
-            same = maps.get(topic, of_predictions)
+            of_main = maps.get(job.target, {})
+            same = maps.get(topic, of_main if schema is DECISIONS else of_predictions)
             kept = self._kept(schema, frames, partial(_renumbered, same=same, last_id=last_id))
             largest = max(largest, int(unique_values(schema, kept, "track_id").max(initial=0)))
             out.append(kept)
@@ -341,7 +342,7 @@ def numbers_of(frames: Sequence[Frame]) -> Ints:
 
 def _renumbered(ids: Ints, same: Mapping[int, int], last_id: int) -> Ints:
     """Ids (N,): those of the log before for tracks that go on, and others after ``last_id``."""
-    out = ids + last_id
+    out = np.where(ids < 0, ids, ids + last_id)
     for mine, theirs in same.items():
         out[ids == mine] = theirs
     return out

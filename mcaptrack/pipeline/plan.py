@@ -305,6 +305,8 @@ class _Planner:
             self._notes.append(f"{why}: running {stage} again, as before")
         there = [f"{main}/{suffix}".rstrip("/") for suffix in transform.writes]
         kept = [one == topic or one in self._opened.channels for one in there]
+        beside = STAGES[stage].beside if topic == main or main in self._opened.channels else ()
+        kept = [is_kept or suffix in beside for suffix, is_kept in zip(transform.writes, kept, strict=True)]
         keep = tuple(suffix for suffix, is_kept in zip(transform.writes, kept, strict=True) if is_kept)
         self._add(Job(stage, transform, source, main, None if all(kept) else keep, frame_id=self._frame_id))
         return True

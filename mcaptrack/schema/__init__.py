@@ -26,6 +26,7 @@ __all__ = [
     "CAMERA_MOTION",
     "COUNTS",
     "COVARIANCE_M2",
+    "DECISIONS",
     "DETECTIONS",
     "EVENTS",
     "EVENT_KINDS",
@@ -43,6 +44,7 @@ __all__ = [
     "ZONE_CROSSINGS",
     "ZONE_VISITS",
     "Column",
+    "DecisionKind",
     "EventKind",
     "Frame",
     "Rows",
@@ -273,6 +275,7 @@ FORECAST_SCORES: Final = Schema("mcaptrack.ForecastScores")
 ZONE_VISITS: Final = Schema("mcaptrack.ZoneVisits")
 ZONE_CROSSINGS: Final = Schema("mcaptrack.ZoneCrossings")
 ZONE_COUNTS: Final = Schema("mcaptrack.ZoneCounts")
+DECISIONS: Final = Schema("mcaptrack.Decisions")
 #: Row schemas by name.
 SCHEMAS: Final = {
     schema.name: schema
@@ -290,11 +293,20 @@ SCHEMAS: Final = {
         ZONE_VISITS,
         ZONE_CROSSINGS,
         ZONE_COUNTS,
+        DECISIONS,
     )
 }
 #: Pictures instead of rows: a transform that reads this schema gets their brightness, or their colours if it asks for
 #: them.
 VIDEO: Final = Schema("foxglove.CompressedVideo")
+
+
+class DecisionKind(IntEnum):
+    """The values of the column ``kind`` of decisions."""
+
+    JOINED = 1
+    KEPT = 2
+    LEFT_OUT = 3
 
 
 class EventKind(IntEnum):

@@ -68,6 +68,8 @@ class Stage:
         Values of all parameters by the name of the profile.
     modes : Mapping[str, tuple[str, ...]]
         Outputs to write, by the name of the mode.
+    beside : tuple[str, ...]
+        Outputs that are made wherever the main one is, also again in logs that lack them.
     implied : Mapping[str, str]
         Options that belong to one transform and choose it, by its name, if none is named.
     upgrade : Callable
@@ -89,6 +91,7 @@ class Stage:
     at_video_rate: bool = False
     profiles: Mapping[str, Transform] = field(default_factory=dict)
     modes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    beside: tuple[str, ...] = ()
     implied: Mapping[str, str] = field(default_factory=dict)
     upgrade: Callable[[Mapping[str, Any]], dict[str, Any]] = dict
 
@@ -293,8 +296,13 @@ _STAGES: Final = (
         at_video_rate=True,
         profiles=PROFILES,
         modes=MappingProxyType(
-            {"both": ("", "online", "predictions"), "offline": ("",), "online": ("online", "predictions")}
+            {
+                "both": ("", "online", "predictions", "decisions"),
+                "offline": ("", "decisions"),
+                "online": ("online", "predictions"),
+            }
         ),
+        beside=("decisions",),
         implied=MappingProxyType({"distance": "consistency"}),
         upgrade=upgrade_parameters,
     ),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from importlib.resources import files
-from itertools import combinations
+from itertools import combinations, pairwise
 from math import exp, hypot, inf, log
 
 import numpy as np
@@ -23,6 +23,9 @@ LINKS, PEOPLE = FITTED["links"]["weights"], FITTED["people"]["weights"]
 LINK_NAMES = ("miss", "misfit", "gap", "misfit or stay", "turn", "distance and speed", "misfit and speed")
 LINK_WEIGHTS = [LINKS[name] for name in LINK_NAMES]
 LINK_BIAS, LINK_USUAL, LINK_LEAST = (FITTED["links"][name] for name in ("bias", "usual", "least"))
+CUTS, CUT_BIAS = FITTED["cuts"]["weights"], FITTED["cuts"]["bias"]
+JOIN_NAMES = (*LINK_NAMES, "margin", "alternative", "taken over", "given away", "log before", "log after")
+JOIN_MARGIN, JOIN_BRIEF_S = 12.0, 1.0
 PERSON_BIAS, BESIDE_M = FITTED["people"]["bias"], 1.2
 MEET_M, MARGIN, EXCHANGE_COST, SAME_ID, LEAST_GAIN = 2.0, 10, 4.0, 1.0, 1.0
 DRIFTS = (0.05, 0.15, 0.4)
@@ -97,14 +100,19 @@ def sigmoid(odds: float) -> float:
 # Links over gaps.
 
 
+def link_spread(motion: Motion, before: State, after: State, gap_s: float) -> float:
+    speed = max(hypot(*before.mean[:, 1]), hypot(*after.mean[:, 1]))
+    variance = before.cov[0, 0] + after.cov[0, 0] + (before.cov[1, 1] + after.cov[1, 1]) * (gap_s / 2) ** 2
+    return variance + (motion.drift + motion.drift_share * speed) ** 2 * gap_s**3 / 12
+
+
 def link_features(motion: Motion, before: State, after: State, gap_s: float) -> list[float]:
     way = after.mean[:, 0] - before.mean[:, 0]
     left, came = before.mean[:, 1], after.mean[:, 1]
     miss = min(hypot(*(way - left * gap_s)), hypot(*(way - came * gap_s)))
     misfit, stay = hypot(*(way - (left + came) / 2 * gap_s)), hypot(*way)
     speed = max(hypot(*left), hypot(*came))
-    variance = before.cov[0, 0] + after.cov[0, 0] + (before.cov[1, 1] + after.cov[1, 1]) * (gap_s / 2) ** 2
-    variance += (motion.drift + motion.drift_share * speed) ** 2 * gap_s**3 / 12
+    variance = link_spread(motion, before, after, gap_s)
     return [
         log(miss + NEAR_M),
         log(1 + misfit**2 / (2 * variance)),
@@ -148,6 +156,91 @@ def linked(motion: Motion, paths: dict[int, Path], max_gap_s: float, least: floa
     for track in sorted(follows, key=lambda t: min(paths[t])):
         name[follows[track]] = name[track]
     return name
+
+
+# Joins: a track goes on with another input track. Is it the same person?
+
+
+def joins(motion: Motion, paths: dict[int, Path], ids: dict[int, dict[int, int]]) -> list[tuple[int, int, list[float]]]:
+    """Each join as its track, the first step of the new input id, and its features; by track and step."""
+    ahead = {name: motion.filtered(path) for name, path in paths.items()}
+    back = {name: motion.backwards(path) for name, path in paths.items()}
+    held: dict[int, list[tuple[int, int]]] = {}  # steps and tracks of each input id
+    for name in sorted(paths):
+        for step in sorted(paths[name]):
+            held.setdefault(ids[name][step], []).append((step, name))
+    for places in held.values():
+        places.sort()
+
+    def fit(a: tuple[int, int], b: tuple[int, int]) -> float:
+        """Student's distribution with two degrees of freedom."""
+        before, after, gap_s = ahead[a[0]][a[1]], back[b[0]][b[1]], (b[1] - a[1]) * motion.step_s
+        misfit = link_features(motion, before, after, gap_s)[1]
+        return -2 * misfit - log(link_spread(motion, before, after, gap_s))
+
+    out = []
+    for name in sorted(paths):
+        for before, after, counts in source_changes(ids[name], JOIN_BRIEF_S / motion.step_s):
+            gap_s = (after - before) * motion.step_s
+            margin, own = JOIN_MARGIN, fit((name, before), (name, after))
+            for other in sorted(paths):
+                if other == name or after not in paths[other]:
+                    continue
+                reach = hypot(*(back[other][after].mean[:, 0] - ahead[name][before].mean[:, 0]))
+                if reach > 1 + REACH_M_PER_S * gap_s:
+                    continue
+                value = own - fit((name, before), (other, after))
+                earlier = [step for step in paths[other] if step < after]
+                if earlier:
+                    theirs = other, max(earlier)
+                    value += fit(theirs, (other, after)) - fit(theirs, (name, after))
+                margin = min(margin, value)
+            had, has = held[ids[name][after]], held[ids[name][before]]
+            at, since = had.index((after, name)), has.index((before, name)) + 1
+            features = link_features(motion, ahead[name][before], back[name][after], gap_s)
+            features += [max(margin, -JOIN_MARGIN), float(margin < JOIN_MARGIN)]
+            features += [float(at > 0 and had[at - 1][1] != name), float(since < len(has) and has[since][1] != name)]
+            out.append((name, after, [*features, log(counts[0]), log(counts[1])]))
+    return out
+
+
+def source_changes(ids: dict[int, int], brief: float) -> list[tuple[int, int, tuple[int, int]]]:
+    """The steps before and after each change of the input id, and the numbers of samples of both; without brief ones."""
+    runs: list[list[int]] = []
+    for step in sorted(ids):
+        if runs and ids[runs[-1][-1]] == ids[step]:
+            runs[-1].append(step)
+        else:
+            runs.append([step])
+    long: list[list[int]] = []
+    for number, run in enumerate(runs):
+        inner = 0 < number < len(runs) - 1
+        is_between = inner and ids[runs[number - 1][0]] == ids[runs[number + 1][0]]
+        is_brief = is_between and runs[number + 1][0] - run[0] < brief
+        if long and (is_brief or ids[long[-1][0]] == ids[run[0]]):
+            long[-1] += run
+        else:
+            long.append(list(run))
+    return [(a[-1], b[0], (len(a), len(b))) for a, b in pairwise(long)]
+
+
+def cut(
+    motion: Motion, paths: dict[int, Path], ids: dict[int, dict[int, int]], least: float
+) -> dict[int, dict[int, int]]:
+    """The track of each step after tracks are cut at joins that are less likely to be right."""
+    following, cuts = max(paths, default=0), {}
+    for name, step, features in joins(motion, paths, ids):
+        odds = sum(CUTS[one] * value for one, value in zip(JOIN_NAMES, features, strict=True)) + CUT_BIAS
+        if sigmoid(odds) < least:
+            following += 1
+            cuts[name, step] = following
+    out: dict[int, dict[int, int]] = {}
+    for name, path in paths.items():
+        now = name
+        for step in sorted(path):
+            now = cuts.get((name, step), now)
+            out.setdefault(name, {})[step] = now
+    return out
 
 
 # Encounters: two people come near each other; were their track ids swapped?

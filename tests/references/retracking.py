@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from tests.references.offline import Motion, exchanged, linked, person_log_odds, sigmoid
+from tests.references.offline import Motion, cut, exchanged, linked, person_log_odds, sigmoid
 
 Point = tuple[float, float]
 Row = dict[str, float]
@@ -116,6 +116,12 @@ def offline(claims: Claims, samples: list[list[Row]], steps: list[int], options,
     of = {(step, row["track_id"]): row for step, rows in zip(steps, samples, strict=True) for row in rows}
     paths = claims.paths(of, o.shares_samples)
     if o.link_s > 0:
+        ids = {track: {step: row["track_id"] for step, row in path.items()} for track, path in paths.items()}
+        pieces: dict[int, dict[int, Row]] = {}
+        for track, names in cut(motion, places_of(paths), ids, o.link_confidence).items():
+            for step, piece in names.items():
+                pieces.setdefault(piece, {})[step] = paths[track][step]
+        paths = pieces
         name = linked(motion, places_of(paths), o.link_s, o.link_confidence)
         joined: dict[int, dict[int, Row]] = {}
         for track, path in paths.items():

@@ -179,7 +179,7 @@ class LogTables:
     def _track_names(self, topic: str) -> TrackNames:
         """The names of the classes of the tracks, and of the ground truth, that the rows of a channel are about."""
         made = provenance_of(self.opened, topic)
-        base = topic.removesuffix("/events").removesuffix("/errors")
+        base = topic.removesuffix("/events").removesuffix("/errors").removesuffix("/decisions")
         if made and made.zones:
             base = made.input
         beside = base.removesuffix("/predictions")

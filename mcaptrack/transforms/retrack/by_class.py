@@ -100,8 +100,8 @@ def split_classes(frames: FrameColumns) -> list[FrameColumns]:
 def join_classes(runs: Sequence[Iterator[tuple[Frame, ...]]], schemas: Sequence[Schema]) -> Iterator[tuple[Frame, ...]]:
     """The results of each class (C,) as one: ids follow on those of the class before. One result for each of F frames.
 
-    All frames of a result have tracks with the same ids: offline and online tracks, and predictions; they are of
-    ``schemas``.
+    All frames of a result have tracks with the same ids: offline and online tracks, predictions and decisions; they are
+    of ``schemas``.
     """
     results = []
     taken = [0]
@@ -120,5 +120,6 @@ def join_classes(runs: Sequence[Iterator[tuple[Frame, ...]]], schemas: Sequence[
 def _joined(frames: Sequence[Frame], above: Sequence[int]) -> Frame:
     """Frames of one output (C,) as one; ids of each are raised ``above`` those of the classes before."""
     rows = np.concatenate([frame.rows for frame in frames])
-    rows["track_id"] += np.repeat(above[: len(frames)], [len(frame.rows) for frame in frames])
+    raised = rows["track_id"] + np.repeat(above[: len(frames)], [len(frame.rows) for frame in frames])
+    rows["track_id"] = np.where(rows["track_id"] < 0, rows["track_id"], raised)
     return frames[0]._replace(rows=rows)

@@ -31,9 +31,9 @@ _LOW: Final = 0.6
 _ENOUGH: Final = 10
 
 
-def track_confidence(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
-    """The probability that each track is a person, (K,)."""
-    return np.asarray(1 / (1 + np.exp(-track_log_odds(model, trajectories, smoothed, step_s))))
+def probability(log_odds: Floats) -> Floats:
+    """Log odds as probabilities."""
+    return np.asarray(1 / (1 + np.exp(-log_odds)))
 
 
 def track_log_odds(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
@@ -68,15 +68,14 @@ def features(model: MotionModel, trajectories: Trajectories, smoothed: State, st
     )
 
 
-def scored_confidence(xy_m: Floats, first: Ints, score: Floats, observed: Bools, usual: float, step_s: float) -> Floats:
-    """The probability that each track of detections with scores is an object, (K,).
+def scored_log_odds(xy_m: Floats, first: Ints, score: Floats, observed: Bools, usual: float, step_s: float) -> Floats:
+    """The log odds that each track of detections with scores is an object, (K,).
 
     Much in traffic stands still, so a track needs no motion; but what neither moves nor has scores as high as is usual
     in the log is clutter. Rows (N,) of track k begin at ``first[k]``, of K + 1; ``xy_m`` (N, 2) are their positions.
     ``usual`` is the median score of the log. Rows without a score count as usual ones.
     """
-    found = scored_features(xy_m, first, score, observed, usual, step_s)
-    return np.asarray(1 / (1 + np.exp(-(found @ np.array(SCORED)))))
+    return np.asarray(scored_features(xy_m, first, score, observed, usual, step_s) @ np.array(SCORED))
 
 
 def scored_features(xy_m: Floats, first: Ints, score: Floats, observed: Bools, usual: float, step_s: float) -> Floats:

@@ -20,7 +20,7 @@ from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajec
 from mcaptrack.transforms.retrack.weights import weights_of
 
 #: Gate on the mean speed between the end of a tracklet and the beginning of the next.
-_MAX_SPEED_M_PER_S: Final = 2.5
+MAX_SPEED_M_PER_S: Final = 2.5
 #: The features of a link, see ``features``.
 FEATURES: Final = ("miss", "misfit", "gap", "misfit or stay", "turn", "distance and speed", "misfit and speed")
 #: Weight of each feature as a log odds ratio; and the log odds without any, in logs where a share of ``_PRIOR`` of the
@@ -87,7 +87,7 @@ def candidates(
         i = part.start + group_index(count[part])
         j: Ints = order[ragged_range(low[part], count[part])]
         gap_s = np.asarray((begins[j] - ends[i]) * step_s, np.float64)
-        near = _length(forward.mean[last[i], :2] - backward.mean[first[j], :2]) <= 1.0 + _MAX_SPEED_M_PER_S * gap_s
+        near = _length(forward.mean[last[i], :2] - backward.mean[first[j], :2]) <= 1.0 + MAX_SPEED_M_PER_S * gap_s
         parts.append((i[near], j[near], gap_s[near]))
     i, j, gap_s = (np.concatenate(members) for members in zip(*parts, strict=True))
     return i, j, gap_s
@@ -149,9 +149,7 @@ def features(model: MotionModel, before: State, after: State, gap_s: Floats) -> 
     miss = np.minimum(_length(way - left * span), _length(way - came * span))
     misfit, stay = _length(way - (left + came) / 2 * span), _length(way)
     speed = np.maximum(_length(left), _length(came))
-    power = (model.drift_m_per_s + model.drift_ratio * speed) ** 2
-    spread = before.cov[:, 0] + after.cov[:, 0] + gap_s**2 / 4 * (before.cov[:, 2] + after.cov[:, 2])
-    spread += power * gap_s**3 / 12
+    spread = _spread(model, before, after, gap_s)
     log_speed = np.log(speed + _SPEED_M_PER_S)
     return np.stack(
         [
@@ -165,6 +163,24 @@ def features(model: MotionModel, before: State, after: State, gap_s: Floats) -> 
         ],
         axis=1,
     )
+
+
+def log_likelihood(model: MotionModel, before: State, after: State, gap_s: Floats) -> Floats:
+    """The log likelihood (E,) of states after gaps if they are of the same person as those before.
+
+    The misfit has Student's distribution with two degrees of freedom, because people also turn and stop.
+    """
+    misfit = features(model, before, after, gap_s)[:, FEATURES.index("misfit")]
+    return np.asarray(-2 * misfit - np.log(_spread(model, before, after, gap_s)))
+
+
+def _spread(model: MotionModel, before: State, after: State, gap_s: Floats) -> Floats:
+    """The variance (E,) of the misfit per axis."""
+    speed = np.maximum(_length(before.mean[:, 2:]), _length(after.mean[:, 2:]))
+    power = (model.drift_m_per_s + model.drift_ratio * speed) ** 2
+    spread = before.cov[:, 0] + after.cov[:, 0] + gap_s**2 / 4 * (before.cov[:, 2] + after.cov[:, 2])
+    spread += power * gap_s**3 / 12
+    return np.asarray(spread)
 
 
 def misfits(before: State, after: State, gap_s: Floats) -> Floats:

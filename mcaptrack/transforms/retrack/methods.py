@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
+from itertools import repeat
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Protocol, TypeAlias, TypeVar
 
 from mcaptrack.predictors import warn_if_weak
-from mcaptrack.schema import TRACKS, Frame, Rows
+from mcaptrack.schema import DECISIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameColumns, collect
 from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.retrack.assignments import Assignments
@@ -53,7 +54,7 @@ class Retrack(LikelihoodOptions):
     """Repair tracks: re-tracking by likelihood.
 
     Reads samples; writes repaired tracks that use the whole log (offline), repaired tracks that use the past alone
-    (online), and predictions from the latter.
+    (online), predictions from the latter, and what was decided offline, with how likely each decision is right.
 
     Examples
     --------
@@ -63,7 +64,7 @@ class Retrack(LikelihoodOptions):
     >>> def row(track_id, x_m):
     ...     return TRACKS.rows(track_id=[track_id], x_m=[x_m], y_m=[0.0], observed=[True], source_id=[-1])
     >>> frames = [Frame(t * 400_000_000, t, row(7 if t < 10 else 8, t / 2)) for t in range(20)]
-    >>> {id for offline, online, predictions in Retrack()(frames) for id in offline.rows["track_id"].tolist()}
+    >>> {id for offline, *_ in Retrack()(frames) for id in offline.rows["track_id"].tolist()}
     {1}
     """
 
@@ -95,7 +96,9 @@ Retracking: TypeAlias = Retrack | RetrackByConsistency
 def _retrack(
     options: Options, new_pass: Callable[[Options, Movers], OnlinePass], frames: Iterable[Frame]
 ) -> Iterator[tuple[Frame, ...]]:
-    """For each frame the offline tracks, the online tracks and their predictions; each class by itself."""
+    """For each frame the offline tracks, the online tracks and their predictions, and decisions if the method writes
+    them; each class by itself.
+    """
     warn_if_weak(options.predictor)
     if options.leaves_unchanged:
         yield from _keep_ids(options, frames)
@@ -111,6 +114,7 @@ def _keep_ids(options: RetrackOptions, frames: Iterable[Frame]) -> Iterator[tupl
     """For each frame tracks that are linked in the picture, if the method does that; the input and its predictions."""
     forecaster = Forecaster(options.predictor, options.horizon_s, options.min_history, options.rate_hz)
     linked: Iterator[Rows] | None = None
+    decisions = repeat(DECISIONS.empty())
     if options.links_in_picture:
         frames = collect(TRACKS, frames)
         linked = link_in_picture(
@@ -119,7 +123,8 @@ def _keep_ids(options: RetrackOptions, frames: Iterable[Frame]) -> Iterator[tupl
     for frame in frames:
         online = frame._replace(rows=frame.rows[frame.rows["observed"]])
         offline = frame if linked is None else frame._replace(rows=next(linked))
-        yield offline, online, frame._replace(rows=forecaster.predict(frame))
+        outputs = offline, online, frame._replace(rows=forecaster.predict(frame)), frame._replace(rows=next(decisions))
+        yield outputs[: len(options.writes)]
 
 
 def _retrack_together(
@@ -131,10 +136,13 @@ def _retrack_together(
     for frame in frames:
         run.step(frame)
     model = motion_model(options, run.noise_m, movers)
-    tracks = offline_tracks(options, model, run.assignments, run.samples, run.steps, frames.t_ns, movers)
-    for frame, rows, (online, predictions) in zip(frames, tracks, run.outputs(), strict=True):
+    offline = offline_tracks(options, model, run.assignments, run.samples, run.steps, frames.t_ns, movers)
+    for frame, rows, (online, predictions), decided in zip(
+        frames, offline.tracks, run.outputs(), offline.decisions, strict=True
+    ):
         # copies, because what is kept can't be written to
-        yield frame._replace(rows=rows), *(one._replace(rows=one.rows.copy()) for one in (online, predictions))
+        causal = (one._replace(rows=one.rows.copy()) for one in (online, predictions))
+        yield (frame._replace(rows=rows), *causal, frame._replace(rows=decided))[: len(options.writes)]
 
 
 _PAPER: Final = RetrackByConsistency(

@@ -6,20 +6,23 @@ Letters: C assignments (a track has a sample at a step), R rows, K tracks, N row
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Final
+from itertools import repeat
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.ragged import group_index
-from mcaptrack.schema import Rows
+from mcaptrack.schema import DECISIONS, Rows
 from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers
-from mcaptrack.transforms.retrack.false_tracks import scored_confidence, track_confidence
+from mcaptrack.transforms.retrack.decisions import Decided, decision_rows
+from mcaptrack.transforms.retrack.false_tracks import probability, scored_log_odds, track_log_odds
 from mcaptrack.transforms.retrack.fixed_tracks import fix_tracks
 from mcaptrack.transforms.retrack.identity_swaps import resolve_swaps
+from mcaptrack.transforms.retrack.joins import Tracked, cut_joins
 from mcaptrack.transforms.retrack.linking import link_tracks
-from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
+from mcaptrack.transforms.retrack.motion_model import MotionModel, State, smooth, to_trajectories
 from mcaptrack.transforms.retrack.offline_rows import Moved, TrackRows, moved_to, rows_by_step
 from mcaptrack.transforms.retrack.options import RetrackOptions
 from mcaptrack.transforms.retrack.samples import LogSamples
@@ -32,6 +35,13 @@ _CONFIRMED_SHARE: Final = 0.25
 _ROUNDS: Final = 3
 
 
+class Offline(NamedTuple):
+    """The rows of all tracks at each step, ordered by id; and the decisions at each step, if they were asked for."""
+
+    tracks: Iterator[Rows]
+    decisions: Iterator[Rows]
+
+
 def offline_tracks(
     options: RetrackOptions,
     model: MotionModel,
@@ -40,8 +50,8 @@ def offline_tracks(
     steps: Sequence[int],
     times_ns: Ints,
     movers: Movers = PEOPLE,
-) -> Iterator[Rows]:
-    """The rows of all tracks at each of ``steps``, ordered by id.
+) -> Offline:
+    """The rows of all tracks at each of ``steps``, and the decisions there if ``options`` writes them.
 
     ``samples`` are those of all steps, ``times_ns`` the times of these; ``model`` is in the unit of ``movers``. A
     sample that was assigned to two tracks goes to the one that had it first, unless both keep it (``shares_samples``),
@@ -54,24 +64,31 @@ def offline_tracks(
     xy = np.stack([samples.column(name)[sample] for name in ("x_m", "y_m")], axis=-1) / movers.unit_m
     step_s = 1 / options.rate_hz
     if options.link_s > 0 and len(track):
+        if not movers.on_ground:
+            track = cut_joins(model, step, track, source, xy, step_s, options.link_confidence)
         track = _linked(options, model, step, track, xy, step_s, movers)
     if options.resolve_swaps and len(track) and not movers.on_ground:
         track = _without_swaps(model, step, track, source, xy, step_s)
     track = fix_tracks(step, track, source, options.fixed_ids)
     kept_tracks = np.unique(track[np.isin(source, np.array(options.fixed_ids, np.int64))])
     order = np.lexsort((step, track))
-    step, track, sample = step[order], track[order], sample[order]
+    step, track, source, sample = step[order], track[order], source[order], sample[order]
     rows = TrackRows.of(step, track, sample)
     is_kept = np.isin(rows.step, np.array(steps, np.int64))  # inside gaps of the log there are no frames
+    is_decided = DECISIONS in options.writes.values()
     moved: Moved | None = None
-    if len(step) and (options.smooth or options.track_confidence > 0):
-        ids, _, trajectories = to_trajectories(step, track, xy[order], model.noise_m)
-        smoothed = smooth(model, trajectories, step_s)[2]
+    states: tuple[State, State] | None = None
+    ids = np.unique(track)
+    odds = np.full(len(ids), np.inf)
+    if len(step) and (options.smooth or options.track_confidence > 0 or is_decided):
+        _, row, trajectories = to_trajectories(step, track, xy[order], model.noise_m)
+        forward, backward, smoothed = smooth(model, trajectories, step_s)
+        states = forward.take(row), backward.take(row)
         if options.smooth:  # rows and trajectories are both ordered by track, then by step
             when = times_ns[np.minimum(np.searchsorted(steps, rows.step), len(times_ns) - 1)]
             moved = moved_to(smoothed.mean[:, :2] * movers.unit_m, rows, samples, options.ground_planes, when)
         if movers.on_ground:
-            confidence = scored_confidence(
+            odds = scored_log_odds(
                 smoothed.mean[:, :2] * movers.unit_m,
                 trajectories.first,
                 rows.between(samples.column("score")),
@@ -80,19 +97,19 @@ def offline_tracks(
                 step_s,
             )
         else:
-            confidence = track_confidence(model, trajectories, smoothed, step_s)
-        is_sure = (confidence >= options.track_confidence)[np.searchsorted(ids, rows.track)]
-    else:
-        is_sure = np.ones(len(rows.track), bool)
-    is_fixed = np.isin(rows.track, kept_tracks)
-    is_sure |= is_fixed
+            odds = track_log_odds(model, trajectories, smoothed, step_s)
+    is_sure = probability(odds) >= options.track_confidence
+    is_fixed = np.isin(ids, kept_tracks)
     min_track_s = options.min_track_s * (_CONFIRMED_SHARE if movers.on_ground else 1.0)
-    min_rows = round(min_track_s * options.rate_hz) + 1
-    _, which, lengths = np.unique(rows.track[is_sure], return_inverse=True, return_counts=True)
-    is_kept &= is_sure
-    is_kept[is_sure] &= (lengths[which] >= min_rows) | is_fixed[is_sure]
-    left = np.flatnonzero(is_kept)
-    return rows_by_step(rows.take(left), samples, moved and moved.take(left), steps)
+    length = np.bincount(np.searchsorted(ids, rows.track), minlength=len(ids))
+    keeps = is_fixed | (is_sure & (length >= round(min_track_s * options.rate_hz) + 1))
+    left = np.flatnonzero(is_kept & keeps[np.searchsorted(ids, rows.track)])
+    decisions: Iterator[Rows] = repeat(DECISIONS.empty(), len(steps))
+    if is_decided and states is not None:
+        tracked = Tracked(step, track, source, *states)
+        decided = Decided(tracked, sample, np.where(is_fixed, np.inf, odds), keeps)
+        decisions = decision_rows(decided, model, samples, steps, step_s)
+    return Offline(rows_by_step(rows.take(left), samples, moved and moved.take(left), steps), decisions)
 
 
 def _without_swaps(model: MotionModel, step: Ints, track: Ints, source: Ints, xy: Floats, step_s: float) -> Ints:

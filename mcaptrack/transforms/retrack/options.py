@@ -12,7 +12,7 @@ from typing import ClassVar, Final, Literal
 
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.predictors import PredictorName
-from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
+from mcaptrack.schema import DECISIONS, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.durations import longest_track_s
 from mcaptrack.transforms.motion_limits import LIMITS_HELP, LIMITS_PATTERN, ClassNames, read_limits
 from mcaptrack.transforms.protocol import check_options, context, option
@@ -175,6 +175,9 @@ class RetrackOptions:
 @dataclass(frozen=True, kw_only=True)
 class LikelihoodOptions(RetrackOptions):
     """The options of re-tracking by likelihood."""
+
+    writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({**RetrackOptions.writes, "decisions": DECISIONS})
+    latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({**RetrackOptions.latency_s, "decisions": float("inf")})
 
     @property
     def links_in_picture(self) -> bool:

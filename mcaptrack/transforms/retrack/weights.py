@@ -1,6 +1,6 @@
-"""The weights of what tells people from false tracks and right links from wrong ones.
+"""The weights of what tells people from false tracks, and right joins and links from wrong ones.
 
-Both are logistic regressions, fitted on synthetic scenes with the faults of trackers: ``tools/fit_retrack.py`` makes
+All are logistic regressions, fitted on synthetic scenes with the faults of trackers: ``tools/fit_retrack.py`` makes
 the file, which says how. No recording was used.
 """
 

@@ -83,7 +83,8 @@ def draw(report: LogReport, at: int, total: int) -> None:
         notes=report.notes,
         people=report.has_only_people,
     )
-    report.background, report.sequence, report.highlights, report.doubts = None, None, [], []
+    report.background, report.sequence, report.highlights = None, None, []
+    report.doubts, report.doubtful_tracks = [], []
     for one in report.track_sets.values():
         one.frames = []
 

@@ -18,7 +18,7 @@ from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events
 from mcaptrack.evaluation.people import PersonScores, person_scores
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes, is_estimated, origin_of, plane_at
-from mcaptrack.schema import EVENTS, TRACKS, Frame
+from mcaptrack.schema import DECISIONS, EVENTS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import Provenance
@@ -28,7 +28,7 @@ from mcaptrack.sources.corrections import CORRECTED
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.viewing.names import tracker_name
 from mcaptrack.viewing.report import statistics
-from mcaptrack.viewing.report.doubts import Doubt, find_doubts
+from mcaptrack.viewing.report.doubts import Doubt, DoubtfulTrack, find_doubtful_tracks, find_doubts
 from mcaptrack.viewing.report.formatting import plain
 from mcaptrack.viewing.report.headline import AFTER, BEFORE, BeforeAfter, compared
 from mcaptrack.viewing.report.identity_events import (
@@ -85,6 +85,7 @@ class LogReport:
     data: dict[str, Any] = field(default_factory=dict)
     people: dict[str, PersonScores] = field(default_factory=dict)
     doubts: list[Doubt] = field(default_factory=list)
+    doubtful_tracks: list[DoubtfulTrack] = field(default_factory=list)
     missing: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     html: str = ""
@@ -141,7 +142,9 @@ def gather(opened: log.Log, camera: str | None, progress: Callable[[str], None] 
     _find_events(opened, out)
     if out.repairs is not None:
         after = out.compared_roles[1]
-        out.doubts = find_doubts(out.repairs, out.track_sets[after].frames, out.people.get(after))
+        decisions = _decisions(opened, out.repairs.topic)
+        out.doubts = find_doubts(out.repairs, out.track_sets[after].frames, out.people.get(after), decisions)
+        out.doubtful_tracks = find_doubtful_tracks(decisions)
     progress(f"{opened.path}: pictures")
     _read_pictures(opened, out)
     out.zones = zone_section(opened, prefix, {role: one.name for role, one in out.track_sets.items()})
@@ -262,6 +265,14 @@ def _find_events(opened: log.Log, out: LogReport) -> None:
         if role in AFTER:
             out.repairs = summarize_events(tracks.topic, events, None, *args)
     out.highlights = most_important(out.channel_events, _THUMBNAILS)
+
+
+def _decisions(opened: log.Log, topic: str) -> list[Frame]:
+    """The decisions of re-tracking about a channel of tracks; none if there are none, or if they are out of date."""
+    channel = opened.channels.get(f"{topic}/decisions")
+    if channel is None or not channel.holds(DECISIONS) or pipeline.is_stale(opened, channel.topic):
+        return []
+    return list(opened.frames(channel.topic, DECISIONS))
 
 
 def _recorded(opened: log.Log, topic: str) -> tuple[list[Frame], MatchRule | None] | None:

@@ -1,4 +1,6 @@
-"""The repairs that are least certain: where a person was expected after a gap, and where the joined track appears."""
+"""The decisions of re-tracking that are least certain: by their probabilities, where the log has these (decisions), and
+otherwise by how far a joined track appears from where the person was expected.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +11,16 @@ import numpy as np
 
 from mcaptrack.evaluation.people import PersonScores
 from mcaptrack.geometry.clocks import seconds_to_ns
-from mcaptrack.schema import EventKind, Frame
-from mcaptrack.viewing.report.formatting import number
+from mcaptrack.schema import DecisionKind, EventKind, Frame
+from mcaptrack.viewing.report.formatting import number, percent
 from mcaptrack.viewing.report.identity_events import ChannelEvents, IdentityEvent
 from mcaptrack.viewing.report.statistics import rows_by_track
 
 #: The number of repairs that are shown, and the least distance from the expected place of those.
 _MOST: Final = 6
 _LEAST_M: Final = 0.5
+#: Decisions that are right with at least this probability are not shown.
+_UNSURE: Final = 0.8
 #: The velocity before a gap is that of the last so many seconds.
 _PAST_S: Final = 2.0
 #: A track belongs to the person that it matches at most so long before, or after, a repair.
@@ -25,39 +29,90 @@ _NEAR_S: Final = 2.0
 
 class Doubt(NamedTuple):
     """A repair: the distance in m from where the person was expected to where the track appears, and in words what the
-    ground truth says about it; "" without any.
+    ground truth says about it; "" without any. How likely it is right, if that is known, and the tracker's track that
+    would go on otherwise; -1 for none.
     """
 
     event: IdentityEvent
     away_m: float
     verdict: str
     is_right: bool | None
+    probability: float | None = None
+    alternative_id: int = -1
 
     def text(self) -> str:
         """The repair in words."""
         start = f"{self.event.text[:1].upper()}{self.event.text[1:]}"
-        where = f"{start}. It appears {number(self.away_m, 1, 'm')} from where it was expected"
+        if self.probability is None:
+            where = f"{start}. It appears {number(self.away_m, 1, 'm')} from where it was expected"
+        else:
+            before, after = int(self.event.row["previous_id"]), self.alternative_id
+            other = f"{before} goes on as {after}" if after >= 0 else f"{before} ended, and another came"
+            where = f"{start}. Right with {percent(self.probability, 0)}; otherwise {other}"
         return f"{where}. {self.verdict}" if self.verdict else f"{where}."
 
 
-def find_doubts(repairs: ChannelEvents | None, tracks: Sequence[Frame], people: PersonScores | None) -> list[Doubt]:
-    """The repairs that are farthest from where the person was expected, the farthest first.
+class DoubtfulTrack(NamedTuple):
+    """A track of which it is not certain that it follows a person: rows of decisions, kept or left out."""
 
-    The person is expected to go on as in the last two seconds before the gap. ``people`` are the scores of these
-    ``tracks`` by person, if there is ground truth. Repairs without positions in metres are left out.
+    t_ns: int
+    row: Any
+
+    def text(self, noun: str) -> str:
+        """The decision in words; ``noun`` is that of what is tracked."""
+        row, likely = self.row, percent(float(self.row["probability"]), 0)
+        long = f"{number(float(row['duration_s']), 1, 's')} long"
+        if int(row["kind"]) == DecisionKind.KEPT:
+            return f"track {row['track_id']} is kept: a {noun} with {likely}, {long}"
+        return f"the tracker's {row['source_id']} is left out: no {noun} with {likely}, {long}"
+
+
+def find_doubts(
+    repairs: ChannelEvents | None,
+    tracks: Sequence[Frame],
+    people: PersonScores | None,
+    decisions: Sequence[Frame] = (),
+) -> list[Doubt]:
+    """The repairs that are least likely, the least likely first; those below ``_UNSURE``.
+
+    ``decisions`` are rows of Decisions of these ``tracks``. Without any, the repairs that are farthest from where the
+    person was expected, going on as in the last two seconds before the gap. ``people`` are the scores of ``tracks`` by
+    person, if there is ground truth. Repairs without positions in metres are left out.
     """
     if repairs is None:
         return []
     rows, t_ns = rows_by_track(tracks)
+    known = {
+        (frame.t_ns, int(row["track_id"]), int(row["source_id"])): row
+        for frame in decisions
+        for row in frame.rows[frame.rows["kind"] == DecisionKind.JOINED]
+    }
     found = []
     for event in repairs.events:
         if int(event.row["kind"]) != EventKind.JOINED:
             continue
+        decided = known.get((event.t_ns, int(event.row["track_id"]), int(event.row["source_id"])))
+        if known and (decided is None or decided["probability"] >= _UNSURE):
+            continue
         away_m = _away_m(rows, t_ns, event)
-        if away_m is not None and away_m >= _LEAST_M:
-            verdict, is_right = _verdict(people, event) if people is not None else ("", None)
-            found.append(Doubt(event, away_m, verdict, is_right))
-    return sorted(found, key=lambda one: (-one.away_m, one.event.t_ns))[:_MOST]
+        if away_m is None or (decided is None and away_m < _LEAST_M):
+            continue
+        doubt = Doubt(event, away_m, *(_verdict(people, event) if people is not None else ("", None)))
+        if decided is not None:
+            likely = float(decided["probability"])
+            doubt = doubt._replace(probability=likely, alternative_id=int(decided["alternative_id"]))
+        found.append(doubt)
+    return sorted(found, key=lambda one: (one.probability or 0.0, -one.away_m, one.event.t_ns))[:_MOST]
+
+
+def find_doubtful_tracks(decisions: Sequence[Frame]) -> list[DoubtfulTrack]:
+    """The tracks that were kept or left out with a probability below ``_UNSURE``, the least likely first."""
+    found = [
+        DoubtfulTrack(frame.t_ns, row)
+        for frame in decisions
+        for row in frame.rows[(frame.rows["kind"] != DecisionKind.JOINED) & (frame.rows["probability"] < _UNSURE)]
+    ]
+    return sorted(found, key=lambda one: (float(one.row["probability"]), one.t_ns))[:_MOST]
 
 
 def _away_m(rows: Any, t_ns: Any, event: IdentityEvent) -> float | None:

@@ -93,6 +93,12 @@ def identity_events(report: LogReport) -> dict[str, Any]:
         "doubts": [
             _event(one.event, one.text(), report) | {"is_wrong": one.is_right is False} for one in report.doubts
         ],
+        "have_odds": any(one.probability is not None for one in report.doubts),
+        "doubtful_tracks": [
+            {"text": one.text("person" if report.has_only_people else "object"), "t_ns": one.t_ns}
+            | {"clock": clock((one.t_ns - report.start_ns) / NS_PER_S), "is_wrong": False, "thumbnails": []}
+            for one in report.doubtful_tracks
+        ],
         "view": command("view", Path(report.file)),
     }
 

@@ -1,0 +1,197 @@
+"""Joins: where a track goes on with another input track, how likely that is right, and what it would be otherwise.
+
+Trackers give a new id when they are not sure that a person is the same, so that places where ids change are those at
+which most mistakes are made. A join is judged by all of a track before it and after it, and by who else was there.
+Probabilities are logistic regressions, fitted on synthetic scenes (see ``weights``).
+
+Letters: C assignments, K tracks, J joins, F features.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
+from mcaptrack.transforms.retrack import linking
+from mcaptrack.transforms.retrack.false_tracks import probability
+from mcaptrack.transforms.retrack.motion_model import MotionModel, State, smooth, to_trajectories
+from mcaptrack.transforms.retrack.weights import weights_of
+
+#: The features of a join: those of a link, and by how much it is likelier than the best alternative (see
+#: ``_alternatives``); whether there is one; whether another track had the samples of the new input id just before, and
+#: has those of the old one just after; and the logarithms of the numbers of samples that both last.
+FEATURES: Final = (
+    *linking.FEATURES,
+    "margin",
+    "alternative",
+    "taken over",
+    "given away",
+    "log before",
+    "log after",
+)
+#: Margins beyond this say no more; what is that much less likely is no alternative.
+_MARGIN: Final = 12.0
+#: Samples of another input track that last less, within one of the same input track, are no joins. Seconds.
+_BRIEF_S: Final = 1.0
+#: The number of pairs that are examined at once.
+_BATCH: Final = 500_000
+#: Weights of joins of online tracks, which may be cut.
+_CUTS_WEIGHTS, _CUTS_FITTED = weights_of("cuts", FEATURES)
+_CUTS_BIAS: Final = float(_CUTS_FITTED["bias"])
+
+
+class Tracked(NamedTuple):
+    """Tracks as assignments (C,), ordered by track, then step: ``step``, ``track`` and input id (``source``) of each.
+
+    ``forward`` and ``backward`` are the filtered states there: from all samples of the track up to it, and from it on.
+    """
+
+    step: Ints
+    track: Ints
+    source: Ints
+    forward: State
+    backward: State
+
+
+class Joins(NamedTuple):
+    """Joins (J,): assignments ``before`` and ``after`` each, that of the ``alternative`` or -1, and features (J, F)."""
+
+    before: Ints
+    after: Ints
+    alternative: Ints
+    features: Floats
+
+
+def cut_joins(
+    model: MotionModel, step: Ints, track: Ints, source: Ints, xy_m: Floats, step_s: float, min_confidence: float
+) -> Ints:
+    """The track of each assignment (C,) after tracks are cut at joins that are right with a smaller probability.
+
+    What comes after a cut is a track of its own, for linking to decide about, with an id above all others.
+    """
+    order = np.lexsort((step, track))
+    tracked = tracked_of(model, step[order], track[order], source[order], xy_m[order], step_s)
+    joins = find_joins(tracked, model, step_s)
+    cut = joins.after[cut_probability(joins.features) < min_confidence]
+    begins = np.zeros(len(track), bool)
+    begins[cut] = True
+    piece = np.maximum.accumulate(np.where(begins | run_starts(tracked.track), np.arange(len(track)), 0))
+    name = np.where(begins, int(track.max(initial=0)) + np.cumsum(begins), tracked.track)
+    out = np.empty_like(track)
+    out[order] = name[piece]
+    return out
+
+
+def tracked_of(model: MotionModel, step: Ints, track: Ints, source: Ints, xy_m: Floats, step_s: float) -> Tracked:
+    """Assignments (C,) of positions (C, 2), ordered by track, then step, with their states."""
+    _, row, trajectories = to_trajectories(step, track, xy_m, model.noise_m)
+    forward, backward, _ = smooth(model, trajectories, step_s)
+    return Tracked(step, track, source, forward.take(row), backward.take(row))
+
+
+def cut_probability(features: Floats) -> Floats:
+    """The probability (J,) that joins of online tracks with these features (J, F) are right."""
+    return probability(features @ _CUTS_WEIGHTS + _CUTS_BIAS)
+
+
+def find_joins(tracked: Tracked, model: MotionModel, step_s: float) -> Joins:
+    """Where tracks go on with another input track."""
+    first, last = _runs(tracked, step_s)
+    log_length = np.log(last - first + 1)
+    goes_on = np.flatnonzero(tracked.track[first[1:]] == tracked.track[first[:-1]])
+    before, after = last[goes_on], first[goes_on + 1]
+    margin, alternative = _alternatives(tracked, model, before, after, step_s)
+    extra = (
+        margin,
+        alternative >= 0,
+        *_elsewhere(tracked, before, after),
+        log_length[goes_on],
+        log_length[goes_on + 1],
+    )
+    found = linking.features(model, *_sides(tracked, before, after, step_s))
+    return Joins(before, after, alternative, np.column_stack([found, *extra]).astype(np.float64))
+
+
+def _runs(tracked: Tracked, step_s: float) -> tuple[Ints, Ints]:
+    """Runs of samples of one track with one input id: their first and last assignments.
+
+    Brief ones between two of the same input id belong to these, as in events.
+    """
+    starts = np.flatnonzero(run_starts(tracked.track, tracked.source))
+    track, source, step = tracked.track[starts], tracked.source[starts], tracked.step[starts]
+    is_brief = np.zeros(len(starts), bool)
+    lasts_s = (step[2:] - step[1:-1]) * step_s
+    is_brief[1:-1] = (track[2:] == track[:-2]) & (source[2:] == source[:-2]) & (lasts_s < _BRIEF_S)
+    starts = starts[~is_brief]
+    starts = starts[run_starts(tracked.track[starts], tracked.source[starts])]
+    return starts, np.append(starts[1:], len(tracked.track))[: len(starts)] - 1
+
+
+def _sides(tracked: Tracked, before: Ints, after: Ints, step_s: float) -> tuple[State, State, Floats]:
+    """The states at both sides of gaps from assignments ``before`` to ``after``, and the seconds between them."""
+    gap_s = np.asarray((tracked.step[after] - tracked.step[before]) * step_s, np.float64)
+    return tracked.forward.take(before), tracked.backward.take(after), gap_s
+
+
+def _alternatives(
+    tracked: Tracked, model: MotionModel, before: Ints, after: Ints, step_s: float
+) -> tuple[Floats, Ints]:
+    """By how much each join (J,) is likelier than the best alternative, as a log likelihood; its assignment, or -1.
+
+    An alternative is another track with a sample at the time of the join: the track would go on with these samples, and
+    the other track with those of the join (the two are exchanged), or it would begin there.
+    """
+
+    def fit(one: Ints, other: Ints) -> Floats:
+        return linking.log_likelihood(model, *_sides(tracked, one, other, step_s))
+
+    by_step = np.argsort(tracked.step, kind="stable")
+    low, high = (np.searchsorted(tracked.step[by_step], tracked.step[after], side) for side in ("left", "right"))
+    best, which = np.full(len(after), _MARGIN), np.full(len(after), -1)
+    own = fit(before, after)
+    previous = np.where(run_starts(tracked.track), -1, np.arange(len(tracked.track)) - 1)
+    count = high - low
+    for part in _batches(count):
+        join = part.start + group_index(count[part])
+        other = by_step[ragged_range(low[part], count[part])]
+        reach_m = 1.0 + linking.MAX_SPEED_M_PER_S * (tracked.step[after] - tracked.step[before])[join] * step_s
+        off = tracked.backward.mean[other, :2] - tracked.forward.mean[before[join], :2]
+        near = (np.hypot(off[:, 0], off[:, 1]) <= reach_m) & (other != after[join])
+        join, other = join[near], other[near]
+        margin = own[join] - fit(before[join], other)
+        there = np.flatnonzero(previous[other] >= 0)
+        theirs = previous[other[there]]
+        margin[there] += fit(theirs, other[there]) - fit(theirs, after[join[there]])
+        order = np.lexsort((tracked.source[other], margin, join))
+        order = order[run_starts(join[order])]
+        order = order[margin[order] < _MARGIN]
+        best[join[order]], which[join[order]] = margin[order], other[order]
+    return np.maximum(best, -_MARGIN), which
+
+
+def _batches(count: Ints) -> list[slice]:
+    """Groups of joins (J,) that have about ``_BATCH`` pairs together."""
+    starts = np.flatnonzero(run_starts(np.cumsum(count) // _BATCH))
+    return [slice(a, b) for a, b in pairwise([*starts.tolist(), len(count)])]
+
+
+def _elsewhere(tracked: Tracked, before: Ints, after: Ints) -> tuple[Bools, Bools]:
+    """Whether another track had the last samples of the new input id before each join (J,); and whether one has the
+    next samples of the old input id after it.
+    """
+    order = np.lexsort((tracked.step, tracked.source))
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+
+    def other(at: Ints, way: int) -> Bools:
+        beside = place[at] + way
+        there = order[np.clip(beside, 0, len(order) - 1)]
+        inside = (beside >= 0) & (beside < len(order))
+        same = inside & (tracked.source[there] == tracked.source[at])
+        return np.asarray(same & (tracked.track[there] != tracked.track[at]))
+
+    return other(after, -1), other(before, 1)

@@ -1,0 +1,172 @@
+"""Decisions of re-tracking: which there are, how likely they are said to be, and joins that are cut."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from mcaptrack.evaluation.track_lifecycle import lifecycle_of
+from mcaptrack.schema import DECISIONS, DecisionKind, EventKind, Frame
+from mcaptrack.transforms import PROFILES, Retrack
+from mcaptrack.transforms.retrack.joins import cut_joins, find_joins, tracked_of
+from mcaptrack.transforms.retrack.motion_model import MotionModel
+from mcaptrack.viewing.report.doubts import find_doubtful_tracks
+from tests.references.offline import Motion, cut, joins
+from tests.worlds import crossing_tracks, noisy_tracks, tracks_at
+
+STEP_S = 0.4
+QUICK = [Phase.explicit, Phase.generate]
+MODEL, SLOW = MotionModel(0.2, 1.75, 0.12, 0.08), Motion(0.2, 1.75, 0.12, 0.08, STEP_S)
+
+
+def decided(frames: list[Frame], transform: Retrack | None = None) -> tuple[list[Frame], list[Frame]]:
+    """The offline tracks and the decisions."""
+    offline, _, _, decisions = (list(part) for part in zip(*(transform or Retrack())(frames), strict=True))
+    return offline, decisions
+
+
+def rows_of(frames: list[Frame]) -> np.ndarray:
+    return np.concatenate([frame.rows for frame in frames])
+
+
+def walking(path, ticks: int = 60) -> list[Frame]:
+    """Frames of tracks: ``path(tick)`` gives positions by input id."""
+    return [Frame(round(tick * STEP_S * 1e9), tick, tracks_at(path(tick))) for tick in range(ticks)]
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=6, phases=QUICK)
+def test_joins_are_the_repairs_among_events_and_tracks_are_kept_or_left_out(seed):
+    """Events are found in the tracks that were written; decisions come from the tracks before they are written."""
+    frames = noisy_tracks(np.random.default_rng(seed), ticks=60)
+    offline, decisions = decided(frames)
+    assert [frame.t_ns for frame in decisions] == [frame.t_ns for frame in frames]
+    by_kind = {
+        kind: [(f.t_ns, row) for f in decisions for row in f.rows if row["kind"] == kind] for kind in DecisionKind
+    }
+    t_ns, events = lifecycle_of(offline).repairs()
+    wanted = {
+        (at, *(int(row[name]) for name in ("track_id", "previous_id", "source_id")))
+        for at, row in zip(t_ns.tolist(), events, strict=True)
+        if row["kind"] == EventKind.JOINED
+    }
+    found = {
+        (at, *(int(row[name]) for name in ("track_id", "previous_id", "source_id")))
+        for at, row in by_kind[DecisionKind.JOINED]
+    }
+    assert found == wanted
+    kept = {int(row["track_id"]): row for _, row in by_kind[DecisionKind.KEPT]}
+    written = rows_of(offline)
+    assert set(kept) == set(written["track_id"].tolist())
+    for name, row in kept.items():
+        mine = written[(written["track_id"] == name) & (written["source_id"] >= 0)]
+        assert row["frames"] == len(mine)
+        assert row["source_id"] == np.bincount(mine["source_id"]).argmax()
+    every = rows_of(decisions)
+    assert ((every["probability"] >= 0) & (every["probability"] <= 1)).all()
+    assert (every["track_id"][every["kind"] == DecisionKind.LEFT_OUT] == -1).all()
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=6, phases=QUICK)
+def test_joins_and_cuts_equal_the_reference(seed):
+    rng = np.random.default_rng(seed)
+    frames = crossing_tracks(rng) if rng.random() < 0.5 else noisy_tracks(rng, ticks=40)
+    rows = [(tick, row) for tick, frame in enumerate(frames) for row in frame.rows[frame.rows["observed"]]]
+    step = np.array([tick for tick, _ in rows])
+    source = np.array([int(row["track_id"]) for _, row in rows])
+    xy = np.array([(row["x_m"], row["y_m"]) for _, row in rows])
+    track = source // 3 * 10 + (step // 9 + source) % 2  # tracks that take over one another's ids now and then
+    _, once = np.unique(np.column_stack([step, track]), axis=0, return_index=True)
+    once = once[np.lexsort((step[once], track[once]))]
+    step, source, xy, track = step[once], source[once], xy[once], track[once]
+    paths: dict = {}
+    ids: dict = {}
+    for at, name, own, place in zip(step.tolist(), track.tolist(), source.tolist(), xy.tolist(), strict=True):
+        paths.setdefault(name, {})[at] = tuple(place)
+        ids.setdefault(name, {})[at] = own
+    found = find_joins(tracked_of(MODEL, step, track, source, xy, STEP_S), MODEL, STEP_S)
+    wanted = joins(SLOW, paths, ids)
+    assert [(int(track[a]), int(step[a])) for a in found.after] == [(name, at) for name, at, _ in wanted]
+    np.testing.assert_allclose(
+        found.features, np.array([one for *_, one in wanted]).reshape(-1, 13), rtol=1e-6, atol=1e-9
+    )
+    pieces = cut(SLOW, paths, ids, 0.5)
+    shuffled = rng.permutation(len(step))
+    made = cut_joins(MODEL, *(column[shuffled] for column in (step, track, source, xy)), STEP_S, 0.5)
+    assert made.tolist() == [
+        pieces[name][at] for name, at in zip(track[shuffled].tolist(), step[shuffled].tolist(), strict=True)
+    ]
+
+
+def test_a_person_who_walks_straight_on_under_another_id_is_surely_the_same():
+    _, decisions = decided(walking(lambda tick: {3 if tick < 30 else 9: (0.5 * tick, 0.0)}))
+    (join,) = (row for row in rows_of(decisions) if row["kind"] == DecisionKind.JOINED)
+    assert (join["previous_id"], join["source_id"], join["alternative_id"]) == (3, 9, -1)
+    assert join["probability"] > 0.9
+    assert join["duration_s"] == pytest.approx(STEP_S)
+    (kept,) = (row for row in rows_of(decisions) if row["kind"] == DecisionKind.KEPT)
+    assert (kept["frames"], kept["source_id"]) == (60, 3)
+    assert kept["probability"] > 0.9
+
+
+def test_the_alternative_is_the_neighbour_and_a_join_in_a_crowd_is_less_certain():
+    def beside(tick: int, apart_m: float) -> dict:
+        people = {1 if tick < 30 else 4: (0.5 * tick, 0.0), 2 if tick < 30 else 5: (0.5 * tick, apart_m)}
+        return people if not 27 <= tick < 30 else {}
+
+    likely = []
+    for apart_m in (0.4, 8.0):
+        _, decisions = decided(walking(lambda tick, far=apart_m: beside(tick, far)))
+        found = [row for row in rows_of(decisions) if row["kind"] == DecisionKind.JOINED]
+        assert {(int(row["previous_id"]), int(row["source_id"])) for row in found} == {(1, 4), (2, 5)}
+        likely.append(min(float(row["probability"]) for row in found))
+        if apart_m < 1:
+            assert {(int(row["source_id"]), int(row["alternative_id"])) for row in found} == {(4, 5), (5, 4)}
+        else:
+            assert {int(row["alternative_id"]) for row in found} == {-1}
+    assert likely[0] < likely[1]
+
+
+def test_what_is_left_out_is_a_row_with_its_place_and_the_input_id():
+    def scene(tick: int) -> dict:
+        people = {1: (0.5 * tick, 0.0)}
+        return people | ({7: (20.0 + tick % 3, 30.0)} if 20 <= tick < 27 else {})
+
+    offline, decisions = decided(walking(scene))
+    assert 7 not in rows_of(offline)["source_id"]
+    (at,) = (frame for frame in decisions if DecisionKind.LEFT_OUT in frame.rows["kind"])
+    (row,) = (one for one in at.rows if one["kind"] == DecisionKind.LEFT_OUT)
+    assert at.index == 20
+    assert (row["source_id"], row["frames"], row["x_m"], row["y_m"]) == (7, 7, 22.0, 30.0)
+    assert row["duration_s"] == pytest.approx(6 * STEP_S)
+
+
+def test_without_linking_nothing_is_cut_and_profiles_of_the_paper_write_no_decisions():
+    """A person steps aside under another input id: online the track goes on, and a cut takes more confidence than there is."""
+    assert [*PROFILES["paper"].writes] == [*PROFILES["authors"].writes] == ["", "online", "predictions"]
+    frames = walking(lambda tick: {3 if tick < 30 else 9: (0.5 * tick, 0.0 if tick < 30 else 0.9)})
+    unlinked = {int(row["track_id"]) for row in rows_of(decided(frames, Retrack(link_s=0.0))[0])}
+    sure = {int(row["track_id"]) for row in rows_of(decided(frames, Retrack(link_confidence=0.99))[0])}
+    assert len(unlinked) == 1
+    assert len(sure) == 2
+
+
+def test_the_least_likely_tracks_come_first_and_sure_ones_not_at_all():
+    rows = DECISIONS.rows(
+        kind=[1, 2, 2, 3, 3],
+        track_id=[1, 1, 2, -1, -1],
+        previous_id=[5, -1, -1, -1, -1],
+        source_id=[6, 5, 6, 7, 8],
+        probability=[0.1, 0.95, 0.6, 0.55, 0.9],
+        alternative_id=[-1] * 5,
+        duration_s=[0.4, 9.0, 8.0, 7.0, 6.0],
+        frames=[0, 20, 19, 18, 17],
+    )
+    found = find_doubtful_tracks([Frame(0, 0, rows)])
+    assert [one.text("person") for one in found] == [
+        "the tracker's 7 is left out: no person with 55\N{NO-BREAK SPACE}%, 7.0\N{NO-BREAK SPACE}s long",
+        "track 2 is kept: a person with 60\N{NO-BREAK SPACE}%, 8.0\N{NO-BREAK SPACE}s long",
+    ]
