@@ -97,7 +97,7 @@ class TestCalibration:
             assert (levels <= level).mean() == pytest.approx(level, abs=0.04)
 
     def test_ellipses_are_of_true_positions_though_measured_ones_have_noise(self):
-        levels = self.forecasts(0.3, noise_m=0.3)[40:]
+        levels = self.forecasts(0.3, noise_m=0.3, steps=200)[100:]
         assert (levels <= 0.5).mean() == pytest.approx(0.5, abs=0.08)
 
     def test_the_covariance_is_that_of_the_mixture(self):
