@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DecisionKind, Frame, Rows
 from mcaptrack.transforms import PROFILES, RetrackByConsistency
-from mcaptrack.transforms.retrack import Retracking
+from mcaptrack.transforms.retrack import Retracking, likelihood
 from tests.tiers import one_in
 from tests.worlds import assert_same_rows, noisy_tracks, ns, places, walk
 
@@ -81,6 +81,17 @@ def test_later_times_and_larger_ids_give_the_same_tracks(method, seed):
         for name in {"source_id", "previous_id", "alternative_id"} & set(wanted.dtype.names):
             changed[name] = np.where(wanted[name] >= 0, wanted[name] + 1000, -1)
         same(found, wanted, **changed)
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_rows_do_not_depend_on_how_many_steps_are_written_at_once(steps, monkeypatch):
+    """Also of tracks that coast from one part to the next."""
+    frames = noisy_tracks(np.random.default_rng(5), ticks=40, hidden=0.2)
+    wanted = outputs(PROFILES["default"], frames)
+    monkeypatch.setattr(likelihood, "_STEPS", steps)
+    for found, rows in zip(outputs(PROFILES["default"], frames), wanted, strict=True):
+        same(found, rows)
+    assert not wanted[1]["observed"].all()
 
 
 def by_place(rows: Rows) -> Rows:
