@@ -72,6 +72,20 @@ def test_three_who_stand_side_by_side_get_three_boxes_and_one_region_without_sep
     assert all(hits(seen, [(93.6, 40, 32.8, 40)]) == 1 for seen in joined)
 
 
+def test_a_belt_in_the_colour_of_the_floor_divides_nobody():
+    """It is 4 px high, a tenth of the person: less than the fifth over which parts are joined."""
+
+    def paint(image, number):
+        floor = image[128:132].copy()
+        walk(image, number)
+        image[128:132] = floor
+
+    found = boxes_of(film(paint), MedianDetector(stabilise=False, separate=False))
+    whole = [hits(seen, [(13.6 + 7.5 * (n % 28), 110, 12.8, 40)]) for n, seen in enumerate(found)]
+    assert sum(whole) > 55
+    assert sum(map(len, found)) < 65
+
+
 def test_boxes_of_several_people_carry_how_many_they_are():
     frames = film(three_side_by_side)
     for separate, wanted in ((True, [1, 1, 1, 1]), (False, [1, 3])):
