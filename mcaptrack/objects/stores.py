@@ -8,13 +8,17 @@ from collections.abc import Mapping
 from datetime import timedelta
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import SCHEMES, Url, hide_secrets
 
 #: A request that fails is sent again so often, and within so many seconds; one without an answer fails after a while.
-_RETRIES, _PATIENCE_S, _CONNECT_S, _READ_S, _REQUEST_S = 6, 60, 5, 20, 300
+_RETRIES, _PATIENCE_S, _CONNECT_S, _READ_S, _REQUEST_S = 9, 60, 5, 20, 300
+#: The first and the longest pause. Each is up to so many times as long as the one before; with 2 all nine would take
+#: less than three seconds.
+_FIRST, _LONGEST = timedelta(milliseconds=100), timedelta(seconds=5)
+_GROWTH: Final = 3
 
 
 def library(url: Url) -> Any:
@@ -50,7 +54,7 @@ def _made_store(scheme: str, bucket: str, settings: tuple[tuple[str, str], ...])
         },
         "retry_config": {
             "max_retries": _RETRIES,
-            "backoff": {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=5), "base": 2},
+            "backoff": {"init_backoff": _FIRST, "max_backoff": _LONGEST, "base": _GROWTH},
             "retry_timeout": timedelta(seconds=_PATIENCE_S),
         },
     }

@@ -27,8 +27,9 @@ FORMATS: Final[tuple[Format, ...]] = get_args(Format)
 _DESCRIBED: Final = ("parquet", "arrow")
 
 _ZSTD_LEVEL: Final = 1  # higher levels hardly make floats that are split by byte smaller
-#: Rows that are read back at once.
+#: Rows that are read back at once; fewer if they are larger.
 _ROWS_READ: Final = 16 * 1024
+_BYTES_READ: Final = 16 * 2**20
 _PREFIX: Final = "mcaptrack."
 
 
@@ -189,7 +190,13 @@ def verify(path: Path, form: Format = "parquet") -> int:
     try:
         if form == "parquet":
             with path.open("rb") as stream, pq.ParquetFile(stream, page_checksum_verification=True) as file:
-                batches = (pa.Table.from_batches([batch]) for batch in file.iter_batches(_ROWS_READ))
+                rows_read, groups = _rows_at_once(file.metadata), range(file.num_row_groups)
+                # One group after the other, because iterating over all of them keeps what was read.
+                batches = (
+                    pa.Table.from_batches([batch])
+                    for group in groups
+                    for batch in file.iter_batches(rows_read, row_groups=[group])
+                )
                 found = digest(file.schema_arrow, counted(batches))
         else:
             with path.open("rb") as stream:
@@ -202,6 +209,12 @@ def verify(path: Path, form: Format = "parquet") -> int:
     if found != stored:
         raise McaptrackError(f"{path} does not hold what was written to it; export it again")
     return rows[0]
+
+
+def _rows_at_once(about: Any) -> int:
+    """The number of rows of a Parquet file to read at once: pictures take more memory than numbers."""
+    size = sum(about.row_group(number).total_byte_size for number in range(about.num_row_groups))
+    return max(1, min(_ROWS_READ, about.num_rows * _BYTES_READ // max(size, 1)))
 
 
 def digest(schema: Any, pieces: Iterable[Any]) -> str:

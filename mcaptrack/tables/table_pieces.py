@@ -18,10 +18,14 @@ class TablePieces:
     num_rows : int
     make : callable
         Gives the rows as Arrow tables of any size.
+    most_bytes : int, optional
+        A piece ends earlier if its rows take more bytes.
     """
 
-    def __init__(self, schema: Any, num_rows: int, make: Callable[[], Iterable[Any]]) -> None:
-        self.schema, self.num_rows, self._make = schema, num_rows, make
+    def __init__(
+        self, schema: Any, num_rows: int, make: Callable[[], Iterable[Any]], most_bytes: int | None = None
+    ) -> None:
+        self.schema, self.num_rows, self._make, self._most_bytes = schema, num_rows, make, most_bytes
 
     def __iter__(self) -> Iterator[Any]:
         """The pieces; at least one, which may be empty."""
@@ -31,6 +35,9 @@ class TablePieces:
         for table in self._make():
             waiting.append(table)
             count += table.num_rows
+            if self._most_bytes is not None and sum(one.nbytes for one in waiting) >= self._most_bytes:
+                yield pa.concat_tables(waiting)
+                waiting, count, is_first = [self.schema.empty_table()], 0, False
             if count < PIECE_ROWS:
                 continue
             whole = pa.concat_tables(waiting)

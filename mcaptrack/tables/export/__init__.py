@@ -148,7 +148,7 @@ class _Job:
         words = {"topic": topic, "blobs": str(blobs).lower(), "source": self.contents.messages_source(topic, blobs)}
         known = tables.file_metadata(path, self.form) or {}
         if not self._stands(name, path, words["source"]):
-            made, left_out = self.contents.messages(topic, blobs)
+            made, left_out = self.contents.message_pieces(topic, blobs)
             words |= {"left_out": ", ".join(left_out)} if left_out else {}
             self._write(name, path, made, words, ("topic", "t_ns"))
         left = words.get("left_out") or known.get("left_out")

@@ -120,7 +120,12 @@ class LogTables:
         return _digest([topic, __version__, self.recording, places.file, self.opened.fingerprint(topic), where, blobs])
 
     def messages(self, topic: str, blobs: bool = False) -> tuple[Any, list[str]]:
-        """The messages of any channel as a flat table, and the fields that were left out.
+        """The messages of any channel as a flat table, and the fields that were left out; as ``message_pieces``."""
+        made, left_out = self.message_pieces(topic, blobs)
+        return made.table(), left_out
+
+    def message_pieces(self, topic: str, blobs: bool = False) -> tuple[TablePieces, list[str]]:
+        """The messages of any channel as a flat table in pieces, and the fields that were left out.
 
         Raises McaptrackError, with topic and time, for messages that can't be read.
         """
