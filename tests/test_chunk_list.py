@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import io
 import struct
+import zlib
+from typing import ClassVar
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 
 from mcaptrack import log
 from mcaptrack.log.chunk_list import ChunkList
+from mcaptrack.log.fingerprint import Checksums, fingerprint
 from mcaptrack.log.records import ChunkIndexRecord
+from mcaptrack.log.writer import LogWriter
 from tests.memory import held
 from tests.tiers import thorough
 
@@ -41,7 +47,6 @@ def test_columns_hold_what_a_list_of_records_holds(plain, wanted):
     assert list(made.with_channels(wanted)) == [one for one in plain if wanted & set(one.message_index_offsets)]
     assert made.channels == {channel for one in plain for channel in one.message_index_offsets}
     assert made.offsets.tolist() == [one.offset for one in plain]
-    assert list(made.before(5)) == [one for one in plain if one.offset < 5]
     assert made.are_all_indexed == all(one.message_index_offsets for one in plain)
     assert made.listed == sum(one.message_index_length - 15 * len(one.message_index_offsets) for one in plain)
     full = [one for one in plain if one.message_index_offsets]
@@ -53,6 +58,11 @@ def test_columns_hold_what_a_list_of_records_holds(plain, wanted):
     made.sort_by_offset()
     ordered = sorted(plain, key=lambda one: one.offset)
     assert list(made) == ordered
+    for end in (0, 5, 2**64):
+        part, kept = made.before(end), [one for one in ordered if one.offset < end]
+        part.append(plain[0] if plain else ChunkIndexRecord(0, 0, 0, 0, {1: 2}, 0, "new", 0, 0))
+        assert list(part)[:-1] == kept
+    assert list(made) == ordered  # what is added to a part isn't added here
     for one in ordered:
         assert made.at(one.offset) == next(other for other in ordered if other.offset == one.offset)
         assert (made.at(one.offset + 1) is None) == all(other.offset != one.offset + 1 for other in ordered)
@@ -100,6 +110,52 @@ def test_a_log_of_many_chunks_takes_few_bytes_a_chunk(many_chunks):
         alive, most = held(lambda: sum(len(message.payload) for message in reading.messages("/a")))
         assert most < AHEAD + 120 * CHUNKS
         assert alive < AHEAD + 20 * CHUNKS
+
+
+def test_fingerprints_keep_eight_bytes_a_chunk(many_chunks):
+    """A checksum each; a dictionary of them takes 150."""
+    with log.read(many_chunks) as opened:
+        source, index = opened.snapshot.source, opened.index
+        whole = fingerprint(source, index)
+
+        def kept() -> Checksums:
+            checksums = Checksums()
+            assert fingerprint(source, index, None, checksums) == fingerprint(source, index, None, checksums) == whole
+            return checksums
+
+        assert 8 * CHUNKS <= held(kept)[0] < 20 * CHUNKS
+
+
+def test_the_summary_is_written_in_parts(many_chunks):
+    """Of hundreds of thousands of chunks it takes tens of megabytes, which were in memory four times."""
+
+    class Sink:
+        sizes: ClassVar[list[int]] = []
+        data = bytearray()
+
+        def write(self, data: bytes) -> None:
+            self.sizes.append(len(data))
+            self.data += data
+
+    sink = Sink()
+    writer = LogWriter(sink)
+    writer.header()
+    with log.read(many_chunks) as opened:
+        for number, channel in opened.index.channels.items():
+            writer.channels[number] = channel
+        for chunk in opened.index.chunks:
+            source = opened.snapshot.source
+            indexes = {number: bytes(16) for number in chunk.message_index_offsets}
+            writer.copy_chunk(bytes(source[chunk.offset : chunk.offset + chunk.length]), chunk, indexes)
+        start = len(sink.sizes)
+        assert writer.finish() == CHUNKS
+    assert max(sink.sizes[start:]) < 70_000 < sum(sink.sizes[start:])
+    with io.BytesIO(bytes(sink.data)) as stream:
+        found = make_reader(stream).get_summary()
+    assert len(found.chunk_indexes) == CHUNKS
+    (crc,) = struct.unpack_from("<I", sink.data, len(sink.data) - 12)
+    (summary_start,) = struct.unpack_from("<Q", sink.data, len(sink.data) - 28)
+    assert crc == zlib.crc32(sink.data[summary_start:-12])
 
 
 def test_chunks_that_stay_open_for_other_channels_are_counted_once_each(many_chunks, tmp_path, monkeypatch):

@@ -34,7 +34,7 @@ _START, _END, _OFFSET, _LENGTH, _INDEX_LENGTH = range(5)
 class ChunkList:
     """Index entries of chunks in the order in which they were added.
 
-    ``at`` and ``row_at`` need them in the order of the file, which ``sort_by_offset`` establishes.
+    ``at``, ``row_at`` and ``before`` need them in the order of the file, which ``sort_by_offset`` establishes.
     """
 
     def __init__(self, chunks: Iterable[ChunkIndexRecord] = ()) -> None:
@@ -111,8 +111,14 @@ class ChunkList:
         return map(self._entry, self.rows_with(channels).tolist())
 
     def before(self, offset: int) -> ChunkList:
-        """The entries of chunks that begin before an offset."""
-        return ChunkList(chunk for chunk in self if chunk.offset < offset)
+        """The entries of chunks that begin before an offset; as ``at``, it needs them in the order of the file."""
+        count = bisect_left(range(len(self)), offset, key=lambda row: self._numbers[row * _WIDTH + _OFFSET])
+        members = self._ends[count - 1] if count else 0
+        out = ChunkList()
+        out._numbers, out._compression = self._numbers[: count * _WIDTH], self._compression[:count]
+        out._ends, out._names = self._ends[:count], self._names.copy()
+        out._channels, out._indexes = self._channels[:members], self._indexes[:members]
+        return out
 
     def sort_by_offset(self) -> None:
         """Bring the entries into the order of the file."""

@@ -26,7 +26,7 @@ from mcaptrack.log.chunks import (
     message_heads_at,
     open_chunk_with_checksum,
 )
-from mcaptrack.log.fingerprint import fingerprint
+from mcaptrack.log.fingerprint import Checksums, fingerprint
 from mcaptrack.log.index import Index
 from mcaptrack.log.located import MessageBatch, MessageBatches, Span, to_int64
 from mcaptrack.log.records import (
@@ -99,7 +99,7 @@ class Messages:
         self._chunks = array("q")
         self._pieces: dict[int, tuple[int, int]] = {}
         self._fingerprints: dict[int | None, str] = {}
-        self._checksums: dict[int, int | str] = {}
+        self._checksums = Checksums()
 
     def times(self, channels: Sequence[int], span: Span = (None, None)) -> Ints:
         """The sorted times of messages, (M,)."""

@@ -40,6 +40,8 @@ _CHUNK_BYTES: Final[Mapping[ChunkKind, int]] = {"media": 4 * 2**20, "rows": 2**2
 #: Views are so repetitive that the fastest level makes them smaller than the default one.
 _ZSTD_LEVEL: Final[Mapping[ChunkKind, int]] = {"rows": 3, "views": 1}
 _MAX_ID: Final = 2**16 - 1
+#: Bytes of the summary that are written at once.
+_SUMMARY_PART: Final = 2**16
 
 
 class Sink(Protocol):
@@ -229,10 +231,12 @@ class LogWriter:
             self.write_description(channel_id)
         data_crc = self.crc if self._crc_known else 0
         self._sink.write(records.pack(Opcode.DATA_END, records.number(data_crc, 4)))
-        self._sink.write(self._summary(self.offset + 13))
+        for part in self._summary(self.offset + 13):
+            self._sink.write(part)
         return sum(self.counts.values())
 
-    def _summary(self, start: int) -> bytes:
+    def _summary(self, start: int) -> Iterator[bytes]:
+        """The summary and the footer, in parts: entries of hundreds of thousands of chunks take tens of megabytes."""
         groups: dict[Opcode, Iterable[bytes]] = {
             Opcode.SCHEMA: map(records.pack_schema, self.schemas.values()),
             Opcode.CHANNEL: map(records.pack_channel, self.channels.values()),
@@ -241,21 +245,19 @@ class LogWriter:
             Opcode.ATTACHMENT_INDEX: (listed.entry for listed in self._attachments),
             Opcode.METADATA_INDEX: (listed.entry for listed in self._metadata),
         }
-        body, offsets = bytearray(), bytearray()
-        for opcode, parts in groups.items():
-            low = len(body)
-            for part in parts:
-                body += part
-            if len(body) > low:  # no offset for an empty group: some readers report it as damage
-                where = records.number(start + low, 8) + records.number(len(body) - low, 8)
+        offsets, at, crc = bytearray(), start, 0
+        for opcode, entries in groups.items():
+            low = at
+            for part in _joined(entries):
+                at, crc = at + len(part), zlib.crc32(part, crc)
+                yield part
+            if at > low:  # no offset for an empty group: some readers report it as damage
+                where = records.number(low, 8) + records.number(at - low, 8)
                 offsets += records.pack(Opcode.SUMMARY_OFFSET, records.number(opcode, 1), where)
-        offsets_start = start + len(body)
-        body += offsets
         footer = records.number(Opcode.FOOTER, 1) + records.number(records.FOOTER_BODY.size, 8)
-        footer += records.number(start, 8) + records.number(offsets_start, 8)
-        body += footer
-        body += records.number(zlib.crc32(body), 4) + MAGIC
-        return bytes(body)
+        footer += records.number(start, 8) + records.number(at, 8)
+        last = bytes(offsets + footer)
+        yield last + records.number(zlib.crc32(last, crc), 4) + MAGIC
 
     def _statistics(self) -> bytes:
         first, last = self._times or (0, 0)
@@ -305,6 +307,18 @@ class LogWriter:
         record = records.pack_chunk((first, last, len(content), zlib.crc32(content)), compression, data)
         known = ChunkIndexRecord(first, last, 0, len(record), {}, 0, compression, len(data), len(content))
         self.copy_chunk(record, known, {channel: entries.tobytes() for channel, entries in indexes.items()})
+
+
+def _joined(entries: Iterable[bytes]) -> Iterator[bytes]:
+    """Join entries to parts of about 64 kB."""
+    part = bytearray()
+    for entry in entries:
+        part += entry
+        if len(part) >= _SUMMARY_PART:
+            yield bytes(part)
+            part.clear()
+    if part:
+        yield bytes(part)
 
 
 def _append(chunk: _OpenChunk, channel_id: int, t_ns: int, record: memoryview) -> None:

@@ -214,7 +214,8 @@ def verify(path: Path, form: Format = "parquet") -> int:
 def _rows_at_once(about: Any) -> int:
     """The number of rows of a Parquet file to read at once: pictures take more memory than numbers."""
     size = sum(about.row_group(number).total_byte_size for number in range(about.num_row_groups))
-    return max(1, min(_ROWS_READ, about.num_rows * _BYTES_READ // max(size, 1)))
+    rows: int = about.num_rows * _BYTES_READ // max(size, 1)
+    return max(1, min(_ROWS_READ, rows))
 
 
 def digest(schema: Any, pieces: Iterable[Any]) -> str:
