@@ -7,11 +7,12 @@ from unittest.mock import patch
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcaptrack import log
-from mcaptrack.tables import build, files, messages
+from mcaptrack.tables import build, files, messages, table_pieces
 from mcaptrack.tables.table_pieces import TablePieces
 from tests.memory import held
 from tests.references.message_types import column
@@ -41,8 +42,8 @@ def table_of(rows: list[dict[str, object]], blobs: bool) -> tuple[TablePieces, l
 
 
 @settings(max_examples=40)
-@given(MESSAGES, st.booleans(), st.integers(1, 5), st.integers(1, 40), st.integers(1, 300))
-def test_parts_give_the_table_of_all_messages(rows, blobs, count, size, piece):
+@given(MESSAGES, st.booleans(), st.integers(1, 5), st.integers(1, 40), st.integers(1, 300), st.integers(1, 6))
+def test_parts_give_the_table_of_all_messages(rows, blobs, count, size, piece, piece_rows):
     names = list(dict.fromkeys(name for row in rows for name in row))
     values = {name: [row.get(name) for row in rows] for name in names}
     left_out = [name for name in names if not blobs and any(isinstance(one, bytes) for one in values[name])]
@@ -50,6 +51,7 @@ def test_parts_give_the_table_of_all_messages(rows, blobs, count, size, piece):
         patch.object(messages, "_PART_MESSAGES", count),
         patch.object(messages, "_PART_BYTES", size),
         patch.object(messages, "_PIECE_BYTES", piece),
+        patch.object(table_pieces, "PIECE_ROWS", piece_rows),
     ):
         made, without = table_of(rows, blobs)
         found = pa.concat_tables(list(made))
@@ -96,6 +98,15 @@ def test_a_channel_of_pictures_is_exported_without_holding_them(tmp_path):
         for blobs in (False, True):
             few, many = export(40, blobs), export(140, blobs)
             assert sum(many) - sum(few) < 0.2 * 100 * 40_000
+
+
+@pytest.mark.parametrize("rows", [0, 7, 8, 16, 17])
+def test_a_table_may_end_where_a_piece_ends(rows):
+    """There was a fault of the program if nothing was left for the next piece."""
+    table = pa.table({"a": np.arange(float(rows)), "b": pa.array(["x"] * rows, pa.string()).dictionary_encode()})
+    with patch.object(table_pieces, "PIECE_ROWS", 8):
+        parts = TablePieces(table.schema, rows, lambda: [table.slice(at, 4) for at in range(0, rows, 4)])
+        assert pa.concat_tables(list(parts)).equals(table)
 
 
 def test_a_log_gives_the_same_table_at_once(tmp_path):

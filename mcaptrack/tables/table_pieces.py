@@ -45,7 +45,7 @@ class TablePieces:
             for start in range(0, end, PIECE_ROWS):
                 yield whole.slice(start, PIECE_ROWS)
             rest = whole.slice(end)  # copied, because a slice keeps what it is a part of
-            waiting, count, is_first = [rest.take(list(range(rest.num_rows)))], count - end, False
+            waiting, count, is_first = [rest.take(pa.array(range(rest.num_rows), pa.int64()))], count - end, False
             del whole
         if count or is_first:
             yield pa.concat_tables(waiting)
