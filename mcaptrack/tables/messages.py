@@ -71,7 +71,7 @@ def messages_table(
 
 
 class _KeptMessages:
-    """The values of flat messages, most of which wait in a temporary file, and what is known of each field."""
+    """The values of flat messages, most of which wait in a temporary file, and facts about each field."""
 
     def __init__(self, blobs: bool) -> None:
         self.facts: dict[Path, _Facts] = {}
@@ -118,7 +118,7 @@ class _KeptMessages:
 
 @dataclass
 class _Maker:
-    """The type of a column, and what makes its values of those of messages."""
+    """The type of a column, and the function that converts its values."""
 
     type: Any
     make: Callable[[Any], Any]
@@ -126,7 +126,7 @@ class _Maker:
 
 @dataclass
 class _Facts:
-    """What is known of the values of a field; of those of lists, their members."""
+    """Facts about the values of a field, by which its column gets a type; of lists, about their members."""
 
     has_bytes: bool = False
     has_lists: bool = False
