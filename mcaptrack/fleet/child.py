@@ -69,6 +69,9 @@ class Child:
         began = monotonic()
         self.progress, self.resident, peak = ("starting", 0.0, None), 0, 0
         self._output.truncate(0)
+        if self._process is not None and not self._sent(request):
+            self.end(grace_s=0.0)  # it was ended while it had nothing to do, which no log is to blame for
+        is_started = self._process is not None
         if self._process is None:
             try:
                 self._start()
@@ -77,7 +80,6 @@ class Child:
                 return Reply("failed", error=f"{words} ({error.strerror or error})")
             deadline = began + _START_S
         else:
-            self._connection.send(request)
             deadline = self._deadline()
         assert self._process is not None
         while True:
@@ -88,7 +90,7 @@ class Child:
                 message = self._connection.recv() if self._connection.poll(_LOOK_S) else self
                 if message is None:
                     self._connection.send(request)
-                    began, deadline = monotonic(), self._deadline()
+                    is_started, began, deadline = True, monotonic(), self._deadline()
             except (EOFError, OSError):
                 return replace(self._died(request), seconds=monotonic() - began, peak_bytes=peak)
             if isinstance(message, Reply):
@@ -97,8 +99,10 @@ class Child:
                 self.progress = message
             self.resident = resident_bytes(self._process.pid)
             peak = max(peak, self.resident)
-            if over := self._over(deadline, began, peak):
+            if over := self._over(deadline, peak):
                 state, words = over
+                if not is_started and state == "timed-out":
+                    words = f"its worker process did not start within {_START_S:g} s (the machine may be too busy)"
                 self.end(grace_s=_GRACE_S if state == "timed-out" else 0.0)
                 seconds = round(monotonic() - began, 3)
                 words = f"{request.log}: {words}, and was ended"
@@ -106,10 +110,18 @@ class Child:
             if self._process.poll() is not None and not self._connection.poll(0):
                 return replace(self._died(request), seconds=monotonic() - began, peak_bytes=peak)
 
-    def _over(self, deadline: float, began: float, peak: int) -> tuple[State, str] | None:
+    def _sent(self, request: Request) -> bool:
+        """Send a request to a worker that waits for one. Returns False if it has ended."""
+        try:
+            self._connection.send(request)
+        except OSError:
+            return False
+        return self._process is not None and self._process.poll() is None
+
+    def _over(self, deadline: float, peak: int) -> tuple[State, str] | None:
         """Return which limit the worker exceeds, and that in words."""
         if monotonic() > deadline:
-            return "timed-out", f"took longer than {monotonic() - began:.0f} s"
+            return "timed-out", f"took longer than {self._limits.timeout_s or _START_S:g} s"
         most = self._limits.memory_bytes
         if most is not None and self.resident > most:
             return "out-of-memory", f"took {peak / 1e6:,.0f} MB of memory, more than {most / 1e6:,.0f}"

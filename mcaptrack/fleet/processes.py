@@ -30,7 +30,11 @@ class Processes:
 
     def _attempt(self, request: Request) -> Reply:
         if not hasattr(self._own, "child"):
-            self._own.child = Child(self._limits)
+            try:
+                self._own.child = Child(self._limits)
+            except OSError as error:  # no folder for temporary files, or no room there
+                words = f"{request.log}: no worker process can be started ({error.strerror or error})"
+                return Reply("failed", error=words)
             with self._lock:
                 self._children.append(self._own.child)
         child: Child = self._own.child
