@@ -132,7 +132,7 @@ def test_images_are_objects_with_an_id(images, tmp_path):
         ({"bbox": "1234"}, "has no bbox of 4 numbers: left, top, width, height"),
         ({"score": "0.5"}, "has a score that isn't a number, '0.5'"),
         ({"category_id": [1]}, "has a category_id that isn't a number, [1]"),
-        ({"track_id": "a"}, "has a track_id that isn't a number, 'a'"),
+        ({"track_id": [1]}, "has a track_id that isn't a number, [1]"),
         ({"iscrowd": "no"}, "has a iscrowd that isn't a number, 'no'"),
         ({"image_id": 7}, "is of image 7, which isn't among the images"),
     ],

@@ -400,6 +400,6 @@ class TestContest:
             "rfdetr": [self.found(0.9, 0.4, 0.3), self.found(0.5), self.found()],
         }
         words = "read as yolox, finds nothing in 7 pictures, and read as rfdetr finds 3 boxes in 2 of 3; choose "
-        with pytest.raises(McaptrackError, match=words + ("`layout=rfdetr`" if is_chosen else "with `layout=`")):
+        with pytest.raises(McaptrackError, match=words + ("`layout='rfdetr'`" if is_chosen else "with `layout=`")):
             refuse_if_misread(Path("net.onnx"), LAYOUTS["yolox"], 7, found, is_chosen)
         refuse_if_misread(Path("net.onnx"), LAYOUTS["yolox"], 7, {"rtdetr": found["rtdetr"]}, is_chosen)
