@@ -173,7 +173,7 @@ def test_each_class_is_retracked_as_if_it_were_alone(method):
     last = max(int(frame.rows["track_id"].max(initial=0)) for output in alone[0] for frame in output)
     for found, first, second in zip(together, *alone, strict=True):
         for frame in second:
-            frame.rows["track_id"] += last
+            frame.rows["track_id"] += np.where(frame.rows["track_id"] < 0, 0, last)  # those left out have none
         for frame, one, other in zip(found, first, second, strict=True):
             assert_same_rows(frame.rows, np.concatenate([one.rows, other.rows]))
     assert {1, 2} == {int(one) for frame in together[0] for one in frame.rows["class_id"]}

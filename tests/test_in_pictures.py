@@ -159,7 +159,7 @@ def test_pictures_of_any_size_give_the_same_tracks(factor):
 
 def test_predictions_and_online_tracks_stay_those_of_the_input():
     frames = crowd(np.random.default_rng(1))
-    for one, (_, online, _) in zip(frames, PICTURES(frames), strict=True):
+    for one, (_, online, *_) in zip(frames, PICTURES(frames), strict=True):
         assert_same_rows(online.rows, one.rows)
 
 

@@ -115,7 +115,7 @@ def methods(predictor: str, profile: str, **protocol: float) -> dict[str, Callab
 
     def retrack(name: str, options: Retracking, online: bool) -> Callable[[list[Frame]], Candidate]:
         def run(samples: list[Frame]) -> Candidate:
-            offline, causal, forecasts = (list(part) for part in zip(*options(samples), strict=True))
+            offline, causal, forecasts, *_ = (list(part) for part in zip(*options(samples), strict=True))
             return Candidate(name, None, causal if online else offline, forecasts if online else None, name)
 
         return run

@@ -41,8 +41,12 @@ def rows(outputs: Outputs) -> int:
     return sum(len(frame.rows) for frame in outputs[0])
 
 
+def forecasts(outputs: Outputs) -> list[Frame]:
+    return next(part for part in outputs if "ahead_s" in part[0].rows.dtype.names)
+
+
 def last_forecast(outputs: Outputs) -> Frame:
-    return next(frame for frame in reversed(outputs[-1]) if len(frame.rows))
+    return next(frame for frame in reversed(forecasts(outputs)) if len(frame.rows))
 
 
 def forecast_steps(outputs: Outputs) -> int:
@@ -51,7 +55,7 @@ def forecast_steps(outputs: Outputs) -> int:
 
 def change_of_forecasts(outputs: Outputs) -> float:
     """How far the forecasts of the same moment, made a step apart, are from each other on average, in metres."""
-    futures = [np.stack([f.rows["x_m"], f.rows["y_m"]], axis=-1) for f in outputs[-1] if len(f.rows) == 12]
+    futures = [np.stack([f.rows["x_m"], f.rows["y_m"]], axis=-1) for f in forecasts(outputs) if len(f.rows) == 12]
     return float(np.mean([np.hypot(*(a[1:] - b[:-1]).T).mean() for a, b in pairwise(futures)]))
 
 
