@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+
 import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
+from mcaptrack import log
 from mcaptrack.evaluation.track_lifecycle import lifecycle_of
 from mcaptrack.schema import DECISIONS, DecisionKind, EventKind, Frame
 from mcaptrack.transforms import PROFILES, Retrack
 from mcaptrack.transforms.retrack.joins import cut_joins, find_joins, tracked_of
 from mcaptrack.transforms.retrack.motion_model import MotionModel
 from mcaptrack.viewing.report.doubts import find_doubtful_tracks
+from tests.commands import done
 from tests.references.offline import Motion, cut, joins
 from tests.worlds import crossing_tracks, noisy_tracks, tracks_at
 
@@ -170,3 +175,18 @@ def test_the_least_likely_tracks_come_first_and_sure_ones_not_at_all():
         "the tracker's 7 is left out: no person with 55\N{NO-BREAK SPACE}%, 7.0\N{NO-BREAK SPACE}s long",
         "track 2 is kept: a person with 60\N{NO-BREAK SPACE}%, 8.0\N{NO-BREAK SPACE}s long",
     ]
+
+
+def test_decisions_do_not_outlive_the_method_that_made_them(template, tmp_path):
+    path, topic = shutil.copy(template, tmp_path / "a.mcap"), "/camera/retracks/decisions"
+    done("retrack", path, "-q")
+    with log.read(path) as opened:
+        assert topic in opened.channels
+    said = done("retrack", path, "--profile", "paper").err
+    assert f"{topic} is removed: retrack by consistency makes none" in said
+    with log.read(path) as opened:
+        assert topic not in opened.channels
+    assert json.loads(done("run", path, "--no-tables", "--no-events", "--json").out)["results"][0]["stages"] == []
+    done("retrack", path, "-q")
+    with log.read(path) as opened:
+        assert topic in opened.channels

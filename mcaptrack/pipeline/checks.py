@@ -48,6 +48,13 @@ class Job(NamedTuple):
         return kept | {self.target + FULL} if STAGES[self.stage].at_video_rate and self.target in kept else kept
 
 
+def superseded(opened: log.Log, job: Job) -> list[str]:
+    """Return results that the job's stage made before, beside those of now, and that its transform doesn't make."""
+    now = {*job.outputs(), job.target + FULL}
+    before = (topic for topic in STAGES[job.stage].outputs(job.target) if topic not in now and topic in opened.channels)
+    return [topic for topic in before if may_replace(opened, topic, job.stage)]
+
+
 def check_inputs(opened: log.Log, prefix: str, jobs: Sequence[Job]) -> None:
     """Raise McaptrackError if a job's input is missing or of the wrong kind, or if a job would replace other results.
 

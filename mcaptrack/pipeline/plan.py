@@ -15,7 +15,7 @@ from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.plane import is_assumed
 from mcaptrack.notices import warn
 from mcaptrack.pipeline import motion
-from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, first_stage
+from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, first_stage, superseded
 from mcaptrack.pipeline.corrections import is_of_corrections
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, read_planes, warn_unused
 from mcaptrack.pipeline.rebuild import MissingPluginError, differing, fuser_of, rebuild
@@ -143,6 +143,11 @@ class _Planner:
             raise McaptrackError(self._refusal())
         check_inputs(self._opened, self._prefix, self.jobs)
         check_spaces(self._opened, self._prefix, self.jobs, self._frame_id)
+        for job in self.jobs:
+            entry = STAGES[job.stage].choice(job.transform)
+            self._notes += [
+                f"{topic} is removed: {job.stage} by {entry} makes none" for topic in superseded(self._opened, job)
+            ]
         for words in self._notes:
             say(words)
         return self.jobs
@@ -372,7 +377,7 @@ class _Planner:
 
     def _add(self, job: Job) -> None:
         self.jobs.append(job)
-        self._changes |= dict.fromkeys(job.kept(), True)
+        self._changes |= dict.fromkeys((*job.kept(), *superseded(self._opened, job)), True)
 
     def _not_made(self, stage: str, topic: str) -> str:
         source = self._sources[stage]

@@ -15,7 +15,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes, scene_planes
 from mcaptrack.notices import Notice, collected, warn
-from mcaptrack.pipeline.checks import Job, check_inputs, read_named_frames
+from mcaptrack.pipeline.checks import Job, check_inputs, read_named_frames, superseded
 from mcaptrack.pipeline.context import in_context
 from mcaptrack.pipeline.corrections import corrected_input, fixed_in
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
@@ -166,7 +166,8 @@ def _run(
     if made or output is not None:
         with part("write"):
             path, _ = path_with(opened, prefix, tracks_topic(prefix), made)
-            report.layouts = write(opened, prefix, made, planes or (), stamps, output, path, boxes.in_space())
+            gone = {topic for job in jobs if job.target in made for topic in superseded(opened, job)}
+            report.layouts = write(opened, prefix, made, planes or (), stamps, output, path, boxes.in_space(), gone)
     provenances = {topic: channel.provenance for topic, channel in made.items()}
     warn_findings(opened, prefix, provenances, planes or (), is_all=watch is not None or not jobs)
     report.stale = outdated_by(opened, {topic: channel.provenance.digest for topic, channel in made.items()})

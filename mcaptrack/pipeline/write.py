@@ -140,8 +140,11 @@ def write(
     output: Path | None,
     path: CameraPath | None = None,
     boxes: Mapping[str, foreign.NamedFrames] = {},
+    gone: Collection[str] = (),
 ) -> dict[str, bytes]:
     """Write channels and their views into the log, or into a copy at ``output``. Returns layout files by name.
+
+    Channels at the topics ``gone`` are dropped.
 
     ``boxes`` are recorded boxes in space that this run has read, by topic; those that viewers don't draw get a view.
 
@@ -167,7 +170,7 @@ def write(
     if frames:
         outdated.add(frame_topic(prefix))
     recorded = {topic for topic in outdated if not may_replace(opened, topic, VIEW)}
-    outdated -= recorded
+    outdated = (outdated - recorded) | {*gone}
     for topic in sorted(recorded):
         warn(f"no view at {topic}, which {describe_origin(opened, topic)}", "left-out")
     # Read everything before anything is written, because the log is changed in place.
