@@ -41,9 +41,10 @@ class Ledger:
         self.refresh()
         self._bad += path.stat().st_size > self._read  # a line without an end
         if self._bad:
-            count = f"{self._bad} lines" if self._bad > 1 else "a line"
+            which = f"{self._bad} lines of the ledger {path}" if self._bad > 1 else f"a line of the ledger {path}"
+            were = "were" if self._bad > 1 else "was"
             warn(
-                f"{count} of the ledger {path} can't be read and were left out; these logs may be done again",
+                f"{which} can't be read and {were} left out; these logs may be done again",
                 "left-out",
             )
 

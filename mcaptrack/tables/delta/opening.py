@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,6 +13,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location, Url, hide_secrets, join
 from mcaptrack.objects.faults import is_of_store, plain, reason
 from mcaptrack.objects.stores import settings_of
+from mcaptrack.tables.delta.quiet import without_panics
 from mcaptrack.tables.fields import RECORDING, TABLES
 
 #: The table that says which logs there are, and its column with the digests of a log's tables, as JSON.
@@ -114,7 +115,8 @@ def reporting(where: Location, done: str) -> Iterator[None]:
     """Turn errors of the library, and of files, into a McaptrackError that names the table."""
     exceptions = library().exceptions
     try:
-        yield
+        with without_panics() if isinstance(where, Url) else nullcontext():
+            yield
     except McaptrackError:
         raise
     except exceptions.TableNotFoundError:
