@@ -147,6 +147,7 @@ def test_what_is_left_out_is_a_row_with_its_place_and_the_input_id():
     assert at.index == 20
     assert (row["source_id"], row["frames"], row["x_m"], row["y_m"]) == (7, 7, 22.0, 30.0)
     assert row["duration_s"] == pytest.approx(6 * STEP_S)
+    assert row["probability"] > 0.5  # that it is no person
 
 
 def test_without_linking_nothing_is_cut_and_profiles_of_the_paper_write_no_decisions():
