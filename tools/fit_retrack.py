@@ -373,11 +373,13 @@ def main() -> None:
     linking._PRIOR, linking._MIN_LOG_ODDS = links["usual"], links["least"]
     people = fit_people(list(told(people_of, scenes, "people")))
     install(false_tracks, "", people)
-    judged = fit_decisions(list(runs(JUDGED, JUDGED_STEPS)))
+    others = list(runs(JUDGED, JUDGED_STEPS))
+    judged = fit_decisions(others)
     card = {
         "made_by": f"tools/fit_retrack.py --seeds {' '.join(map(str, seeds))} --steps {given.steps}, "
         f"mcaptrack {__version__}",
-        "data": f"{len(scenes)} synthetic scenes of mcaptrack with faults of trackers; no recordings",
+        "data": f"{len(scenes)} synthetic scenes of mcaptrack with faults of trackers, and {len(others)} others for joins "
+        "and decisions; no recordings",
         "licence": "Apache-2.0",
         "links": str(sum(int(one.right.sum()) for one in pairs)),
     }

@@ -80,10 +80,13 @@ class KeptPictures:
             yield Frame(t_ns, index, before.copy())
 
 
-def pictures_of(opened: log.Log, job: Job, stamps: list[int]) -> tuple[Callable[[], str], Iterable[Frame]]:
+def pictures_of(
+    opened: log.Log, job: Job, stamps: list[int], damaged: list[int]
+) -> tuple[Callable[[], str], Iterable[Frame]]:
     """Return the digest (once they were read) and the pictures for a job, decoded in its transform's colour format.
 
-    They are decoded in a thread. The capture time of each in ns is appended to ``stamps``.
+    They are decoded in a thread. The capture time of each in ns is appended to ``stamps``, the numbers of damaged ones
+    to ``damaged``.
     """
     import hashlib
 
@@ -100,4 +103,9 @@ def pictures_of(opened: log.Log, job: Job, stamps: list[int]) -> tuple[Callable[
 
     stamps.clear()
     max_bytes = MAX_BYTES if traits_of(job.transform).passes > 1 else 0
-    return total.hexdigest, Ahead(KeptPictures(lambda: decode(encoded(is_first=not stamps)), max_bytes))
+
+    def decoded() -> Iterator[Frame]:
+        is_first = not stamps
+        return decode(encoded(is_first), damaged=damaged if is_first else None)
+
+    return total.hexdigest, Ahead(KeptPictures(decoded, max_bytes))

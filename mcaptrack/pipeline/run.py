@@ -197,7 +197,8 @@ class _Repeatable:
 
 class _Input(NamedTuple):
     """The input of a job: a stream of frames, all frames if they are rows (else empty), and, after the stream was read,
-    the digest and the number of its messages; the names of its classes, and the frame of its metres.
+    the digest and the number of its messages; the names of its classes, the frame of its metres, and the numbers of
+    damaged pictures.
     """
 
     stream: Iterable[Frame]
@@ -206,6 +207,7 @@ class _Input(NamedTuple):
     messages: Callable[[], int]
     classes: Mapping[str, str] = {}
     frame_id: str = ""
+    damaged: Sequence[int] = ()
 
     def corrected(self, opened: log.Log, prefix: str, job: Job) -> tuple[_Input, Mapping[str, str]]:
         """Return tracks with the corrections of people, and the digests of these by topic."""
@@ -269,6 +271,12 @@ def _run_job(
             f"{job.source}: {left_out} of {given.messages()} messages were left out: a video has to begin with a key "
             "picture that has its parameter sets",
             "left-out",
+        )
+    if given.damaged:
+        warn(
+            f"{job.source}: {len(given.damaged)} of {given.messages()} pictures are damaged, number {given.damaged[0]} "
+            "first; what can't be decoded there is taken from others, so that detections may be wrong",
+            "lost",
         )
     provenance = _provenance_of(job, transform, given, warnings, {**known.references, **motion, **corrections})
     provenance = replace(provenance, continued=continued)
@@ -336,11 +344,12 @@ def _input(
     """Return the input of a job; the capture times of pictures in ns are appended to ``stamps``, by topic."""
     if job.source not in made and job.transform.reads is VIDEO:
         seen = stamps.setdefault(job.source, [])
-        digest, pictures = pictures_of(opened, job, seen)
+        damaged: list[int] = []
+        digest, pictures = pictures_of(opened, job, seen, damaged)
         steps = opened.channel(job.source).messages * traits_of(job.transform).passes
         numbers = count(1)
         each = _Repeatable(lambda: _counted(watch.each("decode", pictures), numbers, steps, job.stage, progress))
-        return _Input(each, [], digest, lambda: len(seen))
+        return _Input(each, [], digest, lambda: len(seen), damaged=damaged)
     if job.source in made:
         frames, how = made[job.source].frames, made[job.source].provenance
         of_rows, names, frame_id = how.digest, class_names(how.to_metadata()), how.frame_id

@@ -47,7 +47,9 @@ class EncodedPicture(NamedTuple):
         return self.where or f"frame {self.index}"
 
 
-def decode_gray(pictures: Iterable[EncodedPicture], wanted: Container[int] | None = None) -> Iterator[Frame]:
+def decode_gray(
+    pictures: Iterable[EncodedPicture], wanted: Container[int] | None = None, damaged: list[int] | None = None
+) -> Iterator[Frame]:
     """Decode pictures to gray.
 
     Parameters
@@ -56,6 +58,8 @@ def decode_gray(pictures: Iterable[EncodedPicture], wanted: Container[int] | Non
         In decoding order. Pictures before the first one at which decoding can begin are left out, as viewers do.
     wanted : container of int, optional
         Indexes of the pictures to yield; others are decoded only if later ones depend on them.
+    damaged : list of int, optional
+        Indexes of damaged pictures of videos are added: what can't be decoded there is taken from other pictures.
 
     Yields
     ------
@@ -67,12 +71,14 @@ def decode_gray(pictures: Iterable[EncodedPicture], wanted: Container[int] | Non
     McaptrackError
         For a format that can't be decoded, and for damaged pictures.
     """
-    return _decoded(pictures, raw_gray, _luma, wanted, is_grey=True)
+    return _decoded(pictures, raw_gray, _luma, wanted, damaged, is_grey=True)
 
 
-def decode_bgr(pictures: Iterable[EncodedPicture], wanted: Container[int] | None = None) -> Iterator[Frame]:
+def decode_bgr(
+    pictures: Iterable[EncodedPicture], wanted: Container[int] | None = None, damaged: list[int] | None = None
+) -> Iterator[Frame]:
     """Decode pictures to BGR: as ``decode_gray``, but ``rows`` is (height, width, 3) uint8 (blue, green, red)."""
-    return _decoded(pictures, raw_bgr, _bgr_of_frame(), wanted, is_grey=False)
+    return _decoded(pictures, raw_bgr, _bgr_of_frame(), wanted, damaged, is_grey=False)
 
 
 def _decoded(
@@ -80,12 +86,13 @@ def _decoded(
     of_pixels: Callable[[str, bytes, PixelLayout], Image],
     of_frame: Callable[[Any], Image],
     wanted: Container[int] | None,
+    damaged: list[int] | None,
     is_grey: bool,
 ) -> Iterator[Frame]:
     decoder: _VideoDecoder | None = None
     for picture in pictures:
         if picture.is_video:
-            decoder = decoder or _VideoDecoder(picture.format, of_frame, wanted)
+            decoder = decoder or _VideoDecoder(picture.format, of_frame, wanted, [] if damaged is None else damaged)
             yield from decoder.decode(picture)
         elif wanted is not None and picture.index not in wanted:
             continue
@@ -121,10 +128,12 @@ def _still(picture: EncodedPicture, is_grey: bool) -> Image:
 
 
 class _VideoDecoder:
-    def __init__(self, name: str, of_frame: Callable[[Any], Image], wanted: Container[int] | None) -> None:
+    def __init__(
+        self, name: str, of_frame: Callable[[Any], Image], wanted: Container[int] | None, damaged: list[int]
+    ) -> None:
         import av
 
-        self._of_frame, self._wanted = of_frame, wanted
+        self._of_frame, self._wanted, self._damaged = of_frame, wanted, damaged
 
         self._codec: Any = av.CodecContext.create(CODECS[name].decoder, "r")
         self._codec.thread_type = "AUTO"
@@ -173,6 +182,8 @@ class _VideoDecoder:
             raise McaptrackError(f"{where} can't be decoded: {why}") from error
         for frame in decoded:
             t_ns, index = self._pending.pop(frame.pts)
+            if frame.is_corrupt:
+                self._damaged.append(index)
             if self._wanted is None or index in self._wanted:
                 yield Frame(t_ns, index, self._of_frame(frame))
 
