@@ -378,8 +378,8 @@ def main() -> None:
     card = {
         "made_by": f"tools/fit_retrack.py --seeds {' '.join(map(str, seeds))} --steps {given.steps}, "
         f"mcaptrack {__version__}",
-        "data": f"{len(scenes)} synthetic scenes of mcaptrack with faults of trackers, and {len(others)} others for joins "
-        "and decisions; no recordings",
+        "data": f"{len(scenes)} synthetic scenes of mcaptrack with faults of trackers, and {len(others)} others for "
+        "joins and decisions; no recordings",
         "licence": "Apache-2.0",
         "links": str(sum(int(one.right.sum()) for one in pairs)),
     }
