@@ -48,9 +48,10 @@ def main() -> None:
     sys.unraisablehook = _once_more
     try:
         from mcaptrack.cli import app
-        from mcaptrack.environment import hush_libraries
+        from mcaptrack.environment import hush_libraries, share_allocator
 
         hush_libraries()
+        share_allocator()
 
         app()
     except BrokenPipeError:  # whoever read our output has had enough

@@ -116,6 +116,14 @@ def threads() -> int:
     return int(said) if said.isascii() and said.isdecimal() and int(said) > 0 else cores()
 
 
+def share_allocator() -> None:
+    """Let Arrow take memory from the allocator of all others, unless the user chose another (before Arrow is loaded).
+
+    What it frees there can be used again, and be given back; its own pool keeps tens of megabytes for itself.
+    """
+    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
+
+
 def hush_libraries() -> None:
     """Silence OpenCV's messages about damaged pictures, which the command reports in one line."""
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")

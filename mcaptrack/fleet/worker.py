@@ -23,7 +23,7 @@ from time import monotonic
 from types import FrameType
 from typing import Any, Final, NoReturn
 
-from mcaptrack.environment import hush_libraries
+from mcaptrack.environment import hush_libraries, share_allocator
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet.digests import digest_of_log
 from mcaptrack.fleet.results import State
@@ -96,6 +96,7 @@ def serve(handle: int) -> None:
     signal.signal(signal.SIGTERM, _end)
     faulthandler.enable(sys.stderr)
     hush_libraries()
+    share_allocator()
     _die_with_parent(os.getppid())
     sent = 0.0
 
