@@ -24,7 +24,7 @@ from tests.worlds import small_scene
 
 # The same examples each time, so that a failure comes from a change; `--hypothesis-profile search` tries many new ones.
 settings.register_profile(
-    "same", max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
+    "same", max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
 )
 settings.register_profile("search", settings.get_profile("same"), derandomize=False, print_blob=True, max_examples=3000)
 settings.load_profile("same")
@@ -42,7 +42,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 def pytest_collection_finish() -> None:
     """Spare what was loaded and collected: it stays until the end, and searching it for cycles again takes long."""
     gc.freeze()
-    gc.set_threshold(20_000, 20, 20)
+    gc.set_threshold(100_000, 20, 50)
 
 
 def pytest_unconfigure() -> None:

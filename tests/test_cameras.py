@@ -80,7 +80,7 @@ def test_commands_give_the_same_output_for_results_at_other_topics(path):
         assert after[command] == before[command], command
 
 
-@pytest.mark.parametrize(("stage", "target"), one_in(3, PLACES))
+@pytest.mark.parametrize(("stage", "target"), one_in(4, PLACES))
 def test_outputs_belong_to_the_camera_of_their_source(path, stage, target):
     done(stage, path, "--to", target, "-q")
     with log.read(path) as opened:

@@ -307,6 +307,13 @@ def test_ground_truth_that_cannot_be_compared_is_reported_and_left_out(truth, op
     assert len(found.counts) == 40
 
 
+def test_who_stands_far_from_all_tracks_is_missed_and_not_in_another_unit():
+    standing = walk(lambda n: {1: (50 + n / 1000, 0.0)}, 40, 10)
+    found = find_events(walk(lambda n: {1: (n / 10, 0.0)}, 40, 10), standing, EventOptions(), "a", "/t")
+    assert list(found.notes) == ["a: /t and the ground truth never come near each other"]
+    assert MISS in {kind for _, kind, *_ in happened(found)}
+
+
 @pytest.mark.parametrize("truth", [None, []])
 def test_no_tracks_have_no_events(truth):
     found = find_events([], truth)

@@ -222,7 +222,7 @@ JSON = st.deferred(
 
 
 @given(st.lists(JSON, max_size=5))
-@settings(max_examples=100)
+@settings(max_examples=50)
 def test_whatever_json_holds_becomes_a_table(tmp_path_factory, values):
     path = tmp_path_factory.mktemp("j") / "a.mcap"
     table = one_channel(path, "", "", b"", "json", [json.dumps(value).encode() for value in values])
@@ -232,7 +232,7 @@ def test_whatever_json_holds_becomes_a_table(tmp_path_factory, values):
 
 
 @given(st.binary(max_size=40), st.sampled_from(["protobuf", "json", "ros1", "cdr"]))
-@settings(max_examples=100)
+@settings(max_examples=50)
 def test_any_bytes_are_a_message_or_a_fault_in_one_line(state, payload, encoding):
     schema = {"protobuf": state[1], "json": b"", "ros1": ROS1_IMU.encode(), "cdr": b"float64[] x\nstring s"}[encoding]
     name = {"protobuf": "robot.State", "json": "", "ros1": "robot/Imu", "cdr": "robot/msg/S"}[encoding]

@@ -430,11 +430,14 @@ class TestWordsOfTheCommandLine:
 
     def test_the_library_names_no_option_of_the_command_line(self):
         """Checks all texts outside the command line except documentation, help and pages."""
-        found = []
+        found, option = [], re.compile(r"(?<![\w-])(--[a-z]|-o\b)")
         for path in PACKAGE.rglob("*.py"):
             if {"cli", "viewing"} & set(path.relative_to(PACKAGE).parts):
                 continue
-            tree = ast.parse(path.read_text(encoding="utf-8"))
+            text = path.read_text(encoding="utf-8")
+            if not option.search(text):
+                continue
+            tree = ast.parse(text)
             documents = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
             if "transforms" in path.parts:  # help of options
                 documents |= {
@@ -447,7 +450,7 @@ class TestWordsOfTheCommandLine:
             found += [
                 f"{path.relative_to(PACKAGE)}:{node.lineno}: {node.value}"
                 for node in texts
-                if id(node) not in documents and re.search(r"(?<![\w-])(--[a-z]|-o\b)", node.value)
+                if id(node) not in documents and option.search(node.value)
             ]
         assert found == []
 

@@ -142,7 +142,7 @@ FRAMES = made()
 
 
 @given(FRAMES)
-@settings(max_examples=60)
+@settings(max_examples=30)
 def test_counts_equal_motmetrics(frames):
     import motmetrics
 

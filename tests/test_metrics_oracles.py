@@ -118,7 +118,7 @@ ALL_MISSED: Sequence = ([{1: box((0, 0))}] * 3, [{}] * 3)
 @example(EMPTY)
 @example(GHOSTS)
 @example(ALL_MISSED)
-@settings(max_examples=150)
+@settings(max_examples=60)
 def test_scores_equal_trackeval(sequence):
     part = matchup(*sequence)
     theirs = {name: value for _, result in by_trackeval(part) for name, value in result.items()}

@@ -320,7 +320,7 @@ class TestOffline:
             assert last[one] == pytest.approx(where(90)[person], abs=0.2)
 
     @given(seed=st.integers(0, 2**32 - 1), cut=st.integers(5, 55))
-    @settings(max_examples=4)
+    @settings(max_examples=2)
     def test_predictions_do_not_depend_on_the_future(self, seed, cut):
         """Truncate or replace the rest of the log: online tracks and predictions up to there stay the same to the bit."""
         rng = np.random.default_rng(seed)

@@ -62,7 +62,7 @@ def scattered(rng: np.random.Generator, count: int) -> Paths:
 
 
 @given(seed=SEEDS)
-@settings(max_examples=15)
+@settings(max_examples=10)
 def test_filtered_and_smoothed_states_equal_the_reference(seed):
     rng = np.random.default_rng(seed)
     model, motion = models(rng)
@@ -77,7 +77,7 @@ def test_filtered_and_smoothed_states_equal_the_reference(seed):
 
 
 @given(seed=SEEDS)
-@settings(max_examples=40)
+@settings(max_examples=25)
 def test_links_equal_the_reference(seed):
     rng = np.random.default_rng(seed)
     model, motion = models(rng)
@@ -128,7 +128,7 @@ def test_false_track_odds_equal_the_reference(seed):
 
 
 @given(seed=SEEDS)
-@settings(max_examples=40)
+@settings(max_examples=25)
 def test_swaps_equal_the_reference(seed):
     """Relative positions of two people, with random swaps and random costs of a swap."""
     rng = np.random.default_rng(seed)
@@ -149,7 +149,7 @@ def test_swaps_equal_the_reference(seed):
 
 
 @given(seed=SEEDS)
-@settings(max_examples=40)
+@settings(max_examples=25)
 def test_decisions_at_encounters_equal_the_reference(seed):
     """Pairs of people that cross, some with swapped identities, with input ids that follow the swap or not."""
     rng = np.random.default_rng(seed)
@@ -184,7 +184,7 @@ def test_decisions_at_encounters_equal_the_reference(seed):
 
 
 @given(seed=SEEDS)
-@settings(max_examples=15)
+@settings(max_examples=10)
 def test_links_are_the_same_in_batches_of_any_size(seed):
     rng = np.random.default_rng(seed)
     model, _ = models(rng)
@@ -198,7 +198,7 @@ def test_links_are_the_same_in_batches_of_any_size(seed):
 
 
 @given(seed=SEEDS)
-@settings(max_examples=15)
+@settings(max_examples=10)
 def test_encounters_of_tracks_that_did_not_change_need_no_second_look(seed):
     """Three rounds over all encounters decide the same as rounds over those of the tracks that the last one changed."""
     rng = np.random.default_rng(seed)

@@ -20,6 +20,7 @@ from mcaptrack.transforms.retrack.distances import (
     position_distances,
     prediction_distances,
 )
+from tests.tiers import one_in
 from tests.worlds import ids, places, tracks_at, walk
 
 PAPER, AUTHORS, DEFAULT = PROFILES["paper"], PROFILES["authors"], PROFILES["default"]
@@ -360,7 +361,7 @@ class TestFailuresOfThePaper:
                 straight += (rise[0] > 0) == (rise[1] > 0)
         assert straight == 2
 
-    @every_profile
+    @pytest.mark.parametrize("profile", one_in(3, PROFILES.values()), ids=PROFILES)
     def test_spurious_track(self, profile):
         """A gust in a tree: for 2.4 s false detections jump about under one id. At most half remain; by likelihood none."""
         kept = 0

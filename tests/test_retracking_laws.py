@@ -99,7 +99,7 @@ def by_place(rows: Rows) -> Rows:
     return rows[np.lexsort((rows["y_m"], rows["x_m"]))]
 
 
-@every_method
+@pytest.mark.parametrize("method", one_in(2, METHODS.values()), ids=METHODS)
 @given(seed=SEEDS)
 @settings(max_examples=2)
 def test_crowds_far_apart_do_not_affect_each_other(method, seed):

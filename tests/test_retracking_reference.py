@@ -85,7 +85,7 @@ def algorithm_1(transform: RetrackByConsistency) -> Algorithm1:
 
 
 @given(seed=SEEDS)
-@settings(max_examples=7, phases=QUICK)
+@settings(max_examples=5, phases=QUICK)
 def test_profile_paper_equals_algorithm_1(seed):
     paper = replace(PROFILES["paper"], min_track_s=1.2)
     reference = Algorithm1(paper, constant_velocity(12), 4)
@@ -121,7 +121,7 @@ CHOICES = {
 
 
 @given(seed=SEEDS, chosen=st.fixed_dictionaries({name: st.sampled_from(v) for name, v in (NUMBERS | CHOICES).items()}))
-@settings(max_examples=15, phases=QUICK)
+@settings(max_examples=10, phases=QUICK)
 def test_algorithm_1_with_random_options_equals_the_reference(seed, chosen):
     transform = RetrackByConsistency(**PLAIN, **chosen)
     frames = noisy_tracks(np.random.default_rng(seed), rate_hz=transform.rate_hz)
@@ -149,7 +149,7 @@ LIKELIHOOD = {
 
 
 @given(seed=SEEDS, chosen=st.fixed_dictionaries({name: st.sampled_from(v) for name, v in LIKELIHOOD.items()}))
-@settings(max_examples=15, phases=QUICK)
+@settings(max_examples=10, phases=QUICK)
 def test_the_likelihood_method_equals_the_reference(seed, chosen):
     transform = Retrack(**PLAIN, **chosen)
     predict, past = black_box(
@@ -180,7 +180,7 @@ OFFLINE = {
 
 
 @given(seed=SEEDS, chosen=st.fixed_dictionaries({name: st.sampled_from(v) for name, v in OFFLINE.items()}))
-@settings(max_examples=9, phases=QUICK)
+@settings(max_examples=6, phases=QUICK)
 def test_the_offline_steps_equal_the_reference(seed, chosen):
     kind = chosen.pop("kind")
     transform = kind(predictor="cv", horizon_s=2.0, **chosen)
@@ -203,7 +203,7 @@ def test_every_option_is_varied():
 
 
 @given(seed=SEEDS)
-@settings(max_examples=7, phases=QUICK)
+@settings(max_examples=5, phases=QUICK)
 def test_where_nothing_is_re_tracked_tracks_are_the_input_and_predictions_those_of_predict(seed):
     frames = noisy_tracks(np.random.default_rng(seed))
     options = {"predictor": "cv", "horizon_s": 2.0, "min_history": 3}

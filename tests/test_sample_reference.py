@@ -67,7 +67,7 @@ def slow_sample(frames: list[Frame], options: Sample) -> list[tuple[int, int, li
     gap_s=st.sampled_from([0.0, 0.3, 0.4, 1.0, 2.0]),
     late=st.sampled_from([None, -3.0, 0.7]),
 )
-@settings(max_examples=60)
+@settings(max_examples=30)
 def test_samples_equal_the_reference(seed, rate_hz, gap_s, late):
     rng = np.random.default_rng(seed)
     frames = noisy_tracks(rng, ticks=25, rate_hz=7.0, hidden=0.05)

@@ -20,7 +20,7 @@ from mcaptrack.fleet.claims import Claims, claim_name
 from mcaptrack.location import parse
 from tests import fleet_tasks
 from tests.commands import call, done
-from tests.tiers import thorough
+from tests.tiers import one_in, thorough
 
 NIGHT = parse("s3://bucket/night")
 LOG = "s3://bucket/night/x.mcap"
@@ -213,7 +213,7 @@ def expected(bare, tmp_path) -> bytes:
     return (tmp_path / "b.results.mcap").read_bytes()
 
 
-@pytest.mark.parametrize("fault", ["error", "slow", "cut", "lost"])
+@pytest.mark.parametrize("fault", one_in(2, ["error", "slow", "cut", "lost"]))
 def test_a_whole_run_is_right_though_one_request_in_twenty_fails(store, bare, expected, fault):
     url, number = store.put("night/b.mcap", bare), count(17)
     with store.failing(lambda _: fault if next(number) % 20 == 19 else ""), store.counted() as requests:

@@ -77,7 +77,7 @@ def walking(rng: np.random.Generator, count: int = 45) -> list[Frame]:
 
 @pytest.mark.parametrize("name", TRACKERS)
 @given(seed=st.integers(0, 2**32 - 1), data=st.data())
-@settings(max_examples=30)
+@settings(max_examples=15)
 def test_tracks_equal_the_reference(name, seed, data):
     values = SHARED | OWN[name]
     options = TRACKERS[name](**data.draw(st.fixed_dictionaries({k: st.sampled_from(v) for k, v in values.items()})))

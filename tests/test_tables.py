@@ -93,7 +93,7 @@ def test_a_digest_is_of_names_types_and_values_and_not_of_pieces():
 
 
 @given(st.data())
-@settings(max_examples=30)
+@settings(max_examples=15)
 def test_rows_and_empty_frames_survive_files_to_the_bit(tmp_path_factory, data):
     folder, schema = tmp_path_factory.mktemp("tables"), data.draw(ALL)
     form = data.draw(st.sampled_from(["parquet", "arrow"]))
@@ -116,7 +116,7 @@ def test_rows_and_empty_frames_survive_files_to_the_bit(tmp_path_factory, data):
 
 @given(st.lists(st.tuples(TIMES, DOUBLES, st.none() | DOUBLES), min_size=1, max_size=12))
 @example([(0, 0.0, None), (2**63 - 1, 0.0, None)])
-@settings(max_examples=40)
+@settings(max_examples=20)
 def test_other_libraries_read_the_same_bits_and_nanoseconds(tmp_path_factory, given_rows):
     path = tmp_path_factory.mktemp("t") / "t.parquet"
     frames = []
@@ -276,7 +276,7 @@ WORDS = st.text(st.characters(codec="utf-8"), max_size=12) | st.sampled_from(
 
 
 @given(st.lists(st.tuples(WORDS, st.none() | DOUBLES, TIMES), max_size=6))
-@settings(max_examples=30)
+@settings(max_examples=15)
 def test_text_is_read_back_by_others_as_it_was(tmp_path_factory, rows):
     folder = tmp_path_factory.mktemp("text")
     words, numbers, times = zip(*rows, strict=True) if rows else ((), (), ())
@@ -338,7 +338,7 @@ def test_a_track_without_positions_has_no_path_and_one_row_no_speed():
 
 
 @given(st.data())
-@settings(max_examples=30)
+@settings(max_examples=15)
 def test_summaries_are_what_duckdb_makes_of_the_rows(data):
     people = st.dictionaries(
         st.integers(0, 3), st.tuples(*[st.floats(-50, 50) | st.just(float("nan"))] * 2), max_size=4
@@ -513,7 +513,7 @@ def test_a_file_that_could_not_be_written_is_not_written_to_later(tmp_path, monk
 
 
 @given(st.data())
-@settings(max_examples=30)
+@settings(max_examples=15)
 def test_a_byte_that_changed_on_the_disk_is_noticed(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("t") / "t.parquet"
     table = some_tracks([{k: (k / 3, n / 7) for k in range(30)} for n in range(30)])

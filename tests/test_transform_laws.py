@@ -78,7 +78,7 @@ every = pytest.mark.parametrize(("name", "transform"), _variants(), ids=describe
 @every
 @pytest.mark.parametrize("law", [name for name in LAWS if name != "declares"])
 @given(seed=SEEDS, length=st.integers(2, 40))
-@settings(max_examples=4)
+@settings(max_examples=3)
 def test_laws_hold(name, transform, law, seed, length):
     LAWS[law](transform, INPUTS[name](seed)[:length], seed)
 
@@ -114,7 +114,7 @@ def ends_of_ranges(kind) -> dict[str, list]:
 
 @pytest.mark.parametrize("name", KINDS)
 @given(data=st.data(), seed=SEEDS)
-@settings(max_examples=8)
+@settings(max_examples=5)
 def test_options_at_the_ends_of_their_ranges_run_without_warnings(name, data, seed):
     """Any options at the least or greatest value that they accept: rows conform to the schema, and no warnings."""
     kind = KINDS[name]

@@ -35,6 +35,8 @@ MAX_GAP_S: Final = 2.0
 _OTHER_UNIT: Final = 8.0
 #: The gate for the test whether tracks are anywhere near the ground truth; twice this distance has similarity 0.
 _FAR_M: Final = 5.0
+#: Positions that are nearer to their middle than this are of people who stand, which tells nothing about their unit.
+_STANDING_M: Final = 0.5
 _OVERLAPS: Final = {"iou": iou_of_pairs, "bev-iou": bev_iou_of_pairs, "3d-iou": iou_3d_of_pairs}
 #: The number of pairs of boxes compared at once, to limit memory.
 _PAIRS_AT_ONCE: Final = 1_000_000
@@ -139,7 +141,7 @@ def explain_no_match(
     if len(alike.pairs.frame):
         return []
     small, large = sorted(sizes)
-    if large > _OTHER_UNIT * max(small, 1e-9):
+    if large > _OTHER_UNIT * small and (similarity == "iou" or small > _STANDING_M):
         (a, b), (m, n) = both, sizes
         raise McaptrackError(
             f"{what} of {a} are {m:.3g} {unit}, those of {b} {n:.3g}, and none ever meet: they are not in the same unit"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.schema import SCHEMAS, Schema
@@ -34,7 +35,7 @@ class Field:
     unit: str = ""
     nullable: bool = False
 
-    @property
+    @cached_property
     def arrow(self) -> pa.Field:
         """The column in Arrow, with unit and description as metadata."""
         import pyarrow as pa
@@ -66,7 +67,7 @@ class Table:
     fields: tuple[Field, ...] = ()
     rows_of: Schema | None = None
 
-    @property
+    @cached_property
     def arrow(self) -> pa.Schema:
         """The Arrow schema of the table, without ``recording``, which is in the name of the folder."""
         import pyarrow as pa

@@ -30,6 +30,10 @@ _ZSTD_LEVEL: Final = 1  # higher levels hardly make floats that are split by byt
 #: Rows that are read back at once; fewer if they are larger.
 _ROWS_READ: Final = 16 * 1024
 _BYTES_READ: Final = 16 * 2**20
+#: Below this, starting a thread takes longer than what it would do.
+_ROWS_WORTH_A_THREAD: Final = 8 * 1024
+#: Smaller files leave so little memory behind that looking for it takes longer than they did.
+_BYTES_WORTH_RELEASING: Final = 64 * 1024
 _PREFIX: Final = "mcaptrack."
 
 
@@ -64,7 +68,9 @@ def write(
                 from mcaptrack.tables import text
 
                 text.write(part, pieces_of(table), form)
-            _release()
+            is_large = part.stat().st_size >= _BYTES_WORTH_RELEASING
+            if is_large:
+                _release()
             try:
                 found = verify(part, form) if form in _DESCRIBED else table.num_rows
             except McaptrackError:
@@ -76,7 +82,8 @@ def write(
                 )
     except OSError as error:
         raise McaptrackError(f"{path} can't be written: {error.strerror or error}") from error
-    _release()
+    if is_large:
+        _release()
     return True
 
 
@@ -116,9 +123,13 @@ def _write_parquet(part: Path, table: Any, words: Mapping[str, str], order: Sequ
         try:
             with ThreadPoolExecutor(1) as worker:  # computes the digest while the file is written
                 for piece in pieces_of(table):
-                    added = worker.submit(content.add, piece)
+                    is_large = piece.num_rows >= _ROWS_WORTH_A_THREAD
+                    added = worker.submit(content.add, piece) if is_large else None
                     writer.write_table(piece, row_group_size=PIECE_ROWS)
-                    added.result()
+                    if added:
+                        added.result()
+                    else:
+                        content.add(piece)
                     del piece  # else it would stay while the next one is made
             writer.add_key_value_metadata({_PREFIX + "digest": content.hexdigest()})
             writer.close()
