@@ -275,7 +275,8 @@ def _run_job(
     if given.damaged:
         warn(
             f"{job.source}: {len(given.damaged)} of {given.messages()} pictures are damaged, number {given.damaged[0]} "
-            "first; what can't be decoded there is taken from others, so that detections may be wrong",
+            "first; what can't be decoded there is taken from others, so that detections may be wrong up to the next "
+            "key picture",
             "lost",
         )
     provenance = _provenance_of(job, transform, given, warnings, {**known.references, **motion, **corrections})

@@ -15,25 +15,30 @@ from mcaptrack.sources.video.limits import max_pixels, too_large
 _COVER: Final = 0x400  # AV_DISPOSITION_ATTACHED_PIC
 _NO_TIMESTAMPS: Final = 0x80  # AVFMT_NOTIMESTAMPS
 _LAST_WITH_METADATA_ERRORS: Final = 18
+_MOST_BOXES: Final = 10_000
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[Any]:
-    """Open a video file for reading. Raises McaptrackError if it is not a video, or too damaged to read.
+def reading(path: Path, **demuxer: str) -> Iterator[Any]:
+    """Open a video file for reading, with options of its demuxer.
 
-    Metadata that is not UTF-8 contains surrogate escapes, with every version of PyAV.
+    Raises McaptrackError if it is not a video, or too damaged to read. Metadata that is not UTF-8 contains surrogate
+    escapes, with every version of PyAV.
     """
     import av
 
     major = int(av.__version__.partition(".")[0])
-    options: dict[str, Any] = {"options": {"max_pixels": str(max_pixels())}}
+    limits = {"max_pixels": str(max_pixels())}
+    options: dict[str, Any] = {"options": limits | demuxer}
     if major <= _LAST_WITH_METADATA_ERRORS:
         options["metadata_errors"] = "surrogateescape"
     try:
         with av.open(_url(path), **options) as opened:
+            if not opened.streams and _lacks_index(path):
+                raise _no_index(path)
             for stream in opened.streams.video:
                 if stream.codec_context is not None:
-                    stream.codec_context.options = options["options"]
+                    stream.codec_context.options = limits
             yield opened
     except av.error.EOFError:
         raise McaptrackError(f"{path} is a video without frames") from None
@@ -41,6 +46,8 @@ def reading(path: Path) -> Iterator[Any]:
         why = error.strerror or error
         if is_size_error(error):
             why = f"{why}: it is damaged, or its pictures are too large, {too_large()}"
+        if _lacks_index(path):
+            raise _no_index(path) from error
         raise McaptrackError(
             f"{path} can't be read as a video ({why}); give a complete mp4, mov, mkv, avi or webm file"
         ) from error
@@ -82,6 +89,16 @@ def has_slots(opened: Any) -> bool:
     return "avi" in opened.format.name.split(",")
 
 
+def is_transport(opened: Any) -> bool:
+    """Whether a container is an MPEG transport stream: its packets are numbered."""
+    return "mpegts" in opened.format.name.split(",")
+
+
+def has_sizes(opened: Any) -> bool:
+    """Whether a container says how many bytes a picture has, so that one that is cut off is known."""
+    return has_times(opened) and not is_transport(opened)
+
+
 def has_times(opened: Any) -> bool:
     """Whether pictures have timestamps; those that FFmpeg returns for raw streams are invented."""
     return not opened.format.flags & _NO_TIMESTAMPS
@@ -95,6 +112,36 @@ def count_indexed(opened: Any) -> int:
 def count_empty(opened: Any) -> int:
     """The number of MP4 samples without data: nothing was recorded there."""
     return sum(entry.size == 0 for entry in _mp4_entries(opened))
+
+
+def count_edited(path: Path) -> int:
+    """The number of samples that the edit list of an MP4 leaves out."""
+    with reading(path) as edited, reading(path, ignore_editlist="1") as whole:
+        return max(0, len(_mp4_entries(whole)) - len(_mp4_entries(edited)))
+
+
+def _no_index(path: Path) -> McaptrackError:
+    return McaptrackError(
+        f"{path} can't be read as a video: its pictures have no index (moov), or a part of one, as if it was cut off; "
+        "copy it again, or repair it with the camera, or with a program that takes the index from another of its "
+        "recordings"
+    )
+
+
+def _lacks_index(path: Path) -> bool:
+    """Whether an MP4 has pictures (mdat) but no whole index (moov), by its boxes (ISO 14496-12, 4.2)."""
+    kinds, at, end = set[bytes](), 0, path.stat().st_size
+    with path.open("rb") as file:
+        for _ in range(_MOST_BOXES):
+            file.seek(at)
+            head = file.read(16)
+            size = int.from_bytes(head[8:16] if head[:4] == b"\0\0\0\1" else head[:4])
+            if head[4:8] != b"moov" or at + size <= end:
+                kinds.add(head[4:8])
+            if size < 8 or at + size >= end:
+                break
+            at += size
+    return {b"ftyp", b"mdat"} <= kinds and not {b"moov", b"moof"} & kinds
 
 
 def _mp4_entries(opened: Any) -> Any:

@@ -14,11 +14,13 @@ from typing import Any, Final, NamedTuple
 
 from mcaptrack.sources.video import av1, h264
 from mcaptrack.sources.video.codecs import CODECS
-from mcaptrack.sources.video.container import fraction, has_slots, reading, videos
+from mcaptrack.sources.video.container import fraction, has_slots, is_transport, reading, videos
+from mcaptrack.sources.video.damage import Holes, MissingPictures, transport_faults
 from mcaptrack.sources.video.encode import VideoOptions
 
 _PIXELS: Final = ("yuv420p", "yuvj420p")
 _WORDS: Final = {"h264": "H.264", "h265": "H.265", "vp9": "VP9", "av1": "AV1"}
+_DAMAGED: Final = "some of its packets are damaged"
 _ONLY_SOME: Final = "it is H.265, which viewers play only where the hardware does (`image_format='h265'` keeps it)"
 
 
@@ -38,12 +40,14 @@ class StreamCheck:
     """The result of checking all packets of a stream.
 
     ``format`` is the format name in messages, "" if they have none. ``why_not`` says why the stream can't be passed
-    through, "" if it can; then ``sets`` are the parameter sets to insert before key pictures that lack them.
+    through, "" if it can; then ``sets`` are the parameter sets to insert before key pictures that lack them. Before the
+    pictures ``missing`` there were others.
     """
 
     format: str
     why_not: str
     sets: tuple[bytes, ...] = ()
+    missing: tuple[int, ...] = ()
 
 
 def packets(opened: Any, image_format: str) -> Iterator[StreamPacket]:
@@ -90,6 +94,8 @@ def check_stream(path: Path, options: VideoOptions) -> StreamCheck:
         found.why_not = _check_packets(
             packets(opened, image_format), found, options.fps, Fraction(options.key_within_s)
         )
+        if not found.why_not and is_transport(opened) and transport_faults(path, stream.id):
+            found.why_not = _DAMAGED
         if image_format == "h265" and options.image_format != "h265" and not found.why_not:
             found.why_not = _ONLY_SOME
         return found
@@ -121,9 +127,10 @@ def _check_packets(found: Iterator[StreamPacket], stream: StreamCheck, fps: Frac
     last: Fraction | None = None
     key_at = Fraction(0)
     all_have_sets, cut_off = True, False
+    holes, numbers = Holes(), MissingPictures()
     for count, packet in enumerate(found):
         if cut_off:
-            return "some of its packets are damaged"
+            return _DAMAGED
         if packet.is_damaged:
             cut_off = True  # the last packet can be left out; others are needed by those that follow
             continue
@@ -137,6 +144,10 @@ def _check_packets(found: Iterator[StreamPacket], stream: StreamCheck, fps: Frac
         if last is not None and (seconds <= last):
             return "its frames are not in the order of their times"
         last = seconds
+        if CODECS[stream.format].annex_b:
+            holes.add(packet.data)
+        if stream.format == "h264":
+            numbers.add(count, packet.data)
         unit = inspect(packet.data)
         if unit.reorders:
             return "it has B-frames"
@@ -158,5 +169,7 @@ def _check_packets(found: Iterator[StreamPacket], stream: StreamCheck, fps: Frac
         size = size or unit.size
         if count == 0 and stream.format == "h264" and h264.is_interlaced(known):
             return "it is interlaced"
-    stream.sets = () if all_have_sets else known
+    if holes.count:
+        return _DAMAGED
+    stream.sets, stream.missing = () if all_have_sets else known, tuple(numbers.places)
     return ""

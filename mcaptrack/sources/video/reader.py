@@ -14,32 +14,36 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import numpy as np
-
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Image
-from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
+from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.notices import warn
 from mcaptrack.sources.video.codecs import CODECS
 from mcaptrack.sources.video.container import (
+    count_edited,
     count_empty,
     count_indexed,
     fraction,
+    has_sizes,
     has_slots,
     has_times,
     reading,
     videos,
 )
+from mcaptrack.sources.video.decode import EncodedPicture, decode_gray
 from mcaptrack.sources.video.encode import H264Encoder, StillFormat, VideoOptions, encode_image
 from mcaptrack.sources.video.frame_slots import count_slots
 from mcaptrack.sources.video.image_folder import Images, find_images, read_image
 from mcaptrack.sources.video.limits import check_h264, check_size
 from mcaptrack.sources.video.passthrough import check_stream, packets
+from mcaptrack.sources.video.picture_times import Clock
 from mcaptrack.sources.video.seqinfo import find_seqinfo
+from mcaptrack.sources.video.upright import Orientation, fit, orientation_of
 
 #: A fixed number of threads, so that damaged streams decode to the same pictures on every machine.
 _THREADS: Final = 4
-_FULL_RANGE, _LIMITED_RANGE = 2, 1  # AVCOL_RANGE_JPEG, AVCOL_RANGE_MPEG
+_ONE_EACH: Final = ("h264", "hevc")  # codecs with a picture in each packet, if it has no fields
+_HDR: Final = {16: "PQ", 18: "HLG"}  # AVCOL_TRC_SMPTE2084, AVCOL_TRC_ARIB_STD_B67
 
 
 class PictureMessage(NamedTuple):
@@ -88,6 +92,7 @@ class Video:
     notes: list[str] = field(default_factory=list)
     has_slots: bool = False
     length_s: Fraction | None = None
+    orientation: Orientation = Orientation()  # immutable
 
     @property
     def every(self) -> int:
@@ -95,20 +100,26 @@ class Video:
         return self.images.every if self.images else 1
 
     def pictures(self, start_ns: int = 0) -> Iterator[PictureMessage]:
-        """All pictures in order, the first of them at ``start_ns``."""
-        clock = _Clock(self, start_ns)
+        """All pictures in order, the first of them at ``start_ns``; afterwards warnings about their times."""
+        clock = Clock(self.path, start_ns, self.options.fps or (self.fps if self.images else None))
         if self.options.is_still:
             yield from _encode_stills(self, clock)
         elif self.why_transcode:
             yield from _transcode(self, clock)
         else:
             yield from _remux(self, clock)
+        clock.warn()
 
     def note_missing(self, read: int, hidden: int = 0, last_s: Fraction | None = None) -> None:
         """Compare the number of pictures read with the declared number, of which ``hidden`` are not shown."""
         if self.has_slots and self.fps and last_s is not None:
             hidden += round(last_s * self.fps) + 1 - read  # empty slots
         if self.frames and read + hidden < self.frames:
+            edited = 0 if self.images else count_edited(self.path)
+            if edited:
+                self.notes.append(f"{self.path}: an edit list hides {edited} of its {self.frames} frames")
+            if read + hidden + edited >= self.frames:
+                return
             slots = None if self.images else count_slots(self.path, self.stream)
             if slots is not None and slots >= self.frames:
                 return  # the file is complete: the others are empty slots, or reported as lost
@@ -118,35 +129,6 @@ class Video:
             if gap > max(Fraction(1, 2), 3 / self.fps):
                 ends = f"its pictures end at {float(last_s):.2f} s"
                 self.lost.append(f"{self.path} says it is {float(self.length_s):.2f} s long; {ends}")
-
-
-class _Clock:
-    """Times of pictures: from the container, exact in its time base, or evenly spaced."""
-
-    def __init__(self, video: Video, start_ns: int) -> None:
-        self.fps = video.options.fps or (video.fps if video.images else None)
-        self._where = video.path
-        self._start_ns = start_ns
-        self._first: Fraction | None = None
-        self._last = -1
-
-    def time(self, index: int, seconds: Fraction | None) -> int:
-        if self.fps:
-            seconds = index / self.fps
-        elif seconds is None:
-            raise McaptrackError(
-                f"{self._where}: picture {index} has no time in its container; space them evenly with `fps=`"
-            )
-        else:
-            self._first = seconds if self._first is None else self._first
-            seconds -= self._first
-        t_ns = self._start_ns + round(seconds * NS_PER_S)
-        if not 0 <= t_ns < LAST_NS:
-            raise McaptrackError(
-                f"{self._where}: picture {index} is {float(seconds):g} s after the first; times reach to the year 2262"
-            )
-        self._last = max(t_ns, self._last + 1)  # times are strictly increasing
-        return self._last
 
 
 def open_video(path: Path, options: VideoOptions = VideoOptions()) -> Video:  # noqa: B008  # frozen
@@ -165,26 +147,30 @@ def open_video(path: Path, options: VideoOptions = VideoOptions()) -> Video:  # 
         check_size(context.width, context.height, path)
         first = next(opened.decode(stream), None)
         if first is None:
-            raise McaptrackError(f"{path} is a video without frames")
+            hides = count_edited(path)
+            why = f"without frames{f': its edit list hides all {hides} of them' if hides else ''}"
+            raise McaptrackError(f"{path} is a video {why}")
         if not (has_times(opened) or options.fps):
             raise McaptrackError(f"{path} has no times of its own; give the frames per second with `fps=`")
-        sideways = first.rotation % 180 != 0
+        orientation = orientation_of(first)
         video = Video(
             path,
             options,
             options.image_format if options.is_still else "h264",
-            first.height if sideways else first.width,
-            first.width if sideways else first.height,
+            first.height if orientation.is_transposed else first.width,
+            first.width if orientation.is_transposed else first.height,
             fraction(stream.average_rate),
             stream.frames,
             _creation_ns(opened.metadata.get("creation_time") or stream.metadata.get("creation_time")),
-            f"it is turned by {first.rotation} degrees" if first.rotation else "",
+            f"it is {orientation.words}" if orientation.words else "",
             stream=stream.index,
             has_slots=has_slots(opened),
             length_s=_length_s(opened, stream),
+            orientation=orientation,
         )
         if len(there) > 1:
             video.notes.append(f"{path} holds {len(there)} videos; the first is taken")
+        video.notes += _remarks(path, stream, first, orientation)
         if first.interlaced_frame:
             video.why_transcode = video.why_transcode or "it is interlaced"
     if options.is_still:
@@ -192,6 +178,12 @@ def open_video(path: Path, options: VideoOptions = VideoOptions()) -> Video:  # 
     elif not video.why_transcode:
         found = check_stream(path, options)
         video.why_transcode, video.sets = found.why_not, found.sets
+        if found.missing:
+            places = "1 place" if len(found.missing) == 1 else f"{len(found.missing)} places"
+            video.lost.append(
+                f"{path}: pictures are missing at {places}, before picture {found.missing[0]} first; those up "
+                "to the next key picture may be damaged"
+            )
         video.format = "h264" if found.why_not else found.format
     _make_even(video)
     return video
@@ -203,6 +195,17 @@ def _make_even(video: Video) -> None:
         check_h264(video.width_px, video.height_px, video.path)
         video.width_px += video.width_px % 2
         video.height_px += video.height_px % 2
+
+
+def _remarks(path: Path, stream: Any, first: Any, orientation: Orientation) -> Iterator[str]:
+    """Remarks on pictures that are stored in another way than most."""
+    if orientation.oblique:
+        yield f"{path} should be turned by {orientation.oblique:.1f} degrees; only quarter turns are done"
+    aspect = fraction(stream.sample_aspect_ratio)
+    if aspect and aspect != 1:
+        yield f"{path} has pixels that are {float(aspect):.4g} times as wide as high; pictures stay as they are stored"
+    if first.color_trc in _HDR:
+        yield f"{path} is HDR ({_HDR[first.color_trc]}); its brightness stays as stored, which may not suit detectors"
 
 
 def _length_s(opened: Any, stream: Any) -> Fraction | None:
@@ -245,33 +248,48 @@ def _creation_ns(text: str | None) -> int | None:
     return t_ns if 0 <= t_ns < LAST_NS else None
 
 
-def _remux(video: Video, clock: _Clock) -> Iterator[PictureMessage]:
+def _remux(video: Video, clock: Clock) -> Iterator[PictureMessage]:
     codec = CODECS[video.format]
     index, seconds = 0, None
+    group: list[EncodedPicture] = []  # since the last key picture, where only decoding shows whether the last is whole
     with reading(video.path) as opened:
         for packet in packets(opened, video.format):
             if packet.is_damaged:  # only the last packet can be damaged
                 video.lost.append(f"{video.path} is cut off or damaged after {index} frames; the rest is left out")
                 continue
             data = packet.data
-            if video.sets:
-                head = codec.read_head(data)
-                data = (
-                    codec.with_parameter_sets(data, video.sets) if head.is_key and not head.has_parameter_sets else data
-                )
+            head = codec.read_head(data)
+            if video.sets and head.is_key and not head.has_parameter_sets:
+                data = codec.with_parameter_sets(data, video.sets)
+            if not has_sizes(opened):
+                group = [] if head.is_key else group
+                group.append(EncodedPicture(0, index, video.format, data))
             seconds = packet.seconds
             yield PictureMessage(clock.time(index, seconds), index, data)
             index += 1
         video.frames = video.frames or count_indexed(opened)
         hidden = count_empty(opened)
+    if _is_cut(group):
+        video.lost.append(f"{video.path} is cut off or damaged in its last picture, which is kept as far as it decodes")
     video.note_missing(index, hidden, seconds)
 
 
-def _transcode(video: Video, clock: _Clock) -> Iterator[PictureMessage]:
+def _is_cut(group: list[EncodedPicture]) -> bool:
+    """Whether the last of these pictures is damaged."""
+    damaged: list[int] = []
+    try:
+        for _ in decode_gray(group, wanted=(), damaged=damaged):
+            pass
+    except McaptrackError:
+        return True
+    return bool(damaged) and damaged[-1] == group[-1].index
+
+
+def _transcode(video: Video, clock: Clock) -> Iterator[PictureMessage]:
     options, encoder = video.options, None
     for index, seconds, picture in _decoded_pictures(video):
         t_ns = clock.time(index, seconds)
-        fitted = _fit(video, picture)
+        fitted = _fitted(video, picture)
         if encoder is None:
             fps = clock.fps or video.fps or Fraction(30)
             encoder = H264Encoder(video.width_px, video.height_px, fps, options.crf, options.key_every_s, like=fitted)
@@ -280,10 +298,20 @@ def _transcode(video: Video, clock: _Clock) -> Iterator[PictureMessage]:
         yield PictureMessage(t_ns, index, data)
 
 
-def _encode_stills(video: Video, clock: _Clock) -> Iterator[PictureMessage]:
+def _fitted(video: Video, picture: Any) -> Any:
+    fitted, is_scaled = fit(picture, video.orientation, video.width_px, video.height_px)
+    words = (
+        f"{video.path}: pictures change their size on the way; all are scaled to {video.width_px} x {video.height_px}"
+    )
+    if is_scaled and words not in video.notes:
+        video.notes.append(words)
+    return fitted
+
+
+def _encode_stills(video: Video, clock: Clock) -> Iterator[PictureMessage]:
     name: StillFormat = "jpeg" if video.format == "jpeg" else "png"
     for index, seconds, picture in _decoded_pictures(video):
-        data = encode_image(_upright(picture), name, video.options.jpeg_quality)
+        data = encode_image(video.orientation.of(picture), name, video.options.jpeg_quality)
         del picture
         yield PictureMessage(clock.time(index, seconds), index, data)
 
@@ -291,7 +319,7 @@ def _encode_stills(video: Video, clock: _Clock) -> Iterator[PictureMessage]:
 def images(video: Video) -> Iterator[tuple[Fraction | None, Image]]:
     """Decoded pictures, BGR (height, width, 3), upright, each after its time in seconds."""
     for _, seconds, picture in _decoded_pictures(video):
-        yield seconds, _upright(picture)
+        yield seconds, video.orientation.of(picture)
 
 
 def _decoded_pictures(video: Video) -> Iterator[DecodedPicture]:
@@ -311,7 +339,8 @@ def _decoded_pictures(video: Video) -> Iterator[DecodedPicture]:
 def _decoded(video: Video) -> Iterator[DecodedPicture]:
     import av
 
-    read, failed, damaged, hidden, cut_off, seconds = 0, 0, 0, 0, 0, None
+    given, read, failed, damaged, hidden, cut_off, seconds = 0, 0, 0, 0, 0, 0, None
+    why, has_fields = "", False
     slots: list[int] = []
     with reading(video.path) as opened:
         stream = videos(opened)[0]
@@ -326,59 +355,29 @@ def _decoded(video: Video) -> Iterator[DecodedPicture]:
                     break
                 hidden += packet.is_discard
                 cut_off += packet.is_corrupt
+                given += packet.size > 0 and not packet.is_discard
                 if video.has_slots and packet.size:
                     slots.append(len(slots) if packet.dts is None else packet.dts)
                 frames = packet.decode()
             except av.error.FFmpegError as error:
-                video.lost.append(f"{video.path}: a packet can't be decoded ({error.strerror or error})")
+                why = why or f" ({error.strerror or error})"
                 failed += 1
                 continue
             for frame in frames:
                 ticks = slots[min(read + failed, len(slots) - 1)] if slots else frame.pts
                 seconds = None if ticks is None else ticks * base
                 damaged += frame.is_corrupt
+                has_fields |= frame.interlaced_frame
                 yield DecodedPicture(read + failed, seconds, frame)
                 read += 1
         video.frames = video.frames or count_indexed(opened)
         hidden += count_empty(opened)
+        if stream.codec_context.name in _ONE_EACH and not has_fields:
+            failed = max(failed, given - read)  # FFmpeg passes over some without an error
+    if failed:
+        video.lost.append(f"{video.path}: {failed} of {given} packets can't be decoded{why}")
     if cut_off:
         video.lost.append(f"{video.path}: {cut_off} packets are cut off or damaged")
     if damaged:
         video.lost.append(f"{video.path}: {damaged} of {read} frames are damaged; they are kept as far as they decode")
-    video.note_missing(read, hidden, seconds)
-
-
-def _upright(picture: Any) -> Image:
-    """A picture in BGR, rotated upright."""
-    if isinstance(picture, np.ndarray):
-        return picture
-    return np.rot90(picture.to_ndarray(format="bgr24"), picture.rotation // 90)
-
-
-def _fit(video: Video, picture: Any) -> Any:
-    """A picture in the (even) size of the video, in a format that the encoder takes.
-
-    A missing last row or column repeats the one before it. Pictures of other sizes are scaled, which is noted.
-    """
-    width, height = video.width_px, video.height_px
-    if (
-        not isinstance(picture, np.ndarray)
-        and not picture.rotation
-        and (picture.width, picture.height) == (width, height)
-    ):
-        if picture.format.name == "yuv420p" and picture.color_range != _FULL_RANGE:
-            return picture
-        if picture.format.name.startswith(("yuv4", "yuvj4")):
-            is_full = picture.format.name.startswith("yuvj") or picture.color_range == _FULL_RANGE
-            ranges = {"src_color_range": _FULL_RANGE if is_full else _LIMITED_RANGE, "dst_color_range": _LIMITED_RANGE}
-            return picture.reformat(format="yuv420p", **ranges)
-    image = _upright(picture)
-    right, below = width - image.shape[1], height - image.shape[0]
-    if 0 <= right <= 1 and 0 <= below <= 1:
-        return np.pad(image, ((0, below), (0, right), (0, 0)), mode="edge") if right or below else image
-    import cv2
-
-    words = f"{video.path}: pictures change their size on the way; all are scaled to {width} x {height}"
-    if words not in video.notes:
-        video.notes.append(words)
-    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    video.note_missing(read, hidden + failed, seconds)

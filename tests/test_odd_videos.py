@@ -1,0 +1,307 @@
+"""Videos that are damaged, cut, edited, mirrored or irregular: what ``ingest`` says of them without decoding all."""
+
+from __future__ import annotations
+
+import json
+import struct
+from fractions import Fraction
+from itertools import product
+from pathlib import Path
+from types import SimpleNamespace
+
+import av
+import numpy as np
+import pytest
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import collected
+from mcaptrack.sources.video import VideoOptions, open_video
+from mcaptrack.sources.video.damage import Holes, transport_faults
+from mcaptrack.sources.video.picture_times import Clock
+from mcaptrack.sources.video.upright import orientation_of
+from tests.commands import call
+from tests.worlds import write_clip
+
+NO_B = {"bf": "0", "g": "10"}
+ONE = 0x10000
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The same pictures in three containers: 30 of noise, so that a key picture takes 20 kB, and 12 small ones."""
+    folder = tmp_path_factory.mktemp("odd")
+    image = np.random.default_rng(0).integers(0, 60, (240, 320, 3), np.uint8)
+    for name in ("a.mp4", "a.ts"):
+        with av.open(str(folder / name), "w") as container:
+            stream = container.add_stream("libx264", rate=10, options=NO_B)
+            stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
+            for number in range(30):
+                image[100:140, 8 * number : 8 * number + 20] += 100
+                for packet in stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")):
+                    container.mux(packet)
+            for packet in stream.encode(None):
+                container.mux(packet)
+    write_clip(folder / "a.avi", 12, options=NO_B)
+    return folder
+
+
+def samples(path: Path) -> list[tuple[int, int]]:
+    """Where the packets of a video are: offset and size."""
+    with av.open(str(path)) as opened:
+        return [(packet.pos, packet.size) for packet in opened.demux(video=0) if packet.size]
+
+
+def changed(path: Path, name: str, change) -> Path:
+    """A copy of a file after ``change``, a function of its bytes that returns others."""
+    other = path.with_name(name)
+    other.write_bytes(bytes(change(bytearray(path.read_bytes()))))
+    return other
+
+
+def read(path: Path, **options):
+    """The pictures of a video, and the video with what it says."""
+    video = open_video(path, VideoOptions(**options))
+    return list(video.pictures()), video
+
+
+def zeros(start: int, size: int):
+    def change(data: bytearray) -> bytearray:
+        data[start : start + size] = bytes(size)
+        return data
+
+    return change
+
+
+def test_a_whole_video_says_nothing(folder):
+    for name in ("a.mp4", "a.ts", "a.avi"):
+        with collected() as warnings:
+            _, video = read(folder / name)
+        assert (video.why_transcode, video.lost, video.notes, list(warnings)) == ("", [], [], []), name
+
+
+def test_a_hole_within_a_picture_makes_all_be_decoded_and_counted(folder):
+    at, size = samples(folder / "a.mp4")[20]
+    path = changed(folder / "a.mp4", "hole.mp4", zeros(at + size // 2, 700))
+    pictures, video = read(path)
+    assert video.why_transcode == "some of its packets are damaged"
+    assert len(pictures) == 30
+    assert video.lost == [f"{path}: 1 of 30 frames are damaged; they are kept as far as they decode"]
+
+
+def test_holes_are_zeros_where_none_can_be():
+    unit, start = b"\x41" + b"\x9a\x17" * 50, b"\x00\x00\x00\x01"
+
+    def count(*pictures: bytes) -> int:
+        holes = Holes()
+        for data in pictures:
+            holes.add(data)
+        return holes.count
+
+    whole = [start + unit] * 30
+    assert count(*whole) == 0
+    assert count(*whole, start + unit[:40] + bytes(64) + unit[40:]) == 1
+    assert count(*whole, start + unit[:40] + bytes(63) + unit[40:]) == 0
+    assert count(*whole, start + unit + bytes(200) + start + unit) == 0  # padding before a start code
+    assert count(*whole, start + unit + bytes(200)) == 1  # the rest of a picture is missing
+    assert count(*[start + unit + bytes(200)] * 30) == 0  # all are padded
+    two = start + unit + bytes(100) + start + unit + bytes(64) + b"\x05"
+    assert count(*whole, two) == 1
+
+
+def test_pictures_that_are_missing_are_known_by_the_numbers_of_the_others(folder):
+    def without(*left_out: int) -> list[str]:
+        path = folder / "without.mp4"
+        with av.open(str(folder / "a.mp4")) as source, av.open(str(path), "w") as target:
+            stream = target.add_stream_from_template(source.streams.video[0])
+            for number, packet in enumerate(source.demux(video=0)):
+                if packet.size and number not in left_out:
+                    packet.stream = stream
+                    target.mux(packet)
+        pictures, video = read(path)
+        assert len(pictures) == 30 - len(left_out)
+        assert video.why_transcode == ""
+        return [words.removeprefix(f"{path}: ") for words in video.lost]
+
+    assert without(19, 29) == []  # the last of their groups: nothing depends on them
+    (one,) = without(4, 5)
+    assert one.startswith("pictures are missing at 1 place, before picture 4 first; ")
+    (two,) = without(12, 15, 16)
+    assert two.startswith("pictures are missing at 2 places, before picture 12 first; ")
+
+
+@pytest.mark.parametrize("size", [188, 192, 204])
+def test_faults_of_transport_streams_are_counted(folder, tmp_path, size):
+    whole = np.frombuffer((folder / "a.ts").read_bytes(), np.uint8).reshape(-1, 188)
+    rows = np.zeros((len(whole), size), np.uint8)
+    at = 4 if size == 192 else 0
+    rows[:, at : at + 188] = whole
+    mine = np.flatnonzero((whole[:, 1] & 0x1F == 1) & (whole[:, 2] == 0) & (whole[:, 3] & 0x10 > 0))
+    path = tmp_path / "b.ts"
+
+    def faults(data: bytes) -> int:
+        path.write_bytes(data)
+        return transport_faults(path, 256)
+
+    assert len(mine) > 30
+    assert faults(rows.tobytes()) == 0
+    assert faults(np.delete(rows, mine[9], axis=0).tobytes()) == 1
+    assert faults(np.delete(rows, mine[[9, 10, 20]], axis=0).tobytes()) == 2
+    assert faults(np.insert(rows, mine[9], rows[mine[9]], axis=0).tobytes()) == 0  # packets may come twice
+    damaged = rows.copy()
+    damaged[mine[9]] = 0
+    assert faults(damaged.tobytes()) == 1
+    others = rows.tobytes()
+    assert faults(others[: size * 20] + b"\x00" * 55 + others[size * 20 :]) == 1
+    assert transport_faults(folder / "a.mp4", 256) == 0
+
+
+def test_packets_that_a_transport_stream_lost_make_all_be_decoded(folder):
+    path = changed(folder / "a.ts", "lost.ts", lambda data: data[: 188 * 60] + data[188 * 64 :])
+    _, video = read(path)
+    assert video.why_transcode == "some of its packets are damaged"
+    assert video.lost[-1] == f"{path}: 1 of 30 frames are damaged; they are kept as far as they decode"
+
+
+def test_the_last_picture_of_a_stream_without_sizes_is_decoded(folder):
+    path = changed(folder / "a.ts", "cut.ts", lambda data: data[: len(data) * 2 // 3 // 188 * 188])
+    with av.open(str(path)) as opened:
+        is_damaged = [frame.is_corrupt for frame in opened.decode(video=0)][-1]
+    pictures, video = read(path)
+    assert len(pictures) < 30
+    words = f"{path} is cut off or damaged in its last picture, which is kept as far as it decodes"
+    assert video.lost == [words] * is_damaged == [words]
+
+
+def test_packets_that_give_no_picture_are_counted(folder):
+    at, size = samples(folder / "a.avi")[-1]
+    path = changed(folder / "a.avi", "last.avi", zeros(at, size))
+    pictures, video = read(path)
+    assert len(pictures) == 11
+    assert video.lost == [f"{path}: 1 of 12 packets can't be decoded"]
+
+
+@pytest.mark.parametrize(("start", "left"), [(10, 20), (15, 15)])  # at a key picture, and between two
+def test_what_an_edit_list_hides_is_not_lost(folder, start, left):
+    def edited(data: bytearray) -> bytearray:
+        at = data.find(b"elst")
+        ticks, rate = 10_240, 10
+        assert struct.unpack(">i", data[at + 16 : at + 20]) == (0,)
+        data[at + 16 : at + 20] = struct.pack(">i", start * ticks // rate)
+        return data
+
+    path = changed(folder / "a.mp4", "edited.mp4", edited)
+    pictures, video = read(path)
+    assert len(pictures) == left
+    assert video.lost == []
+    assert video.notes == [f"{path}: an edit list hides 10 of its 30 frames"]
+
+
+def test_a_video_of_which_all_is_hidden_says_so(folder):
+    def hidden(data: bytearray) -> bytearray:
+        at = data.find(b"elst")
+        data[at + 16 : at + 20] = struct.pack(">i", -1)
+        return data
+
+    with pytest.raises(McaptrackError, match="is a video without frames: its edit list hides all 30 of them"):
+        open_video(changed(folder / "a.mp4", "hidden.mp4", hidden))
+
+
+def test_a_recording_without_its_index_says_what_to_do(folder):
+    path = changed(folder / "a.mp4", "noindex.mp4", lambda data: data[: data.find(b"moov") - 4])
+    with pytest.raises(McaptrackError, match=r"no index \(moov\), .*; copy it again, or repair it"):
+        open_video(path)
+    with pytest.raises(McaptrackError, match="give a complete mp4"):
+        open_video(changed(folder / "a.mp4", "zeros.mp4", lambda data: bytes(len(data))))
+    with pytest.raises(McaptrackError, match=r"no index \(moov\)"):
+        open_video(changed(folder / "a.mp4", "half.mp4", lambda data: data[: data.find(b"moov") + 60]))
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "c", "d"),
+    [
+        turn
+        for turn in product((-1, 0, 1), repeat=4)
+        if abs(turn[0] * turn[3] - turn[1] * turn[2]) == 1 and sum(map(abs, turn)) == 2
+    ],
+)
+def test_pictures_stand_where_the_matrix_puts_their_pixels(a, b, c, d):
+    image = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
+    side = struct.pack("=9i", a * ONE, b * ONE, 0, c * ONE, d * ONE, 0, 7 * ONE, 0, 1 << 30)
+    frame = SimpleNamespace(
+        rotation=0,
+        side_data=[type("Side", (bytes,), {"type": SimpleNamespace(name="DISPLAYMATRIX")})(side)],
+        to_ndarray=lambda **_: image,
+    )
+    placed = {(a * x + c * y, b * x + d * y): image[y, x].tolist() for x in range(3) for y in range(2)}
+    left, top = (min(one[axis] for one in placed) for axis in (0, 1))
+    orientation = orientation_of(frame)
+    upright = orientation.of(frame)
+    assert len(placed) == upright.shape[0] * upright.shape[1] == 6
+    assert all(upright[y - top, x - left].tolist() == pixel for (x, y), pixel in placed.items())
+    assert bool(orientation.words) == ((a, b, c, d) != (1, 0, 0, 1))
+    assert (orientation.is_transposed, orientation.oblique) == (a == 0, 0)
+
+
+def test_what_is_kept_as_stored_is_said(tmp_path):
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=10, options=NO_B)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
+        stream.codec_context.color_trc = 16
+        for packet in [*stream.encode(av.VideoFrame(64, 48, "yuv420p")), *stream.encode(None)]:
+            container.mux(packet)
+    raw = bytearray(path.read_bytes())
+    at = raw.find(b"tkhd") + 4 + 40
+    raw[at : at + 20] = struct.pack(">5i", 46341, 46341, 0, -46341, 46341)
+    path.write_bytes(raw)
+    video = open_video(path)
+    assert video.notes == [
+        f"{path} should be turned by 45.0 degrees; only quarter turns are done",
+        f"{path} has pixels that are 1.333 times as wide as high; pictures stay as they are stored",
+        f"{path} is HDR (PQ); its brightness stays as stored, which may not suit detectors",
+    ]
+    assert (video.width_px, video.height_px, video.why_transcode) == (64, 48, "")
+
+
+def said_of(times_ms: list[int], fps: Fraction | None = None) -> list[str]:
+    with collected() as warnings:
+        clock = Clock(Path("a.mp4"), 0, fps)
+        for index, ms in enumerate(times_ms):
+            clock.time(index, Fraction(ms, 1000))
+        clock.warn()
+    assert {one.code for one in warnings} <= {"clock"}
+    return [str(one.message) for one in warnings]
+
+
+def test_gaps_between_regular_pictures_are_said():
+    regular = list(range(0, 4000, 40))
+    assert said_of(regular) == said_of([ms + ms % 3 for ms in regular]) == []
+    assert said_of(regular[:20] + regular[21:]) == []  # one picture alone
+    (one,) = said_of(regular[:20] + regular[25:])
+    assert (
+        "has 1 gap between pictures that otherwise come every 40 ms, the first after 0.76 s, the longest of 0.24" in one
+    )
+    assert "about 5 pictures" in one
+    (two,) = said_of(regular[:20] + regular[22:50] + regular[60:])
+    assert "2 gaps" in two
+    assert "about 12 pictures" in two
+    assert said_of(regular[:20] + regular[25:], Fraction(25)) == []  # the times are others then
+    rng = np.random.default_rng(1)
+    assert said_of(np.cumsum(1 + rng.exponential(100, 200)).astype(int).tolist()) == []  # no clock, no gap
+
+
+def test_times_that_do_not_increase_are_said():
+    (one,) = said_of([0, 40, 40, 80, 120, 110, 160])
+    assert one.startswith("a.mp4: 2 of 7 pictures are not later than the one before, number 2 first; ")
+
+
+def test_the_command_says_it_in_lines_and_as_json(folder):
+    at, size = samples(folder / "a.mp4")[20]
+    path = changed(folder / "a.mp4", "said.mp4", zeros(at + size // 2, 700))
+    outcome = call("ingest", path, "-o", folder / "said.mcap", "--json")
+    assert outcome.code == 3
+    (said,) = json.loads(outcome.out)["warnings"]
+    assert said["code"] == "lost"
+    assert said["message"].endswith("1 of 30 frames are damaged; they are kept as far as they decode")
+    assert said["message"] in outcome.err
