@@ -29,6 +29,7 @@ from mcaptrack.schema.framing import (
     mapped_rows,
 )
 from mcaptrack.schema.resampling import resample, resample_parts
+from mcaptrack.transforms.track_ends import mended_ends
 
 #: Columns taken from the tracker where it has a box.
 _FROM_TRACKER: Final = ("x_px", "y_px", "w_px", "h_px", "score", "observed")
@@ -41,7 +42,7 @@ def to_video_rate(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Pl
 
     Each box of the tracker gets the re-tracked id that its track has at the nearest sample time. Where a re-tracked
     track has no box, its row is interpolated between the samples and not observed. Boxes of tracks that re-tracking
-    left out are left out.
+    left out are left out. Where tracks of boxes in space begin and end is decided again (``mended_ends``).
 
     Parameters
     ----------
@@ -73,7 +74,9 @@ def to_video_rate(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Pl
         near = retracks if (low, high) == (0, len(retracks)) else retracks[low:high]
         rows, ends = _part(joined, near, period, columns, planes, classes)
         out.extend(joined.t_ns, numbers[first:last], ends, rows)
-    return out.done()
+    frames = out.done()
+    # Boxes in space; what several cameras place on the ground has no size, and is seen until it leaves.
+    return mended_ends(frames) if has_velocity and _have_sizes(tracks) else frames
 
 
 def _part(
@@ -120,6 +123,12 @@ def _part(
     order = np.lexsort((rows["track_id"], rows_at))
     rows, rows_at = rows[order], rows_at[order]
     return rows, np.searchsorted(rows_at, np.arange(len(frame_ns) + 1), "left")
+
+
+def _have_sizes(frames: Sequence[Frame]) -> bool:
+    """Whether there are rows with a size in metres, and none with a box in pixels."""
+    has_size = has_any(TRACKS, frames, lambda rows: np.isfinite(rows["length_m"]))
+    return has_size and not has_any(TRACKS, frames, lambda rows: np.isfinite(rows["w_px"]))
 
 
 def linked_tracks(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Planes) -> FrameColumns:
