@@ -14,7 +14,7 @@ from mcaptrack import log
 from mcaptrack.evaluation.track_lifecycle import lifecycle_of
 from mcaptrack.schema import DECISIONS, DecisionKind, EventKind, Frame
 from mcaptrack.transforms import PROFILES, Retrack
-from mcaptrack.transforms.retrack.joins import cut_joins, find_joins, tracked_of
+from mcaptrack.transforms.retrack.joins import Cuts, cut_joins, find_joins, tracked_of
 from mcaptrack.transforms.retrack.motion_model import MotionModel
 from mcaptrack.viewing.report.doubts import find_doubtful_tracks
 from tests.commands import done
@@ -96,14 +96,25 @@ def test_joins_and_cuts_equal_the_reference(seed):
     wanted = joins(SLOW, paths, ids)
     assert [(int(track[a]), int(step[a])) for a in found.after] == [(name, at) for name, at, _ in wanted]
     np.testing.assert_allclose(
-        found.features, np.array([one for *_, one in wanted]).reshape(-1, 13), rtol=1e-6, atol=1e-9
+        found.features, np.array([one for *_, one in wanted]).reshape(-1, 15), rtol=1e-6, atol=1e-9
     )
-    pieces = cut(SLOW, paths, ids, 0.5)
+    pieces, wanted_cuts = cut(SLOW, paths, ids, 0.5)
     shuffled = rng.permutation(len(step))
-    made = cut_joins(MODEL, *(column[shuffled] for column in (step, track, source, xy)), STEP_S, 0.5)
+    made, cuts = cut_joins(MODEL, *(column[shuffled] for column in (step, track, source, xy)), STEP_S, 0.5)
     assert made.tolist() == [
         pieces[name][at] for name, at in zip(track[shuffled].tolist(), step[shuffled].tolist(), strict=True)
     ]
+    np.testing.assert_allclose(np.column_stack(cuts), np.array(wanted_cuts).reshape(-1, 3), rtol=1e-6, atol=1e-9)
+
+
+def test_pieces_that_linking_left_alone_go_together_again_if_that_is_likely():
+    """Of tracks 4, 7, 8 and 9: 4 is linked to 8, and 7 to nothing."""
+    cuts = Cuts(np.array([7, 4, 8]), np.array([9, 7, 4]), np.array([0.6, 0.69, 0.4]))
+    ids, linked = np.array([4, 7, 8, 9]), np.array([2, -1, -1, -1])
+    assert cuts.made_again(ids, linked, 0.5).tolist() == [2, 3, -1, -1]
+    assert cuts.made_again(ids, linked, 0.65).tolist() == [2, -1, -1, -1]
+    assert cuts.made_again(ids, linked, 0.3).tolist() == [2, 3, 0, -1]
+    assert cuts.made_again(ids, np.array([-1, -1, 3, -1]), 0.5).tolist() == [1, -1, 3, -1]
 
 
 def test_a_person_who_walks_straight_on_under_another_id_is_surely_the_same():

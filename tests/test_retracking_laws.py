@@ -103,7 +103,9 @@ def by_place(rows: Rows) -> Rows:
 @given(seed=SEEDS)
 @settings(max_examples=2)
 def test_crowds_far_apart_do_not_affect_each_other(method, seed):
-    """The noise is given and nothing is linked, because both are estimated from the whole log; so are ellipses."""
+    """The noise is given and nothing is linked, because both are estimated from the whole log; so are ellipses, and how
+    likely joins are.
+    """
     rng = np.random.default_rng(seed)
     method = replace(method, noise_m=0.15, link_s=0.0)
     one, two = noisy_tracks(rng, ticks=40), noisy_tracks(rng, ticks=40)
@@ -121,8 +123,8 @@ def test_crowds_far_apart_do_not_affect_each_other(method, seed):
                     renamed.setdefault(k, m) == m
                     for k, m in zip(b["track_id"].tolist(), a["track_id"].tolist(), strict=True)
                 )
-                ellipses = {} if "cov_xx_m2" not in a.dtype.names else {name: a[name] for name in DISTRIBUTION}
-                same(a, b, track_id=a["track_id"], **ellipses)
+                of_the_log = {name: a[name] for name in (*DISTRIBUTION, "probability") if name in a.dtype.names}
+                same(a, b, track_id=a["track_id"], **of_the_log)
         assert len(set(renamed.values())) == len(renamed)
 
 

@@ -48,7 +48,7 @@ Found = TypeVar("Found")
 FITTED = replace(DEFAULT, resolve_swaps=False)
 SEEDS, HELD, STEPS = (101, 102), (201,), 300
 #: Joins are judged in scenes of these seeds and so many steps.
-JUDGED, JUDGED_STEPS = (111,), 100
+JUDGED, JUDGED_STEPS = (111, 112, 113), 100
 #: A track is that of a person who is as near, by most of its first or last so many rows.
 GATE_M, ROWS = 1.0, 8
 #: The longest gap of pairs that weights are fitted on; and the least log odds of the best set of links.

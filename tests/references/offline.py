@@ -25,7 +25,9 @@ LINK_WEIGHTS = [LINKS[name] for name in LINK_NAMES]
 LINK_BIAS, LINK_USUAL, LINK_LEAST = (FITTED["links"][name] for name in ("bias", "usual", "least"))
 CUTS, CUT_BIAS = FITTED["cuts"]["weights"], FITTED["cuts"]["bias"]
 JOIN_NAMES = (*LINK_NAMES, "margin", "alternative", "taken over", "given away", "log before", "log after")
-JOIN_MARGIN, JOIN_BRIEF_S = 12.0, 1.0
+JOIN_NAMES = (*JOIN_NAMES, "log rate", "log elsewhere")
+JOIN_MARGIN, JOIN_BRIEF_S, JOIN_QUESTIONED, JOIN_RATE_SAMPLES = 12.0, 1.0, 0.7, 50
+Cut = tuple[int, int, float]  # the ids of both pieces, and the probability that they belong together
 PERSON_BIAS, BESIDE_M = FITTED["people"]["bias"], 1.2
 MEET_M, MARGIN, EXCHANGE_COST, SAME_ID, LEAST_GAIN = 2.0, 10, 4.0, 1.0, 1.0
 DRIFTS = (0.05, 0.15, 0.4)
@@ -149,10 +151,14 @@ def links(motion: Motion, paths: dict[int, Path], max_gap_s: float, least: float
     return {names[i]: names[j] for (i, j), odds in made.items() if sigmoid(odds + shift) > least}
 
 
-def linked(motion: Motion, paths: dict[int, Path], max_gap_s: float, least: float) -> dict[int, int]:
-    """The id of each track after linking: that of the first one in its chain."""
+def linked(motion: Motion, paths: dict[int, Path], max_gap_s: float, least: float, cuts: list[Cut]) -> dict[int, int]:
+    """The id of each track after linking: that of the first one in its chain. Pieces that are left go together again."""
     name = {track: track for track in paths}
     follows = links(motion, paths, max_gap_s, least)
+    taken = set(follows.values())
+    for before, after, likely in cuts:
+        if before not in follows and after not in taken and likely >= least:
+            follows[before] = after
     for track in sorted(follows, key=lambda t: min(paths[t])):
         name[follows[track]] = name[track]
     return name
@@ -201,6 +207,10 @@ def joins(motion: Motion, paths: dict[int, Path], ids: dict[int, dict[int, int]]
             features += [max(margin, -JOIN_MARGIN), float(margin < JOIN_MARGIN)]
             features += [float(at > 0 and had[at - 1][1] != name), float(since < len(has) and has[since][1] != name)]
             out.append((name, after, [*features, log(counts[0]), log(counts[1])]))
+    samples = sum(len(path) for path in paths.values())
+    elsewhere = sum(sum(features[9:11]) for *_, features in out)
+    for *_, features in out:
+        features += [log((len(out) + 1) / (samples + JOIN_RATE_SAMPLES)), log((elsewhere + 0.5) / (len(out) + 1))]
     return out
 
 
@@ -226,21 +236,25 @@ def source_changes(ids: dict[int, int], brief: float) -> list[tuple[int, int, tu
 
 def cut(
     motion: Motion, paths: dict[int, Path], ids: dict[int, dict[int, int]], least: float
-) -> dict[int, dict[int, int]]:
-    """The track of each step after tracks are cut at joins that are less likely to be right."""
+) -> tuple[dict[int, dict[int, int]], list[Cut]]:
+    """The track of each step after tracks are cut at joins that are less likely to be right; and the cuts."""
     following, cuts = max(paths, default=0), {}
     for name, step, features in joins(motion, paths, ids):
         odds = sum(CUTS[one] * value for one, value in zip(JOIN_NAMES, features, strict=True)) + CUT_BIAS
-        if sigmoid(odds) < least:
+        if sigmoid(odds) < max(JOIN_QUESTIONED, least):
             following += 1
-            cuts[name, step] = following
+            cuts[name, step] = following, sigmoid(odds)
     out: dict[int, dict[int, int]] = {}
+    pieces = []
     for name, path in paths.items():
         now = name
         for step in sorted(path):
-            now = cuts.get((name, step), now)
+            if (name, step) in cuts:
+                piece, likely = cuts[name, step]
+                pieces.append((now, piece, likely))
+                now = piece
             out.setdefault(name, {})[step] = now
-    return out
+    return out, sorted(pieces, key=lambda one: one[1])
 
 
 # Encounters: two people come near each other; were their track ids swapped?

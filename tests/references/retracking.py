@@ -118,11 +118,12 @@ def offline(claims: Claims, samples: list[list[Row]], steps: list[int], options,
     if o.link_s > 0:
         ids = {track: {step: row["track_id"] for step, row in path.items()} for track, path in paths.items()}
         pieces: dict[int, dict[int, Row]] = {}
-        for track, names in cut(motion, places_of(paths), ids, o.link_confidence).items():
+        after_cuts, cuts = cut(motion, places_of(paths), ids, o.link_confidence)
+        for track, names in after_cuts.items():
             for step, piece in names.items():
                 pieces.setdefault(piece, {})[step] = paths[track][step]
         paths = pieces
-        name = linked(motion, places_of(paths), o.link_s, o.link_confidence)
+        name = linked(motion, places_of(paths), o.link_s, o.link_confidence, cuts)
         joined: dict[int, dict[int, Row]] = {}
         for track, path in paths.items():
             joined.setdefault(name[track], {}).update(path)

@@ -23,7 +23,8 @@ from mcaptrack.transforms.retrack.weights import weights_of
 
 #: The features of a join: those of a link, and by how much it is likelier than the best alternative (see
 #: ``_alternatives``); whether there is one; whether another track had the samples of the new input id just before, and
-#: has those of the old one just after; and the logarithms of the numbers of samples that both last.
+#: has those of the old one just after; and the logarithms of the numbers of samples that both last. Two are the same
+#: for all joins of a log: how often input ids change in it, and how often other tracks have samples of the same ids.
 FEATURES: Final = (
     *linking.FEATURES,
     "margin",
@@ -32,11 +33,18 @@ FEATURES: Final = (
     "given away",
     "log before",
     "log after",
+    "log rate",
+    "log elsewhere",
 )
 #: Margins beyond this say no more; what is that much less likely is no alternative.
 _MARGIN: Final = 12.0
 #: Samples of another input track that last less, within one of the same input track, are no joins. Seconds.
 _BRIEF_S: Final = 1.0
+#: Joins that are right with less than this probability are questioned. (Linking also looks at who else ends and begins
+#: there, and most right ones are made again: with as few cuts as were wrong, more wrong joins would stay.)
+_QUESTIONED: Final = 0.7
+#: Samples that are added to those of a log before the rate of joins is taken.
+_RATE_SAMPLES: Final = 50
 #: The number of pairs that are examined at once.
 _BATCH: Final = 500_000
 #: Weights of joins of online tracks, which may be cut.
@@ -66,24 +74,45 @@ class Joins(NamedTuple):
     features: Floats
 
 
+class Cuts(NamedTuple):
+    """Tracks that were cut (J,): the ids of both pieces, and the probability that they belong together."""
+
+    before: Ints
+    after: Ints
+    probability: Floats
+
+    def made_again(self, ids: Ints, continued_by: Ints, min_confidence: float) -> Ints:
+        """The track that continues each of ``ids`` (K,), ascending, or -1: pieces that linking left alone go together
+        again, unless they do with a smaller probability than ``min_confidence``.
+        """
+        before, after = np.searchsorted(ids, self.before), np.searchsorted(ids, self.after)
+        is_free = (continued_by[before] < 0) & ~np.isin(after, continued_by)
+        again = is_free & (self.probability >= min_confidence)
+        out = continued_by.copy()
+        out[before[again]] = after[again]
+        return out
+
+
 def cut_joins(
     model: MotionModel, step: Ints, track: Ints, source: Ints, xy_m: Floats, step_s: float, min_confidence: float
-) -> Ints:
-    """The track of each assignment (C,) after tracks are cut at joins that are right with a smaller probability.
+) -> tuple[Ints, Cuts]:
+    """The track of each assignment (C,) after tracks are cut at questionable joins, and where they are cut.
 
-    What comes after a cut is a track of its own, for linking to decide about, with an id above all others.
+    Those are joins that are right with a smaller probability than ``_QUESTIONED`` or ``min_confidence``. What comes
+    after a cut is a track of its own, for linking to decide about, with an id above all others.
     """
     order = np.lexsort((step, track))
     tracked = tracked_of(model, step[order], track[order], source[order], xy_m[order], step_s)
     joins = find_joins(tracked, model, step_s)
-    cut = joins.after[cut_probability(joins.features) < min_confidence]
+    is_right = cut_probability(joins.features)
+    questioned = is_right < max(_QUESTIONED, min_confidence)
     begins = np.zeros(len(track), bool)
-    begins[cut] = True
+    begins[joins.after[questioned]] = True
     piece = np.maximum.accumulate(np.where(begins | run_starts(tracked.track), np.arange(len(track)), 0))
-    name = np.where(begins, int(track.max(initial=0)) + np.cumsum(begins), tracked.track)
+    name = np.where(begins, int(track.max(initial=0)) + np.cumsum(begins), tracked.track)[piece]
     out = np.empty_like(track)
-    out[order] = name[piece]
-    return out
+    out[order] = name
+    return out, Cuts(name[joins.before[questioned]], name[joins.after[questioned]], is_right[questioned])
 
 
 def tracked_of(model: MotionModel, step: Ints, track: Ints, source: Ints, xy_m: Floats, step_s: float) -> Tracked:
@@ -105,12 +134,16 @@ def find_joins(tracked: Tracked, model: MotionModel, step_s: float) -> Joins:
     goes_on = np.flatnonzero(tracked.track[first[1:]] == tracked.track[first[:-1]])
     before, after = last[goes_on], first[goes_on + 1]
     margin, alternative = _alternatives(tracked, model, before, after, step_s)
+    elsewhere = _elsewhere(tracked, before, after)
+    count = len(before)
     extra = (
         margin,
         alternative >= 0,
-        *_elsewhere(tracked, before, after),
+        *elsewhere,
         log_length[goes_on],
         log_length[goes_on + 1],
+        np.full(count, np.log((count + 1) / (len(tracked.track) + _RATE_SAMPLES))),
+        np.full(count, np.log((np.count_nonzero(elsewhere) + 0.5) / (count + 1))),
     )
     found = linking.features(model, *_sides(tracked, before, after, step_s))
     return Joins(before, after, alternative, np.column_stack([found, *extra]).astype(np.float64))
