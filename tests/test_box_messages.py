@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.foreign import MessageType
@@ -313,12 +314,28 @@ def test_derived_objects_have_a_shape_and_a_certainty_out_of_255_and_move_if_the
     ]
     message = writer.new("derived_object_msgs/ObjectArray", header(writer, START_NS, "map"), objects)
     found = read(writer, message, encoding)
-    assert [box.size for box in found.boxes] == [(4, 2, 1.5), (0.5, 0.5, 1.75), (1, 1, 1)]
-    assert [box.class_name for box in found.boxes] == ["car", "pedestrian", ""]
-    np.testing.assert_array_equal([box.score for box in found.boxes], [0.8, 1.0, np.nan])
-    assert [box.source_id for box in found.boxes] == [40, 41, 42]
-    np.testing.assert_array_equal([box.velocity for box in found.boxes], [[5, 6, 7], [np.nan] * 3, [5, 6, 7]])
-    assert found.ignored == {"objects without a shape": 2}
+    sizes = [(4, 2, 1.5), (0.5, 0.5, 1.75), (1, 1, 1), *[(np.nan,) * 3] * 2]  # radars know no shape
+    np.testing.assert_array_equal([box.size for box in found.boxes], sizes)
+    assert [box.class_name for box in found.boxes] == ["car", "pedestrian", "", "truck", "truck"]
+    np.testing.assert_allclose([box.score for box in found.boxes], [0.8, 1.0, np.nan, 100 / 255, 1 / 255])
+    assert [box.source_id for box in found.boxes] == [40, 41, 42, 43, 44]
+    moving = [[5, 6, 7], [np.nan] * 3, *[[5, 6, 7]] * 3]
+    np.testing.assert_array_equal([box.velocity for box in found.boxes], moving)
+    assert {box.centre for box in found.boxes} == {tuple(SEEN.centre)}
+    assert found.ignored == {}
+
+
+def test_derived_objects_without_a_shape_have_the_box_around_their_polygon():
+    writer = ros("derived_object_msgs/ObjectArray", DERIVED)
+    turn = Rotation.from_euler("z", 0.5)
+    corners = turn.apply([(2, 1, 0), (2, -1, 0), (-2, -1, 0), (-2, 0.5, 0)]) + [7, 8, 0]
+    one = derived(writer, 0, [], 6, 255)
+    one.pose.orientation = point(writer, turn.as_quat(), "Quaternion")
+    one.polygon.points = [point(writer, corner, "Point32") for corner in corners]
+    message = writer.new("derived_object_msgs/ObjectArray", header(writer, START_NS, "map"), [one])
+    (box,) = read(writer, message, "cdr").boxes
+    np.testing.assert_allclose(box.size, [4, 2, np.nan], atol=1e-5)
+    np.testing.assert_allclose(box.centre, [7, 8, 0], atol=1e-5)
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "json"])

@@ -181,14 +181,17 @@ def test_markers_that_are_no_cubes_are_counted_and_lists_of_cubes_are_boxes():
         marker(writer, START_NS, SEEN, kind=1, action=2),
         marker(writer, START_NS + 4, SEEN, space="lidar/van", text="12: 0.25"),
         marker(writer, START_NS, SEEN, space="", text="no number here"),
+        marker(writer, START_NS, SEEN, space="track_17", text="car"),
+        marker(writer, START_NS, SEEN, space="5"),
+        marker(writer, START_NS, SEEN, space="type_2"),
     ]
     found = boxes_of(writer, writer.new("visualization_msgs/MarkerArray", markers))
     np.testing.assert_allclose(
-        [box.centre for box in found.boxes], [[1, 3, 3], [-1, 2, 3], [1, 2, 3], [1, 2, 3]], atol=1e-12
+        [box.centre for box in found.boxes], [[1, 3, 3], [-1, 2, 3], *[[1, 2, 3]] * 5], atol=1e-12
     )
-    assert [box.class_name for box in found.boxes] == ["truck", "truck", "van", "no"]
-    np.testing.assert_allclose([box.score for box in found.boxes], [0.87, 0.87, 0.25, np.nan])
-    assert [box.source_id for box in found.boxes] == [None, None, 12, 12]
+    assert [box.class_name for box in found.boxes] == ["truck", "truck", "van", "no", "car", "", "type_2"]
+    np.testing.assert_allclose([box.score for box in found.boxes], [0.87, 0.87, 0.25, np.nan, np.nan, 0.5, 0.5])
+    assert [box.source_id for box in found.boxes] == [None, None, *[12] * 5]
     assert found.boxes[2].stamp_ns == START_NS + 4
     assert found.ignored == {"markers that are no cubes": 1}
     one = ros("visualization_msgs/Marker")
@@ -427,6 +430,21 @@ def test_boxes_without_a_stamp_are_counted(tmp_path):
     assert len(found.frames) == 4
     words = "have no stamp, or one that is more than 60 s from the log time: their time is the log time"
     assert f"/lidar/boxes: 12 of 12 boxes {words}" in warnings
+
+
+def test_boxes_without_a_class_and_a_clock_that_is_set_back_are_said(tmp_path):
+    robot = Robot(shots=7)
+
+    def made(stamp_ns, boxes):
+        update = scene_update(stamp_ns - (2 * 10**8 if stamp_ns >= robot.shots[5].stamp_ns else 0), boxes)
+        del update.entities[0].metadata[:]
+        return update.SerializeToString()
+
+    found, said = read(write(tmp_path / "a.mcap", robot, by_foxglove(made)))
+    assert [len(frame.rows) for frame in found.frames] == [3, 3, 3, 6, 6]
+    assert "/lidar/boxes: 7 of 21 boxes have no class, or 0: they move as objects of unknown class do" in said
+    words = "times have boxes of several messages, where others have those of one, as if a clock was set back"
+    assert f"/lidar/boxes: 2 of 5 {words}: they count as one frame" in said
 
 
 def test_a_frame_that_moves_is_said(tmp_path):

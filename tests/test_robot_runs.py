@@ -18,7 +18,7 @@ from mcaptrack.foxglove import class_colour
 from mcaptrack.schema import TRACKS
 from mcaptrack.sources import fixed_frame
 from mcaptrack.viewing.report import gather, page
-from tests.commands import done
+from tests.commands import call, done
 from tests.robot_runs import OBJECTS, passing_robot, place, write_passing
 
 #: Enough for predictions with a known future, 4.8 s ahead.
@@ -224,3 +224,10 @@ def test_errors_of_predictions_are_those_of_each_class_alone(passed):
     assert [tuple(line.split()[:2]) for line in table[1:4]] == [
         ("/lidar/samples", "all" if name is None else name) for name in rows
     ]
+
+
+@pytest.mark.parametrize("second", [("--topic", "/radar/boxes"), ("--topic=/radar/boxes",)])
+def test_a_second_topic_is_refused_instead_of_the_first_being_ignored(second):
+    found = call("run", "robot.mcap", "--topic", "/lidar/boxes", *second)
+    assert found.code == 2
+    assert "--topic is given as /lidar/boxes and as /radar/boxes; give one" in found.err

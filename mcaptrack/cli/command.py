@@ -134,8 +134,12 @@ class Command(TyperCommand):
             return self._parse(ctx, args)
 
     def _parse(self, ctx: Any, args: list[str]) -> list[str]:
+        given = list(args)  # parsing may take words away
         with _usage_in_one_line(self.name or ""):
             left = super().parse_args(ctx, args)
+        for option in self.params:
+            if option.name == "topic" and not option.multiple:
+                _refuse_several(given, option.opts)
         if not ctx.resilient_parsing:
             found = found_of(self.name or "")
             self.rename(ctx.params, lambda parameter: _rank(ctx, parameter, found), ctx.params.get("quiet"))
@@ -182,14 +186,27 @@ class Command(TyperCommand):
         return f"options: {', '.join(parts)}"
 
 
+def _refuse_several(words: Sequence[str], options: Sequence[str]) -> None:
+    """Refuse several values of an option that takes one: the last would count, and the others be ignored."""
+    names = {value: None for option in options for value in _values_of(words, option)}
+    if len(names) > 1:
+        refuse_usage(f"{options[0]} is given as {' and as '.join(names)}; give one, and call the command once for each")
+
+
 def _value_of(words: Sequence[str], option: str) -> str:
     """Return the value of an option on a command line that may be wrong; "" without one."""
+    return next(_values_of(words, option), "")
+
+
+def _values_of(words: Sequence[str], option: str) -> Iterator[str]:
+    """Yield the values of an option on a command line that may be wrong."""
     for number, word in enumerate(words):
+        if word == "--":
+            return
         if word == option:
-            return "".join(words[number + 1 : number + 2])
-        if word.startswith(f"{option}="):
-            return word.partition("=")[2]
-    return ""
+            yield "".join(words[number + 1 : number + 2])
+        elif word.startswith(f"{option}="):
+            yield word.partition("=")[2]
 
 
 class Reading(Command):

@@ -22,6 +22,7 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.transform_tree import TransformTree, plain_frame, turned
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, SCORES_NEEDED, Frame, Rows
+from mcaptrack.schema.classes import UNKNOWN
 from mcaptrack.schema.provenance import frame_id_of, input_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.foreign.boxes_3d.recorded import Recorded3d, recorded
@@ -111,6 +112,12 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
         listed = ", ".join(map(str, nameless[:_LISTED])) + (", ..." if len(nameless) > _LISTED else "")
         words = "1 counts as people, and others move as objects of unknown class do"
         warn(f"{opened.path}: classes of {topic} are numbers without names ({listed}): {words}", "classes")
+    if unclassed := int((rows["class_id"] == UNKNOWN).sum()):
+        words = "boxes have no class, or 0: they move as objects of unknown class do"
+        warn(f"{opened.path}: {topic}: {unclassed:,} of {len(rows):,} {words}", "classes")
+    if not assumed and (several := found.of_several_messages(frame)):
+        words = "times have boxes of several messages, where others have those of one, as if a clock was set back"
+        warn(f"{opened.path}: {topic}: {several:,} of {len(start_ns):,} {words}: they count as one frame", "clock")
     order = np.argsort(frame, kind="stable")
     parts = np.split(rows[order], np.searchsorted(frame[order], np.arange(1, len(start_ns))))
     kept = np.flatnonzero(~is_left_out).tolist()

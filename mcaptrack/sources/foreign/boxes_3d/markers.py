@@ -25,7 +25,8 @@ from mcaptrack.sources.foreign.values import integer, text
 _CUBE, _CUBE_LIST, _TEXT, _ADD = 1, 6, 9, 0
 #: Namespaces that say nothing about the class of their markers.
 _GENERIC: Final = re.compile(
-    r"(b(ounding)?_?box(es)?|(basic_?)?shapes?|(box|cube|detection|marker|object|obstacle|track)(e?s)?|ns)(_?array)?|\W*"
+    r"((b(ounding)?_?box(es)?|(basic_?)?shapes?|(box|cluster|cube|detection|id|marker|object|obstacle|track)(e?s)?|ns)"
+    r"(_?array)?[\W_]*\d*|[\W\d_]*)"
 )
 
 

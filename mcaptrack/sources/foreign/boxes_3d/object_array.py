@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import nan
+from math import isnan, nan
 from typing import Any, Final
 
 from mcaptrack.sources.foreign.boxes_3d.box import (
@@ -17,6 +17,7 @@ from mcaptrack.sources.foreign.boxes_3d.box import (
     own_head,
     part,
     quaternion,
+    rotated,
     vector,
 )
 from mcaptrack.sources.foreign.values import integer
@@ -46,20 +47,13 @@ _BOX, _SPHERE, _CYLINDER, _CONE = 1, 2, 3, 4
 
 
 def boxes_of(message: Any) -> Message3d:
-    """The objects of a message that have a shape."""
+    """The objects of a message. Those without a shape, as of radars, have the size of their polygon, or none."""
     head = head_of(message)
-    out = Message3d(*head)
-    for one in message.objects:
-        size = _size(one.shape)
-        if size is None:
-            out.ignored["objects without a shape"] += 1
-        else:
-            out.boxes.append(_box(one, head, size))
-    return out
+    return Message3d(*head, [_box(one, head) for one in message.objects])
 
 
-def _size(shape: Any) -> Vector | None:
-    """The size of the box around a shape; None if it has none."""
+def _size(shape: Any) -> Vector:
+    """The size of the box around a shape; NaN if it has none."""
     kind, lengths = integer(shape.type), [number(one) for one in shape.dimensions]
     if kind == _BOX and len(lengths) >= 3:
         return lengths[0], lengths[1], lengths[2]
@@ -67,15 +61,25 @@ def _size(shape: Any) -> Vector | None:
         return 2 * lengths[0], 2 * lengths[0], 2 * lengths[0]
     if kind in (_CYLINDER, _CONE) and len(lengths) >= 2:  # height and radius
         return 2 * lengths[1], 2 * lengths[1], lengths[0]
-    return None
+    return UNKNOWN_VECTOR
 
 
-def _box(one: Any, around: tuple[int, str], size: Vector) -> Box3d:
+def _box(one: Any, around: tuple[int, str]) -> Box3d:
     certainty = integer(one.classification_certainty)
+    centre, orientation, size = vector(one.pose.position), quaternion(part(one.pose, "orientation")), _size(one.shape)
+    if isnan(size[0]) and (points := [vector(point) for point in part(part(one, "polygon"), "points") or ()]):
+        x, y, z, w = orientation
+        along = [rotated((-x, -y, -z, w), point) for point in points]  # the polygon is in the frame of the message
+        low, high = ([pick(point[axis] for point in along) for axis in range(3)] for pick in (min, max))
+        middle = tuple((a + b) / 2 for a, b in zip(low, high, strict=True))
+        centre, size = (
+            rotated(orientation, (middle[0], middle[1], middle[2])),
+            (high[0] - low[0], high[1] - low[1], nan),
+        )
     return Box3d(
         *own_head(one, around),
-        vector(one.pose.position),
-        quaternion(part(one.pose, "orientation")),
+        centre,
+        orientation,
         size,
         named(enumeration(one, _PREFIX) or _CLASSES, one.classification),
         certainty / _CERTAIN if certainty else nan,

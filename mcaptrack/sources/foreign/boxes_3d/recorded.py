@@ -108,6 +108,17 @@ class Recorded3d:
         out[some[order[1:]]] = ((before == after) | (np.isnan(before) & np.isnan(after))).all(axis=1)
         return out
 
+    def of_several_messages(self, frame: Ints) -> int:
+        """The number of frames with boxes of several messages, if most have those of one; boxes are in ``frame`` (N,).
+
+        0 where each message has one box: then they are parts of a frame.
+        """
+        many = max(len(self.message_ns), 1)
+        if np.bincount(self.message, minlength=1).max() < 2:
+            return 0
+        counts = np.unique(np.unique(frame * many + self.message) // many, return_counts=True)[1]
+        return int((counts > 1).sum()) if np.median(counts) < 2 else 0
+
     def frames(self) -> tuple[Ints, Ints, str]:
         """The times of F frames in ns (F,), increasing, the frame of each box (N,), and what was assumed, in words.
 
