@@ -261,6 +261,19 @@ def test_credentials_come_from_a_profile_and_are_never_shown(store, bare, monkey
     assert "AKID" not in err
 
 
+def test_what_the_store_refuses_is_named(store, bare):
+    url = store.put("a.mcap", bare)
+    refused = "can't be read: the store refuses it to these credentials (forbidden)"
+    with store.failing(lambda _: "denied"):
+        for command in ("check", "info"):
+            assert call(command, url) == (1, "", f"mcaptrack: {url} {refused}\n")
+    url = url.replace("a.mcap", "a.results.mcap")
+    hint = "it may be absent, which S3 tells only to those with s3:ListBucket"
+    with store.failing(lambda request: "denied" if request.key == "a.results.mcap" else ""):
+        for command in ("check", "info"):
+            assert call(command, "s3://bucket/a.mcap") == (1, "", f"mcaptrack: {url} {refused}; {hint}\n")
+
+
 def test_a_log_in_a_store_is_recovered_to_a_file(store, template):
     url = store.put("a.mcap", template.read_bytes()[:-2000])
     assert call("check", url).code == 1

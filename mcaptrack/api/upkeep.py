@@ -91,14 +91,11 @@ def check(log: PathLike, *, progress: Progress = no_progress) -> LogCheck:
     """
     path = log_location(log)
     with warnings_about(path) as warnings:
-        files = tuple(logs.check(part, progress) for part in files_of(path))
-    return LogCheck(path, files, tuple(dict.fromkeys(warnings)))
-
-
-def files_of(log: Location) -> list[Location]:
-    """Return the files of a log: itself, and its results if they stand beside it."""
-    results = logs.find_results(log)
-    return [log] if results is None else [log, results]
+        files = [logs.check(path, progress)]  # before its results, so that errors of a store name the log
+        results = logs.find_results(path)
+        if results is not None:
+            files.append(logs.check(results, progress))
+    return LogCheck(path, tuple(files), tuple(dict.fromkeys(warnings)))
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ def reporting_faults(url: Url, done: str = "read") -> Iterator[None]:
     except exceptions.PreconditionError:
         raise replaced(url) from None
     except exceptions.PermissionDeniedError as error:
-        why = meaning_of(url, error) or FORBIDDEN
+        why = meaning_of(url, error) or f"{FORBIDDEN}{_absent_hint(url) if done == 'read' else ''}"
         raise McaptrackError(f"{url} can't be {done}: {why}") from None
     except exceptions.UnauthenticatedError as error:
         why = meaning_of(url, error) or "the store asks for other credentials"
@@ -104,13 +104,19 @@ def reason(url: Url, error: Exception) -> str:
     if breaks_off(error):
         return "the answer of the store breaks off"
     if "status code: 403" in said:
-        return FORBIDDEN
+        return f"{FORBIDDEN}{_absent_hint(url)}"
     if any(words in said for words in ("timed out", "TimedOut", "timeout")):
         return "the store does not answer in time"
     status = re.search(r"status code: (\d\d\d [A-Za-z ]+)", said)
     if status and status[1].startswith("400"):  # to a request for the head of an object, S3 can't say why
         return f"the store answers {status[1].strip()}; the credentials may have expired"
     return f"the store answers {status[1].strip()}" if status else said[:200]
+
+
+def _absent_hint(url: Url) -> str:
+    """For results, which may be absent: S3 tells only those who may list the bucket."""
+    is_hidden = url.scheme == "s3" and ".results." in url.name
+    return "; it may be absent, which S3 tells only to those with s3:ListBucket" if is_hidden else ""
 
 
 def _credentials_hint(url: Url) -> str:
