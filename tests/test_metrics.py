@@ -10,8 +10,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaptrack.evaluation.metrics import Matchup, clear, combine, distances, metres_to_similarity, score, summary
+from mcaptrack.evaluation.metrics import (
+    Matchup,
+    clear,
+    combine,
+    distances,
+    metres_to_similarity,
+    recalls,
+    score,
+    summary,
+)
+from mcaptrack.evaluation.metrics import identity as one_identity
 from mcaptrack.evaluation.metrics.displacement import combine_displacements, displacement
+from mcaptrack.evaluation.metrics.matchup import SparseTables
 from mcaptrack.geometry.boxes import iou
 from tests.forecasts import forecasts, positions, predicted
 
@@ -32,6 +43,13 @@ def matchup(truth, tracks, gate: float = 1.0) -> Matchup:
         len(true_ids),
         len(track_ids),
     )
+
+
+def sparse(dense: Matchup) -> Matchup:
+    """The same with tables of which only the similarities above 0 are stored."""
+    frame, row, column, _, _, similarity = dense.pairs
+    ends = (np.cumsum([0, *counts]) for counts in (dense.ground_truth_counts, dense.track_counts))
+    return replace(dense, similarity=SparseTables(frame, row, column, similarity, *ends))
 
 
 ONE = [{1: float(n)} for n in range(10)]
@@ -139,6 +157,30 @@ def made(draw) -> list[tuple[dict[int, float], dict[int, float]]]:
 
 
 FRAMES = made()
+
+
+@pytest.mark.parametrize("rules", ["trackeval", "motmetrics"])
+def test_tables_that_are_stored_sparsely_give_the_same_scores(rules, monkeypatch):
+    rng = np.random.default_rng(3)
+    frames = [
+        [{int(one): float(rng.uniform(0, 6)) for one in rng.permutation(9)[: rng.integers(0, 8)]} for _ in range(40)]
+        for _ in range(2)
+    ]
+    dense = matchup(*frames)
+    other = sparse(dense)
+    assert len(other.similarity) == len(dense.similarity)
+    for one, two in zip(other.similarity, dense.similarity, strict=True):
+        np.testing.assert_array_equal(one, two)
+    wanted = score(dense, rules)
+    kept = np.arange(9) % 3 > 0
+    some = [summary(score(recalls._of_tracks(one, kept), rules)) for one in (dense, other)]
+    assert some[0] == some[1]
+    assert some[0]["FP"] < summary(wanted)["FP"]
+    monkeypatch.setitem(one_identity.__globals__, "_LARGE", 0)
+    found = score(other, rules)
+    assert found.counts == wanted.counts
+    for name, values in wanted.hota.items():
+        np.testing.assert_array_equal(found.hota[name], values)
 
 
 @given(FRAMES)

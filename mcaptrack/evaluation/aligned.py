@@ -13,6 +13,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import metrics
 from mcaptrack.evaluation.metrics import Matchup
+from mcaptrack.evaluation.metrics.matchup import SparseTables
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes, iou_of_pairs
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
@@ -39,7 +40,7 @@ _FAR_M: Final = 5.0
 _STANDING_M: Final = 0.5
 _OVERLAPS: Final = {"iou": iou_of_pairs, "bev-iou": bev_iou_of_pairs, "3d-iou": iou_3d_of_pairs}
 #: The number of pairs of boxes compared at once, to limit memory.
-_PAIRS_AT_ONCE: Final = 1_000_000
+_PAIRS_AT_ONCE: Final = 250_000
 #: The columns that each similarity needs, and what they are in messages.
 _NEEDED: Final[dict[Similarity, tuple[str, ...]]] = {
     "iou": ("x_px",),
@@ -182,16 +183,19 @@ def compare_rows(
     """Like `make_matchup`, with the rows that were compared; ``by_class``: rows of different classes are not alike."""
     people, found = (_locate(part, similarity) for part in (ground_truth, tracks))
     a, b = (_places(part.rows, similarity) for part in (people, found))
-    alike: list[Floats] = []
+    classes = (people.rows["class_id"], found.rows["class_id"]) if by_class else None
+    none = np.empty(0, np.intp)
+    parts = [(none, none, none, np.empty(0))]
     step = max(1, round(_PAIRS_AT_ONCE / max(1.0, len(a) * len(b) / max(1, len(ground_truth)) ** 2)))
     for first in range(0, len(ground_truth), step):
         ends = (people.ends[first : first + step + 1], found.ends[first : first + step + 1])
-        classes = (people.rows["class_id"], found.rows["class_id"]) if by_class else None
-        alike += _similarities(a, b, *ends, similarity, gate, classes)
+        frame, row, column, alike = _similarities(a, b, *ends, similarity, gate, classes)
+        parts.append((frame + first, row, column, alike))
+    frame, row, column, alike = (np.concatenate(part) for part in zip(*parts, strict=True))
     matched = Matchup(
         tuple(np.split(people.track, people.ends[1:-1])),
         tuple(np.split(found.track, found.ends[1:-1])),
-        tuple(alike),
+        SparseTables(frame, row, column, alike, people.ends, found.ends),
         0.5 if similarity == "metres" else gate,
         len(people.ids),
         len(found.ids),
@@ -224,13 +228,13 @@ def _similarities(
     similarity: Similarity,
     gate: float,
     classes: tuple[Ints, Ints] | None,
-) -> list[Floats]:
-    """The similarities of boxes or positions ``a`` and ``b`` in some frames, (G, H) for each; all pairs at once.
+) -> tuple[Ints, Ints, Ints, Floats]:
+    """The pairs of boxes or positions ``a`` and ``b`` in some frames that are alike: their frames, counted from the
+    first of these, their numbers in ``a`` and ``b``, and their similarities above 0.
 
     Pairs of different ``classes`` have none.
     """
-    people, found = np.diff(a_ends), np.diff(b_ends)
-    _, row, column = cross_pairs(people, found)
+    frame, row, column = cross_pairs(np.diff(a_ends), np.diff(b_ends))
     row, column = row + a_ends[0], column + b_ends[0]
     if similarity != "metres":
         alike = _OVERLAPS[similarity](a[row], b[column])
@@ -239,5 +243,5 @@ def _similarities(
         alike = metrics.metres_to_similarity(np.hypot(apart[:, 0], apart[:, 1]), gate)
     if classes is not None:
         alike = np.where(classes[0][row] == classes[1][column], alike, 0.0)
-    parts = np.split(alike, np.cumsum(people * found)[:-1])
-    return [part.reshape(g, h) for part, g, h in zip(parts, people.tolist(), found.tolist(), strict=True)]
+    at = alike.nonzero()[0]
+    return frame[at], row[at], column[at], alike[at]

@@ -51,13 +51,25 @@ def hota(matchup: Matchup) -> dict[str, NDArray[np.float64]]:
     track_count = np.bincount(matchup.all_tracks, minlength=n_tracks)
     of_row, of_column = np.bincount(pairs.row, pairs.similarity), np.bincount(pairs.column, pairs.similarity)
     share = pairs.similarity / (of_column[pairs.column] + of_row[pairs.row] - pairs.similarity)
-    cell = pairs.person * n_tracks + pairs.track
-    shared = np.bincount(cell, share, minlength=n_ground_truth * n_tracks).reshape(n_ground_truth, n_tracks)
-    alignment = shared / np.maximum(truth_count[:, None] + track_count[None, :] - shared, _EPS)
+    # Only people and tracks that are alike in some frame have an alignment: a table of all would be far larger.
+    cell, of_pair = np.unique(pairs.person * n_tracks + pairs.track, return_inverse=True)
+    shared = np.bincount(of_pair, share, minlength=len(cell))
+    together = truth_count[cell // max(1, n_tracks)] + track_count[cell % max(1, n_tracks)]
+    gain = (shared / np.maximum(together - shared, _EPS))[of_pair] * pairs.similarity
+    ends = np.searchsorted(pairs.frame, np.arange(len(matchup.ground_truth) + 1))
+    row_ends, column_ends = (np.cumsum(counts) for counts in (matchup.ground_truth_counts, matchup.track_counts))
 
     def solve_frame(number: int, *_: object) -> tuple[Indices, Indices]:
-        persons, tracks = matchup.ground_truth[number], matchup.tracks[number]
-        return solve(-(alignment[persons[:, None], tracks] * matchup.similarity[number]))
+        people, tracks, here = (
+            len(matchup.ground_truth[number]),
+            len(matchup.tracks[number]),
+            slice(*ends[number : number + 2]),
+        )
+        table = np.zeros((people, tracks))
+        table[pairs.row[here] - row_ends[number] + people, pairs.column[here] - column_ends[number] + tracks] = gain[
+            here
+        ]
+        return solve(-table)
 
     found = matchup.assigned(pairs, solve_frame)
     # The number of thresholds that each match passes; from that, the matches that pass each threshold.

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from mcaptrack.evaluation.metrics.matchup import Matchup
-from mcaptrack.geometry.assignment import solve
+from mcaptrack.geometry.assignment import assign_pairs_by_gain, solve
+
+#: Larger tables of people and tracks are not made: most of their pairs never meet.
+_LARGE: Final = 100_000
 
 
 def identity(matchup: Matchup) -> dict[str, float]:
@@ -41,9 +46,13 @@ def identity(matchup: Matchup) -> dict[str, float]:
     pairs = matchup.pairs
     near = pairs.similarity >= matchup.threshold
     cell = pairs.person[near] * matchup.n_tracks + pairs.track[near]
-    together = np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape).astype(float)
     hits = 0.0
-    if together.size:
-        rows, columns = solve(-together)
-        hits = float(together[rows, columns].sum())
+    if shape[0] * shape[1] > _LARGE:
+        cells, together = np.unique(cell, return_counts=True)
+        _, frames = assign_pairs_by_gain((cells // shape[1], cells % shape[1]), together.astype(float), shape)
+        hits = float(frames.sum())
+    elif shape[0] * shape[1]:
+        table = np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape).astype(float)
+        rows, columns = solve(-table)
+        hits = float(table[rows, columns].sum())
     return {"IDTP": hits, "IDFN": matchup.ground_truth_rows - hits, "IDFP": matchup.track_rows - hits}

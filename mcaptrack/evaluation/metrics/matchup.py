@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,71 @@ class RowPairs(NamedTuple):
         return contested
 
 
+class SparseTables(Sequence[Floats]):
+    """The similarities of all frames, of which only those above 0 are stored: 32 bytes a pair.
+
+    As a sequence it has the table (G, H) of each frame.
+
+    Parameters
+    ----------
+    frame, row, column : int arrays (P,)
+        Pairs ordered by frame, row and column; rows and columns are numbered over all frames.
+    similarity : array (P,)
+        Their similarities, above 0.
+    row_ends, column_ends : int arrays (F + 1,)
+        Where the rows and the columns of each of F frames begin, and the last ones end.
+    """
+
+    def __init__(
+        self,
+        frame: Indices,
+        row: Indices,
+        column: Indices,
+        similarity: Floats,
+        row_ends: Indices,
+        column_ends: Indices,
+    ) -> None:
+        self.frame, self.row, self.column, self.similarity = frame, row, column, similarity
+        self._row_ends, self._column_ends = row_ends, column_ends
+        self._ends = np.searchsorted(frame, np.arange(len(row_ends)))
+        self._last = -1
+        self._table = np.empty((0, 0))
+
+    def __len__(self) -> int:
+        return len(self._row_ends) - 1
+
+    @overload
+    def __getitem__(self, number: int, /) -> Floats: ...
+
+    @overload
+    def __getitem__(self, number: slice, /) -> list[Floats]: ...
+
+    def __getitem__(self, number: int | slice, /) -> Floats | list[Floats]:
+        if isinstance(number, slice):
+            return [self[one] for one in range(len(self))[number]]
+        number = range(len(self))[number]
+        if number != self._last:
+            (top, bottom), (left, right) = self._row_ends[number : number + 2], self._column_ends[number : number + 2]
+            here = slice(*self._ends[number : number + 2])
+            self._table = np.zeros((bottom - top, right - left))
+            self._table[self.row[here] - top, self.column[here] - left] = self.similarity[here]
+            self._last = number
+        return self._table
+
+    def of_columns(self, kept: NDArray[np.bool_]) -> SparseTables:
+        """The tables with some of the columns of all frames (C,)."""
+        before = np.concatenate([[0], np.cumsum(kept)])
+        pair = kept[self.column]
+        return SparseTables(
+            self.frame[pair],
+            self.row[pair],
+            before[self.column[pair]],
+            self.similarity[pair],
+            self._row_ends,
+            before[self._column_ends],
+        )
+
+
 SolveFrame = Callable[[int, RowPairs, int, int], tuple[Indices, Indices]]
 
 
@@ -56,7 +121,7 @@ class Matchup:
     ----------
     ground_truth, tracks : tuple of int arrays (G,) and (H,)
         For each frame the ids that are present, numbered densely from 0. No id occurs twice in a frame.
-    similarity : tuple of arrays (G, H)
+    similarity : tuple of arrays (G, H), or SparseTables
         For each frame the similarity of people and tracks, from 0 (unlike) to 1 (equal).
     threshold : float
         Pairs at least this similar can be matched.
@@ -77,7 +142,7 @@ class Matchup:
 
     ground_truth: tuple[Indices, ...]
     tracks: tuple[Indices, ...]
-    similarity: tuple[Floats, ...]
+    similarity: Sequence[Floats]
     threshold: float
     n_ground_truth: int
     n_tracks: int
@@ -115,10 +180,15 @@ class Matchup:
     @cached_property
     def pairs(self) -> RowPairs:
         """The pairs with a similarity above 0."""
-        similarity = self._all_similarity
-        at = similarity.nonzero()[0]
-        frame, row, column = (part[at] for part in cross_pairs(self.ground_truth_counts, self.track_counts))
-        return RowPairs(frame, row, column, self.all_ground_truth[row], self.all_tracks[column], similarity[at])
+        if isinstance(self.similarity, SparseTables):
+            given = self.similarity
+            frame, row, column, similarity = given.frame, given.row, given.column, given.similarity
+        else:
+            of_all = np.concatenate([np.empty(0), *(part.ravel() for part in self.similarity)])
+            at = of_all.nonzero()[0]
+            frame, row, column = (part[at] for part in cross_pairs(self.ground_truth_counts, self.track_counts))
+            similarity = of_all[at]
+        return RowPairs(frame, row, column, self.all_ground_truth[row], self.all_tracks[column], similarity)
 
     def assigned(self, candidates: RowPairs, solve_frame: SolveFrame) -> RowPairs:
         """Assign rows to columns in each frame, among the candidates; pairs come in no particular order.
@@ -131,26 +201,21 @@ class Matchup:
         hard[candidates.frame[candidates.contested()]] = True
         easy, numbers = candidates.where(~hard[candidates.frame]), hard.nonzero()[0]
         ends = np.searchsorted(easy.frame, numbers)
-        found: list[tuple[Indices, Indices]] = []
+        found: list[tuple[Indices, Indices, Floats]] = []
         low = 0
         for number, high in zip(numbers.tolist(), ends.tolist(), strict=True):
-            found.append(solve_frame(number, easy, low, high))
+            rows, columns = solve_frame(number, easy, low, high)
+            found.append((rows, columns, self.similarity[number][rows, columns]))
             low = high
         if not found:
             return easy
-        frame = np.repeat(numbers, [len(rows) for rows, _ in found])
-        rows, columns = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        frame = np.repeat(numbers, [len(rows) for rows, *_ in found])
+        rows, columns, similarity = (np.concatenate(parts) for parts in zip(*found, strict=True))
         people, tracks = self.ground_truth_counts, self.track_counts
         row = (np.cumsum(people) - people)[frame] + rows
         column = (np.cumsum(tracks) - tracks)[frame] + columns
-        size = people * tracks
-        similarity = self._all_similarity[(np.cumsum(size) - size)[frame] + rows * tracks[frame] + columns]
         assigned = RowPairs(frame, row, column, self.all_ground_truth[row], self.all_tracks[column], similarity)
         return RowPairs(*(np.concatenate(both) for both in zip(easy, assigned, strict=True)))
-
-    @cached_property
-    def _all_similarity(self) -> Floats:
-        return np.concatenate([np.empty(0), *(part.ravel() for part in self.similarity)])
 
 
 def _joined(ids: Sequence[Indices]) -> Indices:

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from mcaptrack.evaluation.metrics.clear import Rules, is_switch, matches
-from mcaptrack.evaluation.metrics.matchup import Matchup
+from mcaptrack.evaluation.metrics.matchup import Matchup, SparseTables
 from mcaptrack.geometry.arrays import Bools, Floats
 
 #: The number of recalls.
@@ -138,10 +138,13 @@ def _of_tracks(matchup: Matchup, kept: Bools) -> Matchup:
     if kept.all():
         return matchup
     there = [kept[tracks] for tracks in matchup.tracks]
+    alike = matchup.similarity
     return Matchup(
         matchup.ground_truth,
         tuple(tracks[one] for tracks, one in zip(matchup.tracks, there, strict=True)),
-        tuple(similarity[:, one] for similarity, one in zip(matchup.similarity, there, strict=True)),
+        alike.of_columns(kept[matchup.all_tracks])
+        if isinstance(alike, SparseTables)
+        else tuple(similarity[:, one] for similarity, one in zip(alike, there, strict=True)),
         matchup.threshold,
         matchup.n_ground_truth,
         matchup.n_tracks,
