@@ -348,3 +348,22 @@ def test_summary_offsets_are_in_the_summary_and_name_its_groups(tmp_path):
     ):  # fmt: skip
         summarised(path, *records, *listed, offsets=size)
         assert findings(path) == found
+
+
+def test_a_summary_that_lacks_the_schema_of_one_of_its_channels_is_not_believed(tmp_path):
+    """As many schemas as there are, but not those: the data section says which schema the second channel has."""
+    more = [schema(3, "Other"), channel(4, 3, "/c")]
+    data = MAGIC + b"".join([HEADER, A, B, *more, *WHOLE, END])
+    moved = CHUNK_AT + sum(map(len, more))
+    index_of_chunk = CHUNK_INDEX.replace(struct.pack("<Q", CHUNK_AT), struct.pack("<Q", moved)).replace(
+        struct.pack("<Q", CHUNK_AT + len(WHOLE[0])), struct.pack("<Q", moved + len(WHOLE[0]))
+    )
+    statistics = record(0x0B, struct.pack("<QHIIIIQQIHQ", 2, 2, 2, 0, 0, 1, 5, 7, 10, 2, 2))
+    for third, said in ((schema(3, "Summary"), "Summary"), (schema(9, "Summary"), "Other")):
+        records = b"".join([A, third, B, channel(4, 3, "/c"), index_of_chunk, statistics])
+        footer = struct.pack("<BQQQ", 0x02, 20, len(data), 0)
+        crc = zlib.crc32(records + footer).to_bytes(4, "little")
+        (tmp_path / "a.mcap").write_bytes(data + records + footer + crc + MAGIC)
+        with log.read(tmp_path / "a.mcap") as opened:
+            assert opened.channel("/c").schema_name == said
+            assert opened.channel("/a").schema_name == "Thing"
