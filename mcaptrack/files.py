@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import json
 import os
 import re
 import secrets
@@ -10,7 +11,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Final
+from typing import IO, Any, Final
 
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
@@ -174,6 +175,27 @@ def read_beginning(path: Path, count: int) -> bytes:
             return stream.read(count)
     except OSError as error:
         raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+
+
+def read_json(path: Path, what: str, most_bytes: int) -> Any:
+    """Return the content of a JSON file, of the form ``what``.
+
+    Raises McaptrackError if it can't be read, has more than ``most_bytes``, is nested too deep or is invalid.
+    """
+    refuse_special(path)
+    try:
+        size = path.stat().st_size
+        if size > most_bytes:
+            raise McaptrackError(f"{path} has {size} bytes; at most {most_bytes} of {what} are read: give it in parts")
+        return json.loads(path.read_bytes().decode("utf-8-sig"))
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise McaptrackError(f"{path} is not a text file, as {what} is") from None
+    except RecursionError:
+        raise McaptrackError(f"{path} is nested deeper than {what} is") from None
+    except ValueError as error:
+        raise McaptrackError(f"{path} is not valid JSON: {str(error)[:200]}") from None
 
 
 def refuse_special(path: Path) -> None:

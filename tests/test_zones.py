@@ -406,7 +406,7 @@ WRONG = {
     "1 to 100 printable characters": collection(feature("a\nb", "Polygon", [SQUARE])),
     "not valid JSON": "{",
     "is not a text file": b"\xff\xfe\x00",
-    "zones take at most": b" " * (8 * 2**20 + 1),
+    "of GeoJSON are read: give it in parts": b" " * (8 * 2**20 + 1),
 }
 
 

@@ -6,7 +6,6 @@ have, so that a file has to say what its numbers are: "units": "metres" or "pixe
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -14,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import refuse_special
+from mcaptrack.files import read_json
 from mcaptrack.geometry.zones import Shape, Units, Zone, first_crossing
 from mcaptrack.notices import warn
 
@@ -42,24 +41,9 @@ def read_zones(path: Path) -> tuple[Zone, ...]:
     read, is no GeoJSON, says no units, or has a polygon that crosses itself.
     """
     try:
-        return parse_zones(_load(path))
+        return parse_zones(read_json(path, "GeoJSON", _MAX_BYTES))
     except McaptrackError as error:
         raise McaptrackError(str(error) if str(error).startswith(str(path)) else f"{path}: {error}") from None
-
-
-def _load(path: Path) -> Any:
-    refuse_special(path)
-    try:
-        size = path.stat().st_size
-        if size > _MAX_BYTES:
-            raise McaptrackError(f"{path} has {size} bytes; zones take at most {_MAX_BYTES}")
-        return json.loads(path.read_bytes().decode("utf-8-sig"))
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise McaptrackError(f"{path} is not a text file, as GeoJSON is") from None
-    except (ValueError, RecursionError) as error:
-        raise McaptrackError(f"{path} is not valid JSON: {str(error)[:200]}") from None
 
 
 def parse_zones(content: Any) -> tuple[Zone, ...]:

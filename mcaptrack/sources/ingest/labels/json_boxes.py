@@ -5,7 +5,6 @@ Letters: N rows, F frames.
 
 from __future__ import annotations
 
-import json
 import math
 from array import array
 from collections import Counter
@@ -15,6 +14,7 @@ from typing import Any, Final, NoReturn
 
 import numpy as np
 
+from mcaptrack import files
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import read_beginning, refuse_special
 from mcaptrack.geometry.arrays import Floats
@@ -48,27 +48,9 @@ def is_json(path: Path) -> bool:
     return read_beginning(path, 4096).removeprefix(b"\xef\xbb\xbf").lstrip()[:1] in (b"{", b"[")
 
 
-def load_json(path: Path) -> Any:
-    """The content of a JSON file. Raises McaptrackError if it is too large, nested too deep, or invalid."""
-    refuse_special(path)
-    try:
-        size = path.stat().st_size
-        if size > _MAX_BYTES:
-            raise McaptrackError(f"{path} has {size} bytes; at most {_MAX_BYTES} of JSON are read: give it in parts")
-        return json.loads(path.read_bytes().decode("utf-8-sig"))
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise McaptrackError(f"{path} is not a text file, as JSON is") from None
-    except RecursionError:
-        raise McaptrackError(f"{path} is nested deeper than JSON of boxes is") from None
-    except ValueError as error:
-        raise McaptrackError(f"{path} is not valid JSON: {str(error)[:200]}") from None
-
-
 def read_json(path: Path, label_format: Format, role: Role, given: Mapping[str, str], wanted: WantedClasses) -> Labels:
     """Read JSON of COCO or of supervision, as its content tells. Raises McaptrackError if it is neither."""
-    content = load_json(path)
+    content = files.read_json(path, "JSON", _MAX_BYTES)
     labels = _read_content(path, content, role, given, wanted)
     if label_format not in ("auto", labels.format):
         raise McaptrackError(f"{path} is of the format {labels.format}, not {label_format}")
