@@ -60,7 +60,7 @@ def plan_stage(
         suited = planner.suited_tracker(stage, source)
         transform = make(suited) if make else STAGES[stage].make(suited)
     planner.ensure_motion(transform, source)
-    planner.jobs.append(Job(stage, transform, source, target or usual, keep, frame_id=frame_id))
+    planner.add(Job(stage, transform, source, target or usual, keep, frame_id=frame_id))
     return planner.checked(say)
 
 
@@ -143,11 +143,6 @@ class _Planner:
             raise McaptrackError(self._refusal())
         check_inputs(self._opened, self._prefix, self.jobs)
         check_spaces(self._opened, self._prefix, self.jobs, self._frame_id)
-        for job in self.jobs:
-            entry = STAGES[job.stage].choice(job.transform)
-            self._notes += [
-                f"{topic} is removed: {job.stage} by {entry} makes none" for topic in superseded(self._opened, job)
-            ]
         for words in self._notes:
             say(words)
         return self.jobs
@@ -210,7 +205,7 @@ class _Planner:
         chosen = self._defaults.get(stage) or self._suited(stage, source) or STAGES[stage].default()
         transform = self._with_choice(chosen)
         self.ensure_motion(transform, source)
-        self._add(Job(stage, transform, source, _main(self._opened, stage, topic), frame_id=self._frame_id))
+        self.add(Job(stage, transform, source, _main(self._opened, stage, topic), frame_id=self._frame_id))
         return True
 
     def _suited(self, stage: str, source: str) -> Transform | None:
@@ -313,7 +308,7 @@ class _Planner:
         beside = STAGES[stage].beside if topic == main or main in self._opened.channels else ()
         kept = [is_kept or suffix in beside for suffix, is_kept in zip(transform.writes, kept, strict=True)]
         keep = tuple(suffix for suffix, is_kept in zip(transform.writes, kept, strict=True) if is_kept)
-        self._add(Job(stage, transform, source, main, None if all(kept) else keep, frame_id=self._frame_id))
+        self.add(Job(stage, transform, source, main, None if all(kept) else keep, frame_id=self._frame_id))
         return True
 
     def _is_plane_due(self, source: str) -> bool:
@@ -375,9 +370,12 @@ class _Planner:
         chosen = {name: value for name, value in self._shared.items() if hasattr(transform, name)}
         return replace(transform, **chosen) if chosen else transform
 
-    def _add(self, job: Job) -> None:
+    def add(self, job: Job) -> None:
+        """Plan a job, and say which earlier results go because it makes none of them."""
         self.jobs.append(job)
-        self._changes |= dict.fromkeys((*job.kept(), *superseded(self._opened, job)), True)
+        gone, entry = superseded(self._opened, job), STAGES[job.stage].choice(job.transform)
+        self._changes |= dict.fromkeys((*job.kept(), *gone), True)
+        self._notes += [f"{topic} is removed: {job.stage} by {entry} makes none" for topic in gone]
 
     def _not_made(self, stage: str, topic: str) -> str:
         source = self._sources[stage]
