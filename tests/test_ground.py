@@ -12,7 +12,7 @@ import pytest
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.testing import check_transform
-from mcaptrack.transforms import GroundTracker, Predict, Retrack, Sample
+from mcaptrack.transforms import GroundTracker, Predict, Retrack, RetrackByConsistency, Sample
 from mcaptrack.transforms.ground.state import VX, VY, GroundTracks, X, Y
 from mcaptrack.transforms.motion_limits import LIMITS, limits_of, limits_row, read_limits
 from mcaptrack.transforms.to_video_rate import to_video_rate
@@ -436,8 +436,9 @@ def test_limits_of_users_replace_those_of_the_table():
             GroundTracker(class_limits=wrong)
     zeros = (("car=0", "SPEED, NOISE"), ("car=::0", "NOISE and GATE"), ("car=:::0", "GATE have to be more than 0"))
     for wrong, why in (("car=40, Car=50", "names car twice"), *zeros):
-        with pytest.raises(McaptrackError, match=why):
-            GroundTracker(class_limits=wrong)
+        for make in (GroundTracker, Retrack, RetrackByConsistency, Predict):
+            with pytest.raises(McaptrackError, match=why):
+                make(class_limits=wrong)
 
 
 def compared(truth: dict[str, np.ndarray], frames: list[Frame]) -> tuple[int, float, float]:

@@ -14,18 +14,19 @@ from hypothesis import strategies as st
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.log import writer as writing
 from mcaptrack.log.checksums import crc_before
 from mcaptrack.log.writer import LogWriter
 from tests.interrupted import SCHEMA, contents
 
 
-def recorded(path: Path) -> None:
+def recorded(path: Path, count: int = 60, size: int = 100_000) -> None:
     """A log of pictures, large beside what is added to it."""
     noise = random.Random(1)
     with log.create(path) as writer:
         number = writer.add_channel("/video", SCHEMA, "json", {}, "media")
-        for n in range(60):
-            writer.add_message(number, n * 10, n, noise.randbytes(100_000))
+        for n in range(count):
+            writer.add_message(number, n * 10, n, noise.randbytes(size))
         writer.add_metadata("about", {"robot": "r2"})
 
 
@@ -160,3 +161,17 @@ def test_bytes_that_are_read_back_otherwise_than_written_leave_the_log_as_it_was
                 writer.add_message(writer.add_channel("/new", SCHEMA, "json", {}, "media"), 1, 1, bytes(1000))
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("lost", [4, 4000, 5200])
+def test_a_log_of_which_the_disk_lost_the_end_is_not_published(lost, tmp_path, monkeypatch):
+    verify = writing.verify
+
+    def cut_first(path: Path, *rest: object) -> None:
+        os.truncate(path, path.stat().st_size - lost)
+        verify(path, *rest)
+
+    monkeypatch.setattr(writing, "verify", cut_first)
+    with pytest.raises(McaptrackError, match="0 messages are read back of 50"):
+        recorded(tmp_path / "a.mcap", count=50, size=100)
+    assert list(tmp_path.iterdir()) == []

@@ -14,7 +14,7 @@ import pytest
 
 from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
-from mcaptrack.log import in_place
+from mcaptrack.log import in_place, journal
 from mcaptrack.log.journal import journal_of
 from tests.interrupted import CALLS, SCHEMA, add_results, contents, killed, sabotage
 from tests.logs import write_stock
@@ -120,6 +120,7 @@ def path(place, change, monkeypatch) -> Path:
 def _use_small_pieces(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(in_place, "_PIECE", 100_000)
     patch.setattr(in_place, "_BLOCK", 200_000)
+    patch.setattr(journal, "_BLOCK", 128 * journal.ROW)
 
 
 def left_behind(path: Path, kills: list[dict[str, bytes]]) -> Iterator[dict[str, bytes]]:
