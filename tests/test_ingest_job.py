@@ -8,6 +8,7 @@ from pathlib import Path
 import deltalake
 import pytest
 
+import mcaptrack
 from mcaptrack import log
 from mcaptrack.cli.inputs import expand, only_one_output
 from mcaptrack.errors import McaptrackError
@@ -22,7 +23,7 @@ from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 from mcaptrack.tables.compared import pair_files
 from mcaptrack.tables.delta.opening import DeltaFolder, reporting
 from tests.logs import add_rows, some_log
-from tests.worlds import boxes_at, tracks_at
+from tests.worlds import boxes_at, tracks_at, write_clip
 
 MOT = "".join(
     f"{frame},{who},{10 * who},20,9,30,1,{kind},1\n" for frame in (1, 7, 13) for who, kind in ((1, 1), (2, 3))
@@ -241,3 +242,13 @@ def test_errors_of_tables_are_one_line(tmp_path):
     assert str(DeltaFolder(tmp_path).location("topics/50%/a")) == str(tmp_path / "topics" / "50+" / "a")
     with pytest.raises(McaptrackError, match="their paths are URLs, in which % has a meaning"):
         DeltaFolder(tmp_path / "a%20b")
+
+
+@pytest.mark.parametrize(("fps", "is_said"), [("30000/1001", False), ("29.97", False), ("29.9", True), ("10", True)])
+def test_another_rate_than_that_of_the_video_is_said(tmp_path, fps, is_said):
+    write_clip(tmp_path / "a.mp4", 4, fps=Fraction(30000, 1001))
+    with collected() as notices:
+        mcaptrack.ingest(tmp_path / "a.mp4", output=tmp_path / "a.mcap", fps=fps)
+    said = [one.message for one in notices if "frames a second; its pictures are written at" in one.message]
+    assert bool(said) == is_said
+    assert not said or said[0].endswith(f"has 29.97 frames a second; its pictures are written at {fps} by `fps=`")

@@ -407,3 +407,11 @@ def test_the_stock_library_is_happy_with_an_empty_log(tmp_path):
     assert stock_messages(tmp_path / "a.mcap") == []
     with log.read(tmp_path / "a.mcap") as opened:
         assert opened.channels == {}
+
+
+def test_a_channel_that_is_not_there_is_named_beside_those_that_are(tmp_path):
+    write_log(tmp_path / "a.mcap", SOME)
+    with log.read(tmp_path / "a.mcap") as opened:
+        for look in (opened.times, opened.places, opened.messages, opened.fingerprint):
+            with pytest.raises(McaptrackError, match=r"a\.mcap has no channel /none; it has "):
+                list(look("/none"))

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
@@ -175,3 +176,22 @@ def test_a_log_of_which_the_disk_lost_the_end_is_not_published(lost, tmp_path, m
     with pytest.raises(McaptrackError, match="0 messages are read back of 50"):
         recorded(tmp_path / "a.mcap", count=50, size=100)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_metadata_and_attachments_that_are_replaced_are_listed_once(tmp_path):
+    path = tmp_path / "a.mcap"
+    recorded(path, count=50, size=100)
+    for number in range(3):
+        with (
+            log.read(path) as opened,
+            log.extend(opened, drop_metadata=["about"], drop_attachments=["layout"]) as writer,
+        ):
+            writer.add_metadata("about", {"robot": f"r{number}"})
+            writer.add_attachment("layout", "application/json", bytes([number]))
+        with path.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+        assert [one.name for one in summary.metadata_indexes] == ["about"]
+        assert [one.name for one in summary.attachment_indexes] == ["layout"]
+        with log.read(path) as opened:
+            assert (opened.metadata("about"), opened.attachment("layout")) == ({"robot": f"r{number}"}, bytes([number]))
+    assert log.check(path).findings == []

@@ -107,7 +107,7 @@ def write_clip(
     frames: int = 20,
     *,
     size: tuple[int, int] = (64, 48),
-    fps: int = 10,
+    fps: int | Fraction = 10,
     codec: str = "libx264",
     pixels: str = "yuv420p",
     options: Mapping[str, str] | None = None,

@@ -10,7 +10,7 @@ import math
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -187,21 +187,6 @@ class Talk:
     def warn(self, words: str, code: Code = "other") -> None:
         """Print a warning, also with ``quiet``, and add it to the JSON; see ``mcaptrack.notices``."""
         notices.warn(words, code)
-
-    @contextmanager
-    def attempt(self, path: Location, paths: Sequence[Location]) -> Iterator[None]:
-        """Process one of several inputs: an error in it is printed and does not stop the others.
-
-        The command ends with exit code 3 then, and its JSON lists the inputs that failed.
-        """
-        tried(1)
-        try:
-            yield
-        except McaptrackError as error:
-            if len(paths) == 1:
-                raise
-            self._stop()
-            record_failure(path, str(error))
 
     def _hear(self, notice: Notice) -> None:
         self._stop()
