@@ -16,6 +16,7 @@ from mcaptrack.sources.ingest.labels.box_rows import fitted
 from mcaptrack.sources.ingest.labels.formats import Labels
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline
+from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
 NAN = float("nan")
 
@@ -642,3 +643,19 @@ def test_times_between_pictures_that_are_far_apart_belong_to_none(tmp_path):
     for seconds in ("0.51", "5.51"):
         with pytest.raises(McaptrackError, match=rf"from {seconds} to {seconds} s, the pictures from 5.000 to 5.000 s"):
             one.place(tmp_path / "a", read(tmp_path, table(f"{seconds},1,2,3,4", header="t,x,y,w,h")), [])
+
+
+@pytest.mark.parametrize(
+    ("more", "score", "kinds"),
+    [
+        ("", np.nan, [1]),
+        (",0.75", 0.75, [1]),
+        (",0.75,2", 0.75, [2]),
+        (",0.75,2,-1", 0.75, [2]),
+        (",0.75,2,-1,-1", 0.75, [1]),  # MOT15: column 8 is a position, and all boxes are of people
+    ],
+)
+def test_columns_7_and_8_of_motchallenge_are_score_and_class_but_for_mot15(more, score, kinds, tmp_path):
+    labels = read(tmp_path, f"1,-1,10,20,30,40{more}\n", name="det.txt", wanted=WantedClasses("all"))
+    np.testing.assert_equal(labels.score, [score])
+    assert labels.class_id.tolist() == kinds

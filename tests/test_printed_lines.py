@@ -19,6 +19,7 @@ import pytest
 import mcaptrack
 from mcaptrack.api.running import RunResult
 from mcaptrack.cli import common, inputs, running
+from mcaptrack.cli.calibrate import _words
 from mcaptrack.cli.config import MAX_BYTES, ConfigFile, read_toml
 from mcaptrack.cli.evaluate import _gates, _limit
 from mcaptrack.cli.flags import RUNNING, with_flags
@@ -990,3 +991,35 @@ def test_tables_of_two_logs_of_one_name_are_not_written_to_one_folder(tmp_path, 
     calls = asked_of(monkeypatch, "export")
     refused = call("export", "x/a.mcap", "y/a.mcap", "-o", "tables")
     assert (refused.code, calls, refused.err.count("\n")) == (1, [], 1)
+
+
+LINE = "people walk on one line"
+
+
+@pytest.mark.parametrize(
+    ("found", "is_unchanged", "words"),
+    [
+        (("", 0.0, 0, None, None, None, None, "too few pairs", "", 0.0), False, "as it was: too few pairs"),
+        (
+            ("", 0.0, 1200, 0.1, 0.3, None, None, "it agrees with the others", "", -0.5),
+            False,
+            "as it was: it agrees with the others; feet are 0.10 m (90 %: 0.30 m) from those of the others (1,200 "
+            "compared); its times are 0.50 s early",
+        ),
+        (
+            ("rigid", 2.5, 90, 1.0, 2.0, 0.1, 0.2, "", LINE, 0.25),
+            False,
+            "corrected by a shift and a rotation, which moves feet by 2.50 m: they are 0.10 m (90 %: 0.20 m) from those of "
+            f"the others, and were 1.00 m (90 %: 2.00 m) (90 compared); {LINE}; its times are 0.25 s late",
+        ),
+        (
+            ("full", 2.5, 90, None, 2.0, 0.1, None, "", "", 0.0),
+            True,
+            "corrected already by a homography, which moves feet by 2.50 m: they are - from those of the others, and were - "
+            "(90 compared)",
+        ),
+    ],
+    ids=["too few", "agrees", "corrected", "corrected before"],
+)
+def test_the_line_of_a_camera_says_what_was_found_about_it(found, is_unchanged, words):
+    assert _words(mcaptrack.CameraCorrection(*found, homography=None), is_unchanged) == words

@@ -345,3 +345,20 @@ def test_what_became_of_delta_tables_is_said(capsys):
     ]  # fmt: skip
     with pytest.raises(McaptrackError, match=r"^it is cut off$"):
         finished(busy, is_single=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "concern"),
+    [
+        ({}, False),
+        ({"jobs": 3}, False),
+        ({"scheduler": "tcp://a:1"}, True),
+        ({"output_dir": Path("out")}, True),
+        ({"ledger": Path("a.jsonl")}, True),
+        ({"timeout": "1h"}, True),
+        ({"memory_limit": "1GB"}, True),
+        ({"json_lines": True}, True),
+    ],
+)
+def test_any_of_the_options_that_concern_a_single_log_make_it_one_of_many(options, concern):
+    assert ManyOptions(**options).concern_one == concern
