@@ -14,9 +14,11 @@ from mcaptrack import log
 from mcaptrack.evaluation.track_lifecycle import lifecycle_of
 from mcaptrack.schema import DECISIONS, DecisionKind, EventKind, Frame
 from mcaptrack.transforms import PROFILES, Retrack
+from mcaptrack.transforms.retrack import joins as join_steps
 from mcaptrack.transforms.retrack.joins import Cuts, cut_joins, find_joins, tracked_of
 from mcaptrack.transforms.retrack.motion_model import MotionModel
-from mcaptrack.viewing.report.doubts import find_doubtful_tracks
+from mcaptrack.viewing.report.doubts import Doubt, find_doubtful_tracks
+from mcaptrack.viewing.report.identity_events import IdentityEvent
 from tests.commands import done
 from tests.references.offline import Motion, cut, joins
 from tests.worlds import crossing_tracks, noisy_tracks, tracks_at
@@ -107,6 +109,16 @@ def test_joins_and_cuts_equal_the_reference(seed):
     np.testing.assert_allclose(np.column_stack(cuts), np.array(wanted_cuts).reshape(-1, 3), rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize(("least", "wanted"), [(0.5, [(5, 6)]), (0.2, [(5, 6)]), (0.72, [(5, 6), (6, 7)])])
+def test_joins_below_70_percent_are_cut_or_below_what_links_need(monkeypatch, least, wanted):
+    monkeypatch.setattr(join_steps, "cut_probability", lambda features: np.array([0.69, 0.71, 0.73]))
+    step = np.arange(40)
+    xy = np.column_stack([0.5 * step, np.zeros(40)])
+    track, cuts = cut_joins(MODEL, step, np.full(40, 5), step // 10, xy, STEP_S, least)
+    assert [*zip(cuts.before.tolist(), cuts.after.tolist(), strict=True)] == wanted
+    assert [int(track[at]) for at in (9, 10, 20, 30)] == [5, 6, 6 if len(wanted) == 1 else 7, 5 + len(wanted)]
+
+
 def test_pieces_that_linking_left_alone_go_together_again_if_that_is_likely():
     """Of tracks 4, 7, 8 and 9: 4 is linked to 8, and 7 to nothing."""
     cuts = Cuts(np.array([7, 4, 8]), np.array([9, 7, 4]), np.array([0.6, 0.69, 0.4]))
@@ -187,6 +199,15 @@ def test_the_least_likely_tracks_come_first_and_sure_ones_not_at_all():
         "the tracker's 7 is left out: no person with 55\N{NO-BREAK SPACE}%, 7.0\N{NO-BREAK SPACE}s long",
         "track 2 is kept: a person with 60\N{NO-BREAK SPACE}%, 8.0\N{NO-BREAK SPACE}s long",
     ]
+
+
+@pytest.mark.parametrize(
+    ("alternative", "said"),
+    [(8, "606 goes on as 8"), (606, "606 goes on as it did"), (-1, "606 ended, and another came")],
+)
+def test_what_would_be_otherwise_is_said_of_the_track_before(alternative, said):
+    event = IdentityEvent(0, {"previous_id": 606}, 1.0, "track 3 joins the tracker's 606 and 605")
+    assert Doubt(event, 0.0, "", None, 0.02, alternative).text().endswith(f"; otherwise {said}.")
 
 
 def test_decisions_do_not_outlive_the_method_that_made_them(template, tmp_path):

@@ -285,7 +285,7 @@ def logistic(
 
     def loss(t: np.ndarray) -> tuple[float, np.ndarray]:
         value = z @ t[:count] + t[count:][group]
-        off = share * (1 / (1 + np.exp(-value)) - right)
+        off = share * (false_tracks.probability(value) - right)
         slope = np.concatenate([z.T @ off, own @ off]) + 2 * shrink * t
         return float(share @ (np.logaddexp(0, value) - right * value) + shrink @ t**2), slope
 

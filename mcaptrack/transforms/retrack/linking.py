@@ -16,6 +16,7 @@ import numpy as np
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.assignment import Pairs, assign_by_gain, assign_pairs_by_gain
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
+from mcaptrack.transforms.retrack.false_tracks import probability
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
 from mcaptrack.transforms.retrack.weights import weights_of
 
@@ -116,7 +117,7 @@ def _prior_shift(log_odds: Floats) -> float:
     """The shift of the log odds of links (E,), because another share of them is right in this log than usual."""
     shift = 0.0
     for _ in range(100):
-        right = (1 / (1 + np.exp(-(log_odds + shift)))).sum()
+        right = probability(log_odds + shift).sum()
         share = (right + 0.3) / (len(log_odds) + 3)  # in most logs few are
         before, shift = shift, float(np.log(share / (1 - share)) - np.log(_PRIOR / (1 - _PRIOR)))
         if abs(shift - before) < 1e-4:

@@ -48,6 +48,8 @@ class Doubt(NamedTuple):
         else:
             before, after = int(self.event.row["previous_id"]), self.alternative_id
             other = f"{before} goes on as {after}" if after >= 0 else f"{before} ended, and another came"
+            if after == before:  # the join left an input track that went on
+                other = f"{before} goes on as it did"
             where = f"{start}. Right with {percent(self.probability, 0)}; otherwise {other}"
         return f"{where}. {self.verdict}" if self.verdict else f"{where}."
 
