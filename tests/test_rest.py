@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mcaptrack.predictors import Forecast
+from mcaptrack.predictors import Forecast, vehicle_tails
 from mcaptrack.predictors.tails import TailCalibration
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.transforms import Predict, forecasts
@@ -36,8 +36,9 @@ def axis_m(rows: Rows) -> float:
 
 @pytest.fixture(autouse=True)
 def as_predicted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ellipses as predictors make them: where no velocities are measured they follow the log otherwise."""
+    """Ellipses as predictors make them: otherwise they follow the log, and those of vehicles are mixtures."""
     monkeypatch.setattr(TailCalibration, "of", lambda *_: None)
+    monkeypatch.setattr(vehicle_tails, "_tables", dict)
 
 
 @pytest.mark.parametrize("predictor", ["red", "kalman", "cv"])

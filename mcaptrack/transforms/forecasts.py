@@ -12,6 +12,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories
 from mcaptrack.predictors import Forecast, PeopleSeen, make, predict_among, uses_people
 from mcaptrack.predictors.tails import TailCalibration
+from mcaptrack.predictors.vehicle_tails import calibrated
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.transforms.motion_limits import ClassNames, limits_by_class, units_m
@@ -66,7 +67,7 @@ class Forecaster:
         histories: Callable[[int], PastPositions] = Histories,
         **options: Any,
     ) -> None:
-        self._rate_hz, self._min_history = rate_hz, min_history
+        self._name, self._rate_hz, self._min_history = predictor, rate_hz, min_history
         self._class_names, self._class_limits = class_names, class_limits
         self._predictor = make(predictor, max(1, round(horizon_s * rate_hz)), 1 / rate_hz, **options)
         self._calibration = TailCalibration.of(predictor, self._predictor)
@@ -103,6 +104,9 @@ class Forecaster:
             noise_m = np.array([limits[one].noise_m for one in numbers])[of]
             stay = is_measured * _standing(past[ready], unit_m, self._predictor.step_s)
             forecast = _with_rest(forecast, past[ready][:, -1], stay, noise_m, unit_m, self._predictor.step_s)
+            speed = np.hypot(*(frame.rows[name][ready].astype(float) for name in ("vx_m_per_s", "vy_m_per_s")))
+            kinds = [limits[numbers[one]].name for one in of.tolist()]
+            forecast, tails = calibrated(self._name, forecast, self._predictor.step_s, kinds, speed)
         return forecast_to_rows(ids[ready], forecast, self._predictor.step_s, tails)
 
     def _people(self, rows: Rows, past: Floats, known: Bools, ready: Bools) -> PeopleSeen:
