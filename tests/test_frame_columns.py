@@ -158,3 +158,33 @@ def test_a_log_four_times_as_long_takes_hardly_more_memory(monkeypatch, tmp_path
             tracemalloc.stop()
     of_a_channel = 10 * 90 * 6 * TRACKS.dtype.itemsize
     assert peaks[2] - peaks[1] < 3 * of_a_channel, "with all rows as objects it is ten times those of a channel"
+
+
+@pytest.mark.parametrize("way", ["append", "extend"])
+def test_rows_with_their_columns_in_another_order_are_taken_and_others_refused(way):
+    def collected(rows) -> np.ndarray:
+        collector = FrameCollector(TRACKS)
+        if way == "append":
+            collector.append(Frame(ns(1), 0, rows))
+        else:
+            collector.extend([ns(1)], [0], [0, len(rows)], rows)
+        (frame,) = collector.done()
+        return frame.rows
+
+    rows = TRACKS.empty(2)
+    rows["track_id"], rows["x_px"] = [3, 4], [5.0, 6.0]
+    turned = np.empty(2, [(name, rows.dtype[name]) for name in reversed(rows.dtype.names)])
+    for name in rows.dtype.names:
+        turned[name] = rows[name]
+    for made in (rows, turned):
+        assert collected(made).dtype == TRACKS.dtype
+        assert collected(made)["track_id"].tolist() == [3, 4]
+        assert collected(made)["x_px"].tolist() == [5.0, 6.0]
+    with pytest.raises(ValueError, match="columns"):
+        collected(np.zeros(2, [("a", float)]))
+
+
+def test_a_frame_keeps_no_array_that_it_is_a_part_of():
+    collector, many = FrameCollector(TRACKS), TRACKS.empty(1000)
+    collector.append(Frame(ns(1), 0, many[:1]))
+    assert all(not np.shares_memory(many, kept) for kept in collector._open)
