@@ -415,6 +415,7 @@ class TestErrors:
         assert "Traceback" not in piped.stderr
 
 
+@thorough  # tests/test_signals.py ends every command
 def test_an_interrupted_command_leaves_the_old_log_or_the_new_one(fresh, finished):
     before, after = fresh.read_bytes(), finished.read_bytes()
     started = time.monotonic()

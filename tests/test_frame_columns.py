@@ -122,6 +122,7 @@ def write_boxes(path: Path, seconds: float, count: int = 6) -> Path:
     return path
 
 
+@thorough
 def test_a_log_is_the_same_whatever_the_size_of_blocks_and_parts(tmp_path, request):
     (tmp_path / "whole").mkdir()
     whole = write_boxes(tmp_path / "whole" / "a.mcap", 20.0)

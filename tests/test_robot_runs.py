@@ -20,6 +20,7 @@ from mcaptrack.sources import fixed_frame
 from mcaptrack.viewing.report import gather, page
 from tests.commands import call, done
 from tests.robot_runs import OBJECTS, passing_robot, place, write_passing
+from tests.tiers import thorough
 
 #: Enough for predictions with a known future, 4.8 s ahead.
 SHOTS = 70
@@ -35,6 +36,7 @@ def passed(tmp_path_factory) -> Path:
     return path
 
 
+@thorough
 def test_recorded_boxes_are_decoded_once_in_a_run(passed, tmp_path, monkeypatch):
     """By the tracker; the table of detections and the number of boxes in the summary are of the same rows."""
     path, decoded = tmp_path / "a.mcap", []
