@@ -229,7 +229,7 @@ def test_pictures_stand_where_the_matrix_puts_their_pixels(a, b, c, d):
     side = struct.pack("=9i", a * ONE, b * ONE, 0, c * ONE, d * ONE, 0, 7 * ONE, 0, 1 << 30)
     frame = SimpleNamespace(
         rotation=0,
-        side_data=[type("Side", (bytes,), {"type": SimpleNamespace(name="DISPLAYMATRIX")})(side)],
+        side_data={"DISPLAYMATRIX": side},
         to_ndarray=lambda **_: image,
     )
     placed = {(a * x + c * y, b * x + d * y): image[y, x].tolist() for x in range(3) for y in range(2)}

@@ -40,7 +40,8 @@ class Orientation(NamedTuple):
 
 def orientation_of(frame: Any) -> Orientation:
     """Read the display matrix of a frame of FFmpeg: x' = a x + c y, y' = b x + d y (ISO 14496-12, 8.3.2)."""
-    found = next((bytes(one) for one in frame.side_data if one.type.name == "DISPLAYMATRIX"), b"")
+    # By name, because iterating gives the data themselves up to PyAV 18, and their types from 19 on.
+    found = bytes(frame.side_data.get("DISPLAYMATRIX") or b"")
     if len(found) != _MATRIX.size:
         return Orientation()
     a, b, _, c, d, *_ = _MATRIX.unpack(found)
