@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.evaluation.metrics.matchup import Matchup
+from mcaptrack.evaluation.metrics.matchup import Matchup, SparseTables
 from mcaptrack.geometry.arrays import Indices
 from mcaptrack.geometry.assignment import solve
 
@@ -56,20 +56,11 @@ def hota(matchup: Matchup) -> dict[str, NDArray[np.float64]]:
     shared = np.bincount(of_pair, share, minlength=len(cell))
     together = truth_count[cell // max(1, n_tracks)] + track_count[cell % max(1, n_tracks)]
     gain = (shared / np.maximum(together - shared, _EPS))[of_pair] * pairs.similarity
-    ends = np.searchsorted(pairs.frame, np.arange(len(matchup.ground_truth) + 1))
-    row_ends, column_ends = (np.cumsum(counts) for counts in (matchup.ground_truth_counts, matchup.track_counts))
+    ends = (np.append(0, np.cumsum(counts)) for counts in (matchup.ground_truth_counts, matchup.track_counts))
+    gains = SparseTables(pairs.frame, pairs.row, pairs.column, gain, *ends)
 
     def solve_frame(number: int, *_: object) -> tuple[Indices, Indices]:
-        people, tracks, here = (
-            len(matchup.ground_truth[number]),
-            len(matchup.tracks[number]),
-            slice(*ends[number : number + 2]),
-        )
-        table = np.zeros((people, tracks))
-        table[pairs.row[here] - row_ends[number] + people, pairs.column[here] - column_ends[number] + tracks] = gain[
-            here
-        ]
-        return solve(-table)
+        return solve(-gains[number])
 
     found = matchup.assigned(pairs, solve_frame)
     # The number of thresholds that each match passes; from that, the matches that pass each threshold.

@@ -10,6 +10,7 @@ from mcaptrack.sources.foreign.boxes_3d.box import (
     Box3d,
     Message3d,
     Vector,
+    around,
     enumeration,
     head_of,
     moved,
@@ -54,7 +55,7 @@ def _box(one: Any, head: tuple[int, str]) -> Box3d:
     if integer(shape.type) == _CYLINDER:  # x is the diameter
         size = (size[0], size[0], size[2])
     elif integer(shape.type) == _POLYGON:
-        middle, size = _around([vector(point) for point in shape.footprint.points], size[2])
+        middle, size = _footprint([vector(point) for point in shape.footprint.points], size[2])
         centre = moved(centre, orientation, middle)
     velocity = UNKNOWN_VECTOR
     if getattr(kinematics, "has_twist", True):  # along the axes of the object
@@ -84,13 +85,12 @@ def _class_of(one: Any) -> tuple[str, float]:
     return named(enumeration(guess) or _CLASSES, guess.label), share if share > 0 else nan
 
 
-def _around(points: list[Vector], height: float) -> tuple[Vector, Vector]:
+def _footprint(points: list[Vector], height: float) -> tuple[Vector, Vector]:
     """Middle and size of the upright box around a footprint, along the axes of the object."""
     if not points:
         return (0.0, 0.0, 0.0), (nan, nan, height)
-    low, high = ([pick(point[axis] for point in points) for axis in (0, 1)] for pick in (min, max))
-    middle = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2, 0.0)
-    return middle, (high[0] - low[0], high[1] - low[1], height)
+    (x, y, _), (length, width, _) = around(points)
+    return (x, y, 0.0), (length, width, height)
 
 
 def _id(one: Any) -> str | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from math import isfinite, nan
@@ -113,6 +113,13 @@ def moved(centre: Vector, orientation: Quaternion, point: Vector) -> Vector:
     """A point of a box or group, given along its axes, in the frame of the box."""
     x, y, z = rotated(orientation, point)
     return centre[0] + x, centre[1] + y, centre[2] + z
+
+
+def around(points: Sequence[Vector]) -> tuple[Vector, Vector]:
+    """Middle and size of the box around points, along their axes. There has to be one at least."""
+    low, high = (tuple(pick(point[axis] for point in points) for axis in range(3)) for pick in (min, max))
+    middle = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2)
+    return middle, (high[0] - low[0], high[1] - low[1], high[2] - low[2])
 
 
 def named(names: Mapping[int, str], label: Any) -> str:

@@ -10,6 +10,7 @@ from mcaptrack.sources.foreign.boxes_3d.box import (
     Box3d,
     Message3d,
     Vector,
+    around,
     enumeration,
     head_of,
     named,
@@ -64,20 +65,16 @@ def _size(shape: Any) -> Vector:
     return UNKNOWN_VECTOR
 
 
-def _box(one: Any, around: tuple[int, str]) -> Box3d:
+def _box(one: Any, head: tuple[int, str]) -> Box3d:
     certainty = integer(one.classification_certainty)
     centre, orientation, size = vector(one.pose.position), quaternion(part(one.pose, "orientation")), _size(one.shape)
     if isnan(size[0]) and (points := [vector(point) for point in part(part(one, "polygon"), "points") or ()]):
         x, y, z, w = orientation
         along = [rotated((-x, -y, -z, w), point) for point in points]  # the polygon is in the frame of the message
-        low, high = ([pick(point[axis] for point in along) for axis in range(3)] for pick in (min, max))
-        middle = tuple((a + b) / 2 for a, b in zip(low, high, strict=True))
-        centre, size = (
-            rotated(orientation, (middle[0], middle[1], middle[2])),
-            (high[0] - low[0], high[1] - low[1], nan),
-        )
+        middle, (length, width, _) = around(along)
+        centre, size = rotated(orientation, middle), (length, width, nan)
     return Box3d(
-        *own_head(one, around),
+        *own_head(one, head),
         centre,
         orientation,
         size,
