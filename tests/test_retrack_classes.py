@@ -60,21 +60,27 @@ def test_decisions_about_tracks_that_were_left_out_have_no_id_in_any_class():
     def run(ids: list[int]):
         rows = DECISIONS.empty(len(ids))
         rows["track_id"] = ids
-        yield (Frame(0, 0, rows),)
+        return [collect(DECISIONS, [Frame(0, 0, rows)])]
 
-    ((found,),) = join_classes([run([1, -1, 3]), run([2, -1])], (DECISIONS,))
+    ((found,),) = join_classes([run([1, -1, 3]), run([2, -1])])
     assert found.rows["track_id"].tolist() == [1, -1, 3, 5, -1]
 
 
-def test_ids_of_a_class_follow_those_of_the_class_before():
+@pytest.mark.parametrize("part_rows", [1 << 16, 1])
+def test_ids_of_a_class_follow_those_of_the_class_before(part_rows, monkeypatch):
+    monkeypatch.setattr(framing, "PART_ROWS", part_rows)
+
+    def predicted(some: list[int]):
+        steps = PREDICTIONS.empty(len(some))
+        steps["track_id"] = some
+        return steps
+
     def run(ids: list[list[int]]):
-        for n, some in enumerate(ids):
-            steps = PREDICTIONS.empty(len(some))
-            steps["track_id"] = some
-            yield Frame(n, n, rows_of(some, [1] * len(some))), Frame(n, n, steps)
+        tracks = [Frame(n, n, rows_of(some, [1] * len(some))) for n, some in enumerate(ids)]
+        return collect(TRACKS, tracks), collect(PREDICTIONS, [Frame(n, n, predicted(one)) for n, one in enumerate(ids)])
 
     runs = [run([[1, 4], [2]]), run([[], []]), run([[3], [1, 2]]), run([[1], []])]
-    found = list(join_classes(runs, (TRACKS, PREDICTIONS)))
+    found = list(join_classes(runs))
     assert [tuple(frame.rows["track_id"].tolist() for frame in frames) for frames in found] == [
         ([1, 4, 7, 8], [1, 4, 7, 8]),
         ([2, 5, 6], [2, 5, 6]),
@@ -119,13 +125,14 @@ def test_each_class_has_its_unit_and_its_kind(kind, moves, step, movers):
     assert movers_of([], names, 0.7) == PEOPLE
 
 
-def test_tracks_in_metres_keep_what_they_are_under_numbers_of_their_own():
+@pytest.mark.parametrize("part_rows", [1 << 16, 1])
+def test_tracks_in_metres_keep_what_they_are_under_numbers_of_their_own(part_rows, monkeypatch):
     """Samples at 2.5 Hz, one missing, with ids in any order; steps follow the clock."""
-    kept = KeptIds(Retrack(predictor="cv", noise_m=0.5), Movers(unit_m=2.0))
+    monkeypatch.setattr(framing, "PART_ROWS", part_rows)
+    steps, seen = [0, 1, 3, 4], ([9, 4], [4, 9], [7], [9, 7])
+    frames = [Frame(ns(n / 2.5) + 3, n, rows_of(ids, [1] * len(ids))) for n, ids in zip(steps, seen, strict=True)]
+    kept = KeptIds(Retrack(predictor="cv", noise_m=0.5), Movers(unit_m=2.0), collect(TRACKS, frames))
     assert kept.noise_m == 0.25
-    steps, out = [0, 1, 3, 4], []
-    for n, ids in zip(steps, ([9, 4], [4, 9], [7], [9, 7]), strict=True):
-        kept.step(Frame(ns(n / 2.5) + 3, n, rows_of(ids, [1] * len(ids))))
     assert kept.steps == steps
     out = [(online.rows["source_id"].tolist(), online.rows["track_id"].tolist()) for online, _ in kept.outputs()]
     assert out == [([4, 9], [1, 2]), ([4, 9], [1, 2]), ([7], [3]), ([7, 9], [3, 2])]

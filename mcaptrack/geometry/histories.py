@@ -42,6 +42,42 @@ class Histories:
         past = self.xy_m[slot]
         return past, np.isfinite(past[:, :, 0])
 
+    def push_all(self, steps: Ints, ends: Ints, ids: Ints, xy_m: Floats) -> tuple[Floats, Bools]:
+        """Add positions as ``push`` does, F times in a row; returns the results of each time, end to end.
+
+        ``steps`` (F,) and ``ends`` (F + 1,): time f comes ``steps[f]`` after the one before, and has the tracks
+        ``ids[ends[f] : ends[f + 1]]``, each of them once. ``ids`` is (N,), ``xy_m`` (N, 2).
+        """
+        if not len(steps):
+            return np.empty((0, self.length, 2)), np.empty((0, self.length), bool)
+        length, count = self.length, len(ids)
+        at = np.cumsum(np.minimum(steps, length))
+        old, back = np.nonzero(~np.isnan(self.xy_m).all(axis=2))
+        track = np.concatenate([self.ids[old], ids])
+        step = np.concatenate([back - (length - 1), np.repeat(at, np.diff(ends))])
+        place = np.concatenate([self.xy_m[old, back], xy_m])
+        order = np.lexsort((step, track))
+        track, step, place = track[order], step[order], place[order]
+        windows = np.full((len(track), length, 2), np.nan)
+        windows[:, -1] = place
+        for before in range(1, min(length, len(track))):  # a track has one position a step, so these are all
+            passed = step[before:] - step[:-before]
+            row = ((track[before:] == track[:-before]) & (passed < length)).nonzero()[0]
+            windows[row + before, length - 1 - passed[row]] = place[row]
+        past = np.empty((len(track), length, 2))
+        past[order] = windows
+        past = past[len(track) - count :]
+        # What is remembered: the last position of each track, as far back as it is now.
+        passed = int(at[-1]) - step
+        is_last = np.append(track[1:] != track[:-1], True)[: len(track)].nonzero()[0]
+        moved = np.full((len(is_last), length, 2), np.nan)
+        for one in range(length):
+            row = (passed[is_last] == one).nonzero()[0]
+            moved[row, : length - one] = windows[is_last[row], one:]
+        kept = np.isfinite(moved[:, :, 0]).any(axis=1) | (passed[is_last] == 0)
+        self.ids, self.xy_m = track[is_last[kept]], moved[kept]
+        return past, np.isfinite(past[:, :, 0])
+
 
 def last_positions(xy_m: Floats, valid: Bools, length: int) -> tuple[Floats, Bools]:
     """The last ``length`` positions of histories (B, L, 2), padded with unknown ones, and which of them are known."""

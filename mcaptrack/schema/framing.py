@@ -81,9 +81,12 @@ def join_frames(schema: Schema, frames: Sequence[Frame], first: int = 0, last: i
     return JoinedFrames(rows, group_index(counts), frame_times(some), np.cumsum([0, *counts]))
 
 
-def spans_of(ends: Ints) -> Iterator[tuple[int, int]]:
-    """First and last of consecutive frames with about ``PART_ROWS`` rows together; ``ends`` are as in ``row_ends``."""
-    low, count, rows = 0, len(ends) - 1, PART_ROWS
+def spans_of(ends: Ints, most: int | None = None) -> Iterator[tuple[int, int]]:
+    """First and last of consecutive frames with about ``most`` rows together, or ``PART_ROWS``.
+
+    ``ends`` are as in ``row_ends``.
+    """
+    low, count, rows = 0, len(ends) - 1, PART_ROWS if most is None else most
     while low < count:
         high = int(np.searchsorted(ends, ends[low] + rows, "right")) - 1
         high = min(max(high, low + 1), low + max(rows, 1), count)

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Final, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories
+from mcaptrack.geometry.mixtures import Tails, normal_tails
+from mcaptrack.geometry.ragged import run_starts
 from mcaptrack.predictors import Forecast, PeopleSeen, make, predict_among, uses_people
+from mcaptrack.predictors.linear import LinearPredictor
 from mcaptrack.predictors.tails import TailCalibration
 from mcaptrack.predictors.vehicle_tails import calibrated
-from mcaptrack.schema import Frame, Rows
+from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
+from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
+from mcaptrack.schema.framing import JoinedFrames, join_frames, spans_of
 from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.transforms.motion_limits import ClassNames, limits_by_class, units_m
 
+#: The number of tracks that are predicted at once: what is computed for them takes some kilobytes each.
+_PART_ROWS: Final = 2048
 #: Vehicles that stand mostly stay: their speed over this many steps, in units of length per second, up to which they
 #: count as standing; the probability that they stay; and how far they seem to move then, in units per second.
 _RECENT: Final = 7
@@ -31,6 +39,27 @@ class PastPositions(Protocol):
     def push(self, ids: Ints, xy_m: Floats, steps: int = 1) -> tuple[Floats, Bools]:
         """Add the next positions; returns the past of each track, and which positions of it are known."""
         ...
+
+
+class _Made(NamedTuple):
+    """Forecasts of tracks (N,) as the predictor made them; which tracks have a velocity, and what their class says."""
+
+    forecast: Forecast
+    has_velocity: Bools
+    unit_m: Floats
+    noise_m: Floats
+    kinds: NDArray[np.str_]
+
+    @property
+    def is_vehicle(self) -> Bools:
+        """Which tracks were measured in metres, and are of a class that moves otherwise than people."""
+        return np.asarray(self.has_velocity & (self.unit_m != 1))
+
+    def take(self, which: Ints) -> _Made:
+        """Some of them."""
+        (mean, cov), has_velocity, unit_m, noise_m, kinds = self
+        forecast = Forecast(mean[which], cov[which])
+        return _Made(forecast, has_velocity[which], unit_m[which], noise_m[which], kinds[which])
 
 
 class Forecaster:
@@ -77,37 +106,94 @@ class Forecaster:
 
     def predict(self, frame: Frame) -> Rows:
         """Rows of Predictions for the tracks of a frame."""
-        passed = 1
-        if self._last_ns is not None:
-            passed = max(1, round((frame.t_ns - self._last_ns) * self._rate_hz / NS_PER_S))
-        self._last_ns = frame.t_ns
+        passed = self._passed(frame.t_ns)
         self._step += passed
         ids = frame.rows["track_id"]
         past, known = self._histories.push(ids, np.stack([frame.rows["x_m"], frame.rows["y_m"]], axis=-1), passed)
         # An interpolated position depends on later ones: a prediction from it would not be causal.
         ready = known[:, -self._min_history :].all(axis=1) & frame.rows["observed"]
-        classes, of = np.unique(frame.rows["class_id"][ready], return_inverse=True)
+        people = self._people(frame.rows, past, known, ready) if uses_people(self._predictor) else None
+        made = self._made(frame.rows[ready], past[ready], known[ready], people)
+        tails = None
+        if self._calibration is not None and not made.has_velocity.any():
+            is_coasting = np.zeros(len(made.has_velocity), bool)
+            forecast, tails = self._calibration(self._step, ids[ready], made.forecast, past[ready], is_coasting)
+        elif made.is_vehicle.any():
+            forecast, tails = self._of_vehicles(made, frame.rows[ready], past[ready])
+        else:
+            forecast = made.forecast
+        return forecast_to_rows(ids[ready], forecast, self._predictor.step_s, tails)
+
+    def predict_all(self, frames: FrameColumns) -> FrameColumns:
+        """Predict all frames of tracks, as ``predict`` does one of them.
+
+        Many frames are predicted at a time if all rows have velocities, no id is twice in a frame, and the predictor is
+        linear: the last digits of others depend on the size of a batch.
+        """
+        out = FrameCollector(PREDICTIONS)
+        histories = self._histories if isinstance(self._predictor, LinearPredictor) else None
+        for low, high in spans_of(frames.ends, _PART_ROWS):
+            joined = join_frames(TRACKS, frames, low, high)
+            if isinstance(histories, Histories) and _have_velocities(joined) and not _are_twice(joined):
+                rows, ends = self._together(joined, histories)
+            else:
+                parts = [self.predict(frame) for frame in frames[low:high]]
+                rows, ends = PREDICTIONS.joined(parts), np.cumsum([0, *map(len, parts)])
+            out.extend(joined.t_ns, frames.numbers[low:high], ends, rows)
+        return out.done()
+
+    def _together(self, joined: JoinedFrames, histories: Histories) -> tuple[Rows, Ints]:
+        """The predictions of some frames of tracks that have velocities, and where those of each frame end."""
+        passed = np.array([self._passed(t_ns) for t_ns in joined.t_ns.tolist()], np.int64)
+        self._step += int(passed.sum())
+        ids, place = joined.rows["track_id"], np.stack([joined.rows["x_m"], joined.rows["y_m"]], axis=-1)
+        past, known = histories.push_all(passed, joined.ends, ids, place)
+        is_ready = known[:, -self._min_history :].all(axis=1) & joined.rows["observed"]
+        ready = is_ready.nonzero()[0]
+        rows, past = joined.rows.take(ready), past[ready]
+        made = self._made(rows, past, known[ready], None)
+        forecast, tails = made.forecast, None
+        # As frame by frame: those of frames without a vehicle stay as they are, to the last digit.
+        count = len(joined.t_ns)
+        has_vehicle = np.bincount(joined.frame[ready], made.is_vehicle, count)[joined.frame[ready]] > 0
+        if has_vehicle.all():
+            forecast, tails = self._of_vehicles(made, rows, past)
+        elif has_vehicle.any():
+            here = has_vehicle.nonzero()[0]
+            part, shapes = self._of_vehicles(made.take(here), rows.take(here), past[here])
+            forecast.mean[here], forecast.cov[here] = part
+            if shapes is not None:
+                tails = normal_tails(forecast.mean.shape[:2])
+                for whole, values in zip(tails, shapes, strict=True):
+                    whole[here] = values
+        ends = np.append(0, np.cumsum(np.bincount(joined.frame[ready], minlength=count))) * self._predictor.steps
+        return forecast_to_rows(ids[ready], forecast, self._predictor.step_s, tails), ends
+
+    def _passed(self, t_ns: int) -> int:
+        """The number of steps from the frame before to this one, at least 1."""
+        last_ns, self._last_ns = self._last_ns, t_ns
+        return 1 if last_ns is None else max(1, round((t_ns - last_ns) * self._rate_hz / NS_PER_S))
+
+    def _made(self, rows: Rows, past: Floats, known: Bools, people: PeopleSeen | None) -> _Made:
+        """The forecasts of tracks (N,) as the predictor makes them, in metres."""
+        classes, of = np.unique(rows["class_id"], return_inverse=True)
         numbers = classes.tolist()
         unit_m = np.array(units_m(numbers, self._class_names, self._class_limits))[of]
         scale = unit_m[:, None, None]
-        people = self._people(frame.rows, past, known, ready) if uses_people(self._predictor) else None
-        mean, cov = predict_among(self._predictor, past[ready] / scale, known[ready], people)
-        forecast = Forecast(mean * scale, cov * scale[..., None] ** 2)
-        tails = None
-        has_velocity = np.isfinite(frame.rows["vx_m_per_s"][ready])
-        is_measured = has_velocity & (unit_m != 1)
-        if self._calibration is not None and not has_velocity.any():
-            is_coasting = np.zeros(len(has_velocity), bool)
-            forecast, tails = self._calibration(self._step, ids[ready], forecast, past[ready], is_coasting)
-        elif is_measured.any():
-            limits = limits_by_class(numbers, self._class_names, self._class_limits)
-            noise_m = np.array([limits[one].noise_m for one in numbers])[of]
-            stay = is_measured * _standing(past[ready], unit_m, self._predictor.step_s)
-            forecast = _with_rest(forecast, past[ready][:, -1], stay, noise_m, unit_m, self._predictor.step_s)
-            speed = np.hypot(*(frame.rows[name][ready].astype(float) for name in ("vx_m_per_s", "vy_m_per_s")))
-            kinds = [limits[numbers[one]].name for one in of.tolist()]
-            forecast, tails = calibrated(self._name, forecast, self._predictor.step_s, kinds, speed)
-        return forecast_to_rows(ids[ready], forecast, self._predictor.step_s, tails)
+        mean, cov = predict_among(self._predictor, past / scale, known, people)
+        has_velocity = np.isfinite(rows["vx_m_per_s"])
+        limits = limits_by_class(numbers, self._class_names, self._class_limits)
+        noise_m = np.array([limits[one].noise_m for one in numbers])[of]
+        kinds = np.array([limits[one].name for one in numbers])[of]
+        return _Made(Forecast(mean * scale, cov * scale[..., None] ** 2), has_velocity, unit_m, noise_m, kinds)
+
+    def _of_vehicles(self, made: _Made, rows: Rows, past: Floats) -> tuple[Forecast, Tails | None]:
+        """The forecasts of tracks (N,) in metres, of which vehicles may stay where they are, and are mixtures."""
+        step_s = self._predictor.step_s
+        stay = made.is_vehicle * _standing(past, made.unit_m, step_s)
+        forecast = _with_rest(made.forecast, past[:, -1], stay, made.noise_m, made.unit_m, step_s)
+        speed = np.hypot(*(rows[name].astype(float) for name in ("vx_m_per_s", "vy_m_per_s")))
+        return calibrated(self._name, forecast, step_s, made.kinds.tolist(), speed)
 
     def _people(self, rows: Rows, past: Floats, known: Bools, ready: Bools) -> PeopleSeen:
         """The people who are observed in a frame, for the tracks of it that are ``ready`` (N,).
@@ -120,6 +206,17 @@ class Forecaster:
         _, moment = np.unique(unit_m, return_inverse=True)
         row = np.searchsorted(there, np.flatnonzero(ready))
         return PeopleSeen(past[there] / unit_m[:, None, None], known[there], moment, row)
+
+
+def _have_velocities(joined: JoinedFrames) -> bool:
+    """Whether all rows have a velocity."""
+    return bool(np.isfinite(joined.rows["vx_m_per_s"]).all())
+
+
+def _are_twice(joined: JoinedFrames) -> bool:
+    """Whether an id is twice in a frame."""
+    order = np.lexsort((joined.rows["track_id"], joined.frame))
+    return not run_starts(joined.rows["track_id"][order], joined.frame[order]).all()
 
 
 def _standing(past: Floats, unit_m: Floats, step_s: float) -> Floats:

@@ -10,11 +10,20 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.ragged import group_index
-from mcaptrack.schema import TRACKS, Frame, Schema
+from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.classes import first_classes
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
-from mcaptrack.schema.framing import frame_numbers, has_any, joined_parts, row_ends, unique_values
+from mcaptrack.schema.framing import (
+    frame_numbers,
+    has_any,
+    joined_parts,
+    row_ends,
+    spans_of,
+    split_rows,
+    unique_values,
+)
 from mcaptrack.transforms.motion_limits import ClassNames, limits_by_class, units_m
 
 
@@ -97,29 +106,29 @@ def split_classes(frames: FrameColumns) -> list[FrameColumns]:
     return [collector.done() for collector in out]
 
 
-def join_classes(runs: Sequence[Iterator[tuple[Frame, ...]]], schemas: Sequence[Schema]) -> Iterator[tuple[Frame, ...]]:
-    """The results of each class (C,) as one: ids follow on those of the class before. One result for each of F frames.
+def join_classes(classes: Sequence[Sequence[FrameColumns]]) -> Iterator[tuple[Frame, ...]]:
+    """The outputs of several classes (C,) as one: ids follow on those of the class before. A tuple for each frame.
 
-    All frames of a result have tracks with the same ids: offline and online tracks, predictions and decisions; they are
-    of ``schemas``.
+    All outputs of a class have tracks with the same ids: offline and online tracks, predictions and decisions.
     """
-    results = []
-    taken = [0]
-    for run in runs:
-        collectors, highest = [FrameCollector(schema) for schema in schemas], 0
-        for frames in run:
-            for frame, collector in zip(frames, collectors, strict=True):
-                collector.append(frame)
-                highest = max(highest, int(frame.rows["track_id"].max(initial=0)))
-        taken.append(taken[-1] + highest)
-        results.append(zip(*(collector.done() for collector in collectors), strict=True))
-    for parts in zip(*results, strict=True):
-        yield tuple(_joined(frames, taken) for frames in zip(*parts, strict=True))
+    above = np.cumsum([0, *(max(map(_highest_id, outputs)) for outputs in classes)])
+    return zip(*(_joined(frames, above) for frames in zip(*classes, strict=True)), strict=True)
 
 
-def _joined(frames: Sequence[Frame], above: Sequence[int]) -> Frame:
-    """Frames of one output (C,) as one; ids of each are raised ``above`` those of the classes before."""
-    rows = np.concatenate([frame.rows for frame in frames])
-    raised = rows["track_id"] + np.repeat(above[: len(frames)], [len(frame.rows) for frame in frames])
-    rows["track_id"] = np.where(rows["track_id"] < 0, rows["track_id"], raised)
-    return frames[0]._replace(rows=rows)
+def _highest_id(frames: FrameColumns) -> int:
+    """The highest id of a track; 0 if there is none."""
+    parts = joined_parts(frames.schema, frames)
+    return max((int(part.rows["track_id"].max(initial=0)) for _, _, part in parts), default=0)
+
+
+def _joined(frames: Sequence[FrameColumns], above: Ints) -> Iterator[Frame]:
+    """One output of all classes (C,) as one; ids of each are raised ``above`` those of the classes before."""
+    schema = frames[0].schema
+    for low, high in spans_of(np.sum([one.ends for one in frames], axis=0)):
+        counts = [np.diff(one.ends[low : high + 1]) for one in frames]
+        rows = schema.joined([one.rows(low, high) for one in frames])
+        raised = rows["track_id"] + np.repeat(above[: len(frames)], [int(count.sum()) for count in counts])
+        rows["track_id"] = np.where(rows["track_id"] < 0, rows["track_id"], raised)
+        order = np.argsort(np.concatenate([group_index(count) for count in counts]), kind="stable")
+        ends = np.cumsum(np.sum(counts, axis=0))
+        yield from split_rows(frames[0].t_ns[low:high], frames[0].numbers[low:high], rows.take(order), ends)

@@ -58,7 +58,8 @@ def decision_rows(
     step = decided.tracked.step[at]
     order = np.lexsort((rows["source_id"], rows["track_id"], rows["kind"], step))
     ends = np.append(0, np.searchsorted(step[order], steps, "right")).tolist()
-    yield from (DECISIONS.check(rows[order[low:high]]) for low, high in pairwise(ends))
+    rows = DECISIONS.check(rows.take(order))
+    yield from (rows[low:high] for low, high in pairwise(ends))
 
 
 def find_kept_joins(decided: Decided, model: MotionModel, step_s: float) -> Joins:

@@ -10,28 +10,37 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.schema import Frame
+from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
+from mcaptrack.schema.framing import joined_parts
 from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.by_class import Movers
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
 from mcaptrack.transforms.retrack.options import RetrackOptions
-from mcaptrack.transforms.retrack.samples import LogSamples, OnlineOutputs
+from mcaptrack.transforms.retrack.samples import LogSamples
 
 
 class KeptIds:
-    """Tracks as their input has them: ``step`` for each frame, then ``outputs``."""
+    """Tracks as their input has them.
 
-    def __init__(self, options: RetrackOptions, movers: Movers) -> None:
+    Parameters
+    ----------
+    options : RetrackOptions
+    movers : Movers
+    frames : FrameColumns
+        Samples of tracks; each goes to the track of its input id.
+    """
+
+    def __init__(self, options: RetrackOptions, movers: Movers, frames: FrameColumns) -> None:
         self._options = options
         self.noise_m = (DEFAULT_NOISE_M if options.noise_m is None else options.noise_m) / movers.unit_m
         self.assignments = Assignments()
         self.samples = LogSamples()
         self.steps: list[int] = []
-        self._last_ns = 0
         self._number: dict[int, int] = {}
-        self._outputs = OnlineOutputs()
         self._forecaster = Forecaster(
             options.predictor,
             options.horizon_s,
@@ -40,23 +49,39 @@ class KeptIds:
             options.class_names,
             options.class_limits,
         )
+        self.online = self._read(frames)
 
-    def step(self, frame: Frame) -> None:
-        """One step: samples go to the track of their input id."""
-        passed = 1
-        if self.steps:
-            passed = max(1, round((frame.t_ns - self._last_ns) * self._options.rate_hz / NS_PER_S))
-        self.steps.append(self.steps[-1] + passed if self.steps else 0)
-        self._last_ns = frame.t_ns
-        order = np.argsort(frame.rows["track_id"], kind="stable")
-        rows = frame.rows[order]
-        self.samples.add(frame._replace(rows=rows))
-        own = [self._number.setdefault(one, len(self._number) + 1) for one in rows["track_id"].tolist()]
-        self.assignments.add(self.steps[-1], np.array(own, np.int64), rows["track_id"])
-        online = frame._replace(rows=rows.copy())
-        online.rows["source_id"], online.rows["track_id"] = rows["track_id"], own
-        self._outputs.add(online, frame._replace(rows=self._forecaster.predict(online)))
+    def _read(self, frames: FrameColumns) -> FrameColumns:
+        """The online tracks: frames with the samples under numbers of their own."""
+        out = FrameCollector(TRACKS)
+        last_ns: int | None = None
+        for low, high, joined in joined_parts(TRACKS, frames):
+            for t_ns in joined.t_ns.tolist():
+                passed = 1 if last_ns is None else round((t_ns - last_ns) * self._options.rate_hz / NS_PER_S)
+                self.steps.append(self.steps[-1] + max(1, passed) if self.steps else 0)
+                last_ns = t_ns
+            rows = joined.rows.take(np.lexsort((joined.rows["track_id"], joined.frame)))
+            numbers = frames.numbers[low:high]
+            self.samples.extend(joined.t_ns, numbers, joined.ends, rows)
+            source = rows["track_id"].copy()
+            own = self._numbers(source)
+            self.assignments.add(np.array(self.steps[low:high], np.int64)[joined.frame], own, source)
+            online = rows.copy()
+            online["source_id"], online["track_id"] = source, own
+            out.extend(joined.t_ns, numbers, joined.ends, online)
+        return out.done()
+
+    def _numbers(self, source: Ints) -> Ints:
+        """The number of the track of each input id (R,): from 1 on in the order in which they come."""
+        ids, first, which = np.unique(source, return_index=True, return_inverse=True)
+        for one in ids[np.argsort(first)].tolist():
+            self._number.setdefault(one, len(self._number) + 1)
+        return np.array([self._number[one] for one in ids.tolist()], np.int64)[which]
+
+    def predictions(self) -> FrameColumns:
+        """The predictions of the online tracks, from the past alone."""
+        return self._forecaster.predict_all(self.online)
 
     def outputs(self) -> Iterator[tuple[Frame, Frame]]:
-        """For each step the online tracks and their predictions, from the past alone."""
-        return iter(self._outputs)
+        """For each step the online tracks and their predictions."""
+        return zip(self.online, self.predictions(), strict=True)

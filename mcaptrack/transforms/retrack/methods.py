@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Final, Protocol, TypeAlias, TypeVar
 
 from mcaptrack.predictors import warn_if_weak
 from mcaptrack.schema import DECISIONS, TRACKS, Frame, Rows
-from mcaptrack.schema.frame_columns import FrameColumns, collect
+from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns, collect
 from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.by_class import Movers, join_classes, movers_of, split_classes, usual_score
@@ -18,7 +18,7 @@ from mcaptrack.transforms.retrack.consistency import ConsistencyPass
 from mcaptrack.transforms.retrack.in_pictures import link_in_picture
 from mcaptrack.transforms.retrack.kept_ids import KeptIds
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
-from mcaptrack.transforms.retrack.offline import offline_tracks
+from mcaptrack.transforms.retrack.offline import Offline, offline_tracks
 from mcaptrack.transforms.retrack.options import ConsistencyOptions, LikelihoodOptions, RetrackOptions
 from mcaptrack.transforms.retrack.samples import LogSamples
 
@@ -106,8 +106,10 @@ def _retrack(
     frames = collect(TRACKS, frames)
     parts = [frames] if options.across_classes else split_classes(frames)
     score = usual_score(frames)
-    runs = [_retrack_together(options, new_pass, part, score) for part in parts]
-    yield from runs[0] if len(runs) == 1 else join_classes(runs, tuple(options.writes.values()))
+    if len(parts) == 1:
+        yield from _frame_by_frame(options, frames, *_passes(options, new_pass, frames, score))
+    else:
+        yield from join_classes([_whole(options, part, *_passes(options, new_pass, part, score)) for part in parts])
 
 
 def _keep_ids(options: RetrackOptions, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
@@ -127,22 +129,46 @@ def _keep_ids(options: RetrackOptions, frames: Iterable[Frame]) -> Iterator[tupl
         yield outputs[: len(options.writes)]
 
 
-def _retrack_together(
+def _passes(
     options: Options, new_pass: Callable[[Options, Movers], OnlinePass], frames: FrameColumns, score: float
-) -> Iterator[tuple[Frame, ...]]:
+) -> tuple[OnlinePass | KeptIds, Offline]:
     """Re-track frames without regard to classes; ``score`` is the usual one of the log."""
     movers = movers_of(frames, options.class_names, score, options.class_limits)
-    run: OnlinePass = KeptIds(options, movers) if movers.on_ground else new_pass(options, movers)
-    for frame in frames:
-        run.step(frame)
+    run: OnlinePass | KeptIds
+    if movers.on_ground:
+        run = KeptIds(options, movers, frames)
+    else:
+        run = new_pass(options, movers)
+        for frame in frames:
+            run.step(frame)
     model = motion_model(options, run.noise_m, movers)
-    offline = offline_tracks(options, model, run.assignments, run.samples, run.steps, frames.t_ns, movers)
+    return run, offline_tracks(options, model, run.assignments, run.samples, run.steps, frames.t_ns, movers)
+
+
+def _frame_by_frame(
+    options: Options, frames: FrameColumns, run: OnlinePass | KeptIds, offline: Offline
+) -> Iterator[tuple[Frame, ...]]:
+    """The outputs of re-tracking for each frame."""
     for frame, rows, (online, predictions), decided in zip(
         frames, offline.tracks, run.outputs(), offline.decisions, strict=True
     ):
         # copies, because what is kept can't be written to
         causal = (one._replace(rows=one.rows.copy()) for one in (online, predictions))
         yield (frame._replace(rows=rows), *causal, frame._replace(rows=decided))[: len(options.writes)]
+
+
+def _whole(options: Options, frames: FrameColumns, run: OnlinePass | KeptIds, offline: Offline) -> list[FrameColumns]:
+    """The outputs of re-tracking, each with all of its frames."""
+    made = [FrameCollector(schema) for schema in options.writes.values()]
+    if not isinstance(run, KeptIds):
+        for outputs in _frame_by_frame(options, frames, run, offline):
+            for collector, frame in zip(made, outputs, strict=True):
+                collector.append(frame)
+        return [collector.done() for collector in made]
+    for frame, *both in zip(frames, offline.tracks, offline.decisions, strict=True):
+        for collector, rows in zip((made[0], *made[3:]), both, strict=False):
+            collector.append(frame._replace(rows=rows))
+    return [made[0].done(), run.online, run.predictions(), *(collector.done() for collector in made[3:])]
 
 
 _PAPER: Final = RetrackByConsistency(

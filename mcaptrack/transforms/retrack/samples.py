@@ -40,6 +40,13 @@ class LogSamples:
         self._counts.append(len(frame.rows))
         self._collector.append(frame)
 
+    def extend(self, t_ns: Ints, numbers: Ints, ends: Ints, rows: Rows) -> None:
+        """Add the samples of F frames at once; the arguments are those of ``FrameCollector.extend``."""
+        for name, held in self._held.items():
+            held.extend(rows[name].tobytes())
+        self._counts.extend(np.diff(ends).tolist())
+        self._collector.extend(t_ns, numbers, ends, rows)
+
     def __len__(self) -> int:
         return len(self._held["observed"])
 
