@@ -264,6 +264,46 @@ def test_the_timeout_of_merged_detections_restarts_with_every_occlusion():
     assert online[10:] == [2] * 24
 
 
+def abreast(apart_m: float, aside_m: float, until: int, since: int = 15) -> list[Frame]:
+    """Two walk so far apart; from tick 15 on one is missed, and from ``since`` on the other is so far aside, towards her."""
+
+    def path(tick: int):
+        if tick >= 15:
+            return {1: (0.4 * tick, aside_m if tick >= since else 0.0)}
+        return {1: (0.4 * tick, 0.0), 2: (0.4 * tick, apart_m)}
+
+    return walk(path, until)
+
+
+@pytest.mark.parametrize(
+    ("apart_m", "aside_m", "is_merged"), [(0.5, 0.15, False), (0.5, 0.25, False), (1.2, 0.6, True)]
+)
+def test_a_missed_detection_beside_a_person_is_no_merged_one(apart_m, aside_m, is_merged):
+    """The noise of positions is 0.2 m, so that 0.25 m aside, half way, says nothing, and 0.6 m does."""
+    shown = [len(frame.rows) for _, frame, *_ in FEW(abreast(apart_m, aside_m, 21))]
+    assert shown[15:] == ([2] * 6 if is_merged else [2] * 3 + [1] * 3)
+
+
+def test_how_far_aside_a_detection_is_that_of_two():
+    """As in the reference, a step after the last detection of one, of whom less is known then."""
+    apart_m, since = 1.5, 16
+    last = since + 3  # longer than tracks coast
+
+    def ours(aside_m: float) -> bool:
+        *_, (_, online, *_) = FEW(abreast(apart_m, aside_m, last + 1, since))
+        return len(online.rows) == 1
+
+    def reference(aside_m: float) -> bool:
+        frames = abreast(apart_m, aside_m, last + 1, since)
+        samples = [[dict(zip(row.dtype.names, row.tolist(), strict=True)) for row in frame.rows] for frame in frames]
+        _, online, _ = OnlineTracker(FEW, lambda points: (np.zeros((1, 2)), np.zeros((1, 2, 2))), 1).run(
+            samples, [frame.t_ns for frame in frames]
+        )
+        return len(online[-1]) == 1
+
+    compare(ours, reference, 0.0, apart_m / 2)
+
+
 def test_a_swap_at_the_last_step_of_both_is_undone():
     """Two stand 1.5 m apart, and only their last positions are swapped."""
     paths = {

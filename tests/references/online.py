@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import exp, hypot, log
+from math import exp, hypot, log, pi
 
 import numpy as np
 
@@ -50,9 +50,14 @@ class Person:
         self.cov = self.cov - np.outer(gain, self.cov[0])
 
 
+def log_density(off: np.ndarray, variance: float) -> float:
+    """That of a normal distribution in the plane with the same variance along both axes."""
+    return float(-(off**2).sum() / variance / 2 - log(2 * pi * variance))
+
+
 class OnlineTracker:
     CAP, GATE, CROWD_M, FRESH, FLOOR_M = 26.0, 40.0, 1.7, 4.0, 0.1
-    WIDE = 0.1
+    WIDE, MERGED = 0.1, 4.0
 
     def __init__(self, options, predict: Predict, past: int) -> None:
         o = self.options = options
@@ -160,8 +165,13 @@ class OnlineTracker:
             host = min(sure, key=lambda p: hypot(*(place(has[p.name]) - person.here)))
             at = place(has[host.name])
             middle = (host.here + person.here) / 2
-            if hypot(*(at - person.here)) < o.merge_distance_m and hypot(*(at - middle)) < hypot(*(at - host.here)):
-                hosts.add((host.name, person.name))
+            is_between = hypot(*(at - middle)) < hypot(*(at - host.here))
+            if hypot(*(at - person.here)) < o.merge_distance_m and is_between:
+                noise = self.noise_m**2
+                both = log_density(at - middle, (host.cov[0, 0] + person.cov[0, 0]) / 4 + noise)
+                one = log_density(at - host.here, host.cov[0, 0] + noise)
+                if 2 * (both - one) > self.MERGED or person.merged:
+                    hosts.add((host.name, person.name))
         for host, guest in hosts:
             person = next(p for p in self.people if p.name == guest)
             person.correct(place(has[host]), o.merge_distance_m / 2)

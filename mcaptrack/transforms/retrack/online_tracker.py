@@ -35,13 +35,16 @@ class Association:
     against an input id that was never seen before if the track missed nothing. ``unmatched`` is the cost of leaving a
     pair unmatched, and ``gate`` the largest squared Mahalanobis distance of a pair. ``extra_noise_m`` is added to the
     noise of positions. Two tracks may be merged into one detection that lies within ``merge_distance_m`` of both, for
-    at most ``merge_timeout_s``.
+    at most ``merge_timeout_s``, if the middle between them makes it likelier by ``merge_evidence`` than the position of
+    the track that has it: otherwise a missed detection beside another person would be taken for a merged one. Tracks
+    that are merged stay so without it, because the detection soon draws the track that has it to the middle.
     """
 
     same_id: float
     same_id_crowded: float
     merge_distance_m: float
     merge_timeout_s: float
+    merge_evidence: float = 4.0
     unmatched: float = 26.0
     gate: float = 40.0
     crowd_m: float = 1.7
@@ -121,8 +124,9 @@ class OnlineTracker:
     def _merged_detections(self, track: Ints, row: Ints, xy_m: Floats) -> tuple[Ints, Ints]:
         """Find pairs of tracks merged into one detection (occlusion), and which track has that detection.
 
-        A lost track is occluded by another one if the observation of the latter lies between both. Returns the occluded
-        tracks, and for each the index into ``track`` of the one that occludes it.
+        A lost track becomes occluded by another one if the observation of the latter lies between both, and the middle
+        makes it likelier than its own track does. Returns the occluded tracks, and for each the index into ``track`` of
+        the one that occludes it.
         """
         nothing = np.empty(0, np.intp), np.empty(0, np.intp)
         is_lost = (self.hits >= self.confirm_hits) & (self.merged * self.step_s < self.association.merge_timeout_s)
@@ -136,9 +140,13 @@ class OnlineTracker:
         squared = np.einsum("knd,knd->kn", off, off)
         nearest = squared.argmin(axis=1)
         is_merged = squared[np.arange(len(lost)), nearest] < self.association.merge_distance_m**2
-        own = expected[track[confirmed[nearest]]]
-        to_middle = observed[nearest] - (own + expected[lost]) / 2
-        is_merged &= (to_middle**2).sum(axis=1) < ((observed[nearest] - own) ** 2).sum(axis=1)
+        owner = track[confirmed[nearest]]
+        to_own = ((observed[nearest] - expected[owner]) ** 2).sum(axis=1)
+        to_middle = ((observed[nearest] - (expected[owner] + expected[lost]) / 2) ** 2).sum(axis=1)
+        of_own, of_lost, noise = self.state.cov[owner, 0], self.state.cov[lost, 0], self.model.noise_m**2
+        alone, together = of_own + noise, (of_own + of_lost) / 4 + noise  # the middle of two has a quarter of both
+        evidence = to_own / alone - to_middle / together + 2 * np.log(alone / together)
+        is_merged &= (to_middle < to_own) & ((evidence > self.association.merge_evidence) | (self.merged[lost] > 0))
         return lost[is_merged], confirmed[nearest[is_merged]]
 
     def _update_occluded(self, occluded: Ints, xy_m: Floats, passed: int) -> None:
