@@ -81,13 +81,14 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     },
     "motion": {"mask_boxes": True},
     "sample": {"rate_hz": 2.5, "max_gap_s": 2.0},
-    "predict": {"predictor": "red", "horizon_s": 4.8, "min_history": 4, "class_limits": ""},
+    "predict": {"predictor": "red", "horizon_s": 4.8, "min_history": 4, "adapt": True, "class_limits": ""},
     "retrack": RETRACKING
     | {
         "merge_distance_m": 1.0,
         "merge_timeout_s": 3.0,
         "confirm_s": 1.2,
         "coast_s": 1.2,
+        "adapt": True,
     },
     "consistency": RETRACKING
     | {

@@ -141,6 +141,7 @@ LIKELIHOOD = {
     "merge_timeout_s": [0.0, 0.8, 3.0],
     "confirm_s": [0.0, 0.4, 1.2],
     "coast_s": [0.0, 0.4, 1.2],
+    "adapt": [False, True],
     "min_track_s": [0.0, 0.8, 2.0],
     "interpolated": [False, True],
     "rate_hz": [2.5, 4.0],

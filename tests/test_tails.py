@@ -12,7 +12,7 @@ from mcaptrack.evaluation.metrics.calibration import ellipse_levels
 from mcaptrack.geometry.mixtures import Tails, squared_radius
 from mcaptrack.notices import Notice, listening
 from mcaptrack.predictors import NAMES, Forecast, make
-from mcaptrack.predictors.tails import TABLES, TailCalibration, counts_of, fit_mixture, table_of
+from mcaptrack.predictors.tails import TABLES, Learned, TailCalibration, counts_of, fit_mixture, follow, table_of
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.predictions import tails_of
 from mcaptrack.transforms import PROFILES
@@ -73,12 +73,67 @@ def test_a_mixture_is_found_again_from_its_samples():
     assert [part.item() for part in found] == pytest.approx([0.3, 0.5, 6.0], rel=0.08)
 
 
+class TestFollowing:
+    """What mixtures become after a table and the comparisons of a log, over many iterations."""
+
+    TABLE = Tails(np.full(3, 0.2), np.array([0.3, 0.5, 0.6]), np.array([2.0, 3.0, 4.0]))
+
+    def followed(self, halves: list[np.ndarray], noise: float = 0.0, least: float = 0.0) -> Tails:
+        ahead = np.repeat(np.arange(3), [len(part) for part in halves])
+        counts = counts_of(ahead, np.concatenate(halves), 3)
+        tails = self.TABLE
+        for _ in range(100):
+            tails = follow(self.TABLE, tails, Learned(counts, np.zeros(3), np.full(3, noise), np.full(3, least)))
+        return tails
+
+    def samples(self, narrow: float, wide: float, count: int, noise: float = 0.0) -> np.ndarray:
+        rng = np.random.default_rng(3)
+        scale = np.where(rng.random(count) < 0.3, wide, narrow) + noise
+        return scale * rng.exponential(size=count)
+
+    def test_without_comparisons_they_are_the_table(self):
+        found = self.followed([np.empty(0)] * 3)
+        for one, given in zip(found, self.TABLE, strict=True):
+            assert one.tolist() == pytest.approx(given.tolist())
+
+    @pytest.mark.parametrize("noise", [0.0, 0.5])
+    def test_after_many_they_are_those_of_the_log_without_the_noise_of_its_positions(self, noise):
+        found = self.followed([self.samples(1.0, 20.0, 50_000, noise)] * 3, noise)
+        for one, wanted in zip(found, (0.3, 1.0, 20.0), strict=True):
+            assert one.tolist() == pytest.approx([wanted] * 3, rel=0.08)
+
+    def test_a_few_change_little_and_more_change_more(self):
+        sizes = [self.followed([self.samples(5.0, 5.0, count)] * 3).narrow_scale[1] for count in (0, 1, 30)]
+        assert sizes == sorted(sizes)
+        assert sizes[1] < 2.5  # they are 5
+
+    def test_what_is_known_of_the_near_future_counts_for_the_distant_one_but_less(self):
+        nothing = np.empty(0)
+        found = self.followed([self.samples(0.03, 0.2, 500), nothing, nothing]).narrow_scale / self.TABLE.narrow_scale
+        assert found[0] < 0.2
+        assert found[0] < found[1] == pytest.approx(found[2])
+        assert found[1] < 0.5
+
+    def test_large_and_small_errors_count_alike(self):
+        """Scales are averaged as logarithms: a log with a tenth of the errors changes as much as one with ten times."""
+        less, more = (self.followed([np.full(20, 0.5 * factor)] * 3) for factor in (0.01, 100.0))
+        smaller = np.log(less.narrow_scale / self.TABLE.narrow_scale)
+        larger = np.log(more.wide_scale / self.TABLE.wide_scale)
+        assert (smaller < -2).all()
+        assert (larger > 0.5).all()
+
+    def test_errors_are_no_smaller_than_positions_are_known(self):
+        tiny = [np.full(1000, 1e-4)] * 3
+        assert self.followed(tiny, least=0.2).narrow_scale.tolist() == pytest.approx([0.2] * 3)
+        assert (self.followed(tiny).narrow_scale < 0.01).all()
+
+
 class TestCalibration:
-    def forecasts(self, sd_m: float, noise_m: float = 0.0, steps: int = 60, tracks: int = 40):
+    def forecasts(self, sd_m: float, noise_m: float = 0.0, steps: int = 60, tracks: int = 40, adapts: bool = True):
         """Errors of a known size of a predictor that says 1 m; the levels of the ellipses that hold them, by time."""
         rng = np.random.default_rng(4)
         predictor = make("kalman", 3, 0.4)
-        calibration = TailCalibration.of("kalman", predictor)
+        calibration = TailCalibration.of("kalman", predictor, adapts)
         ids, levels = np.arange(tracks), []
         place = np.zeros((steps + 4, tracks, 2))
         for step in range(steps):
@@ -95,6 +150,29 @@ class TestCalibration:
         levels = self.forecasts(sd_m)[30:]
         for level in (0.5, 0.95):
             assert (levels <= level).mean() == pytest.approx(level, abs=0.04)
+
+    def test_ellipses_that_do_not_follow_stay(self):
+        for level in (0.5, 0.95):
+            held = self.forecasts(0.05, adapts=False) <= level
+            assert held.all()
+
+    def test_one_exchange_of_ids_among_many_tracks_leaves_them_as_they_are(self):
+        """Two of 40 tracks exchange their places for good: a few large errors, once."""
+        predictor = make("cv", 6, 0.4)
+        now = []
+        for is_exchanged in (False, True):
+            calibration = TailCalibration.of("cv", predictor)
+            noise = np.random.default_rng(5).normal(0, 0.1, (60, 40, 2))
+            start = 5.0 * np.arange(40)[:, None] * [[1.0, 0.0]]
+            for step in range(8, 60):
+                place = noise[:step] + start + 0.4 * np.arange(step)[:, None, None] * [0.0, 1.0]
+                if is_exchanged and step > 40:
+                    place[40:, [0, 1]] = place[40:, [1, 0]]
+                past = place[-8:].transpose(1, 0, 2)
+                forecast = predictor.predict(past, np.ones(past.shape[:2], bool))
+                made, tails = calibration(step, np.arange(40), forecast, past, np.zeros(40, bool))
+            now.append((made.cov[5, :, 0, 0] * squared_radius(0.5, Tails(*(part[5] for part in tails)))) ** 0.5)
+        assert now[1].tolist() == pytest.approx(now[0].tolist(), rel=0.1)
 
     def test_ellipses_are_of_true_positions_though_measured_ones_have_noise(self):
         levels = self.forecasts(0.3, noise_m=0.3, steps=200)[100:]

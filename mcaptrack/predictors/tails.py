@@ -4,7 +4,9 @@ The covariance of a predictor is scaled, and becomes that of a mixture of a narr
 begin as a table for each predictor, which was fitted on synthetic walks with the faults of trackers (noise, gaps, short
 and merged tracks, switched ids), before and after re-tracking: ``tools/fit_tails.py`` makes the file. While a log is
 read they follow it, because people and trackers differ: forecasts of a time that has come are compared with where their
-tracks were observed then. Nothing is known that was not known at the time of a forecast.
+tracks were observed then, and scale the distributions of the forecasts after them (compare adaptive conformal
+inference: I. Gibbs and E. Candes, NeurIPS 2021; here the scales are shrunk towards the table, so that few comparisons
+change little). Nothing is known that was not known at the time of a forecast.
 
 The means of forecasts, and the covariances by which tracks are associated, are those of the predictor.
 
@@ -23,25 +25,36 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.mixtures import Tails, mahalanobis_squared, mass_within
+from mcaptrack.geometry.mixtures import Tails, mahalanobis_squared, squared_radius
 from mcaptrack.predictors.forecast import Forecast, Predictor
 
 TABLES: Final = Path(__file__).parent / "trained" / "tails.json"
 #: Edges and centres of bins of half the squared Mahalanobis distance, in which comparisons are counted.
 _EDGES: Final = np.geomspace(1e-4, 1e4, 49)
 _CENTRES: Final = np.sqrt(_EDGES[1:] * _EDGES[:-1])
-#: The table counts like so many comparisons of each step.
-_PRIOR_COUNT: Final = 20.0
 #: Comparisons count 1 / e after so many seconds.
 _MEMORY_S: Final = 300.0
-#: The distribution is fitted again after so many steps, with so many iterations from the last one.
-_REFIT_STEPS: Final = 3
-_ITERATIONS: Final = 4
+#: Forecasts of a track at consecutive times have errors that are alike: they count as so many independent ones.
+_INDEPENDENT_PER_S: Final = 0.625
+#: Mixtures are fitted again after so many seconds.
+_REFIT_S: Final = 0.8
+#: So many independent comparisons count as much as the table, for the size of errors at all steps together; as much as
+#: the size at all steps, for that at one step; and as much as the table, for the share of large errors.
+_ALL_STEPS, _ONE_STEP, _WEIGHT = 1.0, 4.0, 20.0
+#: Large errors are rare and their size varies: for it the table counts so many times as much.
+_LARGE: Final = 20.0
+#: This share of the forecasts of tracks that are no longer observed is taken to have large errors, as in the table:
+#: people who turn or stop are lost more often than others.
+_LOST: Final = 0.005
+#: Errors are no smaller than this share of the variance that noise adds to measured positions, nor than this share of
+#: that noise with a memory of up to ``_NOISE_LAGS[1]`` steps, which trackers make of it by smoothing.
+_LEAST_WHITE, _LEAST_SLOW = 0.3, 0.5
+#: Noise is estimated from the bends of tracks over one step and over several.
+_NOISE_LAGS: Final = (1, 3)
 #: Limits of the weight of the wide part.
 _LEAST_WIDE, _MOST_WIDE = 0.02, 0.6
-#: The noise of measured positions is estimated from those of so many of the last steps, if they are so many.
-_NOISE_STEPS: Final = 40
-_LEAST_POSITIONS: Final = 10
+#: Noise is estimated again after so many steps, from the positions of so many of the last, if there are so many.
+_NOISE_EVERY, _NOISE_STEPS, _LEAST_POSITIONS = 3, 40, 10
 
 
 class TailTable(NamedTuple):
@@ -103,6 +116,52 @@ def counts_of(step: Ints, half_squared: Floats, steps: int) -> Floats:
     return np.asarray(flat.reshape(steps, len(_CENTRES)), np.float64)
 
 
+class Learned(NamedTuple):
+    """The errors of forecasts in a log so far, for T steps ahead.
+
+    ``counts`` (T, B) are independent comparisons by half the squared distance, ``lost`` (T,) independent forecasts of
+    tracks that were not observed then. ``noise`` and ``least`` (T,) are in units of the predictor's covariance: the
+    part of the distances that is noise of measured positions, and the least size of errors.
+    """
+
+    counts: Floats
+    lost: Floats
+    noise: Floats
+    least: Floats
+
+
+def follow(table: Tails, before: Tails, learned: Learned) -> Tails:
+    """The mixtures (T,) of a table after what a log says: one step of expectation and maximisation from ``before``.
+
+    Sizes of errors are scaled by a factor for all steps, so that what is known of the near future counts for the
+    distant one, too, and by one for each step. Both are geometric means of the table's and of the log's, by what either
+    counts.
+    """
+    noise = learned.noise
+    narrow, wide = (before.narrow_scale + noise)[:, None], (before.wide_scale + noise)[:, None]
+    weight = before.wide_weight[:, None]
+    one = (1 - weight) / narrow * np.exp(-_CENTRES / narrow)
+    two = weight / wide * np.exp(-_CENTRES / wide)
+    of_wide = learned.counts * two / np.maximum(one + two, 1e-300)
+    sums = np.stack([learned.counts.sum(axis=1) - of_wide.sum(axis=1), of_wide.sum(axis=1)])  # narrow, wide
+    total = np.stack([(learned.counts - of_wide) @ _CENTRES, of_wide @ _CENTRES])
+    size = np.maximum(total / np.maximum(sums, 1e-9) - noise, np.maximum(_LEAST_WHITE * noise, 1e-4))
+    given = np.stack([table.narrow_scale, table.wide_scale])
+    change = np.where(sums > 1e-6, np.log(size / given), 0.0)
+    trust, lost = np.array([[1.0], [_LARGE]]), _LOST * learned.lost
+    all_sums = sums + np.stack([np.zeros_like(lost), lost])  # those that are lost have the size of the table
+    shared = (sums * change).sum(axis=1) / (trust[:, 0] * _ALL_STEPS + all_sums.sum(axis=1))
+    own = (trust * _ONE_STEP * shared[:, None] + sums * change) / (trust * _ONE_STEP + all_sums)
+    narrow_scale, wide_scale = given * np.exp(own)
+    few, many = all_sums[1], all_sums.sum(axis=0)
+    mean = table.wide_weight.mean()
+    odds = (_WEIGHT * mean + few.sum()) / (_WEIGHT * (1 - mean) + (many - few).sum()) * (1 - mean) / mean
+    expected = 1 / (1 + (1 / table.wide_weight - 1) / odds)
+    wide_weight = np.clip((_WEIGHT * expected + few) / (_WEIGHT + many), _LEAST_WIDE, _MOST_WIDE)
+    narrow_scale = np.maximum(narrow_scale, learned.least)
+    return Tails(wide_weight, narrow_scale, np.maximum(wide_scale, narrow_scale))
+
+
 class _Made(NamedTuple):
     """Forecasts of one time that wait for theirs."""
 
@@ -121,26 +180,34 @@ class TailCalibration:
         The calibration to begin with.
     predictor : Predictor
         The predictor of the forecasts.
+    adapts : bool
+        Whether it follows the log.
     """
 
-    def __init__(self, table: TailTable, predictor: Predictor) -> None:
+    def __init__(self, table: TailTable, predictor: Predictor, adapts: bool = True) -> None:
         self._steps, self._step_s, self._past = predictor.steps, predictor.step_s, predictor.past
         ahead_s: Floats = self._step_s * np.arange(1.0, self._steps + 1)
-        self._table = table.at(ahead_s)
-        self._tails = Tails(self._table.wide_weight, self._table.narrow_scale, self._table.wide_scale)
-        inside = mass_within(2 * _EDGES, Tails(*(part[:, None] for part in self._tails)))
-        self._prior = _PRIOR_COUNT * np.diff(inside, axis=1)
-        self._counts = np.zeros_like(self._prior)
+        self._table, self._adapts = table.at(ahead_s), adapts
+        self._given = Tails(self._table.wide_weight, self._table.narrow_scale, self._table.wide_scale)
+        self._tails = self._given
+        self._counts = np.zeros((self._steps, len(_CENTRES)))
+        self._lost, self._seen, self._inverse = (np.zeros(self._steps) for _ in range(3))
         self._made: deque[_Made] = deque(maxlen=self._steps)
-        self._bends_m2: deque[Floats] = deque(maxlen=_NOISE_STEPS)
-        self._noise_m2 = 0.0
-        self._fitted_at, self._is_new = 0, False
+        self._bends_m2: dict[int, deque[Floats]] = {lag: deque(maxlen=_NOISE_STEPS) for lag in _NOISE_LAGS}
+        self._noise_m2 = dict.fromkeys(_NOISE_LAGS, 0.0)
+        self._fitted_at = self._noise_at = 0
 
     @classmethod
-    def of(cls, name: str, predictor: Predictor) -> TailCalibration | None:
+    def of(cls, name: str, predictor: Predictor, adapts: bool = True) -> TailCalibration | None:
         """The calibration of a predictor by name; None if it has no table."""
         table = table_of(name)
-        return None if table is None else cls(table, predictor)
+        return None if table is None else cls(table, predictor, adapts)
+
+    @property
+    def factor(self) -> float:
+        """The size of the 50 % ellipses beside those of the table, as a ratio of lengths."""
+        radii = squared_radius(0.5, self._tails) / squared_radius(0.5, self._given)
+        return float(np.sqrt(np.median(radii)))
 
     def __call__(
         self, step: int, ids: Ints, forecast: Forecast, past: Floats, is_coasting: Bools
@@ -165,44 +232,67 @@ class TailCalibration:
         Forecast, Tails
             With the covariances of the mixtures, and their shapes (N, T).
         """
-        self._learn(step, ids[~is_coasting], past[~is_coasting])
+        if self._adapts:
+            self._learn(step, ids[~is_coasting], past[~is_coasting])
         known = np.isfinite(past[:, -self._past :, 0]).sum(axis=1)
         factor = np.where((known < self._past)[:, None], self._table.short, 1.0)
         factor = np.where(is_coasting[:, None], self._table.coasting, factor)
         cov = forecast.cov * factor[:, :, None, None]
-        self._made.append(_Made(step, ids.copy(), forecast.mean.copy(), cov))  # not parts of larger arrays
+        if self._adapts:
+            self._made.append(_Made(step, ids.copy(), forecast.mean.copy(), cov))  # not parts of larger arrays
         weight, narrow, wide = self._tails
         whole = (1 - weight) * narrow + weight * wide
         parts = (np.broadcast_to(part, factor.shape) for part in (weight, narrow / whole, wide / whole))
         return Forecast(forecast.mean, cov * whole[:, None, None]), Tails(*parts)
 
     def _learn(self, step: int, ids: Ints, past: Floats) -> None:
-        """Compare earlier forecasts with the tracks that are observed now; fit the mixtures again now and then."""
-        if past.shape[1] >= 3 and len(past):
-            bend = past[:, -1] - 2 * past[:, -2] + past[:, -3]
-            self._bends_m2.append((bend**2).sum(axis=1)[np.isfinite(bend[:, 0])])
+        """Compare earlier forecasts with the tracks that are observed now, and follow what they say."""
+        self._see_bends(step, past)
         due = [(one, step - one.step - 1) for one in self._made if 0 < step - one.step <= self._steps]
-        if due and len(ids):
-            order = np.argsort(ids, kind="stable")
-            of = np.concatenate([one.ids for one, _ in due])
-            ahead = np.repeat([k for _, k in due], [len(one.ids) for one, _ in due])
-            mean = np.concatenate([one.mean[:, k] for one, k in due])
-            cov = np.concatenate([one.cov[:, k] for one, k in due])
-            at = order[np.minimum(np.searchsorted(ids, of, sorter=order), len(ids) - 1)]
-            seen = ids[at] == of
-            self._compare(ahead[seen], past[at[seen], -1] - mean[seen], cov[seen])
-        if self._is_new and step - self._fitted_at >= _REFIT_STEPS:
-            self._counts *= np.exp(-(step - self._fitted_at) * self._step_s / _MEMORY_S)
-            self._tails = fit_mixture(self._counts + self._prior, self._tails, _ITERATIONS)
-            self._fitted_at, self._is_new = step, False
-            bends_m2 = np.concatenate(self._bends_m2) if self._bends_m2 else np.empty(0)
-            if len(bends_m2) >= _LEAST_POSITIONS:  # bends have six times the variance of white noise, in two axes
-                self._noise_m2 = float(np.median(bends_m2)) / (12 * np.log(2))
+        if not due or not len(ids):
+            return
+        order = np.argsort(ids, kind="stable")
+        of = np.concatenate([one.ids for one, _ in due])
+        ahead = np.repeat([k for _, k in due], [len(one.ids) for one, _ in due])
+        mean = np.concatenate([one.mean[:, k] for one, k in due])
+        cov = np.concatenate([one.cov[:, k] for one, k in due])
+        at = order[np.minimum(np.searchsorted(ids, of, sorter=order), len(ids) - 1)]
+        seen = ids[at] == of
+        if not seen.any():
+            return
+        self._add(ahead[~seen], ahead[seen], past[at[seen], -1] - mean[seen], cov[seen])
+        passed_s = (step - self._fitted_at) * self._step_s
+        if passed_s < _REFIT_S - self._step_s / 2:
+            return
+        kept = np.exp(-passed_s / _MEMORY_S)
+        for part in (self._counts, self._lost, self._inverse, self._seen):
+            np.multiply(part, kept, out=part)
+        inverse = self._inverse / np.maximum(self._seen, 1e-9)
+        white, slow = (inverse * self._noise_m2[lag] for lag in _NOISE_LAGS)
+        independent = _INDEPENDENT_PER_S * self._step_s
+        counts, lost = independent * self._counts, independent * self._lost
+        self._tails = follow(self._given, self._tails, Learned(counts, lost, white, _LEAST_SLOW * slow))
+        self._fitted_at = step
 
-    def _compare(self, ahead: Ints, off: Floats, cov: Floats) -> None:
-        """Count errors (M, 2) of steps (M,); the measured positions have noise, too, which the true ones have not."""
-        weight, narrow, wide = self._tails
-        noise = (self._noise_m2 / np.maximum((1 - weight) * narrow + weight * wide, 1e-3))[ahead]
-        half = mahalanobis_squared(off, cov + noise[:, None, None] * np.eye(2)) / 2
+    def _add(self, lost: Ints, ahead: Ints, off: Floats, cov: Floats) -> None:
+        """Count errors (M, 2) so many steps ahead (M,), and the steps of forecasts that can't be compared."""
+        half = mahalanobis_squared(off, cov) / 2
+        size = np.sqrt(cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] ** 2)
         self._counts += counts_of(ahead, half, self._steps)
-        self._is_new = self._is_new or bool(len(ahead))
+        self._lost += np.bincount(lost, minlength=self._steps)
+        self._seen += np.bincount(ahead, minlength=self._steps)
+        self._inverse += np.bincount(ahead, 1 / size, minlength=self._steps)
+
+    def _see_bends(self, step: int, past: Floats) -> None:
+        """Estimate the noise of measured positions, which true ones don't have, now and then."""
+        for lag, kept in self._bends_m2.items():
+            if past.shape[1] > 2 * lag and len(past):
+                bend = past[:, -1] - 2 * past[:, -1 - lag] + past[:, -1 - 2 * lag]
+                kept.append((bend**2).sum(axis=1)[np.isfinite(bend[:, 0])])
+        if step - self._noise_at < _NOISE_EVERY:
+            return
+        self._noise_at = step
+        for lag, kept in self._bends_m2.items():
+            bends_m2 = np.concatenate(kept) if kept else np.empty(0)
+            if len(bends_m2) >= _LEAST_POSITIONS:  # bends have six times the variance of white noise, in two axes
+                self._noise_m2[lag] = float(np.median(bends_m2)) / (12 * np.log(2))

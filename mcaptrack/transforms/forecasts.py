@@ -23,6 +23,8 @@ from mcaptrack.schema.framing import JoinedFrames, join_frames, spans_of
 from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.transforms.motion_limits import ClassNames, limits_by_class, units_m
 
+#: The help of the option by which ellipses follow the log.
+ADAPT_HELP: Final = "let ellipses follow the log: they grow or shrink by the errors of earlier predictions in it"
 #: The number of tracks that are predicted at once: what is computed for them takes some kilobytes each.
 _PART_ROWS: Final = 2048
 #: Vehicles that stand mostly stay: their speed over this many steps, in units of length per second, up to which they
@@ -81,6 +83,8 @@ class Forecaster:
         Limits of the motion of classes instead of those of the table, as the option of transforms.
     histories : callable
         Called with the number of past positions that are needed; keeps them.
+    adapt : bool
+        Whether ellipses follow the log.
     **options
         Own parameters of the predictor.
     """
@@ -94,12 +98,13 @@ class Forecaster:
         class_names: ClassNames = (),
         class_limits: str = "",
         histories: Callable[[int], PastPositions] = Histories,
+        adapt: bool = True,
         **options: Any,
     ) -> None:
         self._name, self._rate_hz, self._min_history = predictor, rate_hz, min_history
         self._class_names, self._class_limits = class_names, class_limits
         self._predictor = make(predictor, max(1, round(horizon_s * rate_hz)), 1 / rate_hz, **options)
-        self._calibration = TailCalibration.of(predictor, self._predictor)
+        self._calibration = TailCalibration.of(predictor, self._predictor, adapt)
         self._step = 0
         self._histories = histories(max(self._predictor.past, min_history))
         self._last_ns: int | None = None

@@ -14,7 +14,7 @@ from mcaptrack.predictors import PredictorName, entry_of, warn_if_weak
 from mcaptrack.predictors.own_options import own_options
 from mcaptrack.registry import Entry
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
-from mcaptrack.transforms.forecasts import Forecaster, PastPositions
+from mcaptrack.transforms.forecasts import ADAPT_HELP, Forecaster, PastPositions
 from mcaptrack.transforms.motion_limits import LIMITS_HELP, LIMITS_PATTERN, ClassNames, read_limits
 from mcaptrack.transforms.protocol import check_options, context, is_option_type, option
 
@@ -49,6 +49,7 @@ class Predict:
     min_history: int = option(
         4, "number of positions, the current one included, that a prediction needs", least=1, most=100
     )
+    adapt: bool = option(True, ADAPT_HELP)
     class_limits: str = option("", LIMITS_HELP, pattern=LIMITS_PATTERN)
     rate_hz: float = context(lambda: 2.5)
     class_names: ClassNames = context(tuple, is_recorded=False)
@@ -73,7 +74,7 @@ class Predict:
         own = {name: getattr(self, name) for name in self.own_options}
         classes = self.class_names, self.class_limits
         rates = self.predictor, self.horizon_s, self.min_history, self.rate_hz
-        return Forecaster(*rates, *classes, histories, **own)
+        return Forecaster(*rates, *classes, histories, self.adapt, **own)
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
         forecaster = self.forecaster()

@@ -53,6 +53,11 @@ def forecast_steps(outputs: Outputs) -> int:
     return int(last_forecast(outputs).rows["step"].max())
 
 
+def spread_of_last(outputs: Outputs) -> float:
+    """The variance along the first axis of the last predicted position, in square metres."""
+    return float(last_forecast(outputs).rows["cov_xx_m2"][-1])
+
+
 def change_of_forecasts(outputs: Outputs) -> float:
     """How far the forecasts of the same moment, made a step apart, are from each other on average, in metres."""
     futures = [np.stack([f.rows["x_m"], f.rows["y_m"]], axis=-1) for f in forecasts(outputs) if len(f.rows) == 12]

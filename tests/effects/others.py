@@ -9,7 +9,7 @@ import numpy as np
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import EstimateMotion, FrameDifferenceDetector, KnnDetector, MedianDetector, Predict, Sample
 from tests import drawn
-from tests.effects import Case, Outputs, change_of_forecasts, forecast_steps, line, rows, shaky
+from tests.effects import Case, Outputs, change_of_forecasts, forecast_steps, line, rows, shaky, spread_of_last
 from tests.worlds import ns, tracks_at
 
 CASES: dict[tuple[str, str], Case] = {}
@@ -49,6 +49,15 @@ case(
     line(0.5, 9, 9),
     first_forecast,
     {1: 0, 2: 1, 4: 3},
+)
+case(
+    "predict",
+    "adapt",
+    "a person walks straight on, which is predicted better than most walks",
+    Predict(predictor="cv"),
+    line(0.5, 40, 40),
+    spread_of_last,
+    {True: "least", False: "more"},
 )
 
 

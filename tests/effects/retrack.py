@@ -20,6 +20,7 @@ from tests.effects import (
     people,
     rows,
     shaky,
+    spread_of_last,
 )
 from tests.worlds import places, tracks_at, walk
 
@@ -122,6 +123,14 @@ case(
     shaky(),
     change_of_forecasts,
     {"cv": "more", "kalman": "least"},
+)
+case(
+    "adapt",
+    "a person walks straight on, which is predicted better than most walks",
+    LIKELY,
+    line(0.5, 40, 40),
+    spread_of_last,
+    {True: "least", False: "more"},
 )
 case("horizon_s", "2.5 steps a second", LIKELY, line(0.5, 20, 20), forecast_steps, {0.4: 1, 2.0: 5, 4.8: 12})
 case(

@@ -48,6 +48,7 @@ class KeptIds:
             options.rate_hz,
             options.class_names,
             options.class_limits,
+            adapt=options.follows_log,
         )
         self.online = self._read(frames)
 

@@ -75,7 +75,7 @@ class LikelihoodPass:
         self._coasting: list[tuple[Ints, Floats, Ints]] = []  # places of rows in _online, positions in m, times
         horizon = max(1, round(options.horizon_s * rate))
         self._predictor: Predictor = make(options.predictor, horizon, 1 / rate)
-        self._forecasts = _Forecasts(options.predictor, self._predictor, movers.unit_m)
+        self._forecasts = _Forecasts(options.predictor, self._predictor, movers.unit_m, options.follows_log)
         self._written = 0
 
     @property
@@ -237,9 +237,9 @@ class _Made(NamedTuple):
 class _Forecasts:
     """Predictions of tracks, frame by frame, made for ``_BATCH`` tracks at once."""
 
-    def __init__(self, name: str, predictor: Predictor, unit_m: float) -> None:
+    def __init__(self, name: str, predictor: Predictor, unit_m: float, adapt: bool) -> None:
         self._predictor, self._unit_m = predictor, unit_m
-        self._calibration = TailCalibration.of(name, predictor)
+        self._calibration = TailCalibration.of(name, predictor, adapt)
         self._out = FrameCollector(PREDICTIONS)
         self._waiting: list[_Waiting] = []
         nothing = np.empty((0, predictor.steps, 2, 2))

@@ -114,7 +114,8 @@ def _retrack(
 
 def _keep_ids(options: RetrackOptions, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
     """For each frame tracks that are linked in the picture, if the method does that; the input and its predictions."""
-    forecaster = Forecaster(options.predictor, options.horizon_s, options.min_history, options.rate_hz)
+    given = options.predictor, options.horizon_s, options.min_history, options.rate_hz
+    forecaster = Forecaster(*given, adapt=options.follows_log)
     linked: Iterator[Rows] | None = None
     decisions = repeat(DECISIONS.empty())
     if options.links_in_picture:

@@ -14,6 +14,7 @@ from mcaptrack.geometry.plane import Planes
 from mcaptrack.predictors import PredictorName
 from mcaptrack.schema import DECISIONS, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.durations import longest_track_s
+from mcaptrack.transforms.forecasts import ADAPT_HELP
 from mcaptrack.transforms.motion_limits import LIMITS_HELP, LIMITS_PATTERN, ClassNames, read_limits
 from mcaptrack.transforms.protocol import check_options, context, option
 from mcaptrack.transforms.retrack.distances import Covariance, Distance
@@ -159,6 +160,11 @@ class RetrackOptions:
         return False
 
     @property
+    def follows_log(self) -> bool:
+        """Whether the ellipses of predictions follow the log."""
+        return True
+
+    @property
     def shares_samples(self) -> bool:
         """Whether a sample that was assigned to two tracks stays with both."""
         return False
@@ -182,6 +188,10 @@ class LikelihoodOptions(RetrackOptions):
     @property
     def links_in_picture(self) -> bool:
         return self.link_s > 0
+
+    @property
+    def follows_log(self) -> bool:
+        return self.adapt
 
     merge_distance_m: float = option(
         1.0,
@@ -211,6 +221,7 @@ class LikelihoodOptions(RetrackOptions):
         least=0.0,
         theme=_LIFE,
     )
+    adapt: bool = option(True, ADAPT_HELP, theme=_PREDICTIONS)
 
 
 @dataclass(frozen=True, kw_only=True)
