@@ -9,7 +9,7 @@ from mcaptrack.schema import Frame
 from mcaptrack.transforms.ground import state
 from mcaptrack.transforms.ground.association import _Apart, associate
 from mcaptrack.transforms.ground.covariances import Covariances, along_axes
-from mcaptrack.transforms.ground.output import Waiting, rows_to_frames
+from mcaptrack.transforms.ground.output import Waiting
 from tests.worlds import ns
 
 #: Of a state of x, its velocity and acceleration, then the same of y, the position.
@@ -183,19 +183,39 @@ class TestWaiting:
             waiting.add(Frame(ns(number), number + 5, np.empty(0)), self.tracks(id=ids, x=[float(one) for one in ids]))
         waiting.confirm(np.array([300.0, 2.0]), np.array([7.0, 8.0]))
         waiting.confirm(np.empty(0), np.empty(0))
-        early = list(waiting.due(ns(1)))
-        assert [frame.index for frame, _ in early] == [5, 6]
-        late = list(waiting.due(np.inf))
-        assert [frame.index for frame, _ in late] == [7]
-        assert list(waiting.due(np.inf)) == []
-        frames = rows_to_frames([*early, *late])
+        waiting.release(ns(1))
+        early = waiting.written()
+        assert [frame.index for frame in early] == [5, 6]
+        assert waiting.written() == []
+        waiting.release(np.inf)
+        late = waiting.written()
+        assert [frame.index for frame in late] == [7]
+        waiting.release(np.inf)
+        assert waiting.written() == []
+        frames = [*early, *late]
         assert [(frame.t_ns, frame.index) for frame in frames] == [(ns(n), n + 5) for n in range(3)]
         assert [frame.rows["track_id"].tolist() for frame in frames] == [[7], [7, 8], [8]]
         assert [frame.rows["x_m"].tolist() for frame in frames] == [[300.0], [300.0, 2.0], [2.0]]
         assert all(frame.rows["observed"].all() for frame in frames)
-        assert rows_to_frames([]) == []
 
-    def test_gaps_are_interpolated_in_frames_that_wait(self):
+    @pytest.mark.parametrize("is_written_at_once", [True, False])
+    def test_a_track_that_is_confirmed_later_has_no_row_in_what_was_released(self, is_written_at_once):
+        """However many frames are written at once. Another id is beyond those that were ever confirmed."""
+        waiting, frames = Waiting(), []
+        for number in range(4):
+            waiting.add(Frame(ns(number), number, np.empty(0)), self.tracks(id=[1, 900]))
+            if number == 2:
+                waiting.confirm(np.array([1.0, 255.0]), np.array([4.0, 5.0]))
+            waiting.release(ns(number - 1))
+            frames += waiting.written() if is_written_at_once else []
+        waiting.release(np.inf)
+        frames += waiting.written()
+        assert [(frame.index, frame.rows["track_id"].tolist()) for frame in frames] == [
+            (0, []), (1, [4]), (2, [4]), (3, [4]),
+        ]  # fmt: skip
+
+    @pytest.mark.parametrize("is_written_at_once", [True, False])
+    def test_gaps_are_interpolated_in_frames_that_wait(self, is_written_at_once):
         """Lost after the first frame, found in the fourth, 2 s later; the first of the two between is written already."""
         waiting = Waiting()
         times_s = (0.0, 0.5, 1.5, 2.0)
@@ -208,10 +228,12 @@ class TestWaiting:
         before[state.LAST.start + state.HEADING, 0] = 3.0  # by less than half a turn, over the back
         before[state.LAST.start + state.LENGTH, 0] = 3.0
         waiting.confirm(np.array([1.0, 2.0]), np.array([1.0, 2.0]))
-        written = list(waiting.due(ns(0.5)))
+        waiting.release(ns(0.5))
+        written = waiting.written() if is_written_at_once else []
         waiting.close_gaps(before, after, 3, ns(2.0))
         waiting.add(Frame(ns(2.0), 3, np.empty(0)), after)
-        frames = rows_to_frames([*written, *waiting.due(np.inf)])
+        waiting.release(np.inf)
+        frames = [*written, *waiting.written()]
         assert [frame.rows["track_id"].tolist() for frame in frames] == [[1, 2], [2], [1, 2], [1, 2]]
         row = frames[2].rows[0]  # three quarters of the way
         assert (row["observed"], row["source_id"], row["x_m"], row["length_m"]) == (False, -1, 6.0, 4.5)

@@ -181,7 +181,7 @@ def test_covariances_that_are_none_are_not_used(what: dict[str, float], kept: bo
     (frame,) = boxes(lambda _: [(3.0, 1.0), (1.0, 2.0)], 1)
     for name, value in what.items():
         frame.rows[f"cov_{name}_m2"][0] = value
-    table = run._detections(frame)
+    (table,) = run.detections([frame])
     assert len(table) == state.DETECTION_ROWS + 3 * kept
     assert table[state.X].tolist() == [1.0, 3.0]  # in an order of their own
     if kept:
@@ -204,5 +204,6 @@ def test_detections_that_are_used(options: dict[str, float], left: list[int]):
     frame.rows["score"], frame.rows["class_id"] = [0.4, 0.5, np.nan, 0.9], [3, 1, 3, 3]
     frame.rows["y_m"][3] = np.nan
     run = _Run(GroundTracker(class_names=NAMES, **options))
-    assert run._detections(frame)[state.X].tolist() == left
+    (found,) = run.detections([frame])
+    assert found[state.X].tolist() == left
     assert run._left_out == 1

@@ -56,11 +56,12 @@ def associate(
         same = np.ones_like(same)
     track, row = _assigned(table, found, apart, near & same, cost, min_iou)
     is_same = np.ones(len(track), bool)
-    if across_classes or same.all():
+    if across_classes or len(row) == found.shape[1]:
         return track, row, is_same
-    lost, free = np.ones(table.shape[1], bool), np.ones(found.shape[1], bool)
+    lost, free = table[HITS] >= _OTHER_HITS, np.ones(found.shape[1], bool)
     lost[track], free[row] = False, False
-    lost &= table[HITS] >= _OTHER_HITS
+    if not lost.any() or same.all():
+        return track, row, is_same
     other = near & lost[:, None] & free
     if not other.any():
         return track, row, is_same

@@ -5,13 +5,13 @@ Letters: K tracks, N rows, F frames that wait.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from mcaptrack.geometry.angles import wrapped
-from mcaptrack.geometry.arrays import Floats
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.ragged import group_index, ragged_range
 from mcaptrack.schema import TRACKS, Frame
@@ -58,72 +58,128 @@ _COLUMNS = {
 }
 
 
+class _Gaps(NamedTuple):
+    """Tracks (K,) that are detected again at a frame: their table before and after, (rows, K); the first frame of each
+    gap, (K,), and the frame and the time at which they are detected.
+    """
+
+    before: Floats
+    after: Floats
+    first: Floats
+    frame: int
+    now_ns: int
+
+
 class Waiting:
-    """Frames and their rows that are not written yet. Frames are numbered from 0."""
+    """Frames and their rows that are not written yet. Frames are numbered from 0.
+
+    ``add``, ``close_gaps`` and ``confirm`` tell what happens at one frame, ``release`` ends it; ``written`` gives
+    frames for many of them at once.
+    """
 
     def __init__(self) -> None:
-        self._frames: deque[tuple[Frame, list[Floats]]] = deque()
-        self._first = 0
-        self._written_as = np.zeros(256, np.int64)
+        # The frames that are not written yet, the rows of tracks that were detected in each, and those in gaps.
+        self._frames: list[Frame] = []
+        self._rows: list[Floats] = []
+        self._late, self._late_in = np.empty((_ROWS, 0)), np.empty(0, np.int64)
+        self._gaps: list[_Gaps] = []
+        # The number of frames that were written and released so far; when each of those between was released, which is
+        # counted in calls of ``release``.
+        self._written = self._released = 0
+        self._released_at: list[int] = []
+        self._calls = 0
+        # By id: what a track is written as, and since when it is confirmed.
+        self._written_as, self._since = np.zeros(256, np.int64), np.zeros(256, np.int64)
 
     def confirm(self, ids: Floats, written_as: Floats) -> None:
         """Tracks of these ids (K,) are confirmed: their rows are written under other ids (K,), also those before."""
         if len(ids):
             while ids.max() >= len(self._written_as):
                 self._written_as = np.concatenate([self._written_as, np.zeros_like(self._written_as)])
+                self._since = np.concatenate([self._since, np.zeros_like(self._since)])
             self._written_as[ids.astype(np.int64)] = written_as
+            self._since[ids.astype(np.int64)] = self._calls
 
     def add(self, frame: Frame, tracks: Floats) -> None:
         """Add a frame with the rows of the tracks that were detected in it, as of their table (rows, K)."""
         rows = np.empty((_ROWS, tracks.shape[1]))
         rows[:DETECTION_ROWS] = tracks[:DETECTION_ROWS]
         rows[_OBSERVED], rows[_ID] = 1.0, tracks[ID]
-        self._frames.append((frame, [rows]))
+        self._frames.append(frame)
+        self._rows.append(rows)
 
     def close_gaps(self, before: Floats, after: Floats, frame: int, now_ns: int) -> None:
         """Interpolate tracks that are detected again, (rows, K) before and after: rows for the frames before ``frame``.
 
-        ``now_ns`` is the time of this frame. Frames that were written already get none.
+        ``now_ns`` is the time of this frame. Frames that were released already get none.
         """
-        low = np.maximum(before[LAST_FRAME].astype(np.int64) + 1, self._first)
-        count = np.maximum(frame - low, 0)
-        if not count.any():
-            return
-        track, at = group_index(count), ragged_range(low, count)
-        ahead_s = np.array([now_ns - waits.t_ns for waits, _ in self._frames]) / NS_PER_S
-        share = 1 - ahead_s[at - self._first] / np.maximum(before[MISSED_S, track], 1e-9)
+        first = np.maximum(before[LAST_FRAME] + 1, self._released)
+        (missed,) = (first < frame).nonzero()
+        if len(missed):
+            both = before.take(missed, axis=1), after.take(missed, axis=1)
+            self._gaps.append(_Gaps(*both, first[missed], frame, now_ns))
+
+    def release(self, until_ns: float) -> None:
+        """Let frames up to a time be written, with the rows of the tracks that are confirmed by now."""
+        while len(self._released_at) < len(self._frames):
+            if self._frames[len(self._released_at)].t_ns > until_ns:
+                break
+            self._released_at.append(self._calls)
+            self._released += 1
+        self._calls += 1
+
+    def written(self) -> list[Frame]:
+        """The frames that were released since the last call: frames of Tracks, rows ordered by id within each."""
+        if self._gaps:
+            self._interpolate()
+        count = len(self._released_at)
+        frames, self._frames = self._frames[:count], self._frames[count:]
+        own, self._rows = self._rows[:count], self._rows[count:]
+        waits = self._late_in >= self._released
+        rows = np.concatenate([self._late.compress(~waits, axis=1), *own], axis=1)
+        number = np.append(self._late_in[~waits] - self._written, group_index([part.shape[1] for part in own]))
+        self._late, self._late_in = self._late.compress(waits, axis=1), self._late_in[waits]
+        ids = rows[_ID].astype(np.int64)
+        known = np.minimum(ids, len(self._written_as) - 1)
+        is_in_time = (ids == known) & (self._since[known] <= np.array(self._released_at, np.int64)[number])
+        rows[_ID] = np.where(is_in_time, self._written_as[known], 0)
+        self._written, self._released_at = self._released, []
+        kept = rows[_ID] > 0
+        return _to_frames(frames, rows.compress(kept, axis=1), number[kept])
+
+    def _interpolate(self) -> None:
+        """Make the rows in gaps."""
+        before, after, first = (
+            np.concatenate(parts, axis=-1) for parts in zip(*(gaps[:3] for gaps in self._gaps), strict=True)
+        )
+        times = np.array([gaps[3:] for gaps in self._gaps], np.int64)
+        frame, now_ns = times.T.repeat([len(gaps.first) for gaps in self._gaps], axis=1)
+        self._gaps = []
+        count = frame - first.astype(np.int64)
+        track, number = group_index(count), ragged_range(first, count)
+        before, after = before.take(track, axis=1), after.take(track, axis=1)
+        t_ns = np.array([frame.t_ns for frame in self._frames], np.int64)[number - self._written]
+        ahead_s = (now_ns[track] - t_ns) / NS_PER_S
+        share = 1 - ahead_s / np.maximum(before[MISSED_S], 1e-9)
         rows = np.empty((_ROWS, len(track)))
-        rows[:DETECTION_ROWS] = after[:DETECTION_ROWS, track]
-        start, end = before[LAST, track], after[BOX, track]
+        rows[:DETECTION_ROWS] = after[:DETECTION_ROWS]
+        start, end = before[LAST], after[BOX]
         step = end - start
         step[HEADING] = wrapped(step[HEADING])
         rows[BOX] = start + share * step
         rows[HEADING] = wrapped(rows[HEADING])
-        rows[[VX, VY]] = before[[VX, VY]][:, track] * (1 - share) + after[[VX, VY]][:, track] * share
+        rows[[VX, VY]] = before[[VX, VY]] * (1 - share) + after[[VX, VY]] * share
         rows[SCORE], rows[SOURCE] = np.nan, -1.0
-        rows[_OBSERVED], rows[_ID] = 0.0, after[ID, track]
-        for number in np.unique(at).tolist():
-            self._frames[number - self._first][1].append(rows[:, at == number])
-
-    def due(self, until_ns: float) -> Iterator[tuple[Frame, Floats]]:
-        """Frames up to a time, and the rows of confirmed tracks in each."""
-        while self._frames and self._frames[0][0].t_ns <= until_ns:
-            frame, parts = self._frames.popleft()
-            self._first += 1
-            rows = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
-            ids = rows[_ID].astype(np.int64)
-            known = np.minimum(ids, len(self._written_as) - 1)
-            rows[_ID] = np.where(ids == known, self._written_as[known], 0)
-            yield frame, rows.compress(rows[_ID] > 0, axis=1)
+        rows[_OBSERVED], rows[_ID] = 0.0, after[ID]
+        self._late = np.concatenate([self._late, rows], axis=1)
+        self._late_in = np.append(self._late_in, number)
 
 
-def rows_to_frames(parts: Sequence[tuple[Frame, Floats]]) -> list[Frame]:
-    """Frames of Tracks; rows are ordered by id within each."""
-    counts = [rows.shape[1] for _, rows in parts]
-    table = np.concatenate([rows for _, rows in parts], axis=1) if parts else np.empty((_ROWS, 0))
-    table = table[:, np.lexsort((table[_ID], group_index(counts)))]
+def _to_frames(frames: Sequence[Frame], table: Floats, number: Ints) -> list[Frame]:
+    """Frames of Tracks, of rows (rows, N) and the index of the frame of each (N,)."""
+    table = table.take(np.lexsort((table[_ID], number)), axis=1)
     out = TRACKS.empty(table.shape[1])
     for name, row in _COLUMNS.items():
         out[name] = table[row]
-    frames = [frame for frame, _ in parts]
-    return split_rows([f.t_ns for f in frames], [f.index for f in frames], out, np.cumsum(counts))
+    ends = np.cumsum(np.bincount(number, minlength=len(frames)))
+    return split_rows([f.t_ns for f in frames], [f.index for f in frames], out, ends)

@@ -29,6 +29,7 @@ PLACE: Final = slice(X, Y + 1)
 #: Position, size and heading.
 BOX: Final = slice(X, HEADING + 1)
 _SIZE: Final = slice(LENGTH, HEIGHT + 1)
+_SHAPE: Final = slice(Z, HEADING + 1)
 
 # Rows of tracks: those of detections first (velocities are those of the filter), then the rest.
 (
@@ -148,9 +149,10 @@ class GroundTracks:
         cos2, sin2 = cos * cos - sin * sin, 2 * sin * cos
         t[_COS], t[_SIN] = cos2 * t[_COS] - sin2 * t[_SIN], sin2 * t[_COS] + cos2 * t[_SIN]
 
-    def update(self, track: Indices, found: Floats, is_same_class: Bools, frame: int) -> None:
-        """Correct tracks (N,) with one detection each, (rows, N), at a frame."""
-        t = self.table[:, track]
+    def update(self, track: Indices, found: Floats, is_same_class: Bools, frame: int) -> tuple[Floats, Floats]:
+        """Correct tracks (N,) with one detection each, (rows, N), at a frame; returns their table before and after."""
+        before = self.table.take(track, axis=1)
+        t = before.copy()
         if self.covariances:
             gain = self.covariances.correct(track, measured(t[NOISE], found))
             _move(t, *along_axes(gain, found[PLACE] - t[PLACE]))
@@ -167,8 +169,9 @@ class GroundTracks:
         t[MISSED_S] = 0
         t[LAST_FRAME] = frame
         t[LAST], t[LAST_VELOCITY], t[LAST_SPREAD] = t[BOX], t[_VELOCITY], t[_VV]
+        t[CLASS] = self._winners(track, t[CLASS])
         self.table[:, track] = t
-        self.table[CLASS, track] = self._winners(track)
+        return before, t
 
     def initiate(self, first_id: int, found: Floats, limits: Mapping[int, MotionLimits], frame: int) -> None:
         """Start a track at each of these detections, (rows, N)."""
@@ -211,19 +214,19 @@ class GroundTracks:
         self.table[_SIZED, which] += lost[_SIZED]
 
     def _vote(self, track: Indices, found: Floats) -> None:
-        for one in np.unique(found[CLASS]).tolist():
-            if one not in self._classes:
-                self._classes[one] = len(self._classes)
-                self.votes = np.concatenate([self.votes, np.zeros((1, self.votes.shape[1]))])
-        which = [self._classes[one] for one in found[CLASS].tolist()]
+        classes = found[CLASS].tolist()
+        for one in sorted(set(classes) - self._classes.keys()):
+            self._classes[one] = len(self._classes)
+            self.votes = np.concatenate([self.votes, np.zeros((1, self.votes.shape[1]))])
+        which = [self._classes[one] for one in classes]
         self.votes[which, track] += np.where(np.isnan(found[SCORE]), 0.5, found[SCORE])
 
-    def _winners(self, track: Indices) -> Floats:
-        """The class with the highest sum of scores, of each of some tracks."""
+    def _winners(self, track: Indices, before: Floats) -> Floats:
+        """The class with the highest sum of scores, of each of some tracks (N,) with these classes (N,) before."""
         if len(self._classes) == 1:
-            return np.asarray(self.table[CLASS, track])
+            return before
         classes = np.array(list(self._classes))
-        return np.asarray(classes[self.votes[:, track].argmax(axis=0)], float)
+        return np.asarray(classes[self.votes.take(track, axis=1).argmax(axis=0)], float)
 
 
 def measured(noise_m: Floats, found: Floats) -> Floats:
@@ -289,6 +292,16 @@ def _move(t: Floats, place: Floats, velocity: Floats, acceleration: Floats) -> N
 
 def _follow_box(t: Floats, found: Floats, weight: Floats) -> None:
     """Correct z, size and heading of tracks (rows, N), in place; sizes and headings with ``weight`` 0 don't count."""
+    if weight.all() and np.isfinite(found[_SHAPE]).all() and not np.isnan(t[_SHAPE]).any():
+        # What nearly all detections are. All else comes to the same then.
+        t[Z] += _HEIGHT_RATE * (found[Z] - t[Z])
+        t[_SIZED] += 1
+        before = t[_SIZE]
+        limit = np.where(t[_SIZED] <= _FIRST_SIZES, np.inf, _SIZE_LIMIT * before)
+        change = np.minimum(np.maximum(found[_SIZE] - before, -limit), limit)
+        before += np.maximum(_SIZE_RATE, 1 / t[_SIZED]) * change
+        _follow_heading(t, found[HEADING], weight)
+        return
     given = np.isfinite(found[Z])
     step = np.where(given, _HEIGHT_RATE * (found[Z] - np.where(np.isnan(t[Z]), found[Z], t[Z])), 0.0)
     t[Z] = np.where(np.isnan(t[Z]), found[Z], t[Z] + step)
@@ -301,9 +314,13 @@ def _follow_box(t: Floats, found: Floats, weight: Floats) -> None:
     limit = np.where(is_new | (t[_SIZED] <= _FIRST_SIZES), np.inf, _SIZE_LIMIT * before)
     change = np.clip(np.where(np.isnan(found[_SIZE]) | is_new, 0.0, found[_SIZE] - before), -limit, limit)
     t[_SIZE] = np.where(is_new, found[_SIZE], before + rate * change * weight)
-    # Heading: the axis as a doubled angle, and apart from it which of its ends is the front.
     turned = np.isfinite(found[HEADING]) * weight
-    measured = np.where(turned > 0, found[HEADING], 0.0)
+    _follow_heading(t, np.where(turned > 0, found[HEADING], 0.0), turned)
+
+
+def _follow_heading(t: Floats, measured: Floats, turned: Floats) -> None:
+    """Correct headings of tracks (rows, N), in place, by measured ones (N,) with weights (N,)."""
+    # The axis as a doubled angle, and apart from it which of its ends is the front.
     rate = _AXIS_RATE * turned
     t[_COS] += rate * (np.cos(2 * measured) - t[_COS])
     t[_SIN] += rate * (np.sin(2 * measured) - t[_SIN])

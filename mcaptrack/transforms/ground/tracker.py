@@ -17,10 +17,11 @@ from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.schema import COVARIANCE_M2, DETECTIONS, TRACKS, Frame, Schema
+from mcaptrack.schema.framing import join_frames
 from mcaptrack.transforms.ground.association import Cost, associate
 from mcaptrack.transforms.ground.fast_starts import fast_starts
 from mcaptrack.transforms.ground.lost_tracks import LostTracks, continuations
-from mcaptrack.transforms.ground.output import Waiting, rows_to_frames
+from mcaptrack.transforms.ground.output import Waiting
 from mcaptrack.transforms.ground.state import (
     CLASS,
     DETECTION_ROWS,
@@ -177,9 +178,11 @@ class GroundTracker:
         run = _Run(self)
         coming = iter(frames)
         while block := list(islice(coming, _BLOCK_FRAMES)):
-            written = [part for frame in block for part in run.step(frame)]
-            yield from ((frame,) for frame in rows_to_frames(written))
-        yield from ((frame,) for frame in rows_to_frames(list(run.waiting.due(np.inf))))
+            for frame, found in zip(block, run.detections(block), strict=True):
+                run.step(frame, found)
+            yield from ((frame,) for frame in run.waiting.written())
+        run.waiting.release(np.inf)
+        yield from ((frame,) for frame in run.waiting.written())
         run.warn()
 
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
@@ -200,12 +203,11 @@ class _Run:
         self._frame, self._next_id = 0, 1
         self._left_out = 0
 
-    def step(self, frame: Frame) -> Iterator[tuple[Frame, Floats]]:
-        """Take one frame; returns those that are due, with their rows."""
+    def step(self, frame: Frame, found: Floats) -> None:
+        """Take one frame with these detections, (rows, N)."""
         options, tracks = self._options, self.tracks
         dt = 0.0 if self._last_ns is None else (frame.t_ns - self._last_ns) / NS_PER_S
         self._last_ns = frame.t_ns
-        found = self._detections(frame)
         if len(found) > DETECTION_ROWS:
             tracks.expect_covariances()
         tracks.predict(dt)
@@ -218,12 +220,11 @@ class _Run:
             tracks.allow_speed(fast)
             track, row = np.concatenate([track, fast]), np.concatenate([row, at])
             is_same = np.concatenate([is_same, np.ones(len(fast), bool)])
-        before = tracks.table[:, track]
         if len(track):
-            tracks.update(track, found[:, row], is_same, self._frame)
+            before, after = tracks.update(track, found.take(row, axis=1), is_same, self._frame)
             # One more detection has to be where the velocity says before such a track is confirmed.
             tracks.table[SCORES, fast] = before[SCORES, len(track) - len(fast) :]
-            self.waiting.close_gaps(before, tracks.table[:, track], self._frame, frame.t_ns)
+            self.waiting.close_gaps(before, after, self._frame, frame.t_ns)
         count = found.shape[1]
         if len(row) < count:
             starts = ~(found[SCORE] < options.birth_score)  # a missing score is not lower
@@ -235,7 +236,7 @@ class _Run:
         if is_new.any():
             is_found = is_found[self._confirm(is_new)]
             table = tracks.table
-        self.waiting.add(frame, table.compress(is_found, axis=1))
+        self.waiting.add(frame, table[: ID + 1].compress(is_found, axis=1))
         if not is_found.all():
             age_s = np.where(table[IS_CONFIRMED] == 1, options.max_age_s, min(_TENTATIVE_S, options.max_age_s))
             is_over = table[MISSED_S] > np.maximum(age_s, 1.5 * dt)
@@ -243,7 +244,7 @@ class _Run:
                 self._lost.add(table.compress(is_over & (table[IS_CONFIRMED] == 1), axis=1))
                 tracks.keep(~is_over)
         self._frame += 1
-        return self.waiting.due(frame.t_ns - options.delay_s * NS_PER_S)
+        self.waiting.release(frame.t_ns - options.delay_s * NS_PER_S)
 
     def _confirm(self, is_new: Bools) -> Bools:
         """Confirm tracks (K,), some of which continue lost ones; returns which tracks are still there."""
@@ -277,13 +278,15 @@ class _Run:
         self.tracks.initiate(self._next_id, found, self._limits, self._frame)
         self._next_id += count
 
-    def _detections(self, frame: Frame) -> Floats:
-        """The detections of a frame that are used, in an order of their own: (rows, N)."""
-        rows, options = frame.rows, self._options
-        found = np.stack([rows[name] for name in _COLUMNS]).astype(float)
+    def detections(self, frames: Sequence[Frame]) -> Iterator[Floats]:
+        """For each frame the detections that are used, in an order of their own: (rows, N)."""
+        joined, options = join_frames(DETECTIONS, frames), self._options
+        rows = joined.rows
+        found = np.stack([rows[name] for name in _COLUMNS], dtype=float)
         xx, xy, yy = given = np.stack([rows[name] for name in COVARIANCE_M2])
         is_given = (xx > 0) & (yy > 0) & (xy * xy < xx * yy) & np.isfinite(given).all(axis=0)
-        if is_given.any():
+        has_any = np.bincount(joined.frame, is_given, len(frames)) > 0
+        if has_any.any():
             found = np.concatenate([found, np.where(is_given, given, np.nan)])
         used = np.isfinite(found[X]) & np.isfinite(found[Y])
         self._left_out += len(rows) - int(used.sum())
@@ -291,9 +294,12 @@ class _Run:
             used &= ~(found[SCORE] < options.min_score)
         if options.class_id is not None:
             used &= found[CLASS] == options.class_id
-        if not used.all():
-            found = found.compress(used, axis=1)
-        return np.take(found, np.lexsort(found[::-1]), axis=1)
+        order = np.lexsort((*found[::-1], joined.frame))
+        order = order[used[order]]
+        found = found.take(order, axis=1)
+        ends = np.append(0, np.cumsum(np.bincount(joined.frame[order], minlength=len(frames)))).tolist()
+        for low, high, has_covariances in zip(ends[:-1], ends[1:], has_any.tolist(), strict=True):
+            yield found[: None if has_covariances else DETECTION_ROWS, low:high]
 
     def warn(self) -> None:
         """Warn of detections without a position in metres."""

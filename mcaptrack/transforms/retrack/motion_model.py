@@ -8,13 +8,14 @@ Letters: K tracks or pairs, N rows of trajectories.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.ragged import ragged_range
+from mcaptrack.geometry.ragged import group_index, ragged_range
 
 #: Standard deviation of measured positions per axis, before any is estimated.
 DEFAULT_NOISE_M: Final = 0.2
@@ -52,29 +53,54 @@ class MotionModel:
 
     def predict(self, state: State, elapsed_s: Floats | float) -> State:
         """States after some time, (K,) or one for all."""
-        mean, (p, c, v) = state.mean, state.cov.T
-        speed = np.hypot(mean[:, 2], mean[:, 3])
-        power = (self.drift_m_per_s + self.drift_ratio * speed) ** 2
-        t = np.broadcast_to(elapsed_s, speed.shape)
-        out = mean.copy()
-        out[:, :2] += mean[:, 2:] * t[:, None]
-        cov = np.empty_like(state.cov)
-        cov[:, 0] = p + t * (2 * c + t * (v + t * power / 3))
-        cov[:, 1] = c + t * (v + t * power / 2)
-        cov[:, 2] = v + t * power
-        return State(out, cov)
+        out = State(np.empty_like(state.mean), np.empty_like(state.cov))
+        self.predict_rows(_rows(state), elapsed_s, _rows(out))
+        return out
+
+    def predict_rows(self, state: StateRows, elapsed_s: Floats | float, out: StateRows) -> None:
+        """As ``predict``, into ``out``."""
+        (x, y, vx, vy), (p, c, v), t = *state, elapsed_s
+        power = (self.drift_m_per_s + self.drift_ratio * np.hypot(vx, vy)) ** 2
+        mean, cov = out
+        mean[0], mean[1], mean[2], mean[3] = x + vx * t, y + vy * t, vx, vy
+        cov[0] = p + t * (2 * c + t * (v + t * power / 3))
+        cov[1] = c + t * (v + t * power / 2)
+        cov[2] = v + t * power
 
     def update(self, state: State, xy_m: Floats, noise_m: Floats) -> State:
         """States after measurements at (K, 2) with noise (K,)."""
-        mean, cov = state
-        s = cov[:, 0] + noise_m**2
-        innovation = xy_m - mean[:, :2]
-        gain = cov[:, :2] / s[:, None]
-        new = mean + np.concatenate([gain[:, :1] * innovation, gain[:, 1:] * innovation], axis=1)
-        p = cov[:, 0] * (1 - gain[:, 0])
-        c = cov[:, 1] * (1 - gain[:, 0])
-        v = cov[:, 2] - gain[:, 1] * cov[:, 1]
-        return State(new, np.stack([p, c, v], axis=1))
+        out = State(state.mean.copy(), state.cov.copy())
+        update_rows(_rows(out), xy_m.T, noise_m)
+        return out
+
+
+class StateRows(NamedTuple):
+    """States with a row for each number: ``mean`` (4, K), ``cov`` (3, K). Long rows are quicker than short ones."""
+
+    mean: Floats
+    cov: Floats
+
+    def take(self, which: Ints | slice) -> StateRows:
+        """The states of some of the tracks; of a slice they are views."""
+        return StateRows(self.mean[:, which], self.cov[:, which])
+
+
+def _rows(state: State) -> StateRows:
+    """States as rows: views."""
+    return StateRows(state.mean.T, state.cov.T)
+
+
+def update_rows(state: StateRows, xy_m: Floats, noise_m: Floats) -> None:
+    """Update states with measurements at (2, K) with noise (K,), in place."""
+    mean, (p, c, v) = state
+    s = p + noise_m**2
+    off = xy_m - mean[:2]
+    of_place, of_velocity = p / s, c / s
+    mean[:2] += of_place * off
+    mean[2:] += of_velocity * off
+    v -= of_velocity * c
+    p *= 1 - of_place
+    c *= 1 - of_place
 
 
 class Trajectories(NamedTuple):
@@ -108,38 +134,78 @@ def to_trajectories(step: Ints, track: Ints, xy_m: Floats, noise_m: float) -> tu
     return ids, row, Trajectories(first, ragged_range(low, length), places, np.full(total, noise_m))
 
 
+class _Steps(NamedTuple):
+    """The rows of trajectories (N,), step by step: the first row of each track, then the second of each, and so on.
+
+    Longer tracks stand before shorter ones, so the tracks of each step are the first ones of those of the step before.
+
+    Attributes
+    ----------
+    forward, backward : (N,) of int
+        Rows of the trajectories, counted from the first row of each track, and from its last one.
+    bounds : list of int
+        The rows of step k are ``bounds[k]`` to ``bounds[k + 1]``.
+    """
+
+    forward: Ints
+    backward: Ints
+    bounds: list[int]
+
+    @classmethod
+    def of(cls, first: Ints) -> _Steps:
+        """The steps of tracks that begin at these rows, (K + 1,)."""
+        order, alive = _by_length(first)
+        step, place = group_index(alive), ragged_range(0, alive)
+        forward = first[:-1][order][place] + step
+        return cls(forward, first[1:][order][place] - 1 - step, [0, *np.cumsum(alive).tolist()])
+
+
 def smooth(model: MotionModel, trajectories: Trajectories, step_s: float) -> tuple[State, State, State]:
     """The state of every row: from past and present, from present and future, and from all (RTS smoother).
 
-    The filters run over all tracks at once. Source: Rauch, Tung, Striebel 1965.
+    The filters run over all tracks at once, forward and backward together. Source: Rauch, Tung, Striebel 1965.
     """
-    forward = _filter(model, trajectories, step_s)
-    backward = _filter(model, _reversed(trajectories), step_s)
-    backward = State(*(part[::-1] for part in backward))
+    steps = _Steps.of(trajectories.first)
+    rows = np.stack([steps.forward, steps.backward], axis=-1).reshape(-1)
+    both = _filter(model, trajectories, rows, [2 * bound for bound in steps.bounds], step_s)
+    forward = _states(both.take(slice(0, None, 2)), steps.forward)
+    backward = _states(both.take(slice(1, None, 2)), steps.backward)
     backward.mean[:, 2:] *= -1
-    order, alive = _by_length(trajectories.first)
-    mean, cov = forward.mean.copy(), forward.cov.copy()
-    last = trajectories.first[1:][order] - 1
-    for back in range(1, len(alive)):
-        at = last[: alive[back]] - back
-        now, later = forward.take(at), State(mean[at + 1], cov[at + 1])
-        ahead = model.predict(now, step_s)
-        p, c, v = now.cov.T
-        # gain = P F' / P', per axis: two rows of two
-        a, b = p + step_s * c, c
-        d, e = c + step_s * v, v
-        pp, pc, pv = ahead.cov.T
-        det = pp * pv - pc**2
-        g00, g01 = (a * pv - b * pc) / det, (b * pp - a * pc) / det
-        g10, g11 = (d * pv - e * pc) / det, (e * pp - d * pc) / det
-        off = later.mean - ahead.mean
-        mean[at, :2] += g00[:, None] * off[:, :2] + g01[:, None] * off[:, 2:]
-        mean[at, 2:] += g10[:, None] * off[:, :2] + g11[:, None] * off[:, 2:]
-        dp, dc, dv = (later.cov - ahead.cov).T
-        cov[at, 0] += g00**2 * dp + 2 * g00 * g01 * dc + g01**2 * dv
-        cov[at, 1] += g00 * g10 * dp + (g00 * g11 + g01 * g10) * dc + g01 * g11 * dv
-        cov[at, 2] += g10**2 * dp + 2 * g10 * g11 * dc + g11**2 * dv
-    return forward, backward, State(mean, cov)
+    smoothed = StateRows(*(np.ascontiguousarray(part[steps.backward].T) for part in forward))
+    _smooth_back(model, smoothed, steps.bounds, step_s)
+    return forward, backward, _states(smoothed, steps.backward)
+
+
+def _states(rows: StateRows, place: Ints) -> State:
+    """States (K,) in another order: that of ``rows[k]`` is at ``place[k]``."""
+    out = State(*(np.empty((len(place), len(part))) for part in rows))
+    for part, values in zip(out, rows, strict=True):
+        part[place] = values.T
+    return out
+
+
+def _smooth_back(model: MotionModel, states: StateRows, bounds: Sequence[int], step_s: float) -> None:
+    """Smooth the states of forward filters (N,), in place. They are laid step by step, from the last one back."""
+    ahead = StateRows(np.empty_like(states.mean), np.empty_like(states.cov))
+    model.predict_rows(states, step_s, ahead)
+    p, c, v = states.cov
+    # gain = P F' / P', per axis: two rows of two
+    a, b = p + step_s * c, c
+    d, e = c + step_s * v, v
+    pp, pc, pv = ahead.cov
+    det = pp * pv - pc**2
+    gains = np.stack([a * pv - b * pc, b * pp - a * pc, d * pv - e * pc, e * pp - d * pc]) / det
+    for later, low, high in zip(bounds, bounds[1:], bounds[2:], strict=False):
+        now, then = slice(low, high), slice(later, later + high - low)
+        mean, cov = states.take(now)
+        g00, g01, g10, g11 = gains[:, now]
+        off = states.mean[:, then] - ahead.mean[:, now]
+        mean[:2] += g00 * off[:2] + g01 * off[2:]
+        mean[2:] += g10 * off[:2] + g11 * off[2:]
+        dp, dc, dv = states.cov[:, then] - ahead.cov[:, now]
+        cov[0] += g00**2 * dp + 2 * g00 * g01 * dc + g01**2 * dv
+        cov[1] += g00 * g10 * dp + (g00 * g11 + g01 * g10) * dc + g01 * g11 * dv
+        cov[2] += g10**2 * dp + 2 * g10 * g11 * dc + g11**2 * dv
 
 
 def _by_length(first: Ints) -> tuple[Ints, Ints]:
@@ -151,32 +217,28 @@ def _by_length(first: Ints) -> tuple[Ints, Ints]:
     return order, alive
 
 
-def _reversed(trajectories: Trajectories) -> Trajectories:
-    """The same trajectories in reversed time."""
-    total = trajectories.first[-1]
-    return Trajectories(
-        (total - trajectories.first)[::-1],
-        -trajectories.step[::-1],
-        trajectories.xy_m[::-1],
-        trajectories.noise_m[::-1],
-    )
-
-
-def _filter(model: MotionModel, trajectories: Trajectories, step_s: float) -> State:
-    """The state of every row from past and present."""
-    order, alive = _by_length(trajectories.first)
-    start = trajectories.first[:-1][order]
-    out = State(np.empty((len(trajectories.step), 4)), np.empty((len(trajectories.step), 3)))
-    state = model.initial(trajectories.xy_m[start])
-    state.cov[:, 0] = trajectories.noise_m[start] ** 2
-    for row in range(len(alive)):
-        at = start[: alive[row]] + row
-        if row:
-            state = model.predict(state.take(slice(alive[row])), step_s)
-            measured = np.isfinite(trajectories.xy_m[at, 0])
-            new = model.update(
-                state.take(measured), trajectories.xy_m[at[measured]], trajectories.noise_m[at[measured]]
-            )
-            state.mean[measured], state.cov[measured] = new
-        out.mean[at], out.cov[at] = state
+def _filter(
+    model: MotionModel, trajectories: Trajectories, rows: Ints, bounds: Sequence[int], step_s: float
+) -> StateRows:
+    """The states (M,) of filters that read ``rows`` (M,) of trajectories, step by step as ``bounds`` says."""
+    xy_m, noise_m = trajectories.xy_m.T.take(rows, axis=1), trajectories.noise_m[rows]
+    out = StateRows(np.empty((4, len(rows))), np.empty((3, len(rows))))
+    if not len(rows):
+        return out
+    start = slice(bounds[0], bounds[1])
+    for part, values in zip(out, _rows(model.initial(xy_m[:, start].T)), strict=True):
+        part[:, start] = values
+    out.cov[0, start] = noise_m[start] ** 2
+    is_measured = np.isfinite(xy_m[0])
+    is_whole = np.logical_and.reduceat(is_measured, bounds[:-1]).tolist()
+    for before, low, high, whole in zip(bounds, bounds[1:], bounds[2:], is_whole[1:], strict=False):
+        now, here = out.take(slice(low, high)), slice(low, high)
+        model.predict_rows(out.take(slice(before, before + high - low)), step_s, now)
+        if whole:
+            update_rows(now, xy_m[:, here], noise_m[here])
+            continue
+        (which,) = is_measured[here].nonzero()
+        some = now.take(which)
+        update_rows(some, xy_m[:, here][:, which], noise_m[here][which])
+        now.mean[:, which], now.cov[:, which] = some
     return out
