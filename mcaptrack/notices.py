@@ -28,6 +28,7 @@ Code = Literal[
     "classes",
     "clock",
     "device",
+    "ellipses",
     "estimated-ground-plane",
     "extrapolated",
     "few-pictures",

@@ -133,7 +133,7 @@ class TestCalibration:
         """Errors of a known size of a predictor that says 1 m; the levels of the ellipses that hold them, by time."""
         rng = np.random.default_rng(4)
         predictor = make("kalman", 3, 0.4)
-        calibration = TailCalibration.of("kalman", predictor, adapts)
+        self.calibration = calibration = TailCalibration.of("kalman", predictor, adapts)
         ids, levels = np.arange(tracks), []
         place = np.zeros((steps + 4, tracks, 2))
         for step in range(steps):
@@ -150,6 +150,27 @@ class TestCalibration:
         levels = self.forecasts(sd_m)[30:]
         for level in (0.5, 0.95):
             assert (levels <= level).mean() == pytest.approx(level, abs=0.04)
+
+    def test_errors_that_are_much_larger_than_in_the_table_are_a_warning(self):
+        for sd_m, adapts, codes in ((0.9, True, []), (3.0, False, []), (1.5, True, ["ellipses"])):
+            self.forecasts(sd_m, steps=20, adapts=adapts)
+            warned: list[Notice] = []
+            with listening(warned.append):
+                self.calibration.warn("kalman")
+            assert [one.code for one in warned] == codes
+
+    def test_unknown_positions_and_certain_predictions_are_not_compared(self):
+        predictor = make("cv", 3, 0.4)
+        calibration = TailCalibration.of("cv", predictor)
+        for step in range(20):
+            past = np.tile([1.0, 2.0], (3, 8, 1))
+            past[1] = np.nan
+            mean, cov = np.tile([1.0, 2.0], (3, 3, 1)), np.tile(np.eye(2), (3, 3, 1, 1))
+            cov[2] = 0.0
+            made, tails = calibration(step, np.arange(3), Forecast(mean, cov), past, np.zeros(3, bool))
+        assert np.isfinite(tails).all()
+        assert np.isfinite(made.cov).all()
+        assert (tails.narrow_scale[0] < 0.5).all()
 
     def test_ellipses_that_do_not_follow_stay(self):
         for level in (0.5, 0.95):

@@ -26,6 +26,7 @@ import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.mixtures import Tails, mahalanobis_squared, squared_radius
+from mcaptrack.notices import warn
 from mcaptrack.predictors.forecast import Forecast, Predictor
 
 TABLES: Final = Path(__file__).parent / "trained" / "tails.json"
@@ -51,6 +52,8 @@ _LOST: Final = 0.005
 _LEAST_WHITE, _LEAST_SLOW = 0.3, 0.5
 #: Noise is estimated from the bends of tracks over one step and over several.
 _NOISE_LAGS: Final = (1, 3)
+#: Warn of ellipses that became so many times as large as those of the table, after so many independent comparisons.
+_LARGER, _ENOUGH = 1.8, 100.0
 #: Limits of the weight of the wide part.
 _LEAST_WIDE, _MOST_WIDE = 0.02, 0.6
 #: Noise is estimated again after so many steps, from the positions of so many of the last, if there are so many.
@@ -209,6 +212,16 @@ class TailCalibration:
         radii = squared_radius(0.5, self._tails) / squared_radius(0.5, self._given)
         return float(np.sqrt(np.median(radii)))
 
+    def warn(self, name: str) -> None:
+        """Warn if ellipses, those of the predictor ``name``, became much larger than those of the table."""
+        independent = _INDEPENDENT_PER_S * self._step_s
+        if independent * self._seen.sum() > _ENOUGH and self.factor > _LARGER:
+            warn(
+                f"errors of predictions by {name} are {self.factor:.1f} times as large as in the walks that its "
+                "ellipses begin with; ellipses followed, but those of the first seconds are too small",
+                "ellipses",
+            )
+
     def __call__(
         self, step: int, ids: Ints, forecast: Forecast, past: Floats, is_coasting: Bools
     ) -> tuple[Forecast, Tails]:
@@ -276,8 +289,11 @@ class TailCalibration:
 
     def _add(self, lost: Ints, ahead: Ints, off: Floats, cov: Floats) -> None:
         """Count errors (M, 2) so many steps ahead (M,), and the steps of forecasts that can't be compared."""
-        half = mahalanobis_squared(off, cov) / 2
-        size = np.sqrt(cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] ** 2)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            half = mahalanobis_squared(off, cov) / 2
+            size = np.sqrt(cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] ** 2)
+        good = np.isfinite(half)
+        ahead, half, size = ahead[good], half[good], size[good]
         self._counts += counts_of(ahead, half, self._steps)
         self._lost += np.bincount(lost, minlength=self._steps)
         self._seen += np.bincount(ahead, minlength=self._steps)

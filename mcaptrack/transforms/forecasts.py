@@ -147,6 +147,11 @@ class Forecaster:
             out.extend(joined.t_ns, frames.numbers[low:high], ends, rows)
         return out.done()
 
+    def warn(self) -> None:
+        """Warn if ellipses became much larger than they began; to be called at the end."""
+        if self._calibration is not None:
+            self._calibration.warn(self._name)
+
     def _together(self, joined: JoinedFrames, histories: Histories) -> tuple[Rows, Ints]:
         """The predictions of some frames of tracks that have velocities, and where those of each frame end."""
         passed = np.array([self._passed(t_ns) for t_ns in joined.t_ns.tolist()], np.int64)

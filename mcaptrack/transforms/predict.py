@@ -80,6 +80,7 @@ class Predict:
         forecaster = self.forecaster()
         for frame in frames:
             yield (frame._replace(rows=forecaster.predict(frame)),)
+        forecaster.warn()
 
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
         """Why there are no predictions, for a warning."""

@@ -238,7 +238,7 @@ class _Forecasts:
     """Predictions of tracks, frame by frame, made for ``_BATCH`` tracks at once."""
 
     def __init__(self, name: str, predictor: Predictor, unit_m: float, adapt: bool) -> None:
-        self._predictor, self._unit_m = predictor, unit_m
+        self._name, self._predictor, self._unit_m = name, predictor, unit_m
         self._calibration = TailCalibration.of(name, predictor, adapt)
         self._out = FrameCollector(PREDICTIONS)
         self._waiting: list[_Waiting] = []
@@ -257,6 +257,8 @@ class _Forecasts:
     def done(self) -> FrameColumns:
         """The predictions; nothing can be added any more."""
         self._predict(1)
+        if self._calibration is not None:
+            self._calibration.warn(self._name)
         return self._out.done()
 
     def _predict(self, least: int) -> None:

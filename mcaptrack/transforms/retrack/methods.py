@@ -128,6 +128,7 @@ def _keep_ids(options: RetrackOptions, frames: Iterable[Frame]) -> Iterator[tupl
         offline = frame if linked is None else frame._replace(rows=next(linked))
         outputs = offline, online, frame._replace(rows=forecaster.predict(frame)), frame._replace(rows=next(decisions))
         yield outputs[: len(options.writes)]
+    forecaster.warn()
 
 
 def _passes(
