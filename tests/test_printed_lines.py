@@ -76,6 +76,7 @@ SUMMARIES: dict[str, tuple[Summary, list[str]]] = {
     "nothing": (Summary(), []),
     "boxes of pictures": (Summary(pictures=1000, boxes=2000), ["boxes: 2,000 in 1,000 pictures"]),
     "boxes of a label file": (Summary(boxes=0), ["boxes: 0"]),
+    "boxes in space": (Summary(boxes=1200, frame_id="map"), ["boxes: 1,200, tracked in the frame map"]),
     "one track": (
         REPAIRED,
         ["tracks: 1,200", "re-tracked: 1 track: 2 gaps closed, 3 split, 4,000 left out"],

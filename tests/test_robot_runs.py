@@ -15,6 +15,7 @@ from mcaptrack import log
 from mcaptrack.evaluation import sequence_of_log
 from mcaptrack.evaluation.forecasts import score_forecasts
 from mcaptrack.foxglove import class_colour
+from mcaptrack.pipeline import summary
 from mcaptrack.schema import TRACKS
 from mcaptrack.sources import fixed_frame
 from mcaptrack.viewing.report import gather, page
@@ -55,6 +56,17 @@ def test_recorded_boxes_are_decoded_once_in_a_run(passed, tmp_path, monkeypatch)
     assert len(decoded) == 2  # nothing is tracked, and the tables are up to date
     mcaptrack.run(path, frame="base_link", sidecar=False, tables=False)
     assert decoded[2:] == [("/lidar/boxes", "base_link")]
+
+
+def test_the_summary_names_the_frame_in_which_boxes_in_space_were_tracked(passed, tmp_path):
+    path = tmp_path / "a.mcap"
+    path.write_bytes(passed.read_bytes())
+    plain = {"sidecar": False, "tables": False, "events": False}
+    assert mcaptrack.run(path, **plain).summary.frame_id == "map"
+    assert mcaptrack.run(path, frame="base_link", **plain).summary.frame_id == "base_link"
+    with log.read(path) as opened, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(summary, "has_any", lambda *_: True)  # of tracks on pictures, too, metres may be in a frame
+        assert summary.summarise(opened, "/lidar").frame_id is None
 
 
 def test_limits_of_classes_that_there_are_not_are_named(passed, tmp_path):

@@ -221,7 +221,8 @@ def _lines_of_summary(summary: Summary) -> Iterator[tuple[str, str]]:
     """Yield a line for each part of a summary: its name and its text."""
     if summary.boxes is not None:
         where = "" if summary.pictures is None else f" in {summary.pictures:,} pictures"
-        yield "boxes", f"{summary.boxes:,}{where}"
+        frame = "" if summary.frame_id is None else f", tracked in the frame {summary.frame_id}"
+        yield "boxes", f"{summary.boxes:,}{where}{frame}"
     if summary.tracks is not None:
         yield "tracks", f"{summary.tracks:,}"
     if summary.corrected is not None:

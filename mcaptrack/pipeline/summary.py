@@ -21,7 +21,8 @@ from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, PREDICTIONS, TRACKS, Fra
 from mcaptrack.schema.camera_motion import rows_to_verdict
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameColumns
-from mcaptrack.schema.framing import joined_parts, row_ends, unique_values
+from mcaptrack.schema.framing import has_any, joined_parts, row_ends, unique_values
+from mcaptrack.schema.provenance import frame_id_of
 from mcaptrack.sources.camera_motion import motion_topic, read_ground_truth
 from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.sources.corrections import corrections_of
@@ -66,7 +67,7 @@ class Summary:
 
     ``ground_plane`` is "given" (measured), "estimated" from boxes or "assumed" (a scale alone); ``plane_fit`` says how
     well one fits that was estimated (see ``mcaptrack.geometry.plane_from_boxes.PlaneFit``). ``camera_motion`` is
-    "still", "shaking" or "moving".
+    "still", "shaking" or "moving". ``frame_id`` is the frame of reference that boxes in space were tracked in.
     """
 
     pictures: int | None = None
@@ -80,6 +81,7 @@ class Summary:
     plane_fit: Mapping[str, float] | None = None
     camera_motion: str | None = None
     corrected: Corrected | None = None
+    frame_id: str | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Convert the summary to JSON values."""
@@ -122,7 +124,16 @@ def summarise(opened: log.Log, prefix: str, boxes_read: BoxesRead | None = None)
         plane_fit=fit_of(provenance_of(opened, camera.ground_plane)),
         camera_motion=None if motion is None else rows_to_verdict(motion).name.lower(),
         corrected=corrected,
+        frame_id=_frame_id(opened, tracks),
     )
+
+
+def _frame_id(opened: log.Log, tracks: str) -> str | None:
+    """Return the frame that tracks are in, if they have no place in pictures; None if none is named."""
+    channel, frames = opened.channels.get(tracks), _frames(opened, tracks, TRACKS)
+    if channel is None or frames is None or has_any(TRACKS, frames, lambda rows: ~np.isnan(rows["x_px"])):
+        return None
+    return frame_id_of(channel.metadata) or None
 
 
 def _corrected(opened: log.Log, prefix: str, tracks: str, samples: str) -> Corrected | None:

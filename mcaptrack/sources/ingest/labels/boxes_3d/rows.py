@@ -38,6 +38,8 @@ _ALONG: Final = np.pi / 4
 _WIDE_M, _FLAT_M = 20.0, 3.0
 _SHOWN: Final = 8
 _SIZE: Final = slice(3, 6)
+#: The columns of boxes.
+_NAMES: Final = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "heading_rad")
 
 
 class TimedLabels(NamedTuple):
@@ -138,8 +140,13 @@ class BoxRows3D:
     def _check_numbers(self) -> None:
         boxes = self.boxes
         self.refuse(~np.isfinite(boxes[:, :2]).all(axis=1), lambda _: "x or y of the box is missing or not finite")
-        known = ~np.isnan(boxes).all(axis=0)
-        self.refuse(~np.isfinite(boxes[:, known]).all(axis=1), lambda _: "a number of the box is missing or not finite")
+        is_odd = ~np.isfinite(boxes) & ~np.isnan(boxes).all(axis=0)
+
+        def odd(row: int) -> str:
+            names = ", ".join(name for name, one in zip(_NAMES, is_odd[row].tolist(), strict=True) if one)
+            return f"a number of the box is missing or not finite ({names}), which other boxes have"
+
+        self.refuse(is_odd.any(axis=1), odd)
         largest = np.abs(boxes[:, :3]).max(axis=1, where=~np.isnan(boxes[:, :3]), initial=0)
         self.refuse(largest > MAX_PLACE, lambda row: f"a coordinate can't be {largest[row]:g}; at most {MAX_PLACE:g} m")
         self.refuse((boxes[:, _SIZE] < 0).any(axis=1), lambda row: f"a size can't be {np.nanmin(boxes[row, _SIZE]):g}")
