@@ -17,6 +17,7 @@ from mcaptrack.transforms.detect.person_model import (
     _mode,
     _scaled,
     region_boxes,
+    regions,
     typical_height,
 )
 
@@ -135,6 +136,14 @@ class TestRegions:
         """An opening of up to 4 rows is closed by a column of 5."""
         mask = drawn((60, 40), (10, 10, 6, 8), (10, 18 + gap, 6, 8))
         assert len(region_boxes(mask, 25)) == count
+
+    @pytest.mark.parametrize(("rows", "columns"), [(217, 302), (255, 257)])
+    def test_noise_may_have_more_regions_than_short_labels_can_tell(self, rows, columns):
+        """OpenCV refuses 65 535 regions with labels of 16 bits, not 65 534."""
+        mask = np.zeros((2 * rows - 1, 2 * columns - 1), np.uint8)
+        mask[::2, ::2] = 255
+        labels, found = regions(mask, 1)
+        assert (len(found), int(labels.max())) == (rows * columns,) * 2
 
     def test_the_typical_height_is_the_median_weighted_by_area(self):
         assert typical_height([]) == typical_height([drawn((100, 100), (5, 5, 19, 1))]) == 20
