@@ -33,7 +33,8 @@ from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest import IngestOptions, ingest, label_frames
 from mcaptrack.sources.ingest.labels.box_rows import OTHERS
 from mcaptrack.sources.ingest.labels.camera import timeline_of
-from mcaptrack.sources.ingest.labels.formats import FORMATS_3D, READERS, Format, Role
+from mcaptrack.sources.ingest.labels.content import FORMATS_3D, Format, Role
+from mcaptrack.sources.ingest.labels.formats import READERS
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline
 from mcaptrack.sources.video import H264Encoder

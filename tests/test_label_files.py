@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.labels import formats, number_table
-from mcaptrack.sources.ingest.labels.formats import Labels
+from mcaptrack.sources.ingest.labels.content import Labels
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline, count_frames
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses

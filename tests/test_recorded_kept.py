@@ -15,7 +15,7 @@ from mcap.writer import Writer
 from mcaptrack import log
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest import IngestOptions, ingest
-from mcaptrack.sources.ingest.labels.formats import Role
+from mcaptrack.sources.ingest.labels.content import Role
 from mcaptrack.transforms import TRANSFORMS
 from tests.bags import camera_bag
 from tests.commands import call

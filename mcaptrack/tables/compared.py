@@ -32,8 +32,10 @@ from mcaptrack.sources.ingest.boxes_3d_job import FRAME, Boxes3DJob
 from mcaptrack.sources.ingest.job import IngestOptions
 from mcaptrack.sources.ingest.label_job import LabelJob
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
-from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX, IgnoredBoxes, Labels, Role
+from mcaptrack.sources.ingest.labels.content import IgnoredBoxes, Labels, Role
+from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX
 from mcaptrack.sources.ingest.labels.label_rows import label_rows
+from mcaptrack.sources.ingest.labels.long_files import LabelFile
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 from mcaptrack.sources.ingest.labels.wanted import ONLY_PEOPLE, WantedClasses
 
@@ -171,7 +173,7 @@ def detections_and_ground_truth(
     """
     options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point)
     with _PairJob([("detections", detections), ("truth", ground_truth)], options) as job:
-        if any(labels.boxes_px is None for _, labels in job.labels.values()):
+        if not all(labels.has_boxes for _, labels in job.labels.values()):
             raise McaptrackError(f"{detections} and {ground_truth} have to hold boxes in pixels, both")
         planes = ((0, job.ground),) if job.ground else ()
         return AlignedDetections(job.all_frames("detections"), job.all_frames("truth"), planes)
@@ -180,7 +182,7 @@ def detections_and_ground_truth(
 class _PairJob(LabelJob):
     """Labels of detections and of ground truth, which may be a table."""
 
-    def read(self, path: Path, role: Role) -> Labels:
+    def read(self, path: Path, role: Role) -> LabelFile:
         return _read(path, role, (), ONLY_PEOPLE) if role == "truth" else super().read(path, role)
 
 

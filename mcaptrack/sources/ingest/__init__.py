@@ -19,8 +19,8 @@ from mcaptrack.sources.ingest.job import MOTION, IngestJob, IngestOptions, Inges
 from mcaptrack.sources.ingest.label_job import LabelJob, label_frames
 from mcaptrack.sources.ingest.labels.box_rows import OTHERS
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
+from mcaptrack.sources.ingest.labels.content import Format, Role
 from mcaptrack.sources.ingest.labels.cvat_files import is_cvat
-from mcaptrack.sources.ingest.labels.formats import Format, Role
 from mcaptrack.sources.ingest.labels.yolo import is_label_folder
 from mcaptrack.sources.ingest.motion_job import MotionJob
 from mcaptrack.sources.ingest.recording_job import RecordingJob

@@ -26,7 +26,7 @@ from mcaptrack.sources.ingest.job import SCHEMA_OF, IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import read_boxes_3d
 from mcaptrack.sources.ingest.labels.boxes_3d.rows import BoxRows3D, TimedLabels
 from mcaptrack.sources.ingest.labels.camera import DEFAULT
-from mcaptrack.sources.ingest.labels.formats import Role
+from mcaptrack.sources.ingest.labels.content import Role
 from mcaptrack.sources.ingest.labels.timeline import frame_times_ns
 
 #: The frame of reference of boxes, if neither the user nor the format nor the log names one.

@@ -12,7 +12,7 @@ from mcaptrack.notices import warn
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.framing import frame_times, unique_values
 from mcaptrack.sources.corrections import CORRECTED_FROM
-from mcaptrack.sources.ingest.labels.formats import Labels
+from mcaptrack.sources.ingest.labels.content import Labels
 from mcaptrack.sources.ingest.labels.timeline import Placed
 
 

@@ -9,10 +9,9 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Set
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal, Self, TypeAlias
-
-import numpy as np
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
@@ -29,10 +28,10 @@ from mcaptrack.sources.ingest.calibration import GivenCalibration, LengthUnit
 from mcaptrack.sources.ingest.ground import PLANE, GivenGround
 from mcaptrack.sources.ingest.labels.box_rows import OTHERS, fitted
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
-from mcaptrack.sources.ingest.labels.formats import Format, Labels, Role
-from mcaptrack.sources.ingest.labels.label_rows import label_rows
+from mcaptrack.sources.ingest.labels.content import Format, Labels, Role
+from mcaptrack.sources.ingest.labels.label_rows import frames_of_labels
+from mcaptrack.sources.ingest.labels.long_files import LabelFile, read_labels_of_any_length
 from mcaptrack.sources.ingest.labels.motions import motion_frames, read_motions
-from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline
 from mcaptrack.sources.ingest.labels.wanted import ONLY_PEOPLE, WantedClasses, describe_classes
 from mcaptrack.sources.ingest.sidecar import encoding_for
@@ -55,7 +54,6 @@ TOPIC_OF: Final[Mapping[Role, str]] = {"corrections": CORRECTED}
 MOTION: Final = "motion"
 #: What an input that is a text file can hold.
 InputRole: TypeAlias = Role | Literal["motion", "calibration"]
-_BLOCK: Final = 4096
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,13 +158,13 @@ class IngestJob:
         calibration = GivenCalibration.read(*given) if options.calibration else None
         #: The ground plane and the calibration that were given.
         self.ground_given = GivenGround(options.ground_plane, calibration, options.point)
-        self.labels: dict[Role, tuple[Path, Labels]] = {
+        self.labels: dict[Role, tuple[Path, LabelFile]] = {
             role: (path, self.read(path, role)) for role, path in options.labels.items()
         }
         self.motions = read_motions(options.motion) if options.motion else None
         self.check_labels()
 
-    def read(self, path: Path, role: Role) -> Labels:
+    def read(self, path: Path, role: Role) -> LabelFile:
         """Read a label file with the format options."""
         options = self.options
         wanted = options.classes or (WantedClasses("all") if role == "corrections" else ONLY_PEOPLE)
@@ -175,7 +173,7 @@ class IngestJob:
                 f"{path} holds 3D boxes, and {self.source} does not; add them with "
                 f"{call('ingest', path, role=role, into='LOG')}"
             )
-        return read_labels(path, options.label_format, role, options.first_frame, options.columns, wanted)
+        return read_labels_of_any_length(path, options.label_format, role, options.first_frame, options.columns, wanted)
 
     @property
     def has_labels(self) -> bool:
@@ -210,13 +208,13 @@ class IngestJob:
         if found is None:
             return
         for role, (path, labels) in self.labels.items():
-            if labels.format in OTHERS:
+            if isinstance(labels, Labels) and labels.format in OTHERS:
                 self.labels[role] = path, fitted(path, labels, found)
 
     def check_labels(self) -> None:
         """Refuse labels that don't suit their role."""
         for role, (path, labels) in self.labels.items():
-            if role == "detections" and labels.boxes_px is None:
+            if role == "detections" and not labels.has_boxes:
                 raise McaptrackError(f"{path} holds positions, not boxes; detections are boxes")
             if role != "detections" and not labels.has_ids:
                 raise McaptrackError(f"{path} has no ids (all are -1); {role} need ids")
@@ -238,7 +236,7 @@ class IngestJob:
             if labels.step > 1:
                 words = f"{path} has labels every {labels.step} frames, from {labels.labelled[0]} on"
                 self.report.remarks.append(f"{words}; the frames in between are left out")
-            if words := describe_classes(labels.class_id, labels.classes):
+            if words := describe_classes(*labels.class_counts(), labels.classes):
                 self.report.remarks.append(f"{path} has several classes; class_id is {words}")
 
     def __enter__(self) -> Self:
@@ -338,7 +336,7 @@ class IngestJob:
         frames = motion_frames(self.motions, timeline.index, timeline.t_ns, size)
         self.write_rows(writer, MOTION, CAMERA_MOTION, lambda: iter(frames), {"file": path.name})
 
-    def label_parameters(self, role: Role, labels: Labels) -> dict[str, Any]:
+    def label_parameters(self, role: Role, labels: LabelFile) -> dict[str, Any]:
         """Additional parameters in the provenance of labels."""
         out: dict[str, Any] = {} if self.options.first_frame is None else {"first_frame": labels.first_frame}
         if self.options.columns and labels.format in ("csv", "supervision"):
@@ -351,17 +349,7 @@ class IngestJob:
 
     def frames(self, role: Role, plane: GroundPlane | None, placed: Placed) -> Frames:
         """The labels of these frames, including empty frames."""
-        labels = self.labels[role][1]
-        rows = label_rows(labels, role, plane)
-        first, last = (np.searchsorted(labels.frame, placed.number, side) for side in ("left", "right"))
-
-        def frames() -> Iterator[Frame]:
-            for low in range(0, len(first), _BLOCK):
-                columns = (column[low : low + _BLOCK] for column in (placed.t_ns, placed.index, first, last))
-                for t_ns, index, start, end in zip(*(column.tolist() for column in columns), strict=True):
-                    yield Frame(t_ns, index, rows[start:end])
-
-        return frames
+        return partial(frames_of_labels, self.labels[role][1].parts, role, plane, placed)
 
     def write_rows(
         self,

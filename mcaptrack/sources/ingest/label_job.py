@@ -35,7 +35,8 @@ from mcaptrack.sources.ingest.labels.camera import (
     picture_size,
     timeline_of,
 )
-from mcaptrack.sources.ingest.labels.formats import Format, Labels, Role
+from mcaptrack.sources.ingest.labels.content import Format, Labels, Role
+from mcaptrack.sources.ingest.labels.long_files import LabelFile
 from mcaptrack.sources.ingest.labels.timeline import MAX_FRAMES, Timeline, count_frames
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 from mcaptrack.sources.planes import planes_in
@@ -93,7 +94,8 @@ class LabelJob(IngestJob):
             self.prefix, self.pictures = camera_of(into, options.camera)
         if into is not None and "corrections" in self.labels:
             path, labels = self.labels["corrections"]
-            self.labels = {**self.labels, "corrections": (path, with_new_ids(into, self.prefix, labels))}
+            if isinstance(labels, Labels):  # corrections are never read in parts
+                self.labels = {**self.labels, "corrections": (path, with_new_ids(into, self.prefix, labels))}
             self.frame_id = frame_of(into, self.pictures) if self.pictures else ""
         seen = detections_topic(into, self.prefix) if into is not None and not self.pictures else ""
         pictures_of = partial(picture_size, into, self.pictures) if into is not None and self.pictures else None
@@ -132,11 +134,11 @@ class LabelJob(IngestJob):
 
     def _boxes_extent(self) -> tuple[int, int]:
         """The image size that contains all boxes, (width, height) in pixels."""
-        boxes = [labels.boxes_px for _, labels in self.labels.values() if labels.boxes_px is not None]
-        if not boxes:
+        corners = [labels.corner_px() for _, labels in self.labels.values() if labels.has_boxes]
+        if not corners:
             return 0, 0
-        corner = np.concatenate([part[:, :2] + part[:, 2:] for part in boxes]).max(axis=0)
-        return max(0, int(np.ceil(corner[0]))), max(0, int(np.ceil(corner[1])))
+        x_px, y_px = np.ceil(np.max(corners, axis=0)).tolist()
+        return max(0, int(x_px)), max(0, int(y_px))
 
     def _measured_plane(self) -> GroundPlane | None:
         """The ground plane of the camera in the log, if it was measured and doesn't change."""
@@ -273,7 +275,7 @@ class LabelJob(IngestJob):
         self.write_labels(writer, self.ground, self.timeline)
         self.write_motion(writer, self.timeline, self._size)
 
-    def label_parameters(self, role: Role, labels: Labels) -> dict[str, Any]:
+    def label_parameters(self, role: Role, labels: LabelFile) -> dict[str, Any]:
         """The frame rate, if there were no pictures."""
         return super().label_parameters(role, labels) | ({} if self._fps is None else {"fps": str(self._fps)})
 
@@ -287,7 +289,7 @@ def _seconds(t_ns: int) -> str:
     return f"{t_ns / NS_PER_S:.3f} s"
 
 
-def _known(path: Path, labels: Labels) -> _Known:
+def _known(path: Path, labels: LabelFile) -> _Known:
     """Frame rate and number of frames by the format of a label file, or by seqinfo.ini."""
     if labels.format == "sdd":
         return _Known(_SDD_FPS, None, _BY_FORMAT[labels.format])

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,7 +103,7 @@ def regions(mask: Image, join_px: int) -> tuple[Labels, Ints]:
     most = (mask.shape[0] + 1) // 2 * ((mask.shape[1] + 1) // 2)
     kind = cv2.CV_16U if most < _MOST_SHORT_LABELS else cv2.CV_32S
     _, labels, found, _ = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=kind)
-    return np.asarray(labels), np.asarray(found[1:], np.int64)
+    return cast("Labels", labels), np.asarray(found[1:], np.int64)
 
 
 def typical_height(masks: Sequence[Image]) -> float:

@@ -18,7 +18,7 @@ from mcaptrack.schema import DETECTIONS, VIDEO
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.foreign.flatten import message_type_of
-from mcaptrack.sources.ingest.labels.formats import Role
+from mcaptrack.sources.ingest.labels.content import Role
 from mcaptrack.sources.ingest.labels.timeline import Timeline
 from mcaptrack.sources.pictures import size_of_pictures
 from mcaptrack.sources.video import is_video_codec, read_head

@@ -19,50 +19,22 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.notices import Code
 from mcaptrack.schema.classes import PERSON
+from mcaptrack.sources.ingest.labels.content import NO_ID, ClassIds, Format, IgnoredBoxes, Labels, Role
 from mcaptrack.sources.ingest.labels.number_table import Lines, NumberTable
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
-Format = Literal[
-    "auto",
-    "mot",
-    "kitti",
-    "sdd",
-    "trajnet",
-    "obsmat",
-    "coco",
-    "cvat",
-    "yolo",
-    "supervision",
-    "csv",
-    "kitti-3d",
-    "nuscenes",
-    "argoverse",
-]
-#: Formats that hold 3D boxes alone; tables ("csv") may hold either.
-FORMATS_3D: Final[tuple[str, ...]] = ("kitti-3d", "nuscenes", "argoverse")
-Role = Literal["detections", "tracks", "truth", "corrections"]
-ClassIds = NDArray[np.uint32]
-
-NO_ID: Final = -1
 #: Coordinates, in pixels or metres, and scores can't be larger.
 MAX_PLACE: Final = 1e8
 MAX_SCORE: Final = 1e9
 MAX_FRAME: Final = 2**31 - 1
-#: Formats in which labels at regular steps are the rule.
-_POSITIONS: Final = ("trajnet", "obsmat")
-#: With fewer labelled frames a regular step of boxes may be a coincidence.
-_SPARSE_FRAMES: Final = 3
 
 #: The classes of MOT16, 17 and 20.
 _MOT_NAMES: Final = (
@@ -84,65 +56,6 @@ _SDD_CLASSES: Final = {"pedestrian": PERSON, "biker": 2, "skater": 3, "cart": 4,
 _KITTI_REGION: Final = "dontcare"
 #: The number of class names of a column, at most: there are data sets with 21,841 classes.
 _MAX_NAMES: Final = 65_536
-
-
-@dataclass(frozen=True)
-class IgnoredBoxes:
-    """Labelled boxes that are not scored: frames (N,) as in the file, boxes (N, 4) in px.
-
-    ``forgiven`` (N,): a track that is matched with the box is ignored, instead of counted as a false positive.
-    ``region`` (N,): tracks inside the box without a match are ignored, too.
-    """
-
-    frame: Ints
-    boxes_px: Floats
-    forgiven: Bools
-    region: Bools
-
-
-@dataclass(frozen=True)
-class Labels:
-    """The rows of a label file, sorted by frame and id.
-
-    ``frame`` (N,) is the number in the file; ``first_frame`` is that of the first picture. ``id`` (N,) is -1 in
-    detections. ``boxes_px`` (N, 4) or ``xy_m`` (N, 2) is None if the format has none. ``score`` (N,) is NaN for missing
-    scores. ``labelled`` (F,) are the sorted frames with rows in the file, including rows that were left out.
-    ``class_id`` (N,) is as in the schema of detections; ``classes`` are names by class id. ``left_out`` describes the
-    rows that were left out; those of ground truth are in ``ignored``. ``remarks`` and ``doubts`` (warnings and their
-    codes) say how the file was understood. ``is_normalised``: boxes are in shares of the picture's size. ``times_s``
-    (F,): the times of frames by the file itself; its frames are then numbered from 0. ``observed`` (N,): which boxes
-    were seen, and not filled in or occluded, if the file says so. ``made_ids``: rising ids that are not of the file.
-    """
-
-    format: Format
-    first_frame: int
-    frame: Ints
-    id: Ints
-    boxes_px: Floats | None
-    xy_m: Floats | None
-    score: Floats
-    labelled: Ints
-    class_id: ClassIds
-    classes: Mapping[int, str] = field(default_factory=dict)
-    left_out: str = ""
-    ignored: IgnoredBoxes | None = None
-    remarks: tuple[str, ...] = ()
-    doubts: tuple[tuple[str, Code], ...] = ()
-    is_normalised: bool = False
-    times_s: Floats | None = None
-    observed: Bools | None = None
-    made_ids: Ints | None = None
-
-    @property
-    def step(self) -> int:
-        """The step of labelled frames: 12 if every twelfth frame is labelled."""
-        least = 2 if self.format in _POSITIONS else _SPARSE_FRAMES
-        return int(np.gcd.reduce(np.diff(self.labelled))) if len(self.labelled) >= least else 1
-
-    @property
-    def has_ids(self) -> bool:
-        """Whether the rows have ids."""
-        return bool((self.id != NO_ID).any())
 
 
 class ClassNames:

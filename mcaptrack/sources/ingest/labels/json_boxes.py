@@ -25,8 +25,8 @@ from mcaptrack.sources.ingest.labels.box_rows import (
     TrackIds,
     numbers_of_names,
 )
+from mcaptrack.sources.ingest.labels.content import NO_ID, Format, Labels, Role
 from mcaptrack.sources.ingest.labels.delimited import read_rows
-from mcaptrack.sources.ingest.labels.formats import NO_ID, Format, Labels, Role
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
 _MAX_BYTES: Final = 512 * 2**20

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
+from typing import Final
+
 import numpy as np
 
 from mcaptrack.geometry.plane import GroundPlane
-from mcaptrack.schema import DETECTIONS, TRACKS, Rows
-from mcaptrack.sources.ingest.labels.formats import Labels, Role
+from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Rows
+from mcaptrack.sources.ingest.labels.content import Labels, Role
+from mcaptrack.sources.ingest.labels.timeline import Placed
+
+#: The number of frames of a block, for which times are converted together.
+_BLOCK: Final = 4096
 
 
 def label_rows(labels: Labels, role: Role, plane: GroundPlane | None) -> Rows:
@@ -32,3 +39,22 @@ def label_rows(labels: Labels, role: Role, plane: GroundPlane | None) -> Rows:
         source_id=np.full(len(labels.frame), -1),
         class_id=labels.class_id,
     )
+
+
+def frames_of_labels(
+    parts: Sequence[Callable[[], Labels]], role: Role, plane: GroundPlane | None, placed: Placed
+) -> Iterator[Frame]:
+    """The rows of labels, in parts of whole frames, as frames: those that are ``placed``, also empty ones."""
+    low = 0
+    for number, read in enumerate(parts):
+        labels = read()
+        is_last = number == len(parts) - 1
+        high = len(placed.number) if is_last else int(np.searchsorted(placed.number, labels.frame[-1], "right"))
+        rows, frame = label_rows(labels, role, plane), labels.frame
+        for start in range(low, high, _BLOCK):
+            some = slice(start, min(start + _BLOCK, high))
+            ends = (np.searchsorted(frame, placed.number[some], side) for side in ("left", "right"))
+            columns = (column.tolist() for column in (placed.t_ns[some], placed.index[some], *ends))
+            for t_ns, index, first, last in zip(*columns, strict=True):
+                yield Frame(t_ns, index, rows[first:last])
+        low = high

@@ -80,7 +80,10 @@ class NumberTable:
                 raise McaptrackError(f"{path}:{number}: not {what}, {why}: {line.strip()[:_SHOWN]}") from None
             numbers.append(number)
             if len(numbers) > _MAX_ROWS:
-                raise McaptrackError(f"{path} has more than {_MAX_ROWS} rows; give it in parts")
+                raise McaptrackError(
+                    f"{path} has more than {_MAX_ROWS} rows; give it in parts, or as detections or tracks of "
+                    "MOTChallenge, sorted by frame"
+                )
         self.values: Floats = np.frombuffer(values, np.float64).reshape(-1, columns)
         self.line: Ints = np.frombuffer(numbers, np.int64)
 

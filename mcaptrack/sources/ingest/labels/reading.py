@@ -12,10 +12,11 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
 from mcaptrack.sources.ingest.labels.columns import choose_columns
+from mcaptrack.sources.ingest.labels.content import FORMATS_3D, Format, Labels, Role
 from mcaptrack.sources.ingest.labels.cvat import read_cvat
 from mcaptrack.sources.ingest.labels.cvat_files import is_cvat
 from mcaptrack.sources.ingest.labels.delimited import MAX_LINE, SUPERVISION, comment_header, header_of, read_csv
-from mcaptrack.sources.ingest.labels.formats import FORMATS_3D, READERS, Format, Labels, Role
+from mcaptrack.sources.ingest.labels.formats import READERS
 from mcaptrack.sources.ingest.labels.json_boxes import is_json, read_json
 from mcaptrack.sources.ingest.labels.number_table import lines_of, split
 from mcaptrack.sources.ingest.labels.wanted import ONLY_PEOPLE, WantedClasses
@@ -62,21 +63,19 @@ def read_labels(
     """
     labels = _read(path, label_format, role, columns or {}, wanted)
     if labels.has_ids and role != "detections":
-        _refuse_repeated_ids(path, labels)
-    order = np.lexsort((labels.id, labels.frame)) if labels.has_ids else np.argsort(labels.frame, kind="stable")
-    boxes, xy = labels.boxes_px, labels.xy_m
+        refuse_repeated_ids(path, labels)
     return replace(
-        labels,
+        in_order(labels, labels.has_ids),
         first_frame=labels.first_frame if first_frame is None else first_frame,
-        frame=labels.frame[order],
-        id=labels.id[order],
-        boxes_px=None if boxes is None else boxes[order],
-        xy_m=None if xy is None else xy[order],
-        score=labels.score[order],
-        class_id=labels.class_id[order],
-        observed=None if labels.observed is None else labels.observed[order],
         doubts=tuple(doubt for doubt in labels.doubts if first_frame is None or doubt[1] != "clock"),
     )
+
+
+def in_order(labels: Labels, has_ids: bool) -> Labels:
+    """The rows sorted by frame, and by id if there are any; otherwise each frame as the file has it."""
+    if has_ids:
+        return labels.take(np.lexsort((labels.id, labels.frame)))
+    return labels.take(np.argsort(labels.frame, kind="stable"))
 
 
 def _read(path: Path, label_format: Format, role: Role, columns: Mapping[str, str], wanted: WantedClasses) -> Labels:
@@ -92,10 +91,7 @@ def _read(path: Path, label_format: Format, role: Role, columns: Mapping[str, st
             raise McaptrackError(f"{path}: `columns=` is for tables with a header, not for CVAT")
         return read_cvat(path, role, wanted)
     if label_format == "auto":
-        found = next(lines_of(path, MAX_LINE), None)
-        if found is None:
-            raise McaptrackError(f"{path} holds no labels")
-        label_format = "csv" if columns else _guess(path, *found)
+        label_format = "csv" if columns else text_format(path)
     if columns and label_format not in ("csv", "supervision"):
         raise McaptrackError(f"{path}: `columns=` is for tables with a header, not for {label_format}")
     if label_format == "cvat":
@@ -109,7 +105,11 @@ def _read(path: Path, label_format: Format, role: Role, columns: Mapping[str, st
     return READERS[label_format](path, lines_of(path), role, wanted)
 
 
-def _guess(path: Path, number: int, line: str) -> Format:
+def text_format(path: Path) -> Format:
+    """The format of a text by its first row. Raises McaptrackError if it is none of those that are known."""
+    number, line = next(lines_of(path, MAX_LINE), (0, ""))
+    if not number:
+        raise McaptrackError(f"{path} holds no labels")
     header = header_of(path, line)
     if header:
         return "supervision" if set(SUPERVISION) <= set(header) else "csv"
@@ -142,7 +142,7 @@ def _has_other_columns(path: Path, number: int, line: str) -> bool:
     return any(columns.get(key) != place for key, place in _MOT_COLUMNS.items())
 
 
-def _refuse_repeated_ids(path: Path, labels: Labels) -> None:
+def refuse_repeated_ids(path: Path, labels: Labels) -> None:
     """Raise McaptrackError if an id appears twice in a frame."""
     order = np.lexsort((labels.id, labels.frame))
     frame, track_id = labels.frame[order], labels.id[order]

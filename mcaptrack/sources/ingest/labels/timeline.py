@@ -20,7 +20,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import warn
-from mcaptrack.sources.ingest.labels.formats import Labels
+from mcaptrack.sources.ingest.labels.long_files import LabelFile
 
 #: The largest frame number: more than three days at 30 frames a second.
 MAX_FRAMES: Final = 10_000_000
@@ -112,7 +112,7 @@ class Timeline:
         gaps = np.diff(self.t_ns) / np.diff(self.index)
         return NS_PER_S / float(np.median(gaps)) if len(gaps) else 0.0
 
-    def place(self, path: Path, labels: Labels, lost: list[str]) -> Placed:
+    def place(self, path: Path, labels: LabelFile, lost: list[str]) -> Placed:
         """Assign the labelled frames of a file to pictures, including frames without labels in between.
 
         Raises McaptrackError if there are labels before the first or after the last picture. If pictures are known to
@@ -121,21 +121,22 @@ class Timeline:
         if labels.times_s is not None:
             return self._place_by_time(path, labels.times_s)
         every = self._every(path, labels)
-        at = (labels.frame - labels.first_frame) // every
+        frame, count = labels.frame_counts()
+        at = (frame - labels.first_frame) // every
         end = int(self.index[-1]) + 1
         if at[0] < 0:
             raise McaptrackError(
-                f"{path}: its first label is of frame {labels.frame[0]}, and frame {labels.first_frame} is assumed to "
+                f"{path}: its first label is of frame {frame[0]}, and frame {labels.first_frame} is assumed to "
                 "be the first picture; give the right number with `first_frame=`"
             )
-        beyond = int((at >= end).sum())
-        if beyond and (self.is_complete or beyond == len(at)):
+        beyond = int(count[at >= end].sum())
+        if beyond and (self.is_complete or (at >= end).all()):
             raise McaptrackError(self._beyond(path, labels, beyond, every * (end - 1) + labels.first_frame))
         if beyond:
             lost.append(f"{path}: {beyond} labels are of frames after the last picture that could be read, {end - 1}")
-        missing = ~np.isin(at[at < end], self.index)
-        if missing.any():
-            lost.append(f"{path}: {int(missing.sum())} labels are of frames with missing pictures")
+        missing = int(count[(at < end) & ~np.isin(at, self.index)].sum())
+        if missing:
+            lost.append(f"{path}: {missing} labels are of frames with missing pictures")
         step = labels.step // every or 1
         known = self.index % step == (int(labels.labelled[0]) - labels.first_frame) // every % step
         return Placed(every * self.index[known] + labels.first_frame, self.index[known], self.t_ns[known])
@@ -171,7 +172,7 @@ class Timeline:
         number[nearest] = np.arange(len(seconds))
         return Placed(number, self.index, self.t_ns)
 
-    def _every(self, path: Path, labels: Labels) -> int:
+    def _every(self, path: Path, labels: LabelFile) -> int:
         """The step of frame numbers in a label file, which may use the numbers in the names of images."""
         if self.every == 1 or ((labels.labelled - labels.first_frame) % self.every).any():
             return 1
@@ -179,10 +180,11 @@ class Timeline:
             warn(f"{path} counts frames as the names of {self.of} do, every {self.every}", "clock")
         return self.every
 
-    def _beyond(self, path: Path, labels: Labels, beyond: int, end: int) -> str:
+    def _beyond(self, path: Path, labels: LabelFile, beyond: int, end: int) -> str:
         """The error for labels after frame ``end`` of the file, the last picture."""
-        first, last = int(labels.frame[0]), int(labels.frame[-1])
-        some = "all" if beyond == len(labels.frame) else beyond
+        frame, count = labels.frame_counts()
+        first, last = int(frame[0]), int(frame[-1])
+        some = "all" if beyond == count.sum() else beyond
         words = (
             f"{path}: {some} labels are of frames after the last picture: {self.of} end with frame "
             f"{end}, the labels with frame {last}"
@@ -202,12 +204,12 @@ def frame_times_ns(index: Ints, fps: Fraction) -> Ints:
     return rounded
 
 
-def count_frames(path: Path, labels: Labels) -> int:
+def count_frames(path: Path, labels: LabelFile) -> int:
     """The number of frames up to the last one that a file labels.
 
     Raises McaptrackError if nearly all of them would be empty, which means that the numbers are wrong.
     """
-    last = max(int(labels.labelled[-1]), int(labels.frame[-1]))
+    last = max(int(labels.labelled[-1]), int(labels.frame_counts()[0][-1]))
     count = last - labels.first_frame + 1
     most = max(_EMPTY_FRAMES, _EMPTY_A_LABELLED * len(labels.labelled) * labels.step)
     if count > min(most, MAX_FRAMES):

@@ -1,4 +1,4 @@
-"""Which classes of label files become tracks and ground truth. Letters: N rows."""
+"""Which classes of label files become tracks and ground truth. Letters: N rows, C classes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.arrays import Bools
+from mcaptrack.geometry.arrays import Bools, Ints
 from mcaptrack.schema.classes import PERSON, is_person
 
 _ALL: Final = "all"
@@ -65,9 +65,8 @@ class WantedClasses:
 ONLY_PEOPLE: Final = WantedClasses()
 
 
-def describe_classes(class_id: NDArray[np.integer], names: Mapping[int, str]) -> str:
-    """List the classes of rows (N,), each with its name and the number of its rows; "" for one class."""
-    ids, counts = np.unique(class_id, return_counts=True)
+def describe_classes(ids: NDArray[np.integer], counts: Ints, names: Mapping[int, str]) -> str:
+    """List classes (C,), each with its name and the number of its rows; "" for one class."""
     if len(ids) < 2:
         return ""
     called = [f"{number} {names[number]}" if number in names else f"{number}" for number in ids.tolist()]

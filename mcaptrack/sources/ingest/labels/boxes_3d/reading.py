@@ -13,8 +13,8 @@ from mcaptrack.sources.ingest.labels.boxes_3d.kitti import read_kitti_3d
 from mcaptrack.sources.ingest.labels.boxes_3d.nuscenes import read_nuscenes, tables_folder
 from mcaptrack.sources.ingest.labels.boxes_3d.rows import BoxRows3D
 from mcaptrack.sources.ingest.labels.boxes_3d.table import holds_boxes_3d, read_table
+from mcaptrack.sources.ingest.labels.content import FORMATS_3D, Format, Role
 from mcaptrack.sources.ingest.labels.delimited import MAX_LINE
-from mcaptrack.sources.ingest.labels.formats import FORMATS_3D, Format, Role
 from mcaptrack.sources.ingest.labels.number_table import lines_of
 
 _BEGIN_BYTES: Final = 4096
