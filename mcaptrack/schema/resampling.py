@@ -57,7 +57,7 @@ def resample(frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int, usual_ns: fl
         last = int(np.searchsorted(t_ns, min(int(at_ns[-1]) + max_gap_ns, LAST_NS), "right"))
     joined = join_frames(TRACKS, frames, first, last)
     order = np.lexsort((joined.row_ns, joined.rows["track_id"]))
-    rows, row_ns = joined.rows[order], joined.row_ns[order]
+    rows, row_ns = joined.rows.take(order), joined.row_ns[order]
     has_next = ~run_ends(run_starts(rows["track_id"]))
     step_ns = np.append(np.diff(row_ns), 0)[: len(rows)]
     is_linked = has_next & (step_ns > 0) & (step_ns <= max_gap_ns)
@@ -71,7 +71,7 @@ def resample(frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int, usual_ns: fl
     span = np.where(is_linked, step_ns, 1)[before]
     share = (at_ns[at] - row_ns[before]) / span
 
-    out = rows[before].copy()
+    out = rows.take(before)
     for name in LINEAR:
         start, end = rows[name][before], rows[name][after]
         out[name] = np.where(share == 0, start, start + share * (end - start))
@@ -81,7 +81,7 @@ def resample(frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int, usual_ns: fl
     between = rows["observed"][before] & rows["observed"][after] & (span <= _MAX_STEP * usual_ns)
     out["observed"] = np.where(share == 0, rows["observed"][before], between)
     order = np.lexsort((out["track_id"], at))
-    return out[order], at[order].astype(np.int64)
+    return out.take(order), at[order].astype(np.int64)
 
 
 def resample_parts(frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int) -> Iterator[tuple[int, int, Rows, Ints]]:

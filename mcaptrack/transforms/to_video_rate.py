@@ -101,7 +101,7 @@ def _part(
     order = np.lexsort((distance_ns, ids, at))
     order = order[kept[order]]
     order = order[run_starts(at[order], ids[order])]
-    boxes, at, ids = boxes[order].copy(), at[order], ids[order]
+    boxes, at, ids = boxes.take(order), at[order], ids[order]
 
     names = np.unique(np.concatenate([base["track_id"], ids]))
     width = len(names) + 1
@@ -115,13 +115,13 @@ def _part(
     outside = boxes[~inside]
     outside["source_id"], outside["track_id"] = outside["track_id"], ids[~inside]
     _to_metres(outside, frame_ns[at[~inside]], planes)
-    rows = np.concatenate([base, outside])
+    rows = TRACKS.joined([base, outside])
     rows_at = np.concatenate([base_at, at[~inside]])
     known, class_id = classes
     if len(known):  # of the re-tracked track: that of the tracker's box may be another one
         rows["class_id"] = class_id[np.searchsorted(known, rows["track_id"])]
     order = np.lexsort((rows["track_id"], rows_at))
-    rows, rows_at = rows[order], rows_at[order]
+    rows, rows_at = rows.take(order), rows_at[order]
     return rows, np.searchsorted(rows_at, np.arange(len(frame_ns) + 1), "left")
 
 

@@ -121,7 +121,7 @@ def _moved_on(frames: FrameColumns) -> tuple[Rows, Ints]:
             passed_s = dt_ns / NS_PER_S
             out.append(_moved(final, *(passed_s * final[name] for name in ("vx_m_per_s", "vy_m_per_s"))))
             frame_of.append(end + 1)
-    return np.concatenate(out), np.array(frame_of, np.int64)
+    return TRACKS.joined(out), np.array(frame_of, np.int64)
 
 
 def _moved(row: Rows, x_m: Floats, y_m: Floats) -> Rows:
@@ -138,9 +138,9 @@ def _with_rows(frames: FrameColumns, rows: Rows, frame_of: Ints) -> FrameColumns
     out = FrameCollector(TRACKS)
     for low, high, joined in joined_parts(TRACKS, frames):
         here = (frame_of >= low) & (frame_of < high)
-        both = np.concatenate([joined.rows, rows[here]])
+        both = TRACKS.joined([joined.rows, rows[here]])
         of = np.concatenate([joined.frame, frame_of[here] - low])
         order = np.lexsort((both["track_id"], of))
         ends = np.searchsorted(of[order], np.arange(high - low + 1))
-        out.extend(joined.t_ns, frames.numbers[low:high], ends, both[order])
+        out.extend(joined.t_ns, frames.numbers[low:high], ends, both.take(order))
     return out.done()
