@@ -31,13 +31,20 @@ class Histories:
         steps = min(steps, self.length)
         moved = np.full_like(self.xy_m, np.nan)
         moved[:, : self.length - steps] = self.xy_m[:, steps:]
-        remembered = np.isfinite(moved[:, :, 0]).any(axis=1) | np.isin(self.ids, ids)
-        new = np.setdiff1d(ids, self.ids[remembered])
-        known = np.concatenate([self.ids[remembered], new])
-        order = np.argsort(known, kind="stable")
-        self.ids = known[order]
-        self.xy_m = np.concatenate([moved[remembered], np.full((len(new), self.length, 2), np.nan)])[order]
         slot = np.searchsorted(self.ids, ids)
+        is_old = np.zeros(len(ids), bool)
+        inside = slot < len(self.ids)
+        is_old[inside] = self.ids[slot[inside]] == ids[inside]
+        remembered = np.isfinite(moved[:, :, 0]).any(axis=1)
+        remembered[slot[is_old]] = True
+        if not (is_old.all() and remembered.all()):
+            new = np.unique(ids[~is_old])
+            known = np.concatenate([self.ids[remembered], new])
+            order = np.argsort(known, kind="stable")
+            self.ids = known[order]
+            moved = np.concatenate([moved[remembered], np.full((len(new), self.length, 2), np.nan)])[order]
+            slot = np.searchsorted(self.ids, ids)
+        self.xy_m = moved
         self.xy_m[slot, -1] = xy_m
         past = self.xy_m[slot]
         return past, np.isfinite(past[:, :, 0])

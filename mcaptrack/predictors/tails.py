@@ -160,7 +160,7 @@ def follow(table: Tails, before: Tails, learned: Learned) -> Tails:
     mean = table.wide_weight.mean()
     odds = (_WEIGHT * mean + few.sum()) / (_WEIGHT * (1 - mean) + (many - few).sum()) * (1 - mean) / mean
     expected = 1 / (1 + (1 / table.wide_weight - 1) / odds)
-    wide_weight = np.clip((_WEIGHT * expected + few) / (_WEIGHT + many), _LEAST_WIDE, _MOST_WIDE)
+    wide_weight = np.minimum(np.maximum((_WEIGHT * expected + few) / (_WEIGHT + many), _LEAST_WIDE), _MOST_WIDE)
     narrow_scale = np.maximum(narrow_scale, learned.least)
     return Tails(wide_weight, narrow_scale, np.maximum(wide_scale, narrow_scale))
 
@@ -304,11 +304,12 @@ class TailCalibration:
         for lag, kept in self._bends_m2.items():
             if past.shape[1] > 2 * lag and len(past):
                 bend = past[:, -1] - 2 * past[:, -1 - lag] + past[:, -1 - 2 * lag]
-                kept.append((bend**2).sum(axis=1)[np.isfinite(bend[:, 0])])
+                kept.append((bend**2).sum(axis=1))
         if step - self._noise_at < _NOISE_EVERY:
             return
         self._noise_at = step
         for lag, kept in self._bends_m2.items():
             bends_m2 = np.concatenate(kept) if kept else np.empty(0)
+            bends_m2 = bends_m2[np.isfinite(bends_m2)]
             if len(bends_m2) >= _LEAST_POSITIONS:  # bends have six times the variance of white noise, in two axes
                 self._noise_m2[lag] = float(np.median(bends_m2)) / (12 * np.log(2))
