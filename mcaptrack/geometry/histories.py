@@ -35,7 +35,7 @@ class Histories:
         is_old = np.zeros(len(ids), bool)
         inside = slot < len(self.ids)
         is_old[inside] = self.ids[slot[inside]] == ids[inside]
-        remembered = np.isfinite(moved[:, :, 0]).any(axis=1)
+        remembered = np.asarray(np.isfinite(moved[:, :, 0]).any(axis=1))
         remembered[slot[is_old]] = True
         if not (is_old.all() and remembered.all()):
             new = np.unique(ids[~is_old])
