@@ -13,13 +13,16 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from mcaptrack import environment, notices, tables
+import mcaptrack
+from mcaptrack import environment, log, notices, tables
 from mcaptrack.errors import McaptrackError
 from mcaptrack.pipeline.ahead import Ahead
 from mcaptrack.pipeline.pictures import KeptPictures
+from mcaptrack.pipeline.spaces import spaces_of_boxes
 from mcaptrack.pipeline.timing import Stopwatch
 from mcaptrack.schema import TRACKS, Frame, frame_columns, framing
 from mcaptrack.schema.frame_columns import FrameColumns, collect
+from mcaptrack.sources.ingest.labels.camera import boxes_extent
 from mcaptrack.tables import ordered, table_pieces
 from mcaptrack.transforms import PROFILES, Retrack
 from mcaptrack.transforms.retrack import identity_swaps, likelihood
@@ -135,6 +138,24 @@ def test_rows_are_taken_from_blocks_in_any_order():
     places = np.random.default_rng(0).integers(0, 200 * PEOPLE, 500)
     assert repr(columns.take(places)) == repr(columns.rows()[places])
     assert len(columns.take(places[:0])) == 0
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_every_fifth_frame_holds_no_rows_of_the_others():
+    columns = collect(TRACKS, walks(400))
+    assert repr([frame.rows for frame in columns[::5]]) == repr([frame.rows for frame in walks(400)][::5])
+    assert held(lambda: columns[::5])[0] < 0.5 * sum(frame.rows.nbytes for frame in columns)
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_the_spaces_and_the_extent_of_boxes_are_found_without_all_rows(tmp_path, monkeypatch):
+    places = ((frame, 10 * one + frame) for frame in range(1, 61) for one in range(10))
+    (tmp_path / "a.txt").write_text("".join(f"{frame},-1,{x},1,20,100,1\n" for frame, x in places))
+    mcaptrack.ingest(tmp_path / "a.txt", tmp_path / "a.mcap", role="detections", fps=10)
+    opened = log.Log(tmp_path / "a.mcap")
+    monkeypatch.delattr(log.Log, "rows")
+    assert spaces_of_boxes(opened, "/camera/detections") == {"picture"}
+    assert boxes_extent(opened, "/camera/detections") == (60 + 90 + 20, 101)
 
 
 def test_pictures_that_are_kept_are_not_in_memory():

@@ -12,6 +12,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.schema import DETECTIONS, TRACKS
+from mcaptrack.schema.framing import joined_parts
 from mcaptrack.schema.provenance import frame_id_of
 from mcaptrack.sources.calibrations import holds_calibrations
 from mcaptrack.sources.cameras import camera_at, is_made_by_stage
@@ -33,9 +34,13 @@ def spaces_of_boxes(opened: log.Log, topic: str) -> frozenset[Space]:
         return frozenset({"picture"})
     if not frame_id_of(channel.metadata) and is_made_by_stage(channel):
         return frozenset({"picture"})
-    rows = opened.rows(topic, DETECTIONS).rows
     there: dict[Space, str] = {"picture": "x_px", "ground": "x_m"}
-    return frozenset(space for space, column in there.items() if np.isfinite(rows[column]).any())
+    found = set[Space]()
+    for _, _, part in joined_parts(DETECTIONS, opened.frame_columns(topic, DETECTIONS)):
+        found |= {space for space, column in there.items() if np.isfinite(part.rows[column]).any()}
+        if len(found) == len(there):
+            break
+    return frozenset(found)
 
 
 def tracker_of(space: str) -> str:

@@ -99,8 +99,8 @@ class FrameColumns(Sequence[Frame]):
     def __getitem__(self, key: int | slice) -> Frame | list[Frame]:
         if isinstance(key, slice):
             first, last, step = key.indices(len(self))
-            if step != 1:
-                return [self[at] for at in range(first, last, step)]
+            if step != 1:  # copies, so that blocks of which they are parts don't stay in memory
+                return [self[at]._replace(rows=self.rows(at, at + 1)) for at in range(first, last, step)]
             out: list[Frame] = []
             for number, low, high in self._touched(first, last):
                 out += self._frames(number, low, high)

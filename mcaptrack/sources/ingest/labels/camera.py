@@ -15,6 +15,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import parse_fps
 from mcaptrack.schema import DETECTIONS, VIDEO
+from mcaptrack.schema.framing import joined_parts
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.foreign.flatten import message_type_of
@@ -170,9 +171,12 @@ def boxes_extent(opened: log.Log, topic: str) -> tuple[int, int]:
     channel = opened.channels.get(topic)
     if channel is None or not channel.messages or channel.schema_name != DETECTIONS.name:
         return 0, 0
-    corner = columns_to_boxes(opened.rows(topic, DETECTIONS).rows)
-    right, bottom = (corner[:, :2] + corner[:, 2:]).max(axis=0, initial=1.0)
-    return int(np.ceil(right)), int(np.ceil(bottom))
+    corner = np.ones(2)
+    for _, _, part in joined_parts(DETECTIONS, opened.frame_columns(topic, DETECTIONS)):
+        boxes = columns_to_boxes(part.rows)
+        corner = np.maximum(corner, (boxes[:, :2] + boxes[:, 2:]).max(axis=0, initial=1.0))
+    right, bottom = np.ceil(corner).tolist()
+    return int(right), int(bottom)
 
 
 def picture_size(opened: log.Log, topic: str) -> tuple[int, int]:
