@@ -15,7 +15,7 @@ from mcaptrack.evaluation.track_lifecycle import lifecycle_of
 from mcaptrack.schema import DECISIONS, DecisionKind, EventKind, Frame
 from mcaptrack.transforms import PROFILES, Retrack
 from mcaptrack.transforms.retrack import joins as join_steps
-from mcaptrack.transforms.retrack.joins import Cuts, cut_joins, find_joins, tracked_of
+from mcaptrack.transforms.retrack.joins import cut_joins, find_joins, tracked_of
 from mcaptrack.transforms.retrack.motion_model import MotionModel
 from mcaptrack.viewing.report.doubts import Doubt, find_doubtful_tracks
 from mcaptrack.viewing.report.identity_events import IdentityEvent
@@ -117,16 +117,6 @@ def test_joins_below_70_percent_are_cut_or_below_what_links_need(monkeypatch, le
     track, cuts = cut_joins(MODEL, step, np.full(40, 5), step // 10, xy, STEP_S, least)
     assert [*zip(cuts.before.tolist(), cuts.after.tolist(), strict=True)] == wanted
     assert [int(track[at]) for at in (9, 10, 20, 30)] == [5, 6, 6 if len(wanted) == 1 else 7, 5 + len(wanted)]
-
-
-def test_pieces_that_linking_left_alone_go_together_again_if_that_is_likely():
-    """Of tracks 4, 7, 8 and 9: 4 is linked to 8, and 7 to nothing."""
-    cuts = Cuts(np.array([7, 4, 8]), np.array([9, 7, 4]), np.array([0.6, 0.69, 0.4]))
-    ids, linked = np.array([4, 7, 8, 9]), np.array([2, -1, -1, -1])
-    assert cuts.made_again(ids, linked, 0.5).tolist() == [2, 3, -1, -1]
-    assert cuts.made_again(ids, linked, 0.65).tolist() == [2, -1, -1, -1]
-    assert cuts.made_again(ids, linked, 0.3).tolist() == [2, 3, 0, -1]
-    assert cuts.made_again(ids, np.array([-1, -1, 3, -1]), 0.5).tolist() == [1, -1, 3, -1]
 
 
 def test_a_person_who_walks_straight_on_under_another_id_is_surely_the_same():

@@ -8,11 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcaptrack.transforms.retrack import linking, offline
+from mcaptrack.transforms.retrack.cut_links import CutTracks, find_candidates, link_pieces
 from mcaptrack.transforms.retrack.false_tracks import track_log_odds
 from mcaptrack.transforms.retrack.identity_swaps import find_swaps, resolve_swaps
+from mcaptrack.transforms.retrack.joins import Cuts
 from mcaptrack.transforms.retrack.linking import link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
 from tests.memory import held
+from tests.references import cut_links
 from tests.references.offline import DRIFTS, Motion, course_of, exchanged, links, person_log_odds
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -88,6 +91,80 @@ def test_links_equal_the_reference(seed):
     found = link_tracks(model, out, forward, backward, 0.4, most_s, least)
     names = sorted(paths)
     assert {names[i]: names[j] for i, j in enumerate(found.tolist()) if j >= 0} == links(motion, paths, most_s, least)
+
+
+@given(seed=SEEDS)
+@settings(max_examples=6)
+def test_links_of_tracks_that_were_cut_equal_the_reference(seed):
+    """Some tracks were one with another one before, and two or three share an input id."""
+    rng = np.random.default_rng(seed)
+    model, motion = models(rng)
+    paths = scattered(rng, int(rng.integers(2, 14)))
+    names = sorted(paths)
+    pairs = [(a, b) for a in names for b in names if max(paths[a]) < min(paths[b])]
+    cuts: dict[int, tuple[int, float]] = {}
+    for number in rng.permutation(len(pairs)).tolist():
+        before, after = pairs[number]
+        if before not in cuts and after not in {one for one, _ in cuts.values()} and rng.random() < 0.4:
+            cuts[before] = after, float(rng.choice([0.0, rng.random() * 0.7]))
+    given_cuts = [(before, after, likely) for before, (after, likely) in cuts.items()]
+    ids = {name: {step: int(rng.integers(3)) + 5 * (step // 12) for step in path} for name, path in paths.items()}
+    most_s, least = float(rng.choice([1.2, 6.0, 20.0])), float(rng.choice([0.1, 0.5, 0.9]))
+    out, _ = laid_out(paths, model.noise_m)
+    forward, backward, _ = smooth(model, out, 0.4)
+    rows = [(step, name, ids[name][step]) for name, path in paths.items() for step in path]
+    step, track, source = np.array(rows)[rng.permutation(len(rows))].T
+    sides = np.array(given_cuts).reshape(-1, 3)
+    pieces = CutTracks.of(step, track, source, Cuts(*sides[:, :2].astype(int).T, sides[:, 2]))
+    found = link_pieces(model, out, forward, backward, 0.4, most_s, least, pieces)
+    wanted = cut_links.links(motion, paths, ids, most_s, least, given_cuts)
+    assert {names[i]: names[j] for i, j in enumerate(found.tolist()) if j >= 0} == wanted
+
+
+def cut_at(paths: Paths, ids: dict[int, int], cuts: list[tuple[int, int, float]]):
+    """What the links of such tracks are decided by; each has one input id."""
+    model = MotionModel(0.1, 1.0, 0.1, 0.0)
+    out, _ = laid_out(paths, 0.1)
+    forward, backward, _ = smooth(model, out, 0.4)
+    step, track = np.array([(step, name) for name, path in paths.items() for step in path]).T
+    sides = np.array(cuts).reshape(-1, 3)
+    source = np.array([ids.get(name, name) for name in track.tolist()])
+    pieces = CutTracks.of(step, track, source, Cuts(*sides[:, :2].astype(int).T, sides[:, 2]))
+    return model, out, forward, backward, 0.4, pieces
+
+
+def straight(first: int, aside_m: float) -> dict[int, tuple[float, float]]:
+    return {step: (0.4 * step, aside_m) for step in range(first, first + 15)}
+
+
+def test_many_cuts_do_not_make_other_gaps_look_crossed():
+    """A track ends, and 4 s later another begins aside of where it would be; 30 others were cut in between, far away."""
+    others = {10 + k: straight(15 * (k % 2), 500.0 * (1 + k // 2)) for k in range(60)}
+    cuts = [(10 + k, 11 + k, 0.65) for k in range(0, 60, 2)]
+
+    def are_linked(aside_m: float, beside: Paths, given_cuts: list) -> bool:
+        *given_all, pieces = cut_at({1: straight(0, 0.0), 2: straight(25, aside_m)} | beside, {}, given_cuts)
+        found = link_pieces(*given_all, 20.0, 0.5, pieces)
+        assert (found[2::2] == np.arange(3, len(found), 2)).all()
+        return found[0] == 1
+
+    places = np.linspace(0.0, 4.0, 40).tolist()
+    alone = [are_linked(aside_m, {}, []) for aside_m in places]
+    assert {True, False} == set(alone)
+    assert [are_linked(aside_m, others, cuts) for aside_m in places] == alone
+
+
+@pytest.mark.parametrize(
+    ("since", "source", "may_be"), [(28, 5, True), (28, 6, False), (29, 5, False)], ids=["5.6 s", "another id", "6 s"]
+)
+def test_pieces_with_one_input_id_may_be_linked_within_6_s_however_they_move(since, source, may_be):
+    """Cut at step 14, a track goes on as another piece, and its input id is seen again later, 12 m aside."""
+    paths = {1: straight(0, 0.0), 2: straight(15, 0.5), 3: straight(since, -12.0)}
+    *given_all, pieces = cut_at(paths, {1: 5, 3: source}, [(1, 2, 0.1)])
+    found = find_candidates(*given_all, 20.0, pieces)
+    pairs = set(zip(found.ends.tolist(), found.begins.tolist(), strict=True))
+    assert (0, 1) in pairs
+    assert ((0, 2) in pairs) == may_be
 
 
 @given(seed=SEEDS)

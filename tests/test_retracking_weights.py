@@ -11,7 +11,7 @@ import pytest
 
 import mcaptrack
 from mcaptrack.predictors.weights import load
-from mcaptrack.transforms.retrack import false_tracks, joins, linking
+from mcaptrack.transforms.retrack import cut_links, false_tracks, joins, linking
 from mcaptrack.transforms.retrack.motion_model import to_trajectories
 from mcaptrack.transforms.retrack.weights import WEIGHTS, weights_of
 from tools import crowds
@@ -46,7 +46,7 @@ def test_weights_go_by_the_names_of_features_in_any_order():
     names = ("gap", "miss")
     found = json.loads(WEIGHTS.read_text())["links"]["weights"]
     assert weights_of("links", names)[0].tolist() == [found["gap"], found["miss"]]
-    models = {"links": linking, "people": false_tracks, "cuts": joins, "joins": joins}
+    models = {"links": linking, "people": false_tracks, "cuts": joins, "relinks": cut_links, "joins": joins}
     for model, features in ((name, module.FEATURES) for name, module in models.items()):
         assert set(json.loads(WEIGHTS.read_text())[model]["weights"]) == set(features)
 

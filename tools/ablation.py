@@ -92,7 +92,7 @@ def _parts() -> dict[str, tuple[str, Retracking]]:
         name = f"no {_NAMES.get(field.name, field.name.replace('_', ' '))}"
         if field.name in _OFF:
             out[name] = f"--{flag} {_OFF[field.name]:g}", replace(DEFAULT, **{field.name: _OFF[field.name]})
-        elif getattr(DEFAULT, field.name) is True:
+        elif field.name in _NAMES and getattr(DEFAULT, field.name) is True:  # others don't concern tracks
             out[name] = f"--no-{flag}", replace(DEFAULT, **{field.name: False})
     return out
 

@@ -3,10 +3,10 @@
 Writes mcaptrack/transforms/retrack/weights.json. Scenes are those of `crowds.py`: squares, streets, crossings and open
 places with groups, people who stand, and bicycles; each is corrupted by `corruptions.py` with faults of its own. They
 are sampled and re-tracked, and what re-tracking decides about is compared with who was there: links first, then the
-tracks that come of these links; and, in other scenes, which joins of online tracks are right, then how likely what is
-decided after cutting wrong ones is right. No recording is used. With --check it says whether the same comes out now.
-With --held nothing is written: scenes of other seeds score the weights of the file, and say how reliable probabilities
-are. A few minutes of one core.
+tracks that come of these links; and, in other scenes, which joins of online tracks are right, then which links after
+cutting wrong ones, then how likely what is decided so is right. No recording is used. With --check it says whether the
+same comes out now. With --held nothing is written: scenes of other seeds score the weights of the file, and say how
+reliable probabilities are. A few minutes of one core.
 
     .venv/bin/python tools/fit_retrack.py [--check | --held] [--seeds 101 102] [--steps 300]
 
@@ -28,6 +28,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 from corruptions import corrupt
 from crowds import drawn
+from regression import logistic, show_reliability
 from reproduce import on_clock
 
 from mcaptrack import __version__
@@ -36,7 +37,7 @@ from mcaptrack.evaluation.metrics import combine, score, summary
 from mcaptrack.geometry.assignment import assign, solve
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES, Sample
-from mcaptrack.transforms.retrack import decisions, false_tracks, joins, linking, offline
+from mcaptrack.transforms.retrack import cut_links, decisions, false_tracks, joins, linking, offline
 from mcaptrack.transforms.retrack.joins import Joins, Tracked, find_joins, tracked_of
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
 from mcaptrack.transforms.retrack.motion_model import Trajectories
@@ -53,8 +54,6 @@ JUDGED, JUDGED_STEPS = (111, 112, 113), 100
 GATE_M, ROWS = 1.0, 8
 #: The longest gap of pairs that weights are fitted on; and the least log odds of the best set of links.
 MAX_GAP_S, LEAST = 30.0, -4.0
-#: How strongly weights are drawn to 0, and how strongly those that scenes have of their own (shares of right links).
-RIDGE, OWN_RIDGE = 1e-5, 1e-4
 
 
 class Run(NamedTuple):
@@ -165,7 +164,7 @@ class Pairs:
 
 def pairs_of(run: Run) -> Pairs:
     """The candidate links of a scene."""
-    model, paths, forward, backward, step_s = reached("link_tracks", FITTED, *run.args[1:])[:5]
+    model, paths, forward, backward, step_s = reached("link_pieces", FITTED, *run.args[1:])[:5]
     i, j, gap_s = linking.candidates(paths, forward, backward, step_s, MAX_GAP_S)
     first, last = paths.first[:-1], paths.first[1:] - 1
     found = linking.features(model, forward.take(last[i]), backward.take(first[j]), gap_s)
@@ -223,6 +222,21 @@ def cuts_of(run: Run) -> Judged:
     return judged_joins(run, tracked, find_joins(tracked, model, step_s), xy_m[order])[0]
 
 
+def relinks_of(run: Run) -> Judged:
+    """The candidate links at the cuts of a scene: right are those that are nearest in time from both sides."""
+    given = reached("link_pieces", *run.args)
+    found, paths = cut_links.find_candidates(*given[:6], given[7]), given[1]
+    owner = owners_of(run, paths)
+    ends, begins = usual(owner, paths, -1)[found.ends], usual(owner, paths, 1)[found.begins]
+    same = np.flatnonzero((ends >= 0) & (ends == begins))
+    right = np.ones(len(ends), bool)
+    for side in (found.ends, found.begins):
+        nearest = same[np.lexsort((found.gap_s[same], side[same]))]
+        right &= np.isin(np.arange(len(ends)), nearest[np.unique(side[nearest], return_index=True)[1]])
+    counts = found.at_cut & ((ends >= 0) | (begins >= 0))
+    return Judged(found.features[counts], right[counts])
+
+
 def decisions_of(run: Run) -> tuple[Judged, Judged]:
     """The joins of the offline tracks of a scene, and which tracks are people."""
     decided, model, samples, _, step_s = reached("decision_rows", *run.args)
@@ -247,51 +261,18 @@ def fit_judged(names: tuple[str, ...], parts: Iterable[Judged]) -> dict[str, Any
 
 
 def fit_decisions(scenes: list[Run]) -> dict[str, Any]:
-    """The weights of joins that may be cut, then of those that are left and of tracks, with these cut."""
+    """The weights of joins that may be cut, then of links at cuts, then of joins that are made and of tracks."""
     cuts = fit_judged(joins.FEATURES, told(cuts_of, scenes, "joins that may be cut"))
     install(joins, "CUTS_", cuts)
+    relinks = fit_judged(cut_links.FEATURES, told(relinks_of, scenes, "links at cuts"))
+    install(cut_links, "RELINKS_", relinks)
     of_joins, of_people = zip(*told(decisions_of, scenes, "decisions"), strict=True)
     return {
         "cuts": cuts,
+        "relinks": relinks,
         "joins": fit_judged(joins.FEATURES, of_joins),
         "decided": fit_judged(("log odds",), of_people),
     }
-
-
-def show_reliability(name: str, probability: np.ndarray, right: np.ndarray) -> None:
-    """Print how many of the decisions (D,) with a probability are right, by steps of it."""
-    print(f"{name}: {len(right)}, {100 * right.mean():.1f} % right")
-    place = np.minimum((probability * 10).astype(int), 9)
-    for one in np.unique(place).tolist():
-        here = place == one
-        said, were = (100 * values[here].mean() for values in (probability, right))
-        print(f"  {one / 10:.1f} to {one / 10 + 0.1:.1f}: {here.sum():6}, said {said:.1f} %, right {were:.1f} %")
-
-
-def logistic(
-    features: np.ndarray, right: np.ndarray, weight: np.ndarray, group: np.ndarray | None = None, ridge: float = RIDGE
-) -> np.ndarray:
-    """The weights of the features and the bias. Members of a group have a bias of their own in addition."""
-    from scipy.optimize import minimize
-    from scipy.sparse import coo_array
-
-    mean, spread = features.mean(axis=0), features.std(axis=0) + 1e-9
-    z = np.column_stack([(features - mean) / spread, np.ones(len(features))])
-    count, share = z.shape[1], weight / weight.sum()
-    group = np.zeros(len(z), int) if group is None else group
-    own = coo_array((np.ones(len(z)), (group, np.arange(len(z)))), shape=(int(group.max()) + 1, len(z))).tocsr()
-    shrink = np.full(count + own.shape[0], OWN_RIDGE)
-    shrink[:count], shrink[count - 1] = ridge, 0.0
-
-    def loss(t: np.ndarray) -> tuple[float, np.ndarray]:
-        value = z @ t[:count] + t[count:][group]
-        off = share * (false_tracks.probability(value) - right)
-        slope = np.concatenate([z.T @ off, own @ off]) + 2 * shrink * t
-        return float(share @ (np.logaddexp(0, value) - right * value) + shrink @ t**2), slope
-
-    t = minimize(loss, np.zeros(len(shrink)), jac=True, method="L-BFGS-B", options={"maxiter": 2000, "gtol": 1e-9}).x
-    weights = t[: count - 1] / spread
-    return np.append(weights, t[count - 1] - weights @ mean)
 
 
 def fit_links(pairs: list[Pairs]) -> dict[str, Any]:

@@ -151,19 +151,6 @@ def links(motion: Motion, paths: dict[int, Path], max_gap_s: float, least: float
     return {names[i]: names[j] for (i, j), odds in made.items() if sigmoid(odds + shift) > least}
 
 
-def linked(motion: Motion, paths: dict[int, Path], max_gap_s: float, least: float, cuts: list[Cut]) -> dict[int, int]:
-    """The id of each track after linking: that of the first one in its chain. Pieces that are left go together again."""
-    name = {track: track for track in paths}
-    follows = links(motion, paths, max_gap_s, least)
-    taken = set(follows.values())
-    for before, after, likely in cuts:
-        if before not in follows and after not in taken and likely >= least:
-            follows[before] = after
-    for track in sorted(follows, key=lambda t: min(paths[t])):
-        name[follows[track]] = name[track]
-    return name
-
-
 # Joins: a track goes on with another input track. Is it the same person?
 
 

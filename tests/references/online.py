@@ -170,7 +170,7 @@ class OnlineTracker:
                 noise = self.noise_m**2
                 both = log_density(at - middle, (host.cov[0, 0] + person.cov[0, 0]) / 4 + noise)
                 one = log_density(at - host.here, host.cov[0, 0] + noise)
-                if 2 * (both - one) > self.MERGED or person.merged:
+                if 2 * (both - one) > self.MERGED or person.merged or person.source == -1:
                     hosts.add((host.name, person.name))
         for host, guest in hosts:
             person = next(p for p in self.people if p.name == guest)

@@ -8,7 +8,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from tests.references.offline import Motion, cut, exchanged, linked, person_log_odds, sigmoid
+from tests.references.cut_links import linked
+from tests.references.offline import Motion, cut, exchanged, person_log_odds, sigmoid
 
 Point = tuple[float, float]
 Row = dict[str, float]
@@ -123,7 +124,8 @@ def offline(claims: Claims, samples: list[list[Row]], steps: list[int], options,
             for step, piece in names.items():
                 pieces.setdefault(piece, {})[step] = paths[track][step]
         paths = pieces
-        name = linked(motion, places_of(paths), o.link_s, o.link_confidence, cuts)
+        ids = {track: {step: row["track_id"] for step, row in path.items()} for track, path in paths.items()}
+        name = linked(motion, places_of(paths), ids, o.link_s, o.link_confidence, cuts)
         joined: dict[int, dict[int, Row]] = {}
         for track, path in paths.items():
             joined.setdefault(name[track], {}).update(path)

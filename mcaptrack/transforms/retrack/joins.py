@@ -81,17 +81,6 @@ class Cuts(NamedTuple):
     after: Ints
     probability: Floats
 
-    def made_again(self, ids: Ints, continued_by: Ints, min_confidence: float) -> Ints:
-        """The track that continues each of ``ids`` (K,), ascending, or -1: pieces that linking left alone go together
-        again, unless they do with a smaller probability than ``min_confidence``.
-        """
-        before, after = np.searchsorted(ids, self.before), np.searchsorted(ids, self.after)
-        is_free = (continued_by[before] < 0) & ~np.isin(after, continued_by)
-        again = is_free & (self.probability >= min_confidence)
-        out = continued_by.copy()
-        out[before[again]] = after[again]
-        return out
-
 
 def cut_joins(
     model: MotionModel, step: Ints, track: Ints, source: Ints, xy_m: Floats, step_s: float, min_confidence: float

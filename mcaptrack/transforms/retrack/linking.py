@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.assignment import Pairs, assign_by_gain, assign_pairs_by_gain
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
 from mcaptrack.transforms.retrack.false_tracks import probability
@@ -60,18 +60,36 @@ def link_tracks(
         i, j, gap_s = i[fits], j[fits], gap_s[fits]
     if len(i) == 0:
         return continued_by
-    found = features(model, forward.take(last[i]), backward.take(first[j]), gap_s)
-    gain = found @ _WEIGHTS + _BIAS - _MIN_LOG_ODDS
-    good = gain > 0
-    i, j, gain = i[good], j[good], gain[good]
-    log_odds = np.full(len(first), -np.inf)
-    for edges in _components(i, j, len(first)):
-        ends, beginnings = np.unique(i[edges]), np.unique(j[edges])
-        pairs = np.searchsorted(ends, i[edges]), np.searchsorted(beginnings, j[edges])
-        (row, column), gained = _assigned(pairs, np.round(gain[edges], 6), (len(ends), len(beginnings)))
-        continued_by[ends[row]], log_odds[ends[row]] = beginnings[column], gained + _MIN_LOG_ODDS
-    shift = _prior_shift(log_odds[continued_by >= 0])
-    return np.where(log_odds + shift > np.log(min_confidence / (1 - min_confidence)), continued_by, -1)
+    gain = log_odds(features(model, forward.take(last[i]), backward.take(first[j]), gap_s))
+    made = best_links(i, j, gain, len(first))
+    shift = prior_shift(gain[made])
+    made = made[gain[made] + shift > np.log(min_confidence / (1 - min_confidence))]
+    continued_by[i[made]] = j[made]
+    return continued_by
+
+
+def log_odds(found: Floats) -> Floats:
+    """The log odds that links with these features (E, F) are right, where as many are as usual."""
+    return np.asarray(found @ _WEIGHTS + _BIAS)
+
+
+def has_chance(log_odds: Floats) -> Bools:
+    """Whether links with these log odds (E,) are considered at all."""
+    return np.asarray(log_odds > _MIN_LOG_ODDS)
+
+
+def best_links(i: Ints, j: Ints, log_odds: Floats, count: int) -> Ints:
+    """The best set of the links (E,) between ends ``i`` and beginnings ``j`` of so many tracks, by ends."""
+    continued_by = np.full(count, -1)
+    good = np.flatnonzero(has_chance(log_odds))
+    ends, begins, gain = i[good], j[good], np.round(log_odds[good] - _MIN_LOG_ODDS, 6)
+    for edges in _components(ends, begins, count):
+        own, other = np.unique(ends[edges]), np.unique(begins[edges])
+        pairs = np.searchsorted(own, ends[edges]), np.searchsorted(other, begins[edges])
+        row, column = _assigned(pairs, gain[edges], (len(own), len(other)))
+        continued_by[own[row]] = other[column]
+    made = good[continued_by[ends] == begins]
+    return np.asarray(made[np.argsort(i[made], kind="stable")])
 
 
 def candidates(
@@ -100,20 +118,19 @@ def _batches(count: Ints) -> list[slice]:
     return [slice(a, b) for a, b in zip(starts.tolist(), [*starts[1:].tolist(), len(count)], strict=True)]
 
 
-def _assigned(pairs: Pairs, gain: Floats, shape: tuple[int, int]) -> tuple[Pairs, Floats]:
-    """The best set of links among candidates (E,) of ends and beginnings, and their gains.
+def _assigned(pairs: Pairs, gain: Floats, shape: tuple[int, int]) -> Pairs:
+    """The best set of links among candidates (E,) of ends and beginnings.
 
     Thousands of broken tracks that hang together would have a table of gigabytes, nearly all of it empty.
     """
     if shape[0] * shape[1] > _TABLE_CELLS:
-        return assign_pairs_by_gain(pairs, gain, shape)
+        return assign_pairs_by_gain(pairs, gain, shape)[0]
     table = np.full(shape, -1.0)
     table[pairs] = gain
-    row, column = assign_by_gain(table)
-    return (row, column), table[row, column]
+    return assign_by_gain(table)
 
 
-def _prior_shift(log_odds: Floats) -> float:
+def prior_shift(log_odds: Floats) -> float:
     """The shift of the log odds of links (E,), because another share of them is right in this log than usual."""
     shift = 0.0
     for _ in range(100):

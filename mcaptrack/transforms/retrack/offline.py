@@ -16,11 +16,12 @@ from mcaptrack.geometry.ragged import group_index
 from mcaptrack.schema import DECISIONS, Rows
 from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers
+from mcaptrack.transforms.retrack.cut_links import CutTracks, link_pieces
 from mcaptrack.transforms.retrack.decisions import Decided, decision_rows
 from mcaptrack.transforms.retrack.false_tracks import probability, scored_log_odds, track_log_odds
 from mcaptrack.transforms.retrack.fixed_tracks import fix_tracks
 from mcaptrack.transforms.retrack.identity_swaps import resolve_swaps
-from mcaptrack.transforms.retrack.joins import Cuts, Tracked, cut_joins
+from mcaptrack.transforms.retrack.joins import Tracked, cut_joins
 from mcaptrack.transforms.retrack.linking import link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, smooth, to_trajectories
 from mcaptrack.transforms.retrack.offline_rows import Moved, TrackRows, moved_to, rows_by_step
@@ -64,10 +65,11 @@ def offline_tracks(
     xy = np.stack([samples.column(name)[sample] for name in ("x_m", "y_m")], axis=-1) / movers.unit_m
     step_s = 1 / options.rate_hz
     if options.link_s > 0 and len(track):
-        cuts: Cuts | None = None
+        pieces: CutTracks | None = None
         if not movers.on_ground:
             track, cuts = cut_joins(model, step, track, source, xy, step_s, options.link_confidence)
-        track = _linked(options, model, step, track, xy, step_s, movers, cuts)
+            pieces = CutTracks.of(step, track, source, cuts)
+        track = _linked(options, model, step, track, xy, step_s, movers, pieces)
     if options.resolve_swaps and len(track) and not movers.on_ground:
         track = _without_swaps(model, step, track, source, xy, step_s)
     track = fix_tracks(step, track, source, options.fixed_ids)
@@ -136,15 +138,16 @@ def _linked(
     xy: Floats,
     step_s: float,
     movers: Movers,
-    cuts: Cuts | None,
+    pieces: CutTracks | None,
 ) -> Ints:
     """The track of each assignment (C,) after linking tracks of the same person."""
     ids, _, trajectories = to_trajectories(step, track, xy, model.noise_m)
     forward, backward, _ = smooth(model, trajectories, step_s)
-    limits = (options.link_s / movers.unit_m, options.link_confidence, *((MAX_MISFIT,) if movers.on_ground else ()))
-    continued_by = link_tracks(model, trajectories, forward, backward, step_s, *limits)
-    if cuts is not None:
-        continued_by = cuts.made_again(ids, continued_by, options.link_confidence)
+    limits = options.link_s / movers.unit_m, options.link_confidence
+    if pieces is None:
+        continued_by = link_tracks(model, trajectories, forward, backward, step_s, *limits, MAX_MISFIT)
+    else:
+        continued_by = link_pieces(model, trajectories, forward, backward, step_s, *limits, pieces)
     root = np.arange(len(ids))
     order = np.argsort(trajectories.step[trajectories.first[:-1]], kind="stable")  # a continuation begins later
     for one in order[continued_by[order] >= 0].tolist():

@@ -146,7 +146,8 @@ class OnlineTracker:
         of_own, of_lost, noise = self.state.cov[owner, 0], self.state.cov[lost, 0], self.model.noise_m**2
         alone, together = of_own + noise, (of_own + of_lost) / 4 + noise  # the middle of two has a quarter of both
         evidence = to_own / alone - to_middle / together + 2 * np.log(alone / together)
-        is_merged &= (to_middle < to_own) & ((evidence > self.association.merge_evidence) | (self.merged[lost] > 0))
+        was_merged = (self.merged[lost] > 0) | (self.source[lost] == -1)  # they may take turns at having the detection
+        is_merged &= (to_middle < to_own) & (was_merged | (evidence > self.association.merge_evidence))
         return lost[is_merged], confirmed[nearest[is_merged]]
 
     def _update_occluded(self, occluded: Ints, xy_m: Floats, passed: int) -> None:

@@ -1,0 +1,49 @@
+"""Logistic regressions of `fit_retrack.py`: how they are fitted, and how reliable their probabilities are.
+
+Letters: N members, F features, D decisions.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mcaptrack.transforms.retrack.false_tracks import probability
+
+#: How strongly weights are drawn to 0, and how strongly those that groups have of their own (shares of right links).
+RIDGE, OWN_RIDGE = 1e-5, 1e-4
+
+
+def logistic(
+    features: np.ndarray, right: np.ndarray, weight: np.ndarray, group: np.ndarray | None = None, ridge: float = RIDGE
+) -> np.ndarray:
+    """The weights of the features and the bias. Members of a group have a bias of their own in addition."""
+    from scipy.optimize import minimize
+    from scipy.sparse import coo_array
+
+    mean, spread = features.mean(axis=0), features.std(axis=0) + 1e-9
+    z = np.column_stack([(features - mean) / spread, np.ones(len(features))])
+    count, share = z.shape[1], weight / weight.sum()
+    group = np.zeros(len(z), int) if group is None else group
+    own = coo_array((np.ones(len(z)), (group, np.arange(len(z)))), shape=(int(group.max()) + 1, len(z))).tocsr()
+    shrink = np.full(count + own.shape[0], OWN_RIDGE)
+    shrink[:count], shrink[count - 1] = ridge, 0.0
+
+    def loss(t: np.ndarray) -> tuple[float, np.ndarray]:
+        value = z @ t[:count] + t[count:][group]
+        off = share * (probability(value) - right)
+        slope = np.concatenate([z.T @ off, own @ off]) + 2 * shrink * t
+        return float(share @ (np.logaddexp(0, value) - right * value) + shrink @ t**2), slope
+
+    t = minimize(loss, np.zeros(len(shrink)), jac=True, method="L-BFGS-B", options={"maxiter": 2000, "gtol": 1e-9}).x
+    weights = t[: count - 1] / spread
+    return np.append(weights, t[count - 1] - weights @ mean)
+
+
+def show_reliability(name: str, likely: np.ndarray, right: np.ndarray) -> None:
+    """Print how many of the decisions (D,) with a probability are right, by steps of it."""
+    print(f"{name}: {len(right)}, {100 * right.mean():.1f} % right")
+    place = np.minimum((likely * 10).astype(int), 9)
+    for one in np.unique(place).tolist():
+        here = place == one
+        said, were = (100 * values[here].mean() for values in (likely, right))
+        print(f"  {one / 10:.1f} to {one / 10 + 0.1:.1f}: {here.sum():6}, said {said:.1f} %, right {were:.1f} %")
