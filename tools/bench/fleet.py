@@ -59,7 +59,7 @@ def draw(folder: Path, count: int) -> None:
     source.write_text("".join(lines))
     folder.mkdir()
     first = folder / "log000.mcap"
-    words = ["--as", "detections", "--fps", str(FPS), "--size", "640x480", "-q"]
+    words = ["--as", "detections", "--fps", str(FPS), "-q"]
     subprocess.run([sys.executable, "-m", "mcaptrack", "ingest", source, *words, "-o", first], check=True)
     for number in range(1, count - len(HARMFUL)):
         shutil.copyfile(first, folder / f"log{number:03}.mcap")

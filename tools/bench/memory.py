@@ -89,7 +89,7 @@ def boxes(folder: Path, minutes: float) -> list[str]:
                 f"{frame},-1,{x:.1f},{y:.1f},40,100,{0.9:.1f},-1,-1,-1\n" for x, y in (place[seen] + noise).tolist()
             )
     return [
-        f"ingest a.txt --as detections --format mot --fps {BOX_HZ} --size 1920x1080 -o a.mcap",
+        f"ingest a.txt --as detections --format mot --fps {BOX_HZ} -o a.mcap",
         *(line.format("a.mcap") for line in RUN),
         "check a.mcap",
         "recover a.mcap -o again.mcap",
