@@ -36,7 +36,7 @@ from mcaptrack.sources.ingest.labels.content import IgnoredBoxes, Labels, Role
 from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX
 from mcaptrack.sources.ingest.labels.label_rows import label_rows
 from mcaptrack.sources.ingest.labels.long_files import LabelFile
-from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
+from mcaptrack.sources.ingest.labels.reading import in_order, read_homography, read_labels
 from mcaptrack.sources.ingest.labels.wanted import ONLY_PEOPLE, WantedClasses
 
 #: Formats that give the frame number of each row.
@@ -229,18 +229,10 @@ def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
     frame, track_id = table["frame"][mine], table["track_id"][mine]
     boxes = np.stack([table[name][mine] for name in columns[3:7]], axis=-1)
     xy_m = np.stack([table["x_m"][mine], table["y_m"][mine]], axis=-1)
-    order = np.lexsort((track_id, frame))
-    return Labels(
-        "parquet",  # type: ignore[arg-type]
-        0,
-        frame[order],
-        track_id[order],
-        boxes[order],
-        xy_m[order],
-        table["score"][mine][order],
-        np.unique(frame),
-        np.full(len(frame), PERSON, np.uint32),
-    )
+    people = np.full(len(frame), PERSON, np.uint32)
+    name: Any = "parquet"
+    labels = Labels(name, 0, frame, track_id, boxes, xy_m, table["score"][mine], np.unique(frame), people)
+    return in_order(labels, has_ids=True)
 
 
 def _by_number(

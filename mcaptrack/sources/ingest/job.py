@@ -9,7 +9,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Set
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from fractions import Fraction
-from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal, Self, TypeAlias
 
@@ -349,7 +348,7 @@ class IngestJob:
 
     def frames(self, role: Role, plane: GroundPlane | None, placed: Placed) -> Frames:
         """The labels of these frames, including empty frames."""
-        return partial(frames_of_labels, self.labels[role][1].parts, role, plane, placed)
+        return frames_of_labels(self.labels[role][1].parts, role, plane, placed)
 
     def write_rows(
         self,

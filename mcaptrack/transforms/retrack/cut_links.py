@@ -40,7 +40,7 @@ FEATURES: Final = (
     "short gap",
 )
 _SHORT_S: Final = 1.0
-#: CutTracks with one input id are candidates over gaps of less than this, however unlikely by their motion. Seconds.
+#: Pieces with one input id are candidates over gaps of less than this, however unlikely by their motion. Seconds.
 _SAME_ID_S: Final = 6.0
 #: Odds that are enough for a link, as a share of those of the least confidence: pieces of a person that stay apart cost
 #: more than wrong ones that go together, and more so where a person surely goes on. (Chosen on synthetic crowds.)

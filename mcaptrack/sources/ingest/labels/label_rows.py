@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
 
+from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Rows
 from mcaptrack.sources.ingest.labels.content import Labels, Role
@@ -43,18 +45,29 @@ def label_rows(labels: Labels, role: Role, plane: GroundPlane | None) -> Rows:
 
 def frames_of_labels(
     parts: Sequence[Callable[[], Labels]], role: Role, plane: GroundPlane | None, placed: Placed
-) -> Iterator[Frame]:
-    """The rows of labels, in parts of whole frames, as frames: those that are ``placed``, also empty ones."""
-    low = 0
-    for number, read in enumerate(parts):
-        labels = read()
-        is_last = number == len(parts) - 1
-        high = len(placed.number) if is_last else int(np.searchsorted(placed.number, labels.frame[-1], "right"))
-        rows, frame = label_rows(labels, role, plane), labels.frame
-        for start in range(low, high, _BLOCK):
-            some = slice(start, min(start + _BLOCK, high))
-            ends = (np.searchsorted(frame, placed.number[some], side) for side in ("left", "right"))
-            columns = (column.tolist() for column in (placed.t_ns[some], placed.index[some], *ends))
-            for t_ns, index, first, last in zip(*columns, strict=True):
-                yield Frame(t_ns, index, rows[first:last])
-        low = high
+) -> Callable[[], Iterator[Frame]]:
+    """The rows of labels, in parts of whole frames, as frames: those that are ``placed``, also empty ones.
+
+    They are made as often as the result is called, and converted once if there is one part.
+    """
+
+    @lru_cache(maxsize=1)
+    def converted(number: int) -> tuple[Ints, Rows]:
+        labels = parts[number]()
+        return labels.frame, label_rows(labels, role, plane)
+
+    def frames() -> Iterator[Frame]:
+        low = 0
+        for number in range(len(parts)):
+            frame, rows = converted(number)
+            is_last = number == len(parts) - 1
+            high = len(placed.number) if is_last else int(np.searchsorted(placed.number, frame[-1], "right"))
+            for start in range(low, high, _BLOCK):
+                some = slice(start, min(start + _BLOCK, high))
+                ends = (np.searchsorted(frame, placed.number[some], side) for side in ("left", "right"))
+                columns = (column.tolist() for column in (placed.t_ns[some], placed.index[some], *ends))
+                for t_ns, index, first, last in zip(*columns, strict=True):
+                    yield Frame(t_ns, index, rows[first:last])
+            low = high
+
+    return frames
