@@ -25,7 +25,7 @@ from mcaptrack.schema.frame_columns import FrameColumns, collect
 from mcaptrack.sources.ingest.labels.camera import boxes_extent
 from mcaptrack.tables import ordered, table_pieces
 from mcaptrack.transforms import PROFILES, Retrack
-from mcaptrack.transforms.retrack import identity_swaps, likelihood
+from mcaptrack.transforms.retrack import identity_swaps, likelihood, online_forecasts
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
 from tests.memory import held
 
@@ -55,7 +55,7 @@ def small_blocks(monkeypatch):
     monkeypatch.setattr(ordered, "GROUP_ROWS", 256)
     monkeypatch.setattr(ordered, "_BUFFER_BYTES", 2**10)
     monkeypatch.setattr(table_pieces, "PIECE_ROWS", 256)
-    monkeypatch.setattr(likelihood, "_BATCH", 128)
+    monkeypatch.setattr(online_forecasts, "_BATCH", 128)
     monkeypatch.setattr(likelihood, "_STEPS", 16)
     monkeypatch.setattr(identity_swaps, "_CELLS", 64)
 

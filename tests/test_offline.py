@@ -14,7 +14,14 @@ from mcaptrack.transforms import PROFILES
 from mcaptrack.transforms.retrack.identity_swaps import _continuity, find_swaps
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
 from mcaptrack.transforms.retrack.linking import link_tracks, misfits
-from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories, smooth, to_trajectories
+from mcaptrack.transforms.retrack.motion_model import (
+    MotionModel,
+    State,
+    StateRows,
+    Trajectories,
+    smooth,
+    to_trajectories,
+)
 from tests.worlds import places, walk
 
 MODEL = MotionModel(noise_m=0.1, speed_m_per_s=1.5, drift_m_per_s=0.15, drift_ratio=0.0)
@@ -94,10 +101,13 @@ class TestMotion:
         np.testing.assert_allclose(backward.mean[:, 2:], -forward.mean[::-1, 2:])
 
     def test_two_predictions_in_a_row_equal_one_over_the_whole_time(self):
-        state = State(np.array([[1.0, 2, 0.5, -1]]), np.array([[0.1, 0.02, 0.3]]))
-        one, two = MODEL.predict(state, 1.2), MODEL.predict(MODEL.predict(state, 0.4), 0.8)
-        np.testing.assert_allclose(one.mean, two.mean)
-        np.testing.assert_allclose(one.cov, two.cov)
+        state = StateRows(np.array([[1.0], [2], [0.5], [-1]]), np.array([[0.1], [0.02], [0.3]]))
+        one = StateRows(np.empty((4, 1)), np.empty((3, 1)))
+        MODEL.predict(state, 1.2, one)
+        for seconds in (0.4, 0.8):
+            MODEL.predict(state, seconds, state)  # in place
+        np.testing.assert_allclose(one.mean, state.mean)
+        np.testing.assert_allclose(one.cov, state.cov)
 
 
 @given(seed=st.integers(0, 2**32 - 1))

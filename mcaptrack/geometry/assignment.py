@@ -64,7 +64,7 @@ def assign_by_gain(gain: Floats) -> Pairs:
     best = gain.argmax(axis=1)
     row = np.flatnonzero(gain[np.arange(len(best)), best] > 0)
     column = best[row]
-    if len(np.unique(column)) == len(column):  # the best column of each row is free
+    if len(column) == 0 or np.bincount(column).max() == 1:  # the best column of each row is free
         return row, column
     cost = np.maximum(gain, 0.0)
     rows, columns = solve(np.negative(cost, out=cost))  # in place: whole logs have large tables

@@ -5,7 +5,7 @@ Letters: R rows of online tracks, L past positions.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -13,22 +13,19 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.ragged import group_index
-from mcaptrack.predictors import Forecast, PeopleSeen, Predictor, make, predict_among, uses_people
-from mcaptrack.predictors.tails import TailCalibration
-from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
-from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
-from mcaptrack.schema.predictions import forecast_to_rows
+from mcaptrack.predictors import Predictor, make
+from mcaptrack.schema import TRACKS, Frame, Rows
+from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M, MotionModel
 from mcaptrack.transforms.retrack.offline_rows import move_rows
-from mcaptrack.transforms.retrack.online_tracker import Association, OnlineTracker, Step
+from mcaptrack.transforms.retrack.online_forecasts import OnlineForecasts, Unpredicted
+from mcaptrack.transforms.retrack.online_tracker import HITS, IDS, MISSED, Association, OnlineTracker
 from mcaptrack.transforms.retrack.options import LikelihoodOptions, RetrackOptions
 from mcaptrack.transforms.retrack.samples import LogSamples
 
-#: Predictions that are made at once: more take memory, fewer take time.
-_BATCH: Final = 4096
-#: Online tracks are written of so many steps at once.
+#: Frames are read so many at once, and online tracks written.
 _STEPS: Final = 256
 #: The least noise (m) and speed (m/s): a covariance of 0 can't be inverted.
 _MIN_SPREAD: Final = 1e-3
@@ -37,8 +34,8 @@ _MIN_SPREAD: Final = 1e-3
 class LikelihoodPass:
     """Online tracking over one log: ``step`` for each frame, then ``outputs``.
 
-    Rows of online tracks are made of some steps at once (``_write``), because one step has few of them. What later
-    steps need of these is kept: the last sample of each track, and its past positions.
+    Frames are read some at once (``_track``), and rows of online tracks are made of as many (``_write``), because one
+    frame has few of them. What later steps need is kept: the last sample of each track, and its past positions.
     """
 
     def __init__(self, options: LikelihoodOptions, movers: Movers = PEOPLE) -> None:
@@ -60,14 +57,11 @@ class LikelihoodPass:
             max_age_tentative=min(self._confirm_hits, max_age),
             estimate_noise=options.noise_m is None,
         )
-        self.assignments = Assignments()
-        self.samples = LogSamples()
+        self._assignments = Assignments()
+        self._samples = LogSamples()
         self.steps: list[int] = []
         self._last_ns = 0
-        # steps that are not written yet
-        self._frames: list[Frame] = []
-        self._results: list[Step] = []
-        self._observed: list[Ints] = []
+        self._frames: list[Frame] = []  # those that are not read yet
         # what is known of earlier ones: tracks and their last samples, and their positions in the recent past
         self._ids, self._last_rows = np.empty(0, np.int64), TRACKS.empty()
         self._recent = _Positions(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)))
@@ -75,43 +69,43 @@ class LikelihoodPass:
         self._coasting: list[tuple[Ints, Floats, Ints]] = []  # places of rows in _online, positions in m, times
         horizon = max(1, round(options.horizon_s * rate))
         self._predictor: Predictor = make(options.predictor, horizon, 1 / rate)
-        self._forecasts = _Forecasts(options.predictor, self._predictor, movers.unit_m, options.follows_log)
+        self._forecasts = OnlineForecasts(options.predictor, self._predictor, movers.unit_m, options.follows_log)
         self._written = 0
 
     @property
     def noise_m(self) -> float:
         """The noise of measured positions: as given, or as estimated so far; in the unit of the objects."""
-        return self._tracker.model.noise_m
+        self._track()
+        return self._tracker.noise_m
+
+    @property
+    def assignments(self) -> Assignments:
+        """Which track had which sample so far."""
+        self._track()
+        return self._assignments
+
+    @property
+    def samples(self) -> LogSamples:
+        """The samples so far."""
+        self._track()
+        return self._samples
 
     def step(self, frame: Frame) -> None:
         """One step: association, update, birth and termination of tracks."""
         passed = 1
         if self.steps:
             passed = max(1, round((frame.t_ns - self._last_ns) * self._options.rate_hz / NS_PER_S))
-        step = self.steps[-1] + passed if self.steps else 0
-        rows = frame.rows
-        observed = np.flatnonzero(rows["observed"]) if not self._options.interpolated else np.arange(len(rows))
-        observed = observed[np.argsort(rows["track_id"][observed], kind="stable")]
-        xy = np.stack([rows["x_m"][observed], rows["y_m"][observed]], axis=-1) / self._unit_m
-        source = rows["track_id"][observed]
-        result = self._tracker.step(xy, source, passed)
-        is_matched = result.row >= 0
-        self.assignments.add(step, result.ids[is_matched], source[result.row[is_matched]])
-        self.samples.add(frame)
-        self.steps.append(step)
+        self.steps.append(self.steps[-1] + passed if self.steps else 0)
         self._last_ns = frame.t_ns
         self._frames.append(frame)
-        self._results.append(result)
-        self._observed.append(observed)
         if len(self._frames) >= _STEPS:
-            self._write()
+            self._track()
 
     def outputs(self) -> Iterator[tuple[Frame, Frame]]:
         """For each step the online tracks and their predictions, from the past alone."""
         if not self.steps:
             return
-        if self._frames:
-            self._write()
+        self._track()
         online, predictions = self._online.done(), self._forecasts.done()
         # All at once, because the last digits of a product of matrices depend on their size.
         nothing = np.empty(0, np.int64), np.empty((0, 2)), np.empty(0, np.int64)
@@ -127,18 +121,45 @@ class LikelihoodPass:
             rows[places[low:high] - start] = coasting[low:high]
             yield tracks._replace(rows=rows), forecast
 
-    def _write(self) -> None:
-        """Make the rows of online tracks, and their predictions, of the steps that are not written yet."""
-        options, results, frames = self._options, self._results, self._frames
-        tick = group_index([len(result.ids) for result in results])
-        ids, row, mean, hits, missed = (np.concatenate([result[k] for result in results]) for k in range(5))
-        samples = TRACKS.joined([self._last_rows, *(frame.rows for frame in frames)])
+    def _track(self) -> None:
+        """Track through the frames that are not read yet, and write these steps."""
+        frames, self._frames = self._frames, []
+        if not frames:
+            return
+        t_ns, numbers = (np.array(values, np.int64) for values in zip(*(frame[:2] for frame in frames), strict=True))
+        ends = np.cumsum([0, *(len(frame.rows) for frame in frames)])
+        samples = TRACKS.joined([frame.rows for frame in frames])
+        self._samples.extend(t_ns, numbers, ends, samples)
+        steps = np.array(self.steps[-len(frames) :], np.int64)
+        before = self.steps[-len(frames) - 1] if len(self.steps) > len(frames) else steps[0] - 1
+        # observations of each step, ordered by their input ids
+        tick, source = group_index(np.diff(ends)), samples["track_id"]
+        observed = np.lexsort((source, tick))
+        if not self._options.interpolated:
+            observed = observed[samples["observed"][observed]]
+        tick, source = tick[observed], source[observed]
+        xy_m = np.stack([samples["x_m"][observed], samples["y_m"][observed]]) / self._unit_m
+        bounds = np.searchsorted(tick, np.arange(len(frames) + 1))
+        parts = zip(bounds.tolist(), bounds[1:].tolist(), np.diff(steps, prepend=before).tolist(), strict=False)
+        results = [self._tracker.step(xy_m[:, low:high], source[low:high], passed) for low, high, passed in parts]
+        tracks, row, place = (np.concatenate(all_, axis=-1) for all_ in zip(*results, strict=True))
+        tick = group_index([len(result.row) for result in results])
+        has = row >= 0
+        row[has] = observed[bounds[tick[has]] + row[has]]
+        self._assignments.add(steps[tick[has]], tracks[IDS, has], samples["track_id"][row[has]])
+        self._write(_Read(t_ns, numbers, steps, samples), tick, row, tracks, place)
+
+    def _write(self, read: _Read, tick: Ints, row: Ints, tracks: Ints, place: Floats) -> None:
+        """Make the rows of online tracks, and their predictions, of some steps.
+
+        Of the tracks alive at each of the steps, end to end: the index of the step, the row that each has, or -1; whole
+        numbers and positions as in ``Step``.
+        """
+        options, steps = self._options, read.steps
+        ids, hits, missed = tracks[IDS], tracks[HITS], tracks[MISSED]
+        samples = TRACKS.joined([self._last_rows, read.samples])
         known = len(self._last_rows)
-        offset = known + np.cumsum([0, *(len(frame.rows) for frame in frames)])
-        at = np.concatenate(
-            [np.where(s.row >= 0, o[s.row] if len(o) else -1, -1) for s, o in zip(results, self._observed, strict=True)]
-        )
-        sample = np.where(row >= 0, offset[tick] + at, -1)
+        sample = np.where(row >= 0, known + row, -1)
         # the last sample of each track up to each step: before the first of these steps, that of ``_last_rows``
         earlier = np.concatenate([np.arange(known), sample])
         order = np.lexsort((np.concatenate([np.full(known, -1), tick]), np.concatenate([self._ids, ids])))
@@ -149,7 +170,7 @@ class LikelihoodPass:
         is_coasting = (row < 0) & (hits * 2 >= self._confirm_hits * 3)
         is_coasting &= missed <= round(options.coast_s * options.rate_hz)
         is_confirmed = (row >= 0) & (hits >= self._confirm_hits)
-        shown = np.flatnonzero((is_confirmed | is_coasting) & np.isfinite(mean[:, 0]))
+        shown = np.flatnonzero((is_confirmed | is_coasting) & np.isfinite(place[0]))
         shown = shown[np.lexsort((ids[shown], tick[shown]))]
 
         rows = samples[last_sample[shown]].copy()
@@ -157,28 +178,25 @@ class LikelihoodPass:
         rows["track_id"] = ids[shown]
         coasts = row[shown] < 0
         rows["observed"] &= ~coasts
-        t_ns = np.array([frame.t_ns for frame in frames], np.int64)
         xy_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
-        xy_m[coasts] = mean[shown[coasts], :2] * self._unit_m
-        self._coasting.append((self._written + np.flatnonzero(coasts), xy_m[coasts], t_ns[tick[shown[coasts]]]))
-        steps = np.array(self.steps[-len(frames) :], np.int64)
+        xy_m[coasts] = place.T[shown[coasts]] * self._unit_m
+        self._coasting.append((self._written + np.flatnonzero(coasts), xy_m[coasts], read.t_ns[tick[shown[coasts]]]))
         is_matched = sample >= 0
-        self._remember(ids[is_matched], steps[tick[is_matched]], samples[sample[is_matched]])
+        self._remember(int(steps[0]), ids[is_matched], steps[tick[is_matched]], samples[sample[is_matched]])
         past = self._past(ids[shown], steps[tick[shown]], xy_m)
-        ends = np.searchsorted(tick[shown], np.arange(len(frames) + 1))
-        numbers = [frame.index for frame in frames]
-        self._online.extend(t_ns, numbers, ends, rows)
-        self._forecasts.add(t_ns, numbers, steps, ends, _Waiting(rows["track_id"], *past, coasts, steps[tick[shown]]))
+        ends = np.searchsorted(tick[shown], np.arange(len(steps) + 1))
+        self._online.extend(read.t_ns, read.numbers, ends, rows)
+        waiting = Unpredicted(rows["track_id"], *past, coasts, steps[tick[shown]])
+        self._forecasts.add(read.t_ns, read.numbers, steps, ends, waiting)
         self._written += len(rows)
-        is_last = tick == len(frames) - 1
+        is_last = tick == len(steps) - 1
         self._ids, self._last_rows = ids[is_last], samples[last_sample[is_last]]
-        self._frames, self._results, self._observed = [], [], []
 
-    def _remember(self, track: Ints, step: Ints, samples: Rows) -> None:
-        """Add positions of tracks to their past; only that which predictions need is kept."""
+    def _remember(self, first: int, track: Ints, step: Ints, samples: Rows) -> None:
+        """Add positions of tracks from step ``first`` on to their past; only that which predictions need is kept."""
         recent = self._recent
         xy_m = np.stack([samples["x_m"], samples["y_m"]], axis=-1)
-        kept = recent.step > self.steps[-1 - len(self._frames)] - self._predictor.past if len(recent.step) else slice(0)
+        kept = recent.step > first - 1 - self._predictor.past
         both = zip(recent, (track, step, xy_m), strict=True)
         self._recent = _Positions(*(np.concatenate([before[kept], new]) for before, new in both))
 
@@ -207,91 +225,13 @@ class _Positions(NamedTuple):
     xy_m: Floats
 
 
-class _Waiting(NamedTuple):
-    """Tracks without predictions yet: ids, past positions (R, L, 2), which are known, whether tracks coast, steps."""
+class _Read(NamedTuple):
+    """Frames that were read: times in ns, numbers, steps; and their samples, end to end."""
 
-    ids: Ints
-    past: Floats
-    known: Bools
-    coasts: Bools
-    step: Ints
-
-    def part(self, which: slice) -> _Waiting:
-        ids, past, known, coasts, step = self
-        return _Waiting(ids[which], past[which], known[which], coasts[which], step[which])
-
-
-class _Made(NamedTuple):
-    """Predictions as the predictor made them: ids, past positions, whether tracks coast, means and covariances."""
-
-    ids: Ints
-    past: Floats
-    coasts: Bools
-    mean: Floats
-    cov: Floats
-
-    def part(self, which: slice) -> _Made:
-        return _Made(self.ids[which], self.past[which], self.coasts[which], self.mean[which], self.cov[which])
-
-
-class _Forecasts:
-    """Predictions of tracks, frame by frame, made for ``_BATCH`` tracks at once."""
-
-    def __init__(self, name: str, predictor: Predictor, unit_m: float, adapt: bool) -> None:
-        self._name, self._predictor, self._unit_m = name, predictor, unit_m
-        self._calibration = TailCalibration.of(name, predictor, adapt)
-        self._out = FrameCollector(PREDICTIONS)
-        self._waiting: list[_Waiting] = []
-        nothing = np.empty((0, predictor.steps, 2, 2))
-        self._made = [
-            _Made(np.empty(0, np.int64), np.empty((0, predictor.past, 2)), np.empty(0, bool), nothing[..., 0], nothing)
-        ]
-        self._frames: list[tuple[int, int, int, int]] = []  # time, number, step and tracks of frames in neither
-
-    def add(self, t_ns: Ints, numbers: Sequence[int], steps: Ints, ends: Ints, tracks: _Waiting) -> None:
-        """Add the tracks of frames, ``ends[f]`` to ``ends[f + 1]`` of frame f, with their past positions."""
-        self._frames += zip(t_ns.tolist(), numbers, steps.tolist(), np.diff(ends).tolist(), strict=True)
-        self._waiting.append(tracks)
-        self._predict(_BATCH)
-
-    def done(self) -> FrameColumns:
-        """The predictions; nothing can be added any more."""
-        self._predict(1)
-        if self._calibration is not None:
-            self._calibration.warn(self._name)
-        return self._out.done()
-
-    def _predict(self, least: int) -> None:
-        """Predict in batches, as long as at least so many tracks wait, and write the frames that are complete."""
-        waiting = _Waiting(*(np.concatenate(parts) for parts in zip(*self._waiting, strict=True)))
-        done = 0
-        while len(waiting.ids) - done >= least:
-            end = done + _BATCH
-            if uses_people(self._predictor):  # whole steps, because their tracks are predicted together
-                end = int(np.searchsorted(waiting.step, waiting.step[min(end, len(waiting.ids)) - 1], "right"))
-            ids, past, known, coasts, steps = waiting.part(slice(done, end))
-            units = past / self._unit_m
-            people = PeopleSeen(units, known, steps, np.arange(len(ids)))
-            mean, cov = predict_among(self._predictor, units, known, people)
-            self._made.append(_Made(ids, past, coasts, mean * self._unit_m, cov * self._unit_m**2))
-            done += len(ids)
-        self._waiting = [waiting.part(slice(done, None))]
-        made = _Made(*(np.concatenate(parts) for parts in zip(*self._made, strict=True)))
-        ends = np.cumsum([0, *(count for *_, count in self._frames)])
-        complete = int(np.searchsorted(ends, len(made.ids), "right")) - 1
-        for (t_ns, number, step, _), low, high in zip(self._frames, ends[:complete], ends[1:], strict=False):
-            rows = self._rows(step, made.part(slice(low, high)))
-            self._out.append(Frame(t_ns, number, rows))
-        self._frames = self._frames[complete:]
-        left = made.part(slice(ends[complete], None))  # copied, so that the larger arrays are not held
-        self._made = [_Made(left.ids.copy(), left.past.copy(), left.coasts.copy(), left.mean.copy(), left.cov.copy())]
-
-    def _rows(self, step: int, made: _Made) -> Rows:
-        """The predictions of a step; calibrated by those of the steps before."""
-        forecast, tails = Forecast(made.mean, made.cov), None
-        if self._calibration is not None:
-            forecast, tails = self._calibration(step, made.ids, forecast, made.past, made.coasts)
-        return forecast_to_rows(made.ids, forecast, self._predictor.step_s, tails)
+    t_ns: Ints
+    numbers: Ints
+    steps: Ints
+    samples: Rows
 
 
 def motion_model(options: RetrackOptions, noise_m: float, movers: Movers = PEOPLE) -> MotionModel:

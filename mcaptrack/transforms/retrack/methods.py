@@ -31,9 +31,17 @@ class OnlinePass(Protocol):
     It may hold for the whole log what the module ``samples`` says, and no rows.
     """
 
-    assignments: Assignments
-    samples: LogSamples
     steps: list[int]
+
+    @property
+    def assignments(self) -> Assignments:
+        """Which track had which sample so far."""
+        ...
+
+    @property
+    def samples(self) -> LogSamples:
+        """The samples so far."""
+        ...
 
     @property
     def noise_m(self) -> float:

@@ -46,19 +46,14 @@ class MotionModel:
     drift_m_per_s: float
     drift_ratio: float
 
-    def initial(self, xy_m: Floats) -> State:
-        """States of tracks that were measured once, at (K, 2)."""
-        mean = np.concatenate([xy_m, np.zeros_like(xy_m)], axis=1)
-        return State(mean, np.tile([self.noise_m**2, 0.0, self.speed_m_per_s**2], (len(xy_m), 1)))
-
-    def predict(self, state: State, elapsed_s: Floats | float) -> State:
-        """States after some time, (K,) or one for all."""
-        out = State(np.empty_like(state.mean), np.empty_like(state.cov))
-        self.predict_rows(_rows(state), elapsed_s, _rows(out))
+    def initial(self, xy_m: Floats, noise_m: float) -> StateRows:
+        """States of tracks that were measured once, at (2, K), with this noise."""
+        out = StateRows(np.zeros((4, xy_m.shape[1])), np.zeros((3, xy_m.shape[1])))
+        out.mean[:2], out.cov[0], out.cov[2] = xy_m, noise_m**2, self.speed_m_per_s**2
         return out
 
-    def predict_rows(self, state: StateRows, elapsed_s: Floats | float, out: StateRows) -> None:
-        """As ``predict``, into ``out``."""
+    def predict(self, state: StateRows, elapsed_s: Floats | float, out: StateRows) -> None:
+        """States after some time, (K,) or one for all, into ``out``, which may be ``state`` itself."""
         (x, y, vx, vy), (p, c, v), t = *state, elapsed_s
         power = (self.drift_m_per_s + self.drift_ratio * np.hypot(vx, vy)) ** 2
         mean, cov = out
@@ -66,12 +61,6 @@ class MotionModel:
         cov[0] = p + t * (2 * c + t * (v + t * power / 3))
         cov[1] = c + t * (v + t * power / 2)
         cov[2] = v + t * power
-
-    def update(self, state: State, xy_m: Floats, noise_m: Floats) -> State:
-        """States after measurements at (K, 2) with noise (K,)."""
-        out = State(state.mean.copy(), state.cov.copy())
-        update_rows(_rows(out), xy_m.T, noise_m)
-        return out
 
 
 class StateRows(NamedTuple):
@@ -85,12 +74,7 @@ class StateRows(NamedTuple):
         return StateRows(self.mean[:, which], self.cov[:, which])
 
 
-def _rows(state: State) -> StateRows:
-    """States as rows: views."""
-    return StateRows(state.mean.T, state.cov.T)
-
-
-def update_rows(state: StateRows, xy_m: Floats, noise_m: Floats) -> None:
+def update(state: StateRows, xy_m: Floats, noise_m: Floats) -> None:
     """Update states with measurements at (2, K) with noise (K,), in place."""
     mean, (p, c, v) = state
     s = p + noise_m**2
@@ -187,7 +171,7 @@ def _states(rows: StateRows, place: Ints) -> State:
 def _smooth_back(model: MotionModel, states: StateRows, bounds: Sequence[int], step_s: float) -> None:
     """Smooth the states of forward filters (N,), in place. They are laid step by step, from the last one back."""
     ahead = StateRows(np.empty_like(states.mean), np.empty_like(states.cov))
-    model.predict_rows(states, step_s, ahead)
+    model.predict(states, step_s, ahead)
     p, c, v = states.cov
     # gain = P F' / P', per axis: two rows of two
     a, b = p + step_s * c, c
@@ -226,19 +210,19 @@ def _filter(
     if not len(rows):
         return out
     start = slice(bounds[0], bounds[1])
-    for part, values in zip(out, _rows(model.initial(xy_m[:, start].T)), strict=True):
+    for part, values in zip(out, model.initial(xy_m[:, start], model.noise_m), strict=True):
         part[:, start] = values
     out.cov[0, start] = noise_m[start] ** 2
     is_measured = np.isfinite(xy_m[0])
     is_whole = np.logical_and.reduceat(is_measured, bounds[:-1]).tolist()
     for before, low, high, whole in zip(bounds, bounds[1:], bounds[2:], is_whole[1:], strict=False):
         now, here = out.take(slice(low, high)), slice(low, high)
-        model.predict_rows(out.take(slice(before, before + high - low)), step_s, now)
+        model.predict(out.take(slice(before, before + high - low)), step_s, now)
         if whole:
-            update_rows(now, xy_m[:, here], noise_m[here])
+            update(now, xy_m[:, here], noise_m[here])
             continue
         (which,) = is_measured[here].nonzero()
         some = now.take(which)
-        update_rows(some, xy_m[:, here][:, which], noise_m[here][which])
+        update(some, xy_m[:, here][:, which], noise_m[here][which])
         now.mean[:, which], now.cov[:, which] = some
     return out

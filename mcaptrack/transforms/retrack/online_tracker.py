@@ -5,25 +5,32 @@ count as evidence: much where a person walks alone, little in a crowd, where tra
 an observation is coasting: its filter predicts on until the track terminates. Tracks that are occluded stay alive while
 they are merged into one detection with another track.
 
-Letters: K tracks, N observations of one step.
+The numbers of tracks are rows of arrays, with a column for each track. A step has few tracks, so what takes time is the
+number of operations on arrays. Letters: K tracks, N observations of one step, P pairs of both, L lost tracks.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.assignment import assign_by_gain
-from mcaptrack.transforms.retrack.motion_model import MotionModel, State
+from mcaptrack.transforms.retrack.motion_model import MotionModel, StateRows, update
 
 #: Limits of the estimated noise of measured positions, in metres.
 NOISE_M: Final = (0.03, 0.8)
 #: The share of positions expected outside the circle by which the noise is judged, and the lowest rate of adaptation.
 _OUTSIDE: Final = 0.1
 _MIN_RATE: Final = 0.01
+#: The squared radius of that circle, for a variance of 1.
+_CIRCLE: Final = -2 * np.log(_OUTSIDE)
+#: The rows of the whole numbers of tracks: id, input id of the last observation (-1: of a merged detection), number of
+#: observations, steps since the last one, and steps for which the track is merged into the detection of another one.
+IDS, SOURCE, HITS, MISSED, MERGED = range(5)
+_NOTHING: Final = np.empty(0, np.intp), np.empty(0, np.intp)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,13 +60,15 @@ class Association:
 
 
 class Step(NamedTuple):
-    """The tracks alive after a step: ``row`` (K,) of the observation that each has, or -1; means, hits and misses."""
+    """The tracks alive after a step.
 
-    ids: Ints
+    ``tracks`` (5, K) are their whole numbers (``IDS`` to ``MERGED``), ``row`` (K,) is the observation that each has, or
+    -1, and ``xy_m`` (2, K) where they are.
+    """
+
+    tracks: Ints
     row: Ints
-    mean: Floats
-    hits: Ints
-    missed: Ints
+    xy_m: Floats
 
 
 @dataclass
@@ -67,7 +76,8 @@ class OnlineTracker:
     """The tracks that are alive. Ages are in steps.
 
     Tracks are tentative before ``confirm_hits`` observations; they terminate after ``max_age`` steps without one,
-    tentative ones after ``max_age_tentative``.
+    tentative ones after ``max_age_tentative``. ``noise_m`` is the noise of positions: that of the model, or as it was
+    estimated so far.
     """
 
     model: MotionModel
@@ -76,78 +86,77 @@ class OnlineTracker:
     max_age: int
     confirm_hits: int
     max_age_tentative: int
-    ids: Ints = field(default_factory=lambda: np.empty(0, np.int64))
-    state: State = field(default_factory=lambda: State(np.empty((0, 4)), np.empty((0, 3))))
-    source: Ints = field(default_factory=lambda: np.empty(0, np.int64))
-    hits: Ints = field(default_factory=lambda: np.empty(0, np.int64))
-    missed: Ints = field(default_factory=lambda: np.empty(0, np.int64))
-    merged: Ints = field(default_factory=lambda: np.empty(0, np.int64))
-    next_id: int = 1
     estimate_noise: bool = True
+    tracks: Ints = field(default_factory=lambda: np.empty((5, 0), np.int64))
+    state: StateRows = field(default_factory=lambda: StateRows(np.empty((4, 0)), np.empty((3, 0))))
+    next_id: int = 1
     judged: int = 0
     known_sources: set[int] = field(default_factory=set)
+    noise_m: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.noise_m = self.model.noise_m
 
     def step(self, xy_m: Floats, source: Ints, passed: int) -> Step:
-        """Advance by ``passed`` steps and associate observations at (N, 2) with the input ids ``source`` (N,)."""
-        self.missed = self.missed + passed
-        is_over = np.where(self.hits >= self.confirm_hits, self.max_age, self.max_age_tentative) < self.missed
+        """Advance by ``passed`` steps and associate observations at (2, N) with the input ids ``source`` (N,)."""
+        self.tracks[MISSED] += passed
+        is_over = np.where(self.tracks[HITS] >= self.confirm_hits, self.max_age, self.max_age_tentative)
+        is_over = is_over < self.tracks[MISSED]
         if is_over.any():
-            self._keep(~is_over)
-        if len(self.ids):
-            self.state = self.model.predict(self.state, passed * self.step_s)
+            kept = (~is_over).nonzero()[0]
+            self.tracks, self.state = self.tracks[:, kept], self.state.take(kept)
+        if self.tracks.shape[1]:
+            self.model.predict(self.state, passed * self.step_s, self.state)
         track, row = assign_by_gain(self._gain(xy_m, source))
-        occluded, occluder = self._merged_detections(track, row, xy_m)
+        observed = xy_m[:, row]
+        occluded, occluder = self._merged_detections(track, observed)
         if len(occluded):
-            self._update_occluded(occluded, xy_m[row[occluder]], passed)
+            self._update_occluded(occluded, observed[:, occluder], passed)
         if len(track):
-            before = self.state.take(track)
-            noise_m = np.full(len(track), self.model.noise_m)
-            noise_m[occluder] = self.association.merge_distance_m / 2
-            self._adapt_noise(before, xy_m[row], track, noise_m == self.model.noise_m)
-            new = self.model.update(before, xy_m[row], noise_m)
-            self.state.mean[track], self.state.cov[track] = new
-            self.missed[track] = 0
-            self.hits[track] += 1
-            self.merged[track] = 0
-            self.source[track] = source[row]
-            self.source[track[occluder]] = -1
-        row_of = np.full(len(self.ids), -1)
+            self._update(track, observed, source[row], occluder)
+        row_of = np.full(self.tracks.shape[1], -1)
         row_of[track] = row
-        free = np.ones(len(xy_m), bool)
-        free[row] = False
-        if free.any():
-            row_of = np.concatenate([row_of, np.flatnonzero(free)])
-            self._start(xy_m[free], source[free])
+        if len(row) < len(source):
+            is_free = np.ones(len(source), bool)
+            is_free[row] = False
+            free = is_free.nonzero()[0]
+            row_of = np.concatenate([row_of, free])
+            self._start(xy_m[:, free], source[free])
         self.known_sources.update(source.tolist())
-        return Step(self.ids, row_of, self.state.mean.copy(), self.hits.copy(), self.missed)
+        return Step(self.tracks.copy(), row_of, self.state.mean[:2].copy())
 
-    def _merged_detections(self, track: Ints, row: Ints, xy_m: Floats) -> tuple[Ints, Ints]:
+    def _merged_detections(self, track: Ints, observed: Floats) -> tuple[Ints, Ints]:
         """Find pairs of tracks merged into one detection (occlusion), and which track has that detection.
 
         A lost track becomes occluded by another one if the observation of the latter lies between both, and the middle
-        makes it likelier than its own track does. Returns the occluded tracks, and for each the index into ``track`` of
-        the one that occludes it.
+        makes it likelier than its own track does. ``observed`` (2, P) are the observations of the tracks ``track``
+        (P,). Returns the occluded tracks, and for each the index into ``track`` of the one that occludes it.
         """
-        nothing = np.empty(0, np.intp), np.empty(0, np.intp)
-        is_lost = (self.hits >= self.confirm_hits) & (self.merged * self.step_s < self.association.merge_timeout_s)
+        tracks, (p, _, _) = self.tracks, self.state.cov
+        is_confirmed = tracks[HITS] >= self.confirm_hits
+        is_lost = is_confirmed & (tracks[MERGED] * self.step_s < self.association.merge_timeout_s)
         is_lost[track] = False
-        confirmed = np.flatnonzero(self.hits[track] >= self.confirm_hits)
-        lost = np.flatnonzero(is_lost)
-        if len(lost) == 0 or len(confirmed) == 0:
-            return nothing
-        observed, expected = xy_m[row[confirmed]], self.state.mean[:, :2]
-        off = expected[lost, None] - observed[None]
-        squared = np.einsum("knd,knd->kn", off, off)
+        lost = is_lost.nonzero()[0]
+        if len(lost) == 0:
+            return _NOTHING
+        confirmed = is_confirmed[track].nonzero()[0]
+        if len(confirmed) == 0:
+            return _NOTHING
+        seen, expected = observed[:, confirmed], self.state.mean[:2, lost]
+        squared = _squared(expected[:, :, None] - seen[:, None])
         nearest = squared.argmin(axis=1)
-        is_merged = squared[np.arange(len(lost)), nearest] < self.association.merge_distance_m**2
-        owner = track[confirmed[nearest]]
-        to_own = ((observed[nearest] - expected[owner]) ** 2).sum(axis=1)
-        to_middle = ((observed[nearest] - (expected[owner] + expected[lost]) / 2) ** 2).sum(axis=1)
-        of_own, of_lost, noise = self.state.cov[owner, 0], self.state.cov[lost, 0], self.model.noise_m**2
-        alone, together = of_own + noise, (of_own + of_lost) / 4 + noise  # the middle of two has a quarter of both
+        is_merged = squared.min(axis=1) < self.association.merge_distance_m**2
+        if not is_merged.any():
+            return _NOTHING
+        lost, expected, nearest = lost[is_merged], expected[:, is_merged], nearest[is_merged]
+        seen, owner = seen[:, nearest], track[confirmed[nearest]]
+        own = self.state.mean[:2, owner]
+        to_own, to_middle = _squared(seen - own), _squared(seen - (own + expected) / 2)
+        noise = self.noise_m**2
+        alone, together = p[owner] + noise, (p[owner] + p[lost]) / 4 + noise  # the middle of two: a quarter of both
         evidence = to_own / alone - to_middle / together + 2 * np.log(alone / together)
-        was_merged = (self.merged[lost] > 0) | (self.source[lost] == -1)  # they may take turns at having the detection
-        is_merged &= (to_middle < to_own) & (was_merged | (evidence > self.association.merge_evidence))
+        was_merged = (tracks[MERGED, lost] > 0) | (tracks[SOURCE, lost] == -1)  # they may take turns at having it
+        is_merged = (to_middle < to_own) & (was_merged | (evidence > self.association.merge_evidence))
         return lost[is_merged], confirmed[nearest[is_merged]]
 
     def _update_occluded(self, occluded: Ints, xy_m: Floats, passed: int) -> None:
@@ -155,59 +164,70 @@ class OnlineTracker:
 
         Its input id says nothing about either track once they separate.
         """
-        noise_m = np.full(len(occluded), self.association.merge_distance_m / 2)
-        new = self.model.update(self.state.take(occluded), xy_m, noise_m)
-        self.state.mean[occluded], self.state.cov[occluded] = new
-        self.missed[occluded] = np.maximum(self.missed[occluded] - passed, 1)
-        self.merged[occluded] += passed
+        state = self.state.take(occluded)
+        update(state, xy_m, np.full(len(occluded), self.association.merge_distance_m / 2))
+        self.state.mean[:, occluded], self.state.cov[:, occluded] = state
+        self.tracks[MISSED, occluded] = np.maximum(self.tracks[MISSED, occluded] - passed, 1)
+        self.tracks[MERGED, occluded] += passed
 
-    def _adapt_noise(self, before: State, xy_m: Floats, track: Ints, is_single: Bools) -> None:
+    def _update(self, track: Ints, xy_m: Floats, source: Ints, occluder: Ints) -> None:
+        """Update tracks (P,) with their observations (2, P); those of ``occluder`` are merged with others."""
+        state = self.state.take(track)
+        noise_m = np.full(len(track), self.noise_m)
+        noise_m[occluder] = self.association.merge_distance_m / 2
+        if self.estimate_noise:
+            self._adapt_noise(state, xy_m, (self.tracks[HITS, track] >= self.confirm_hits) & (noise_m == self.noise_m))
+        update(state, xy_m, noise_m)
+        self.state.mean[:, track], self.state.cov[:, track] = state
+        source[occluder] = -1
+        self.tracks[SOURCE, track] = source
+        self.tracks[HITS, track] += 1
+        self.tracks[MISSED:, track] = 0
+
+    def _adapt_noise(self, before: StateRows, xy_m: Floats, usable: Bools) -> None:
         """Estimate the noise of positions: a share ``_OUTSIDE`` of them lies outside a circle if it is right."""
-        usable = (self.hits[track] >= self.confirm_hits) & is_single
-        if self.estimate_noise and usable.any():
-            off = (xy_m - before.mean[:, :2])[usable]
-            limit = -2 * np.log(_OUTSIDE) * (before.cov[usable, 0] + self.model.noise_m**2)
-            outside = (off**2).sum(axis=1) > limit
-            self.judged += len(outside)
-            rate = max(_MIN_RATE, 5 / (self.judged + 50))  # fast at first
-            log_noise = np.log(self.model.noise_m) + rate * float((outside - _OUTSIDE).sum())
-            self.model = replace(self.model, noise_m=float(np.clip(np.exp(log_noise), *NOISE_M)))
+        off = (xy_m - before.mean[:2])[:, usable]
+        if not off.shape[1]:
+            return
+        outside = _squared(off) > _CIRCLE * (before.cov[0, usable] + self.noise_m**2)
+        self.judged += len(outside)
+        rate = max(_MIN_RATE, 5 / (self.judged + 50))  # fast at first
+        log_noise = np.log(self.noise_m) + rate * float((outside - _OUTSIDE).sum())
+        self.noise_m = min(max(float(np.exp(log_noise)), NOISE_M[0]), NOISE_M[1])
 
     def _gain(self, xy_m: Floats, source: Ints) -> Floats:
         """The gain of matching each pair (K, N); negative beyond the gate."""
-        association = self.association
-        if len(self.ids) == 0 or len(xy_m) == 0:
-            return np.empty((len(self.ids), len(xy_m)))
-        s = self.state.cov[:, 0] + self.model.noise_m**2 + association.extra_noise_m**2
-        off = xy_m[None] - self.state.mean[:, None, :2]
-        squared = np.einsum("knd,knd->kn", off, off) / s[:, None]
-        gain = association.unmatched - squared - 2 * np.log(s)[:, None]
-        same = self.source[:, None] == source[None]
-        if len(xy_m) > 1:
-            apart = xy_m[:, None] - xy_m[None]
-            near = np.einsum("mnd,mnd->mn", apart, apart) < association.crowd_m**2
-            crowded = near.sum(axis=0) > 1
-        else:
-            crowded = np.zeros(1, bool)
-        gain += same * np.where(crowded, association.same_id_crowded, association.same_id)
-        is_new = np.array([one not in self.known_sources for one in source.tolist()])
-        if is_new.any():
-            gain -= association.new_id * (is_new[None] & (self.missed == 1)[:, None])
+        association, tracks = self.association, self.tracks
+        if tracks.shape[1] == 0 or len(source) == 0:
+            return np.empty((tracks.shape[1], len(source)))
+        s = self.state.cov[0] + self.noise_m**2 + association.extra_noise_m**2
+        squared = _squared(xy_m[:, None] - self.state.mean[:2, :, None])
+        squared /= s[:, None]
+        gain = association.unmatched - squared
+        gain -= (2 * np.log(s))[:, None]
+        near = _squared(xy_m[:, :, None] - xy_m[:, None]) < association.crowd_m**2
+        bonus = np.where(near.sum(axis=0) > 1, association.same_id_crowded, association.same_id)
+        gain += (tracks[SOURCE][:, None] == source) * bonus
+        names = source.tolist()
+        if not self.known_sources.issuperset(names):
+            is_new = np.array([one not in self.known_sources for one in names])
+            gain -= association.new_id * (is_new & (tracks[MISSED] == 1)[:, None])
         return np.where(squared <= association.gate, np.round(gain, 6), -1.0)
 
     def _start(self, xy_m: Floats, source: Ints) -> None:
-        """Birth: start a track for each observation that was not matched."""
-        count = len(xy_m)
-        self.ids = np.concatenate([self.ids, np.arange(self.next_id, self.next_id + count)])
+        """Birth: start a track for each observation (2, N) that was not matched."""
+        count = len(source)
+        born = np.zeros((5, count), np.int64)
+        born[IDS] = range(self.next_id, self.next_id + count)
+        born[SOURCE], born[HITS] = source, 1
         self.next_id += count
-        started = self.model.initial(xy_m)
-        self.state = State(*(np.concatenate(both) for both in zip(self.state, started, strict=True)))
-        self.source = np.concatenate([self.source, source])
-        self.hits = np.concatenate([self.hits, np.ones(count, np.int64)])
-        self.missed = np.concatenate([self.missed, np.zeros(count, np.int64)])
-        self.merged = np.concatenate([self.merged, np.zeros(count, np.int64)])
+        self.tracks = np.concatenate([self.tracks, born], axis=1)
+        new = self.model.initial(xy_m, self.noise_m)
+        self.state = StateRows(*(np.concatenate(both, axis=1) for both in zip(self.state, new, strict=True)))
 
-    def _keep(self, kept: Bools) -> None:
-        self.ids, self.source = self.ids[kept], self.source[kept]
-        self.hits, self.missed, self.merged = self.hits[kept], self.missed[kept], self.merged[kept]
-        self.state = self.state.take(kept)
+
+def _squared(off: Floats) -> Floats:
+    """The squared lengths of differences (2, ...)."""
+    off *= off
+    out: Floats = off[0] + off[1]
+    return out

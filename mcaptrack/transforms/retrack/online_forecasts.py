@@ -1,0 +1,118 @@
+"""Predictions of online tracks, made for many tracks at once and calibrated step by step.
+
+Letters: R rows of online tracks, L past positions.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.mixtures import Tails
+from mcaptrack.predictors import Forecast, PeopleSeen, Predictor, predict_among, uses_people
+from mcaptrack.predictors.tails import TailCalibration
+from mcaptrack.schema import PREDICTIONS
+from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
+from mcaptrack.schema.predictions import forecast_to_rows
+
+#: Predictions that are made at once: more take memory, fewer take time.
+_BATCH: Final = 4096
+
+
+class Unpredicted(NamedTuple):
+    """Tracks without predictions yet: ids, past positions (R, L, 2), which are known, whether tracks coast, steps."""
+
+    ids: Ints
+    past: Floats
+    known: Bools
+    coasts: Bools
+    step: Ints
+
+    def part(self, which: slice) -> Unpredicted:
+        ids, past, known, coasts, step = self
+        return Unpredicted(ids[which], past[which], known[which], coasts[which], step[which])
+
+
+class _Made(NamedTuple):
+    """Predictions as the predictor made them: ids, past positions, whether tracks coast, means and covariances."""
+
+    ids: Ints
+    past: Floats
+    coasts: Bools
+    mean: Floats
+    cov: Floats
+
+    def part(self, which: slice) -> _Made:
+        return _Made(self.ids[which], self.past[which], self.coasts[which], self.mean[which], self.cov[which])
+
+
+class OnlineForecasts:
+    """Predictions of tracks, frame by frame, made for ``_BATCH`` tracks at once."""
+
+    def __init__(self, name: str, predictor: Predictor, unit_m: float, adapt: bool) -> None:
+        self._name, self._predictor, self._unit_m = name, predictor, unit_m
+        self._calibration = TailCalibration.of(name, predictor, adapt)
+        self._out = FrameCollector(PREDICTIONS)
+        self._waiting: list[Unpredicted] = []
+        nothing = np.empty((0, predictor.steps, 2, 2))
+        self._made = [
+            _Made(np.empty(0, np.int64), np.empty((0, predictor.past, 2)), np.empty(0, bool), nothing[..., 0], nothing)
+        ]
+        self._frames: list[tuple[int, int, int, int]] = []  # time, number, step and tracks of frames in neither
+
+    def add(self, t_ns: Ints, numbers: Ints, steps: Ints, ends: Ints, tracks: Unpredicted) -> None:
+        """Add the tracks of frames, ``ends[f]`` to ``ends[f + 1]`` of frame f, with their past positions."""
+        self._frames += zip(t_ns.tolist(), numbers.tolist(), steps.tolist(), np.diff(ends).tolist(), strict=True)
+        self._waiting.append(tracks)
+        self._predict(_BATCH)
+
+    def done(self) -> FrameColumns:
+        """The predictions; nothing can be added any more."""
+        self._predict(1)
+        if self._calibration is not None:
+            self._calibration.warn(self._name)
+        return self._out.done()
+
+    def _predict(self, least: int) -> None:
+        """Predict in batches, as long as at least so many tracks wait, and write the frames that are complete."""
+        waiting = Unpredicted(*(np.concatenate(parts) for parts in zip(*self._waiting, strict=True)))
+        done = 0
+        while len(waiting.ids) - done >= least:
+            end = done + _BATCH
+            if uses_people(self._predictor):  # whole steps, because their tracks are predicted together
+                end = int(np.searchsorted(waiting.step, waiting.step[min(end, len(waiting.ids)) - 1], "right"))
+            ids, past, known, coasts, steps = waiting.part(slice(done, end))
+            units = past / self._unit_m
+            people = PeopleSeen(units, known, steps, np.arange(len(ids)))
+            mean, cov = predict_among(self._predictor, units, known, people)
+            self._made.append(_Made(ids, past, coasts, mean * self._unit_m, cov * self._unit_m**2))
+            done += len(ids)
+        self._waiting = [waiting.part(slice(done, None))]
+        made = _Made(*(np.concatenate(parts) for parts in zip(*self._made, strict=True)))
+        ends = np.cumsum([0, *(count for *_, count in self._frames)])
+        complete = int(np.searchsorted(ends, len(made.ids), "right")) - 1
+        self._write(complete, ends, made)
+        left = made.part(slice(ends[complete], None))  # copied, so that the larger arrays are not held
+        self._made = [_Made(left.ids.copy(), left.past.copy(), left.coasts.copy(), left.mean.copy(), left.cov.copy())]
+
+    def _write(self, count: int, ends: Ints, made: _Made) -> None:
+        """Write the first ``count`` frames, of which frame f has ``ends[f]`` to ``ends[f + 1]`` of ``made``."""
+        if not count:
+            return
+        calibration, last = self._calibration, ends[count]
+        cov, tails = made.cov[:last], None
+        if calibration is not None:  # by the predictions of the steps before
+            parts = [
+                calibration(step, one.ids, Forecast(one.mean, one.cov), one.past, one.coasts)
+                for (_, _, step, _), low, high in zip(self._frames[:count], ends, ends[1:], strict=False)
+                for one in [made.part(slice(low, high))]
+            ]
+            cov = np.concatenate([forecast.cov for forecast, _ in parts])
+            tails = Tails(*(np.concatenate(shapes) for shapes in zip(*(of for _, of in parts), strict=True)))
+        forecast = Forecast(made.mean[:last], cov)
+        rows = forecast_to_rows(made.ids[:last], forecast, self._predictor.step_s, tails)
+        t_ns, numbers, *_ = zip(*self._frames[:count], strict=True)
+        self._out.extend(t_ns, numbers, ends[: count + 1] * self._predictor.steps, rows)
+        self._frames = self._frames[count:]
