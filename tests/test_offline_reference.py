@@ -1,4 +1,4 @@
-"""Links, encounters, false tracks and smoothing, each against a second, slow implementation, on synthetic paths."""
+"""Links, encounters and smoothing, each against a second, slow implementation, on synthetic paths."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ from hypothesis import strategies as st
 
 from mcaptrack.transforms.retrack import linking, offline
 from mcaptrack.transforms.retrack.cut_links import CutTracks, find_candidates, link_pieces
-from mcaptrack.transforms.retrack.false_tracks import track_log_odds
 from mcaptrack.transforms.retrack.identity_swaps import find_swaps, resolve_swaps
 from mcaptrack.transforms.retrack.joins import Cuts
 from mcaptrack.transforms.retrack.linking import link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
 from tests.memory import held
 from tests.references import cut_links
-from tests.references.offline import DRIFTS, Motion, course_of, exchanged, links, person_log_odds
+from tests.references.offline import DRIFTS, Motion, course_of, exchanged, links
 
 SEEDS = st.integers(0, 2**32 - 1)
 Paths = dict[int, dict[int, tuple[float, float]]]
@@ -189,19 +188,6 @@ def test_links_of_thousands_of_broken_tracks_take_memory_for_the_candidates_alon
     linking._assigned(pairs, gain, (count, count))
     _, most = held(lambda: linking._assigned(pairs, gain, (count, count)))
     assert most < 2_000_000
-
-
-@given(seed=SEEDS)
-@settings(max_examples=25)
-def test_false_track_odds_equal_the_reference(seed):
-    rng = np.random.default_rng(seed)
-    model, motion = models(rng)
-    paths = scattered(rng, int(rng.integers(1, 8)))
-    out, _ = laid_out(paths, model.noise_m)
-    _, _, smoothed = smooth(model, out, 0.4)
-    found = track_log_odds(model, out, smoothed, 0.4)
-    wanted = person_log_odds(motion, paths)
-    np.testing.assert_allclose(found, [wanted[name] for name in sorted(paths)], atol=1e-9)
 
 
 @given(seed=SEEDS)

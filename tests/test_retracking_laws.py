@@ -103,11 +103,11 @@ def by_place(rows: Rows) -> Rows:
 @given(seed=SEEDS)
 @settings(max_examples=2)
 def test_crowds_far_apart_do_not_affect_each_other(method, seed):
-    """The noise is given and nothing is linked, because both are estimated from the whole log; so are ellipses, and how
-    likely joins are.
+    """The noise is given, and nothing is linked or left out, because all of this is estimated from the whole log; so are
+    ellipses, and how likely joins are.
     """
     rng = np.random.default_rng(seed)
-    method = replace(method, noise_m=0.15, link_s=0.0)
+    method = replace(method, noise_m=0.15, link_s=0.0, track_confidence=0.0)
     one, two = noisy_tracks(rng, ticks=40), noisy_tracks(rng, ticks=40)
     two = [b._replace(t_ns=a.t_ns) for a, b in zip(one, moved(two, np.eye(2), np.array([5e3, 0.0])), strict=True)]
     for frame in two:

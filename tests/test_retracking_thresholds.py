@@ -14,11 +14,12 @@ import pytest
 
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES
-from mcaptrack.transforms.retrack.false_tracks import track_log_odds
 from mcaptrack.transforms.retrack.identity_swaps import find_encounters, resolve_swaps
 from mcaptrack.transforms.retrack.linking import candidates, link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
-from tests.references.offline import PEOPLE, Motion, Path, encounters, exchanged, links, person_log_odds
+from mcaptrack.transforms.retrack.track_features import FEATURES, features
+from tests.references.false_tracks import person_features
+from tests.references.offline import Motion, Path, encounters, exchanged, links
 from tests.references.online import OnlineTracker
 from tests.tiers import one_in
 from tests.worlds import walk
@@ -166,29 +167,34 @@ def test_the_highest_speed_of_a_link(gap):
     compare(ours, lambda speed: links(MOTION, paths(speed), 20.0, 0.05).get(1) == 2, 1.0, 9.0)
 
 
-def test_the_distance_within_which_a_track_is_a_duplicate():
-    """A short track beside a long one counts as its duplicate up to 1.2 m."""
+def feature(name: str, paths: dict[int, Path]) -> tuple[float, float]:
+    """A feature of the second of two tracks: of the package, and of the reference."""
+    out, _ = laid_out(paths)
+    _, _, smoothed = smooth(MODEL, out, 0.4)
+    return float(features(MODEL, out, smoothed, 0.4)[1, FEATURES.index(name)]), person_features(MOTION, paths)[2][name]
 
-    def odds(beside_m: float) -> tuple[float, float]:
+
+@pytest.mark.parametrize(("name", "limit_m"), [("duplicate", 1.2), ("beside", 1.8)])
+def test_the_distance_within_which_a_track_is_beside_a_longer_one(name, limit_m):
+    def share(beside_m: float) -> tuple[float, float]:
         paths = {1: line(0, 40, (0.0, 0.0), (1.0, 0.0)), 2: line(12, 10, (4.8, beside_m), (1.0, 0.0))}
-        out, _ = laid_out(paths)
-        _, _, smoothed = smooth(MODEL, out, 0.4)
-        return float(track_log_odds(MODEL, out, smoothed, 0.4)[1]), person_log_odds(MOTION, paths)[2]
+        return feature(name, paths)
 
-    near, far = odds(1.1), odds(1.3)
-    assert far[0] - near[0] == pytest.approx(-PEOPLE["duplicate"])  # the log odds of a track beside a person
-    assert near == pytest.approx(near[::-1])
-    for side in (0, 1):
-        compare(lambda more, s=side: odds(1.0 + more)[s] < sum(near + far) / 4, lambda more: more < 0.2, 0.0, 1.0)
+    assert share(limit_m - 0.01) == pytest.approx((1.0, 1.0))
+    assert share(limit_m + 0.01) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(("count", "wanted"), [(4, 1.0), (3, 0.0)])
+def test_the_samples_that_a_track_needs_to_be_beside_another(count, wanted):
+    paths = {1: line(0, 40, (0.0, 0.0), (1.0, 0.0)), 2: line(12, count, (4.8, 0.5), (1.0, 0.0))}
+    assert feature("beside", paths) == (wanted, wanted)
 
 
 @pytest.mark.parametrize(("start", "end"), [(12, 22), (4, 14), (26, 36), (0, 10), (2, 12), (30, 40), (28, 38)])
 def test_a_duplicate_begins_after_the_other_track_and_ends_before_it(start, end):
     paths = {1: line(0, 40, (0.0, 0.0), (1.0, 0.0)), 2: line(start, end - start, (0.4 * start, 0.5), (1.0, 0.0))}
-    out, _ = laid_out(paths)
-    _, _, smoothed = smooth(MODEL, out, 0.4)
-    found = float(track_log_odds(MODEL, out, smoothed, 0.4)[1])
-    assert found == pytest.approx(person_log_odds(MOTION, paths)[2])
+    found, wanted = feature("duplicate", paths)
+    assert found == pytest.approx(wanted)
 
 
 def crossing(beside_m: float, gap: int, shift: int, named: str) -> tuple[dict[int, Path], dict[int, dict[int, int]]]:

@@ -2,11 +2,11 @@
 
 Writes mcaptrack/transforms/retrack/weights.json. Scenes are those of `crowds.py`: squares, streets, crossings and open
 places with groups, people who stand, and bicycles; each is corrupted by `corruptions.py` with faults of its own. They
-are sampled and re-tracked, and what re-tracking decides about is compared with who was there: links first, then the
-tracks that come of these links; and, in other scenes, which joins of online tracks are right, then which links after
-cutting wrong ones, then how likely what is decided so is right. No recording is used. With --check it says whether the
-same comes out now. With --held nothing is written: scenes of other seeds score the weights of the file, and say how
-reliable probabilities are. A few minutes of one core.
+are sampled and re-tracked, and what re-tracking decides about is compared with who was there: links first; then, in
+other scenes, which joins of online tracks are right, then which links after cutting wrong ones; then which of the
+tracks that come of all these links are people; and, in the other scenes, how likely what is decided so is right. No
+recording is used. With --check it says whether the same comes out now. With --held nothing is written: scenes of other
+seeds score the weights of the file, and say how reliable probabilities are. A few minutes of one core.
 
     .venv/bin/python tools/fit_retrack.py [--check | --held] [--seeds 101 102] [--steps 300]
 
@@ -37,7 +37,7 @@ from mcaptrack.evaluation.metrics import combine, score, summary
 from mcaptrack.geometry.assignment import assign, solve
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES, Sample
-from mcaptrack.transforms.retrack import cut_links, decisions, false_tracks, joins, linking, offline
+from mcaptrack.transforms.retrack import cut_links, decisions, false_tracks, joins, linking, offline, track_features
 from mcaptrack.transforms.retrack.joins import Joins, Tracked, find_joins, tracked_of
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
 from mcaptrack.transforms.retrack.motion_model import Trajectories
@@ -48,6 +48,8 @@ Found = TypeVar("Found")
 #: Who is who at encounters changes neither links nor how likely a track is, and takes longest.
 FITTED = replace(DEFAULT, resolve_swaps=False)
 SEEDS, HELD, STEPS = (101, 102), (201,), 300
+#: Which tracks are people is told in scenes of these seeds, too: a scene has few of them that are doubtful.
+MORE = (103, 104)
 #: Joins are judged in scenes of these seeds and so many steps.
 JUDGED, JUDGED_STEPS = (111, 112, 113), 100
 #: A track is that of a person who is as near, by most of its first or last so many rows.
@@ -180,11 +182,11 @@ def pairs_of(run: Run) -> Pairs:
 
 def people_of(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The features of the tracks of a scene (K, F), the share of each that is a person, and its number of rows."""
-    model, paths, smoothed, step_s = reached("track_log_odds", FITTED, *run.args[1:])
+    model, paths, smoothed, step_s = reached("log_odds_in_log", FITTED, *run.args[1:])
     observed = np.isfinite(paths.xy_m[:, 0])
     count = np.add.reduceat(observed.astype(float), paths.first[:-1])
     own = np.add.reduceat((owners_of(run, paths) >= 0).astype(float), paths.first[:-1])
-    return false_tracks.features(model, paths, smoothed, step_s), own / count, count
+    return track_features.features(model, paths, smoothed, step_s), own / count, count
 
 
 class Judged(NamedTuple):
@@ -260,16 +262,19 @@ def fit_judged(names: tuple[str, ...], parts: Iterable[Judged]) -> dict[str, Any
     return {"weights": named(names, weights[:-1]), "bias": round(float(weights[-1]), 3)}
 
 
-def fit_decisions(scenes: list[Run]) -> dict[str, Any]:
-    """The weights of joins that may be cut, then of links at cuts, then of joins that are made and of tracks."""
+def fit_cuts(scenes: list[Run]) -> dict[str, Any]:
+    """The weights of joins that may be cut, then of links at cuts."""
     cuts = fit_judged(joins.FEATURES, told(cuts_of, scenes, "joins that may be cut"))
     install(joins, "CUTS_", cuts)
     relinks = fit_judged(cut_links.FEATURES, told(relinks_of, scenes, "links at cuts"))
     install(cut_links, "RELINKS_", relinks)
+    return {"cuts": cuts, "relinks": relinks}
+
+
+def fit_decisions(scenes: list[Run]) -> dict[str, Any]:
+    """The weights of joins that are made, and of tracks."""
     of_joins, of_people = zip(*told(decisions_of, scenes, "decisions"), strict=True)
     return {
-        "cuts": cuts,
-        "relinks": relinks,
         "joins": fit_judged(joins.FEATURES, of_joins),
         "decided": fit_judged(("log odds",), of_people),
     }
@@ -298,7 +303,9 @@ def fit_people(parts: list[tuple[np.ndarray, ...]]) -> dict[str, Any]:
     """The weights of tracks."""
     features, share, count = (np.concatenate(members) for members in zip(*parts, strict=True))
     weights = logistic(features, share, count)
-    return {"weights": named(false_tracks.FEATURES, weights[:-1]), "bias": round(float(weights[-1]), 3)}
+    names = track_features.FEATURES
+    found: dict[str, Any] = {"weights": named(names, weights[:-1]), "bias": round(float(weights[-1]), 3)}
+    return found | {"mean": named(names, features.mean(axis=0)), "spread": named(names, features.std(axis=0))}
 
 
 def named(names: tuple[str, ...], weights: np.ndarray) -> dict[str, float]:
@@ -346,25 +353,29 @@ def main() -> None:
     if given.held:
         held(seeds, given.steps)
         return
-    joins._CUTS_BIAS = np.inf  # links and people don't depend on what is cut
+    joins._CUTS_BIAS = np.inf  # links don't depend on what is cut
     scenes = list(runs(seeds, given.steps))
     pairs = list(told(pairs_of, scenes, "links"))
     links = fit_links(pairs)
     install(linking, "", links)
     linking._PRIOR, linking._MIN_LOG_ODDS = links["usual"], links["least"]
-    people = fit_people(list(told(people_of, scenes, "people")))
-    install(false_tracks, "", people)
     others = list(runs(JUDGED, JUDGED_STEPS))
+    cuts = fit_cuts(others)
+    more = [*scenes, *runs(MORE, given.steps)]
+    people = fit_people(list(told(people_of, more, "people")))
+    install(false_tracks, "", people)
+    for name in ("mean", "spread"):
+        setattr(false_tracks, f"_{name.upper()}", np.array(list(people[name].values())))
     judged = fit_decisions(others)
     card = {
         "made_by": f"tools/fit_retrack.py --seeds {' '.join(map(str, seeds))} --steps {given.steps}, "
         f"mcaptrack {__version__}",
-        "data": f"{len(scenes)} synthetic scenes of mcaptrack with faults of trackers, and {len(others)} others for "
+        "data": f"{len(more)} synthetic scenes of mcaptrack with faults of trackers, and {len(others)} others for "
         "joins and decisions; no recordings",
         "licence": "Apache-2.0",
         "links": str(sum(int(one.right.sum()) for one in pairs)),
     }
-    fitted = {"card": card, "links": links, "people": people} | judged
+    fitted = {"card": card, "links": links, "people": people} | cuts | judged
     text = json.dumps(fitted, indent=1) + "\n"
     if given.check:
         print("the same" if WEIGHTS.read_text(encoding="utf-8") == text else text)

@@ -19,7 +19,7 @@ Path = dict[int, Point]
 
 REACH_M_PER_S, NEAR_M, SPEED_M_PER_S = 2.5, 0.3, 0.15
 FITTED = json.loads((files("mcaptrack") / "transforms/retrack/weights.json").read_text())
-LINKS, PEOPLE = FITTED["links"]["weights"], FITTED["people"]["weights"]
+LINKS = FITTED["links"]["weights"]
 LINK_NAMES = ("miss", "misfit", "gap", "misfit or stay", "turn", "distance and speed", "misfit and speed")
 LINK_WEIGHTS = [LINKS[name] for name in LINK_NAMES]
 LINK_BIAS, LINK_USUAL, LINK_LEAST = (FITTED["links"][name] for name in ("bias", "usual", "least"))
@@ -28,7 +28,6 @@ JOIN_NAMES = (*LINK_NAMES, "margin", "alternative", "taken over", "given away", 
 JOIN_NAMES = (*JOIN_NAMES, "log rate", "log elsewhere")
 JOIN_MARGIN, JOIN_BRIEF_S, JOIN_QUESTIONED, JOIN_RATE_SAMPLES = 12.0, 1.0, 0.7, 50
 Cut = tuple[int, int, float]  # the ids of both pieces, and the probability that they belong together
-PERSON_BIAS, BESIDE_M = FITTED["people"]["bias"], 1.2
 MEET_M, MARGIN, EXCHANGE_COST, SAME_ID, LEAST_GAIN = 2.0, 10, 4.0, 1.0, 1.0
 DRIFTS = (0.05, 0.15, 0.4)
 
@@ -358,38 +357,3 @@ def exchanged(motion: Motion, paths: dict[int, Path], ids: dict[int, dict[int, i
                 at = {step: min(step - low, len(course) - 1) for step in paths[mine]}
                 owner[mine] = {s: other if k >= 0 and course[k] else mine for s, k in at.items()}
     return owner
-
-
-# False tracks.
-
-
-def person_log_odds(motion: Motion, paths: dict[int, Path]) -> dict[int, float]:
-    """For each track the log odds that it is a person."""
-    where = {name: motion.smoothed(path) for name, path in paths.items()}
-    out = {}
-    for name, path in paths.items():
-        states = where[name]
-        length, count = len(states), len(path)
-        places = np.array([state.mean[:, 0] for state in states.values()])
-        off = sum(((np.array(at) - states[step].mean[:, 0]) ** 2).sum() for step, at in path.items())
-        speed = sum(hypot(*state.mean[:, 1]) for state in states.values()) / length
-        extent = hypot(*(places.max(axis=0) - places.min(axis=0)))
-        features = {
-            "log length": log(length * motion.step_s),
-            "log count": log(count),
-            "log extent": log(extent + 0.3),
-            "log speed": log(speed + 0.1),
-            "log roughness": log(off / count / (2 * motion.noise_m**2) + 0.1),
-            "observed": count / length,
-            "duplicate": max((beside(states, other) for who, other in where.items() if who != name), default=0.0),
-        }
-        out[name] = sum(PEOPLE[one] * value for one, value in features.items()) + PERSON_BIAS
-    return out
-
-
-def beside(mine: dict[int, State], theirs: dict[int, State]) -> float:
-    """The share of a track's steps beside another track that began well before it and ended well after it."""
-    if not (min(theirs) + 3 < min(mine) and max(theirs) - 3 > max(mine)):
-        return 0.0
-    near = [s for s in mine if s in theirs and hypot(*(mine[s].mean[:, 0] - theirs[s].mean[:, 0])) < BESIDE_M]
-    return len(near) / len(mine)

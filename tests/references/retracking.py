@@ -9,7 +9,8 @@ from itertools import pairwise
 import numpy as np
 
 from tests.references.cut_links import linked
-from tests.references.offline import Motion, cut, exchanged, person_log_odds, sigmoid
+from tests.references.false_tracks import log_odds_in_log
+from tests.references.offline import Motion, cut, exchanged, sigmoid
 
 Point = tuple[float, float]
 Row = dict[str, float]
@@ -141,7 +142,7 @@ def offline(claims: Claims, samples: list[list[Row]], steps: list[int], options,
         if not owner:
             break
     tracks = {track: filled(path, track) for track, path in paths.items()}
-    odds = person_log_odds(motion, places_of(paths))
+    odds = log_odds_in_log(motion, places_of(paths))
     for track in list(tracks):
         if o.smooth:
             for step, state in motion.smoothed(places_of(paths)[track]).items():

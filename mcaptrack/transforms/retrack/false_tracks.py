@@ -10,20 +10,18 @@ from typing import Final
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.neighbours import near_pairs
-from mcaptrack.geometry.ragged import group_index
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
+from mcaptrack.transforms.retrack.track_features import FEATURES, features
 from mcaptrack.transforms.retrack.weights import weights_of
 
-#: A duplicate of a track is nearer to it than this.
-_DUPLICATE_M: Final = 1.2
-#: A track lies inside another if it begins more than so many steps after it and ends as many before it.
-_INSIDE_STEPS: Final = 3
-
-FEATURES: Final = ("log length", "log count", "log extent", "log speed", "log roughness", "observed", "duplicate")
-#: Weight of each feature as a log odds ratio, and the log odds without any.
+#: Weight of each feature as a log odds ratio, and the log odds without any; means and spreads of features.
 _WEIGHTS, _FITTED = weights_of("people", FEATURES)
 _BIAS: Final = float(_FITTED["bias"])
+_MEAN, _SPREAD = (np.array([_FITTED[what][name] for name in FEATURES]) for what in ("mean", "spread"))
+#: How strongly weights stay as they were fitted while they follow a log, and how much each step of a track counts
+#: against that, up to so many steps. (Chosen on synthetic scenes and crowds.)
+_STAYS: Final = 30.0
+_EACH_STEP, _MOST_STEPS = 1 / 8, 20
 #: The same for detections with scores: log odds without any; of the mean score, as a ratio to the usual one, above
 #: ``_LOW``, times the number of rows up to ``_ENOUGH``; of log seconds; of the share that was observed; of log extent.
 SCORED: Final = (-3.1, 0.8, 1.1, 5.1, 1.6)
@@ -41,31 +39,29 @@ def track_log_odds(model: MotionModel, trajectories: Trajectories, smoothed: Sta
     return np.asarray(features(model, trajectories, smoothed, step_s) @ _WEIGHTS + _BIAS)
 
 
-def features(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
-    """The features that distinguish people from false tracks, (K, F): see ``FEATURES``."""
-    first, last = trajectories.first[:-1], trajectories.first[1:] - 1
-    length = last - first + 1
-    observed = np.isfinite(trajectories.xy_m[:, 0])
-    count = np.add.reduceat(observed.astype(float), first)
-    xy = smoothed.mean[:, :2]
-    low, high = np.minimum.reduceat(xy, first), np.maximum.reduceat(xy, first)
-    extent = np.hypot(*(high - low).T)
-    residual = np.where(observed[:, None], trajectories.xy_m - xy, 0.0)
-    roughness = np.add.reduceat((residual**2).sum(axis=1), first) / count / (2 * model.noise_m**2)
-    speed = np.hypot(smoothed.mean[:, 2], smoothed.mean[:, 3])
-    mean_speed = np.add.reduceat(speed, first) / length
-    return np.stack(
-        [
-            np.log(length * step_s),
-            np.log(count),
-            np.log(extent + 0.3),
-            np.log(mean_speed + 0.1),
-            np.log(roughness + 0.1),
-            count / length,
-            _duplicate_share(trajectories, xy),
-        ],
-        axis=1,
-    )
+def log_odds_in_log(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
+    """The log odds that each track is a person, (K,), by weights that follow the log.
+
+    What false tracks are like differs from log to log: somewhere they flicker, elsewhere they stand still for long, as
+    some people do. Tracks that are like one another are people or false together, so the weights move to where few
+    tracks of this log are doubtful: they minimise the entropy of the tracks and the distance from the fitted weights
+    (Grandvalet and Bengio, Semi-supervised learning by entropy minimization, 2005).
+    """
+    from scipy.optimize import minimize
+
+    standard = (features(model, trajectories, smoothed, step_s) - _MEAN) / _SPREAD
+    known = np.column_stack([standard, np.ones(len(standard))])
+    counts = _EACH_STEP * np.minimum(np.diff(trajectories.first), _MOST_STEPS)
+    fitted = np.append(_WEIGHTS * _SPREAD, _BIAS + _WEIGHTS @ _MEAN)
+
+    def loss(weights: Floats) -> tuple[float, Floats]:
+        value, off = known @ weights, weights - fitted
+        likely = probability(value)
+        entropy = np.logaddexp(0, value) - likely * value
+        slope = known.T @ (counts * -value * likely * (1 - likely))
+        return float(counts @ entropy + _STAYS / 2 * (off @ off)), slope + _STAYS * off
+
+    return np.asarray(known @ minimize(loss, fitted, jac=True, method="L-BFGS-B").x)
 
 
 def scored_log_odds(xy_m: Floats, first: Ints, score: Floats, observed: Bools, usual: float, step_s: float) -> Floats:
@@ -88,20 +84,3 @@ def scored_features(xy_m: Floats, first: Ints, score: Floats, observed: Bools, u
     extent = np.hypot(*(np.maximum.reduceat(xy_m, begin) - np.minimum.reduceat(xy_m, begin)).T)
     moved = np.log(np.clip(extent, 0.5, 5.0))
     return np.stack([np.ones(len(begin)), excess, np.log(length * step_s), count / length, moved], axis=1)
-
-
-def _duplicate_share(trajectories: Trajectories, xy: Floats) -> Floats:
-    """The share of each track's rows that are near one other track which began before it and ended after it, (K,)."""
-    begins, ends = trajectories.step[trajectories.first[:-1]], trajectories.step[trajectories.first[1:] - 1]
-    length = np.diff(trajectories.first)
-    track = group_index(length)
-    a, b = (track[side] for side in near_pairs(trajectories.step, xy, _DUPLICATE_M))
-    is_a_short = length[a] <= length[b]
-    short, long = np.where(is_a_short, a, b), np.where(is_a_short, b, a)
-    pair, count = np.unique(short * len(length) + long, return_counts=True)
-    short, long = pair // len(length), pair % len(length)
-    share = count / length[short]
-    is_inside = (begins[long] + _INSIDE_STEPS < begins[short]) & (ends[long] - _INSIDE_STEPS > ends[short])
-    out = np.zeros(len(length))
-    np.maximum.at(out, short, share * is_inside)
-    return out

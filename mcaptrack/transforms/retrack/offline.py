@@ -18,7 +18,7 @@ from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers
 from mcaptrack.transforms.retrack.cut_links import CutTracks, link_pieces
 from mcaptrack.transforms.retrack.decisions import Decided, decision_rows
-from mcaptrack.transforms.retrack.false_tracks import probability, scored_log_odds, track_log_odds
+from mcaptrack.transforms.retrack.false_tracks import log_odds_in_log, probability, scored_log_odds
 from mcaptrack.transforms.retrack.fixed_tracks import fix_tracks
 from mcaptrack.transforms.retrack.identity_swaps import resolve_swaps
 from mcaptrack.transforms.retrack.joins import Tracked, cut_joins
@@ -100,7 +100,7 @@ def offline_tracks(
                 step_s,
             )
         else:
-            odds = track_log_odds(model, trajectories, smoothed, step_s)
+            odds = log_odds_in_log(model, trajectories, smoothed, step_s)
     is_sure = probability(odds) >= options.track_confidence
     is_fixed = np.isin(ids, kept_tracks)
     min_track_s = options.min_track_s * (_CONFIRMED_SHARE if movers.on_ground else 1.0)

@@ -1,0 +1,145 @@
+"""The features that tell people from false tracks: how long, where and how regularly a track was seen.
+
+Much of it is known only from the other tracks of the log: whether a track never leaves the side of another, and whether
+it is missed for longer than others are.
+
+Letters: K tracks, N rows of trajectories, F features, G gaps, P pairs of rows.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Floats
+from mcaptrack.geometry.neighbours import near_pairs
+from mcaptrack.geometry.ragged import group_index, run_starts
+from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
+
+#: The features of a track: logarithms of its seconds, samples, extent, mean speed and mean squared residual; the share
+#: of its steps with a sample; the share of its rows near a track that began before and ended after; the share of its
+#: samples beside one longer track, and how constantly it was at the same side of that one; and how rare its gaps are.
+FEATURES: Final = (
+    "log length",
+    "log count",
+    "log extent",
+    "log speed",
+    "log roughness",
+    "observed",
+    "duplicate",
+    "beside",
+    "in step",
+    "rare gaps",
+)
+#: A duplicate of a track is nearer to it than this.
+_DUPLICATE_M: Final = 1.2
+#: A track lies inside another if it begins more than so many steps after it and ends as many before it.
+_INSIDE_STEPS: Final = 3
+#: A track is beside a longer one where it is nearer to it than this, if at so many samples.
+_BESIDE_M: Final = 1.8
+_BESIDE_SAMPLES: Final = 4
+#: Two tracks are in step if their distance varies by less than this factor of the noise of both.
+_IN_STEP: Final = 2.0
+_LEAST_SPREAD: Final = 0.05
+#: Gaps are compared with those of tracks that go farther than this: what goes somewhere is a person.
+_GOES_M: Final = 3.0
+
+
+def features(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
+    """The features that distinguish people from false tracks, (K, F): see ``FEATURES``."""
+    first, last = trajectories.first[:-1], trajectories.first[1:] - 1
+    length = last - first + 1
+    observed = np.isfinite(trajectories.xy_m[:, 0])
+    count = np.add.reduceat(observed.astype(float), first)
+    xy = smoothed.mean[:, :2]
+    low, high = np.minimum.reduceat(xy, first), np.maximum.reduceat(xy, first)
+    extent = np.hypot(*(high - low).T)
+    residual = np.where(observed[:, None], trajectories.xy_m - xy, 0.0)
+    roughness = np.add.reduceat((residual**2).sum(axis=1), first) / count / (2 * model.noise_m**2)
+    speed = np.hypot(smoothed.mean[:, 2], smoothed.mean[:, 3])
+    mean_speed = np.add.reduceat(speed, first) / length
+    return np.column_stack(
+        [
+            np.log(length * step_s),
+            np.log(count),
+            np.log(extent + 0.3),
+            np.log(mean_speed + 0.1),
+            np.log(roughness + 0.1),
+            count / length,
+            _duplicate_share(trajectories, xy),
+            *_beside(trajectories, xy, model.noise_m),
+            _rare_gaps(trajectories, extent > _GOES_M),
+        ]
+    )
+
+
+def _duplicate_share(trajectories: Trajectories, xy: Floats) -> Floats:
+    """The share of each track's rows that are near one other track which began before it and ended after it, (K,)."""
+    begins, ends = trajectories.step[trajectories.first[:-1]], trajectories.step[trajectories.first[1:] - 1]
+    length = np.diff(trajectories.first)
+    track = group_index(length)
+    a, b = (track[side] for side in near_pairs(trajectories.step, xy, _DUPLICATE_M))
+    is_a_short = length[a] <= length[b]
+    short, long = np.where(is_a_short, a, b), np.where(is_a_short, b, a)
+    pair, count = np.unique(short * len(length) + long, return_counts=True)
+    short, long = pair // len(length), pair % len(length)
+    share = count / length[short]
+    is_inside = (begins[long] + _INSIDE_STEPS < begins[short]) & (ends[long] - _INSIDE_STEPS > ends[short])
+    out = np.zeros(len(length))
+    np.maximum.at(out, short, share * is_inside)
+    return out
+
+
+def _beside(trajectories: Trajectories, xy: Floats, noise_m: float) -> tuple[Floats, Floats]:
+    """The share of each track's samples beside the companion that it is most in step with, (K,); and that times how
+    much steadier the distance of their samples is than ``_IN_STEP``, as a logarithm, (K,).
+
+    A companion has more samples, or as many and is the first of the two. People who walk together are measured one by
+    one, so their distance varies by the noise of both; two detections of one person share what is wrong with them.
+    """
+    seen = np.flatnonzero(np.isfinite(trajectories.xy_m[:, 0]))
+    track = group_index(np.diff(trajectories.first))
+    count = np.bincount(track[seen], minlength=len(trajectories.first) - 1)
+    pair = np.stack(near_pairs(trajectories.step[seen], xy[seen], _BESIDE_M))
+    own, other = seen[np.concatenate([pair, pair[::-1]], axis=1)]
+    a, b = track[own], track[other]
+    is_longer = (count[b] > count[a]) | ((count[b] == count[a]) & (b < a))
+    own, other, a, b = own[is_longer], other[is_longer], a[is_longer], b[is_longer]
+    order = np.lexsort((trajectories.step[own], b, a))
+    own, other, a, b = own[order], other[order], a[order], b[order]
+    starts = np.flatnonzero(run_starts(a, b))
+    together = np.diff(np.append(starts, len(a)))
+    share, in_step = np.zeros((2, len(count)))
+    if len(starts) == 0:
+        return share, in_step
+    apart = trajectories.xy_m[own] - trajectories.xy_m[other]
+    mean = np.add.reduceat(apart, starts) / together[:, None]
+    off = ((apart - np.repeat(mean, together, axis=0)) ** 2).sum(axis=1)
+    varies = np.sqrt(np.add.reduceat(off, starts) / np.maximum(2 * (together - 1), 1) / 2) / noise_m
+    track = a[starts]
+    shares = together / count[track]
+    steady = shares * np.maximum(np.log(_IN_STEP) - np.log(varies + _LEAST_SPREAD), 0)
+    often = together >= _BESIDE_SAMPLES
+    order = np.lexsort((shares, steady, track))[::-1]
+    order = order[often[order]]
+    best = order[run_starts(track[order])]
+    share[track[best]], in_step[track[best]] = shares[best], steady[best]
+    return share, in_step
+
+
+def _rare_gaps(trajectories: Trajectories, goes: Floats) -> Floats:
+    """The rarity of the gaps of each track, (K,): the mean of the negative logarithms of the shares of gaps that are
+    as long, among those of the other tracks that go somewhere; 0 without gaps.
+    """
+    seen = np.flatnonzero(np.isfinite(trajectories.xy_m[:, 0]))
+    track = group_index(np.diff(trajectories.first))[seen]
+    missed = np.diff(trajectories.step[seen]) - 1
+    is_gap = (np.diff(track) == 0) & (missed > 0)
+    missed, track = missed[is_gap], track[1:][is_gap]
+    usual = np.sort(missed[goes[track]])
+    own = goes[track]  # a gap isn't compared with itself
+    as_long = len(usual) - np.searchsorted(usual, missed) - own
+    rare = -np.log((as_long + 1) / (len(usual) - own + 2))
+    total, count = (np.bincount(track, weights, minlength=len(goes)) for weights in (rare, None))
+    return np.asarray(total / np.maximum(count, 1))
