@@ -16,7 +16,7 @@ from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, ev
 from mcaptrack.evaluation.forecasts import score_forecasts
 from mcaptrack.evaluation.metrics.calibration import RELIABILITY_LEVELS, ellipse_levels, negative_log_likelihood
 from mcaptrack.foxglove.views.people import ellipses, forecasts
-from mcaptrack.geometry.mixtures import Tails, mass_within, normal_tails, squared_radius
+from mcaptrack.geometry.mixtures import Tails, half_radius, mass_within, normal_tails, squared_radius
 from mcaptrack.predictors import Forecast
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.cdr import CdrCodec, fields_of, read_definition, ros_definition
@@ -47,6 +47,12 @@ def test_levels_and_radii_are_monotone_and_inverse(weight, narrow, wide):
         assert mass_within(np.array([radius]), shape).item() == pytest.approx(level, abs=1e-12)
     assert mass_within(np.zeros(1), shape).item() == 0
     assert mass_within(np.array([1e9]), shape).item() == pytest.approx(1)
+
+
+@given(WEIGHTS, st.floats(-4, 0), st.floats(0, 4), st.floats(0.01, 0.995))
+def test_radii_in_few_operations_are_those_of_halvings(weight, narrow, wide, level):
+    shape = tails(weight, 10**narrow, 10**wide)
+    assert 2 * half_radius(np.array([level]), shape).item() == pytest.approx(squared_radius(level, shape).item(), 1e-6)
 
 
 @pytest.mark.parametrize("level", RELIABILITY_LEVELS)

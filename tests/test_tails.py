@@ -124,7 +124,7 @@ class TestFollowing:
 
     def test_errors_are_no_smaller_than_positions_are_known(self):
         tiny = [np.full(1000, 1e-4)] * 3
-        assert self.followed(tiny, least=0.2).narrow_scale.tolist() == pytest.approx([0.2] * 3)
+        assert self.followed(tiny, least=0.2).narrow_scale.tolist() == pytest.approx([0.2] * 3, rel=0.01)
         assert (self.followed(tiny).narrow_scale < 0.01).all()
 
 

@@ -16,6 +16,8 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 
 #: Halvings of the interval in which a quantile lies: to the precision of 64-bit numbers.
 _HALVINGS: Final = 60
+#: Steps of Newton's method for quantiles: after these they are exact to a millionth.
+_NEWTON_STEPS: Final = 8
 
 
 class Tails(NamedTuple):
@@ -108,6 +110,27 @@ def squared_radius(level: float, tails: Tails) -> Floats:
         is_short = mass_within(middle, known) < level
         low, high = np.where(is_short, middle, low), np.where(is_short, high, middle)
     return np.asarray((low + high) / 2)
+
+
+def half_radius(level: Floats, tails: Tails) -> Floats:
+    """Half of ``squared_radius`` (...) in fewer operations, for mixtures with a narrow scale below the wide one.
+
+    By Newton's method on the logarithm of the probability beyond, which is convex.
+
+    Examples
+    --------
+    >>> one = Tails(np.array([0.2]), np.array([0.5]), np.array([4.0]))
+    >>> 2 * half_radius(np.array([0.95]), one).round(6) == squared_radius(0.95, one).round(6)
+    array([ True])
+    """
+    weight, narrow, wide = tails
+    wanted = np.log1p(-level)
+    half = np.zeros(np.broadcast(wanted, weight).shape)
+    for _ in range(_NEWTON_STEPS):
+        one, two = (1 - weight) * np.exp(-half / narrow), weight * np.exp(-half / wide)
+        beyond = one + two
+        half = half + (np.log(beyond) - wanted) * beyond / (one / narrow + two / wide)
+    return np.asarray(half)
 
 
 def log_density(squared: Floats, log_area: Floats, tails: Tails) -> Floats:

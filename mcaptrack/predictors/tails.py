@@ -6,7 +6,8 @@ and merged tracks, switched ids), before and after re-tracking: ``tools/fit_tail
 read they follow it, because people and trackers differ: forecasts of a time that has come are compared with where their
 tracks were observed then, and scale the distributions of the forecasts after them (compare adaptive conformal
 inference: I. Gibbs and E. Candes, NeurIPS 2021; here the scales are shrunk towards the table, so that few comparisons
-change little). Nothing is known that was not known at the time of a forecast.
+change little). What ellipses have held in the log so far corrects them (``held_levels``), and the noise of positions is
+taken out of the comparisons (``position_noise``). Nothing is known that was not known at the time of a forecast.
 
 The means of forecasts, and the covariances by which tracks are associated, are those of the predictor.
 
@@ -28,6 +29,8 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.mixtures import Tails, mahalanobis_squared, squared_radius
 from mcaptrack.notices import warn
 from mcaptrack.predictors.forecast import Forecast, Predictor
+from mcaptrack.predictors.held_levels import HeldLevels
+from mcaptrack.predictors.position_noise import PositionNoise
 
 TABLES: Final = Path(__file__).parent / "trained" / "tails.json"
 #: Edges and centres of bins of half the squared Mahalanobis distance, in which comparisons are counted.
@@ -47,17 +50,12 @@ _LARGE: Final = 20.0
 #: This share of the forecasts of tracks that are no longer observed is taken to have large errors, as in the table:
 #: people who turn or stop are lost more often than others.
 _LOST: Final = 0.005
-#: Errors are no smaller than this share of the variance that noise adds to measured positions, nor than this share of
-#: that noise with a memory of up to ``_NOISE_LAGS[1]`` steps, which trackers make of it by smoothing.
-_LEAST_WHITE, _LEAST_SLOW = 0.3, 0.5
-#: Noise is estimated from the bends of tracks over one step and over several.
-_NOISE_LAGS: Final = (1, 3)
+#: Errors of measured positions are no smaller than this share of the least ones of true positions.
+_LEAST_MEASURED: Final = 0.1
 #: Warn of ellipses that became so many times as large as those of the table, after so many independent comparisons.
 _LARGER, _ENOUGH = 1.8, 100.0
 #: Limits of the weight of the wide part.
 _LEAST_WIDE, _MOST_WIDE = 0.02, 0.6
-#: Noise is estimated again after so many steps, from the positions of so many of the last, if there are so many.
-_NOISE_EVERY, _NOISE_STEPS, _LEAST_POSITIONS = 3, 40, 10
 
 
 class TailTable(NamedTuple):
@@ -123,14 +121,20 @@ class Learned(NamedTuple):
     """The errors of forecasts in a log so far, for T steps ahead.
 
     ``counts`` (T, B) are independent comparisons by half the squared distance, ``lost`` (T,) independent forecasts of
-    tracks that were not observed then. ``noise`` and ``least`` (T,) are in units of the predictor's covariance: the
-    part of the distances that is noise of measured positions, and the least size of errors.
+    tracks that were not observed then. ``noise`` and ``least`` (T,) are in units of the predictor's covariance: what
+    is added to the size of errors by comparing with measured positions, and their least size.
     """
 
     counts: Floats
     lost: Floats
     noise: Floats
     least: Floats
+
+    def measured(self, tails: Tails) -> Tails:
+        """The distributions (T,) of distances from measured positions, of those from true ones."""
+        least = np.maximum(_LEAST_MEASURED * self.least, 1e-6)
+        narrow, wide = (np.maximum(part + self.noise, least) for part in (tails.narrow_scale, tails.wide_scale))
+        return Tails(tails.wide_weight, narrow, wide)
 
 
 def follow(table: Tails, before: Tails, learned: Learned) -> Tails:
@@ -141,14 +145,13 @@ def follow(table: Tails, before: Tails, learned: Learned) -> Tails:
     counts.
     """
     noise = learned.noise
-    narrow, wide = (before.narrow_scale + noise)[:, None], (before.wide_scale + noise)[:, None]
-    weight = before.wide_weight[:, None]
+    weight, narrow, wide = (part[:, None] for part in learned.measured(before))
     one = (1 - weight) / narrow * np.exp(-_CENTRES / narrow)
     two = weight / wide * np.exp(-_CENTRES / wide)
     of_wide = learned.counts * two / np.maximum(one + two, 1e-300)
     sums = np.stack([learned.counts.sum(axis=1) - of_wide.sum(axis=1), of_wide.sum(axis=1)])  # narrow, wide
     total = np.stack([(learned.counts - of_wide) @ _CENTRES, of_wide @ _CENTRES])
-    size = np.maximum(total / np.maximum(sums, 1e-9) - noise, np.maximum(_LEAST_WHITE * noise, 1e-4))
+    size = np.maximum(total / np.maximum(sums, 1e-9) - noise, np.maximum(learned.least, 1e-4))
     given = np.stack([table.narrow_scale, table.wide_scale])
     change = np.where(sums > 1e-6, np.log(size / given), 0.0)
     trust, lost = np.array([[1.0], [_LARGE]]), _LOST * learned.lost
@@ -166,12 +169,13 @@ def follow(table: Tails, before: Tails, learned: Learned) -> Tails:
 
 
 class _Made(NamedTuple):
-    """Forecasts of one time that wait for theirs."""
+    """Forecasts of one time that wait for theirs; ``tails`` (T,) are before the correction by levels."""
 
     step: int
     ids: Ints
     mean: Floats
     cov: Floats
+    tails: Tails
 
 
 class TailCalibration:
@@ -192,13 +196,13 @@ class TailCalibration:
         ahead_s: Floats = self._step_s * np.arange(1.0, self._steps + 1)
         self._table, self._adapts = table.at(ahead_s), adapts
         self._given = Tails(self._table.wide_weight, self._table.narrow_scale, self._table.wide_scale)
-        self._tails = self._given
+        self._fitted = self._tails = self._given
         self._counts = np.zeros((self._steps, len(_CENTRES)))
         self._lost, self._seen, self._inverse = (np.zeros(self._steps) for _ in range(3))
         self._made: deque[_Made] = deque(maxlen=self._steps)
-        self._bends_m2: dict[int, deque[Floats]] = {lag: deque(maxlen=_NOISE_STEPS) for lag in _NOISE_LAGS}
-        self._noise_m2 = dict.fromkeys(_NOISE_LAGS, 0.0)
-        self._fitted_at = self._noise_at = 0
+        self._noise, self._levels = PositionNoise(self._step_s), HeldLevels(self._steps)
+        self._learned = self._learned_so_far()
+        self._fitted_at = 0
 
     @classmethod
     def of(cls, name: str, predictor: Predictor, adapts: bool = True) -> TailCalibration | None:
@@ -252,7 +256,7 @@ class TailCalibration:
         factor = np.where(is_coasting[:, None], self._table.coasting, factor)
         cov = forecast.cov * factor[:, :, None, None]
         if self._adapts:
-            self._made.append(_Made(step, ids.copy(), forecast.mean.copy(), cov))  # not parts of larger arrays
+            self._made.append(_Made(step, ids.copy(), forecast.mean.copy(), cov, self._fitted))  # not parts of arrays
         weight, narrow, wide = self._tails
         whole = (1 - weight) * narrow + weight * wide
         parts = (np.broadcast_to(part, factor.shape) for part in (weight, narrow / whole, wide / whole))
@@ -260,7 +264,7 @@ class TailCalibration:
 
     def _learn(self, step: int, ids: Ints, past: Floats) -> None:
         """Compare earlier forecasts with the tracks that are observed now, and follow what they say."""
-        self._see_bends(step, past)
+        self._noise.see(step, past)
         due = [(one, step - one.step - 1) for one in self._made if 0 < step - one.step <= self._steps]
         if not due or not len(ids):
             return
@@ -269,47 +273,46 @@ class TailCalibration:
         ahead = np.repeat([k for _, k in due], [len(one.ids) for one, _ in due])
         mean = np.concatenate([one.mean[:, k] for one, k in due])
         cov = np.concatenate([one.cov[:, k] for one, k in due])
+        tails = Tails(*np.array([[part[k] for part in one.tails] for one, k in due]).T)
         at = order[np.minimum(np.searchsorted(ids, of, sorter=order), len(ids) - 1)]
         seen = ids[at] == of
         if not seen.any():
             return
-        self._add(ahead[~seen], ahead[seen], past[at[seen], -1] - mean[seen], cov[seen])
+        which = np.repeat(np.arange(len(due)), [len(one.ids) for one, _ in due])[seen]
+        self._add(ahead[~seen], ahead[seen], past[at[seen], -1] - mean[seen], cov[seen], tails.chosen(which))
         passed_s = (step - self._fitted_at) * self._step_s
         if passed_s < _REFIT_S - self._step_s / 2:
             return
         kept = np.exp(-passed_s / _MEMORY_S)
         for part in (self._counts, self._lost, self._inverse, self._seen):
             np.multiply(part, kept, out=part)
-        inverse = self._inverse / np.maximum(self._seen, 1e-9)
-        white, slow = (inverse * self._noise_m2[lag] for lag in _NOISE_LAGS)
-        independent = _INDEPENDENT_PER_S * self._step_s
-        counts, lost = independent * self._counts, independent * self._lost
-        self._tails = follow(self._given, self._tails, Learned(counts, lost, white, _LEAST_SLOW * slow))
+        self._learned, before = self._learned_so_far(), self._fitted
+        self._fitted = follow(self._given, before, self._learned)
+        # levels of ellipses that were much smaller or larger say little about those of now
+        change = np.abs(np.log(self._fitted.narrow_scale / before.narrow_scale))
+        self._levels.forget(kept * np.exp(-change))
+        corrected = self._levels.correct(self._fitted, _INDEPENDENT_PER_S * self._step_s)
+        narrow = np.maximum(corrected.narrow_scale, self._learned.least)
+        self._tails = Tails(corrected.wide_weight, narrow, np.maximum(corrected.wide_scale, narrow))
         self._fitted_at = step
 
-    def _add(self, lost: Ints, ahead: Ints, off: Floats, cov: Floats) -> None:
-        """Count errors (M, 2) so many steps ahead (M,), and the steps of forecasts that can't be compared."""
+    def _learned_so_far(self) -> Learned:
+        inverse = self._inverse / np.maximum(self._seen, 1e-9)
+        independent, noise = _INDEPENDENT_PER_S * self._step_s, self._noise.of_errors(self._steps)
+        return Learned(
+            independent * self._counts, independent * self._lost, inverse * noise.added, inverse * noise.least
+        )
+
+    def _add(self, lost: Ints, ahead: Ints, off: Floats, cov: Floats, tails: Tails) -> None:
+        """Count errors (M, 2) so many steps ahead (M,) of forecasts with ``tails`` (M,), and the steps of others."""
         with np.errstate(invalid="ignore", divide="ignore"):
             half = mahalanobis_squared(off, cov) / 2
             size = np.sqrt(cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] ** 2)
         good = np.isfinite(half)
         ahead, half, size = ahead[good], half[good], size[good]
+        added, least = self._learned.noise[ahead], self._learned.least[ahead]
+        self._levels.add(ahead, half, Learned(half, half, added, least).measured(tails.chosen(good)))
         self._counts += counts_of(ahead, half, self._steps)
         self._lost += np.bincount(lost, minlength=self._steps)
         self._seen += np.bincount(ahead, minlength=self._steps)
         self._inverse += np.bincount(ahead, 1 / size, minlength=self._steps)
-
-    def _see_bends(self, step: int, past: Floats) -> None:
-        """Estimate the noise of measured positions, which true ones don't have, now and then."""
-        for lag, kept in self._bends_m2.items():
-            if past.shape[1] > 2 * lag and len(past):
-                bend = past[:, -1] - 2 * past[:, -1 - lag] + past[:, -1 - 2 * lag]
-                kept.append((bend**2).sum(axis=1))
-        if step - self._noise_at < _NOISE_EVERY:
-            return
-        self._noise_at = step
-        for lag, kept in self._bends_m2.items():
-            bends_m2 = np.concatenate(kept) if kept else np.empty(0)
-            bends_m2 = bends_m2[np.isfinite(bends_m2)]
-            if len(bends_m2) >= _LEAST_POSITIONS:  # bends have six times the variance of white noise, in two axes
-                self._noise_m2[lag] = float(np.median(bends_m2)) / (12 * np.log(2))

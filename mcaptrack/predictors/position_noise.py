@@ -1,0 +1,87 @@
+"""The noise of measured positions in a log, as far as tracks show it: white noise, and noise that lasts.
+
+A detector's box may be off for a second or two, and a tracker smooths boxes: positions then have errors that are alike
+from step to step. Such noise hides in a track. A forecast starts with it, so that near forecasts agree better with
+the track than with the truth; far ones agree worse. What shows are the bends of tracks, second differences over one,
+two and three steps. White noise bends a track alike over any time, people bend it much more over longer times, and
+lasting noise is between them. So the three are told apart by how bends grow, as variances of clocks are (Allan).
+How long noise lasts can't be seen beside the motion of people; it is taken to be about a second.
+
+Letters: N tracks, L past positions, T future steps.
+
+References
+----------
+D. W. Allan, "Statistics of atomic frequency standards", Proceedings of the IEEE 54, 1966.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.optimize import nnls
+
+from mcaptrack.geometry.arrays import Floats
+
+#: Steps over which bends are seen.
+_LAGS: Final = (1, 2, 3)
+#: The time constant of lasting noise, and the power of the time with which the variance of bends by motion grows.
+_LASTS_S, _MOTION = 1.2, 3.4
+#: Noise is estimated again after so many steps, from the positions of so many of the last, if there are so many.
+_EVERY, _STEPS, _LEAST_POSITIONS = 3, 40, 10
+#: Errors of forecasts are no smaller than these shares of the variance of white and of lasting noise.
+_LEAST_WHITE, _LEAST_LASTING = 0.3, 0.7
+
+
+class NoiseOfErrors(NamedTuple):
+    """The effect of noise on the errors of forecasts, (T,) in m^2 for each axis.
+
+    ``added`` is how much larger the variance of errors is if forecasts are compared with measured positions instead of
+    true ones; it is negative where both have the same noise. ``least`` is the least variance of errors.
+    """
+
+    added: Floats
+    least: Floats
+
+
+class PositionNoise:
+    """Estimates the noise of the positions of tracks, in the order of time; steps have ``step_s`` seconds."""
+
+    def __init__(self, step_s: float) -> None:
+        self._step_s = step_s
+        like = np.exp(-step_s * np.array(_LAGS) / _LASTS_S)
+        lasting = 1 - 4 / 3 * like + like**2 / 3
+        # bends have six times the variance of white noise
+        self._shapes = np.stack([np.ones(len(_LAGS)), lasting, np.array(_LAGS, np.float64) ** _MOTION], axis=-1)
+        self._bends_m2: dict[int, deque[Floats]] = {lag: deque(maxlen=_STEPS) for lag in _LAGS}
+        self._variances_m2 = np.zeros(len(_LAGS))
+        self._seen_at = 0
+        self.white_m2 = self.lasting_m2 = 0.0
+
+    def see(self, step: int, past: Floats) -> None:
+        """Take the past positions (N, L, 2) of the tracks that are observed at a step, the current ones last."""
+        for lag, kept in self._bends_m2.items():
+            if past.shape[1] > 2 * lag and len(past):
+                bend = past[:, -1] - 2 * past[:, -1 - lag] + past[:, -1 - 2 * lag]
+                kept.append((bend**2).sum(axis=1))
+        if step - self._seen_at < _EVERY:
+            return
+        self._seen_at = step
+        for place, kept in enumerate(self._bends_m2.values()):
+            bends_m2 = np.concatenate(kept) if kept else np.empty(0)
+            bends_m2 = bends_m2[np.isfinite(bends_m2)]
+            if len(bends_m2) >= _LEAST_POSITIONS:  # of two axes; the median, because some tracks turn or are exchanged
+                self._variances_m2[place] = float(np.median(bends_m2)) / (12 * np.log(2))
+        seen = self._variances_m2 > 0
+        if seen.any():
+            given = self._variances_m2[seen]
+            parts, _ = nnls(self._shapes[seen] / given[:, None], np.ones(len(given)))
+            self.white_m2, self.lasting_m2 = float(parts[0]), float(parts[1])
+
+    def of_errors(self, steps: int) -> NoiseOfErrors:
+        """The effect of noise on the errors of forecasts of so many steps."""
+        like = np.exp(-self._step_s * np.arange(1.0, steps + 1) / _LASTS_S)
+        added = self.white_m2 + self.lasting_m2 * (1 - 2 * like)
+        least = _LEAST_WHITE * self.white_m2 + _LEAST_LASTING * self.lasting_m2
+        return NoiseOfErrors(added, np.full(steps, least))
