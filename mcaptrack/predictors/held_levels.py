@@ -56,13 +56,13 @@ class HeldLevels:
         """
         share = self._shares(independent)
         below = np.concatenate([np.zeros((len(share), 1)), np.cumsum(share, axis=1)], axis=1)
-        scales = []
-        for level in (_MIDDLE, _OUTER):
-            at = np.minimum((below <= level).sum(axis=1) - 1, _BINS - 1)[:, None]
-            inside = (level - np.take_along_axis(below, at, 1)) / np.take_along_axis(share, at, 1)
-            held = np.clip((at + inside)[:, 0] / _BINS, _LOWEST, _HIGHEST)
-            scales.append(half_radius(held, tails) / half_radius(np.full(len(held), level), tails))
-        narrow, wide = tails.narrow_scale * scales[0], tails.wide_scale * np.maximum(np.maximum(*scales), 1.0)
+        level = np.array([[_MIDDLE], [_OUTER]])
+        at = np.minimum((below <= level[..., None]).sum(axis=2) - 1, _BINS - 1)
+        step = np.arange(len(share))
+        held = np.clip((at + (level - below[step, at]) / share[step, at]) / _BINS, _LOWEST, _HIGHEST)
+        now, wanted = half_radius(np.stack([held, np.broadcast_to(level, held.shape)]), tails)
+        middle, outer = now / wanted
+        narrow, wide = tails.narrow_scale * middle, tails.wide_scale * np.maximum(np.maximum(middle, outer), 1.0)
         return Tails(tails.wide_weight, narrow, np.maximum(wide, narrow))
 
     def _shares(self, independent: float) -> Floats:

@@ -28,8 +28,8 @@ from mcaptrack.geometry.arrays import Floats
 _LAGS: Final = (1, 2, 3)
 #: The time constant of lasting noise, and the power of the time with which the variance of bends by motion grows.
 _LASTS_S, _MOTION = 1.2, 3.4
-#: Noise is estimated again after so many steps, from the positions of so many of the last, if there are so many.
-_EVERY, _STEPS, _LEAST_POSITIONS = 3, 40, 10
+#: Noise is estimated again after so many steps, from so many times as many, if there are so many positions.
+_EVERY, _KEPT, _LEAST_POSITIONS = 3, 13, 10
 #: Errors of forecasts are no smaller than these shares of the variance of white and of lasting noise.
 _LEAST_WHITE, _LEAST_LASTING = 0.3, 0.7
 
@@ -54,25 +54,30 @@ class PositionNoise:
         lasting = 1 - 4 / 3 * like + like**2 / 3
         # bends have six times the variance of white noise
         self._shapes = np.stack([np.ones(len(_LAGS)), lasting, np.array(_LAGS, np.float64) ** _MOTION], axis=-1)
-        self._bends_m2: dict[int, deque[Floats]] = {lag: deque(maxlen=_STEPS) for lag in _LAGS}
+        self._bends_m2: deque[Floats] = deque(maxlen=_KEPT)
+        self._waiting: list[Floats] = []
         self._variances_m2 = np.zeros(len(_LAGS))
         self._seen_at = 0
         self.white_m2 = self.lasting_m2 = 0.0
 
     def see(self, step: int, past: Floats) -> None:
         """Take the past positions (N, L, 2) of the tracks that are observed at a step, the current ones last."""
-        for lag, kept in self._bends_m2.items():
-            if past.shape[1] > 2 * lag and len(past):
-                bend = past[:, -1] - 2 * past[:, -1 - lag] + past[:, -1 - 2 * lag]
-                kept.append((bend**2).sum(axis=1))
+        if len(past):
+            self._waiting.append(past[:, -1 - 2 * _LAGS[-1] :])
         if step - self._seen_at < _EVERY:
             return
         self._seen_at = step
-        for place, kept in enumerate(self._bends_m2.values()):
-            bends_m2 = np.concatenate(kept) if kept else np.empty(0)
-            bends_m2 = bends_m2[np.isfinite(bends_m2)]
-            if len(bends_m2) >= _LEAST_POSITIONS:  # of two axes; the median, because some tracks turn or are exchanged
-                self._variances_m2[place] = float(np.median(bends_m2)) / (12 * np.log(2))
+        if self._waiting:
+            self._bends_m2.append(_bends_m2(np.concatenate(self._waiting)))
+            self._waiting.clear()
+            self._estimate()
+
+    def _estimate(self) -> None:
+        """Estimate the noise from the bends of the last steps."""
+        for place, bends_m2 in enumerate(np.concatenate(self._bends_m2).T):
+            known = bends_m2[np.isfinite(bends_m2)]
+            if len(known) >= _LEAST_POSITIONS:  # of two axes; the median, because some tracks turn or are exchanged
+                self._variances_m2[place] = float(np.median(known)) / (12 * np.log(2))
         seen = self._variances_m2 > 0
         if seen.any():
             given = self._variances_m2[seen]
@@ -85,3 +90,10 @@ class PositionNoise:
         added = self.white_m2 + self.lasting_m2 * (1 - 2 * like)
         least = _LEAST_WHITE * self.white_m2 + _LEAST_LASTING * self.lasting_m2
         return NoiseOfErrors(added, np.full(steps, least))
+
+
+def _bends_m2(past: Floats) -> Floats:
+    """The squared bends of pasts (N, L, 2) over each of the lags, in m^2; (N, lags) for as many as the pasts allow."""
+    lags = np.array([lag for lag in _LAGS if past.shape[1] > 2 * lag], np.int64)
+    bends = past[:, -1:] - 2 * past[:, -1 - lags] + past[:, -1 - 2 * lags]
+    return np.asarray((bends**2).sum(axis=2))

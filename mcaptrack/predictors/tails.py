@@ -178,6 +178,14 @@ class _Made(NamedTuple):
     tails: Tails
 
 
+class _Due(NamedTuple):
+    """Forecasts of a time that has come, and their steps; which of their tracks are seen, and where these are now."""
+
+    forecasts: list[tuple[_Made, int]]
+    seen: Bools
+    now: Floats
+
+
 class TailCalibration:
     """Makes mixtures of the forecasts of one log, in the order of time.
 
@@ -200,6 +208,7 @@ class TailCalibration:
         self._counts = np.zeros((self._steps, len(_CENTRES)))
         self._lost, self._seen, self._inverse = (np.zeros(self._steps) for _ in range(3))
         self._made: deque[_Made] = deque(maxlen=self._steps)
+        self._due: list[_Due] = []
         self._noise, self._levels = PositionNoise(self._step_s), HeldLevels(self._steps)
         self._learned = self._learned_so_far()
         self._fitted_at = 0
@@ -263,26 +272,22 @@ class TailCalibration:
         return Forecast(forecast.mean, cov * whole[:, None, None]), Tails(*parts)
 
     def _learn(self, step: int, ids: Ints, past: Floats) -> None:
-        """Compare earlier forecasts with the tracks that are observed now, and follow what they say."""
+        """Compare earlier forecasts with the tracks that are observed now, and follow what they say, now and then."""
         self._noise.see(step, past)
         due = [(one, step - one.step - 1) for one in self._made if 0 < step - one.step <= self._steps]
         if not due or not len(ids):
             return
         order = np.argsort(ids, kind="stable")
         of = np.concatenate([one.ids for one, _ in due])
-        ahead = np.repeat([k for _, k in due], [len(one.ids) for one, _ in due])
-        mean = np.concatenate([one.mean[:, k] for one, k in due])
-        cov = np.concatenate([one.cov[:, k] for one, k in due])
-        tails = Tails(*np.array([[part[k] for part in one.tails] for one, k in due]).T)
         at = order[np.minimum(np.searchsorted(ids, of, sorter=order), len(ids) - 1)]
         seen = ids[at] == of
         if not seen.any():
             return
-        which = np.repeat(np.arange(len(due)), [len(one.ids) for one, _ in due])[seen]
-        self._add(ahead[~seen], ahead[seen], past[at[seen], -1] - mean[seen], cov[seen], tails.chosen(which))
+        self._due.append(_Due(due, seen, past[at[seen], -1]))
         passed_s = (step - self._fitted_at) * self._step_s
         if passed_s < _REFIT_S - self._step_s / 2:
             return
+        self._compare()
         kept = np.exp(-passed_s / _MEMORY_S)
         for part in (self._counts, self._lost, self._inverse, self._seen):
             np.multiply(part, kept, out=part)
@@ -303,16 +308,25 @@ class TailCalibration:
             independent * self._counts, independent * self._lost, inverse * noise.added, inverse * noise.least
         )
 
-    def _add(self, lost: Ints, ahead: Ints, off: Floats, cov: Floats, tails: Tails) -> None:
-        """Count errors (M, 2) so many steps ahead (M,) of forecasts with ``tails`` (M,), and the steps of others."""
+    def _compare(self) -> None:
+        """Count the errors of the forecasts that were due since the last time, M of them seen, and those not seen."""
+        due = [one for part in self._due for one in part.forecasts]
+        seen = np.concatenate([part.seen for part in self._due])
+        size = [len(one.ids) for one, _ in due]
+        ahead, which = np.repeat([k for _, k in due], size), np.repeat(np.arange(len(due)), size)[seen]
+        self._lost += np.bincount(ahead[~seen], minlength=self._steps)
+        mean = np.concatenate([one.mean[:, k] for one, k in due])[seen]
+        cov = np.concatenate([one.cov[:, k] for one, k in due])[seen]
+        ahead, off = ahead[seen], np.concatenate([part.now for part in self._due]) - mean
         with np.errstate(invalid="ignore", divide="ignore"):
             half = mahalanobis_squared(off, cov) / 2
-            size = np.sqrt(cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] ** 2)
+            size_m2 = np.sqrt(cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] ** 2)
         good = np.isfinite(half)
-        ahead, half, size = ahead[good], half[good], size[good]
-        added, least = self._learned.noise[ahead], self._learned.least[ahead]
-        self._levels.add(ahead, half, Learned(half, half, added, least).measured(tails.chosen(good)))
+        ahead, half, which = ahead[good], half[good], which[good]
+        tails = Tails(*np.array([one.tails for one, _ in due])[which, :, ahead].T)
+        learned = self._learned._replace(noise=self._learned.noise[ahead], least=self._learned.least[ahead])
+        self._levels.add(ahead, half, learned.measured(tails))
         self._counts += counts_of(ahead, half, self._steps)
-        self._lost += np.bincount(lost, minlength=self._steps)
         self._seen += np.bincount(ahead, minlength=self._steps)
-        self._inverse += np.bincount(ahead, 1 / size, minlength=self._steps)
+        self._inverse += np.bincount(ahead, 1 / size_m2[good], minlength=self._steps)
+        self._due.clear()
