@@ -89,6 +89,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "confirm_s": 1.2,
         "coast_s": 1.2,
         "adapt": True,
+        "appearance": True,
     },
     "consistency": RETRACKING
     | {

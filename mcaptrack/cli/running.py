@@ -233,6 +233,12 @@ def _lines_of_summary(summary: Summary) -> Iterator[tuple[str, str]]:
         words = ", ".join(f"{getattr(summary.repair, name):,} {word}" for name, word in done)
         count = summary.repair.tracks
         yield "re-tracked", f"{count:,} {'track' if count == 1 else 'tracks'}: {words}"
+    if summary.appearance is not None:
+        looks, share = summary.appearance, f"{summary.appearance.separation:.0%}"
+        over = f"{looks.tracks:,} {'track' if looks.tracks == 1 else 'tracks'}"
+        words = f"compared: two people differ more than one does in {share} of cases ({over})"
+        no = f"not compared: two people differ more than one does in only {share} of cases ({over})"
+        yield "colours", words if looks.used else no
     if summary.scores is not None:
         (was, now), (before, after) = summary.scores.idf1, summary.scores.switches
         words = f"IDF1 {was:.1%} before re-tracking, {now:.1%} after; identity switches {before:,}, then {after:,}"

@@ -15,6 +15,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes, scene_planes
 from mcaptrack.notices import Notice, collected, warn
+from mcaptrack.pipeline.appearance import with_descriptors
 from mcaptrack.pipeline.checks import Job, check_inputs, read_named_frames, superseded
 from mcaptrack.pipeline.context import in_context
 from mcaptrack.pipeline.corrections import corrected_input, fixed_in
@@ -138,7 +139,7 @@ def _run(
             warn_memory(given.frames)
         try:
             with part(job.stage):
-                made |= _run_job(opened, prefix, job, given, made, planes or (), before)
+                made |= _run_job(opened, prefix, job, given, made, planes or (), before, progress)
         except McaptrackError as error:
             if not job.is_optional:
                 raise
@@ -228,10 +229,12 @@ def _run_job(
     made: Mapping[str, Made],
     planes: Planes,
     before: Before | None,
+    progress: Progress,
 ) -> dict[str, Made]:
     """Run a job, and return its channels by topic. ``made`` are the channels of earlier jobs."""
     known = side_inputs(opened, prefix, job, made)
     given, corrections = given.corrected(opened, prefix, job)
+    shown = given.frames
     path, motion = path_with(opened, prefix, job.source, made) if job.transform.reads is TRACKS else (None, {})
     if path is not None:  # boxes of pictures that the camera moved between can't be joined as they are
         given, planes = given.in_scene(path), scene_planes(planes, path)
@@ -245,6 +248,7 @@ def _run_job(
     fixed = fixed_in(opened, prefix, job.source, made) if hasattr(context, "fixed_ids") else ()
     transform = replace(context, **known.values, **({"fixed_ids": fixed} if fixed else {}))
     transform = before.in_context(transform) if before and lead else transform
+    transform = with_descriptors(transform, opened, prefix, shown, progress)
     collectors = [FrameCollector(schema) for schema in transform.writes.values()]
     taken = [0]
     try:
@@ -392,5 +396,5 @@ def input_of(
     frames, names, _ = read_named_frames(opened, topic, transform.reads)
     classes = {str(number): name for number, name in names.items()}
     known = in_context(opened, prefix, job, frames, read_planes(opened, prefix) or (), classes)
-    known = replace(known, **side_inputs(opened, prefix, job, {}).values)
+    known = with_descriptors(replace(known, **side_inputs(opened, prefix, job, {}).values), opened, prefix, frames)
     return frames, {f.name: getattr(known, f.name) for f in fields(known) if f.metadata.get("context")}

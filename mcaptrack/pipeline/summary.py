@@ -22,7 +22,7 @@ from mcaptrack.schema.camera_motion import rows_to_verdict
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameColumns
 from mcaptrack.schema.framing import has_any, joined_parts, row_ends, unique_values
-from mcaptrack.schema.provenance import frame_id_of
+from mcaptrack.schema.provenance import Provenance, frame_id_of
 from mcaptrack.sources.camera_motion import motion_topic, read_ground_truth
 from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.sources.corrections import corrections_of
@@ -62,6 +62,18 @@ class Corrected:
 
 
 @dataclass(frozen=True)
+class Looks:
+    """The colours of clothes in re-tracking: whether they were used, and how well they tell people apart.
+
+    ``separation`` is the probability that two people differ more than one does after a gap, as measured on ``tracks``.
+    """
+
+    used: bool
+    separation: float
+    tracks: int
+
+
+@dataclass(frozen=True)
 class Summary:
     """Counts and scores for one camera; None for channels that the log lacks.
 
@@ -82,6 +94,7 @@ class Summary:
     camera_motion: str | None = None
     corrected: Corrected | None = None
     frame_id: str | None = None
+    appearance: Looks | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Convert the summary to JSON values."""
@@ -125,7 +138,17 @@ def summarise(opened: log.Log, prefix: str, boxes_read: BoxesRead | None = None)
         camera_motion=None if motion is None else rows_to_verdict(motion).name.lower(),
         corrected=corrected,
         frame_id=_frame_id(opened, tracks),
+        appearance=_appearance(provenance_of(opened, retracks)),
     )
+
+
+def _appearance(made: Provenance | None) -> Looks | None:
+    """Return what re-tracking found of the appearance of people; None if it didn't look."""
+    facts = made.model if made else {}
+    try:
+        return Looks(facts["appearance"] == "used", float(facts["separation"]), int(facts["tracks"]))
+    except (KeyError, ValueError):
+        return None
 
 
 def _frame_id(opened: log.Log, tracks: str) -> str | None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES, Retrack, RetrackByConsistency
+from tests.clothes import BLUE, RED, two_who_turn_back
 from tests.effects import (
     Case,
     Outputs,
@@ -102,6 +103,13 @@ def off_the_path(outputs: Outputs) -> float:
     return float(np.hypot(*np.array(off).T).mean())
 
 
+def turned_back(outputs: Outputs) -> int:
+    """The number of tracks that have input ids 1 and 11, or 2 and 12."""
+    rows = [row for frame in outputs[0] for row in frame.rows[["track_id", "source_id"]].tolist()]
+    pairs = set(rows)
+    return sum((one, source + 10) in pairs for one, source in pairs if source in (1, 2))
+
+
 CIRCLES = turning(0.8, 15.0)
 LIKELY = replace(PROFILES["default"], link_s=0.0, resolve_swaps=False, smooth=False, track_confidence=0.0)
 PAPER = PROFILES["paper"]
@@ -131,6 +139,14 @@ case(
     line(0.5, 40, 40),
     spread_of_last,
     {True: "least", False: "more"},
+)
+case(
+    "appearance",
+    "two people in red and blue walk towards each other, are hidden, and turn back: by their motion they have passed",
+    Retrack(descriptors=two_who_turn_back(RED, BLUE)[1]),
+    list(two_who_turn_back(RED, BLUE)[0]),
+    turned_back,
+    {True: 2, False: 0},
 )
 case("horizon_s", "2.5 steps a second", LIKELY, line(0.5, 20, 20), forecast_steps, {0.4: 1, 2.0: 5, 4.8: 12})
 case(

@@ -17,6 +17,8 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.ragged import run_ends, run_starts
 from mcaptrack.transforms.retrack import linking
+from mcaptrack.transforms.retrack.appearance import Evidence
+from mcaptrack.transforms.retrack.appearance_calibration import MOST
 from mcaptrack.transforms.retrack.joins import Cuts
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
 from mcaptrack.transforms.retrack.weights import weights_of
@@ -81,7 +83,8 @@ class CutTracks(NamedTuple):
 
 class CandidateLinks(NamedTuple):
     """Candidate links (E,): from the end of one track to the beginning of another, and the seconds between them;
-    whether one of them was cut there; their log odds as a link without cuts; the features (E, F) of one at a cut.
+    whether one of them was cut there; their log odds as a link without cuts; the features (E, F) of one at a cut; and
+    the log likelihood ratio of what is known of both beside their motion.
     """
 
     ends: Ints
@@ -90,6 +93,7 @@ class CandidateLinks(NamedTuple):
     at_cut: Bools
     log_odds: Floats
     features: Floats
+    evidence: Floats
 
 
 def find_candidates(
@@ -100,16 +104,24 @@ def find_candidates(
     step_s: float,
     max_gap_s: float,
     pieces: CutTracks,
+    evidence: Evidence | None = None,
 ) -> CandidateLinks:
-    """The links that may be made: those with a chance as without cuts, and at cuts those of one track or input id."""
+    """The links that may be made: those with a chance as without cuts, and at cuts those of one track or input id.
+
+    ``evidence`` is what else tells whether both sides are one person.
+    """
     i, j, gap_s = linking.candidates(trajectories, forward, backward, step_s, max_gap_s)
     first, last = trajectories.first[:-1], trajectories.first[1:] - 1
     found = linking.features(model, forward.take(last[i]), backward.take(first[j]), gap_s)
-    log_odds = linking.log_odds(found)
     cut_before, cut_after = np.isfinite(pieces.odds_after[i]), np.isfinite(pieces.odds_before[j])
     same_track, same_id = pieces.went_on[i] == j, pieces.last_source[i] == pieces.first_source[j]
-    may_be = linking.has_chance(log_odds) | same_track
-    may_be |= same_id & (cut_before | cut_after) & (gap_s < _SAME_ID_S)
+    is_known = same_track | (same_id & (cut_before | cut_after) & (gap_s < _SAME_ID_S))
+    log_odds, beside = linking.log_odds(found), np.zeros(len(i))
+    if evidence is not None:
+        near = np.flatnonzero(is_known | linking.has_chance(log_odds + MOST))
+        beside[near] = evidence(i[near], j[near])
+        log_odds = log_odds + beside
+    may_be = linking.has_chance(log_odds) | is_known
     extra = (
         same_track,
         np.where(same_track, pieces.odds_after[i], 0.0),
@@ -124,7 +136,7 @@ def find_candidates(
         gap_s < _SHORT_S,
     )
     features = np.column_stack([found, *extra]).astype(np.float64)
-    all_of = CandidateLinks(i, j, gap_s, cut_before | cut_after, log_odds, features)
+    all_of = CandidateLinks(i, j, gap_s, cut_before | cut_after, log_odds, features, beside)
     return CandidateLinks(*(values[may_be] for values in all_of))
 
 
@@ -137,14 +149,15 @@ def link_pieces(
     max_gap_s: float,
     min_confidence: float,
     pieces: CutTracks,
+    evidence: Evidence | None = None,
 ) -> Ints:
     """For each of the tracks after cutting the one that continues it, or -1; (K,)."""
     count = len(trajectories.first) - 1
     continued_by = np.full(count, -1)
-    found = find_candidates(model, trajectories, forward, backward, step_s, max_gap_s, pieces)
+    found = find_candidates(model, trajectories, forward, backward, step_s, max_gap_s, pieces, evidence)
     if len(found.ends) == 0:
         return continued_by
-    at_cut = found.features @ _RELINKS_WEIGHTS + _RELINKS_BIAS
+    at_cut = found.features @ _RELINKS_WEIGHTS + _RELINKS_BIAS + found.evidence
     log_odds = np.where(found.at_cut, at_cut, found.log_odds)
     shift = 0.0
     made = np.empty(0, np.int64)

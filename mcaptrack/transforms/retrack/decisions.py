@@ -19,8 +19,9 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.ragged import run_ends, run_starts
 from mcaptrack.schema import DECISIONS, DecisionKind, Rows
+from mcaptrack.transforms.retrack.appearance import Appearance
 from mcaptrack.transforms.retrack.false_tracks import probability
-from mcaptrack.transforms.retrack.joins import FEATURES, Joins, Tracked, find_joins
+from mcaptrack.transforms.retrack.joins import FEATURES, Joins, Tracked, find_joins, with_appearance
 from mcaptrack.transforms.retrack.motion_model import MotionModel
 from mcaptrack.transforms.retrack.samples import LogSamples
 from mcaptrack.transforms.retrack.weights import weights_of
@@ -37,13 +38,15 @@ class Decided(NamedTuple):
     """All tracks of a log as they were decided, those that were left out included.
 
     ``sample`` (C,) is the sample of each assignment. ``log_odds`` (K,) that tracks are people, of the test of false
-    tracks, and which were ``kept`` (K,), are ordered by id.
+    tracks, and which were ``kept`` (K,), are ordered by id. ``appearance`` is that of the assignments, None where it
+    isn't used.
     """
 
     tracked: Tracked
     sample: Ints
     log_odds: Floats
     kept: Bools
+    appearance: Appearance | None = None
 
 
 def decision_rows(
@@ -86,7 +89,8 @@ def _joined(decided: Decided, joins: Joins, step_s: float) -> tuple[Ints, Rows]:
     rows = DECISIONS.empty(len(joins.after))
     rows["kind"], rows["track_id"] = DecisionKind.JOINED, track[joins.after]
     rows["previous_id"], rows["source_id"] = source[joins.before], source[joins.after]
-    rows["probability"] = join_probability(joins.features)
+    by_motion = join_probability(joins.features)
+    rows["probability"] = with_appearance(by_motion, joins, decided.tracked, decided.appearance, step_s)
     rows["alternative_id"] = np.where(joins.alternative >= 0, source[joins.alternative], _NO_ID)
     rows["duration_s"] = (step[joins.after] - step[joins.before]) * step_s
     return joins.after, rows

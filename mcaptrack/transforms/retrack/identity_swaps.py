@@ -18,6 +18,7 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.neighbours import near_pairs
 from mcaptrack.geometry.ragged import group_index, run_ends, run_starts
+from mcaptrack.transforms.retrack.appearance import Sides
 from mcaptrack.transforms.retrack.motion_model import MotionModel, Trajectories
 
 #: Drifts of a relative velocity within a second, in m/s: the most likely of these is taken for each encounter.
@@ -42,23 +43,25 @@ def resolve_swaps(
     source: Ints,
     step_s: float,
     examined: Bools | None = None,
+    seen: Sides | None = None,
 ) -> tuple[Ints, int]:
     """The track that each row of the trajectories belongs to (N,), and the number of encounters that were changed.
 
     ``row`` are the rows with an observation, and ``source`` the input id of each. An encounter is left for the next
     call if one of its tracks was changed in this one. Only encounters of ``examined`` tracks (K,) are looked at, by
-    default all.
+    default all. ``seen`` compares what the tracks look like before and after an encounter.
     """
     count = len(trajectories.first) - 1
     track = group_index(np.diff(trajectories.first))
     input_id = np.full(len(track), -1)
     input_id[row] = source
-    i, j, low, high = find_encounters(trajectories)
+    i, j, low, high, meet, part_ways = find_encounters(trajectories)
     if len(i) == 0:
         return track, 0
     if examined is not None:
         touched = examined[i] | examined[j]
-        i, j, low, high = i[touched], j[touched], low[touched], high[touched]
+        i, j, low, high, meet, part_ways = (of[touched] for of in (i, j, low, high, meet, part_ways))
+    looks_swapped = np.zeros(len(i)) if seen is None else seen.of_swaps(i, j, meet, part_ways)
     begin = trajectories.first[:-1] - trajectories.step[trajectories.first[:-1]]
     swapped: dict[int, Bools] = {}
     gain = np.zeros(len(i))
@@ -70,7 +73,8 @@ def resolve_swaps(
         relative = np.where(inside[..., None], trajectories.xy_m[row_i] - trajectories.xy_m[row_j], np.nan)
         id_i, id_j = np.where(inside, input_id[row_i], -1), np.where(inside, input_id[row_j], -1)
         cost = _SWAP_COST + _SAME_ID_COST * _continuity(id_i, id_j)
-        found, gain[part] = find_swaps(relative, cost, step_s, model.noise_m, model.speed_m_per_s)
+        noise = model.noise_m, model.speed_m_per_s
+        found, gain[part] = find_swaps(relative, cost, step_s, *noise, looks_swapped[part])
         swapped |= {one: found[row].copy() for row, one in enumerate(part.tolist()) if gain[one] >= _MIN_GAIN}
     owner, used, changed = track.copy(), np.zeros(count, bool), 0
     for encounter in np.argsort(-gain, kind="stable").tolist():
@@ -101,8 +105,10 @@ def _batches(length: Ints) -> Iterator[Ints]:
         first = last
 
 
-def find_encounters(trajectories: Trajectories) -> tuple[Ints, Ints, Ints, Ints]:
-    """Pairs of tracks that come near each other, and the first and last step of each encounter, (C,) each."""
+def find_encounters(trajectories: Trajectories) -> tuple[Ints, Ints, Ints, Ints, Ints, Ints]:
+    """Pairs of tracks that come near each other, the first and last step of each encounter, and those at which both
+    are near, (C,) each.
+    """
     first = trajectories.first
     count = len(first) - 1
     track = group_index(np.diff(first))
@@ -119,7 +125,7 @@ def find_encounters(trajectories: Trajectories) -> tuple[Ints, Ints, Ints, Ints]
     track_begins, track_ends = trajectories.step[first[:-1]], trajectories.step[first[1:] - 1]
     low = np.maximum(when[begin] - _MARGIN, np.maximum(track_begins[i], track_begins[j]))
     high = np.minimum(when[end] + _MARGIN, np.minimum(track_ends[i], track_ends[j]))
-    return i, j, low, high
+    return i, j, low, high, when[begin], when[end]
 
 
 def _continuity(id_i: Ints, id_j: Ints) -> Floats:
@@ -136,15 +142,23 @@ def _continuity(id_i: Ints, id_j: Ints) -> Floats:
 
 
 def find_swaps(
-    relative_m: Floats, swap_cost: Floats, step_s: float, noise_m: float, speed_m_per_s: float
+    relative_m: Floats,
+    swap_cost: Floats,
+    step_s: float,
+    noise_m: float,
+    speed_m_per_s: float,
+    looks_swapped: Floats | None = None,
 ) -> tuple[Bools, Floats]:
     """At which steps of encounters the identities are swapped, (C, T), and how much more likely that is than no swap.
 
     ``relative_m`` (C, T, 2) is the position of one track relative to the other, NaN where one of them was not observed.
     ``swap_cost`` (C, T) is the cost of a swap between a step and the one before, as a log likelihood. The identities of
-    the first step stand. The gain (C,) is a difference of log likelihoods.
+    the first step stand. ``looks_swapped`` (C,) is the log likelihood ratio that they are swapped at the last step, by
+    other evidence. The gain (C,) is a difference of log likelihoods.
     """
-    models = (_viterbi(relative_m, swap_cost, step_s, noise_m, speed_m_per_s, drift**2) for drift in DRIFTS_M_PER_S)
+    swapped = np.zeros(len(relative_m)) if looks_swapped is None else looks_swapped
+    given = relative_m, swap_cost, step_s, noise_m, speed_m_per_s, swapped
+    models = (_viterbi(*given, drift**2) for drift in DRIFTS_M_PER_S)
     best, best_gain, evidence = next(models)
     for path, gain, total in models:
         better = total > evidence
@@ -155,7 +169,13 @@ def find_swaps(
 
 
 def _viterbi(
-    relative_m: Floats, swap_cost: Floats, step_s: float, noise_m: float, speed_m_per_s: float, power: float
+    relative_m: Floats,
+    swap_cost: Floats,
+    step_s: float,
+    noise_m: float,
+    speed_m_per_s: float,
+    looks_swapped: Floats,
+    power: float,
 ) -> tuple[Bools, Floats, Floats]:
     """Swaps (C, T), their gain (C,) and log likelihood (C,) for one drift of the relative velocity."""
     count, steps = relative_m.shape[:2]
@@ -200,6 +220,7 @@ def _viterbi(
         mean[..., 2:] += gain_rate[..., None] * off
         cov = np.stack([p * (1 - gain), c * (1 - gain), v - gain_rate * c], axis=-1)
         started |= observed
+    total[:, 1] += looks_swapped
     path = np.zeros((count, steps), bool)
     now = total[:, 1] > total[:, 0]
     for step in range(steps - 1, -1, -1):

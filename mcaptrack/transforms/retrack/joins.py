@@ -17,6 +17,7 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
 from mcaptrack.transforms.retrack import linking
+from mcaptrack.transforms.retrack.appearance import Appearance
 from mcaptrack.transforms.retrack.false_tracks import probability
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, smooth, to_trajectories
 from mcaptrack.transforms.retrack.weights import weights_of
@@ -83,18 +84,27 @@ class Cuts(NamedTuple):
 
 
 def cut_joins(
-    model: MotionModel, step: Ints, track: Ints, source: Ints, xy_m: Floats, step_s: float, min_confidence: float
+    model: MotionModel,
+    step: Ints,
+    track: Ints,
+    source: Ints,
+    xy_m: Floats,
+    step_s: float,
+    min_confidence: float,
+    appearance: Appearance | None = None,
 ) -> tuple[Ints, Cuts]:
     """The track of each assignment (C,) after tracks are cut at questionable joins, and where they are cut.
 
     Those are joins that are right with a smaller probability than ``_QUESTIONED`` or ``min_confidence``. What comes
-    after a cut is a track of its own, for linking to decide about, with an id above all others.
+    after a cut is a track of its own, for linking to decide about, with an id above all others. The probability at cuts
+    is that by motion alone: linking looks at ``appearance``, too.
     """
     order = np.lexsort((step, track))
     tracked = tracked_of(model, step[order], track[order], source[order], xy_m[order], step_s)
     joins = find_joins(tracked, model, step_s)
     is_right = cut_probability(joins.features)
-    questioned = is_right < max(_QUESTIONED, min_confidence)
+    seen = None if appearance is None else appearance.take(order)
+    questioned = with_appearance(is_right, joins, tracked, seen, step_s) < max(_QUESTIONED, min_confidence)
     begins = np.zeros(len(track), bool)
     begins[joins.after[questioned]] = True
     piece = np.maximum.accumulate(np.where(begins | run_starts(tracked.track), np.arange(len(track)), 0))
@@ -102,6 +112,19 @@ def cut_joins(
     out = np.empty_like(track)
     out[order] = name
     return out, Cuts(name[joins.before[questioned]], name[joins.after[questioned]], is_right[questioned])
+
+
+def with_appearance(
+    is_right: Floats, joins: Joins, tracked: Tracked, appearance: Appearance | None, step_s: float
+) -> Floats:
+    """The probability that joins are right (J,), from that by motion and from what tracks look like."""
+    if appearance is None:
+        return is_right
+    _, part = np.unique(np.stack([tracked.track, tracked.source]), axis=1, return_inverse=True)
+    sides = appearance.between(tracked.step, part.ravel(), step_s)
+    odds = is_right / np.maximum(1 - is_right, np.finfo(float).tiny)
+    odds = odds * np.exp(sides.of_assignments(joins.before, joins.after))
+    return np.asarray(odds / (1 + odds))
 
 
 def tracked_of(model: MotionModel, step: Ints, track: Ints, source: Ints, xy_m: Floats, step_s: float) -> Tracked:

@@ -16,6 +16,7 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.assignment import Pairs, assign_by_gain, assign_pairs_by_gain
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
+from mcaptrack.transforms.retrack.appearance import Evidence
 from mcaptrack.transforms.retrack.false_tracks import probability
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
 from mcaptrack.transforms.retrack.weights import weights_of
@@ -45,12 +46,14 @@ def link_tracks(
     max_gap_s: float,
     min_confidence: float,
     max_misfit: tuple[float, float] = (np.inf, 0.0),
+    evidence: Evidence | None = None,
 ) -> Ints:
     """For each track the one that continues it, or -1; (K,).
 
     A link is made if it is right with a probability of at least ``min_confidence``. How many links are right at all
     differs from log to log: hardly any where gaps are short and people who disappear have left, most where they are
-    occluded for long. That share is estimated from the links themselves (expectation maximisation).
+    occluded for long. That share is estimated from the links themselves (expectation maximisation). ``evidence`` is
+    what else tells whether both sides are one person.
     """
     first, last = trajectories.first[:-1], trajectories.first[1:] - 1
     continued_by = np.full(len(first), -1)
@@ -61,6 +64,8 @@ def link_tracks(
     if len(i) == 0:
         return continued_by
     gain = log_odds(features(model, forward.take(last[i]), backward.take(first[j]), gap_s))
+    if evidence is not None:
+        gain = gain + evidence(i, j)
     made = best_links(i, j, gain, len(first))
     shift = prior_shift(gain[made])
     made = made[gain[made] + shift > np.log(min_confidence / (1 - min_confidence))]

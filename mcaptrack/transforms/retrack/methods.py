@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import repeat
 from types import MappingProxyType
@@ -12,6 +12,8 @@ from mcaptrack.predictors import warn_if_weak
 from mcaptrack.schema import DECISIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns, collect
 from mcaptrack.transforms.forecasts import Forecaster
+from mcaptrack.transforms.protocol import ModelCard
+from mcaptrack.transforms.retrack.appearance_calibration import AppearanceCalibration
 from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.by_class import Movers, join_classes, movers_of, split_classes, usual_score
 from mcaptrack.transforms.retrack.consistency import ConsistencyPass
@@ -77,7 +79,15 @@ class Retrack(LikelihoodOptions):
     """
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        return _retrack(self, LikelihoodPass, frames)
+        seen: list[AppearanceCalibration] = []
+        yield from _retrack(self, LikelihoodPass, frames, seen)
+        object.__setattr__(self, "_seen", seen)
+
+    def model_card(self) -> ModelCard:
+        """Whether appearance told tracks apart in the last run, of the class that was seen most; empty without."""
+        seen: Sequence[AppearanceCalibration] = getattr(self, "_seen", ())
+        most = max(seen, key=lambda one: one.tracks, default=None)
+        return ModelCard() if most is None else ModelCard(facts=most.facts())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,10 +112,13 @@ Retracking: TypeAlias = Retrack | RetrackByConsistency
 
 
 def _retrack(
-    options: Options, new_pass: Callable[[Options, Movers], OnlinePass], frames: Iterable[Frame]
+    options: Options,
+    new_pass: Callable[[Options, Movers], OnlinePass],
+    frames: Iterable[Frame],
+    seen: list[AppearanceCalibration] | None = None,
 ) -> Iterator[tuple[Frame, ...]]:
     """For each frame the offline tracks, the online tracks and their predictions, and decisions if the method writes
-    them; each class by itself.
+    them; each class by itself. How appearance tells tracks apart is added to ``seen``, for each class.
     """
     warn_if_weak(options.predictor)
     if options.leaves_unchanged:
@@ -114,10 +127,17 @@ def _retrack(
     frames = collect(TRACKS, frames)
     parts = [frames] if options.across_classes else split_classes(frames)
     score = usual_score(frames)
+    calibrations = [] if seen is None else seen
+
+    def passes(part: FrameColumns) -> tuple[OnlinePass | KeptIds, Offline]:
+        run, offline = _passes(options, new_pass, part, score)
+        calibrations.extend([] if offline.calibration is None else [offline.calibration])
+        return run, offline
+
     if len(parts) == 1:
-        yield from _frame_by_frame(options, frames, *_passes(options, new_pass, frames, score))
+        yield from _frame_by_frame(options, frames, *passes(frames))
     else:
-        yield from join_classes([_whole(options, part, *_passes(options, new_pass, part, score)) for part in parts])
+        yield from join_classes([_whole(options, part, *passes(part)) for part in parts])
 
 
 def _keep_ids(options: RetrackOptions, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:

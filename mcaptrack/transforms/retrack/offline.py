@@ -14,6 +14,8 @@ import numpy as np
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.ragged import group_index
 from mcaptrack.schema import DECISIONS, Rows
+from mcaptrack.transforms.retrack.appearance import Appearance
+from mcaptrack.transforms.retrack.appearance_calibration import AppearanceCalibration
 from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers
 from mcaptrack.transforms.retrack.cut_links import CutTracks, link_pieces
@@ -37,10 +39,13 @@ _ROUNDS: Final = 3
 
 
 class Offline(NamedTuple):
-    """The rows of all tracks at each step, ordered by id; and the decisions at each step, if they were asked for."""
+    """The rows of all tracks at each step, ordered by id; the decisions at each step, if they were asked for; and how
+    appearance tells people apart, None if nothing was seen of them.
+    """
 
     tracks: Iterator[Rows]
     decisions: Iterator[Rows]
+    calibration: AppearanceCalibration | None
 
 
 def offline_tracks(
@@ -64,14 +69,17 @@ def offline_tracks(
         step, track, source, sample = step[kept], track[kept], source[kept], sample[kept]
     xy = np.stack([samples.column(name)[sample] for name in ("x_m", "y_m")], axis=-1) / movers.unit_m
     step_s = 1 / options.rate_hz
+    seen_ns = times_ns[np.searchsorted(steps, step)]
+    seen = Appearance.of(options.looks, seen_ns, step, source, xy, step_s)
+    appearance = seen if seen and seen.calibration.tells_apart else None
     if options.link_s > 0 and len(track):
         pieces: CutTracks | None = None
         if not movers.on_ground:
-            track, cuts = cut_joins(model, step, track, source, xy, step_s, options.link_confidence)
+            track, cuts = cut_joins(model, step, track, source, xy, step_s, options.link_confidence, appearance)
             pieces = CutTracks.of(step, track, source, cuts)
-        track = _linked(options, model, step, track, xy, step_s, movers, pieces)
+        track = _linked(options, model, step, track, xy, step_s, movers, pieces, appearance)
     if options.resolve_swaps and len(track) and not movers.on_ground:
-        track = _without_swaps(model, step, track, source, xy, step_s)
+        track = _without_swaps(model, step, track, source, xy, step_s, appearance)
     track = fix_tracks(step, track, source, options.fixed_ids)
     kept_tracks = np.unique(track[np.isin(source, np.array(options.fixed_ids, np.int64))])
     order = np.lexsort((step, track))
@@ -110,18 +118,29 @@ def offline_tracks(
     decisions: Iterator[Rows] = repeat(DECISIONS.empty(), len(steps))
     if is_decided and states is not None:
         tracked = Tracked(step, track, source, *states)
-        decided = Decided(tracked, sample, np.where(is_fixed, np.inf, odds), keeps)
+        looks = None if appearance is None else appearance.take(order)
+        decided = Decided(tracked, sample, np.where(is_fixed, np.inf, odds), keeps, looks)
         decisions = decision_rows(decided, model, samples, steps, step_s)
-    return Offline(rows_by_step(rows.take(left), samples, moved and moved.take(left), steps), decisions)
+    made = rows_by_step(rows.take(left), samples, moved and moved.take(left), steps)
+    return Offline(made, decisions, seen and seen.calibration)
 
 
-def _without_swaps(model: MotionModel, step: Ints, track: Ints, source: Ints, xy: Floats, step_s: float) -> Ints:
+def _without_swaps(
+    model: MotionModel,
+    step: Ints,
+    track: Ints,
+    source: Ints,
+    xy: Floats,
+    step_s: float,
+    appearance: Appearance | None = None,
+) -> Ints:
     """The track of each assignment (C,) after deciding again which track is which where two of them met."""
     examined: Ints | None = None  # tracks that were changed: the encounters of all others stay as they are
     for _ in range(_ROUNDS):
         ids, row, trajectories = to_trajectories(step, track, xy, model.noise_m)
         which = None if examined is None else np.isin(ids, examined)
-        owner, changed = resolve_swaps(model, trajectories, row, source, step_s, which)
+        seen = None if appearance is None else appearance.between(step, track, step_s)
+        owner, changed = resolve_swaps(model, trajectories, row, source, step_s, which, seen)
         track = ids[owner[row]]
         if not changed:
             break
@@ -139,15 +158,17 @@ def _linked(
     step_s: float,
     movers: Movers,
     pieces: CutTracks | None,
+    appearance: Appearance | None = None,
 ) -> Ints:
     """The track of each assignment (C,) after linking tracks of the same person."""
     ids, _, trajectories = to_trajectories(step, track, xy, model.noise_m)
     forward, backward, _ = smooth(model, trajectories, step_s)
     limits = options.link_s / movers.unit_m, options.link_confidence
+    seen = None if appearance is None else appearance.between(step, track, step_s).of_tracks
     if pieces is None:
-        continued_by = link_tracks(model, trajectories, forward, backward, step_s, *limits, MAX_MISFIT)
+        continued_by = link_tracks(model, trajectories, forward, backward, step_s, *limits, MAX_MISFIT, seen)
     else:
-        continued_by = link_pieces(model, trajectories, forward, backward, step_s, *limits, pieces)
+        continued_by = link_pieces(model, trajectories, forward, backward, step_s, *limits, pieces, seen)
     root = np.arange(len(ids))
     order = np.argsort(trajectories.step[trajectories.first[:-1]], kind="stable")  # a continuation begins later
     for one in order[continued_by[order] >= 0].tolist():

@@ -17,6 +17,7 @@ from mcaptrack.transforms.durations import longest_track_s
 from mcaptrack.transforms.forecasts import ADAPT_HELP
 from mcaptrack.transforms.motion_limits import LIMITS_HELP, LIMITS_PATTERN, ClassNames, read_limits
 from mcaptrack.transforms.protocol import check_options, context, option
+from mcaptrack.transforms.retrack.appearance import Descriptors
 from mcaptrack.transforms.retrack.distances import Covariance, Distance
 
 # Headings of the options in the help.
@@ -170,6 +171,11 @@ class RetrackOptions:
         """Whether a sample that was assigned to two tracks stays with both."""
         return False
 
+    @property
+    def looks(self) -> Descriptors | None:
+        """The descriptors of the samples, where these are compared."""
+        return None
+
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
         """Why no rows came of frames, for a warning."""
         longest_s = longest_track_s(given)
@@ -223,6 +229,17 @@ class LikelihoodOptions(RetrackOptions):
         theme=_LIFE,
     )
     adapt: bool = option(True, ADAPT_HELP, theme=_PREDICTIONS)
+    appearance: bool = option(
+        True,
+        "compare the colours of what people wear before and after gaps and encounters, where the log has pictures and "
+        "these tell people apart",
+        theme=_OFFLINE,
+    )
+    descriptors: Descriptors | None = context(lambda: None, is_recorded=False)
+
+    @property
+    def looks(self) -> Descriptors | None:
+        return self.descriptors if self.appearance else None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,221 @@
+"""The colours of clothes in re-tracking: histograms, how a log calibrates them, and what they decide."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.colour_histograms import LENGTH, at_border, describe, is_clear
+from mcaptrack.notices import collected
+from mcaptrack.pipeline.appearance import _nearest, with_descriptors
+from mcaptrack.pipeline.summary import summarise
+from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.sources.cameras import provenance_of
+from mcaptrack.sources.pictures import Pictures
+from mcaptrack.transforms import Retrack, RetrackByConsistency, Sample
+from mcaptrack.transforms.retrack.appearance import Descriptors
+from tests.clothes import BLUE, RED, UNTIL_S, two_who_turn_back
+
+
+def identities(transform: Retrack, frames) -> set[frozenset[int]]:
+    """The input ids of each re-tracked track."""
+    found: dict[int, set[int]] = {}
+    for offline, *_ in transform(frames):
+        for track, source in zip(offline.rows["track_id"].tolist(), offline.rows["source_id"].tolist(), strict=True):
+            found.setdefault(track, set()).update([source] if source >= 0 else [])
+    return {frozenset(ids) for ids in found.values()}
+
+
+PASSED, TURNED = {frozenset({1, 12}), frozenset({2, 11})}, {frozenset({1, 11}), frozenset({2, 12})}
+
+
+def test_people_in_different_clothes_are_told_apart_where_motion_is_wrong():
+    frames, descriptors = two_who_turn_back(RED, BLUE)
+    assert identities(Retrack(), frames) == PASSED
+    looks = Retrack(descriptors=descriptors)
+    assert identities(looks, frames) == TURNED
+    facts = looks.model_card().facts
+    assert (facts["appearance"], facts["tracks"]) == ("used", "4")
+    assert float(facts["separation"]) > 0.95
+    assert identities(replace(looks, appearance=False), frames) == PASSED
+
+
+def assert_same(one: Frame, other: Frame) -> None:
+    for name in one.rows.dtype.names:
+        np.testing.assert_array_equal(one.rows[name], other.rows[name])
+
+
+def test_people_in_the_same_clothes_are_judged_by_motion_alone():
+    frames, descriptors = two_who_turn_back(BLUE, BLUE)
+    looks = Retrack(descriptors=descriptors)
+    for one, other in zip(looks(frames), Retrack()(frames), strict=True):
+        for seen, moved in zip(one, other, strict=True):
+            assert_same(seen, moved)
+    facts = looks.model_card().facts
+    assert facts["appearance"] == "not used"
+    assert float(facts["separation"]) < 0.75
+
+
+def test_the_order_of_samples_changes_no_identity_and_the_future_nothing_online():
+    frames, descriptors = two_who_turn_back(RED, BLUE)
+    turned = [frame._replace(rows=frame.rows[::-1]) for frame in frames]
+    assert identities(Retrack(descriptors=descriptors), turned) == TURNED
+    whole, part = (list(Retrack(descriptors=descriptors)(given)) for given in (frames, frames[:50]))
+    for one, other in zip(whole, part, strict=False):
+        assert_same(one[1], other[1])
+        assert_same(one[2], other[2])
+
+
+def test_decisions_are_as_likely_as_motion_and_colours_say():
+    frames, descriptors = two_who_turn_back(RED, BLUE)
+
+    def joined(transform: Retrack) -> dict[tuple[int, int], float]:
+        rows = np.concatenate([decisions.rows for *_, decisions in transform(frames)])
+        rows = rows[rows["previous_id"] >= 0]
+        pairs = zip(rows["previous_id"].tolist(), rows["source_id"].tolist(), strict=True)
+        return dict(zip(pairs, rows["probability"].tolist(), strict=True))
+
+    by_looks = joined(Retrack(descriptors=descriptors))
+    assert set(joined(Retrack())) == {(1, 12), (2, 11)}
+    assert set(by_looks) == {(1, 11), (2, 12)}
+    assert min(by_looks.values()) > 0.5  # though not by motion
+
+
+def sides(transform: Retrack, frames) -> list[list[int]]:
+    """The tracks from left to right some time before and some time after they met."""
+    tracks = [offline.rows for offline, *_ in transform(frames) if len(offline.rows) == 2]
+    at = tracks[15], tracks[-15]
+    return [rows["track_id"][np.argsort(rows["x_m"])].tolist() for rows in at]
+
+
+def test_input_ids_that_were_exchanged_are_put_right_by_colours():
+    """A tracker follows the motion: it keeps ids 1 and 2, each for the other one. It had lost both before."""
+    ids_since = ((0.0, (5, 6)), (4.8, (1, 2)), (UNTIL_S, (2, 1)), (22.8, (7, 8)))
+    frames, descriptors = two_who_turn_back(RED, BLUE, ids_since)
+    (left, right), passed = sides(Retrack(), frames)
+    assert passed == [right, left]
+    before, after = sides(Retrack(descriptors=descriptors), frames)
+    assert before == after
+
+
+def patch(*colours: tuple[int, int, int]) -> np.ndarray:
+    """A picture of 40x80 px that is divided from top to bottom into as many parts as there are colours."""
+    return np.concatenate([np.full((80 // len(colours), 40, 3), colour, np.uint8) for colour in colours])
+
+
+WHOLE = np.array([[0.0, 0.0, 40.0, 80.0]])
+
+
+def test_a_histogram_of_one_colour_by_hand():
+    """Mid-grey 119 has L* = 50.03, in 8 bits 128, and a = b = 128: in bin (128 - 20) / 215 * 7 = 3.516 of 8, and in bin
+    30 / 60 * 9 = 4.5 of 10. Six histograms share 1, so a bin with a share s of its histogram is 255 * sqrt(s / 6)."""
+    (found,) = describe(patch((119, 119, 119)), WHOLE)
+    light, axis = np.zeros(8), np.zeros(10)
+    light[3:5], axis[4:6] = (1 - 0.516, 0.516), 0.5
+    wanted = np.concatenate([light, axis, axis] * 2)
+    np.testing.assert_allclose(found, np.rint(255 * np.sqrt(wanted / 6)), atol=1)
+
+
+def test_histograms_tell_upper_body_from_legs_and_look_the_same_near_and_far():
+    both = describe(np.hstack([patch(RED, BLUE), patch(BLUE, RED)]), WHOLE + [[0, 0, 0, 0], [40, 0, 0, 0]]) / 255
+    assert np.square(both[0] - both[1]).sum() > 0.5
+    np.testing.assert_allclose(both[0], np.roll(both[1], LENGTH // 2), atol=0.15)  # the parts are not equally tall
+    large = np.kron(patch(RED, BLUE), np.ones((3, 3, 1), np.uint8))
+    np.testing.assert_allclose(describe(large, 3 * WHOLE)[0] / 255, both[0], atol=0.01)
+    assert describe(large, np.empty((0, 4))).shape == (0, LENGTH)
+
+
+@pytest.mark.parametrize(
+    ("boxes", "wanted"),
+    [
+        ([[50, 20, 20, 50]], [True]),
+        ([[0, 20, 20, 50]], [False]),  # cut off by the border
+        (
+            [[50, 31, 20, 50], [150, 20, 3, 50], [150, 20, 20, 7]],
+            [False, False, False],
+        ),  # so is this; two are too small
+        ([[50, 20, 20, 50], [57, 20, 20, 50]], [False, False]),  # 65 % of each
+        ([[50, 20, 20, 50], [64, 20, 20, 50]], [True, True]),  # 30 %
+        ([[50, 20, 20, 50], [50, 20, 10, 25]], [True, False]),  # a quarter of the first, all of the second
+        (np.empty((0, 4)), []),
+    ],
+)
+def test_boxes_are_clear_by_hand(boxes, wanted):
+    assert is_clear(np.array(boxes, float), 200, 80).tolist() == wanted
+
+
+def test_boxes_at_a_border_by_hand():
+    boxes = [[15, 20, 20, 30], [25, 20, 20, 30], [170, 20, 20, 30], [100, 5, 20, 30], [100, 45, 20, 30]]
+    assert at_border(np.array(boxes, float), 200, 80).tolist() == [True, False, True, True, True]
+
+
+def test_samples_find_their_descriptors():
+    ids = [(t, one) for t in (10, 20, 40) for one in (3, 7, 9) if (t, one) != (20, 7)]
+    t_ns, track_id = np.array(ids).T
+    nothing = np.zeros((len(ids), LENGTH), np.uint8), np.ones(len(ids), bool), np.zeros(len(ids), bool)
+    descriptors = Descriptors(t_ns, track_id, *nothing)
+    wanted = [(t, one) for t in (0, 10, 20, 30, 40, 50) for one in (2, 3, 7, 8, 9, 10)]
+    found = descriptors.find(*np.array(wanted).T).tolist()
+    assert found == [ids.index(one) if one in ids else -1 for one in wanted]
+
+
+@pytest.fixture(scope="module")
+def log_of_run(finished):
+    with log.Log(finished) as opened:
+        yield opened
+
+
+def test_a_run_looks_at_every_clear_box_and_says_what_it_found(log_of_run):
+    frames = log_of_run.frame_columns("/camera/samples", TRACKS)
+    reports = []
+    made = with_descriptors(Retrack(), log_of_run, "/camera", frames, lambda *one: reports.append(one))
+    seen = made.descriptors
+    observed = [(f.t_ns, one) for f in frames for one in sorted(f.rows["track_id"][f.rows["observed"]].tolist())]
+    assert list(zip(seen.t_ns.tolist(), seen.track_id.tolist(), strict=True)) == observed
+    assert seen.values[seen.is_clear].any(axis=1).all()
+    assert not seen.values[~seen.is_clear].any()
+    assert reports == [("appearance", n + 1, len(reports)) for n in range(len(frames))]
+    list(made(frames))
+    provenance = provenance_of(log_of_run, "/camera/retracks")
+    assert provenance.model == made.model_card().facts
+    looks = summarise(log_of_run, "/camera").appearance
+    assert asdict(looks) == {
+        "used": provenance.model["appearance"] == "used",
+        "separation": float(provenance.model["separation"]),
+        "tracks": int(provenance.model["tracks"]),
+    }
+
+
+def test_what_does_not_compare_colours_has_none(log_of_run):
+    frames = log_of_run.frame_columns("/camera/samples", TRACKS)
+    for transform in (Retrack(appearance=False), Retrack(poor_scale=True), RetrackByConsistency(), Sample()):
+        assert with_descriptors(transform, log_of_run, "/camera", frames) is transform
+    in_metres = [frame._replace(rows=frame.rows.copy()) for frame in frames]
+    for frame in in_metres:
+        frame.rows["x_px"] = np.nan
+    for given in (in_metres, [frame._replace(t_ns=frame.t_ns + 10**12) for frame in frames]):
+        assert with_descriptors(Retrack(), log_of_run, "/camera", given).descriptors is None
+    assert Retrack().model_card().facts == {}
+
+
+def test_pictures_that_cannot_be_decoded_are_a_warning(log_of_run, monkeypatch):
+    def damaged(*_):
+        raise McaptrackError("the picture can't be decoded")
+
+    monkeypatch.setattr(Pictures, "frames", damaged)
+    frames = log_of_run.frame_columns("/camera/samples", TRACKS)
+    with collected() as warnings:
+        assert with_descriptors(Retrack(), log_of_run, "/camera", frames).descriptors is None
+    assert [(one.code, "can't be decoded" in one.message) for one in warnings] == [("option-not-used", True)]
+
+
+def test_the_picture_of_a_sample_is_the_nearest_one_within_a_tenth_of_a_second():
+    pictures = np.array([0, 100, 240, 1000]) * 1_000_000
+    samples = np.array([-150, -99, 49, 51, 169, 171, 341, 899, 901, 1100, 1101]) * 1_000_000
+    assert _nearest(pictures, samples).tolist() == [-1, 0, 0, 1, 1, 2, -1, -1, 3, 3, -1]
+    assert _nearest(pictures[:1], samples[:3]).tolist() == [-1, 0, 0]
+    assert _nearest(pictures[:0], samples[:2]).tolist() == [-1, -1]
