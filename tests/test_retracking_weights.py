@@ -121,11 +121,14 @@ def test_the_best_set_of_links_is_that_of_all_permutations():
     ends, begins = (side.ravel() for side in np.indices((5, 5)))
     gain = rng.uniform(-3.5, 4, 25)
     right = (ends == begins) * 1.0
-    found, is_right = Pairs(5, ends, begins, np.empty((25, 0)), right).best(gain)
+    features = np.full((25, len(linking.FEATURES)), np.nan)
+    features[:, linking.FEATURES.index("gap")] = np.arange(25)
+    found, is_right, gap_s = Pairs(5, ends, begins, features, right).best(gain)
     table = gain.reshape(5, 5) + 4.0
     best = max(permutations(range(5)), key=lambda order: table[range(5), order].sum())
     assert found.sum() == pytest.approx((table[range(5), best] - 4.0).sum())
     assert is_right.sum() == sum(a == b for a, b in enumerate(best))
+    assert sorted(gap_s.tolist()) == [5 * a + b for a, b in enumerate(best)]
 
 
 def test_tracks_belong_to_the_person_they_follow_and_doubles_and_clutter_to_nobody():

@@ -24,6 +24,8 @@ from tests.references.offline import (
 NAMES = (*LINK_NAMES, "same track", "odds of join", "same input id", "odds before", "odds after")
 NAMES = (*NAMES, "cut before", "cut after", "log before", "log after", "next step", "short gap")
 WEIGHTS, BIAS = FITTED["relinks"]["weights"], FITTED["relinks"]["bias"]
+GAPS_S, BY_GAP, GAP_LINKS = (0.9, 1.7, 3.3, 6.5, 13.0, 1e9), FITTED["links"]["usual by gap"], 5.0
+Candidate = tuple[float, bool, float]  # log odds, whether it is at a cut, seconds of the gap
 SHORT_S, SAME_ID_S, AT_CUTS, ELSEWHERE = 1.0, 6.0, 1 / 11, 1 / 3
 
 
@@ -53,13 +55,12 @@ def links(
 ) -> dict[int, int]:
     """For each linked track the track that continues it."""
     candidates = odds_of(motion, paths, ids, max_gap_s, cuts)
-    elsewhere = [odds for odds, is_cut in best(candidates, 0.0).values() if not is_cut]
-    shift = usual(elsewhere)
-    made = best(candidates, shift)
-    shift = usual([odds for odds, is_cut in made.values() if not is_cut])
+    shifts = usual_by_gap(best(candidates, [0.0] * len(GAPS_S)))
+    made = best(candidates, shifts)
+    shifts = usual_by_gap(made)
     out = {}
-    for (a, b), (odds, is_cut) in made.items():
-        enough = log(AT_CUTS) if is_cut else log(ELSEWHERE) - shift
+    for (a, b), (odds, is_cut, gap_s) in made.items():
+        enough = log(AT_CUTS) if is_cut else log(ELSEWHERE) - shifts[gap_class(gap_s)]
         if odds > log(least / (1 - least)) + enough:
             out[a] = b
     return out
@@ -67,8 +68,8 @@ def links(
 
 def odds_of(
     motion: Motion, paths: dict[int, Path], ids: dict[int, dict[int, int]], max_gap_s: float, cuts: list[Cut]
-) -> dict[tuple[int, int], tuple[float, bool]]:
-    """The log odds of each link that may be, and whether it is at a cut."""
+) -> dict[tuple[int, int], Candidate]:
+    """The links that may be."""
     ends = {name: motion.filtered(path)[max(path)] for name, path in paths.items()}
     begins = {name: motion.backwards(path)[min(path)] for name, path in paths.items()}
     after = {one: (other, min(max(likely, 1e-6), 1 - 1e-6)) for one, other, likely in cuts}
@@ -100,22 +101,42 @@ def odds_of(
             ]
             found += [log(len(paths[a])), log(len(paths[b])), gap == 1, gap_s < SHORT_S]
             odds = sum(WEIGHTS[one] * value for one, value in zip(NAMES, found, strict=True)) + BIAS
-        out[a, b] = odds, is_cut
+        out[a, b] = odds, is_cut, gap_s
     return out
 
 
-def best(
-    candidates: dict[tuple[int, int], tuple[float, bool]], shift: float
-) -> dict[tuple[int, int], tuple[float, bool]]:
-    """The set of links with the largest sum of log odds above the least; ``shift`` is added to those without a cut."""
+def best(candidates: dict[tuple[int, int], Candidate], shifts: list[float]) -> dict[tuple[int, int], Candidate]:
+    """The set of links with the largest sum of log odds above the least; shifts are added to those without a cut."""
     from scipy.optimize import linear_sum_assignment
 
     names = sorted({name for pair in candidates for name in pair})
     gains = np.zeros((len(names), len(names)))
-    for (a, b), (odds, is_cut) in candidates.items():
-        gains[names.index(a), names.index(b)] = max(odds + (0.0 if is_cut else shift) - LINK_LEAST, 0)
+    for (a, b), (odds, is_cut, gap_s) in candidates.items():
+        shift = 0.0 if is_cut else shifts[gap_class(gap_s)]
+        gains[names.index(a), names.index(b)] = max(odds + shift - LINK_LEAST, 0)
     pairs = [(names[i], names[j]) for i, j in zip(*linear_sum_assignment(-gains), strict=True) if gains[i, j]]
     return {pair: candidates[pair] for pair in pairs}
+
+
+def gap_class(gap_s: float) -> int:
+    """The class of a gap: the first one with a bound that isn't less."""
+    return next(number for number, bound in enumerate(GAPS_S) if gap_s <= bound)
+
+
+def usual_by_gap(made: dict[tuple[int, int], Candidate]) -> list[float]:
+    """The same for each class of gaps: all links count as some links of each class."""
+    elsewhere = [(odds, gap_class(gap_s)) for odds, is_cut, gap_s in made.values() if not is_cut]
+    all_of = usual([odds for odds, _ in elsewhere])
+    out = []
+    for one, often in enumerate(BY_GAP):
+        here = [odds for odds, number in elsewhere if number == one]
+        expected, shift = sigmoid(log(often / (1 - often)) + all_of), 0.0
+        for _ in range(50):
+            right = sum(sigmoid(odds + shift) for odds in here) + GAP_LINKS * expected
+            share = right / (len(here) + GAP_LINKS)
+            shift = log(share / (1 - share)) - log(often / (1 - often))
+        out.append(shift)
+    return out
 
 
 def usual(made: list[float]) -> float:

@@ -159,12 +159,12 @@ def link_pieces(
         return continued_by
     at_cut = found.features @ _RELINKS_WEIGHTS + _RELINKS_BIAS + found.evidence
     log_odds = np.where(found.at_cut, at_cut, found.log_odds)
-    shift = 0.0
+    shift = np.zeros(len(log_odds))
     made = np.empty(0, np.int64)
     for _ in range(2):  # the share of right links that is usual in this log is known after the first round
         made = linking.best_links(found.ends, found.begins, log_odds + np.where(found.at_cut, 0.0, shift), count)
         elsewhere = made[~found.at_cut[made]]
-        shift = linking.prior_shift(log_odds[elsewhere])
+        shift = linking.prior_shifts(log_odds[elsewhere], found.gap_s[elsewhere], found.gap_s)
     log_odds += np.where(found.at_cut, -np.log(_ENOUGH_AT_CUTS), shift - np.log(_ENOUGH_ELSEWHERE))
     made = made[log_odds[made] > np.log(min_confidence / (1 - min_confidence))]
     continued_by[found.ends[made]] = found.begins[made]

@@ -29,6 +29,11 @@ FEATURES: Final = ("miss", "misfit", "gap", "misfit or stay", "turn", "distance 
 #: best links is right. Links with log odds below ``_MIN_LOG_ODDS`` are not considered.
 _WEIGHTS, _FITTED = weights_of("links", FEATURES)
 _BIAS, _PRIOR, _MIN_LOG_ODDS = (float(_FITTED[name]) for name in ("bias", "usual", "least"))
+#: Gaps are of classes with these bounds in seconds; the mean probability of the best links of each, where as many are
+#: right as usual; and with how many links more this is taken to be so in a log.
+_GAPS_S: Final = (0.9, 1.7, 3.3, 6.5, 13.0)
+_BY_GAP: Final = np.array(_FITTED["usual by gap"])
+_GAP_LINKS: Final = 5.0
 #: Added to distances and speeds before taking logarithms: differences below these mean nothing.
 _NEAR_M, _SPEED_M_PER_S = 0.3, 0.15
 #: The number of pairs that are examined at once.
@@ -145,6 +150,25 @@ def prior_shift(log_odds: Floats) -> float:
         if abs(shift - before) < 1e-4:
             break
     return shift
+
+
+def prior_shifts(log_odds: Floats, gap_s: Floats, others_s: Floats) -> Floats:
+    """The shifts of the log odds of links over gaps of ``others_s`` (O,), from those of the best links (E,).
+
+    How long people are missed differs from log to log, too, so gaps of about the same length are shifted together: few
+    of them as all links are.
+    """
+    count = len(_BY_GAP)
+    gap = np.searchsorted(_GAPS_S, gap_s)
+    usual = np.log(_BY_GAP / (1 - _BY_GAP))
+    expected = probability(usual + prior_shift(log_odds))
+    links = np.bincount(gap, minlength=count) + _GAP_LINKS
+    shifts = np.zeros(count)
+    for _ in range(50):
+        right = np.bincount(gap, probability(log_odds + shifts[gap]), minlength=count)
+        share = (right + _GAP_LINKS * expected) / links
+        shifts = np.log(share / (1 - share)) - usual
+    return np.asarray(shifts[np.searchsorted(_GAPS_S, others_s)])
 
 
 def _components(i: Ints, j: Ints, count: int) -> list[Ints]:
