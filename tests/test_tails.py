@@ -129,15 +129,31 @@ class TestFollowing:
 
 
 class TestCalibration:
-    def forecasts(self, sd_m: float, noise_m: float = 0.0, steps: int = 60, tracks: int = 40, adapts: bool = True):
-        """Errors of a known size of a predictor that says 1 m; the levels of the ellipses that hold them, by time."""
+    def forecasts(
+        self,
+        sd_m: float,
+        noise_m: float = 0.0,
+        steps: int = 60,
+        tracks: int = 40,
+        adapts: bool = True,
+        ring: bool = False,
+        passing: int = 0,
+    ):
+        """Errors of a known size of a predictor that says 1 m; the levels of the ellipses that hold them, by time.
+
+        With ``ring`` they are all about as large; ``passing`` tracks are others each time.
+        """
         rng = np.random.default_rng(4)
         predictor = make("kalman", 3, 0.4)
         self.calibration = calibration = TailCalibration.of("kalman", predictor, adapts)
         ids, levels = np.arange(tracks), []
         place = np.zeros((steps + 4, tracks, 2))
         for step in range(steps):
-            mean = np.stack([place[step + k] + sd_m * rng.normal(size=(tracks, 2)) for k in (1, 2, 3)], axis=1)
+            off = rng.normal(size=(tracks, 3, 2))
+            if ring:
+                off *= rng.uniform(0.8, 1, (tracks, 3, 1)) / np.linalg.norm(off, axis=2, keepdims=True)
+            mean = np.stack([place[step + k] for k in (1, 2, 3)], axis=1) + sd_m * off
+            ids[tracks - passing :] += tracks
             cov = np.tile(np.eye(2), (tracks, 3, 1, 1))
             past = noise_m * rng.normal(size=(tracks, 8, 2))
             made, tails = calibration(step, ids, Forecast(mean, cov), past, np.zeros(tracks, bool))
@@ -150,6 +166,25 @@ class TestCalibration:
         levels = self.forecasts(sd_m)[30:]
         for level in (0.5, 0.95):
             assert (levels <= level).mean() == pytest.approx(level, abs=0.04)
+
+    def test_also_where_no_mixture_fits(self):
+        held = (self.forecasts(0.5, ring=True)[30:] <= 0.5).mean()
+        assert held == pytest.approx(0.5, abs=0.1)
+
+    def test_they_are_no_smaller_than_noise_allows(self):
+        self.forecasts(0.001, noise_m=0.3)
+        nothing = Forecast(np.zeros((1, 3, 2)), np.tile(np.eye(2), (1, 3, 1, 1)))
+        made, tails = self.calibration(60, np.array([-1]), nothing, np.zeros((1, 8, 2)), np.zeros(1, bool))
+        assert (made.cov[0, :, 0, 0] * tails.narrow_scale[0] > 0.27 * 0.3**2).all()
+
+    def test_tracks_that_are_lost_count_as_some_large_errors(self):
+        weights = []
+        for passing in (0, 200):
+            self.forecasts(0.3, passing=passing, tracks=20 + passing)
+            nothing = Forecast(np.zeros((1, 3, 2)), np.tile(np.eye(2), (1, 3, 1, 1)))
+            _, tails = self.calibration(60, np.array([-1]), nothing, np.zeros((1, 8, 2)), np.zeros(1, bool))
+            weights.append(tails.wide_weight[0, 0])
+        assert weights[0] < 0.8 * weights[1]
 
     def test_errors_that_are_much_larger_than_in_the_table_are_a_warning(self):
         for sd_m, adapts, codes in ((0.9, True, []), (3.0, False, []), (1.5, True, ["ellipses"])):

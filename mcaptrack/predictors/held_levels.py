@@ -29,6 +29,8 @@ _MIDDLE, _OUTER = 0.5, 0.9
 _UNIFORM, _ALL_STEPS = 20.0, 40.0
 #: Levels of which half of the errors, or nine tenths, are smaller, lie between these.
 _LOWEST, _HIGHEST = 0.02, 0.995
+#: The correction isn't for what the fit of the mixture has still to learn: limits of the factors of the covariance.
+_LEAST_NARROW, _MOST_NARROW, _MOST_WIDE = 0.6, 2.0, 1.5
 
 
 class HeldLevels:
@@ -62,7 +64,8 @@ class HeldLevels:
         held = np.clip((at + (level - below[step, at]) / share[step, at]) / _BINS, _LOWEST, _HIGHEST)
         now, wanted = half_radius(np.stack([held, np.broadcast_to(level, held.shape)]), tails)
         middle, outer = now / wanted
-        narrow, wide = tails.narrow_scale * middle, tails.wide_scale * np.maximum(np.maximum(middle, outer), 1.0)
+        narrow = tails.narrow_scale * np.clip(middle, _LEAST_NARROW, _MOST_NARROW)
+        wide = tails.wide_scale * np.clip(np.maximum(middle, outer), 1.0, _MOST_WIDE)
         return Tails(tails.wide_weight, narrow, np.maximum(wide, narrow))
 
     def _shares(self, independent: float) -> Floats:
