@@ -48,7 +48,7 @@ def test_each_part_is_left_out_once_and_the_steps_end_at_the_default():
     ]
     assert sorted(len(names) for names in changed) == [0] + [1] * (len(PARTS) - 1)
     switches = {one.name for one in fields(default) if getattr(default, one.name) is True}
-    switches -= {"adapt", "appearance"}  # of ellipses and of pictures
+    switches -= {"adapt", "adapt_online", "appearance"}  # of ellipses, of online tracks and of pictures
     assert switches <= {name for names in changed for name in names}
 
 

@@ -88,6 +88,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "merge_timeout_s": 3.0,
         "confirm_s": 1.2,
         "coast_s": 1.2,
+        "adapt_online": True,
         "adapt": True,
         "appearance": True,
     },

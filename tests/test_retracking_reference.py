@@ -142,6 +142,7 @@ LIKELIHOOD = {
     "confirm_s": [0.0, 0.4, 1.2],
     "coast_s": [0.0, 0.4, 1.2],
     "adapt": [False, True],
+    "adapt_online": [False, True, True],
     "min_track_s": [0.0, 0.8, 2.0],
     "interpolated": [False, True],
     "rate_hz": [2.5, 4.0],

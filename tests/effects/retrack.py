@@ -111,7 +111,9 @@ def turned_back(outputs: Outputs) -> int:
 
 
 CIRCLES = turning(0.8, 15.0)
-LIKELY = replace(PROFILES["default"], link_s=0.0, resolve_swaps=False, smooth=False, track_confidence=0.0)
+LIKELY = replace(
+    PROFILES["default"], link_s=0.0, resolve_swaps=False, smooth=False, track_confidence=0.0, adapt_online=False
+)
 PAPER = PROFILES["paper"]
 #: The paper's method with nothing that hides short tracks.
 BARE = replace(PAPER, min_hits=0, min_track_s=0.0)
@@ -264,6 +266,14 @@ case(
     line(0.5, 10, 20),
     online_rows,
     {0.0: 7, 0.4: 8, 1.2: 10, 2.0: 12},
+)
+case(
+    "adapt_online",
+    "a person is seen from tick 0 on; no track was false yet",
+    LIKELY,
+    line(0.5, 20, 20),
+    first_online,
+    {False: 3, True: 0},
 )
 case(
     "alpha",

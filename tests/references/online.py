@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from math import exp, hypot, log, pi
 
@@ -50,6 +51,58 @@ class Person:
         self.cov = self.cov - np.outer(gain, self.cov[0])
 
 
+class Lives:
+    """What became of the tracks so far, and the area in which confirmed ones were seen."""
+
+    LASTS, RETURNS, COUNTS = 0.6, 0.8, 2
+
+    def __init__(self, confirm: int, max_age: int) -> None:
+        self.lasting, self.max_age = 3 * (confirm - 1) + 1, max_age
+        self.went_on, self.ended = Counter(), Counter()
+        self.back, self.stayed = Counter(), Counter()
+        self.places: list[Point] = []
+        self.before: dict[int, tuple[int, int, bool]] = {}
+
+    def learn(self, now: dict[int, tuple[int, int, bool]], passed: int) -> None:
+        """``now`` has the observations, steps without one, and whether outside, of each track."""
+        for name, (hits, missed, outside) in self.before.items() if passed == 1 else ():
+            then = now.get(name)
+            if hits < self.lasting and then is None:
+                self.ended[hits] += 1
+            elif hits < self.lasting and then[0] > hits:
+                self.went_on[hits] += 1
+            if missed and (hits < self.lasting or outside):
+                if then is not None and then[1] == 0:
+                    self.back[outside, missed] += 1
+                elif then is None or then[1] > missed:  # one that is merged with another grows no older
+                    self.stayed[outside, missed] += 1
+        self.before = now
+
+    def lasts(self, hits: int) -> float:
+        each = self.LASTS ** (1 / max(self.lasting - 1, 1))
+        out = 1.0
+        for k in range(hits, self.lasting):
+            total = self.went_on[k] + self.ended[k]
+            out *= (self.went_on[k] + self.COUNTS * each) / (total + self.COUNTS)
+        return out
+
+    def comes_back(self, missed: int, outside: bool) -> float:
+        each = (1 - self.RETURNS) ** (1 / self.max_age)
+        away = 1.0
+        for age in range(missed, self.max_age + 1):
+            total = self.back[outside, age] + self.stayed[outside, age]
+            away *= (self.stayed[outside, age] + self.COUNTS * each) / (total + self.COUNTS)
+        return 1 - away
+
+    def is_outside(self, at: np.ndarray) -> bool:
+        """Whether the places so far are on one side of a line through a place, or on a line."""
+        off = np.array(self.places).reshape(-1, 2) - at
+        if len(off) < 3 or np.linalg.matrix_rank(off - off[0], tol=1e-9) < 2:
+            return True
+        angle = np.sort(np.arctan2(off[:, 1], off[:, 0]))
+        return bool(max(np.diff(angle).max(), angle[0] + 2 * pi - angle[-1]) > pi)
+
+
 def log_density(off: np.ndarray, variance: float) -> float:
     """That of a normal distribution in the plane with the same variance along both axes."""
     return float(-(off**2).sum() / variance / 2 - log(2 * pi * variance))
@@ -75,27 +128,54 @@ class OnlineTracker:
         steps = steps_of(times_ns, o.rate_hz)
         online, predictions = [], []
         places: dict[tuple[int, int], Point] = {}
+        lives = Lives(self.confirm, self.max_age)
         for at, (step, rows) in enumerate(zip(steps, samples, strict=True)):
             passed = step - steps[at - 1] if at else 1
             seen = sorted((r for r in rows if r["observed"] or o.interpolated), key=lambda row: row["track_id"])
             has = self.step(seen, passed)
-            shown = []
+            now = {
+                one.name: (one.hits, 0 if one.name in has else one.missed, lives.is_outside(one.here))
+                for one in self.people
+            }
+            lives.learn(now, passed)
+            lives.places += [one.here for one in self.people if one.name in has and one.hits >= self.confirm]
+            shown, known = [], set()
             for person in self.people:
                 row = has.get(person.name)
                 if row is not None:
                     self.claims.made.append((step, person.name, row["track_id"]))
                     places[step, person.name] = (row["x_m"], row["y_m"])
                     person.row = row
-                    if person.hits >= self.confirm:
-                        shown.append(row | {"source_id": row["track_id"], "track_id": person.name})
-                elif person.hits >= 1.5 * self.confirm and person.missed <= round(o.coast_s * o.rate_hz):
+                if not self.is_written(person, now[person.name], lives):
+                    continue
+                if person.hits >= self.confirm:
+                    known.add(person.name)
+                if row is not None:
+                    shown.append(row | {"source_id": row["track_id"], "track_id": person.name})
+                else:
                     lost = person.row | {"source_id": -1, "track_id": person.name, "observed": False}
                     move_to(lost, person.here, o.ground_planes)
                     shown.append(lost)
             shown.sort(key=lambda row: row["track_id"])
             online.append(shown)
-            predictions.append([(row["track_id"], *self.forecast(row, step, places)) for row in shown])
+            predictions.append(
+                [(row["track_id"], *self.forecast(row, step, places)) for row in shown if row["track_id"] in known]
+            )
         return offline(self.claims, samples, steps, o, self.noise_m), online, predictions
+
+    def is_written(self, person: Person, now: tuple[int, int, bool], lives: Lives) -> bool:
+        """Whether a track is written online."""
+        o, (hits, missed, outside) = self.options, now
+        if not o.adapt_online:
+            enough = self.confirm if missed == 0 else 1.5 * self.confirm
+            return hits >= enough and missed <= round(o.coast_s * o.rate_hz)
+        if missed == 0:
+            return hits >= self.confirm or lives.lasts(hits) >= 0.5
+        if missed > round(o.coast_s * o.rate_hz):
+            return False
+        if hits >= lives.lasting and not outside:
+            return True
+        return lives.comes_back(missed, outside) * lives.lasts(hits + 1) >= 0.5
 
     def forecast(self, row: Row, step: int, places: dict[tuple[int, int], Point]):
         past = [places.get((step - back, row["track_id"])) for back in range(self.past - 1, 0, -1)]

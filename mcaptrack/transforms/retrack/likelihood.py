@@ -21,9 +21,10 @@ from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M, MotionModel
 from mcaptrack.transforms.retrack.offline_rows import move_rows
 from mcaptrack.transforms.retrack.online_forecasts import OnlineForecasts, Unpredicted
-from mcaptrack.transforms.retrack.online_tracker import HITS, IDS, MISSED, Association, OnlineTracker
+from mcaptrack.transforms.retrack.online_tracker import HITS, IDS, Association, OnlineTracker
 from mcaptrack.transforms.retrack.options import LikelihoodOptions, RetrackOptions
 from mcaptrack.transforms.retrack.samples import LogSamples
+from mcaptrack.transforms.retrack.shown_tracks import ShownTracks
 
 #: Frames are read so many at once, and online tracks written.
 _STEPS: Final = 256
@@ -40,7 +41,7 @@ class LikelihoodPass:
 
     def __init__(self, options: LikelihoodOptions, movers: Movers = PEOPLE) -> None:
         rate, self._options, self._unit_m = options.rate_hz, options, movers.unit_m
-        self._confirm_hits = round(options.confirm_s * rate) + 1
+        confirm_hits = self._confirm_hits = round(options.confirm_s * rate) + 1
         max_age = max(1, round(options.max_age_s * rate))
         noise = DEFAULT_NOISE_M if options.noise_m is None else options.noise_m / movers.unit_m
         self._tracker = OnlineTracker(
@@ -53,10 +54,11 @@ class LikelihoodPass:
             ),
             step_s=1 / rate,
             max_age=max_age,
-            confirm_hits=self._confirm_hits,
-            max_age_tentative=min(self._confirm_hits, max_age),
+            confirm_hits=confirm_hits,
+            max_age_tentative=min(confirm_hits, max_age),
             estimate_noise=options.noise_m is None,
         )
+        self._shown = ShownTracks(confirm_hits, round(options.coast_s * rate), max_age, options.adapt_online)
         self._assignments = Assignments()
         self._samples = LogSamples()
         self.steps: list[int] = []
@@ -140,14 +142,17 @@ class LikelihoodPass:
         tick, source = tick[observed], source[observed]
         xy_m = np.stack([samples["x_m"][observed], samples["y_m"][observed]]) / self._unit_m
         bounds = np.searchsorted(tick, np.arange(len(frames) + 1))
-        parts = zip(bounds.tolist(), bounds[1:].tolist(), np.diff(steps, prepend=before).tolist(), strict=False)
-        results = [self._tracker.step(xy_m[:, low:high], source[low:high], passed) for low, high, passed in parts]
+        passed = np.diff(steps, prepend=before)
+        results = [
+            self._tracker.step(xy_m[:, low:high], source[low:high], steps_passed)
+            for low, high, steps_passed in zip(bounds.tolist(), bounds[1:].tolist(), passed.tolist(), strict=False)
+        ]
         tracks, row, place = (np.concatenate(all_, axis=-1) for all_ in zip(*results, strict=True))
         tick = group_index([len(result.row) for result in results])
         has = row >= 0
         row[has] = observed[bounds[tick[has]] + row[has]]
         self._assignments.add(steps[tick[has]], tracks[IDS, has], samples["track_id"][row[has]])
-        self._write(_Read(t_ns, numbers, steps, samples), tick, row, tracks, place)
+        self._write(_Read(t_ns, numbers, steps, passed, samples), tick, row, tracks, place)
 
     def _write(self, read: _Read, tick: Ints, row: Ints, tracks: Ints, place: Floats) -> None:
         """Make the rows of online tracks, and their predictions, of some steps.
@@ -155,22 +160,19 @@ class LikelihoodPass:
         Of the tracks alive at each of the steps, end to end: the index of the step, the row that each has, or -1; whole
         numbers and positions as in ``Step``.
         """
-        options, steps = self._options, read.steps
-        ids, hits, missed = tracks[IDS], tracks[HITS], tracks[MISSED]
+        steps = read.steps
+        ids = tracks[IDS]
         samples = TRACKS.joined([self._last_rows, read.samples])
-        known = len(self._last_rows)
-        sample = np.where(row >= 0, known + row, -1)
+        before = len(self._last_rows)
+        sample = np.where(row >= 0, before + row, -1)
         # the last sample of each track up to each step: before the first of these steps, that of ``_last_rows``
-        earlier = np.concatenate([np.arange(known), sample])
-        order = np.lexsort((np.concatenate([np.full(known, -1), tick]), np.concatenate([self._ids, ids])))
+        earlier = np.concatenate([np.arange(before), sample])
+        order = np.lexsort((np.concatenate([np.full(before, -1), tick]), np.concatenate([self._ids, ids])))
         last = np.maximum.accumulate(np.where(earlier[order] >= 0, np.arange(len(order)), -1))
         last_sample = np.empty_like(earlier)
         last_sample[order] = earlier[order][last]
-        last_sample = last_sample[known:]
-        is_coasting = (row < 0) & (hits * 2 >= self._confirm_hits * 3)
-        is_coasting &= missed <= round(options.coast_s * options.rate_hz)
-        is_confirmed = (row >= 0) & (hits >= self._confirm_hits)
-        shown = np.flatnonzero((is_confirmed | is_coasting) & np.isfinite(place[0]))
+        last_sample = last_sample[before:]
+        shown = np.flatnonzero(self._shown(read.passed, tick, row >= 0, tracks, place) & np.isfinite(place[0]))
         shown = shown[np.lexsort((ids[shown], tick[shown]))]
 
         rows = samples[last_sample[shown]].copy()
@@ -183,11 +185,12 @@ class LikelihoodPass:
         self._coasting.append((self._written + np.flatnonzero(coasts), xy_m[coasts], read.t_ns[tick[shown[coasts]]]))
         is_matched = sample >= 0
         self._remember(int(steps[0]), ids[is_matched], steps[tick[is_matched]], samples[sample[is_matched]])
-        past = self._past(ids[shown], steps[tick[shown]], xy_m)
-        ends = np.searchsorted(tick[shown], np.arange(len(steps) + 1))
-        self._online.extend(read.t_ns, read.numbers, ends, rows)
-        waiting = Unpredicted(rows["track_id"], *past, coasts, steps[tick[shown]])
-        self._forecasts.add(read.t_ns, read.numbers, steps, ends, waiting)
+        past, known = self._past(ids[shown], steps[tick[shown]], xy_m)
+        ticks = np.arange(len(steps) + 1)
+        self._online.extend(read.t_ns, read.numbers, np.searchsorted(tick[shown], ticks), rows)
+        confirmed = np.flatnonzero(tracks[HITS, shown] >= self._confirm_hits)  # before, little is known of velocities
+        waiting = Unpredicted(ids[shown], past, known, coasts, steps[tick[shown]]).part(confirmed)
+        self._forecasts.add(read.t_ns, read.numbers, steps, np.searchsorted(tick[shown[confirmed]], ticks), waiting)
         self._written += len(rows)
         is_last = tick == len(steps) - 1
         self._ids, self._last_rows = ids[is_last], samples[last_sample[is_last]]
@@ -226,11 +229,12 @@ class _Positions(NamedTuple):
 
 
 class _Read(NamedTuple):
-    """Frames that were read: times in ns, numbers, steps; and their samples, end to end."""
+    """Frames that were read: times in ns, numbers, steps, and how many passed; and their samples, end to end."""
 
     t_ns: Ints
     numbers: Ints
     steps: Ints
+    passed: Ints
     samples: Rows
 
 

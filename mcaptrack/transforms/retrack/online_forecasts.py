@@ -30,7 +30,7 @@ class Unpredicted(NamedTuple):
     coasts: Bools
     step: Ints
 
-    def part(self, which: slice) -> Unpredicted:
+    def part(self, which: slice | Ints) -> Unpredicted:
         ids, past, known, coasts, step = self
         return Unpredicted(ids[which], past[which], known[which], coasts[which], step[which])
 

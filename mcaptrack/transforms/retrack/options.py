@@ -217,15 +217,22 @@ class LikelihoodOptions(RetrackOptions):
     )
     confirm_s: float = option(
         1.2,
-        "online, a track is confirmed and written once it was observed for this many seconds",
+        "online, a track is confirmed once it was observed for this many seconds: predicted, and written if it was "
+        "not before",
         least=0.0,
         theme=_LIFE,
         was="sure_s",
     )
     coast_s: float = option(
         1.2,
-        "online, a track is written for this many seconds without an observation",
+        "online, a track is written for up to this many seconds without an observation",
         least=0.0,
+        theme=_LIFE,
+    )
+    adapt_online: bool = option(
+        True,
+        "online, follow the log so far: write new tracks at once if most tracks last, and lost ones only as long as it "
+        "is likely that they come back",
         theme=_LIFE,
     )
     adapt: bool = option(True, ADAPT_HELP, theme=_PREDICTIONS)

@@ -1,0 +1,143 @@
+"""Which online tracks are written, step by step, by what the log says so far of how long tracks last.
+
+A track is confirmed once it was observed for a while, because false detections flicker. But if all tracks of a tracker
+follow people, this delay hides people; and if many are false, even those that were confirmed are soon over. Both are
+seen in the log: for each number of observations, how many of the tracks so far were observed again (the estimator of
+E. L. Kaplan and P. Meier, 1958, which also counts tracks that are not over yet). A track that lasts with a probability
+of at least a half is written from its first observation.
+
+A track that is lost is written for a while, because most come back. Those that don't have left, or were false. Which is
+likelier is learned in the same way, for each number of steps without an observation, for tracks that have not lasted
+yet, and for those that would be outside of the area in which tracks were seen so far: most of these have left it.
+
+Letters: F steps, R tracks of all steps, end to end; H levels of observations, the last one of tracks that have lasted;
+A levels of steps without an observation.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.hulls import GrowingHull
+from mcaptrack.transforms.retrack.online_tracker import HITS, IDS, MISSED
+
+#: A track has lasted once it was observed for so many times as long as its confirmation takes.
+_LASTING: Final = 3
+#: Before anything is known: the probability that a track lasts, and that a lost one comes back; and for how many tracks
+#: this counts at each number of observations and steps.
+_LASTS, _RETURNS, _WEIGHT = 0.6, 0.8, 2.0
+#: Numbers of observations, and of steps without one, are counted in at most so many levels.
+_LEVELS: Final = 200
+
+
+class ShownTracks:
+    """Which tracks are written: called with the steps of a log, some at a time.
+
+    Parameters
+    ----------
+    confirm_hits : int
+        A track with so many observations is written in any case.
+    coast : int
+        A lost track is written for at most so many steps.
+    max_age : int
+        Tracks terminate after so many steps without an observation.
+    adapts : bool
+        Whether it follows the log. Otherwise tracks are written once they are confirmed, and if they are lost once they
+        were observed half as often again.
+    """
+
+    def __init__(self, confirm_hits: int, coast: int, max_age: int, adapts: bool) -> None:
+        self._adapts = adapts
+        self._confirm_hits, self._coast, self._max_age = confirm_hits, coast, max_age
+        self._lasting = _LASTING * (confirm_hits - 1) + 1
+        self._levels, self._ages = min(self._lasting, _LEVELS), min(max_age, _LEVELS)
+        self._seen = GrowingHull()
+        # By level of observations: tracks that reached the next one or terminated, and those that terminated. By inside
+        # and outside and level of steps without an observation: tracks that went on from there, and that came back.
+        self._counts = np.zeros((2, self._levels + 1))
+        self._returns = np.zeros((2, 2, self._ages + 1))
+        self._prior = _WEIGHT * (1 - _LASTS ** (1 / max(self._levels - 1, 1)))
+        self._prior_returns = _WEIGHT * (1 - (1 - _RETURNS) ** (1 / self._ages))
+        #: Of the last step: id, levels of observations and of steps without one, and whether outside, (4, K).
+        self._last: Ints = np.empty((4, 0), np.int64)
+
+    def __call__(self, passed: Ints, tick: Ints, is_observed: Bools, tracks: Ints, xy_m: Floats) -> Bools:
+        """Which of the tracks alive at each of F steps are written, (R,).
+
+        ``passed`` (F,) is by how many steps time advanced, ``tick`` (R,) the number of the step of each row, rising;
+        ``tracks`` (5, R) and ``xy_m`` (2, R) are as in ``Step``. Nothing is known at a step that was not known then.
+        """
+        is_confirmed, may_coast = tracks[HITS] >= self._confirm_hits, tracks[MISSED] <= self._coast
+        if not self._adapts:
+            is_old = tracks[HITS] * 2 >= self._confirm_hits * 3
+            return np.asarray(np.where(is_observed, is_confirmed, may_coast & is_old))
+        outside = ~self._inside(len(passed), tick, is_observed & is_confirmed, xy_m)
+        level, next_level = (self._level(tracks[HITS] + more) for more in (0, 1))
+        age = np.where(is_observed, 0, -(-np.minimum(tracks[MISSED], self._max_age) * self._ages // self._max_age))
+        lasts, returns = self._learn(passed, tick, np.stack([tracks[IDS], level, age, outside]))
+        lasting, where = level >= self._levels, outside.astype(np.intp)
+        early = lasts[tick, level] >= 0.5
+        comes_back = returns[tick, where, age] * lasts[tick, next_level] >= 0.5
+        stays = may_coast & ((lasting & ~outside) | comes_back)
+        return np.asarray(np.where(is_observed, early | is_confirmed, stays))
+
+    def _level(self, hits: Ints) -> Ints:
+        return -(-np.minimum(hits, self._lasting) * self._levels // self._lasting)
+
+    def _inside(self, count: int, tick: Ints, is_sure: Bools, xy_m: Floats) -> Bools:
+        """Which tracks (R,) are in the area in which others, or they themselves, were seen before."""
+        bounds = np.searchsorted(tick, np.arange(count + 1)).tolist()
+        inside = np.zeros(len(tick), bool)
+        for low, high in pairwise(bounds):
+            here = xy_m[:, low:high]
+            inside[low:high] = self._seen.holds(here)
+            if (is_sure[low:high] & ~inside[low:high]).any():
+                self._seen.add(here[:, is_sure[low:high]])
+        return inside
+
+    def _learn(self, passed: Ints, tick: Ints, now: Ints) -> tuple[Floats, Floats]:
+        """Learn from what became of tracks, of which ``now`` (4, R) is known at each step.
+
+        Returns the probability that a track lasts at each step by its level of observations, (F, H + 1), and that a
+        lost one comes back, by whether it is outside and the level of steps without an observation, (F, 2, A + 1).
+        """
+        count, levels = len(passed), self._levels + 1
+        all_, at = np.concatenate([self._last, now], axis=1), np.append(np.full(self._last.shape[1], -1), tick)
+        order = np.lexsort((at, all_[0]))
+        (ids, level, age, outside), at = all_[:, order], at[order]
+        goes_on = np.append(ids[1:] == ids[:-1], False)[: len(ids)]
+        known = goes_on | (at < count - 1)  # what became of those of the last step is not known yet
+        then = np.minimum(at + 1, count - 1)
+        known &= passed[then] == 1  # a gap of the log ends tracks, and says nothing about them
+        next_level, next_age = (np.append(one[1:], 0)[: len(ids)] for one in (level, age))
+        lasting, back = level >= self._levels, goes_on & (next_age == 0)
+        is_new = known & ~lasting & (~goes_on | (next_level > level))
+        is_lost = known & (age > 0) & (~lasting | (outside > 0)) & (~goes_on | back | (next_age > age))
+        place = then * levels + level
+        counts = np.stack([_counted(place[which], count, (levels,)) for which in (is_new, is_new & ~goes_on)])
+        shape = 2, self._ages + 1
+        place = (then * 2 + outside) * shape[1] + age
+        returns = np.stack([_counted(place[which], count, shape) for which in (is_lost, is_lost & back)])
+        counts[:, 0] += self._counts
+        returns[:, 0] += self._returns
+        counts, returns = counts.cumsum(axis=1), returns.cumsum(axis=1)
+        self._counts, self._returns, self._last = counts[:, -1], returns[:, -1], now[:, tick == count - 1]
+        survives: Floats = 1 - (counts[1] + self._prior) / (counts[0] + _WEIGHT)
+        survives[:, -1] = 1.0
+        stays_lost: Floats = 1 - (returns[1] + self._prior_returns) / (returns[0] + _WEIGHT)
+        return _from_here_on(survives), 1 - _from_here_on(stays_lost)
+
+
+def _counted(place: Ints, count: int, shape: tuple[int, ...]) -> Floats:
+    """Count each of the places of ``count`` tables, laid end to end."""
+    size = count * int(np.prod(shape))
+    return np.bincount(place, minlength=size).reshape(count, *shape).astype(np.float64)
+
+
+def _from_here_on(survives: Floats) -> Floats:
+    """The products of the last elements along the last axis, from each of them on."""
+    return np.asarray(np.cumprod(survives[..., ::-1], axis=-1)[..., ::-1], np.float64)
