@@ -44,6 +44,12 @@ def test_people_in_different_clothes_are_told_apart_where_motion_is_wrong():
     assert identities(replace(looks, appearance=False), frames) == PASSED
 
 
+def test_people_at_the_border_of_the_picture_are_not_joined_for_looking_alike():
+    frames, descriptors = two_who_turn_back(RED, BLUE)
+    everywhere = descriptors._replace(at_border=np.ones(len(descriptors.t_ns), bool))
+    assert TURNED.isdisjoint(identities(Retrack(descriptors=everywhere), frames))
+
+
 def assert_same(one: Frame, other: Frame) -> None:
     for name in one.rows.dtype.names:
         np.testing.assert_array_equal(one.rows[name], other.rows[name])

@@ -1,9 +1,9 @@
 """The samples that are re-tracked: the columns that are computed with in memory, whole rows in a temporary file.
 
 A person who is seen for an hour has 9,000 samples at 2.5 Hz. What re-tracking may hold for each of them, from the first
-step to the last, are numbers: the columns below (33 bytes), assignments, and the states of its filters. Rows of tracks
-(153 bytes) and of predictions (840 bytes for each sample) are made part by part, and kept as ``FrameColumns``, most of
-which is not in memory. Letters: N samples, F frames.
+step to the last, are numbers: the columns below (33 bytes), assignments, the states of its filters, and what is seen of
+it (74 bytes, see ``appearance``). Rows of tracks (153 bytes) and of predictions (840 bytes for each sample) are made
+part by part, and kept as ``FrameColumns``, most of which is not in memory. Letters: N samples, F frames.
 """
 
 from __future__ import annotations
