@@ -17,7 +17,7 @@ from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.sources.cameras import provenance_of
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.transforms import Retrack, RetrackByConsistency, Sample
-from mcaptrack.transforms.retrack.appearance import Descriptors
+from mcaptrack.transforms.retrack.appearance import Appearance, Descriptors
 from tests.clothes import BLUE, RED, UNTIL_S, two_who_turn_back
 
 
@@ -44,10 +44,19 @@ def test_people_in_different_clothes_are_told_apart_where_motion_is_wrong():
     assert identities(replace(looks, appearance=False), frames) == PASSED
 
 
-def test_people_at_the_border_of_the_picture_are_not_joined_for_looking_alike():
-    frames, descriptors = two_who_turn_back(RED, BLUE)
-    everywhere = descriptors._replace(at_border=np.ones(len(descriptors.t_ns), bool))
-    assert TURNED.isdisjoint(identities(Retrack(descriptors=everywhere), frames))
+def test_tracks_at_the_border_of_the_picture_are_not_joined_for_looking_alike():
+    _, descriptors = two_who_turn_back(RED, BLUE)
+    t_ns, track = descriptors.t_ns, descriptors.track_id
+    step, nowhere = np.rint(t_ns / 4e8).astype(np.int64), np.zeros((len(t_ns), 2))
+    ratios = []
+    for is_there in (False, True):
+        placed = descriptors._replace(at_border=np.full(len(t_ns), is_there))
+        seen = Appearance.of(placed, t_ns, step, track, nowhere, 0.4).between(step, track, 0.4)
+        ratios.append(seen.of_tracks(np.array([0, 0]), np.array([2, 3])).tolist())  # 1 goes on as 11, and as 12
+    (alike, different), (alike_at_border, different_at_border) = ratios
+    assert alike > 1.5
+    assert alike_at_border == 0
+    assert different == different_at_border < -1.5
 
 
 def assert_same(one: Frame, other: Frame) -> None:
