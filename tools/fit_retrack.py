@@ -221,7 +221,7 @@ def judged_joins(run: Run, tracked: Tracked, found: Joins, xy_m: np.ndarray) -> 
 
 def cuts_of(run: Run) -> Judged:
     """The joins of the online tracks of a scene."""
-    model, step, track, source, xy_m, step_s, _ = reached("cut_joins", *run.args)
+    model, step, track, source, xy_m, step_s = reached("cut_joins", *run.args)[:6]
     order = np.lexsort((step, track))
     tracked = tracked_of(model, step[order], track[order], source[order], xy_m[order], step_s)
     return judged_joins(run, tracked, find_joins(tracked, model, step_s), xy_m[order])[0]
