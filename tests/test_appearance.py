@@ -205,6 +205,23 @@ def test_a_run_looks_at_every_clear_box_and_says_what_it_found(log_of_run):
     }
 
 
+def test_samples_without_a_picture_take_none_of_the_others_away(log_of_run, monkeypatch):
+    monkeypatch.setattr("mcaptrack.pipeline.appearance._NEAR_NS", 1_000_000)
+    frames = list(log_of_run.frame_columns("/camera/samples", TRACKS))[:12]
+
+    def seen(given):
+        return with_descriptors(Retrack(), log_of_run, "/camera", given).descriptors
+
+    def unseen(part):
+        return [frame._replace(t_ns=frame.t_ns + 5_000_000) for frame in part]
+
+    wanted = seen(frames[:3] + frames[8:10])
+    assert len(np.unique(wanted.t_ns)) == 5
+    found = seen(frames[:3] + unseen(frames[3:8]) + frames[8:10] + unseen(frames[10:]))  # a hole, and no end
+    for one, other in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_what_does_not_compare_colours_has_none(log_of_run):
     frames = log_of_run.frame_columns("/camera/samples", TRACKS)
     for transform in (Retrack(appearance=False), Retrack(poor_scale=True), RetrackByConsistency(), Sample()):

@@ -79,10 +79,10 @@ def _described(
     pictures: Pictures, frames: Sequence[Frame], nearest: Ints, progress: Callable[[int, int], None]
 ) -> Iterator[Descriptors]:
     """For each frame with a picture what is seen in its samples."""
-    wanted = np.unique(nearest[nearest >= 0])
-    of_picture = np.searchsorted(nearest, wanted)  # frames are in order of time
+    shown = np.flatnonzero(nearest >= 0)  # in order of time, as pictures are
+    wanted, of_picture = np.unique(nearest[shown], return_index=True)
     decoded = pictures.frames(wanted.tolist())
-    place = dict(zip(wanted.tolist(), of_picture.tolist(), strict=True))
+    place = dict(zip(wanted.tolist(), shown[of_picture].tolist(), strict=True))
     for done, picture in enumerate(decoded):
         progress(done + 1, len(wanted))
         at = place[picture.index]
