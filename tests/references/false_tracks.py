@@ -27,7 +27,8 @@ def person_features(motion: Motion, paths: dict[int, Path]) -> dict[int, dict[st
         length, count = len(states), len(path)
         off = sum(((np.array(at) - states[step].mean[:, 0]) ** 2).sum() for step, at in path.items())
         speed = sum(hypot(*state.mean[:, 1]) for state in states.values()) / length
-        share, in_step = companion(name, paths, where, motion.noise_m)
+        errors = min(sqrt(off / count / 2) / motion.noise_m, 1)
+        share, in_step = companion(name, paths, where, motion.noise_m, errors)
         out[name] = {
             "log length": log(length * motion.step_s),
             "log count": log(count),
@@ -86,7 +87,7 @@ def inside(mine: dict[int, State], theirs: dict[int, State]) -> float:
     return len(near) / len(mine)
 
 
-def companion(name: int, paths: dict[int, Path], where: dict, noise_m: float) -> tuple[float, float]:
+def companion(name: int, paths: dict[int, Path], where: dict, noise_m: float, errors: float) -> tuple[float, float]:
     """The share of a track's samples beside the longer track with which it is most in step; and how much it is."""
     best = (0.0, 0.0)
     mine = paths[name]
@@ -100,7 +101,8 @@ def companion(name: int, paths: dict[int, Path], where: dict, noise_m: float) ->
         apart = np.array([np.subtract(mine[s], theirs[s]) for s in both])
         variance = apart.var(axis=0, ddof=1).mean() / 2  # of one of the two, on one axis
         share = len(both) / len(mine)
-        best = max(best, (share * max(log(2) - log(sqrt(variance) / noise_m + 0.05), 0.0), share))
+        steadier = log(2) + log((errors + 0.05) / 1.05) - log(sqrt(variance) / noise_m + 0.05)
+        best = max(best, (share * max(steadier, 0.0), share))
     return best[1], best[0]
 
 

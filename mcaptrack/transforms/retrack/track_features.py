@@ -39,7 +39,8 @@ _INSIDE_STEPS: Final = 3
 #: A track is beside a longer one where it is nearer to it than this, if at so many samples.
 _BESIDE_M: Final = 1.8
 _BESIDE_SAMPLES: Final = 4
-#: Two tracks are in step if their distance varies by less than this factor of the noise of both.
+#: Two tracks are in step if their distance varies by less than this factor of the noise of both; so much is added to
+#: ratios to the noise.
 _IN_STEP: Final = 2.0
 _LEAST_SPREAD: Final = 0.05
 #: Gaps are compared with those of tracks that go farther than this: what goes somewhere is a person.
@@ -68,7 +69,7 @@ def features(model: MotionModel, trajectories: Trajectories, smoothed: State, st
             np.log(roughness + 0.1),
             count / length,
             _duplicate_share(trajectories, xy),
-            *_beside(trajectories, xy, model.noise_m),
+            *_beside(trajectories, xy, model.noise_m, np.sqrt(roughness)),
             _rare_gaps(trajectories, extent > _GOES_M),
         ]
     )
@@ -91,12 +92,14 @@ def _duplicate_share(trajectories: Trajectories, xy: Floats) -> Floats:
     return out
 
 
-def _beside(trajectories: Trajectories, xy: Floats, noise_m: float) -> tuple[Floats, Floats]:
+def _beside(trajectories: Trajectories, xy: Floats, noise_m: float, errors: Floats) -> tuple[Floats, Floats]:
     """The share of each track's samples beside the companion that it is most in step with, (K,); and that times how
-    much steadier the distance of their samples is than ``_IN_STEP``, as a logarithm, (K,).
+    much steadier the distance of their samples is than ``_IN_STEP`` allows, as a logarithm, (K,).
 
     A companion has more samples, or as many and is the first of the two. People who walk together are measured one by
-    one, so their distance varies by the noise of both; two detections of one person share what is wrong with them.
+    one, so their distance varies by the noise of both; two detections of one person share what is wrong with them. That
+    says nothing where nothing is wrong, so variation is compared with the ``errors`` (K,) of the track, as a ratio to
+    the noise, where these are smaller.
     """
     seen = np.flatnonzero(np.isfinite(trajectories.xy_m[:, 0]))
     track = group_index(np.diff(trajectories.first))
@@ -119,7 +122,8 @@ def _beside(trajectories: Trajectories, xy: Floats, noise_m: float) -> tuple[Flo
     varies = np.sqrt(np.add.reduceat(off, starts) / np.maximum(2 * (together - 1), 1) / 2) / noise_m
     track = a[starts]
     shares = together / count[track]
-    steady = shares * np.maximum(np.log(_IN_STEP) - np.log(varies + _LEAST_SPREAD), 0)
+    expected = np.log(_IN_STEP * (np.minimum(errors[track], 1) + _LEAST_SPREAD) / (1 + _LEAST_SPREAD))
+    steady = shares * np.maximum(expected - np.log(varies + _LEAST_SPREAD), 0)
     often = together >= _BESIDE_SAMPLES
     order = np.lexsort((shares, steady, track))[::-1]
     order = order[often[order]]
