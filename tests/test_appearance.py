@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mcaptrack import log
+from mcaptrack.cli.running import _lines_of_summary
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.colour_histograms import LENGTH, at_border, describe, is_clear
 from mcaptrack.notices import collected
@@ -220,6 +221,20 @@ def test_samples_without_a_picture_take_none_of_the_others_away(log_of_run, monk
     found = seen(frames[:3] + unseen(frames[3:8]) + frames[8:10] + unseen(frames[10:]))  # a hole, and no end
     for one, other in zip(found, wanted, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_too_few_people_to_compare_are_said(log_of_run, monkeypatch):
+    frames = [frame._replace(rows=frame.rows[:1]) for frame in log_of_run.frame_columns("/camera/samples", TRACKS)][:8]
+    made = with_descriptors(Retrack(), log_of_run, "/camera", frames)
+    assert made.model_card().facts == {}  # before a run
+    list(made(frames))
+    assert made.model_card().facts == {"appearance": "not used"}
+    provenance = replace(provenance_of(log_of_run, "/camera/retracks"), model=made.model_card().facts)
+    monkeypatch.setattr("mcaptrack.pipeline.summary.provenance_of", lambda *_: provenance)
+    summary = summarise(log_of_run, "/camera")
+    assert asdict(summary.appearance) == {"used": False, "separation": None, "tracks": 0}
+    (words,) = [words for name, words in _lines_of_summary(summary) if name == "colours"]
+    assert words.startswith("not compared: too few people")
 
 
 def test_what_does_not_compare_colours_has_none(log_of_run):

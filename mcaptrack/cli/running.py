@@ -233,7 +233,9 @@ def _lines_of_summary(summary: Summary) -> Iterator[tuple[str, str]]:
         words = ", ".join(f"{getattr(summary.repair, name):,} {word}" for name, word in done)
         count = summary.repair.tracks
         yield "re-tracked", f"{count:,} {'track' if count == 1 else 'tracks'}: {words}"
-    if summary.appearance is not None:
+    if summary.appearance is not None and summary.appearance.separation is None:
+        yield "colours", "not compared: too few people were seen well before and after gaps"
+    elif summary.appearance is not None:
         looks, share = summary.appearance, f"{summary.appearance.separation:.0%}"
         over = f"{looks.tracks:,} {'track' if looks.tracks == 1 else 'tracks'}"
         words = f"compared: two people differ more than one does in {share} of cases ({over})"

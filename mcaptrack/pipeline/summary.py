@@ -65,11 +65,12 @@ class Corrected:
 class Looks:
     """The colours of clothes in re-tracking: whether they were used, and how well they tell people apart.
 
-    ``separation`` is the probability that two people differ more than one does after a gap, as measured on ``tracks``.
+    ``separation`` is the probability that two people differ more than one does after a gap, as measured on ``tracks``;
+    None if too few people were seen for that.
     """
 
     used: bool
-    separation: float
+    separation: float | None
     tracks: int
 
 
@@ -146,6 +147,8 @@ def _appearance(made: Provenance | None) -> Looks | None:
     """Return what re-tracking found of the appearance of people; None if it didn't look."""
     facts = made.model if made else {}
     try:
+        if "separation" not in facts:
+            return Looks(facts["appearance"] == "used", None, 0)
         return Looks(facts["appearance"] == "used", float(facts["separation"]), int(facts["tracks"]))
     except (KeyError, ValueError):
         return None

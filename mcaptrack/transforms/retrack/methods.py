@@ -85,9 +85,11 @@ class Retrack(LikelihoodOptions):
 
     def model_card(self) -> ModelCard:
         """Whether appearance told tracks apart in the last run, of the class that was seen most; empty without."""
-        seen: Sequence[AppearanceCalibration] = getattr(self, "_seen", ())
+        seen: Sequence[AppearanceCalibration] | None = getattr(self, "_seen", None)
+        if seen is None or self.looks is None:
+            return ModelCard()
         most = max(seen, key=lambda one: one.tracks, default=None)
-        return ModelCard() if most is None else ModelCard(facts=most.facts())
+        return ModelCard(facts={"appearance": "not used"} if most is None else most.facts())
 
 
 @dataclass(frozen=True, kw_only=True)
