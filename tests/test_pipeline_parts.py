@@ -337,7 +337,13 @@ def test_the_rate_of_other_inputs_is_known_and_a_high_one_is_said(tmp_path, rate
             with notices.listening(lambda _: None), notices.collected() as said:
                 frames, known = pipeline.input_of(opened, "/camera", "retrack", Retrack(), source)
             people = {"class_names": ((1, "person"),), "fixed_ids": ()}
-            assert known == {"rate_hz": rate_hz, "ground_planes": (), "poor_scale": False, **people}
+            assert known == {
+                "rate_hz": rate_hz,
+                "ground_planes": (),
+                "poor_scale": False,
+                "descriptors": None,
+                **people,
+            }
             assert [frame.t_ns for frame in frames] == [frame.t_ns for frame in paced(rate_hz)]
             assert [(one.message, one.code) for one in said] == [(words, "clock")] * (is_said and source is not None)
 
