@@ -30,6 +30,8 @@ def answered(text: str, folder: Path) -> str:
 
     def with_answer(found: re.Match[str]) -> str:
         query = found["query"]
+        if not connection.sql(query).fetchone():  # it asks for other logs
+            return found[0]
         sure = "from metrics" not in query and not SURE.search(query)
         head = "" if sure else "For example:\n\n"
         return f"```sql\n{query}```\n\n{head}{answer(connection.sql(query))}"

@@ -20,7 +20,6 @@ from collections import deque
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.optimize import nnls
 
 from mcaptrack.geometry.arrays import Floats
 
@@ -74,6 +73,8 @@ class PositionNoise:
 
     def _estimate(self) -> None:
         """Estimate the noise from the bends of the last steps."""
+        from scipy.optimize import nnls
+
         for place, bends_m2 in enumerate(np.concatenate(self._bends_m2).T):
             known = bends_m2[np.isfinite(bends_m2)]
             if len(known) >= _LEAST_POSITIONS:  # of two axes; the median, because some tracks turn or are exchanged
