@@ -73,17 +73,19 @@ class PositionNoise:
 
     def _estimate(self) -> None:
         """Estimate the noise from the bends of the last steps."""
-        from scipy.optimize import nnls
+        from scipy.optimize import lsq_linear  # ``nnls`` of some releases of SciPy gives up at times
 
         for place, bends_m2 in enumerate(np.concatenate(self._bends_m2).T):
             known = bends_m2[np.isfinite(bends_m2)]
             if len(known) >= _LEAST_POSITIONS:  # of two axes; the median, because some tracks turn or are exchanged
                 self._variances_m2[place] = float(np.median(known)) / (12 * np.log(2))
-        seen = self._variances_m2 > 0
-        if seen.any():
-            given = self._variances_m2[seen]
-            parts, _ = nnls(self._shapes[seen] / given[:, None], np.ones(len(given)))
-            self.white_m2, self.lasting_m2 = float(parts[0]), float(parts[1])
+        given = self._variances_m2
+        if (given > 0).all():
+            unit_m2 = float(given.mean())
+            shapes = self._shapes * (unit_m2 / given)[:, None]
+            parts = lsq_linear(shapes, np.ones(len(given)), (0, np.inf), method="bvls").x
+            white, lasting, _ = (max(float(part), 0.0) for part in parts)  # -1e-19 is within rounding
+            self.white_m2, self.lasting_m2 = white * unit_m2, lasting * unit_m2
 
     def of_errors(self, steps: int) -> NoiseOfErrors:
         """The effect of noise on the errors of forecasts of so many steps."""
