@@ -49,14 +49,11 @@ def person_features(motion: Motion, paths: dict[int, Path]) -> dict[int, dict[st
     return out
 
 
-def person_log_odds(motion: Motion, paths: dict[int, Path]) -> dict[int, float]:
-    """For each track the log odds that it is a person."""
-    found = person_features(motion, paths)
-    return {name: sum(PEOPLE[one] * value for one, value in of.items()) + PERSON_BIAS for name, of in found.items()}
-
-
 def log_odds_in_log(motion: Motion, paths: dict[int, Path]) -> dict[int, float]:
-    """The same by weights that follow the log: entropy of the tracks plus distance from the fitted weights is least."""
+    """For each track the log odds that it is a person, by weights that follow the log.
+
+    For these the entropy of the tracks plus the distance from the fitted weights is least.
+    """
     found = person_features(motion, paths)
     mean, spread = (np.array([FITTED["people"][what][one] for one in PEOPLE]) for what in ("mean", "spread"))
     fitted = np.array(list(PEOPLE.values()))

@@ -34,11 +34,6 @@ def probability(log_odds: Floats) -> Floats:
     return np.asarray(1 / (1 + np.exp(-log_odds)))
 
 
-def track_log_odds(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
-    """The log odds that each track is a person, (K,)."""
-    return np.asarray(features(model, trajectories, smoothed, step_s) @ _WEIGHTS + _BIAS)
-
-
 def log_odds_in_log(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
     """The log odds that each track is a person, (K,), by weights that follow the log.
 
