@@ -179,6 +179,17 @@ def test_links_are_the_same_without_a_table_of_all_pairs(seed):
         assert link_tracks(model, out, forward, backward, 0.4, 20.0, 0.1).tolist() == whole.tolist()
 
 
+@given(seed=SEEDS)
+@settings(max_examples=25)
+def test_shifts_by_the_length_of_gaps_equal_the_reference(seed):
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(0, 40))
+    odds, gap_s = rng.normal(rng.normal(0, 2), 2, count), rng.choice(np.arange(0.4, 20, 0.4), count)
+    made = {(k, k): (float(odds[k]), False, float(gap_s[k])) for k in range(count)}
+    found = linking.prior_shifts(odds, gap_s, np.array([0.4, 1.2, 2.0, 4.0, 8.0, 16.0]))
+    np.testing.assert_allclose(found, cut_links.usual_by_gap(made), atol=1e-3)
+
+
 def test_links_of_thousands_of_broken_tracks_take_memory_for_the_candidates_alone():
     """A chain of tracks that hang together: a table of all has 9 million cells, of which 9000 are candidates."""
     count = 3000
