@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.transforms import PROFILES
 from mcaptrack.transforms.retrack.false_tracks import log_odds_in_log
-from mcaptrack.transforms.retrack.motion_model import smooth
+from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories, smooth
 from mcaptrack.transforms.retrack.track_features import FEATURES, features
 from tests.references.false_tracks import log_odds_in_log as in_log
 from tests.references.false_tracks import person_features
+from tests.references.offline import Motion
 from tests.test_offline_reference import Paths, laid_out, models, scattered, walk_of
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -31,32 +32,30 @@ def with_companions(rng: np.random.Generator, count: int) -> Paths:
     return paths
 
 
+def drawn(seed: int, most: int) -> tuple[Paths, Motion, tuple[MotionModel, Trajectories, State, float]]:
+    """Up to so many tracks and more beside them, the reference's model of motion, and all that the package is given."""
+    rng = np.random.default_rng(seed)
+    model, motion = models(rng)
+    paths = with_companions(rng, int(rng.integers(1, most + 1)))
+    out, _ = laid_out(paths, model.noise_m)
+    return paths, motion, (model, out, smooth(model, out, 0.4)[2], 0.4)
+
+
 @given(seed=SEEDS)
 @settings(max_examples=25)
 def test_features_equal_the_reference(seed):
-    rng = np.random.default_rng(seed)
-    model, motion = models(rng)
-    paths = with_companions(rng, int(rng.integers(1, 8)))
-    out, _ = laid_out(paths, model.noise_m)
-    _, _, smoothed = smooth(model, out, 0.4)
+    paths, motion, given_all = drawn(seed, 7)
     wanted = person_features(motion, paths)
-    found = features(model, out, smoothed, 0.4)
-    for name, row in zip(sorted(paths), found, strict=True):
+    for name, row in zip(sorted(paths), features(*given_all), strict=True):
         assert dict(zip(FEATURES, row.tolist(), strict=True)) == pytest.approx(wanted[name], abs=1e-9)
 
 
 @given(seed=SEEDS)
 @settings(max_examples=10)
 def test_weights_follow_the_log_to_where_few_tracks_are_doubtful(seed):
-    rng = np.random.default_rng(seed)
-    model, motion = models(rng)
-    paths = with_companions(rng, 12)
-    out, _ = laid_out(paths, model.noise_m)
-    _, _, smoothed = smooth(model, out, 0.4)
+    paths, motion, given_all = drawn(seed, 12)
     wanted = in_log(motion, paths)
-    np.testing.assert_allclose(
-        log_odds_in_log(model, out, smoothed, 0.4), [wanted[k] for k in sorted(paths)], atol=1e-3
-    )
+    np.testing.assert_allclose(log_odds_in_log(*given_all), [wanted[k] for k in sorted(paths)], atol=1e-3)
 
 
 def frames_of(paths: Paths) -> list[Frame]:
