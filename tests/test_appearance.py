@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -10,11 +11,11 @@ import pytest
 from mcaptrack import log
 from mcaptrack.cli.running import _lines_of_summary
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.colour_histograms import LENGTH, at_border, describe, is_clear
+from mcaptrack.geometry.colour_histograms import BINS, LENGTH, at_border, describe, is_clear, mean_shares
 from mcaptrack.notices import collected
 from mcaptrack.pipeline.appearance import _nearest, with_descriptors
 from mcaptrack.pipeline.summary import summarise
-from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema import APPEARANCE, TRACKS, Frame
 from mcaptrack.sources.cameras import provenance_of
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.transforms import Retrack, RetrackByConsistency, Sample
@@ -239,7 +240,7 @@ def test_too_few_people_to_compare_are_said(log_of_run, monkeypatch):
 
 def test_what_does_not_compare_colours_has_none(log_of_run):
     frames = log_of_run.frame_columns("/camera/samples", TRACKS)
-    for transform in (Retrack(appearance=False), Retrack(poor_scale=True), RetrackByConsistency(), Sample()):
+    for transform in (Retrack(appearance=False), Retrack(poor_scale=True, link_s=0), RetrackByConsistency(), Sample()):
         assert with_descriptors(transform, log_of_run, "/camera", frames) is transform
     in_metres = [frame._replace(rows=frame.rows.copy()) for frame in frames]
     for frame in in_metres:
@@ -266,3 +267,94 @@ def test_the_picture_of_a_sample_is_the_nearest_one_within_a_tenth_of_a_second()
     assert _nearest(pictures, samples).tolist() == [-1, 0, 0, 1, 1, 2, -1, -1, 3, 3, -1]
     assert _nearest(pictures[:1], samples[:3]).tolist() == [-1, 0, 0]
     assert _nearest(pictures[:0], samples[:2]).tolist() == [-1, -1]
+
+
+def stored(transform: Retrack, frames) -> list[tuple[int, np.ndarray]]:
+    """The times and rows of what is stored of the appearance of tracks, where there are any."""
+    return [(looks.t_ns, looks.rows) for *_, looks in transform(frames) if len(looks.rows)]
+
+
+def test_stored_colours_are_the_mean_of_the_clear_pictures_of_each_track():
+    """Of track 1 in red, which goes on as 11, and of track 2 in blue, which goes on as 12."""
+    frames, descriptors = two_who_turn_back(RED, BLUE)
+    assert {len(outputs) for outputs in Retrack(descriptors=descriptors)(frames)} == {4}
+    found = stored(Retrack(descriptors=descriptors, store_appearance=True), frames)
+    rows = np.concatenate([rows for _, rows in found])
+    assert sorted(rows[["track_id", "body_part"]].tolist()) == [(1, 1), (1, 2), (2, 1), (2, 2)]
+    bins = [name for name in rows.dtype.names if name.rstrip("0123456789").endswith("_")]
+    assert len(bins) == LENGTH / 2
+    for track, ids in ((1, (1, 11)), (2, (2, 12))):
+        mine = np.isin(descriptors.track_id, ids) & descriptors.is_clear
+        t_ns = descriptors.t_ns[mine]
+        wanted = np.square(descriptors.values[mine] / 255.0).mean(axis=0).reshape(2, -1) * 6  # six histograms share 1
+        (at,) = {t for t, some in found if track in some["track_id"]}
+        assert at == t_ns.max()
+        for part, shares in enumerate(wanted, 1):
+            (row,) = rows[(rows["track_id"] == track) & (rows["body_part"] == part)]
+            assert row["pictures"] == mine.sum()
+            assert row["duration_s"] == pytest.approx((t_ns.max() - t_ns.min()) / 1e9)
+            np.testing.assert_allclose([row[name] for name in bins], shares, atol=0.01)
+            for axis in ("lightness", "green_red", "blue_yellow"):
+                assert sum(row[name] for name in bins if name.startswith(axis)) == pytest.approx(1)
+
+
+def test_the_bins_of_stored_colours_are_where_the_schema_says():
+    """The histogram of a picture of the colour of each bin's centre, by OpenCV, is that bin alone, but for rounding."""
+    import cv2
+
+    for column in APPEARANCE.columns[4:]:
+        axis, centre = column.name.rsplit("_", 1)[0], float(re.search(r"near (-?[\d.]+)", column.doc)[1])
+        at = ["lightness", "green_red", "blue_yellow"].index(axis)
+        lab = np.array([60.0, 0.0, 0.0], np.float32)
+        lab[at] = centre
+        colour = cv2.cvtColor(lab.reshape(1, 1, 3), cv2.COLOR_LAB2BGR).reshape(3) * 255
+        values = describe(patch(tuple(np.clip(np.rint(colour), 0, 255).astype(int).tolist())), WHOLE)
+        (upper, legs) = mean_shares(values, np.zeros(1, int), 1)[0]
+        for part in (upper, legs):
+            shares = dict(zip(BINS, part.tolist(), strict=True))
+            own = {name: share for name, share in shares.items() if name.startswith(axis)}
+            assert max(own, key=own.get) == column.name, own
+            assert own[column.name] > 0.7
+
+
+def test_stored_colours_need_no_comparison_and_leave_out_who_is_never_seen():
+    frames, descriptors = two_who_turn_back(RED, BLUE)
+    unseen = descriptors._replace(is_clear=descriptors.is_clear & ~np.isin(descriptors.track_id, (2, 11)))
+    found = stored(Retrack(descriptors=unseen, store_appearance=True, appearance=False), frames)
+    assert {one for _, rows in found for one in rows["track_id"].tolist()} == {1}  # by motion 1 goes on as 12
+    assert sum(len(rows) for _, rows in found) == 2
+
+
+def exchanged(descriptors: Descriptors, one: int, other: int) -> Descriptors:
+    """The same, but that two tracks, which are seen at the same times, look like each other."""
+    values = descriptors.values.copy()
+    of_one, of_other = (descriptors.track_id == track for track in (one, other))
+    values[of_one], values[of_other] = descriptors.values[of_other], descriptors.values[of_one]
+    return descriptors._replace(values=values)
+
+
+IN_PICTURES = Retrack(poor_scale=True)
+
+
+@pytest.mark.parametrize(("second", "are_linked"), [(BLUE, False), (RED, True)])
+def test_links_in_the_picture_look_at_colours_where_these_tell_people_apart(second, are_linked):
+    frames, descriptors = two_who_turn_back(RED, second)
+    linked, alone = {frozenset({1, 11}), frozenset({2, 12})}, {frozenset({one}) for one in (1, 2, 11, 12)}
+    for looks, wanted in ((None, linked), (descriptors, linked), (exchanged(descriptors, 11, 12), alone)):
+        found: dict[int, set[int]] = {}
+        for offline, *_ in replace(IN_PICTURES, descriptors=looks)(frames):
+            for one, source in offline.rows[["track_id", "source_id"]].tolist():
+                found.setdefault(one, {one}).update([source] if source >= 0 else [])
+        assert set(map(frozenset, found.values())) == (linked if are_linked else wanted)
+
+
+def test_stored_colours_of_tracks_that_are_linked_in_the_picture_have_their_ids():
+    frames, descriptors = two_who_turn_back(RED, BLUE)
+    looks = replace(IN_PICTURES, descriptors=descriptors, store_appearance=True)
+    rows = np.concatenate([rows for _, rows in stored(looks, frames)])
+    clear = descriptors.track_id[descriptors.is_clear]
+    both = [int(np.isin(clear, ids).sum()) for ids in ((1, 11), (2, 12))]
+    assert rows[["track_id", "pictures"]].tolist() == [(1, both[0])] * 2 + [(2, both[1])] * 2
+    assert looks.model_card().facts["appearance"] == "used"
+    unlinked = stored(replace(looks, link_s=0.0), frames)
+    assert {one for _, rows in unlinked for one in rows["track_id"].tolist()} == {1, 2, 11, 12}

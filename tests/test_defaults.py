@@ -90,7 +90,8 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "coast_s": 1.2,
         "adapt_online": True,
         "adapt": True,
-        "appearance": True,
+        "appearance": None,
+        "store_appearance": False,
     },
     "consistency": RETRACKING
     | {

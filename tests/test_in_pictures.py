@@ -316,7 +316,7 @@ def test_links_are_as_probable_as_the_model_says(seed):
     made = []
     for nudge in (-1e-5, 1e-5):
         least = 1 / (1 + np.exp(-odds - nudge))
-        found = np.concatenate(list(link_in_picture(frames, 9.0, least, False)))
+        found = np.concatenate(list(link_in_picture(frames, 9.0, least, False).rows))
         made.append(2 not in found["track_id"])
     assert made == [True, False]
 
@@ -324,18 +324,18 @@ def test_links_are_as_probable_as_the_model_says(seed):
 def test_the_longest_gaps_are_linked_and_no_longer_ones():
     for missed, joined in ((10, True), (11, False)):  # 4.0 and 4.4 s between the samples before and after
         frames = collect(TRACKS, with_gap(100.0, range(4, 3 + missed)))
-        found = np.concatenate(list(link_in_picture(frames, 9.0, 1e-9, False)))
+        found = np.concatenate(list(link_in_picture(frames, 9.0, 1e-9, False).rows))
         assert (2 not in found["track_id"]) == joined
-        found = np.concatenate(list(link_in_picture(frames, (missed - 1) * 0.4, 1e-9, False)))
+        found = np.concatenate(list(link_in_picture(frames, (missed - 1) * 0.4, 1e-9, False).rows))
         assert 2 in found["track_id"]
 
 
 def test_tracks_of_people_who_said_so_are_not_joined():
     frames = collect(TRACKS, with_gap(100.0, range(8, 10)))
     for fixed, count in (((), 1), ((1,), 1), ((2,), 1), ((1, 2), 2)):
-        found = np.concatenate(list(link_in_picture(frames, 4.0, 0.5, False, fixed)))
+        found = np.concatenate(list(link_in_picture(frames, 4.0, 0.5, False, fixed).rows))
         assert len(np.unique(found["track_id"])) == count
-    assert list(link_in_picture(collect(TRACKS, []), 4.0, 0.5, False)) == []
+    assert list(link_in_picture(collect(TRACKS, []), 4.0, 0.5, False).rows) == []
 
 
 def test_a_track_of_three_parts_has_one_id_also_in_its_gaps_and_rows_are_in_order_of_ids():
@@ -349,7 +349,7 @@ def test_a_track_of_three_parts_has_one_id_also_in_its_gaps_and_rows_are_in_orde
     frames = [frame(n, boxes(n)) for n in range(20)]
     both = [np.concatenate([one.rows, nowhere]) for one in frames]
     frames = [one._replace(rows=rows[np.argsort(rows["track_id"])]) for one, rows in zip(frames, both, strict=True)]
-    for n, rows in enumerate(link_in_picture(collect(TRACKS, frames), 4.0, 0.5, False)):
+    for n, rows in enumerate(link_in_picture(collect(TRACKS, frames), 4.0, 0.5, False).rows):
         assert rows["track_id"].tolist() == [4, 7, 9]
         assert rows["x_px"][2] == pytest.approx(walking(n, 100.0)[0] - 20)
         source = -1 if n in (6, 7, 13, 14) else 9 if n < 6 else 2 if n < 13 else 3

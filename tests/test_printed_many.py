@@ -20,7 +20,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import FleetResult, FleetStatus, LogOutcome, Running
 from mcaptrack.fleet.expansion import NamedLog
 from mcaptrack.notices import Notice
-from mcaptrack.pipeline.summary import Corrected, Repair, Summary, SummaryScores
+from mcaptrack.pipeline.summary import Corrected, Looks, Repair, Summary, SummaryScores
 from tests.commands import run_result as result
 
 A, B, C = Path("a.mcap"), Path("b.mcap"), Path("c.mcap")
@@ -58,10 +58,11 @@ def camera(is_scene: bool = False, **counts: Any) -> CameraResult:
     return CameraResult(("track",), {"/x/tracks": 3}, {"/x/tracks": 4}, {"/x/tracks": 2}, Summary(**counts), is_scene)
 
 
-LEFT = camera(pictures=1000, boxes=2000, tracks=1, ground_plane="given")
+LEFT = camera(pictures=1000, boxes=2000, tracks=1, ground_plane="given", appearance=Looks(True, 0.9, 8))
 RIGHT = camera(
-    tracks=1200, repair=Repair(1100, 0, 0, 0), scores=SummaryScores((0.5, 0.755), (3, 2), "by boxes"), camera_motion="x"
-)
+    tracks=1200, repair=Repair(1100, 0, 0, 0), scores=SummaryScores((0.5, 0.755), (3, 2), "by boxes"), camera_motion="x",
+    appearance=Looks(False, 0.55, 12),
+)  # fmt: skip
 SCENE = camera(True, tracks=9)
 BOTH = {"left": LEFT, "right": RIGHT, "scene": SCENE}
 
@@ -69,8 +70,8 @@ BOTH = {"left": LEFT, "right": RIGHT, "scene": SCENE}
 def test_each_camera_has_a_line_and_the_scene_its_summary():
     whole = result(cameras=BOTH, left_out={"up": "has no tracks; give `topic=`"}, summary=Summary(tracks=9))
     assert list(running._lines_of_run(whole)) == [
-        ("left", "1,000 pictures, 2,000 boxes, 1 track, ground plane given"),
-        ("right", "1,200 tracks, 1,100 after re-tracking, IDF1 75.5%"),
+        ("left", "1,000 pictures, 2,000 boxes, 1 track, colours compared, ground plane given"),
+        ("right", "1,200 tracks, 1,100 after re-tracking, colours not compared, IDF1 75.5%"),
         ("up", "left out: it has no tracks; give --topic"),
         ("fused", "scene, the scene"),
         ("tracks", "9"),

@@ -335,6 +335,7 @@ def test_files_and_logs_give_the_same_tables(known, tmp_path):
             "zone_crossings",
             "zone_counts",
             "decisions",
+            "appearances",
         ), name
 
 

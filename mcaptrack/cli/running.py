@@ -210,6 +210,8 @@ def _line_of_camera(camera: CameraResult) -> str:
         words.append(f"{summary.tracks:,} {'track' if summary.tracks == 1 else 'tracks'}")
     if summary.repair is not None:
         words.append(f"{summary.repair.tracks:,} after re-tracking")
+    if summary.appearance is not None:
+        words.append(f"colours {'' if summary.appearance.used else 'not '}compared")
     if summary.scores is not None:
         words.append(f"IDF1 {summary.scores.idf1[1]:.1%}")
     if summary.ground_plane is not None:

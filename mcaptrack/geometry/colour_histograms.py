@@ -21,8 +21,14 @@ _PARTS: Final = ((5, 16), (16, 29))
 #: The lightness and both axes of colour (CIELAB in 8 bits): the ends of the first and of the last bin, and how many.
 #: Bins are wide and a pixel counts for two of them, so that a change of light moves little.
 _BINS: Final = ((20.0, 235.0, 8), (98.0, 158.0, 10), (98.0, 158.0, 10))
+#: The names of the bins of one part of the body, in their order.
+BINS: Final = tuple(
+    f"{axis}_{number + 1}"
+    for axis, (_, _, count) in zip(("lightness", "green_red", "blue_yellow"), _BINS, strict=True)
+    for number in range(count)
+)
 #: The length of a descriptor, in bytes.
-LENGTH: Final = len(_PARTS) * sum(count for _, _, count in _BINS)
+LENGTH: Final = len(_PARTS) * len(BINS)
 #: Boxes that another one covers to more than this share may show another person.
 _MAX_COVERED: Final = 0.35
 #: Smaller boxes have too few pixels, and those that end at a border of the picture show less than a person.
@@ -58,6 +64,19 @@ def describe(picture: Image, boxes: Floats) -> NDArray[np.uint8]:
     lab = lab.reshape(patches.shape)
     parts = [_histogram(lab[:, low:high, :, axis], *_BINS[axis]) for low, high in _PARTS for axis in range(3)]
     return np.asarray(np.rint(255 * np.sqrt(np.hstack(parts) / len(parts))), np.uint8)
+
+
+def mean_shares(descriptors: NDArray[np.uint8], group: Ints, count: int) -> Floats:
+    """The mean histograms of groups of descriptors (N, ``LENGTH``): shares of pixels, (count, parts of the body, BINS).
+
+    ``group`` (N,) is from 0 to below ``count``; no group is empty. The shares of each axis are 1 together.
+    """
+    squares = np.square(descriptors / 255.0)
+    mean = np.stack([np.bincount(group, column, count) for column in squares.T], axis=-1)
+    shares = mean.reshape(count, len(_PARTS), len(BINS))
+    starts = np.cumsum([0, *(bins for _, _, bins in _BINS[:-1])])
+    total = np.add.reduceat(shares, starts, axis=2)
+    return np.asarray(shares / np.repeat(total, [bins for _, _, bins in _BINS], axis=2))
 
 
 def _histogram(values: NDArray[np.uint8], low: float, high: float, count: int) -> Floats:

@@ -29,7 +29,7 @@ from mcaptrack.pipeline.planes import read_planes
 from mcaptrack.pipeline.staleness import is_stale
 from mcaptrack.pipeline.visible import picture_size
 from mcaptrack.pipeline.write import digest_of
-from mcaptrack.schema import DECISIONS, DETECTIONS, PREDICTIONS, TRACKS, VIDEO, Frame, Rows, Schema
+from mcaptrack.schema import APPEARANCE, DECISIONS, DETECTIONS, PREDICTIONS, TRACKS, VIDEO, Frame, Rows, Schema
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_numbers, frame_times, unique_values
 from mcaptrack.schema.provenance import Provenance
@@ -216,11 +216,11 @@ class Before:
         out: list[Sequence[Frame]] = []
         largest = last_id
         for topic, schema, frames in zip(topics, schemas, outputs, strict=True):
-            if schema not in (TRACKS, PREDICTIONS, DECISIONS):
+            if schema not in (TRACKS, PREDICTIONS, DECISIONS, APPEARANCE):
                 out.append(self._kept(schema, frames, None))
                 continue
             of_main = maps.get(job.target, {})
-            same = maps.get(topic, of_main if schema is DECISIONS else of_predictions)
+            same = maps.get(topic, of_main if schema in (DECISIONS, APPEARANCE) else of_predictions)
             kept = self._kept(schema, frames, partial(_renumbered, same=same, last_id=last_id))
             largest = max(largest, int(unique_values(schema, kept, "track_id").max(initial=0)))
             out.append(kept)

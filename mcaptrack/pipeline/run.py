@@ -248,7 +248,7 @@ def _run_job(
     fixed = fixed_in(opened, prefix, job.source, made) if hasattr(context, "fixed_ids") else ()
     transform = replace(context, **known.values, **({"fixed_ids": fixed} if fixed else {}))
     transform = before.in_context(transform) if before and lead else transform
-    transform = with_descriptors(transform, opened, prefix, shown, progress)
+    transform = with_descriptors(transform, opened, prefix, shown, progress, job.keep)
     collectors = [FrameCollector(schema) for schema in transform.writes.values()]
     taken = [0]
     try:

@@ -146,10 +146,10 @@ def summarise(opened: log.Log, prefix: str, boxes_read: BoxesRead | None = None)
 def _appearance(made: Provenance | None) -> Looks | None:
     """Return what re-tracking found of the appearance of people; None if it didn't look."""
     facts = made.model if made else {}
+    separation = facts.get("separation")
     try:
-        if "separation" not in facts:
-            return Looks(facts["appearance"] == "used", None, 0)
-        return Looks(facts["appearance"] == "used", float(facts["separation"]), int(facts["tracks"]))
+        was = None if separation is None else float(separation)
+        return Looks(facts["appearance"] == "used", was, int(facts.get("tracks", 0)))
     except (KeyError, ValueError):
         return None
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 __all__ = [
+    "APPEARANCE",
     "BOX_PX",
     "CAMERA_MOTION",
     "COUNTS",
@@ -43,6 +44,7 @@ __all__ = [
     "ZONE_COUNTS",
     "ZONE_CROSSINGS",
     "ZONE_VISITS",
+    "BodyPart",
     "Column",
     "DecisionKind",
     "EventKind",
@@ -276,6 +278,7 @@ ZONE_VISITS: Final = Schema("mcaptrack.ZoneVisits")
 ZONE_CROSSINGS: Final = Schema("mcaptrack.ZoneCrossings")
 ZONE_COUNTS: Final = Schema("mcaptrack.ZoneCounts")
 DECISIONS: Final = Schema("mcaptrack.Decisions")
+APPEARANCE: Final = Schema("mcaptrack.Appearance")
 #: Row schemas by name.
 SCHEMAS: Final = {
     schema.name: schema
@@ -294,11 +297,19 @@ SCHEMAS: Final = {
         ZONE_CROSSINGS,
         ZONE_COUNTS,
         DECISIONS,
+        APPEARANCE,
     )
 }
 #: Pictures instead of rows: a transform that reads this schema gets their brightness, or their colours if it asks for
 #: them.
 VIDEO: Final = Schema("foxglove.CompressedVideo")
+
+
+class BodyPart(IntEnum):
+    """The values of the column ``body_part`` of appearance."""
+
+    UPPER_BODY = 1
+    LEGS = 2
 
 
 class DecisionKind(IntEnum):

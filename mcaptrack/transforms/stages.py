@@ -297,12 +297,12 @@ _STAGES: Final = (
         profiles=PROFILES,
         modes=MappingProxyType(
             {
-                "both": ("", "online", "predictions", "decisions"),
-                "offline": ("", "decisions"),
+                "both": ("", "online", "predictions", "decisions", "appearance"),
+                "offline": ("", "decisions", "appearance"),
                 "online": ("online", "predictions"),
             }
         ),
-        beside=("decisions",),
+        beside=("decisions", "appearance"),
         implied=MappingProxyType({"distance": "consistency"}),
         upgrade=upgrade_parameters,
     ),

@@ -110,6 +110,11 @@ def turned_back(outputs: Outputs) -> int:
     return sum((one, source + 10) in pairs for one, source in pairs if source in (1, 2))
 
 
+def stored_rows(outputs: Outputs) -> int:
+    """The rows of the output beside offline tracks, online ones, predictions and decisions."""
+    return sum(len(frame.rows) for output in outputs[4:] for frame in output)
+
+
 CIRCLES = turning(0.8, 15.0)
 LIKELY = replace(
     PROFILES["default"], link_s=0.0, resolve_swaps=False, smooth=False, track_confidence=0.0, adapt_online=False
@@ -149,6 +154,14 @@ case(
     list(two_who_turn_back(RED, BLUE)[0]),
     turned_back,
     {True: 2, False: 0},
+)
+case(
+    "store_appearance",
+    "what is seen of each of two people who turn back, as rows for the upper body and for the legs",
+    Retrack(descriptors=two_who_turn_back(RED, BLUE)[1]),
+    list(two_who_turn_back(RED, BLUE)[0]),
+    stored_rows,
+    {True: 4, False: 0},
 )
 case("horizon_s", "2.5 steps a second", LIKELY, line(0.5, 20, 20), forecast_steps, {0.4: 1, 2.0: 5, 4.8: 12})
 case(

@@ -184,7 +184,9 @@ class LogTables:
     def _track_names(self, topic: str) -> TrackNames:
         """The names of the classes of the tracks, and of the ground truth, that the rows of a channel are about."""
         made = provenance_of(self.opened, topic)
-        base = topic.removesuffix("/events").removesuffix("/errors").removesuffix("/decisions")
+        base = topic
+        for beside in ("/events", "/errors", "/decisions", "/appearance"):
+            base = base.removesuffix(beside)
         if made and made.zones:
             base = made.input
         beside = base.removesuffix("/predictions")

@@ -57,6 +57,13 @@ class Descriptors(NamedTuple):
         found = (have[row] == want) & (times[at] == t_ns) & (ids[who] == track_id)
         return np.where(found, row, -1)
 
+    def tracks_of(self, t_ns: Ints, track_id: Ints, track: Ints) -> Ints:
+        """The ``track`` of each descriptor (S,), or -1, by those of samples (C,)."""
+        found = self.find(t_ns, track_id)
+        out = np.full(len(self.t_ns), -1)
+        out[found[found >= 0]] = track[found >= 0]
+        return out
+
 
 class Appearance(NamedTuple):
     """The appearance of assignments: the row of ``descriptors`` of each (C,), or -1, and what distances mean."""

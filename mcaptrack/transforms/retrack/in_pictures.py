@@ -4,14 +4,15 @@ A camera that looks along the ground tells distances badly: a few pixels are met
 is measured well, and so is its height. Positions, speeds, noise and gates are therefore in heights of the box, in which
 people near and far move alike. A tracker associates boxes by their overlap at the rate of the video, which samples
 can't improve: only ends and beginnings of its tracks are decided here. A link is as likely as the motion and the height
-before a gap fit those after it, compared with how often a new track would begin there in this log by chance.
+before a gap fit those after it, compared with how often a new track would begin there in this log by chance; and as
+likely as what people wear before and after it is one person's, where the log has pictures that tell people apart.
 
 Letters: K tracks, N rows of samples, E candidate links.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -25,6 +26,8 @@ from mcaptrack.schema import TRACKS, Rows
 from mcaptrack.schema.frame_columns import FrameColumns
 from mcaptrack.schema.framing import joined_parts
 from mcaptrack.schema.resampling import LINEAR
+from mcaptrack.transforms.retrack.appearance import Appearance, Descriptors, Evidence
+from mcaptrack.transforms.retrack.appearance_calibration import AppearanceCalibration
 
 #: The longest gap of a link, and the mean one: how often gaps are as long falls off exponentially. In seconds.
 MAX_GAP_S: Final = 4.0
@@ -38,6 +41,27 @@ _NOISE, _END_NOISE, _SPEED, _DRIFT = 0.06, 0.08, 0.6, 0.25
 _HEIGHT_NOISE, _HEIGHT_END_NOISE, _GROWTH, _HEIGHT_DRIFT, _HEIGHTS = 0.06, 0.12, 0.2, 0.15, 0.5
 #: The share of ends that are followed by a beginning of the same person.
 _RETURNS: Final = 0.5
+#: The height of a person, for how far people may have walked between two places in the picture: as if all were as far
+#: away as the usual box.
+_PERSON_M: Final = 1.7
+
+
+class Linked(NamedTuple):
+    """The rows of each frame; the id of each input track after linking, ``track`` (K,) by ``ids`` (K,) in ascending
+    order; and how appearance tells people apart, None if nothing was seen of them.
+    """
+
+    rows: Iterator[Rows]
+    ids: Ints
+    track: Ints
+    calibration: AppearanceCalibration | None
+
+    def track_of(self, ids: Ints) -> Ints:
+        """The ids (N,) of input tracks after linking; -1 for those that have no box."""
+        if len(self.ids) == 0:
+            return np.full(len(ids), -1)
+        place = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
+        return np.where(self.ids[place] == ids, self.track[place], -1)
 
 
 def link_in_picture(
@@ -46,16 +70,20 @@ def link_in_picture(
     min_confidence: float,
     across_classes: bool,
     fixed: Collection[int] = (),
-) -> Iterator[Rows]:
+    looks: Descriptors | None = None,
+    rate_hz: float = 2.5,
+) -> Linked:
     """The rows of each frame, with tracks linked over gaps of up to ``max_gap_s``, and the gaps interpolated.
 
     A link is made if it is right with a probability of at least ``min_confidence``. A track that continues another has
     the id of that one. No link joins two of the tracks ``fixed``. Where nothing is linked, rows are those of the input.
+    ``looks`` are compared if they tell tracks apart; samples come at ``rate_hz``.
     """
     if not len(frames):
-        return
+        return Linked(iter(()), np.empty(0, np.int64), np.empty(0, np.int64), None)
     tracks = _tracks(frames)
-    before, after = _links(tracks, min(max_gap_s, MAX_GAP_S), min_confidence, across_classes)
+    calibration, seen = _appearance(tracks, looks, frames.t_ns, rate_hz)
+    before, after = _links(tracks, min(max_gap_s, MAX_GAP_S), min_confidence, across_classes, seen)
     root = np.arange(len(tracks.ids))
     holds = np.isin(tracks.ids, np.array(sorted(fixed), np.int64))
     made = np.ones(len(before), bool)
@@ -72,6 +100,11 @@ def link_in_picture(
     lost = dict(zip(tracks.ids[before].tolist(), tracks.frame[last[before]].tolist(), strict=True))
     found = dict(zip(tracks.ids[after].tolist(), tracks.frame[tracks.first[after]].tolist(), strict=True))
     gaps = _Gaps(frames, {one: (lost[one], other, found[other]) for one, other in ends.items()})
+    return Linked(_renamed(frames, name, gaps), tracks.ids, tracks.ids[root], calibration)
+
+
+def _renamed(frames: FrameColumns, name: Mapping[int, int], gaps: _Gaps) -> Iterator[Rows]:
+    """The rows of each frame and those of gaps there, under the new name of each id."""
     for number, frame in enumerate(frames):
         rows = frame.rows.copy()
         ids = np.array([name.get(one, one) for one in rows["track_id"].tolist()], rows["track_id"].dtype)
@@ -162,7 +195,23 @@ def _ends(tracks: _Tracks, at: Ints) -> _Ends:
     return _Ends(tracks.t_s[at], place, speed, height_px, log_height, fits[0][2], fits[0][3])
 
 
-def _links(tracks: _Tracks, max_gap_s: float, min_confidence: float, across_classes: bool) -> tuple[Ints, Ints]:
+def _appearance(
+    tracks: _Tracks, looks: Descriptors | None, times_ns: Ints, rate_hz: float
+) -> tuple[AppearanceCalibration | None, Evidence | None]:
+    """The calibration of appearance, and its evidence for links where it tells tracks apart."""
+    step = np.rint(tracks.t_s * rate_hz).astype(np.int64)
+    source = np.repeat(tracks.ids, np.diff(tracks.first))
+    middle_px = tracks.boxes[:, :2] + tracks.boxes[:, 2:] / 2
+    xy_m = middle_px * (_PERSON_M / np.median(tracks.boxes[:, 3])) if len(step) else middle_px
+    seen = Appearance.of(looks, times_ns[tracks.frame], step, source, xy_m, 1 / rate_hz)
+    if seen is None or not seen.calibration.tells_apart:
+        return seen and seen.calibration, None
+    return seen.calibration, seen.between(step, source, 1 / rate_hz).of_tracks
+
+
+def _links(
+    tracks: _Tracks, max_gap_s: float, min_confidence: float, across_classes: bool, seen: Evidence | None
+) -> tuple[Ints, Ints]:
     """The links: tracks (E,) and the ones that continue them (E,)."""
     nothing = np.empty(0, np.int64), np.empty(0, np.int64)
     count = len(tracks.ids)
@@ -177,6 +226,7 @@ def _links(tracks: _Tracks, max_gap_s: float, min_confidence: float, across_clas
         same = tracks.classes[i] == tracks.classes[j]
         i, j = i[same], j[same]
     gain = _log_odds(lost, found, i, j, _births(tracks)) - np.log(min_confidence / (1 - min_confidence))
+    gain += 0.0 if seen is None else seen(i, j)
     good = gain > 0
     if not good.any():
         return nothing

@@ -9,11 +9,12 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Final, Protocol, TypeAlias, TypeVar
 
 from mcaptrack.predictors import warn_if_weak
-from mcaptrack.schema import DECISIONS, TRACKS, Frame, Rows
+from mcaptrack.schema import APPEARANCE, DECISIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns, collect
 from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.protocol import ModelCard
 from mcaptrack.transforms.retrack.appearance_calibration import AppearanceCalibration
+from mcaptrack.transforms.retrack.appearance_rows import appearance_rows
 from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.by_class import Movers, join_classes, movers_of, split_classes, usual_score
 from mcaptrack.transforms.retrack.consistency import ConsistencyPass
@@ -119,17 +120,17 @@ def _retrack(
     frames: Iterable[Frame],
     seen: list[AppearanceCalibration] | None = None,
 ) -> Iterator[tuple[Frame, ...]]:
-    """For each frame the offline tracks, the online tracks and their predictions, and decisions if the method writes
-    them; each class by itself. How appearance tells tracks apart is added to ``seen``, for each class.
+    """For each frame the offline tracks, the online tracks and their predictions, and further outputs that the options
+    write; each class by itself. How appearance tells tracks apart is added to ``seen``, for each class.
     """
     warn_if_weak(options.predictor)
+    calibrations = [] if seen is None else seen
     if options.leaves_unchanged:
-        yield from _keep_ids(options, frames)
+        yield from _keep_ids(options, frames, calibrations)
         return
     frames = collect(TRACKS, frames)
     parts = [frames] if options.across_classes else split_classes(frames)
     score = usual_score(frames)
-    calibrations = [] if seen is None else seen
 
     def passes(part: FrameColumns) -> tuple[OnlinePass | KeptIds, Offline]:
         run, offline = _passes(options, new_pass, part, score)
@@ -142,22 +143,27 @@ def _retrack(
         yield from join_classes([_whole(options, part, *passes(part)) for part in parts])
 
 
-def _keep_ids(options: RetrackOptions, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
+def _keep_ids(
+    options: RetrackOptions, frames: Iterable[Frame], seen: list[AppearanceCalibration]
+) -> Iterator[tuple[Frame, ...]]:
     """For each frame tracks that are linked in the picture, if the method does that; the input and its predictions."""
     given = options.predictor, options.horizon_s, options.min_history, options.rate_hz
     forecaster = Forecaster(*given, adapt=options.follows_log)
     linked: Iterator[Rows] | None = None
-    decisions = repeat(DECISIONS.empty())
+    stored: Iterator[Rows] = repeat(APPEARANCE.empty())
     if options.links_in_picture:
         frames = collect(TRACKS, frames)
-        linked = link_in_picture(
-            frames, options.link_s, options.link_confidence, options.across_classes, options.fixed_ids
-        )
+        limits = options.link_s, options.link_confidence, options.across_classes
+        found = link_in_picture(frames, *limits, options.fixed_ids, options.looks, options.rate_hz)
+        seen.extend([] if found.calibration is None else [found.calibration])
+        linked = found.rows
+        if (looks := options.stored_looks) is not None:
+            stored = appearance_rows(looks, found.track_of(looks.track_id), frames.t_ns)
     for frame in frames:
-        online = frame._replace(rows=frame.rows[frame.rows["observed"]])
-        offline = frame if linked is None else frame._replace(rows=next(linked))
-        outputs = offline, online, frame._replace(rows=forecaster.predict(frame)), frame._replace(rows=next(decisions))
-        yield outputs[: len(options.writes)]
+        online = frame.rows[frame.rows["observed"]]
+        offline = frame.rows if linked is None else next(linked)
+        rows = offline, online, forecaster.predict(frame), DECISIONS.empty(), next(stored)
+        yield tuple(frame._replace(rows=one) for one in rows[: len(options.writes)])
     forecaster.warn()
 
 
@@ -181,12 +187,11 @@ def _frame_by_frame(
     options: Options, frames: FrameColumns, run: OnlinePass | KeptIds, offline: Offline
 ) -> Iterator[tuple[Frame, ...]]:
     """The outputs of re-tracking for each frame."""
-    for frame, rows, (online, predictions), decided in zip(
-        frames, offline.tracks, run.outputs(), offline.decisions, strict=True
-    ):
+    further = zip(offline.decisions, offline.looks, strict=True)
+    for frame, rows, causal, others in zip(frames, offline.tracks, run.outputs(), further, strict=True):
         # copies, because what is kept can't be written to
-        causal = (one._replace(rows=one.rows.copy()) for one in (online, predictions))
-        yield (frame._replace(rows=rows), *causal, frame._replace(rows=decided))[: len(options.writes)]
+        outputs = rows, *(one.rows.copy() for one in causal), *others
+        yield tuple(frame._replace(rows=one) for one in outputs[: len(options.writes)])
 
 
 def _whole(options: Options, frames: FrameColumns, run: OnlinePass | KeptIds, offline: Offline) -> list[FrameColumns]:
@@ -197,8 +202,9 @@ def _whole(options: Options, frames: FrameColumns, run: OnlinePass | KeptIds, of
             for collector, frame in zip(made, outputs, strict=True):
                 collector.append(frame)
         return [collector.done() for collector in made]
-    for frame, *both in zip(frames, offline.tracks, offline.decisions, strict=True):
-        for collector, rows in zip((made[0], *made[3:]), both, strict=False):
+    offline_rows = zip(offline.tracks, offline.decisions, offline.looks, strict=True)
+    for frame, all_rows in zip(frames, offline_rows, strict=True):
+        for collector, rows in zip((made[0], *made[3:]), all_rows, strict=False):
             collector.append(frame._replace(rows=rows))
     return [made[0].done(), run.online, run.predictions(), *(collector.done() for collector in made[3:])]
 

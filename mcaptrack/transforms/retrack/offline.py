@@ -13,9 +13,10 @@ import numpy as np
 
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.ragged import group_index
-from mcaptrack.schema import DECISIONS, Rows
+from mcaptrack.schema import APPEARANCE, DECISIONS, Rows
 from mcaptrack.transforms.retrack.appearance import Appearance
 from mcaptrack.transforms.retrack.appearance_calibration import AppearanceCalibration
+from mcaptrack.transforms.retrack.appearance_rows import appearance_rows
 from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers
 from mcaptrack.transforms.retrack.cut_links import CutTracks, link_pieces
@@ -39,12 +40,13 @@ _ROUNDS: Final = 3
 
 
 class Offline(NamedTuple):
-    """The rows of all tracks at each step, ordered by id; the decisions at each step, if they were asked for; and how
-    appearance tells people apart, None if nothing was seen of them.
+    """The rows of all tracks at each step, ordered by id; the decisions at each step, and what tracks look like, if
+    they were asked for; and how appearance tells people apart, None if nothing was seen of them.
     """
 
     tracks: Iterator[Rows]
     decisions: Iterator[Rows]
+    looks: Iterator[Rows]
     calibration: AppearanceCalibration | None
 
 
@@ -57,7 +59,7 @@ def offline_tracks(
     times_ns: Ints,
     movers: Movers = PEOPLE,
 ) -> Offline:
-    """The rows of all tracks at each of ``steps``, and the decisions there if ``options`` writes them.
+    """The rows of all tracks at each of ``steps``, and those of further outputs if ``options`` writes them.
 
     ``samples`` are those of all steps, ``times_ns`` the times of these; ``model`` is in the unit of ``movers``. A
     sample that was assigned to two tracks goes to the one that had it first, unless both keep it (``shares_samples``),
@@ -118,11 +120,16 @@ def offline_tracks(
     decisions: Iterator[Rows] = repeat(DECISIONS.empty(), len(steps))
     if is_decided and states is not None:
         tracked = Tracked(step, track, source, *states)
-        looks = None if appearance is None else appearance.take(order)
-        decided = Decided(tracked, sample, np.where(is_fixed, np.inf, odds), keeps, looks)
+        ordered = None if appearance is None else appearance.take(order)
+        decided = Decided(tracked, sample, np.where(is_fixed, np.inf, odds), keeps, ordered)
         decisions = decision_rows(decided, model, samples, steps, step_s)
     made = rows_by_step(rows.take(left), samples, moved and moved.take(left), steps)
-    return Offline(made, decisions, seen and seen.calibration)
+    looks: Iterator[Rows] = repeat(APPEARANCE.empty(), len(steps))
+    if (stored := options.stored_looks) is not None:
+        kept = np.flatnonzero(keeps[np.searchsorted(ids, track)])
+        seen_ns = times_ns[np.searchsorted(steps, step[kept])]
+        looks = appearance_rows(stored, stored.tracks_of(seen_ns, source[kept], track[kept]), times_ns)
+    return Offline(made, decisions, looks, seen and seen.calibration)
 
 
 def _without_swaps(

@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar, Final, Literal
+from typing import ClassVar, Final, Generic, Literal, TypeVar
 
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.predictors import PredictorName
-from mcaptrack.schema import DECISIONS, PREDICTIONS, TRACKS, Frame, Schema
+from mcaptrack.schema import APPEARANCE, DECISIONS, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.durations import longest_track_s
 from mcaptrack.transforms.forecasts import ADAPT_HELP
 from mcaptrack.transforms.motion_limits import LIMITS_HELP, LIMITS_PATTERN, ClassNames, read_limits
@@ -26,6 +26,8 @@ _MOTION: Final = "Motion model"
 _PREDICTIONS: Final = "Predictions"
 _LIFE: Final = "Begin and end of tracks"
 _OFFLINE: Final = "With the whole log known (offline)"
+#: The output that is written on request.
+APPEARANCE_OUTPUT: Final = "appearance"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,6 +178,11 @@ class RetrackOptions:
         """The descriptors of the samples, where these are compared."""
         return None
 
+    @property
+    def stored_looks(self) -> Descriptors | None:
+        """The descriptors of the samples, where what tracks look like is written."""
+        return None
+
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
         """Why no rows came of frames, for a warning."""
         longest_s = longest_track_s(given)
@@ -185,16 +192,34 @@ class RetrackOptions:
         return "no track is likely enough to be a person (track_confidence)"
 
 
+Value = TypeVar("Value")
+
+
+class _OfOutputs(Generic[Value]):
+    """A value for each output: of the class those of all outputs, of an object those of the outputs that it writes."""
+
+    def __init__(self, of_all: Mapping[str, Value]) -> None:
+        self._of_all = MappingProxyType(of_all)
+        self._usual = MappingProxyType({name: value for name, value in of_all.items() if name != APPEARANCE_OUTPUT})
+
+    def __get__(self, options: LikelihoodOptions | None, _: type) -> Mapping[str, Value]:
+        return self._of_all if options is None or options.store_appearance else self._usual
+
+
 @dataclass(frozen=True, kw_only=True)
 class LikelihoodOptions(RetrackOptions):
     """The options of re-tracking by likelihood."""
 
-    writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({**RetrackOptions.writes, "decisions": DECISIONS})
-    latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({**RetrackOptions.latency_s, "decisions": float("inf")})
+    writes: ClassVar[Mapping[str, Schema]] = _OfOutputs(  # type: ignore[assignment]
+        {**RetrackOptions.writes, "decisions": DECISIONS, APPEARANCE_OUTPUT: APPEARANCE}
+    )
+    latency_s: ClassVar[Mapping[str, float]] = _OfOutputs(  # type: ignore[assignment]
+        {**RetrackOptions.latency_s, "decisions": float("inf"), APPEARANCE_OUTPUT: float("inf")}
+    )
 
     @property
     def links_in_picture(self) -> bool:
-        return self.link_s > 0
+        return self.link_s > 0 or self.store_appearance
 
     @property
     def follows_log(self) -> bool:
@@ -236,17 +261,26 @@ class LikelihoodOptions(RetrackOptions):
         theme=_LIFE,
     )
     adapt: bool = option(True, ADAPT_HELP, theme=_PREDICTIONS)
-    appearance: bool = option(
-        True,
-        "compare the colours of what people wear before and after gaps and encounters, where the log has pictures and "
-        "these tell people apart",
+    appearance: bool | None = option(
+        None,
+        "compare the colours of what people wear before and after gaps and encounters; by default where the log has "
+        "pictures that tell people apart",
+        theme=_OFFLINE,
+    )
+    store_appearance: bool = option(
+        False,
+        "also write the mean colours of each track, as histograms of the upper body and of the legs",
         theme=_OFFLINE,
     )
     descriptors: Descriptors | None = context(lambda: None, is_recorded=False)
 
     @property
     def looks(self) -> Descriptors | None:
-        return self.descriptors if self.appearance else None
+        return None if self.appearance is False else self.descriptors
+
+    @property
+    def stored_looks(self) -> Descriptors | None:
+        return self.descriptors if self.store_appearance else None
 
 
 @dataclass(frozen=True, kw_only=True)
