@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mcaptrack.predictors import Forecast, vehicle_tails
-from mcaptrack.predictors.tails import TailCalibration
+from mcaptrack.predictors.tail_calibration import TailCalibration
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.transforms import Predict, forecasts
 from tests.worlds import ns

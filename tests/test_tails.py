@@ -12,7 +12,8 @@ from mcaptrack.evaluation.metrics.calibration import ellipse_levels
 from mcaptrack.geometry.mixtures import Tails, squared_radius
 from mcaptrack.notices import Notice, listening
 from mcaptrack.predictors import NAMES, Forecast, make
-from mcaptrack.predictors.tails import TABLES, Learned, TailCalibration, counts_of, fit_mixture, follow, table_of
+from mcaptrack.predictors.tail_calibration import TailCalibration
+from mcaptrack.predictors.tails import TABLES, Learned, counts_of, fit_mixture, follow, table_of
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.predictions import tails_of
 from mcaptrack.transforms import PROFILES
@@ -81,10 +82,8 @@ class TestFollowing:
     def followed(self, halves: list[np.ndarray], noise: float = 0.0, least: float = 0.0) -> Tails:
         ahead = np.repeat(np.arange(3), [len(part) for part in halves])
         counts = counts_of(ahead, np.concatenate(halves), 3)
-        tails = self.TABLE
-        for _ in range(100):
-            tails = follow(self.TABLE, tails, Learned(counts, np.zeros(3), np.full(3, noise), np.full(3, least)))
-        return tails
+        learned = Learned(counts, np.zeros(3), np.full(3, noise), np.full(3, least))
+        return follow(self.TABLE, self.TABLE, learned, 100)
 
     def samples(self, narrow: float, wide: float, count: int, noise: float = 0.0) -> np.ndarray:
         rng = np.random.default_rng(3)
@@ -156,7 +155,9 @@ class TestCalibration:
             ids[tracks - passing :] += tracks
             cov = np.tile(np.eye(2), (tracks, 3, 1, 1))
             past = noise_m * rng.normal(size=(tracks, 8, 2))
-            made, tails = calibration(step, ids, Forecast(mean, cov), past, np.zeros(tracks, bool))
+            made, tails = calibration(
+                np.full(tracks, step), ids.copy(), Forecast(mean, cov), past, np.zeros(tracks, bool)
+            )
             truth = np.stack([place[step + k] for k in (1, 2, 3)], axis=1)
             levels.append(ellipse_levels(made.mean - truth, made.cov, tails))
         return np.array(levels)
@@ -174,7 +175,7 @@ class TestCalibration:
     def test_they_are_no_smaller_than_noise_allows(self):
         self.forecasts(0.001, noise_m=0.3)
         nothing = Forecast(np.zeros((1, 3, 2)), np.tile(np.eye(2), (1, 3, 1, 1)))
-        made, tails = self.calibration(60, np.array([-1]), nothing, np.zeros((1, 8, 2)), np.zeros(1, bool))
+        made, tails = self.calibration(np.array([60]), np.array([-1]), nothing, np.zeros((1, 8, 2)), np.zeros(1, bool))
         assert (made.cov[0, :, 0, 0] * tails.narrow_scale[0] > 0.27 * 0.3**2).all()
 
     def test_tracks_that_are_lost_count_as_some_large_errors(self):
@@ -182,7 +183,7 @@ class TestCalibration:
         for passing in (0, 200):
             self.forecasts(0.3, passing=passing, tracks=20 + passing)
             nothing = Forecast(np.zeros((1, 3, 2)), np.tile(np.eye(2), (1, 3, 1, 1)))
-            _, tails = self.calibration(60, np.array([-1]), nothing, np.zeros((1, 8, 2)), np.zeros(1, bool))
+            _, tails = self.calibration(np.array([60]), np.array([-1]), nothing, np.zeros((1, 8, 2)), np.zeros(1, bool))
             weights.append(tails.wide_weight[0, 0])
         assert weights[0] < 0.8 * weights[1]
 
@@ -202,7 +203,7 @@ class TestCalibration:
             past[1] = np.nan
             mean, cov = np.tile([1.0, 2.0], (3, 3, 1)), np.tile(np.eye(2), (3, 3, 1, 1))
             cov[2] = 0.0
-            made, tails = calibration(step, np.arange(3), Forecast(mean, cov), past, np.zeros(3, bool))
+            made, tails = calibration(np.full(3, step), np.arange(3), Forecast(mean, cov), past, np.zeros(3, bool))
         assert np.isfinite(tails).all()
         assert np.isfinite(made.cov).all()
         assert (tails.narrow_scale[0] < 0.5).all()
@@ -226,7 +227,7 @@ class TestCalibration:
                     place[40:, [0, 1]] = place[40:, [1, 0]]
                 past = place[-8:].transpose(1, 0, 2)
                 forecast = predictor.predict(past, np.ones(past.shape[:2], bool))
-                made, tails = calibration(step, np.arange(40), forecast, past, np.zeros(40, bool))
+                made, tails = calibration(np.full(40, step), np.arange(40), forecast, past, np.zeros(40, bool))
             now.append((made.cov[5, :, 0, 0] * squared_radius(0.5, Tails(*(part[5] for part in tails)))) ** 0.5)
         assert now[1].tolist() == pytest.approx(now[0].tolist(), rel=0.1)
 
@@ -234,12 +235,52 @@ class TestCalibration:
         levels = self.forecasts(0.3, noise_m=0.3, steps=200)[100:]
         assert (levels <= 0.5).mean() == pytest.approx(0.5, abs=0.08)
 
+    @pytest.mark.parametrize("together", [7, 60])
+    def test_many_times_at_once_give_the_same_as_one_by_one(self, together):
+        """Tracks come and go, and there are times without tracks."""
+        rng, predictor = np.random.default_rng(8), make("kalman", 12, 0.4)
+        step = np.repeat(np.array([*range(30), *range(47, 77)]), 9)
+        ids, coasts = np.tile(np.arange(9), 60) + 9 * (step // 10), rng.random(540) < 0.1
+        past = 0.4 * (step[:, None, None] + np.arange(-7, 1)[:, None]) + rng.normal(0, 0.1, (540, 8, 2))
+        past[rng.random(540) < 0.1, :4] = np.nan
+        forecast = predictor.predict(past, np.isfinite(past[..., 0]))
+
+        def calibrated(times: int) -> list[np.ndarray]:
+            calibration, parts = TailCalibration.of("kalman", predictor), []
+            for low in range(0, 540, 9 * times):
+                here = slice(low, low + 9 * times)
+                one = Forecast(forecast.mean[here], forecast.cov[here])
+                made, tails = calibration(step[here], ids[here], one, past[here], coasts[here])
+                parts.append((made.mean, made.cov, *tails))
+            return [np.concatenate(part) for part in zip(*parts, strict=True)]
+
+        alone, many = calibrated(1), calibrated(together)
+        assert np.ptp(alone[3][:, 5]) > 0.1
+        for one, other in zip(alone, many, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+    def test_fits_are_rarer_after_some_time_and_only_while_tracks_are_seen(self):
+        """Every 0.8 s, from 16 s on after a twentieth of the time, at most every 4 s."""
+        predictor = make("cv", 3, 0.4)
+        calibration, changed, last = TailCalibration.of("cv", predictor), [], None
+        for step in [*range(300), *range(1000, 1010)]:
+            past = np.tile(np.random.default_rng(step).normal(size=(1, 8, 2)), (2, 1, 1))
+            forecast = predictor.predict(past, np.ones((2, 8), bool))
+            _, tails = calibration(np.full(2, step), np.arange(2), forecast, past, np.full(2, 50 < step < 60))
+            now = tails.narrow_scale[0].tolist()
+            if last is not None and now != last:
+                changed.append(step)
+            last = now
+        assert changed[:4] == [2, 4, 6, 8]
+        assert [step for step in changed if 40 < step < 64] == [42, 44, 46, 48, 50, 60, 63]
+        assert changed[-4:] == [272, 282, 292, 1000]
+
     def test_the_covariance_is_that_of_the_mixture(self):
         predictor = make("red", 12, 0.4)
         calibration = TailCalibration.of("red", predictor)
         past = np.cumsum(np.full((2, 8, 2), 0.3), axis=1)
         plain = predictor.predict(past, np.ones((2, 8), bool))
-        made, tails = calibration(0, np.array([1, 2]), plain, past, np.zeros(2, bool))
+        made, tails = calibration(np.zeros(2, int), np.array([1, 2]), plain, past, np.zeros(2, bool))
         weight, narrow, wide = tails
         assert ((1 - weight) * narrow + weight * wide).ravel().tolist() == pytest.approx([1.0] * 24)
         assert made.mean.tolist() == plain.mean.tolist()
@@ -250,7 +291,8 @@ class TestCalibration:
         past = np.cumsum(np.full((3, 8, 2), 0.3), axis=1)
         past[1, :4] = np.nan
         given = Forecast(np.zeros((3, 12, 2)), np.tile(np.eye(2), (3, 12, 1, 1)))
-        made, _ = TailCalibration.of("kalman", predictor)(0, np.arange(3), given, past, np.array([False, False, True]))
+        calibration, coasts = TailCalibration.of("kalman", predictor), np.array([False, False, True])
+        made, _ = calibration(np.zeros(3, int), np.arange(3), given, past, coasts)
         whole, short, coasting = made.cov[:, :, 0, 0]
         assert (short > whole).all()
         assert (coasting > short).all()
@@ -269,7 +311,7 @@ class TestInTransforms:
     def test_predictions_follow_the_log(self):
         """People who walk straight on come to have small ellipses, others keep theirs."""
         calm = spread([frame for (frame,) in Predict()(walkers())])
-        assert calm[-1] < 0.3 * calm[5]
+        assert calm[-1] < 0.3 * calm[3]  # the first, by the table
 
     @pytest.mark.parametrize("name", ["predictions", "retracks"])
     def test_predictions_depend_on_the_past_alone(self, name):

@@ -7,7 +7,7 @@ two and three steps. White noise bends a track alike over any time, people bend 
 lasting noise is between them. So the three are told apart by how bends grow, as variances of clocks are (Allan).
 How long noise lasts can't be seen beside the motion of people; it is taken to be about a second.
 
-Letters: N tracks, L past positions, T future steps.
+Letters: N tracks, L past positions, T future steps, R times.
 
 References
 ----------
@@ -16,25 +16,33 @@ D. W. Allan, "Statistics of atomic frequency standards", Proceedings of the IEEE
 
 from __future__ import annotations
 
-from collections import deque
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Floats
+from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.predictors.running_sums import running
 
 #: Steps over which bends are seen.
 _LAGS: Final = (1, 2, 3)
 #: The time constant of lasting noise, and the power of the time with which the variance of bends by motion grows.
 _LASTS_S, _MOTION = 1.2, 3.4
-#: Noise is estimated again after so many steps, from so many times as many, if there are so many positions.
-_EVERY, _KEPT, _LEAST_POSITIONS = 3, 13, 10
+#: Bends count 1 / e after so many steps, and less than so many say nothing.
+_MEMORY, _LEAST_POSITIONS = 39, 10
+#: Squared bends in m^2 are counted in bins between these powers of ten, so many to each.
+_LOWEST, _HIGHEST, _BINS = -8, 6, 16
+#: Positions of a past, the current one included, that show bends.
+PAST: Final = 1 + 2 * _LAGS[-1]
+#: Which of the three parts there may be, but for none.
+_CHOICES: Final = np.array([[bool(number & 1 << part) for part in range(3)] for number in range(8)])
+#: What is added to the equations of each choice: those of other columns are 0, and some columns are almost alike.
+_ALONE: Final = np.stack([np.diag(np.where(choice, 1e-12, 1.0)) for choice in _CHOICES])
 #: Errors of forecasts are no smaller than these shares of the variance of white and of lasting noise.
 _LEAST_WHITE, _LEAST_LASTING = 0.3, 0.7
 
 
 class NoiseOfErrors(NamedTuple):
-    """The effect of noise on the errors of forecasts, (T,) in m^2 for each axis.
+    """The effect of noise on the errors of forecasts at R times, (R, T) in m^2 for each axis.
 
     ``added`` is how much larger the variance of errors is if forecasts are compared with measured positions instead of
     true ones; it is negative where both have the same noise. ``least`` is the least variance of errors.
@@ -53,46 +61,60 @@ class PositionNoise:
         lasting = 1 - 4 / 3 * like + like**2 / 3
         # bends have six times the variance of white noise
         self._shapes = np.stack([np.ones(len(_LAGS)), lasting, np.array(_LAGS, np.float64) ** _MOTION], axis=-1)
-        self._bends_m2: deque[Floats] = deque(maxlen=_KEPT)
-        self._waiting: list[Floats] = []
-        self._variances_m2 = np.zeros(len(_LAGS))
-        self._seen_at = 0
-        self.white_m2 = self.lasting_m2 = 0.0
+        self._counts = np.zeros((len(_LAGS), (_HIGHEST - _LOWEST) * _BINS))
 
-    def see(self, step: int, past: Floats) -> None:
-        """Take the past positions (N, L, 2) of the tracks that are observed at a step, the current ones last."""
-        if len(past):
-            self._waiting.append(past[:, -1 - 2 * _LAGS[-1] :])
-        if step - self._seen_at < _EVERY:
-            return
-        self._seen_at = step
-        if self._waiting:
-            self._bends_m2.append(_bends_m2(np.concatenate(self._waiting)))
-            self._waiting.clear()
-            self._estimate()
+    def follow(self, passed: Ints, place: Ints, past: Floats, steps: int) -> NoiseOfErrors:
+        """The effect of noise on the errors of forecasts of so many ``steps``, at some times (R,).
 
-    def _estimate(self) -> None:
-        """Estimate the noise from the bends of the last steps."""
-        from scipy.optimize import lsq_linear  # ``nnls`` of some releases of SciPy gives up at times
-
-        for place, bends_m2 in enumerate(np.concatenate(self._bends_m2).T):
-            known = bends_m2[np.isfinite(bends_m2)]
-            if len(known) >= _LEAST_POSITIONS:  # of two axes; the median, because some tracks turn or are exchanged
-                self._variances_m2[place] = float(np.median(known)) / (12 * np.log(2))
-        given = self._variances_m2
-        if (given > 0).all():
-            unit_m2 = float(given.mean())
-            shapes = self._shapes * (unit_m2 / given)[:, None]
-            parts = lsq_linear(shapes, np.ones(len(given)), (0, np.inf), method="bvls").x
-            white, lasting, _ = (max(float(part), 0.0) for part in parts)  # -1e-19 is within rounding
-            self.white_m2, self.lasting_m2 = white * unit_m2, lasting * unit_m2
-
-    def of_errors(self, steps: int) -> NoiseOfErrors:
-        """The effect of noise on the errors of forecasts of so many steps."""
+        ``passed`` (R,) are the steps since the time before, ``past`` (N, L, 2) the past positions of tracks that were
+        observed in these steps, the current ones last, and ``place`` (N,) says of which time they are.
+        """
+        white_m2, lasting_m2 = (part[:, None] for part in self.variances_m2(passed, place, past))
         like = np.exp(-self._step_s * np.arange(1.0, steps + 1) / _LASTS_S)
-        added = self.white_m2 + self.lasting_m2 * (1 - 2 * like)
-        least = _LEAST_WHITE * self.white_m2 + _LEAST_LASTING * self.lasting_m2
-        return NoiseOfErrors(added, np.full(steps, least))
+        least = np.broadcast_to(_LEAST_WHITE * white_m2 + _LEAST_LASTING * lasting_m2, (len(passed), steps))
+        return NoiseOfErrors(white_m2 + lasting_m2 * (1 - 2 * like), least)
+
+    def variances_m2(self, passed: Ints, place: Ints, past: Floats) -> tuple[Floats, Floats]:
+        """The variances (R,) of white and of lasting noise, in m^2 for each axis; as for ``follow``.
+
+        They are 0 as long as little is known.
+        """
+        bends_m2 = _bends_m2(past)
+        row, lag = np.nonzero(np.isfinite(bends_m2))
+        lags, bins = self._counts.shape
+        power = np.log10(np.maximum(bends_m2[row, lag], 10.0**_LOWEST)) - _LOWEST
+        cell = (place[row] * lags + lag) * bins + np.minimum((power * _BINS).astype(np.int64), bins - 1)
+        new = np.bincount(cell, minlength=len(passed) * lags * bins).reshape(len(passed), lags, bins)
+        counts, self._counts = running(self._counts, np.exp(-passed / _MEMORY), new)
+        below = counts.cumsum(axis=2)
+        total = below[..., -1]
+        # of two axes; the median, because some tracks turn or are exchanged
+        median = np.minimum((below < total[..., None] / 2).sum(axis=2), bins - 1)[..., None]
+        above = np.take_along_axis(below, median, 2)[..., 0] - total / 2
+        within = 1 - above / np.maximum(np.take_along_axis(counts, median, 2)[..., 0], 1e-300)
+        is_known = (total >= _LEAST_POSITIONS).all(axis=1)
+        variance_m2 = 10 ** (_LOWEST + (median[..., 0] + within) / _BINS) / (12 * np.log(2))
+        variance_m2[~is_known] = 1.0
+        unit_m2 = variance_m2.mean(axis=1)
+        parts = nonnegative(self._shapes * (unit_m2[:, None] / variance_m2)[:, :, None])
+        white, lasting, _ = (parts * np.where(is_known, unit_m2, 0.0)[:, None]).T
+        return white, lasting
+
+
+def nonnegative(shapes: Floats) -> Floats:
+    """The nonnegative factors (R, 3) with which the sums of columns of ``shapes`` (R, M, 3) are nearest to 1.
+
+    By least squares: the best of the solutions for each choice of columns, of those without negative factors.
+    """
+    size = np.sqrt((shapes**2).sum(axis=1))
+    columns = shapes / size[:, None]
+    product, with_one = np.einsum("rmk,rml->rkl", columns, columns)[:, None], columns.sum(axis=1)
+    both = _CHOICES[:, :, None] & _CHOICES[:, None, :]
+    one_side = np.where(_CHOICES, with_one[:, None], 0.0)
+    parts = np.linalg.solve(np.where(both, product, 0.0) + _ALONE, one_side[..., None])[..., 0]
+    gain = np.where((parts >= 0).all(axis=2), (parts * one_side).sum(axis=2), -1.0)
+    best = gain.argmax(axis=1)
+    return np.asarray(parts[np.arange(len(parts)), best] / size)
 
 
 def _bends_m2(past: Floats) -> Floats:

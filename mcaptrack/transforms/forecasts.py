@@ -15,7 +15,7 @@ from mcaptrack.geometry.mixtures import Tails, normal_tails
 from mcaptrack.geometry.ragged import run_starts
 from mcaptrack.predictors import Forecast, PeopleSeen, make, predict_among, uses_people
 from mcaptrack.predictors.linear import LinearPredictor
-from mcaptrack.predictors.tails import TailCalibration
+from mcaptrack.predictors.tail_calibration import TailCalibration
 from mcaptrack.predictors.vehicle_tails import calibrated
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
@@ -121,8 +121,8 @@ class Forecaster:
         made = self._made(frame.rows[ready], past[ready], known[ready], people)
         tails = None
         if self._calibration is not None and not made.has_velocity.any():
-            is_coasting = np.zeros(len(made.has_velocity), bool)
-            forecast, tails = self._calibration(self._step, ids[ready], made.forecast, past[ready], is_coasting)
+            step, is_coasting = np.full(len(made.has_velocity), self._step), np.zeros(len(made.has_velocity), bool)
+            forecast, tails = self._calibration(step, ids[ready], made.forecast, past[ready], is_coasting)
         elif made.is_vehicle.any():
             forecast, tails = self._of_vehicles(made, frame.rows[ready], past[ready])
         else:

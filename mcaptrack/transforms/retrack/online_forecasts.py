@@ -10,9 +10,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.mixtures import Tails
 from mcaptrack.predictors import Forecast, PeopleSeen, Predictor, predict_among, uses_people
-from mcaptrack.predictors.tails import TailCalibration
+from mcaptrack.predictors.tail_calibration import TailCalibration
 from mcaptrack.schema import PREDICTIONS
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.predictions import forecast_to_rows
@@ -101,18 +100,12 @@ class OnlineForecasts:
         """Write the first ``count`` frames, of which frame f has ``ends[f]`` to ``ends[f + 1]`` of ``made``."""
         if not count:
             return
-        calibration, last = self._calibration, ends[count]
-        cov, tails = made.cov[:last], None
+        calibration, tails = self._calibration, None
+        ids, past, coasts, mean, cov = made.part(slice(ends[count]))
         if calibration is not None:  # by the predictions of the steps before
-            parts = [
-                calibration(step, one.ids, Forecast(one.mean, one.cov), one.past, one.coasts)
-                for (_, _, step, _), low, high in zip(self._frames[:count], ends, ends[1:], strict=False)
-                for one in [made.part(slice(low, high))]
-            ]
-            cov = np.concatenate([forecast.cov for forecast, _ in parts])
-            tails = Tails(*(np.concatenate(shapes) for shapes in zip(*(of for _, of in parts), strict=True)))
-        forecast = Forecast(made.mean[:last], cov)
-        rows = forecast_to_rows(made.ids[:last], forecast, self._predictor.step_s, tails)
+            step = np.repeat([step for _, _, step, _ in self._frames[:count]], np.diff(ends[: count + 1]))
+            (_, cov), tails = calibration(step, ids, Forecast(mean, cov), past, coasts)
+        rows = forecast_to_rows(ids, Forecast(mean, cov), self._predictor.step_s, tails)
         t_ns, numbers, *_ = zip(*self._frames[:count], strict=True)
         self._out.extend(t_ns, numbers, ends[: count + 1] * self._predictor.steps, rows)
         self._frames = self._frames[count:]
