@@ -32,18 +32,18 @@ from tests.memory import held
 PEOPLE = 12
 
 
-def walks(frames: int) -> Iterator[Frame]:
+def walks(frames: int, people: int = PEOPLE) -> Iterator[Frame]:
     """People who walk side by side, each at another speed, at 2.5 Hz; half of them change their ids every minute."""
     for number in range(frames):
-        ids = np.arange(PEOPLE) + PEOPLE * (number // 150) * (np.arange(PEOPLE) % 2)
-        x_m = 0.1 * (1 + np.arange(PEOPLE)) * number
+        ids = np.arange(people) + people * (number // 150) * (np.arange(people) % 2)
+        x_m = 0.1 * (1 + np.arange(people) % PEOPLE) * number
         rows = TRACKS.rows(
             track_id=ids,
             x_m=x_m,
-            y_m=1.5 * np.arange(PEOPLE),
-            observed=[True] * PEOPLE,
-            source_id=[-1] * PEOPLE,
-            class_id=[1] * PEOPLE,
+            y_m=1.5 * np.arange(people),
+            observed=[True] * people,
+            source_id=[-1] * people,
+            class_id=[1] * people,
         )
         yield Frame(400_000_000 * number, number, rows)
 
@@ -57,6 +57,7 @@ def small_blocks(monkeypatch):
     monkeypatch.setattr(table_pieces, "PIECE_ROWS", 256)
     monkeypatch.setattr(online_forecasts, "_BATCH", 128)
     monkeypatch.setattr(likelihood, "_STEPS", 16)
+    monkeypatch.setattr(likelihood, "_SAMPLES", 256)
     monkeypatch.setattr(identity_swaps, "_CELLS", 64)
 
 
@@ -73,6 +74,23 @@ def test_online_retracking_holds_numbers_of_each_sample_and_no_rows():
     online(10)  # what is imported, and made once
     short, long = (held(lambda frames=frames: online(frames))[0] for frames in (48, 144))
     assert (long - short) / (96 * PEOPLE) < 130
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_online_retracking_of_crowds_is_done_in_parts(monkeypatch):
+    """Some frames are read at once, and their tracks predicted: of 200 people these would take 2 to 10 kB each."""
+    monkeypatch.setattr(likelihood, "_STEPS", 10_000)
+
+    def online(frames: int) -> None:
+        run = LikelihoodPass(Retrack())
+        for frame in walks(frames, 200):
+            run.step(frame)
+        for _ in run.outputs():
+            pass
+
+    online(10)
+    short, long = (held(lambda frames=frames: online(frames))[1] for frames in (30, 60))
+    assert (long - short) / (30 * 200) < 400
 
 
 @pytest.mark.parametrize("name", ["default", "authors"])

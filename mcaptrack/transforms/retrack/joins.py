@@ -19,7 +19,7 @@ from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
 from mcaptrack.transforms.retrack import linking
 from mcaptrack.transforms.retrack.appearance import Appearance
 from mcaptrack.transforms.retrack.false_tracks import probability
-from mcaptrack.transforms.retrack.motion_model import MotionModel, State, smooth, to_trajectories
+from mcaptrack.transforms.retrack.motion_model import MotionModel, State, filtered, to_trajectories
 from mcaptrack.transforms.retrack.weights import weights_of
 
 #: The features of a join: those of a link, and by how much it is likelier than the best alternative (see
@@ -130,7 +130,7 @@ def with_appearance(
 def tracked_of(model: MotionModel, step: Ints, track: Ints, source: Ints, xy_m: Floats, step_s: float) -> Tracked:
     """Assignments (C,) of positions (C, 2), ordered by track, then step, with their states."""
     _, row, trajectories = to_trajectories(step, track, xy_m, model.noise_m)
-    forward, backward, _ = smooth(model, trajectories, step_s)
+    forward, backward = filtered(model, trajectories, step_s)
     return Tracked(step, track, source, forward.take(row), backward.take(row))
 
 

@@ -26,8 +26,8 @@ from mcaptrack.transforms.retrack.options import LikelihoodOptions, RetrackOptio
 from mcaptrack.transforms.retrack.samples import LogSamples
 from mcaptrack.transforms.retrack.shown_tracks import ShownTracks
 
-#: Frames are read so many at once, and online tracks written.
-_STEPS: Final = 256
+#: So many frames are read at once, and online tracks written, or fewer with so many samples.
+_STEPS, _SAMPLES = 256, 2**14
 #: The least noise (m) and speed (m/s): a covariance of 0 can't be inverted.
 _MIN_SPREAD: Final = 1e-3
 
@@ -63,7 +63,8 @@ class LikelihoodPass:
         self._samples = LogSamples()
         self.steps: list[int] = []
         self._last_ns = 0
-        self._frames: list[Frame] = []  # those that are not read yet
+        self._frames: list[Frame] = []  # those that are not read yet, and their number of samples
+        self._unread = 0
         # what is known of earlier ones: tracks and their last samples, and their positions in the recent past
         self._ids, self._last_rows = np.empty(0, np.int64), TRACKS.empty()
         self._recent = _Positions(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)))
@@ -100,7 +101,8 @@ class LikelihoodPass:
         self.steps.append(self.steps[-1] + passed if self.steps else 0)
         self._last_ns = frame.t_ns
         self._frames.append(frame)
-        if len(self._frames) >= _STEPS:
+        self._unread += len(frame.rows)
+        if len(self._frames) >= _STEPS or self._unread >= _SAMPLES:
             self._track()
 
     def outputs(self) -> Iterator[tuple[Frame, Frame]]:
@@ -125,7 +127,7 @@ class LikelihoodPass:
 
     def _track(self) -> None:
         """Track through the frames that are not read yet, and write these steps."""
-        frames, self._frames = self._frames, []
+        frames, self._frames, self._unread = self._frames, [], 0
         if not frames:
             return
         t_ns, numbers = (np.array(values, np.int64) for values in zip(*(frame[:2] for frame in frames), strict=True))

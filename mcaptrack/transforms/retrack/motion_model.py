@@ -144,20 +144,31 @@ class _Steps(NamedTuple):
         return cls(forward, first[1:][order][place] - 1 - step, [0, *np.cumsum(alive).tolist()])
 
 
+def filtered(model: MotionModel, trajectories: Trajectories, step_s: float) -> tuple[State, State]:
+    """The state of every row from past and present, and from present and future."""
+    return _filtered(model, trajectories, _Steps.of(trajectories.first), step_s)
+
+
 def smooth(model: MotionModel, trajectories: Trajectories, step_s: float) -> tuple[State, State, State]:
     """The state of every row: from past and present, from present and future, and from all (RTS smoother).
 
-    The filters run over all tracks at once, forward and backward together. Source: Rauch, Tung, Striebel 1965.
+    Source: Rauch, Tung, Striebel 1965.
     """
     steps = _Steps.of(trajectories.first)
+    forward, backward = _filtered(model, trajectories, steps, step_s)
+    smoothed = StateRows(*(np.ascontiguousarray(part[steps.backward].T) for part in forward))
+    _smooth_back(model, smoothed, steps.bounds, step_s)
+    return forward, backward, _states(smoothed, steps.backward)
+
+
+def _filtered(model: MotionModel, trajectories: Trajectories, steps: _Steps, step_s: float) -> tuple[State, State]:
+    """As ``filtered``; the filters run over all tracks at once, forward and backward together."""
     rows = np.stack([steps.forward, steps.backward], axis=-1).reshape(-1)
     both = _filter(model, trajectories, rows, [2 * bound for bound in steps.bounds], step_s)
     forward = _states(both.take(slice(0, None, 2)), steps.forward)
     backward = _states(both.take(slice(1, None, 2)), steps.backward)
     backward.mean[:, 2:] *= -1
-    smoothed = StateRows(*(np.ascontiguousarray(part[steps.backward].T) for part in forward))
-    _smooth_back(model, smoothed, steps.bounds, step_s)
-    return forward, backward, _states(smoothed, steps.backward)
+    return forward, backward
 
 
 def _states(rows: StateRows, place: Ints) -> State:

@@ -26,7 +26,7 @@ from mcaptrack.transforms.retrack.fixed_tracks import fix_tracks
 from mcaptrack.transforms.retrack.identity_swaps import resolve_swaps
 from mcaptrack.transforms.retrack.joins import Tracked, cut_joins
 from mcaptrack.transforms.retrack.linking import link_tracks
-from mcaptrack.transforms.retrack.motion_model import MotionModel, State, smooth, to_trajectories
+from mcaptrack.transforms.retrack.motion_model import MotionModel, State, filtered, smooth, to_trajectories
 from mcaptrack.transforms.retrack.offline_rows import Moved, TrackRows, moved_to, rows_by_step
 from mcaptrack.transforms.retrack.options import RetrackOptions
 from mcaptrack.transforms.retrack.samples import LogSamples
@@ -169,7 +169,7 @@ def _linked(
 ) -> Ints:
     """The track of each assignment (C,) after linking tracks of the same person."""
     ids, _, trajectories = to_trajectories(step, track, xy, model.noise_m)
-    forward, backward, _ = smooth(model, trajectories, step_s)
+    forward, backward = filtered(model, trajectories, step_s)
     limits = options.link_s / movers.unit_m, options.link_confidence
     seen = None if appearance is None else appearance.between(step, track, step_s).of_tracks
     if pieces is None:

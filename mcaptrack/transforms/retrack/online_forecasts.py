@@ -46,6 +46,9 @@ class _Made(NamedTuple):
     def part(self, which: slice) -> _Made:
         return _Made(self.ids[which], self.past[which], self.coasts[which], self.mean[which], self.cov[which])
 
+    def copied(self) -> _Made:
+        return _Made(self.ids.copy(), self.past.copy(), self.coasts.copy(), self.mean.copy(), self.cov.copy())
+
 
 class OnlineForecasts:
     """Predictions of tracks, frame by frame, made for ``_BATCH`` tracks at once."""
@@ -56,9 +59,8 @@ class OnlineForecasts:
         self._out = FrameCollector(PREDICTIONS)
         self._waiting: list[Unpredicted] = []
         nothing = np.empty((0, predictor.steps, 2, 2))
-        self._made = [
-            _Made(np.empty(0, np.int64), np.empty((0, predictor.past, 2)), np.empty(0, bool), nothing[..., 0], nothing)
-        ]
+        ids, past, coasts = np.empty(0, np.int64), np.empty((0, predictor.past, 2)), np.empty(0, bool)
+        self._left = _Made(ids, past, coasts, nothing[..., 0], nothing)  # of a frame that is not complete
         self._frames: list[tuple[int, int, int, int]] = []  # time, number, step and tracks of frames in neither
 
     def add(self, t_ns: Ints, numbers: Ints, steps: Ints, ends: Ints, tracks: Unpredicted) -> None:
@@ -86,25 +88,26 @@ class OnlineForecasts:
             units = past / self._unit_m
             people = PeopleSeen(units, known, steps, np.arange(len(ids)))
             mean, cov = predict_among(self._predictor, units, known, people)
-            self._made.append(_Made(ids, past, coasts, mean * self._unit_m, cov * self._unit_m**2))
+            self._write(_Made(ids, past, coasts, mean * self._unit_m, cov * self._unit_m**2))
             done += len(ids)
         self._waiting = [waiting.part(slice(done, None))]
-        made = _Made(*(np.concatenate(parts) for parts in zip(*self._made, strict=True)))
-        ends = np.cumsum([0, *(count for *_, count in self._frames)])
-        complete = int(np.searchsorted(ends, len(made.ids), "right")) - 1
-        self._write(complete, ends, made)
-        left = made.part(slice(ends[complete], None))  # copied, so that the larger arrays are not held
-        self._made = [_Made(left.ids.copy(), left.past.copy(), left.coasts.copy(), left.mean.copy(), left.cov.copy())]
+        self._write(self._left.part(slice(0)))  # frames without tracks
 
-    def _write(self, count: int, ends: Ints, made: _Made) -> None:
-        """Write the first ``count`` frames, of which frame f has ``ends[f]`` to ``ends[f + 1]`` of ``made``."""
+    def _write(self, new: _Made) -> None:
+        """Write the frames that are complete with these predictions."""
+        made = (
+            new if new is self._left else _Made(*(np.concatenate(both) for both in zip(self._left, new, strict=True)))
+        )
+        ends = np.cumsum([0, *(count for *_, count in self._frames)])
+        count = int(np.searchsorted(ends, len(made.ids), "right")) - 1
+        self._left = made.part(slice(ends[count], None)).copied()  # so that the larger arrays are not held
         if not count:
             return
-        calibration, tails = self._calibration, None
         ids, past, coasts, mean, cov = made.part(slice(ends[count]))
-        if calibration is not None:  # by the predictions of the steps before
+        tails = None
+        if self._calibration is not None:  # by the predictions of the steps before
             step = np.repeat([step for _, _, step, _ in self._frames[:count]], np.diff(ends[: count + 1]))
-            (_, cov), tails = calibration(step, ids, Forecast(mean, cov), past, coasts)
+            (_, cov), tails = self._calibration(step, ids, Forecast(mean, cov), past, coasts)
         rows = forecast_to_rows(ids, Forecast(mean, cov), self._predictor.step_s, tails)
         t_ns, numbers, *_ = zip(*self._frames[:count], strict=True)
         self._out.extend(t_ns, numbers, ends[: count + 1] * self._predictor.steps, rows)
