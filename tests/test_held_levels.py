@@ -85,16 +85,23 @@ def test_running_sums_are_those_of_each_time_after_the_one_before():
 
 
 class TestNoise:
-    def paths(self, white_m: float, lasting_m: float, turns: float = 0.0, lasts_s: float = 1.2) -> np.ndarray:
+    def lasting(self, rng: np.random.Generator, sd_m: float, steps: int, *shape: int) -> np.ndarray:
+        """Noise (steps, ...) that lasts: a part for each time constant, as of processes that forget (AR(1))."""
+        parts = []
+        for keep in np.exp(-STEP_S / np.array([0.6, 1.2, 2.4, 4.8])):
+            drawn = rng.normal(0, sd_m / 2, (steps, *shape))
+            drawn[1:] *= np.sqrt(1 - keep**2)
+            for step in range(1, steps):
+                drawn[step] += keep * drawn[step - 1]
+            parts.append(drawn)
+        return np.sum(parts, axis=0)
+
+    def paths(self, white_m: float, lasting_m: float, turns: float = 0.0) -> np.ndarray:
         """The pasts, (93, 60, 8, 2), of 60 people who walk, straight on or in circles, and are measured."""
         rng, people, steps = np.random.default_rng(2), 60, 100
-        keep = np.exp(-STEP_S / lasts_s)
-        off = lasting_m * rng.normal(size=(people, 2))
         angle = turns * STEP_S * np.arange(steps) + rng.uniform(0, 6, (people, 1))
         path = np.cumsum(0.5 * np.stack([np.cos(angle), np.sin(angle)], axis=-1), axis=1)
-        for step in range(steps):
-            off = keep * off + np.sqrt(1 - keep**2) * lasting_m * rng.normal(size=(people, 2))
-            path[:, step] += off + white_m * rng.normal(size=(people, 2))
+        path += self.lasting(rng, lasting_m, steps, people, 2).swapaxes(0, 1) + white_m * rng.normal(size=path.shape)
         return np.stack([path[:, step - 7 : step + 1] for step in range(7, steps)])
 
     def seen(self, white_m: float, lasting_m: float, **motion: float) -> tuple[float, float]:
@@ -135,10 +142,7 @@ class TestNoise:
         """A person stands; a forecast is the last measured position, and is compared with measured ones later."""
         past = self.paths(0.0, 0.3).reshape(-1, 8, 2)
         found = NoiseOfErrors(*(part[0] for part in self.effect(past)))
-        rng, keep = np.random.default_rng(3), np.exp(-STEP_S / 1.2)
-        off = [rng.normal(0, 0.3, 20_000)]
-        for _ in range(12):
-            off.append(keep * off[-1] + np.sqrt(1 - keep**2) * rng.normal(0, 0.3, 20_000))
+        off = self.lasting(np.random.default_rng(3), 0.3, 13, 20_000)
         added = [np.var(later - off[0]) - np.var(off[0]) for later in off[1:]]
         assert found.added.tolist() == pytest.approx(added, abs=0.03)
         assert found.added[0] < 0 < found.added[-1]

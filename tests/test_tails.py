@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from mcaptrack.evaluation.metrics.calibration import ellipse_levels
 from mcaptrack.geometry.mixtures import Tails, squared_radius
 from mcaptrack.notices import Notice, listening
 from mcaptrack.predictors import NAMES, Forecast, make
+from mcaptrack.predictors.position_noise import PositionNoise
 from mcaptrack.predictors.tail_calibration import TailCalibration
 from mcaptrack.predictors.tails import TABLES, Learned, counts_of, fit_mixture, follow, table_of
 from mcaptrack.schema import TRACKS, Frame
@@ -327,6 +329,29 @@ class TestInTransforms:
             for column in one.rows.dtype.names:
                 np.testing.assert_allclose(one.rows[column], other.rows[column], rtol=1e-6)
         assert any(len(frame.rows) for frame in begun)
+
+    def test_interpolated_positions_say_nothing_about_noise(self, monkeypatch):
+        """A quarter of the positions is interpolated between neighbours: their noise is smaller, and like theirs."""
+        found: list[tuple[float, float]] = []
+        given = PositionNoise.variances_m2
+
+        def kept(*values: Any) -> tuple[np.ndarray, np.ndarray]:
+            out = given(*values)
+            found.append((float(out[0][-1]), float(out[1][-1])))
+            return out
+
+        monkeypatch.setattr(PositionNoise, "variances_m2", kept)
+        frames, rng = walkers(count=40, ticks=60, noise_m=0.2), np.random.default_rng(9)
+        for before, frame, after in zip(frames, frames[1:], frames[2:], strict=False):
+            is_seen = rng.random(40) > 0.25
+            for name in ("x_m", "y_m"):
+                between = (before.rows[name] + after.rows[name]) / 2
+                frame.rows[name] = np.where(is_seen, frame.rows[name], between)
+            frame.rows["observed"] = is_seen
+        list(Predict()(frames))
+        white_m, lasting_m = np.sqrt(np.median(found[-10:], axis=0))
+        assert white_m == pytest.approx(0.2, rel=0.1)
+        assert lasting_m < 0.1
 
     def test_the_profiles_of_the_paper_have_none(self):
         for name in ("paper", "authors"):

@@ -5,7 +5,8 @@ from step to step. Such noise hides in a track. A forecast starts with it, so th
 the track than with the truth; far ones agree worse. What shows are the bends of tracks, second differences over one,
 two and three steps. White noise bends a track alike over any time, people bend it much more over longer times, and
 lasting noise is between them. So the three are told apart by how bends grow, as variances of clocks are (Allan).
-How long noise lasts can't be seen beside the motion of people; it is taken to be about a second.
+How long noise lasts can't be seen beside the motion of people: it is taken to have no time scale of its own, with as
+much of its variance in each octave from a step or two to the usual horizon (as flicker noise).
 
 Letters: N tracks, L past positions, T future steps, R times.
 
@@ -25,10 +26,12 @@ from mcaptrack.predictors.running_sums import running
 
 #: Steps over which bends are seen.
 _LAGS: Final = (1, 2, 3)
-#: The time constant of lasting noise, and the power of the time with which the variance of bends by motion grows.
-_LASTS_S, _MOTION = 1.2, 3.4
-#: Bends count 1 / e after so many steps, and less than so many say nothing.
-_MEMORY, _LEAST_POSITIONS = 39, 10
+#: The time constants of lasting noise, each with as much of its variance.
+_LASTS_S: Final = np.array([0.6, 1.2, 2.4, 4.8])
+#: The power of the time with which the variance of bends by motion grows.
+_MOTION: Final = 3.4
+#: Bends count 1 / e after so many seconds, and less than so many say nothing.
+_MEMORY_S, _LEAST_POSITIONS = 60.0, 30
 #: Squared bends in m^2 are counted in bins between these powers of ten, so many to each.
 _LOWEST, _HIGHEST, _BINS = -8, 6, 16
 #: Positions of a past, the current one included, that show bends.
@@ -57,10 +60,10 @@ class PositionNoise:
 
     def __init__(self, step_s: float) -> None:
         self._step_s = step_s
-        like = np.exp(-step_s * np.array(_LAGS) / _LASTS_S)
-        lasting = 1 - 4 / 3 * like + like**2 / 3
+        lags = np.array(_LAGS)
+        lasting = 1 - 4 / 3 * _likeness(step_s * lags) + _likeness(2 * step_s * lags) / 3
         # bends have six times the variance of white noise
-        self._shapes = np.stack([np.ones(len(_LAGS)), lasting, np.array(_LAGS, np.float64) ** _MOTION], axis=-1)
+        self._shapes = np.stack([np.ones(len(lags)), lasting, lags**_MOTION], axis=-1)
         self._counts = np.zeros((len(_LAGS), (_HIGHEST - _LOWEST) * _BINS))
 
     def follow(self, passed: Ints, place: Ints, past: Floats, steps: int) -> NoiseOfErrors:
@@ -70,7 +73,7 @@ class PositionNoise:
         observed in these steps, the current ones last, and ``place`` (N,) says of which time they are.
         """
         white_m2, lasting_m2 = (part[:, None] for part in self.variances_m2(passed, place, past))
-        like = np.exp(-self._step_s * np.arange(1.0, steps + 1) / _LASTS_S)
+        like = _likeness(self._step_s * np.arange(1.0, steps + 1))
         least = np.broadcast_to(_LEAST_WHITE * white_m2 + _LEAST_LASTING * lasting_m2, (len(passed), steps))
         return NoiseOfErrors(white_m2 + lasting_m2 * (1 - 2 * like), least)
 
@@ -85,7 +88,7 @@ class PositionNoise:
         power = np.log10(np.maximum(bends_m2[row, lag], 10.0**_LOWEST)) - _LOWEST
         cell = (place[row] * lags + lag) * bins + np.minimum((power * _BINS).astype(np.int64), bins - 1)
         new = np.bincount(cell, minlength=len(passed) * lags * bins).reshape(len(passed), lags, bins)
-        counts, self._counts = running(self._counts, np.exp(-passed / _MEMORY), new)
+        counts, self._counts = running(self._counts, np.exp(-passed * self._step_s / _MEMORY_S), new)
         below = counts.cumsum(axis=2)
         total = below[..., -1]
         # of two axes; the median, because some tracks turn or are exchanged
@@ -99,6 +102,11 @@ class PositionNoise:
         parts = nonnegative(self._shapes * (unit_m2[:, None] / variance_m2)[:, :, None])
         white, lasting, _ = (parts * np.where(is_known, unit_m2, 0.0)[:, None]).T
         return white, lasting
+
+
+def _likeness(passed_s: Floats) -> Floats:
+    """The correlation (K,) of lasting noise with itself after some time (K,)."""
+    return np.asarray(np.exp(-passed_s[:, None] / _LASTS_S).mean(axis=1))
 
 
 def nonnegative(shapes: Floats) -> Floats:

@@ -127,7 +127,13 @@ class TailCalibration:
             )
 
     def __call__(
-        self, step: Ints, ids: Ints, forecast: Forecast, past: Floats, is_coasting: Bools
+        self,
+        step: Ints,
+        ids: Ints,
+        forecast: Forecast,
+        past: Floats,
+        is_coasting: Bools,
+        observed: Floats | None = None,
     ) -> tuple[Forecast, Tails]:
         """Calibrate the forecasts of tracks at one time or at several.
 
@@ -143,6 +149,8 @@ class TailCalibration:
             Past positions, the current one last, in the unit of the forecasts; unknown ones are NaN.
         is_coasting : (N,) of bool
             Which tracks are not observed now.
+        observed : (N, L, 2) of float, optional
+            Past positions without interpolated ones, which have less noise; by default those of ``past``.
 
         Returns
         -------
@@ -157,7 +165,8 @@ class TailCalibration:
         if self._adapts and len(ids):
             refits = self._refits(step[~is_coasting])
             fit += np.searchsorted(refits, step, "right")
-            self._made.append(_Made(step, ids, ~is_coasting, past[:, -PAST:], forecast.mean, cov, fit))
+            seen = (past if observed is None else observed)[:, -PAST:]
+            self._made.append(_Made(step, ids, ~is_coasting, seen, forecast.mean, cov, fit))
             if len(refits):
                 self._learn(refits)
         weight, narrow, wide = self._tails[fit - self._dropped].transpose(1, 0, 2)

@@ -15,6 +15,7 @@ from mcaptrack.geometry.mixtures import Tails, normal_tails
 from mcaptrack.geometry.ragged import run_starts
 from mcaptrack.predictors import Forecast, PeopleSeen, make, predict_among, uses_people
 from mcaptrack.predictors.linear import LinearPredictor
+from mcaptrack.predictors.position_noise import PAST
 from mcaptrack.predictors.tail_calibration import TailCalibration
 from mcaptrack.predictors.vehicle_tails import calibrated
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
@@ -107,6 +108,7 @@ class Forecaster:
         self._calibration = TailCalibration.of(predictor, self._predictor, adapt)
         self._step = 0
         self._histories = histories(max(self._predictor.past, min_history))
+        self._observed = Histories(PAST)  # without interpolated positions
         self._last_ns: int | None = None
 
     def predict(self, frame: Frame) -> Rows:
@@ -114,7 +116,8 @@ class Forecaster:
         passed = self._passed(frame.t_ns)
         self._step += passed
         ids = frame.rows["track_id"]
-        past, known = self._histories.push(ids, np.stack([frame.rows["x_m"], frame.rows["y_m"]], axis=-1), passed)
+        xy_m = np.stack([frame.rows["x_m"], frame.rows["y_m"]], axis=-1)
+        past, known = self._histories.push(ids, xy_m, passed)
         # An interpolated position depends on later ones: a prediction from it would not be causal.
         ready = known[:, -self._min_history :].all(axis=1) & frame.rows["observed"]
         people = self._people(frame.rows, past, known, ready) if uses_people(self._predictor) else None
@@ -122,7 +125,9 @@ class Forecaster:
         tails = None
         if self._calibration is not None and not made.has_velocity.any():
             step, is_coasting = np.full(len(made.has_velocity), self._step), np.zeros(len(made.has_velocity), bool)
-            forecast, tails = self._calibration(step, ids[ready], made.forecast, past[ready], is_coasting)
+            observed, _ = self._observed.push(ids, np.where(frame.rows["observed"][:, None], xy_m, np.nan), passed)
+            given = made.forecast, past[ready], is_coasting, observed[ready]
+            forecast, tails = self._calibration(step, ids[ready], *given)
         elif made.is_vehicle.any():
             forecast, tails = self._of_vehicles(made, frame.rows[ready], past[ready])
         else:
