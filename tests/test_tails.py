@@ -353,6 +353,24 @@ class TestInTransforms:
         assert white_m == pytest.approx(0.2, rel=0.1)
         assert lasting_m < 0.1
 
+    def test_positions_on_both_sides_of_times_with_velocities_are_not_neighbours(self, monkeypatch):
+        """People on straight lines have no bends, also where some of their rows are of another tracker."""
+        seen: list[np.ndarray] = []
+        given = PositionNoise.variances_m2
+
+        def kept(noise: PositionNoise, passed: np.ndarray, place: np.ndarray, past: np.ndarray) -> Any:
+            seen.append(past)
+            return given(noise, passed, place, past)
+
+        monkeypatch.setattr(PositionNoise, "variances_m2", kept)
+        frames = walkers(noise_m=0.0)
+        for frame in frames[30:33]:
+            frame.rows["vx_m_per_s"] = frame.rows["vy_m_per_s"] = 1.0
+        list(Predict()(frames))
+        bends = np.diff(np.concatenate(seen), 2, axis=1)
+        assert np.isfinite(bends).any()
+        assert np.nanmax(np.abs(bends)) < 1e-9
+
     def test_the_profiles_of_the_paper_have_none(self):
         for name in ("paper", "authors"):
             made = [frames[2].rows for frames in PROFILES[name](walkers(ticks=20))]

@@ -108,7 +108,7 @@ class Forecaster:
         self._calibration = TailCalibration.of(predictor, self._predictor, adapt)
         self._step = 0
         self._histories = histories(max(self._predictor.past, min_history))
-        self._observed = Histories(PAST)  # without interpolated positions
+        self._observed, self._observed_at = Histories(PAST), 0  # without interpolated positions; their last step
         self._last_ns: int | None = None
 
     def predict(self, frame: Frame) -> Rows:
@@ -125,7 +125,8 @@ class Forecaster:
         tails = None
         if self._calibration is not None and not made.has_velocity.any():
             step, is_coasting = np.full(len(made.has_velocity), self._step), np.zeros(len(made.has_velocity), bool)
-            observed, _ = self._observed.push(ids, np.where(frame.rows["observed"][:, None], xy_m, np.nan), passed)
+            observed_m, since = np.where(frame.rows["observed"][:, None], xy_m, np.nan), self._step - self._observed_at
+            (observed, _), self._observed_at = self._observed.push(ids, observed_m, since), self._step
             given = made.forecast, past[ready], is_coasting, observed[ready]
             forecast, tails = self._calibration(step, ids[ready], *given)
         elif made.is_vehicle.any():
