@@ -117,7 +117,7 @@ class TestNoise:
         assert white == pytest.approx(white_m, abs=0.06)
         assert lasting == pytest.approx(lasting_m, abs=0.06)
         if not white_m:
-            assert lasting == pytest.approx(lasting_m, rel=0.04)
+            assert lasting == pytest.approx(lasting_m, rel=0.04, abs=1e-6)
 
     def test_people_who_turn_are_not_taken_for_noise(self):
         assert np.hypot(*self.seen(0.01, 0.0, turns=0.5)) < 0.06
