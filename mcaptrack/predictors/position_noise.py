@@ -82,6 +82,18 @@ class PositionNoise:
 
         They are 0 as long as little is known.
         """
+        variance_m2 = self.bends_m2(passed, place, past)
+        is_known = np.isfinite(variance_m2).all(axis=1)
+        variance_m2[~is_known] = 1.0
+        unit_m2 = variance_m2.mean(axis=1)
+        parts = nonnegative(self._shapes * (unit_m2[:, None] / variance_m2)[:, :, None])
+        white, lasting, _ = (parts * np.where(is_known, unit_m2, 0.0)[:, None]).T
+        return white, lasting
+
+    def bends_m2(self, passed: Ints, place: Ints, past: Floats) -> Floats:
+        """The variance (R, lags) of white noise that would bend tracks as much over each of the lags, in m^2 for each
+        axis; NaN where little is known. The rest is as for ``follow``.
+        """
         bends_m2 = _bends_m2(past)
         row, lag = np.nonzero(np.isfinite(bends_m2))
         lags, bins = self._counts.shape
@@ -95,13 +107,8 @@ class PositionNoise:
         median = np.minimum((below < total[..., None] / 2).sum(axis=2), bins - 1)[..., None]
         above = np.take_along_axis(below, median, 2)[..., 0] - total / 2
         within = 1 - above / np.maximum(np.take_along_axis(counts, median, 2)[..., 0], 1e-300)
-        is_known = (total >= _LEAST_POSITIONS).all(axis=1)
         variance_m2 = 10 ** (_LOWEST + (median[..., 0] + within) / _BINS) / (12 * np.log(2))
-        variance_m2[~is_known] = 1.0
-        unit_m2 = variance_m2.mean(axis=1)
-        parts = nonnegative(self._shapes * (unit_m2[:, None] / variance_m2)[:, :, None])
-        white, lasting, _ = (parts * np.where(is_known, unit_m2, 0.0)[:, None]).T
-        return white, lasting
+        return np.asarray(np.where(total >= _LEAST_POSITIONS, variance_m2, np.nan))
 
 
 def _likeness(passed_s: Floats) -> Floats:

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.ragged import group_index
 from mcaptrack.predictors import Predictor, make
@@ -18,11 +18,13 @@ from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers
+from mcaptrack.transforms.retrack.input_noise import InputNoise
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M, MotionModel
 from mcaptrack.transforms.retrack.offline_rows import move_rows
 from mcaptrack.transforms.retrack.online_forecasts import OnlineForecasts, Unpredicted
 from mcaptrack.transforms.retrack.online_tracker import HITS, IDS, Association, OnlineTracker
 from mcaptrack.transforms.retrack.options import LikelihoodOptions, RetrackOptions
+from mcaptrack.transforms.retrack.recent_positions import RecentPositions
 from mcaptrack.transforms.retrack.samples import LogSamples
 from mcaptrack.transforms.retrack.shown_tracks import ShownTracks
 
@@ -65,14 +67,15 @@ class LikelihoodPass:
         self._last_ns = 0
         self._frames: list[Frame] = []  # those that are not read yet, and their number of samples
         self._unread = 0
-        # what is known of earlier ones: tracks and their last samples, and their positions in the recent past
+        # what is known of earlier ones: tracks and their last samples
         self._ids, self._last_rows = np.empty(0, np.int64), TRACKS.empty()
-        self._recent = _Positions(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)))
         self._online = FrameCollector(TRACKS)
         self._coasting: list[tuple[Ints, Floats, Ints]] = []  # places of rows in _online, positions in m, times
         horizon = max(1, round(options.horizon_s * rate))
         self._predictor: Predictor = make(options.predictor, horizon, 1 / rate)
         self._forecasts = OnlineForecasts(options.predictor, self._predictor, movers.unit_m, options.follows_log)
+        self._recent = RecentPositions(self._predictor.past)  # of tracks, in m
+        self._input = InputNoise(1 / rate) if options.noise_m is None else None
         self._written = 0
 
     @property
@@ -145,9 +148,11 @@ class LikelihoodPass:
         xy_m = np.stack([samples["x_m"][observed], samples["y_m"][observed]]) / self._unit_m
         bounds = np.searchsorted(tick, np.arange(len(frames) + 1))
         passed = np.diff(steps, prepend=before)
+        most_m = self._input.most_m(passed, steps, tick, source, xy_m.T) if self._input else [np.inf] * len(frames)
+        each = zip(bounds.tolist(), bounds[1:].tolist(), passed.tolist(), most_m, strict=False)
         results = [
-            self._tracker.step(xy_m[:, low:high], source[low:high], steps_passed)
-            for low, high, steps_passed in zip(bounds.tolist(), bounds[1:].tolist(), passed.tolist(), strict=False)
+            self._tracker.step(xy_m[:, low:high], source[low:high], steps_passed, limit)
+            for low, high, steps_passed, limit in each
         ]
         tracks, row, place = (np.concatenate(all_, axis=-1) for all_ in zip(*results, strict=True))
         tick = group_index([len(result.row) for result in results])
@@ -186,8 +191,10 @@ class LikelihoodPass:
         xy_m[coasts] = place.T[shown[coasts]] * self._unit_m
         self._coasting.append((self._written + np.flatnonzero(coasts), xy_m[coasts], read.t_ns[tick[shown[coasts]]]))
         is_matched = sample >= 0
-        self._remember(int(steps[0]), ids[is_matched], steps[tick[is_matched]], samples[sample[is_matched]])
-        past, known = self._past(ids[shown], steps[tick[shown]], xy_m)
+        seen = samples[sample[is_matched]]
+        seen_m = np.stack([seen["x_m"], seen["y_m"]], axis=-1)
+        self._recent.add(int(steps[0]), ids[is_matched], steps[tick[is_matched]], seen_m)
+        past, known = self._recent.before(ids[shown], steps[tick[shown]], xy_m)
         ticks = np.arange(len(steps) + 1)
         self._online.extend(read.t_ns, read.numbers, np.searchsorted(tick[shown], ticks), rows)
         confirmed = np.flatnonzero(tracks[HITS, shown] >= self._confirm_hits)  # before, little is known of velocities
@@ -196,38 +203,6 @@ class LikelihoodPass:
         self._written += len(rows)
         is_last = tick == len(steps) - 1
         self._ids, self._last_rows = ids[is_last], samples[last_sample[is_last]]
-
-    def _remember(self, first: int, track: Ints, step: Ints, samples: Rows) -> None:
-        """Add positions of tracks from step ``first`` on to their past; only that which predictions need is kept."""
-        recent = self._recent
-        xy_m = np.stack([samples["x_m"], samples["y_m"]], axis=-1)
-        kept = recent.step > first - 1 - self._predictor.past
-        both = zip(recent, (track, step, xy_m), strict=True)
-        self._recent = _Positions(*(np.concatenate([before[kept], new]) for before, new in both))
-
-    def _past(self, ids: Ints, steps: Ints, now_m: Floats) -> tuple[Floats, Bools]:
-        """Last positions of tracks as known at ``steps`` (R,), (R, L, 2), and which of them are known, (R, L)."""
-        length, recent = self._predictor.past, self._recent
-        width = self.steps[-1] + 2
-        have = recent.track * width + recent.step
-        order = np.argsort(have)
-        have, xy_m = have[order], recent.xy_m[order]
-        past = np.full((len(ids), length, 2), np.nan)
-        for back in range(1, length if len(have) else 0):
-            want = ids * width + steps - back
-            place = np.minimum(np.searchsorted(have, want), len(have) - 1)
-            found = (have[place] == want) & (steps >= back)
-            past[found, length - 1 - back] = xy_m[place[found]]
-        past[:, -1] = now_m
-        return past, np.isfinite(past[..., 0])
-
-
-class _Positions(NamedTuple):
-    """Positions of tracks: the track of each, its step, and x and y in m."""
-
-    track: Ints
-    step: Ints
-    xy_m: Floats
 
 
 class _Read(NamedTuple):

@@ -97,8 +97,13 @@ class OnlineTracker:
     def __post_init__(self) -> None:
         self.noise_m = self.model.noise_m
 
-    def step(self, xy_m: Floats, source: Ints, passed: int) -> Step:
-        """Advance by ``passed`` steps and associate observations at (2, N) with the input ids ``source`` (N,)."""
+    def step(self, xy_m: Floats, source: Ints, passed: int, most_noise_m: float = np.inf) -> Step:
+        """Advance by ``passed`` steps and associate observations at (2, N) with the input ids ``source`` (N,).
+
+        The noise of positions is estimated as no larger than ``most_noise_m``.
+        """
+        if self.estimate_noise:
+            self.noise_m = min(self.noise_m, most_noise_m)
         self.tracks[MISSED] += passed
         is_over = np.where(self.tracks[HITS] >= self.confirm_hits, self.max_age, self.max_age_tentative)
         is_over = is_over < self.tracks[MISSED]
