@@ -210,7 +210,7 @@ class TestEncounters:
             mean, cov = move @ mean, move @ cov @ move.T + noise
             variance = cov[0, 0] + 2 * 0.05**2
             off = at - mean[0]
-            total += multivariate_t(shape=variance * np.eye(2), df=4).logpdf(off)
+            total += multivariate_t(shape=variance * np.eye(2), df=6).logpdf(off)
             gain = cov[:, 0] / variance
             mean, cov = mean + np.outer(gain, off), cov - np.outer(gain, cov[0])
         return float(total)

@@ -256,9 +256,9 @@ class Survivor:
     course: list[bool] = field(default_factory=list)
 
     def likelihood(self, at: np.ndarray, noise: float) -> float:
-        """By Student's distribution in the plane with four degrees of freedom, but for a constant."""
+        """By Student's distribution in the plane with six degrees of freedom, but for a constant."""
         variance = self.cov[0, 0] + noise
-        return -3 * log(1 + ((at - self.mean[:, 0]) ** 2).sum() / (4 * variance)) - log(variance)
+        return -4 * log(1 + ((at - self.mean[:, 0]) ** 2).sum() / (6 * variance)) - log(variance)
 
     def after(self, at: np.ndarray | None, noise: float, score: float, exchanged: bool) -> Survivor:
         mean, cov = self.mean, self.cov

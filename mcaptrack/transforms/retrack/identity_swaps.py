@@ -28,7 +28,7 @@ _NEAR_M: Final = 2.0
 _MARGIN: Final = 10
 #: Errors of the expected relative position have Student's distribution with so many degrees of freedom: people also
 #: turn round, and a normal distribution would then believe in a swap against all other evidence.
-_FREEDOM: Final = 4.0
+_FREEDOM: Final = 6.0
 #: Cost of a swap as a log likelihood, and how much more it costs for each of the two tracks that keeps its input id
 #: there (and less for each that takes over the input id of the other).
 _SWAP_COST: Final = 2.0
