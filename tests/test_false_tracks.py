@@ -115,19 +115,3 @@ def test_a_place_that_is_missed_for_longer_than_people_are_is_left_out_and_someb
     found = tracked(paths)
     assert found[11] == 55
     assert 12 not in found
-
-
-def test_what_appears_where_it_stands_is_left_out_and_people_who_stop_there_are_not():
-    """Some stand for ten seconds: they come and go on, and something is only seen there."""
-    rng = np.random.default_rng(6)
-    paths = walkers(rng, 5)
-    step = np.arange(60)
-    for k in range(3):
-        along = 1.2 * 0.4 * (np.minimum(step, 18) + np.maximum(step - 43, 0))
-        place = np.column_stack([along - 9.0, np.full(60, 30.0 + 6 * k)]) + rng.normal(0, 0.1, (60, 2))
-        paths[11 + k] = {s: tuple(place[s].tolist()) for s in range(7, 54)}
-    thing = rng.normal(0, 0.1, (60, 2)) + (30.0, 40.0)
-    paths[21] = {s: tuple(thing[s].tolist()) for s in range(8, 52)}
-    found = tracked(paths)
-    assert [found[11 + k] for k in range(3)] == [47] * 3
-    assert 21 not in found

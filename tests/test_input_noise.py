@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from mcaptrack.transforms import PROFILES, Sample
 from mcaptrack.transforms.retrack.input_noise import InputNoise
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
+from mcaptrack.transforms.retrack.motion_model import MotionModel
+from mcaptrack.transforms.retrack.online_tracker import Association, OnlineTracker
 from tests.references.online import Bends
 from tools.corruptions import STEP_S, corrupt
 from tools.crowds import drawn
@@ -69,3 +71,31 @@ def test_people_merged_into_one_detection_are_not_taken_for_noise():
     for (frame,) in Sample(start_ns=round(clock[0] * STEP_S * 1e9))(on_clock(rows, clock)):
         run.step(frame)
     assert run.noise_m < 0.5
+
+
+def test_ids_of_any_size_give_the_same_limit():
+    """256 steps: with these ids, products of both wrap around."""
+    place, source = np.divmod(np.arange(256 * 20), 20)
+    at = 5.0 * source[:, None] + np.random.default_rng(3).normal(0, 0.4, (256 * 20, 2))
+    one, steps = np.ones(256, int), np.arange(256)
+    found = [InputNoise(STEP_S).most_m(one, steps, place, source * size, at) for size in (1, 2**56)]
+    assert found[0][-1] == pytest.approx(0.6, rel=0.1)
+    assert found[0] == found[1]
+
+
+def test_the_estimate_keeps_the_limit_at_once():
+    """Forty people jump about by metres: all of them are outside of their circles at the same step."""
+    tracker = OnlineTracker(
+        model=MotionModel(0.2, 1.5, 0.12, 0.08),
+        association=Association(same_id=12.0, same_id_crowded=4.0, merge_distance_m=0.0, merge_timeout_s=0.0),
+        step_s=STEP_S,
+        max_age=5,
+        confirm_hits=2,
+        max_age_tentative=2,
+    )
+    home = 20.0 * np.stack(np.divmod(np.arange(40), 8)).astype(float)
+    for step in range(8):
+        tracker.step(home + (step % 2) * 0.9, np.arange(40), 1, most_noise_m=0.3)
+        assert tracker.noise_m <= 0.3
+    tracker.step(home, np.arange(40), 1)
+    assert tracker.noise_m > 0.3

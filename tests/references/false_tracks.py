@@ -45,24 +45,8 @@ def person_features(motion: Motion, paths: dict[int, Path]) -> dict[int, dict[st
                 + [gap for gap in gaps(path) if name in goes],
                 name in goes,
             ),
-            "slow ends": slowness(motion, states, paths),
         }
     return out
-
-
-def slowness(motion: Motion, states: dict[int, State], paths: dict[int, Path]) -> float:
-    """How slow a track begins and ends: minus the logarithm of its speed within 1.6 s, unless the log begins or ends there."""
-    begin, end = min(min(path) for path in paths.values()), max(max(path) for path in paths.values())
-    speeds = {step: hypot(*state.mean[:, 1]) for step, state in states.items()}
-    count, margin = max(round(1.6 / motion.step_s), 1), round(2 / motion.step_s)
-    total = 0.0
-    for is_near, steps in (
-        (min(speeds) - begin < margin, sorted(speeds)[:count]),
-        (end - max(speeds) < margin, sorted(speeds)[-count:]),
-    ):
-        if not is_near:
-            total -= log(sum(speeds[step] for step in steps) / len(steps) + 0.2)
-    return total / 2
 
 
 def log_odds_in_log(motion: Motion, paths: dict[int, Path]) -> dict[int, float]:
@@ -80,7 +64,7 @@ def log_odds_in_log(motion: Motion, paths: dict[int, Path]) -> dict[int, float]:
     def loss(weights: np.ndarray) -> float:
         likely = np.clip(1 / (1 + np.exp(-known @ weights)), 1e-12, 1 - 1e-12)
         entropy = -likely * np.log(likely) - (1 - likely) * np.log(1 - likely)
-        return float(counts @ entropy + 7.5 * ((weights - start) ** 2).sum())
+        return float(counts @ entropy + 15 * ((weights - start) ** 2).sum())
 
     best = minimize(loss, start, method="BFGS", options={"gtol": 1e-6}).x
     return dict(zip(found, (known @ best).tolist(), strict=True))

@@ -174,7 +174,8 @@ class OnlineTracker:
             passed = step - steps[at - 1] if at else 1
             seen = sorted((r for r in rows if r["observed"] or o.interpolated), key=lambda row: row["track_id"])
             if o.noise_m is None:
-                self.noise_m = min(self.noise_m, bends.limit(step, seen))
+                self.most_noise_m = bends.limit(step, seen)
+                self.noise_m = min(self.noise_m, self.most_noise_m)
             has = self.step(seen, passed)
             now = {
                 one.name: (one.hits, 0 if one.name in has else one.missed, lives.is_outside(one.here))
@@ -315,4 +316,4 @@ class OnlineTracker:
             self.judged += len(outside)
             rate = max(0.01, 5 / (self.judged + 50))
             change = rate * sum(out - self.WIDE for out in outside)
-            self.noise_m = min(max(exp(log(noise_m) + change), 0.03), 0.8)
+            self.noise_m = min(max(exp(log(noise_m) + change), 0.03), 0.8, self.most_noise_m)

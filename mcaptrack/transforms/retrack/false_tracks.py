@@ -20,7 +20,7 @@ _BIAS: Final = float(_FITTED["bias"])
 _MEAN, _SPREAD = (np.array([_FITTED[what][name] for name in FEATURES]) for what in ("mean", "spread"))
 #: How strongly weights stay as they were fitted while they follow a log, and how much each step of a track counts
 #: against that, up to so many steps. (Chosen on synthetic scenes and crowds.)
-_STAYS: Final = 15.0
+_STAYS: Final = 30.0
 _EACH_STEP, _MOST_STEPS = 1 / 8, 20
 #: The same for detections with scores: log odds without any; of the mean score, as a ratio to the usual one, above
 #: ``_LOW``, times the number of rows up to ``_ENOUGH``; of log seconds; of the share that was observed; of log extent.

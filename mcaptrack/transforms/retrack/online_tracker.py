@@ -102,8 +102,7 @@ class OnlineTracker:
 
         The noise of positions is estimated as no larger than ``most_noise_m``.
         """
-        if self.estimate_noise:
-            self.noise_m = min(self.noise_m, most_noise_m)
+        self._limit_noise(most_noise_m)
         self.tracks[MISSED] += passed
         is_over = np.where(self.tracks[HITS] >= self.confirm_hits, self.max_age, self.max_age_tentative)
         is_over = is_over < self.tracks[MISSED]
@@ -119,6 +118,7 @@ class OnlineTracker:
             self._update_occluded(occluded, observed[:, occluder], passed)
         if len(track):
             self._update(track, observed, source[row], occluder)
+            self._limit_noise(most_noise_m)
         row_of = np.full(self.tracks.shape[1], -1)
         row_of[track] = row
         if len(row) < len(source):
@@ -199,6 +199,10 @@ class OnlineTracker:
         rate = max(_MIN_RATE, 5 / (self.judged + 50))  # fast at first
         log_noise = np.log(self.noise_m) + rate * float((outside - _OUTSIDE).sum())
         self.noise_m = min(max(float(np.exp(log_noise)), NOISE_M[0]), NOISE_M[1])
+
+    def _limit_noise(self, most_noise_m: float) -> None:
+        if self.estimate_noise:
+            self.noise_m = min(self.noise_m, most_noise_m)
 
     def _gain(self, xy_m: Floats, source: Ints) -> Floats:
         """The gain of matching each pair (K, N); negative beyond the gate."""

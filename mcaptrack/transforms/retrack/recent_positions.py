@@ -28,7 +28,10 @@ class RecentPositions:
         ``now`` (N, 2) are those at ``step``; NaN where a track has none.
         """
         width = max(self._step.max(initial=0), step.max(initial=0)) + 1
-        have = self._track * width + self._step
+        # ids of the input may be as large as they like
+        _, number = np.unique(np.concatenate([self._track, track]), return_inverse=True)
+        had, track = number[: len(self._track)], number[len(self._track) :]
+        have = had * width + self._step
         order = np.argsort(have)
         have, xy = have[order], self._xy[order]
         past = np.full((len(track), self._length, 2), np.nan)

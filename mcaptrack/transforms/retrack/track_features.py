@@ -1,8 +1,7 @@
 """The features that tell people from false tracks: how long, where and how regularly a track was seen.
 
 Much of it is known only from the other tracks of the log: whether a track never leaves the side of another, and whether
-it is missed for longer than others are. And people who stand have come, and will go: what is not a person appears where
-it stands.
+it is missed for longer than others are.
 
 Letters: K tracks, N rows of trajectories, F features, G gaps, P pairs of rows.
 """
@@ -20,8 +19,7 @@ from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajec
 
 #: The features of a track: logarithms of its seconds, samples, extent, mean speed and mean squared residual; the share
 #: of its steps with a sample; the share of its rows near a track that began before and ended after; the share of its
-#: samples beside one longer track, and how constantly it was at the same side of that one; how rare its gaps are; and
-#: how slow it was at its ends.
+#: samples beside one longer track, and how constantly it was at the same side of that one; and how rare its gaps are.
 FEATURES: Final = (
     "log length",
     "log count",
@@ -33,7 +31,6 @@ FEATURES: Final = (
     "beside",
     "in step",
     "rare gaps",
-    "slow ends",
 )
 #: A duplicate of a track is nearer to it than this.
 _DUPLICATE_M: Final = 1.2
@@ -48,11 +45,6 @@ _IN_STEP: Final = 2.0
 _LEAST_SPREAD: Final = 0.05
 #: Gaps are compared with those of tracks that go farther than this: what goes somewhere is a person.
 _GOES_M: Final = 3.0
-#: Speeds at the ends of tracks are means over so many seconds, and so much is added to them; tracks that begin or end
-#: within so many seconds of the first or last of the log didn't come, or go, then.
-_ENDS_S: Final = 1.6
-_ENDS_M_PER_S: Final = 0.2
-_BORDER_S: Final = 2.0
 
 
 def features(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
@@ -79,7 +71,6 @@ def features(model: MotionModel, trajectories: Trajectories, smoothed: State, st
             _duplicate_share(trajectories, xy),
             *_beside(trajectories, xy, model.noise_m, np.sqrt(roughness)),
             _rare_gaps(trajectories, extent > _GOES_M),
-            _slow_ends(trajectories, speed, step_s),
         ]
     )
 
@@ -156,19 +147,3 @@ def _rare_gaps(trajectories: Trajectories, goes: Floats) -> Floats:
     rare = -np.log((as_long + 1) / (len(usual) - own + 2))
     total, count = (np.bincount(track, weights, minlength=len(goes)) for weights in (rare, None))
     return np.asarray(total / np.maximum(count, 1))
-
-
-def _slow_ends(trajectories: Trajectories, speed: Floats, step_s: float) -> Floats:
-    """How slow each track is at its ends, (K,): the mean of the negative logarithms of its speeds there, from those of
-    all rows (N,). An end that is one of the log counts as that of somebody who walks.
-    """
-    first, after = trajectories.first[:-1], trajectories.first[1:]
-    begins, ends = trajectories.step[first], trajectories.step[after - 1]
-    rows = np.minimum(max(round(_ENDS_S / step_s), 1), after - first)
-    border = round(_BORDER_S / step_s)
-    total = np.concatenate([[0.0], np.cumsum(speed)])
-    came = (total[first + rows] - total[first]) / rows
-    left = (total[after] - total[after - rows]) / rows
-    slow_came = np.where(begins < begins.min() + border, 0.0, -np.log(came + _ENDS_M_PER_S))
-    slow_left = np.where(ends > ends.max() - border, 0.0, -np.log(left + _ENDS_M_PER_S))
-    return np.asarray((slow_came + slow_left) / 2)
