@@ -28,7 +28,7 @@ JOIN_NAMES = (*LINK_NAMES, "margin", "alternative", "taken over", "given away", 
 JOIN_NAMES = (*JOIN_NAMES, "log rate", "log elsewhere")
 JOIN_MARGIN, JOIN_BRIEF_S, JOIN_QUESTIONED, JOIN_RATE_SAMPLES = 12.0, 1.0, 0.7, 50
 Cut = tuple[int, int, float]  # the ids of both pieces, and the probability that they belong together
-MEET_M, MARGIN, EXCHANGE_COST, SAME_ID, LEAST_GAIN = 2.0, 10, 2.0, 1.0, 1.0
+MEET_M, MARGIN, EXCHANGE_COST, SAME_ID, LEAST_GAIN = 2.0, 10, 4.0, 1.0, 1.0
 DRIFTS = (0.05, 0.15, 0.4)
 
 
@@ -256,9 +256,8 @@ class Survivor:
     course: list[bool] = field(default_factory=list)
 
     def likelihood(self, at: np.ndarray, noise: float) -> float:
-        """By Student's distribution in the plane with six degrees of freedom, but for a constant."""
         variance = self.cov[0, 0] + noise
-        return -4 * log(1 + ((at - self.mean[:, 0]) ** 2).sum() / (6 * variance)) - log(variance)
+        return -0.5 * ((at - self.mean[:, 0]) ** 2).sum() / variance - log(variance)
 
     def after(self, at: np.ndarray | None, noise: float, score: float, exchanged: bool) -> Survivor:
         mean, cov = self.mean, self.cov

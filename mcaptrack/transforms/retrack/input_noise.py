@@ -1,7 +1,7 @@
 """The most that the noise of positions can be, as far as the tracks of the input show it.
 
 Online tracking estimates noise from how far observations are from where tracks expect them. Where many are given to the
-wrong track, as in crowds whose people are merged into one detection now and then, these distances say little about
+wrong track, as in crowds in which people are merged into one detection now and then, these distances say little about
 noise; a larger estimate lets more of them be wrong, and it would grow without end. Tracks of the input don't depend on
 what is decided here: noise bends them, and so does the motion of people, so that there is hardly more noise than bends.
 
@@ -20,7 +20,7 @@ from mcaptrack.transforms.retrack.recent_positions import RecentPositions
 
 #: How many times as large noise may be as bends of the input say: trackers smooth their tracks.
 _FACTOR: Final = 1.5
-#: Noise may be so large in any case: trackers whose tracks hardly bend may be off for long. In metres.
+#: Noise may be so large in any case: smooth tracks may be off for long. In metres.
 _LEAST_M: Final = 0.3
 
 
