@@ -28,7 +28,7 @@ JOIN_NAMES = (*LINK_NAMES, "margin", "alternative", "taken over", "given away", 
 JOIN_NAMES = (*JOIN_NAMES, "log rate", "log elsewhere")
 JOIN_MARGIN, JOIN_BRIEF_S, JOIN_QUESTIONED, JOIN_RATE_SAMPLES = 12.0, 1.0, 0.7, 50
 Cut = tuple[int, int, float]  # the ids of both pieces, and the probability that they belong together
-MEET_M, MARGIN, EXCHANGE_COST, SAME_ID, LEAST_GAIN = 2.0, 10, 4.0, 1.0, 1.0
+MEET_M, MARGIN, EXCHANGE_COST, SAME_ID, LEAST_COST, LEAST_GAIN = 2.0, 10, 2.0, 1.0, 1.0, 1.0
 DRIFTS = (0.05, 0.15, 0.4)
 
 
@@ -256,8 +256,9 @@ class Survivor:
     course: list[bool] = field(default_factory=list)
 
     def likelihood(self, at: np.ndarray, noise: float) -> float:
+        """By Student's distribution in the plane with six degrees of freedom, but for a constant."""
         variance = self.cov[0, 0] + noise
-        return -0.5 * ((at - self.mean[:, 0]) ** 2).sum() / variance - log(variance)
+        return -4 * log(1 + ((at - self.mean[:, 0]) ** 2).sum() / (6 * variance)) - log(variance)
 
     def after(self, at: np.ndarray | None, noise: float, score: float, exchanged: bool) -> Survivor:
         mean, cov = self.mean, self.cov
@@ -336,7 +337,7 @@ def exchange_costs(a: dict[int, int], b: dict[int, int], low: int, high: int) ->
         now_a, now_b = a.get(step), b.get(step)
         same = (now_a is not None and now_a == last_a) + (now_b is not None and now_b == last_b)
         crossed = (now_a is not None and now_a == last_b) + (now_b is not None and now_b == last_a)
-        costs.append(EXCHANGE_COST + SAME_ID * (same - crossed))
+        costs.append(max(EXCHANGE_COST + SAME_ID * (same - crossed), LEAST_COST))
         last_a, last_b = last_a if now_a is None else now_a, last_b if now_b is None else now_b
     return costs
 

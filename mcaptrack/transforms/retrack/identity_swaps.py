@@ -26,10 +26,14 @@ DRIFTS_M_PER_S: Final = (0.05, 0.15, 0.4)
 #: Two tracks nearer than this meet; an encounter lasts so many steps longer at both ends.
 _NEAR_M: Final = 2.0
 _MARGIN: Final = 10
-#: Cost of a swap as a log likelihood, and how much more it costs for each of the two tracks that keeps its input id
-#: there (and less for each that takes over the input id of the other).
-_SWAP_COST: Final = 4.0
+#: Errors of the expected relative position have Student's distribution with so many degrees of freedom: people also
+#: turn round, and a normal distribution would then believe in a swap against all other evidence.
+_FREEDOM: Final = 6.0
+#: Cost of a swap as a log likelihood; how much more it costs for each of the two tracks that keeps its input id there
+#: (and less for each that takes over the input id of the other); and what it costs at least.
+_SWAP_COST: Final = 2.0
 _SAME_ID_COST: Final = 1.0
+_LEAST_COST: Final = 1.0
 #: Steps of encounters that are computed with at once.
 _CELLS: Final = 2**18
 #: The least gain in log likelihood of swaps over none.
@@ -72,7 +76,7 @@ def resolve_swaps(
         row_j = np.where(inside, steps + begin[j[part]][:, None], 0)
         relative = np.where(inside[..., None], trajectories.xy_m[row_i] - trajectories.xy_m[row_j], np.nan)
         id_i, id_j = np.where(inside, input_id[row_i], -1), np.where(inside, input_id[row_j], -1)
-        cost = _SWAP_COST + _SAME_ID_COST * _continuity(id_i, id_j)
+        cost = np.maximum(_SWAP_COST + _SAME_ID_COST * _continuity(id_i, id_j), _LEAST_COST)
         noise = model.noise_m, model.speed_m_per_s
         found, gain[part] = find_swaps(relative, cost, step_s, *noise, looks_swapped[part])
         swapped |= {one: found[row].copy() for row, one in enumerate(part.tolist()) if gain[one] >= _MIN_GAIN}
@@ -202,7 +206,8 @@ def _viterbi(
         go = observed & started
         # from each hypothesis (0, 1, 2) to each labelling (+1, -1)
         off = z[:, None, None] * np.array([1.0, -1.0])[None, None, :, None] - mean[:, :, None, :2]
-        like = -0.5 * (off**2).sum(-1) / s[..., None] - np.log(s)[..., None]
+        # Student's distribution in the plane
+        like = -(_FREEDOM / 2 + 1) * np.log1p((off**2).sum(-1) / s[..., None] / _FREEDOM) - np.log(s)[..., None]
         like = np.where(go[:, None, None], like, 0.0)
         stay = total[:, :2] + np.stack([like[:, 0, 0], like[:, 1, 1]], axis=1)
         change = total[:, 1::-1] + np.stack([like[:, 1, 0], like[:, 0, 1]], axis=1) - swap_cost[:, step, None]
