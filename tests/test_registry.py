@@ -6,8 +6,10 @@ import json
 import os
 import signal
 import sys
-from importlib.metadata import packages_distributions, version
+from email.message import Message
+from importlib.metadata import PathDistribution, packages_distributions, version
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -257,6 +259,30 @@ def test_an_entry_point_of_a_package_without_name_or_version_is_found(installed,
     assert (entry.distribution, entry.version) == of
     assert str(entry).startswith("tracker odd")
     assert find("tracker", "nearest").distribution == "own-trackers"
+
+
+@pytest.mark.parametrize("metadata", [{"Name": "broken"}, {"Version": "1"}, {}])
+def test_a_finder_that_refuses_what_metadata_lack_leaves_the_rest_known(installed, monkeypatch, metadata):
+    """Some versions of importlib_metadata, once imported, find packages in place of Python itself, with such metadata."""
+
+    class Fields(Message):
+        def __getitem__(self, name):
+            if name not in self:
+                raise KeyError(name)
+            return super().__getitem__(name)
+
+    class Found(PathDistribution):
+        metadata = Fields()
+
+    for field in metadata.items():
+        Found.metadata.add_header(*field)
+    folder = installed / "elsewhere" / "broken.dist-info"
+    folder.mkdir(parents=True)
+    (folder / "entry_points.txt").write_bytes(POINT)
+    finder = SimpleNamespace(find_distributions=lambda context=None: iter([Found(folder)]), find_spec=lambda *_: None)
+    monkeypatch.setattr(sys, "meta_path", [*sys.meta_path, finder])
+    entry = find("tracker", "odd")
+    assert (entry.distribution, entry.version) == (metadata.get("Name", ""), metadata.get("Version", ""))
 
 
 def test_names_with_a_colon_are_those_of_classes(installed):

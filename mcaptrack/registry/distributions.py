@@ -77,11 +77,15 @@ def _has_module(distribution: Distribution, top: str) -> bool:
 
 def _name_and_version(distribution: Distribution | None) -> tuple[str, str]:
     """Name and version of a distribution; "" for what its metadata lack."""
+    if distribution is None:
+        return "", ""
     try:
-        found = ("", "") if distribution is None else (distribution.metadata["Name"], distribution.version)
+        fields = distribution.metadata
+        # some versions of importlib raise an error at fields["Name"] where it is missing
+        name, version = (fields.get_all(name, [""])[0] for name in ("Name", "Version"))
     except Exception:  # metadata that can't be read
         return "", ""
-    return found[0] or "", found[1] or ""
+    return name or "", version or ""
 
 
 def entry_points(group: str, unreadable: list[str] | None = None) -> list[EntryPoint]:
