@@ -342,19 +342,37 @@ def exchange_costs(a: dict[int, int], b: dict[int, int], low: int, high: int) ->
     return costs
 
 
-def exchanged(motion: Motion, paths: dict[int, Path], ids: dict[int, dict[int, int]]) -> dict[int, dict[int, int]]:
-    """For tracks with identity swaps: the track to which each step belongs. {} if there is none."""
+def exchanged(
+    motion: Motion, paths: dict[int, Path], ids: dict[int, dict[int, int]]
+) -> tuple[dict[int, dict[int, int]], int]:
+    """For each track the one to which each step belongs after identity swaps, and how many encounters were changed."""
     decided = []
     for a, b, low, high in encounters(paths):
         steps = range(low, high + 1)
         apart = [np.subtract(paths[a][s], paths[b][s]) if s in paths[a] and s in paths[b] else None for s in steps]
         costs = exchange_costs(ids[a], ids[b], low, high)
         course, gain, _ = max((course_of(apart, costs, motion, d) for d in DRIFTS), key=lambda each: each[2])
-        decided.append((gain, a, b, low, course))
-    owner: dict[int, dict[int, int]] = {}
-    for gain, a, b, low, course in sorted(decided, key=lambda each: -each[0]):
-        if gain >= LEAST_GAIN and a not in owner and b not in owner:
-            for mine, other in ((a, b), (b, a)):
-                at = {step: min(step - low, len(course) - 1) for step in paths[mine]}
-                owner[mine] = {s: other if k >= 0 and course[k] else mine for s, k in at.items()}
-    return owner
+        if gain >= LEAST_GAIN:
+            decided.append((gain, a, b, low, high, course))
+
+    def meet(one: tuple, other: tuple) -> bool:
+        return bool({*one[1:3]} & {*other[1:3]}) and one[3] <= other[4] and other[3] <= one[4]
+
+    sets = [[]]
+    for one in decided:
+        sets += [[*some, one] for some in sets if not any(meet(one, other) for other in some)]
+    best = max(sets, key=lambda some: sum(one[0] for one in some))
+    toggled: dict[int, list[tuple[int, int]]] = {}
+    for _, a, b, low, _, course in best:
+        for step, (was, now) in enumerate(pairwise([False, *course]), low):
+            if was != now:
+                toggled.setdefault(step, []).append((a, b))
+    owner: dict[int, dict[int, int]] = {track: {} for track in paths}
+    goes_on = {track: track for track in paths}
+    for step in sorted({step for path in paths.values() for step in path} | set(toggled)):
+        for a, b in toggled.get(step, ()):
+            goes_on[a], goes_on[b] = goes_on[b], goes_on[a]
+        for track, path in paths.items():
+            if step in path:
+                owner[track][step] = goes_on[track]
+    return owner, len(best)

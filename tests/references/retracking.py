@@ -131,15 +131,15 @@ def offline(claims: Claims, samples: list[list[Row]], steps: list[int], options,
         for track, path in paths.items():
             joined.setdefault(name[track], {}).update(path)
         paths = joined
-    for _ in range(3 if o.resolve_swaps else 0):
+    for _ in range(5 if o.resolve_swaps else 0):
         ids = {track: {step: row["track_id"] for step, row in path.items()} for track, path in paths.items()}
-        owner = exchanged(motion, places_of(paths), ids)
+        owner, count = exchanged(motion, places_of(paths), ids)
         changed: dict[int, dict[int, Row]] = {}
         for track, path in paths.items():
             for step, row in path.items():
-                changed.setdefault(owner.get(track, {}).get(step, track), {})[step] = row
+                changed.setdefault(owner[track][step], {})[step] = row
         paths = changed
-        if not owner:
+        if not count:
             break
     tracks = {track: filled(path, track) for track, path in paths.items()}
     odds = log_odds_in_log(motion, places_of(paths))

@@ -11,7 +11,7 @@ Letters: C encounters, T steps of them, N rows of trajectories.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.neighbours import near_pairs
 from mcaptrack.geometry.ragged import group_index, run_ends, run_starts
 from mcaptrack.transforms.retrack.appearance import Sides
+from mcaptrack.transforms.retrack.compatible_swaps import compatible
 from mcaptrack.transforms.retrack.motion_model import MotionModel, Trajectories
 
 #: Drifts of a relative velocity within a second, in m/s: the most likely of these is taken for each encounter.
@@ -52,10 +53,9 @@ def resolve_swaps(
     """The track that each row of the trajectories belongs to (N,), and the number of encounters that were changed.
 
     ``row`` are the rows with an observation, and ``source`` the input id of each. An encounter is left for the next
-    call if one of its tracks was changed in this one. Only encounters of ``examined`` tracks (K,) are looked at, by
-    default all. ``seen`` compares what the tracks look like before and after an encounter.
+    call if a better one changes one of its tracks at the same time. Only encounters of ``examined`` tracks (K,) are
+    looked at, by default all. ``seen`` compares what the tracks look like before and after an encounter.
     """
-    count = len(trajectories.first) - 1
     track = group_index(np.diff(trajectories.first))
     input_id = np.full(len(track), -1)
     input_id[row] = source
@@ -67,7 +67,7 @@ def resolve_swaps(
         i, j, low, high, meet, part_ways = (of[touched] for of in (i, j, low, high, meet, part_ways))
     looks_swapped = np.zeros(len(i)) if seen is None else seen.of_swaps(i, j, meet, part_ways)
     begin = trajectories.first[:-1] - trajectories.step[trajectories.first[:-1]]
-    swapped: dict[int, Bools] = {}
+    found: dict[int, _Swaps] = {}
     gain = np.zeros(len(i))
     for part in _batches(high - low + 1):
         steps = low[part, None] + np.arange(int((high - low)[part].max()) + 1)
@@ -78,24 +78,42 @@ def resolve_swaps(
         id_i, id_j = np.where(inside, input_id[row_i], -1), np.where(inside, input_id[row_j], -1)
         cost = np.maximum(_SWAP_COST + _SAME_ID_COST * _continuity(id_i, id_j), _LEAST_COST)
         noise = model.noise_m, model.speed_m_per_s
-        found, gain[part] = find_swaps(relative, cost, step_s, *noise, looks_swapped[part])
-        swapped |= {one: found[row].copy() for row, one in enumerate(part.tolist()) if gain[one] >= _MIN_GAIN}
-    owner, used, changed = track.copy(), np.zeros(count, bool), 0
-    for encounter in np.argsort(-gain, kind="stable").tolist():
-        if gain[encounter] < _MIN_GAIN:
-            break
-        a, b = int(i[encounter]), int(j[encounter])
-        if used[a] or used[b]:
-            continue
-        used[a] = used[b] = True
-        changed += 1
-        is_swapped = swapped[encounter][: high[encounter] - low[encounter] + 1]
-        for own, other in ((a, b), (b, a)):
-            rows = slice(trajectories.first[own], trajectories.first[own + 1])
-            since = trajectories.step[rows] - low[encounter]
-            goes = (since >= 0) & is_swapped[np.clip(since, 0, len(is_swapped) - 1)]
-            owner[rows] = np.where(goes, other, own)
-    return owner, changed
+        paths, gain[part] = find_swaps(relative, cost, step_s, *noise, looks_swapped[part])
+        for one, path, length in zip(part.tolist(), paths, (high - low)[part].tolist(), strict=True):
+            if gain[one] >= _MIN_GAIN:
+                found[one] = _Swaps(int(i[one]), int(j[one]), int(low[one]), path[: length + 1].copy())
+    which = np.array(sorted(found), np.int64)
+    made = which[compatible(np.stack([i, j], axis=1)[which], low[which], high[which], gain[which])]
+    return _exchanged(trajectories, track, [found[one] for one in made.tolist()]), len(made)
+
+
+class _Swaps(NamedTuple):
+    """The swaps of an encounter of the tracks ``a`` and ``b``: whether they are swapped at steps from ``low`` on."""
+
+    a: int
+    b: int
+    low: int
+    is_swapped: Bools
+
+
+def _exchanged(trajectories: Trajectories, track: Ints, encounters: list[_Swaps]) -> Ints:
+    """The track that each row (N,) belongs to after the swaps of encounters, of which no two change a track at once.
+
+    Two tracks that are swapped go on as each other, or as whoever these are by then.
+    """
+    owner = track.copy()
+    now: dict[int, int] = {}
+    swaps = sorted(
+        (met.low + int(at), met.a, met.b)
+        for met in encounters
+        for at in np.flatnonzero(np.diff(met.is_swapped, prepend=False))
+    )
+    for step, a, b in swaps:
+        now[a], now[b] = now.get(b, b), now.get(a, a)
+        for one in (a, b):
+            first, last = trajectories.first[one : one + 2]
+            owner[first + step - trajectories.step[first] : last] = now[one]
+    return owner
 
 
 def _batches(length: Ints) -> Iterator[Ints]:

@@ -36,7 +36,7 @@ MAX_MISFIT: Final = (0.6, 0.2)
 #: Tracks in metres were confirmed by the scores of their detections: they may be shorter by this factor.
 _CONFIRMED_SHARE: Final = 0.25
 #: The number of times that encounters are examined again after identities were swapped.
-_ROUNDS: Final = 3
+_ROUNDS: Final = 5
 
 
 class Offline(NamedTuple):
