@@ -11,7 +11,7 @@ from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.transforms import PROFILES
 from mcaptrack.transforms.retrack.false_tracks import log_odds_in_log
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories, smooth
-from mcaptrack.transforms.retrack.track_features import FEATURES, features
+from mcaptrack.transforms.retrack.track_features import FEATURES, features, stand_throughout
 from tests.references.false_tracks import log_odds_in_log as in_log
 from tests.references.false_tracks import person_features
 from tests.references.offline import Motion
@@ -54,8 +54,39 @@ def test_features_equal_the_reference(seed):
 @settings(max_examples=10)
 def test_weights_follow_the_log_to_where_few_tracks_are_doubtful(seed):
     paths, motion, given_all = drawn(seed, 12)
-    wanted = in_log(motion, paths)
-    np.testing.assert_allclose(log_odds_in_log(*given_all), [wanted[k] for k in sorted(paths)], atol=1e-3)
+    first, last = min(min(path) for path in paths.values()), max(max(path) for path in paths.values())
+    log = first - int(seed % 4), last + int(seed % 3)
+    wanted = in_log(motion, paths, log)
+    np.testing.assert_allclose(log_odds_in_log(*given_all, log), [wanted[k] for k in sorted(paths)], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("begins", "ends", "wide_m", "stands"),
+    [
+        (0, 39, 0.0, True),
+        (4, 35, 0.0, False),  # of 39 steps, a tenth is 3.9
+        (3, 36, 0.0, True),
+        (0, 35, 0.0, False),
+        (4, 39, 0.0, False),
+        (0, 39, 1.45, True),
+        (0, 39, 1.55, False),
+    ],
+)
+def test_who_stands_for_the_whole_log_by_hand(begins, ends, wide_m, stands):
+    """In a log of 40 steps; the track is seen at two places by turns, from one corner of its box to the other."""
+    steps = range(begins, ends + 1)
+    side = wide_m / np.sqrt(2)
+    paths = {1: {s: (side, side) if s % 4 > 1 else (0.0, 0.0) for s in steps}}
+    out, _ = laid_out(paths, 1e-3)
+    smoothed = smooth(MotionModel(1e-3, 1.0, 100.0, 0.0), out, 0.4)[2]  # it follows the positions
+    assert stand_throughout(out, smoothed, (0, 39), 0.4).tolist() == [stands]
+
+
+def test_of_a_long_log_two_seconds_are_its_border():
+    for begins, stands in ((5, True), (6, False)):
+        out, _ = laid_out({1: dict.fromkeys(range(begins, 400), (0.0, 0.0))}, 0.1)
+        smoothed = smooth(MotionModel(0.1, 1.0, 0.1, 0.1), out, 0.4)[2]
+        assert stand_throughout(out, smoothed, (0, 399), 0.4).tolist() == [stands]
 
 
 def frames_of(paths: Paths) -> list[Frame]:
@@ -115,3 +146,21 @@ def test_a_place_that_is_missed_for_longer_than_people_are_is_left_out_and_someb
     found = tracked(paths)
     assert found[11] == 55
     assert 12 not in found
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_who_stands_for_the_whole_of_a_short_log_is_left_in_though_seen_now_and_then(seed):
+    """Three stand among people who walk, in 16 s; flicker wanders for a second or two at other places."""
+    rng = np.random.default_rng(seed)
+    paths = walkers(rng, 4, 40)
+    for name in (11, 12, 13):
+        place = rng.normal(0, 0.2, (40, 2)) + [3.0 * (name - 10), -5.0]
+        seen = {0, 39, *np.flatnonzero(rng.random(40) < 0.75).tolist()}
+        paths[name] = {s: tuple(place[s].tolist()) for s in sorted(seen)}
+    for name in range(20, 28):
+        begins, lasts = int(rng.integers(0, 34)), int(rng.integers(2, 6))
+        place = rng.uniform(-30, 60, 2) + np.cumsum(rng.normal(0, 0.3, (lasts, 2)), axis=0) - [0, 100]
+        paths[name] = {begins + k: tuple(place[k].tolist()) for k in range(lasts)}
+    found = tracked(paths)
+    assert {11, 12, 13} < set(found)
+    assert not {*range(20, 28)} & set(found)

@@ -171,7 +171,8 @@ def test_a_person_is_told_from_a_double_and_a_broken_track_has_a_right_link():
     assert pairs.features[pairs.right > 0, linking.FEATURES.index("gap")] == pytest.approx(11 * STEP_S)
     assert len(cuts.are_right) == len(cuts.features)
     assert len(links.are_right) == len(links.features)
-    features, share, count = people_of(run)
+    features, share, count, throughout = people_of(run)
+    assert not throughout.any()
     assert sorted(zip(share.tolist(), count.tolist(), strict=True)) == [(0.0, 15.0), (1.0, 50.0), (1.0, 60.0)]
     assert features.shape == (3, len(FEATURES))
     joined, people = decisions_of(run)

@@ -28,7 +28,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 from corruptions import corrupt
 from crowds import drawn
-from regression import logistic, show_reliability
+from regression import logistic, shift, show_reliability
 from reproduce import on_clock
 
 from mcaptrack import __version__
@@ -183,13 +183,25 @@ def pairs_of(run: Run) -> Pairs:
     return Pairs(len(first), i, j, found, right)
 
 
-def people_of(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The features of the tracks of a scene (K, F), the share of each that is a person, and its number of rows."""
-    model, paths, smoothed, step_s = reached("log_odds_in_log", FITTED, *run.args[1:])
+class People(NamedTuple):
+    """The tracks of a scene: their features (K, F), the share of each that is a person, its number of samples, and
+    whether it stands for the whole log.
+    """
+
+    features: np.ndarray
+    share: np.ndarray
+    count: np.ndarray
+    throughout: np.ndarray
+
+
+def people_of(run: Run) -> People:
+    """The tracks of a scene."""
+    model, paths, smoothed, step_s, log = reached("log_odds_in_log", FITTED, *run.args[1:])
     observed = np.isfinite(paths.xy_m[:, 0])
     count = np.add.reduceat(observed.astype(float), paths.first[:-1])
     own = np.add.reduceat((owners_of(run, paths) >= 0).astype(float), paths.first[:-1])
-    return track_features.features(model, paths, smoothed, step_s), own / count, count
+    throughout = track_features.stand_throughout(paths, smoothed, log, step_s)
+    return People(track_features.features(model, paths, smoothed, step_s), own / count, count, throughout)
 
 
 class Judged(NamedTuple):
@@ -304,12 +316,18 @@ def fit_links(pairs: list[Pairs]) -> dict[str, Any]:
     }
 
 
-def fit_people(parts: list[tuple[np.ndarray, ...]]) -> dict[str, Any]:
-    """The weights of tracks."""
-    features, share, count = (np.concatenate(members) for members in zip(*parts, strict=True))
+def fit_people(parts: list[People]) -> dict[str, Any]:
+    """The weights of tracks.
+
+    What it counts that a track stands for the whole log is fitted in a second step, so that others are judged as if
+    nothing were known of it.
+    """
+    features, share, count, throughout = (np.concatenate(members) for members in zip(*parts, strict=True))
     weights = logistic(features, share, count)
     names = track_features.FEATURES
     found: dict[str, Any] = {"weights": named(names, weights[:-1]), "bias": round(float(weights[-1]), 3)}
+    odds = (features @ weights[:-1] + weights[-1])[throughout]
+    found["stands throughout"] = round(shift(odds, share[throughout], count[throughout]), 2)
     return found | {"mean": named(names, features.mean(axis=0)), "spread": named(names, features.std(axis=0))}
 
 
@@ -370,6 +388,7 @@ def main() -> None:
     more = [*scenes, *runs(MORE, given.steps)]
     people = fit_people(list(told(people_of, more, "people")))
     install(false_tracks, "", people)
+    false_tracks._THROUGHOUT = people["stands throughout"]
     for name in ("mean", "spread"):
         setattr(false_tracks, f"_{name.upper()}", np.array(list(people[name].values())))
     judged = fit_decisions(others)

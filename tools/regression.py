@@ -39,6 +39,17 @@ def logistic(
     return np.append(weights, t[count - 1] - weights @ mean)
 
 
+def shift(log_odds: np.ndarray, right: np.ndarray, weight: np.ndarray) -> float:
+    """What has to be added to the log odds of members (N,) of whom these shares are right.
+
+    Half of one more member, of the usual weight, is right and the other half wrong: there may be no other wrong one.
+    """
+    from scipy.optimize import brentq
+
+    odds, share, each = (np.append(all_, one) for all_, one in ((log_odds, 0.0), (right, 0.5), (weight, weight.mean())))
+    return float(brentq(lambda added: each @ (probability(odds + added) - share), -20.0, 20.0))
+
+
 def show_reliability(name: str, likely: np.ndarray, right: np.ndarray) -> None:
     """Print how many of the decisions (D,) with a probability are right, by steps of it."""
     print(f"{name}: {len(right)}, {100 * right.mean():.1f} % right")

@@ -14,6 +14,7 @@ from scipy.optimize import minimize
 from tests.references.offline import FITTED, Motion, Path, State
 
 PEOPLE, PERSON_BIAS = FITTED["people"]["weights"], FITTED["people"]["bias"]
+THROUGHOUT = FITTED["people"]["stands throughout"]
 DUPLICATE_M, BESIDE_M, BESIDE_SAMPLES, GOES_M = 1.2, 1.8, 4, 3.0
 
 
@@ -49,11 +50,19 @@ def person_features(motion: Motion, paths: dict[int, Path]) -> dict[int, dict[st
     return out
 
 
-def log_odds_in_log(motion: Motion, paths: dict[int, Path]) -> dict[int, float]:
-    """For each track the log odds that it is a person, by weights that follow the log.
+def stands_throughout(motion: Motion, path: Path, log: tuple[int, int]) -> bool:
+    """Whether a track stands still from the first step of the log to the last, but for 2 s or a tenth of the log."""
+    border = min(2.0, 0.1 * (log[1] - log[0]) * motion.step_s)
+    late, early = (min(path) - log[0]) * motion.step_s, (log[1] - max(path)) * motion.step_s
+    return max(late, early) <= border + 1e-9 and extent(motion.smoothed(path)) < 1.5
+
+
+def log_odds_in_log(motion: Motion, paths: dict[int, Path], log: tuple[int, int]) -> dict[int, float]:
+    """For each track the log odds that it is a person, by weights that follow the log, of these steps.
 
     For these the entropy of the tracks plus the distance from the fitted weights is least.
     """
+    extra = np.array([stands_throughout(motion, path, log) for path in paths.values()]) * THROUGHOUT
     found = person_features(motion, paths)
     mean, spread = (np.array([FITTED["people"][what][one] for one in PEOPLE]) for what in ("mean", "spread"))
     fitted = np.array(list(PEOPLE.values()))
@@ -62,12 +71,12 @@ def log_odds_in_log(motion: Motion, paths: dict[int, Path]) -> dict[int, float]:
     start = np.append(fitted * spread, PERSON_BIAS + fitted @ mean)
 
     def loss(weights: np.ndarray) -> float:
-        likely = np.clip(1 / (1 + np.exp(-known @ weights)), 1e-12, 1 - 1e-12)
+        likely = np.clip(1 / (1 + np.exp(-known @ weights - extra)), 1e-12, 1 - 1e-12)
         entropy = -likely * np.log(likely) - (1 - likely) * np.log(1 - likely)
         return float(counts @ entropy + 15 * ((weights - start) ** 2).sum())
 
     best = minimize(loss, start, method="BFGS", options={"gtol": 1e-6}).x
-    return dict(zip(found, (known @ best).tolist(), strict=True))
+    return dict(zip(found, (known @ best + extra).tolist(), strict=True))
 
 
 def extent(states: dict[int, State]) -> float:

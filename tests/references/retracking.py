@@ -142,7 +142,7 @@ def offline(claims: Claims, samples: list[list[Row]], steps: list[int], options,
         if not count:
             break
     tracks = {track: filled(path, track) for track, path in paths.items()}
-    odds = log_odds_in_log(motion, places_of(paths))
+    odds = log_odds_in_log(motion, places_of(paths), (steps[0], steps[-1]))
     for track in list(tracks):
         if o.smooth:
             for step, state in motion.smoothed(places_of(paths)[track]).items():

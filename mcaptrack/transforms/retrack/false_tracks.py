@@ -11,12 +11,14 @@ import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
-from mcaptrack.transforms.retrack.track_features import FEATURES, features
+from mcaptrack.transforms.retrack.track_features import FEATURES, features, stand_throughout
 from mcaptrack.transforms.retrack.weights import weights_of
 
 #: Weight of each feature as a log odds ratio, and the log odds without any; means and spreads of features.
 _WEIGHTS, _FITTED = weights_of("people", FEATURES)
 _BIAS: Final = float(_FITTED["bias"])
+#: What is added to the log odds of tracks that stand for the whole log.
+_THROUGHOUT: Final = float(_FITTED["stands throughout"])
 _MEAN, _SPREAD = (np.array([_FITTED[what][name] for name in FEATURES]) for what in ("mean", "spread"))
 #: How strongly weights stay as they were fitted while they follow a log, and how much each step of a track counts
 #: against that, up to so many steps. (Chosen on synthetic scenes and crowds.)
@@ -34,8 +36,12 @@ def probability(log_odds: Floats) -> Floats:
     return np.asarray(1 / (1 + np.exp(-log_odds)))
 
 
-def log_odds_in_log(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
+def log_odds_in_log(
+    model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float, log: tuple[int, int]
+) -> Floats:
     """The log odds that each track is a person, (K,), by weights that follow the log.
+
+    ``log`` are the first and last step of the log.
 
     What false tracks are like differs from log to log: somewhere they flicker, elsewhere they stand still for long, as
     some people do. Tracks that are like one another are people or false together, so the weights move to where few
@@ -46,17 +52,19 @@ def log_odds_in_log(model: MotionModel, trajectories: Trajectories, smoothed: St
 
     standard = (features(model, trajectories, smoothed, step_s) - _MEAN) / _SPREAD
     known = np.column_stack([standard, np.ones(len(standard))])
+    # not a feature: its weight doesn't follow the log, and is no reason to think less of others who stand
+    extra = _THROUGHOUT * stand_throughout(trajectories, smoothed, log, step_s)
     counts = _EACH_STEP * np.minimum(np.diff(trajectories.first), _MOST_STEPS)
     fitted = np.append(_WEIGHTS * _SPREAD, _BIAS + _WEIGHTS @ _MEAN)
 
     def loss(weights: Floats) -> tuple[float, Floats]:
-        value, off = known @ weights, weights - fitted
+        value, off = known @ weights + extra, weights - fitted
         likely = probability(value)
         entropy = np.logaddexp(0, value) - likely * value
         slope = known.T @ (counts * -value * likely * (1 - likely))
         return float(counts @ entropy + _STAYS / 2 * (off @ off)), slope + _STAYS * off
 
-    return np.asarray(known @ minimize(loss, fitted, jac=True, method="L-BFGS-B").x)
+    return np.asarray(known @ minimize(loss, fitted, jac=True, method="L-BFGS-B").x + extra)
 
 
 def scored_log_odds(xy_m: Floats, first: Ints, score: Floats, observed: Bools, usual: float, step_s: float) -> Floats:

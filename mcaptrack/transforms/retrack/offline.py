@@ -110,7 +110,7 @@ def offline_tracks(
                 step_s,
             )
         else:
-            odds = log_odds_in_log(model, trajectories, smoothed, step_s)
+            odds = log_odds_in_log(model, trajectories, smoothed, step_s, (steps[0], steps[-1]))
     is_sure = probability(odds) >= options.track_confidence
     is_fixed = np.isin(ids, kept_tracks)
     min_track_s = options.min_track_s * (_CONFIRMED_SHARE if movers.on_ground else 1.0)

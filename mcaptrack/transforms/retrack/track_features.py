@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Floats
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.neighbours import near_pairs
 from mcaptrack.geometry.ragged import group_index, run_starts
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
@@ -45,6 +45,10 @@ _IN_STEP: Final = 2.0
 _LEAST_SPREAD: Final = 0.05
 #: Gaps are compared with those of tracks that go farther than this: what goes somewhere is a person.
 _GOES_M: Final = 3.0
+#: What stays inside a box with a shorter diagonal stands; it stands for the whole log if it begins and ends within so
+#: many seconds of it, or this share of it where that is less.
+_STANDS_M: Final = 1.5
+_BORDER_S, _BORDER_SHARE = 2.0, 0.1
 
 
 def features(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
@@ -54,8 +58,7 @@ def features(model: MotionModel, trajectories: Trajectories, smoothed: State, st
     observed = np.isfinite(trajectories.xy_m[:, 0])
     count = np.add.reduceat(observed.astype(float), first)
     xy = smoothed.mean[:, :2]
-    low, high = np.minimum.reduceat(xy, first), np.maximum.reduceat(xy, first)
-    extent = np.hypot(*(high - low).T)
+    extent = _extent(xy, first)
     residual = np.where(observed[:, None], trajectories.xy_m - xy, 0.0)
     roughness = np.add.reduceat((residual**2).sum(axis=1), first) / count / (2 * model.noise_m**2)
     speed = np.hypot(smoothed.mean[:, 2], smoothed.mean[:, 3])
@@ -73,6 +76,22 @@ def features(model: MotionModel, trajectories: Trajectories, smoothed: State, st
             _rare_gaps(trajectories, extent > _GOES_M),
         ]
     )
+
+
+def stand_throughout(trajectories: Trajectories, smoothed: State, log: tuple[int, int], step_s: float) -> Bools:
+    """Which tracks (K,) stand still from the first step of the log to its last one, ``log``.
+
+    People may stand for longer than a log is, but clutter comes and goes.
+    """
+    first, last = trajectories.first[:-1], trajectories.first[1:] - 1
+    border = min(_BORDER_S / step_s, _BORDER_SHARE * (log[1] - log[0]))
+    begins, ends = trajectories.step[first] <= log[0] + border, trajectories.step[last] >= log[1] - border
+    return np.asarray(begins & ends & (_extent(smoothed.mean[:, :2], first) < _STANDS_M))
+
+
+def _extent(xy: Floats, first: Ints) -> Floats:
+    """The diagonal of the box around each track (K,)."""
+    return np.asarray(np.hypot(*(np.maximum.reduceat(xy, first) - np.minimum.reduceat(xy, first)).T))
 
 
 def _duplicate_share(trajectories: Trajectories, xy: Floats) -> Floats:
@@ -132,7 +151,7 @@ def _beside(trajectories: Trajectories, xy: Floats, noise_m: float, errors: Floa
     return share, in_step
 
 
-def _rare_gaps(trajectories: Trajectories, goes: Floats) -> Floats:
+def _rare_gaps(trajectories: Trajectories, goes: Bools) -> Floats:
     """The rarity of the gaps of each track, (K,): the mean of the negative logarithms of the shares of gaps that are
     as long, among those of the other tracks that go somewhere; 0 without gaps.
     """
