@@ -269,9 +269,12 @@ class Survivor:
 
 
 def course_of(
-    apart: list[np.ndarray | None], cost: list[float], motion: Motion, drift: float
+    apart: list[np.ndarray | None], cost: list[float], motion: Motion, drift: float, evidence: float = 0.0
 ) -> tuple[list[bool], float, float]:
-    """The likeliest hypothesis of swaps (Viterbi), its gain over no swap, and its log likelihood."""
+    """The likeliest hypothesis of swaps (Viterbi), its gain over no swap, and its log likelihood.
+
+    ``evidence`` is a log likelihood ratio that both are swapped in the end.
+    """
     t, noise = motion.step_s, 2 * motion.noise_m**2
     move = np.array([[1, t], [0, 1]])
     wander = drift**2 * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
@@ -307,12 +310,15 @@ def course_of(
             ]
         kept, crossed, never = (one.after(where, noise, score, side) for one, where, score, side in new)
         started |= at is not None
+    crossed.score += evidence
     best = crossed if crossed.score > kept.score else kept
     return best.course, best.score - never.score, best.score
 
 
-def encounters(paths: dict[int, Path]) -> list[tuple[int, int, int, int]]:
-    """Pairs of tracks that come near each other, with the first and last step of the encounter."""
+def encounters(paths: dict[int, Path]) -> list[tuple[int, int, int, int, int, int]]:
+    """Pairs of tracks that come near each other, with the first and last step of the encounter, and those between which
+    they are near.
+    """
     out = []
     for a, b in combinations(sorted(paths), 2):
         one, other = paths[a], paths[b]
@@ -326,7 +332,9 @@ def encounters(paths: dict[int, Path]) -> list[tuple[int, int, int, int]]:
             else:
                 groups.append([step])
         first, last = max(min(one), min(other)), min(max(one), max(other))
-        out += [(a, b, max(group[0] - MARGIN, first), min(group[-1] + MARGIN, last)) for group in groups]
+        for group in groups:
+            met, parted = group[0], group[-1]
+            out.append((a, b, max(met - MARGIN, first), min(parted + MARGIN, last), met, parted))
     return out
 
 
@@ -342,16 +350,43 @@ def exchange_costs(a: dict[int, int], b: dict[int, int], low: int, high: int) ->
     return costs
 
 
+def pace(motion: Motion, path: Path, steps: range) -> tuple[float, float] | None:
+    """The mean speed between the first and last position in these steps, and its variance; None for less than 1.2 s."""
+    seen = [step for step in steps if step in path]
+    seconds = (seen[-1] - seen[0]) * motion.step_s if seen else 0.0
+    if seconds < 1.2 - 1e-9:
+        return None
+    (x0, y0), (x1, y1) = path[seen[0]], path[seen[-1]]
+    return hypot(x1 - x0, y1 - y0) / seconds, 2 * motion.noise_m**2 / seconds**2
+
+
+def by_pace(motion: Motion, a: Path, b: Path, met: int, parted: int) -> float:
+    """The log likelihood ratio that two who came at their paces went on at each other's, at most 3."""
+    span = round(8 / motion.step_s)
+    before, after = range(met - span, met + 1), range(parted, parted + span + 1)
+    paces = [pace(motion, path, steps) for steps in (before, after) for path in (a, b)]
+    if None in paces:
+        return 0.0
+    (a0, b0, a1, b1), spread = zip(*paces, strict=True)
+    variance = 0.4**2 + sum(spread) / 2
+
+    def log_likelihood(*changes: float) -> float:
+        return sum(-(change**2) / (2 * variance) for change in changes)
+
+    return min(max(log_likelihood(b1 - a0, a1 - b0) - log_likelihood(a1 - a0, b1 - b0), -3.0), 3.0)
+
+
 def exchanged(
     motion: Motion, paths: dict[int, Path], ids: dict[int, dict[int, int]]
 ) -> tuple[dict[int, dict[int, int]], int]:
     """For each track the one to which each step belongs after identity swaps, and how many encounters were changed."""
     decided = []
-    for a, b, low, high in encounters(paths):
+    for a, b, low, high, met, parted in encounters(paths):
         steps = range(low, high + 1)
         apart = [np.subtract(paths[a][s], paths[b][s]) if s in paths[a] and s in paths[b] else None for s in steps]
         costs = exchange_costs(ids[a], ids[b], low, high)
-        course, gain, _ = max((course_of(apart, costs, motion, d) for d in DRIFTS), key=lambda each: each[2])
+        paces = by_pace(motion, paths[a], paths[b], met, parted)
+        course, gain, _ = max((course_of(apart, costs, motion, d, paces) for d in DRIFTS), key=lambda each: each[2])
         if gain >= LEAST_GAIN:
             decided.append((gain, a, b, low, high, course))
 

@@ -21,6 +21,7 @@ from mcaptrack.geometry.ragged import group_index, run_ends, run_starts
 from mcaptrack.transforms.retrack.appearance import Sides
 from mcaptrack.transforms.retrack.compatible_swaps import compatible
 from mcaptrack.transforms.retrack.motion_model import MotionModel, Trajectories
+from mcaptrack.transforms.retrack.paces import swapped_by_pace
 
 #: Drifts of a relative velocity within a second, in m/s: the most likely of these is taken for each encounter.
 DRIFTS_M_PER_S: Final = (0.05, 0.15, 0.4)
@@ -65,7 +66,9 @@ def resolve_swaps(
     if examined is not None:
         touched = examined[i] | examined[j]
         i, j, low, high, meet, part_ways = (of[touched] for of in (i, j, low, high, meet, part_ways))
-    looks_swapped = np.zeros(len(i)) if seen is None else seen.of_swaps(i, j, meet, part_ways)
+    evidence = swapped_by_pace(trajectories, np.stack([i, j]), meet, part_ways, step_s, model.noise_m)
+    if seen is not None:
+        evidence += seen.of_swaps(i, j, meet, part_ways)
     begin = trajectories.first[:-1] - trajectories.step[trajectories.first[:-1]]
     found: dict[int, _Swaps] = {}
     gain = np.zeros(len(i))
@@ -78,7 +81,7 @@ def resolve_swaps(
         id_i, id_j = np.where(inside, input_id[row_i], -1), np.where(inside, input_id[row_j], -1)
         cost = np.maximum(_SWAP_COST + _SAME_ID_COST * _continuity(id_i, id_j), _LEAST_COST)
         noise = model.noise_m, model.speed_m_per_s
-        paths, gain[part] = find_swaps(relative, cost, step_s, *noise, looks_swapped[part])
+        paths, gain[part] = find_swaps(relative, cost, step_s, *noise, evidence[part])
         for one, path, length in zip(part.tolist(), paths, (high - low)[part].tolist(), strict=True):
             if gain[one] >= _MIN_GAIN:
                 found[one] = _Swaps(int(i[one]), int(j[one]), int(low[one]), path[: length + 1].copy())
@@ -169,22 +172,22 @@ def find_swaps(
     step_s: float,
     noise_m: float,
     speed_m_per_s: float,
-    looks_swapped: Floats | None = None,
+    evidence: Floats | None = None,
 ) -> tuple[Bools, Floats]:
     """At which steps of encounters the identities are swapped, (C, T), and how much more likely that is than no swap.
 
     ``relative_m`` (C, T, 2) is the position of one track relative to the other, NaN where one of them was not observed.
     ``swap_cost`` (C, T) is the cost of a swap between a step and the one before, as a log likelihood. The identities of
-    the first step stand. ``looks_swapped`` (C,) is the log likelihood ratio that they are swapped at the last step, by
-    other evidence. The gain (C,) is a difference of log likelihoods.
+    the first step stand. ``evidence`` (C,) is the log likelihood ratio that they are swapped at the last step, by what
+    else is known. The gain (C,) is a difference of log likelihoods.
     """
-    swapped = np.zeros(len(relative_m)) if looks_swapped is None else looks_swapped
+    swapped = np.zeros(len(relative_m)) if evidence is None else evidence
     given = relative_m, swap_cost, step_s, noise_m, speed_m_per_s, swapped
     models = (_viterbi(*given, drift**2) for drift in DRIFTS_M_PER_S)
-    best, best_gain, evidence = next(models)
+    best, best_gain, likelihood = next(models)
     for path, gain, total in models:
-        better = total > evidence
-        evidence = np.where(better, total, evidence)
+        better = total > likelihood
+        likelihood = np.where(better, total, likelihood)
         best = np.where(better[:, None], path, best)
         best_gain = np.where(better, gain, best_gain)
     return best, best_gain
@@ -196,7 +199,7 @@ def _viterbi(
     step_s: float,
     noise_m: float,
     speed_m_per_s: float,
-    looks_swapped: Floats,
+    is_swapped: Floats,
     power: float,
 ) -> tuple[Bools, Floats, Floats]:
     """Swaps (C, T), their gain (C,) and log likelihood (C,) for one drift of the relative velocity."""
@@ -243,7 +246,7 @@ def _viterbi(
         mean[..., 2:] += gain_rate[..., None] * off
         cov = np.stack([p * (1 - gain), c * (1 - gain), v - gain_rate * c], axis=-1)
         started |= observed
-    total[:, 1] += looks_swapped
+    total[:, 1] += is_swapped
     path = np.zeros((count, steps), bool)
     now = total[:, 1] > total[:, 0]
     for step in range(steps - 1, -1, -1):
