@@ -18,8 +18,8 @@ HIDDEN_S, UNTIL_S = 14.0, 15.8
 
 def side(way: float) -> tuple[tuple[float, float, float], ...]:
     """A route to and fro on one side (-1 or 1): to the middle, and after a while in which nobody is seen, back again."""
-    turns = [(0.0, 3.0), (3.0, 0.8), (6.0, 3.0), (9.0, 0.8), (12.0, 3.0), (HIDDEN_S, 0.4)]
-    turns += [(UNTIL_S, 0.4), (UNTIL_S + 2.0, 3.0), (21.0, 0.8), (24.0, 3.0), (27.0, 0.8), (30.0, 3.0)]
+    turns = [(0.0, 3.7), (3.0, 0.8), (6.0, 3.7), (9.0, 0.8), (12.0, 3.7), (HIDDEN_S, 0.4)]
+    turns += [(UNTIL_S, 0.4), (UNTIL_S + 2.0, 3.7), (21.0, 0.8), (24.0, 3.7), (27.0, 0.8), (30.0, 3.7)]
     return tuple((seconds, way * x_m, 9.0) for seconds, x_m in turns)
 
 

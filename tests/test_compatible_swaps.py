@@ -112,3 +112,12 @@ def test_who_meets_six_others_in_a_row_keeps_one_identity():
     model = MotionModel(noise_m, 1.0, 0.1, 0.1)
     found = offline._without_swaps(model, step, track, track, xy.reshape(-1, 2), 0.4).reshape(name.shape)
     assert all(len(set(one.tolist())) == 1 for one in found)
+
+
+def test_more_encounters_than_a_solver_should_get_at_once_are_decided_one_after_another(monkeypatch):
+    met = [([1, 2], 0, 9, 4.0), ([2, 3], 5, 9, 5.0), ([3, 4], 10, 9, 4.0)]
+    for most, wanted in ((3, [0, 2]), (2, [1])):
+        monkeypatch.setattr(compatible_swaps, "_MOST", most)
+        with collected() as said:
+            assert chosen(met) == wanted
+        assert len(said) == (most < 3)

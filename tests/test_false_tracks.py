@@ -61,32 +61,37 @@ def test_weights_follow_the_log_to_where_few_tracks_are_doubtful(seed):
 
 
 @pytest.mark.parametrize(
-    ("begins", "ends", "wide_m", "stands"),
+    ("begins", "ends", "wide_m", "missed", "stands"),
     [
-        (0, 39, 0.0, True),
-        (4, 35, 0.0, False),  # of 39 steps, a tenth is 3.9
-        (3, 36, 0.0, True),
-        (0, 35, 0.0, False),
-        (4, 39, 0.0, False),
-        (0, 39, 1.45, True),
-        (0, 39, 1.55, False),
+        (0, 39, 0.0, 0, True),
+        (4, 35, 0.0, 0, False),  # of 39 steps, a tenth is 3.9
+        (3, 36, 0.0, 0, True),
+        (0, 35, 0.0, 0, False),
+        (4, 39, 0.0, 0, False),
+        (0, 39, 1.45, 0, True),
+        (0, 39, 1.55, 0, False),
+        (0, 39, 0.0, 5, True),  # 2 s
+        (0, 39, 0.0, 6, False),
     ],
 )
-def test_who_stands_for_the_whole_log_by_hand(begins, ends, wide_m, stands):
+def test_who_stands_for_the_whole_log_by_hand(begins, ends, wide_m, missed, stands):
     """In a log of 40 steps; the track is seen at two places by turns, from one corner of its box to the other."""
-    steps = range(begins, ends + 1)
     side = wide_m / np.sqrt(2)
+    steps = [step for step in range(begins, ends + 1) if not 10 < step <= 10 + missed]
     paths = {1: {s: (side, side) if s % 4 > 1 else (0.0, 0.0) for s in steps}}
     out, _ = laid_out(paths, 1e-3)
     smoothed = smooth(MotionModel(1e-3, 1.0, 100.0, 0.0), out, 0.4)[2]  # it follows the positions
-    assert stand_throughout(out, smoothed, (0, 39), 0.4).tolist() == [stands]
+    assert stand_throughout(out, smoothed, np.zeros(1), (0, 39), 0.4).tolist() == [stands]
 
 
-def test_of_a_long_log_two_seconds_are_its_border():
-    for begins, stands in ((5, True), (6, False)):
-        out, _ = laid_out({1: dict.fromkeys(range(begins, 400), (0.0, 0.0))}, 0.1)
-        smoothed = smooth(MotionModel(0.1, 1.0, 0.1, 0.1), out, 0.4)[2]
-        assert stand_throughout(out, smoothed, (0, 399), 0.4).tolist() == [stands]
+@pytest.mark.parametrize(
+    ("begins", "last", "in_step", "stands"),
+    [(5, 399, 0.0, True), (6, 399, 0.0, False), (0, 25, 0.0, True), (0, 24, 0.0, False), (0, 399, 1.0, False)],
+)
+def test_two_seconds_of_a_long_log_ten_of_a_short_one_and_doubles(begins, last, in_step, stands):
+    out, _ = laid_out({1: dict.fromkeys(range(begins, last + 1), (0.0, 0.0))}, 0.1)
+    smoothed = smooth(MotionModel(0.1, 1.0, 0.1, 0.1), out, 0.4)[2]
+    assert stand_throughout(out, smoothed, np.full(1, in_step), (0, last), 0.4).tolist() == [stands]
 
 
 def frames_of(paths: Paths) -> list[Frame]:
@@ -164,3 +169,18 @@ def test_who_stands_for_the_whole_of_a_short_log_is_left_in_though_seen_now_and_
     found = tracked(paths)
     assert {11, 12, 13} < set(found)
     assert not {*range(20, 28)} & set(found)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("steps", [40, 600])
+def test_a_double_of_a_person_who_stands_for_the_whole_log_is_left_out(steps, seed):
+    rng = np.random.default_rng(seed)
+    paths = walkers(rng, 4, steps)
+    for name in (11, 12, 13):
+        place = rng.normal(0, 0.1, (steps, 2)) + [5.0 * (name - 10), -10.0]
+        paths[name] = dict(enumerate(map(tuple, place.tolist())))
+        double = place + [0.5, 0.6] + rng.normal(0, 0.04, (steps, 2))
+        paths[name + 10] = {s: tuple(double[s].tolist()) for s in np.flatnonzero(rng.random(steps) < 0.9).tolist()}
+    found = tracked(paths)
+    assert {11, 12, 13} < set(found)
+    assert not {21, 22, 23} & set(found)

@@ -186,7 +186,7 @@ class TestEncounters:
         course, _ = find_swaps(self.apart(slice(8, 15), 0.05), np.full((1, 40), 5.0), STEP_S, 0.05, 1.5)
         assert np.flatnonzero(course[0]).tolist() == list(range(8, 15))
 
-    @pytest.mark.parametrize(("turn", "drift"), [(0.0, 0.05), (0.4, 0.15), (0.9, 0.4)])
+    @pytest.mark.parametrize(("turn", "drift"), [(0.0, 0.05), (0.4, 0.15), (0.7, 0.4), (1.6, 1.2)])
     def test_the_gain_is_that_of_the_most_likely_drift(self, turn, drift):
         """One walks around the other: the faster, the more their relative velocity drifts. By a filter for each path."""
         angle = turn * STEP_S * np.arange(30)
@@ -195,7 +195,7 @@ class TestEncounters:
         away[12:] *= -1
         course, gain = find_swaps(away[None], np.full((1, 30), 5.0), STEP_S, 0.05, 1.5)
         assert np.flatnonzero(course[0]).tolist() == list(range(12, 30))
-        none = {one: self.log_likelihood(away, one) for one in (0.05, 0.15, 0.4)}
+        none = {one: self.log_likelihood(away, one) for one in (0.05, 0.15, 0.4, 1.2)}
         swapped = {one: self.log_likelihood(np.where(course[0][:, None], -away, away), one) for one in none}
         assert max(swapped, key=swapped.get) == drift
         assert gain[0] == pytest.approx(swapped[drift] - 5.0 - none[drift])

@@ -42,7 +42,8 @@ def logistic(
 def shift(log_odds: np.ndarray, right: np.ndarray, weight: np.ndarray) -> float:
     """What has to be added to the log odds of members (N,) of whom these shares are right.
 
-    Half of one more member, of the usual weight, is right and the other half wrong: there may be no other wrong one.
+    One more member counts, with log odds of 0 and a share of a half: otherwise the answer would have no limit where
+    all are right.
     """
     from scipy.optimize import brentq
 

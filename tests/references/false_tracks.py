@@ -50,11 +50,15 @@ def person_features(motion: Motion, paths: dict[int, Path]) -> dict[int, dict[st
     return out
 
 
-def stands_throughout(motion: Motion, path: Path, log: tuple[int, int]) -> bool:
-    """Whether a track stands still from the first step of the log to the last, but for 2 s or a tenth of the log."""
-    border = min(2.0, 0.1 * (log[1] - log[0]) * motion.step_s)
+def stands_throughout(motion: Motion, path: Path, in_step: float, log: tuple[int, int]) -> bool:
+    """Whether a track stands still from the first step of the log to the last, and is no double.
+
+    It may be missed for 2 s, at its ends for a tenth of the log at most, which lasts at least 10 s.
+    """
+    lasts = (log[1] - log[0]) * motion.step_s
     late, early = (min(path) - log[0]) * motion.step_s, (log[1] - max(path)) * motion.step_s
-    return max(late, early) <= border + 1e-9 and extent(motion.smoothed(path)) < 1.5
+    is_there = max(late, early) <= min(2.0, 0.1 * lasts) + 1e-9 and max(gaps(path), default=0) * motion.step_s <= 2.0
+    return is_there and lasts >= 10 - 1e-9 and in_step < 1.0 and extent(motion.smoothed(path)) < 1.5
 
 
 def log_odds_in_log(motion: Motion, paths: dict[int, Path], log: tuple[int, int]) -> dict[int, float]:
@@ -62,8 +66,9 @@ def log_odds_in_log(motion: Motion, paths: dict[int, Path], log: tuple[int, int]
 
     For these the entropy of the tracks plus the distance from the fitted weights is least.
     """
-    extra = np.array([stands_throughout(motion, path, log) for path in paths.values()]) * THROUGHOUT
     found = person_features(motion, paths)
+    stand = [stands_throughout(motion, path, found[name]["in step"], log) for name, path in paths.items()]
+    extra = np.array(stand) * THROUGHOUT
     mean, spread = (np.array([FITTED["people"][what][one] for one in PEOPLE]) for what in ("mean", "spread"))
     fitted = np.array(list(PEOPLE.values()))
     known = np.array([[*((np.array([of[one] for one in PEOPLE]) - mean) / spread), 1.0] for of in found.values()])

@@ -29,7 +29,7 @@ JOIN_NAMES = (*JOIN_NAMES, "log rate", "log elsewhere")
 JOIN_MARGIN, JOIN_BRIEF_S, JOIN_QUESTIONED, JOIN_RATE_SAMPLES = 12.0, 1.0, 0.7, 50
 Cut = tuple[int, int, float]  # the ids of both pieces, and the probability that they belong together
 MEET_M, MARGIN, EXCHANGE_COST, SAME_ID, LEAST_COST, LEAST_GAIN = 2.0, 10, 2.0, 1.0, 1.0, 1.0
-DRIFTS = (0.05, 0.15, 0.4)
+DRIFTS = (0.05, 0.15, 0.4, 1.2)
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,9 @@ from mcaptrack.transforms.retrack.compatible_swaps import compatible
 from mcaptrack.transforms.retrack.motion_model import MotionModel, Trajectories
 from mcaptrack.transforms.retrack.paces import swapped_by_pace
 
-#: Drifts of a relative velocity within a second, in m/s: the most likely of these is taken for each encounter.
-DRIFTS_M_PER_S: Final = (0.05, 0.15, 0.4)
+#: Drifts of a relative velocity within a second, in m/s: the most likely of these is taken for each encounter. With the
+#: largest, of people who walk to and fro, motion says little.
+DRIFTS_M_PER_S: Final = (0.05, 0.15, 0.4, 1.2)
 #: Two tracks nearer than this meet; an encounter lasts so many steps longer at both ends.
 _NEAR_M: Final = 2.0
 _MARGIN: Final = 10

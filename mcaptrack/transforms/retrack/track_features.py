@@ -45,10 +45,13 @@ _IN_STEP: Final = 2.0
 _LEAST_SPREAD: Final = 0.05
 #: Gaps are compared with those of tracks that go farther than this: what goes somewhere is a person.
 _GOES_M: Final = 3.0
-#: What stays inside a box with a shorter diagonal stands; it stands for the whole log if it begins and ends within so
-#: many seconds of it, or this share of it where that is less.
+#: What stays inside a box with a shorter diagonal stands. It does so for the whole log if it begins and ends within so
+#: many seconds of it, or this share of it where that is less, is missed for no longer at once, and the log lasts longer
+#: than the shortest one.
 _STANDS_M: Final = 1.5
-_BORDER_S, _BORDER_SHARE = 2.0, 0.1
+_MISSED_S, _BORDER_SHARE, _SHORTEST_S = 2.0, 0.1, 10.0
+#: What is in step with another track to this extent is a double of it.
+_DOUBLE: Final = 1.0
 
 
 def features(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
@@ -78,15 +81,31 @@ def features(model: MotionModel, trajectories: Trajectories, smoothed: State, st
     )
 
 
-def stand_throughout(trajectories: Trajectories, smoothed: State, log: tuple[int, int], step_s: float) -> Bools:
-    """Which tracks (K,) stand still from the first step of the log to its last one, ``log``.
+def stand_throughout(
+    trajectories: Trajectories, smoothed: State, in_step: Floats, log: tuple[int, int], step_s: float
+) -> Bools:
+    """Which tracks (K,) stand still from the first step of the log to its last one, ``log``, and are no doubles.
 
-    People may stand for longer than a log is, but clutter comes and goes.
+    People may stand for longer than a log is; most clutter comes and goes. ``in_step`` (K,) is that feature.
     """
     first, last = trajectories.first[:-1], trajectories.first[1:] - 1
-    border = min(_BORDER_S / step_s, _BORDER_SHARE * (log[1] - log[0]))
+    most = _MISSED_S / step_s
+    border = min(most, _BORDER_SHARE * (log[1] - log[0]))
     begins, ends = trajectories.step[first] <= log[0] + border, trajectories.step[last] >= log[1] - border
-    return np.asarray(begins & ends & (_extent(smoothed.mean[:, :2], first) < _STANDS_M))
+    stays = (_extent(smoothed.mean[:, :2], first) < _STANDS_M) & (in_step < _DOUBLE)
+    is_long = (log[1] - log[0]) * step_s >= _SHORTEST_S - 1e-9
+    track, missed = _gaps(trajectories)
+    is_missed = np.bincount(track[missed > most], minlength=len(first)) > 0
+    return np.asarray(begins & ends & stays & ~is_missed & is_long)
+
+
+def _gaps(trajectories: Trajectories) -> tuple[Ints, Ints]:
+    """The track of each gap (G,), and the steps for which it is missed."""
+    seen = np.flatnonzero(np.isfinite(trajectories.xy_m[:, 0]))
+    track = group_index(np.diff(trajectories.first))[seen]
+    missed = np.diff(trajectories.step[seen]) - 1
+    is_gap = (np.diff(track) == 0) & (missed > 0)
+    return track[1:][is_gap], missed[is_gap]
 
 
 def _extent(xy: Floats, first: Ints) -> Floats:
@@ -155,11 +174,7 @@ def _rare_gaps(trajectories: Trajectories, goes: Bools) -> Floats:
     """The rarity of the gaps of each track, (K,): the mean of the negative logarithms of the shares of gaps that are
     as long, among those of the other tracks that go somewhere; 0 without gaps.
     """
-    seen = np.flatnonzero(np.isfinite(trajectories.xy_m[:, 0]))
-    track = group_index(np.diff(trajectories.first))[seen]
-    missed = np.diff(trajectories.step[seen]) - 1
-    is_gap = (np.diff(track) == 0) & (missed > 0)
-    missed, track = missed[is_gap], track[1:][is_gap]
+    track, missed = _gaps(trajectories)
     usual = np.sort(missed[goes[track]])
     own = goes[track]  # a gap isn't compared with itself
     as_long = len(usual) - np.searchsorted(usual, missed) - own
