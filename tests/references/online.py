@@ -8,6 +8,8 @@ from math import exp, floor, hypot, inf, log, log10, pi, sqrt
 
 import numpy as np
 
+from tests.references.cut_links import gap_class, usual_by_gap
+from tests.references.offline import LINK_BIAS, LINK_LEAST, LINK_WEIGHTS, Motion, State, link_features
 from tests.references.retracking import (
     LEAST,
     Claims,
@@ -103,6 +105,129 @@ class Lives:
         return bool(max(np.diff(angle).max(), angle[0] + 2 * pi - angle[-1]) > pi)
 
 
+class Places:
+    """What became of the last 2000 tracks that began, or were lost."""
+
+    def __init__(self) -> None:
+        self.all: list[tuple[np.ndarray, bool]] = []
+
+    def ratio(self, at: np.ndarray) -> float:
+        """The odds that it goes well within 2 m, compared with everywhere; 8 more are as everywhere."""
+        ended = self.all[-2000:]
+        well = (sum(good for _, good in ended) + 1) / (len(ended) + 2)
+        near = [good for there, good in ended if hypot(*(there - at)) <= 2]
+        return (near.count(True) / well + 8) / (near.count(False) / (1 - well) + 8)
+
+
+def at_odds(probability: float, ratio: float) -> float:
+    return probability * ratio / (1 - probability + probability * ratio)
+
+
+class Ways:
+    """Places where tracks began and were lost, and the odds of tracks that are alive."""
+
+    def __init__(self, lasting: int) -> None:
+        self.lasting = lasting
+        self.began, self.lost = Places(), Places()
+        self.alive: dict[int, dict] = {}
+
+    def learn(self, people: list[Person], has: dict[int, Row], passed: int) -> None:
+        for name in [one for one in self.alive if one not in {person.name for person in people}]:
+            known = self.alive.pop(name)
+            if passed == 1 and not known["lasted"]:
+                self.began.all.append((known["began"], False))
+            if passed == 1 and known["lost"] is not None:
+                self.lost.all.append((known["lost"], False))
+        for known in (self.alive[p.name] for p in people if p.name in has and p.name in self.alive):
+            if known["lost"] is not None:
+                self.lost.all.append((known["lost"], True))
+            known["lost"] = None
+        for p in people:
+            if p.name not in self.alive:
+                self.alive[p.name] = {"began": p.here, "lasted": False, "lost": None, "lasts": self.began.ratio(p.here)}
+        for p in people:
+            known = self.alive[p.name]
+            if p.hits >= self.lasting and not known["lasted"]:
+                known["lasted"] = True
+                self.began.all.append((known["began"], True))
+        for p in people:
+            known = self.alive[p.name]
+            if p.name not in has and known["lost"] is None:
+                known["lost"] = p.here
+                known["returns"] = self.lost.ratio(known["lost"])
+
+
+@dataclass
+class Left:
+    """A track as it was last observed, under the name that it is written."""
+
+    first: int
+    last: int
+    state: State
+    written: int | None = None
+    over: bool = False
+
+
+class Returns:
+    """Tracks under the names of lost ones that they continue."""
+
+    def __init__(self, motion: Motion, options) -> None:
+        self.motion, self.options = motion, options
+        self.tracks: dict[int, Left] = {}
+        self.used: set[int] = set()
+        self.made: list[tuple[float, bool, float]] = []
+        self.estimated = 0
+        self.shifts = usual_by_gap({})
+
+    def learn(self, people: list[Person], has: dict[int, Row], step: int) -> None:
+        for person in people:
+            if person.name not in self.tracks:
+                self.tracks[person.name] = Left(step, step, State(person.mean, person.cov))
+            if person.name in has:
+                known = self.tracks[person.name]
+                known.last, known.state = step, State(person.mean, person.cov)
+        for name, known in self.tracks.items():
+            known.over = name not in {person.name for person in people}
+
+    def name(self, written: list[Person], step: int) -> None:
+        """Decide on those that are written for the first time."""
+        from scipy.optimize import linear_sum_assignment
+
+        new = [person for person in written if self.tracks[person.name].written is None]
+        for person in new:
+            self.tracks[person.name].written = person.name
+        if self.options.link_s <= 0:
+            return
+        lost = [one for one, known in self.tracks.items() if known.over and known.written and one not in self.used]
+        found, gains = {}, np.zeros((len(lost), len(new)))
+        for i, one in enumerate(lost):
+            for j, person in enumerate(new):
+                known, gap_s = self.tracks[one], (step - self.tracks[one].last) * self.motion.step_s
+                apart = hypot(*(known.state.mean[:, 0] - person.here))
+                if (
+                    gap_s > self.options.link_s
+                    or apart > 1 + 2.5 * gap_s
+                    or known.last >= self.tracks[person.name].first
+                ):
+                    continue
+                mean, cov = person.mean.copy(), person.cov.copy()
+                if person.hits == 1:
+                    mean[:, 1], cov[1, 1] = known.state.mean[:, 1], known.state.cov[1, 1]
+                features = link_features(self.motion, known.state, State(mean, cov), gap_s)
+                odds = float(np.dot(LINK_WEIGHTS, features) + LINK_BIAS)
+                found[i, j], gains[i, j] = (odds, False, gap_s), max(odds - LINK_LEAST, 0)
+        best = [pair for pair in zip(*linear_sum_assignment(-gains), strict=True) if gains[pair] > 0]
+        least = log(self.options.link_confidence / (1 - self.options.link_confidence) / 3)
+        for i, j in best:
+            if found[i, j][0] + self.shifts[gap_class(found[i, j][2])] > least:
+                self.tracks[new[j].name].written = self.tracks[lost[i]].written
+                self.used.add(lost[i])
+        self.made += [found[pair] for pair in best]
+        if len(self.made) > self.estimated + min(self.estimated / 10, 50):
+            self.estimated = len(self.made)
+            self.shifts = usual_by_gap(dict(enumerate(self.made[-500:])))
+
+
 def log_density(off: np.ndarray, variance: float) -> float:
     """That of a normal distribution in the plane with the same variance along both axes."""
     return float(-(off**2).sum() / variance / 2 - log(2 * pi * variance))
@@ -170,6 +295,9 @@ class OnlineTracker:
         places: dict[tuple[int, int], Point] = {}
         lives = Lives(self.confirm, self.max_age)
         bends = Bends(1 / o.rate_hz)
+        ways = Ways(lives.lasting)
+        motion = Motion(self.noise_m, max(o.speed_m_per_s, LEAST), o.drift_m_per_s, o.drift_ratio, 1 / o.rate_hz)
+        returns = Returns(motion, o)
         for at, (step, rows) in enumerate(zip(steps, samples, strict=True)):
             passed = step - steps[at - 1] if at else 1
             seen = sorted((r for r in rows if r["observed"] or o.interpolated), key=lambda row: row["track_id"])
@@ -183,46 +311,54 @@ class OnlineTracker:
             }
             lives.learn(now, passed)
             lives.places += [one.here for one in self.people if one.name in has and one.hits >= self.confirm]
-            shown, known = [], set()
+            ways.learn(self.people, has, passed)
+            returns.learn(self.people, has, step)
+            written = [one for one in self.people if self.is_written(one, now[one.name], lives, ways)]
+            returns.name(written, step)
+            shown = []
             for person in self.people:
                 row = has.get(person.name)
                 if row is not None:
                     self.claims.made.append((step, person.name, row["track_id"]))
                     places[step, person.name] = (row["x_m"], row["y_m"])
                     person.row = row
-                if not self.is_written(person, now[person.name], lives):
+                if person not in written:
                     continue
-                if person.hits >= self.confirm:
-                    known.add(person.name)
+                name = returns.tracks[person.name].written
                 if row is not None:
-                    shown.append(row | {"source_id": row["track_id"], "track_id": person.name})
+                    shown.append((row | {"source_id": row["track_id"], "track_id": name}, person))
                 else:
-                    lost = person.row | {"source_id": -1, "track_id": person.name, "observed": False}
+                    lost = person.row | {"source_id": -1, "track_id": name, "observed": False}
                     move_to(lost, person.here, o.ground_planes)
-                    shown.append(lost)
-            shown.sort(key=lambda row: row["track_id"])
-            online.append(shown)
+                    shown.append((lost, person))
+            shown.sort(key=lambda one: one[0]["track_id"])
+            online.append([row for row, _ in shown])
             predictions.append(
-                [(row["track_id"], *self.forecast(row, step, places)) for row in shown if row["track_id"] in known]
+                [
+                    (row["track_id"], *self.forecast(row, person.name, step, places))
+                    for row, person in shown
+                    if person.hits >= self.confirm
+                ]
             )
         return offline(self.claims, samples, steps, o, self.noise_m), online, predictions
 
-    def is_written(self, person: Person, now: tuple[int, int, bool], lives: Lives) -> bool:
+    def is_written(self, person: Person, now: tuple[int, int, bool], lives: Lives, ways: Ways) -> bool:
         """Whether a track is written online."""
-        o, (hits, missed, outside) = self.options, now
+        o, (hits, missed, outside), place = self.options, now, ways.alive[person.name]
         if not o.adapt_online:
             enough = self.confirm if missed == 0 else 1.5 * self.confirm
             return hits >= enough and missed <= round(o.coast_s * o.rate_hz)
         if missed == 0:
-            return hits >= self.confirm or lives.lasts(hits) >= 0.5
+            return hits >= self.confirm or at_odds(lives.lasts(hits), place["lasts"]) >= 0.5
         if missed > round(o.coast_s * o.rate_hz):
             return False
         if hits >= lives.lasting and not outside:
             return True
-        return lives.comes_back(missed, outside) * lives.lasts(hits + 1) >= 0.5
+        comes_back = at_odds(lives.comes_back(missed, outside), place["returns"])
+        return comes_back * at_odds(lives.lasts(hits + 1), place["lasts"]) >= 0.5
 
-    def forecast(self, row: Row, step: int, places: dict[tuple[int, int], Point]):
-        past = [places.get((step - back, row["track_id"])) for back in range(self.past - 1, 0, -1)]
+    def forecast(self, row: Row, name: int, step: int, places: dict[tuple[int, int], Point]):
+        past = [places.get((step - back, name)) for back in range(self.past - 1, 0, -1)]
         return self.predict([*past, (row["x_m"], row["y_m"])])
 
     def step(self, rows: list[Row], passed: int) -> dict[int, Row]:

@@ -44,9 +44,8 @@ FEATURES: Final = (
 _SHORT_S: Final = 1.0
 #: Pieces with one input id are candidates over gaps of less than this, however unlikely by their motion. Seconds.
 _SAME_ID_S: Final = 6.0
-#: Odds that are enough for a link, as a share of those of the least confidence: pieces of a person that stay apart cost
-#: more than wrong ones that go together, and more so where a person surely goes on. (Chosen on synthetic crowds.)
-_ENOUGH_AT_CUTS, _ENOUGH_ELSEWHERE = 1 / 11, 1 / 3
+#: As ``linking.ENOUGH``, where a person surely goes on.
+_ENOUGH_AT_CUTS: Final = 1 / 11
 #: Probabilities of joins are taken for no closer to 0 and 1 than this.
 _CLOSEST: Final = 1e-6
 _RELINKS_WEIGHTS, _RELINKS_FITTED = weights_of("relinks", FEATURES)
@@ -164,8 +163,9 @@ def link_pieces(
     for _ in range(2):  # the share of right links that is usual in this log is known after the first round
         made = linking.best_links(found.ends, found.begins, log_odds + np.where(found.at_cut, 0.0, shift), count)
         elsewhere = made[~found.at_cut[made]]
-        shift = linking.prior_shifts(log_odds[elsewhere], found.gap_s[elsewhere], found.gap_s)
-    log_odds += np.where(found.at_cut, -np.log(_ENOUGH_AT_CUTS), shift - np.log(_ENOUGH_ELSEWHERE))
+        shifts = linking.prior_shifts(log_odds[elsewhere], found.gap_s[elsewhere])
+        shift = shifts[linking.gap_classes(found.gap_s)]
+    log_odds += np.where(found.at_cut, -np.log(_ENOUGH_AT_CUTS), shift - np.log(linking.ENOUGH))
     made = made[log_odds[made] > np.log(min_confidence / (1 - min_confidence))]
     continued_by[found.ends[made]] = found.begins[made]
     return continued_by

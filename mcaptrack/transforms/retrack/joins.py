@@ -203,7 +203,7 @@ def _alternatives(
     for part in _batches(count):
         join = part.start + group_index(count[part])
         other = by_step[ragged_range(low[part], count[part])]
-        reach_m = 1.0 + linking.MAX_SPEED_M_PER_S * (tracked.step[after] - tracked.step[before])[join] * step_s
+        reach_m = linking.reach_m((tracked.step[after] - tracked.step[before])[join] * step_s)
         off = tracked.backward.mean[other, :2] - tracked.forward.mean[before[join], :2]
         near = (np.hypot(off[:, 0], off[:, 1]) <= reach_m) & (other != after[join])
         join, other = join[near], other[near]

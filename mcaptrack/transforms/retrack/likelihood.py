@@ -19,9 +19,10 @@ from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.transforms.retrack.assignments import Assignments
 from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers
 from mcaptrack.transforms.retrack.input_noise import InputNoise
-from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M, MotionModel
+from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M, MotionModel, State, StateRows
 from mcaptrack.transforms.retrack.offline_rows import move_rows
 from mcaptrack.transforms.retrack.online_forecasts import OnlineForecasts, Unpredicted
+from mcaptrack.transforms.retrack.online_links import OnlineLinks
 from mcaptrack.transforms.retrack.online_tracker import HITS, IDS, Association, OnlineTracker
 from mcaptrack.transforms.retrack.options import LikelihoodOptions, RetrackOptions
 from mcaptrack.transforms.retrack.recent_positions import RecentPositions
@@ -61,6 +62,7 @@ class LikelihoodPass:
             estimate_noise=options.noise_m is None,
         )
         self._shown = ShownTracks(confirm_hits, round(options.coast_s * rate), max_age, options.adapt_online)
+        self._links = OnlineLinks(self._tracker.model, 1 / rate, options.link_s, options.link_confidence)
         self._assignments = Assignments()
         self._samples = LogSamples()
         self.steps: list[int] = []
@@ -154,18 +156,18 @@ class LikelihoodPass:
             self._tracker.step(xy_m[:, low:high], source[low:high], steps_passed, limit)
             for low, high, steps_passed, limit in each
         ]
-        tracks, row, place = (np.concatenate(all_, axis=-1) for all_ in zip(*results, strict=True))
+        tracks, row, mean, cov = (np.concatenate(all_, axis=-1) for all_ in zip(*results, strict=True))
         tick = group_index([len(result.row) for result in results])
         has = row >= 0
         row[has] = observed[bounds[tick[has]] + row[has]]
         self._assignments.add(steps[tick[has]], tracks[IDS, has], samples["track_id"][row[has]])
-        self._write(_Read(t_ns, numbers, steps, passed, samples), tick, row, tracks, place)
+        self._write(_Read(t_ns, numbers, steps, passed, samples), tick, row, tracks, StateRows(mean, cov))
 
-    def _write(self, read: _Read, tick: Ints, row: Ints, tracks: Ints, place: Floats) -> None:
+    def _write(self, read: _Read, tick: Ints, row: Ints, tracks: Ints, state: StateRows) -> None:
         """Make the rows of online tracks, and their predictions, of some steps.
 
         Of the tracks alive at each of the steps, end to end: the index of the step, the row that each has, or -1; whole
-        numbers and positions as in ``Step``.
+        numbers and states as in ``Step``.
         """
         steps = read.steps
         ids = tracks[IDS]
@@ -179,12 +181,15 @@ class LikelihoodPass:
         last_sample = np.empty_like(earlier)
         last_sample[order] = earlier[order][last]
         last_sample = last_sample[before:]
-        shown = np.flatnonzero(self._shown(read.passed, tick, row >= 0, tracks, place) & np.isfinite(place[0]))
-        shown = shown[np.lexsort((ids[shown], tick[shown]))]
+        place = state.mean[:2]
+        is_shown = self._shown(read.passed, tick, row >= 0, tracks, place) & np.isfinite(place[0])
+        names = self._links(steps, tick, tracks, State(state.mean.T, state.cov.T), row >= 0, is_shown)
+        shown = np.flatnonzero(is_shown)
+        shown = shown[np.lexsort((names[shown], tick[shown]))]
 
         rows = samples[last_sample[shown]].copy()
         rows["source_id"] = np.where(row[shown] >= 0, rows["track_id"], -1)
-        rows["track_id"] = ids[shown]
+        rows["track_id"] = names[shown]
         coasts = row[shown] < 0
         rows["observed"] &= ~coasts
         xy_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
@@ -198,7 +203,7 @@ class LikelihoodPass:
         ticks = np.arange(len(steps) + 1)
         self._online.extend(read.t_ns, read.numbers, np.searchsorted(tick[shown], ticks), rows)
         confirmed = np.flatnonzero(tracks[HITS, shown] >= self._confirm_hits)  # before, little is known of velocities
-        waiting = Unpredicted(ids[shown], past, known, coasts, steps[tick[shown]]).part(confirmed)
+        waiting = Unpredicted(names[shown], past, known, coasts, steps[tick[shown]]).part(confirmed)
         self._forecasts.add(read.t_ns, read.numbers, steps, np.searchsorted(tick[shown[confirmed]], ticks), waiting)
         self._written += len(rows)
         is_last = tick == len(steps) - 1

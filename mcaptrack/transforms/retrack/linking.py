@@ -21,8 +21,8 @@ from mcaptrack.transforms.retrack.false_tracks import probability
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
 from mcaptrack.transforms.retrack.weights import weights_of
 
-#: Gate on the mean speed between the end of a tracklet and the beginning of the next.
-MAX_SPEED_M_PER_S: Final = 2.5
+#: A track that continues another begins no farther from its end than this, and so much more for each second between.
+_REACH_M, _MAX_SPEED_M_PER_S = 1.0, 2.5
 #: The features of a link, see ``features``.
 FEATURES: Final = ("miss", "misfit", "gap", "misfit or stay", "turn", "distance and speed", "misfit and speed")
 #: Weight of each feature as a log odds ratio; and the log odds without any, in logs where a share of ``_PRIOR`` of the
@@ -36,8 +36,13 @@ _BY_GAP: Final = np.array(_FITTED["usual by gap"])
 _GAP_LINKS: Final = 5.0
 #: Added to distances and speeds before taking logarithms: differences below these mean nothing.
 _NEAR_M, _SPEED_M_PER_S = 0.3, 0.15
+#: Odds that are enough for a link, as a share of those of the least confidence: pieces of a person that stay apart cost
+#: more than wrong ones that go together. (Chosen on synthetic crowds.)
+ENOUGH: Final = 1 / 3
 #: The number of pairs that are examined at once.
 _BATCH: Final = 1_000_000
+#: So few links are decided together: splitting them would take longer.
+_FEW: Final = 50
 #: The largest table of ends and beginnings that is made: 16 MB.
 _TABLE_CELLS: Final = 2_000_000
 
@@ -93,7 +98,8 @@ def best_links(i: Ints, j: Ints, log_odds: Floats, count: int) -> Ints:
     continued_by = np.full(count, -1)
     good = np.flatnonzero(has_chance(log_odds))
     ends, begins, gain = i[good], j[good], np.round(log_odds[good] - _MIN_LOG_ODDS, 6)
-    for edges in _components(ends, begins, count):
+    parts = [np.arange(len(good))] if len(good) <= _FEW else _components(ends, begins, count)
+    for edges in parts:
         own, other = np.unique(ends[edges]), np.unique(begins[edges])
         pairs = np.searchsorted(own, ends[edges]), np.searchsorted(other, begins[edges])
         row, column = _assigned(pairs, gain[edges], (len(own), len(other)))
@@ -116,10 +122,20 @@ def candidates(
         i = part.start + group_index(count[part])
         j: Ints = order[ragged_range(low[part], count[part])]
         gap_s = np.asarray((begins[j] - ends[i]) * step_s, np.float64)
-        near = _length(forward.mean[last[i], :2] - backward.mean[first[j], :2]) <= 1.0 + MAX_SPEED_M_PER_S * gap_s
+        near = are_in_reach(forward.take(last[i]), backward.take(first[j]), gap_s)
         parts.append((i[near], j[near], gap_s[near]))
     i, j, gap_s = (np.concatenate(members) for members in zip(*parts, strict=True))
     return i, j, gap_s
+
+
+def reach_m(gap_s: Floats) -> Floats:
+    """The distance that people walk within gaps (E,), at most."""
+    return np.asarray(_REACH_M + _MAX_SPEED_M_PER_S * gap_s)
+
+
+def are_in_reach(before: State, after: State, gap_s: Floats) -> Bools:
+    """Whether people may get from the one to the other within the gaps (E,)."""
+    return np.asarray(_length(before.mean[:, :2] - after.mean[:, :2]) <= reach_m(gap_s))
 
 
 def _batches(count: Ints) -> list[slice]:
@@ -152,14 +168,19 @@ def prior_shift(log_odds: Floats) -> float:
     return shift
 
 
-def prior_shifts(log_odds: Floats, gap_s: Floats, others_s: Floats) -> Floats:
-    """The shifts of the log odds of links over gaps of ``others_s`` (O,), from those of the best links (E,).
+def gap_classes(gap_s: Floats) -> Ints:
+    """The class of each gap (E,) by its length, from 0 on."""
+    return np.searchsorted(_GAPS_S, gap_s)
+
+
+def prior_shifts(log_odds: Floats, gap_s: Floats) -> Floats:
+    """The shifts of the log odds of links over gaps of each class (see ``gap_classes``), from the best links (E,).
 
     How long people are missed differs from log to log, too, so gaps of about the same length are shifted together: few
     of them as all links are.
     """
     count = len(_BY_GAP)
-    gap = np.searchsorted(_GAPS_S, gap_s)
+    gap = gap_classes(gap_s)
     usual = np.log(_BY_GAP / (1 - _BY_GAP))
     expected = probability(usual + prior_shift(log_odds))
     links = np.bincount(gap, minlength=count) + _GAP_LINKS
@@ -168,7 +189,7 @@ def prior_shifts(log_odds: Floats, gap_s: Floats, others_s: Floats) -> Floats:
         right = np.bincount(gap, probability(log_odds + shifts[gap]), minlength=count)
         share = (right + _GAP_LINKS * expected) / links
         shifts = np.log(share / (1 - share)) - usual
-    return np.asarray(shifts[np.searchsorted(_GAPS_S, others_s)])
+    return shifts
 
 
 def _components(i: Ints, j: Ints, count: int) -> list[Ints]:

@@ -63,12 +63,13 @@ class Step(NamedTuple):
     """The tracks alive after a step.
 
     ``tracks`` (5, K) are their whole numbers (``IDS`` to ``MERGED``), ``row`` (K,) is the observation that each has, or
-    -1, and ``xy_m`` (2, K) where they are.
+    -1, and ``mean`` (4, K) and ``cov`` (3, K) are their states, as in ``StateRows``.
     """
 
     tracks: Ints
     row: Ints
-    xy_m: Floats
+    mean: Floats
+    cov: Floats
 
 
 @dataclass
@@ -128,7 +129,7 @@ class OnlineTracker:
             row_of = np.concatenate([row_of, free])
             self._start(xy_m[:, free], source[free])
         self.known_sources.update(source.tolist())
-        return Step(self.tracks.copy(), row_of, self.state.mean[:2].copy())
+        return Step(self.tracks.copy(), row_of, self.state.mean.copy(), self.state.cov.copy())
 
     def _merged_detections(self, track: Ints, observed: Floats) -> tuple[Ints, Ints]:
         """Find pairs of tracks merged into one detection (occlusion), and which track has that detection.
