@@ -98,8 +98,8 @@ class RetrackOptions:
     )
     link_s: float = option(
         20.0,
-        "link the end of a track with the beginning of another up to this many seconds later, by likelihood also online, "
-        "from the past alone; 0 for never",
+        "link the end of a track with the beginning of another up to this many seconds later, by likelihood also "
+        "online, from the past alone; 0 for never",
         least=0.0,
         theme=_OFFLINE,
     )
