@@ -81,7 +81,7 @@ def test_who_stands_for_the_whole_log_by_hand(begins, ends, wide_m, missed, stan
     paths = {1: {s: (side, side) if s % 4 > 1 else (0.0, 0.0) for s in steps}}
     out, _ = laid_out(paths, 1e-3)
     smoothed = smooth(MotionModel(1e-3, 1.0, 100.0, 0.0), out, 0.4)[2]  # it follows the positions
-    assert stand_throughout(out, smoothed, np.zeros(1), (0, 39), 0.4).tolist() == [stands]
+    assert stand_throughout(out, smoothed, np.zeros((1, len(FEATURES))), (0, 39), 0.4).tolist() == [stands]
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,8 @@ def test_who_stands_for_the_whole_log_by_hand(begins, ends, wide_m, missed, stan
 def test_two_seconds_of_a_long_log_ten_of_a_short_one_and_doubles(begins, last, in_step, stands):
     out, _ = laid_out({1: dict.fromkeys(range(begins, last + 1), (0.0, 0.0))}, 0.1)
     smoothed = smooth(MotionModel(0.1, 1.0, 0.1, 0.1), out, 0.4)[2]
-    assert stand_throughout(out, smoothed, np.full(1, in_step), (0, last), 0.4).tolist() == [stands]
+    found = np.where(np.array(FEATURES) == "in step", in_step, 0.0)[None]
+    assert stand_throughout(out, smoothed, found, (0, last), 0.4).tolist() == [stands]
 
 
 def frames_of(paths: Paths) -> list[Frame]:

@@ -201,8 +201,7 @@ def people_of(run: Run) -> People:
     count = np.add.reduceat(observed.astype(float), paths.first[:-1])
     own = np.add.reduceat((owners_of(run, paths) >= 0).astype(float), paths.first[:-1])
     found = track_features.features(model, paths, smoothed, step_s)
-    in_step = found[:, track_features.FEATURES.index("in step")]
-    throughout = track_features.stand_throughout(paths, smoothed, in_step, log, step_s)
+    throughout = track_features.stand_throughout(paths, smoothed, found, log, step_s)
     return People(found, own / count, count, throughout)
 
 

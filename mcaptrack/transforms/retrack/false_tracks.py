@@ -18,7 +18,6 @@ from mcaptrack.transforms.retrack.weights import weights_of
 _WEIGHTS, _FITTED = weights_of("people", FEATURES)
 _BIAS: Final = float(_FITTED["bias"])
 _MEAN, _SPREAD = (np.array([_FITTED[what][name] for name in FEATURES]) for what in ("mean", "spread"))
-_IN_STEP: Final = FEATURES.index("in step")
 #: What is added to the log odds of tracks that stand for the whole log.
 _THROUGHOUT: Final = float(_FITTED["stands throughout"])
 #: How strongly weights stay as they were fitted while they follow a log, and how much each step of a track counts
@@ -55,7 +54,7 @@ def log_odds_in_log(
     standard = (found - _MEAN) / _SPREAD
     known = np.column_stack([standard, np.ones(len(standard))])
     # not a feature: its weight doesn't follow the log, and is no reason to think less of others who stand
-    extra = _THROUGHOUT * stand_throughout(trajectories, smoothed, found[:, _IN_STEP], log, step_s)
+    extra = _THROUGHOUT * stand_throughout(trajectories, smoothed, found, log, step_s)
     counts = _EACH_STEP * np.minimum(np.diff(trajectories.first), _MOST_STEPS)
     fitted = np.append(_WEIGHTS * _SPREAD, _BIAS + _WEIGHTS @ _MEAN)
 

@@ -46,8 +46,8 @@ _LEAST_SPREAD: Final = 0.05
 #: Gaps are compared with those of tracks that go farther than this: what goes somewhere is a person.
 _GOES_M: Final = 3.0
 #: What stays inside a box with a shorter diagonal stands. It does so for the whole log if it begins and ends within so
-#: many seconds of it, or this share of it where that is less, is missed for no longer at once, and the log lasts longer
-#: than the shortest one.
+#: many seconds of it, or this share of it where that is less, is missed for no longer at once, and the log has at least
+#: so many seconds.
 _STANDS_M: Final = 1.5
 _MISSED_S, _BORDER_SHARE, _SHORTEST_S = 2.0, 0.1, 10.0
 #: What is in step with another track to this extent is a double of it.
@@ -82,17 +82,17 @@ def features(model: MotionModel, trajectories: Trajectories, smoothed: State, st
 
 
 def stand_throughout(
-    trajectories: Trajectories, smoothed: State, in_step: Floats, log: tuple[int, int], step_s: float
+    trajectories: Trajectories, smoothed: State, found: Floats, log: tuple[int, int], step_s: float
 ) -> Bools:
     """Which tracks (K,) stand still from the first step of the log to its last one, ``log``, and are no doubles.
 
-    People may stand for longer than a log is; most clutter comes and goes. ``in_step`` (K,) is that feature.
+    People may stand for longer than a log is; most clutter comes and goes. ``found`` (K, F) are the features.
     """
     first, last = trajectories.first[:-1], trajectories.first[1:] - 1
     most = _MISSED_S / step_s
     border = min(most, _BORDER_SHARE * (log[1] - log[0]))
     begins, ends = trajectories.step[first] <= log[0] + border, trajectories.step[last] >= log[1] - border
-    stays = (_extent(smoothed.mean[:, :2], first) < _STANDS_M) & (in_step < _DOUBLE)
+    stays = (_extent(smoothed.mean[:, :2], first) < _STANDS_M) & (found[:, FEATURES.index("in step")] < _DOUBLE)
     is_long = (log[1] - log[0]) * step_s >= _SHORTEST_S - 1e-9
     track, missed = _gaps(trajectories)
     is_missed = np.bincount(track[missed > most], minlength=len(first)) > 0
