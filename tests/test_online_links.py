@@ -76,6 +76,21 @@ def test_another_one_elsewhere_is_another_one():
     assert len(names(online(walk(hidden(10, y_m=8.0), 60)))) == 2
 
 
+@pytest.mark.parametrize(("hits", "waits"), [(20, 0), (3, 3)])
+def test_who_surely_comes_back_is_written_at_once_if_confirmed_before(hits, waits):
+    """Most detections flicker, so that others wait for 1.2 s. One that was seen three times was never written."""
+
+    def path(n: int) -> dict[int, tuple[float, float]]:
+        out = {1000 + n: (100.0 * (n + 1), -500.0)} if n % 2 else {}
+        if 60 - hits <= n < 60 or n >= 70:
+            out[1 if n < 60 else 2] = (0.5 * n, 0.0)
+        return out
+
+    found = [[one for one in frame.rows if one["y_m"] > -1] for frame in online(walk(path, 90))]
+    assert [len(rows) for rows in found[70:]] == [0] * waits + [1] * (20 - waits)
+    assert len({int(row["track_id"]) for rows in found for row in rows}) == 1
+
+
 def test_a_lost_track_is_continued_once():
     """Two come out where one went in: one of them is new."""
 
@@ -149,6 +164,11 @@ def test_links_do_not_depend_on_how_many_steps_are_read_at_once(monkeypatch):
     frames = passers(np.random.default_rng(3))
     wanted = [ids(frame) for frame in online(frames)]
     assert wanted != [ids(frame) for frame in online(frames, link_s=0.0)]
+    # all at one place, so that links are of equal odds
+    path = [tick for tick in range(300) if tick % 23 > 7]
+    alike = walk(lambda n: {3 * (n // 23) + k: (0.0, 0.0) for k in range(3)} if n in path else {}, 300)
+    same_odds = [ids(frame) for frame in online(alike)]
     for steps in (1, 7):
         monkeypatch.setattr(likelihood, "_STEPS", steps)
         assert [ids(frame) for frame in online(frames)] == wanted
+        assert [ids(frame) for frame in online(alike)] == same_odds

@@ -106,7 +106,7 @@ class Lives:
 
 
 class Places:
-    """What became of the last 2000 tracks that began, or were lost."""
+    """What became of the last 2000 tracks that were lost."""
 
     def __init__(self) -> None:
         self.all: list[tuple[np.ndarray, bool]] = []
@@ -123,38 +123,26 @@ def at_odds(probability: float, ratio: float) -> float:
     return probability * ratio / (1 - probability + probability * ratio)
 
 
-class Ways:
-    """Places where tracks began and were lost, and the odds of tracks that are alive."""
+class Losses:
+    """Places where tracks were lost, of those that are lost, and the odds that these come back."""
 
-    def __init__(self, lasting: int) -> None:
-        self.lasting = lasting
-        self.began, self.lost = Places(), Places()
-        self.alive: dict[int, dict] = {}
+    def __init__(self) -> None:
+        self.lost = Places()
+        self.now: dict[int, tuple[np.ndarray, float]] = {}
 
     def learn(self, people: list[Person], has: dict[int, Row], passed: int) -> None:
-        for name in [one for one in self.alive if one not in {person.name for person in people}]:
-            known = self.alive.pop(name)
-            if passed == 1 and not known["lasted"]:
-                self.began.all.append((known["began"], False))
-            if passed == 1 and known["lost"] is not None:
-                self.lost.all.append((known["lost"], False))
-        for known in (self.alive[p.name] for p in people if p.name in has and p.name in self.alive):
-            if known["lost"] is not None:
-                self.lost.all.append((known["lost"], True))
-            known["lost"] = None
+        for name in [one for one in self.now if one not in {person.name for person in people}]:
+            place, _ = self.now.pop(name)
+            if passed == 1:
+                self.lost.all.append((place, False))
+        for name in [one for one in self.now if one in has]:
+            self.lost.all.append((self.now.pop(name)[0], True))
         for p in people:
-            if p.name not in self.alive:
-                self.alive[p.name] = {"began": p.here, "lasted": False, "lost": None, "lasts": self.began.ratio(p.here)}
-        for p in people:
-            known = self.alive[p.name]
-            if p.hits >= self.lasting and not known["lasted"]:
-                known["lasted"] = True
-                self.began.all.append((known["began"], True))
-        for p in people:
-            known = self.alive[p.name]
-            if p.name not in has and known["lost"] is None:
-                known["lost"] = p.here
-                known["returns"] = self.lost.ratio(known["lost"])
+            if p.name not in has and p.name not in self.now:
+                self.now[p.name] = (p.here, self.lost.ratio(p.here))
+
+    def ratio(self, name: int) -> float:
+        return self.now[name][1] if name in self.now else 1.0
 
 
 @dataclass
@@ -164,6 +152,7 @@ class Left:
     first: int
     last: int
     state: State
+    hits: int = 1
     written: int | None = None
     over: bool = False
 
@@ -171,8 +160,8 @@ class Left:
 class Returns:
     """Tracks under the names of lost ones that they continue."""
 
-    def __init__(self, motion: Motion, options) -> None:
-        self.motion, self.options = motion, options
+    def __init__(self, motion: Motion, options, confirm: int) -> None:
+        self.motion, self.options, self.confirm = motion, options, confirm
         self.tracks: dict[int, Left] = {}
         self.used: set[int] = set()
         self.made: list[tuple[float, bool, float]] = []
@@ -185,19 +174,22 @@ class Returns:
                 self.tracks[person.name] = Left(step, step, State(person.mean, person.cov))
             if person.name in has:
                 known = self.tracks[person.name]
-                known.last, known.state = step, State(person.mean, person.cov)
+                known.last, known.hits, known.state = step, person.hits, State(person.mean, person.cov)
         for name, known in self.tracks.items():
             known.over = name not in {person.name for person in people}
 
-    def name(self, written: list[Person], step: int) -> None:
-        """Decide on those that are written for the first time."""
+    def name(self, written: list[Person], step: int, has: dict[int, Row], people: list[Person]) -> list[Person]:
+        """Decide on those without a name; returns those that are written, too, because they continue others."""
         from scipy.optimize import linear_sum_assignment
 
-        new = [person for person in written if self.tracks[person.name].written is None]
+        more = [one for one in people if one.name in has and one not in written]
+        new = [one for one in people if one in written or one in more]
+        new = [person for person in new if self.tracks[person.name].written is None]
         for person in new:
-            self.tracks[person.name].written = person.name
+            if person in written:
+                self.tracks[person.name].written = person.name
         if self.options.link_s <= 0:
-            return
+            return []
         lost = [one for one, known in self.tracks.items() if known.over and known.written and one not in self.used]
         found, gains = {}, np.zeros((len(lost), len(new)))
         for i, one in enumerate(lost):
@@ -210,22 +202,29 @@ class Returns:
                     or known.last >= self.tracks[person.name].first
                 ):
                     continue
+                if person not in written and known.hits < self.confirm:
+                    continue
                 mean, cov = person.mean.copy(), person.cov.copy()
                 if person.hits == 1:
                     mean[:, 1], cov[1, 1] = known.state.mean[:, 1], known.state.cov[1, 1]
                 features = link_features(self.motion, known.state, State(mean, cov), gap_s)
                 odds = float(np.dot(LINK_WEIGHTS, features) + LINK_BIAS)
                 found[i, j], gains[i, j] = (odds, False, gap_s), max(odds - LINK_LEAST, 0)
-        best = [pair for pair in zip(*linear_sum_assignment(-gains), strict=True) if gains[pair] > 0]
-        least = log(self.options.link_confidence / (1 - self.options.link_confidence) / 3)
-        for i, j in best:
-            if found[i, j][0] + self.shifts[gap_class(found[i, j][2])] > least:
+        least = log(self.options.link_confidence / (1 - self.options.link_confidence))
+        for i, j in zip(*linear_sum_assignment(-gains), strict=True):
+            if gains[i, j] <= 0:
+                continue
+            shifted = found[i, j][0] + self.shifts[gap_class(found[i, j][2])]
+            is_right = shifted > (least - log(3) if new[j] in written else least)
+            if is_right:
                 self.tracks[new[j].name].written = self.tracks[lost[i]].written
                 self.used.add(lost[i])
-        self.made += [found[pair] for pair in best]
+            if is_right or new[j] in written:
+                self.made.append(found[i, j])
         if len(self.made) > self.estimated + min(self.estimated / 10, 50):
             self.estimated = len(self.made)
             self.shifts = usual_by_gap(dict(enumerate(self.made[-500:])))
+        return [one for one in more if self.tracks[one.name].written not in (None, one.name)]
 
 
 def log_density(off: np.ndarray, variance: float) -> float:
@@ -295,9 +294,9 @@ class OnlineTracker:
         places: dict[tuple[int, int], Point] = {}
         lives = Lives(self.confirm, self.max_age)
         bends = Bends(1 / o.rate_hz)
-        ways = Ways(lives.lasting)
+        losses = Losses()
         motion = Motion(self.noise_m, max(o.speed_m_per_s, LEAST), o.drift_m_per_s, o.drift_ratio, 1 / o.rate_hz)
-        returns = Returns(motion, o)
+        returns = Returns(motion, o, self.confirm)
         for at, (step, rows) in enumerate(zip(steps, samples, strict=True)):
             passed = step - steps[at - 1] if at else 1
             seen = sorted((r for r in rows if r["observed"] or o.interpolated), key=lambda row: row["track_id"])
@@ -311,10 +310,10 @@ class OnlineTracker:
             }
             lives.learn(now, passed)
             lives.places += [one.here for one in self.people if one.name in has and one.hits >= self.confirm]
-            ways.learn(self.people, has, passed)
+            losses.learn(self.people, has, passed)
             returns.learn(self.people, has, step)
-            written = [one for one in self.people if self.is_written(one, now[one.name], lives, ways)]
-            returns.name(written, step)
+            written = [one for one in self.people if self.is_written(one, now[one.name], lives, losses)]
+            written += returns.name(written, step, has, self.people)
             shown = []
             for person in self.people:
                 row = has.get(person.name)
@@ -342,20 +341,20 @@ class OnlineTracker:
             )
         return offline(self.claims, samples, steps, o, self.noise_m), online, predictions
 
-    def is_written(self, person: Person, now: tuple[int, int, bool], lives: Lives, ways: Ways) -> bool:
+    def is_written(self, person: Person, now: tuple[int, int, bool], lives: Lives, losses: Losses) -> bool:
         """Whether a track is written online."""
-        o, (hits, missed, outside), place = self.options, now, ways.alive[person.name]
+        o, (hits, missed, outside) = self.options, now
         if not o.adapt_online:
             enough = self.confirm if missed == 0 else 1.5 * self.confirm
             return hits >= enough and missed <= round(o.coast_s * o.rate_hz)
         if missed == 0:
-            return hits >= self.confirm or at_odds(lives.lasts(hits), place["lasts"]) >= 0.5
+            return hits >= self.confirm or lives.lasts(hits) >= 0.5
         if missed > round(o.coast_s * o.rate_hz):
             return False
         if hits >= lives.lasting and not outside:
             return True
-        comes_back = at_odds(lives.comes_back(missed, outside), place["returns"])
-        return comes_back * at_odds(lives.lasts(hits + 1), place["lasts"]) >= 0.5
+        comes_back = at_odds(lives.comes_back(missed, outside), losses.ratio(person.name))
+        return comes_back * lives.lasts(hits + 1) >= 0.5
 
     def forecast(self, row: Row, name: int, step: int, places: dict[tuple[int, int], Point]):
         past = [places.get((step - back, name)) for back in range(self.past - 1, 0, -1)]

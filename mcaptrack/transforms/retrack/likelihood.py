@@ -62,7 +62,7 @@ class LikelihoodPass:
             estimate_noise=options.noise_m is None,
         )
         self._shown = ShownTracks(confirm_hits, round(options.coast_s * rate), max_age, options.adapt_online)
-        self._links = OnlineLinks(self._tracker.model, 1 / rate, options.link_s, options.link_confidence)
+        self._links = OnlineLinks(self._tracker.model, 1 / rate, options.link_s, options.link_confidence, confirm_hits)
         self._assignments = Assignments()
         self._samples = LogSamples()
         self.steps: list[int] = []
@@ -183,8 +183,8 @@ class LikelihoodPass:
         last_sample = last_sample[before:]
         place = state.mean[:2]
         is_shown = self._shown(read.passed, tick, row >= 0, tracks, place) & np.isfinite(place[0])
-        names = self._links(steps, tick, tracks, State(state.mean.T, state.cov.T), row >= 0, is_shown)
-        shown = np.flatnonzero(is_shown)
+        names, is_shown = self._links(steps, tick, tracks, State(state.mean.T, state.cov.T), row >= 0, is_shown)
+        shown = np.flatnonzero(is_shown & np.isfinite(place[0]))
         shown = shown[np.lexsort((names[shown], tick[shown]))]
 
         rows = samples[last_sample[shown]].copy()

@@ -8,8 +8,8 @@ of at least a half is written from its first observation.
 
 A track that is lost is written for a while, because most come back. Those that don't have left, or were false. Which is
 likelier is learned in the same way, for each number of steps without an observation, for tracks that have not lasted
-yet, and for those that would be outside of the area in which tracks were seen so far: most of these have left it. Both
-also depend on where a track began and where it was lost (``places``).
+yet, and for those that would be outside of the area in which tracks were seen so far: most of these have left it. It
+also depends on where the track was lost (``places``).
 
 Letters: F steps, R tracks of all steps, end to end; H levels of observations, the last one of tracks that have lasted;
 A levels of steps without an observation.
@@ -25,7 +25,7 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.hulls import GrowingHull
 from mcaptrack.transforms.retrack.online_tracker import HITS, IDS, MISSED
-from mcaptrack.transforms.retrack.places import PlacesOfTracks
+from mcaptrack.transforms.retrack.places import PlacesOfLosses
 
 #: A track has lasted once it was observed for so many times as long as its confirmation takes.
 _LASTING: Final = 3
@@ -58,7 +58,7 @@ class ShownTracks:
         self._lasting = _LASTING * (confirm_hits - 1) + 1
         self._levels, self._ages = min(self._lasting, _LEVELS), min(max_age, _LEVELS)
         self._seen = GrowingHull()
-        self._places = PlacesOfTracks()
+        self._places = PlacesOfLosses()
         # By level of observations: tracks that reached the next one or terminated, and those that terminated. By inside
         # and outside and level of steps without an observation: tracks that went on from there, and that came back.
         self._counts = np.zeros((2, self._levels + 1))
@@ -83,9 +83,9 @@ class ShownTracks:
         age = np.where(is_observed, 0, -(-np.minimum(tracks[MISSED], self._max_age) * self._ages // self._max_age))
         lasts, returns = self._learn(passed, tick, np.stack([tracks[IDS], level, age, outside]))
         lasting, where = level >= self._levels, outside.astype(np.intp)
-        began, lost = self._places(passed, tick, tracks[IDS], lasting, is_observed, xy_m)
-        early = _at_odds(lasts[tick, level], began) >= 0.5
-        comes_back = _at_odds(returns[tick, where, age], lost) * _at_odds(lasts[tick, next_level], began) >= 0.5
+        ratio = self._places(passed, tick, tracks[IDS], is_observed, xy_m)
+        early = lasts[tick, level] >= 0.5
+        comes_back = _at_odds(returns[tick, where, age], ratio) * lasts[tick, next_level] >= 0.5
         stays = may_coast & ((lasting & ~outside) | comes_back)
         return np.asarray(np.where(is_observed, early | is_confirmed, stays))
 
