@@ -12,7 +12,7 @@ Positions = dict[int, tuple[float, float]]
 
 
 def test_the_ratio_of_odds_by_hand():
-    """Six of ten went well; all four here did: (4 / 0.6 + 8) / 8, with 7 of 12 as the share (one more of each)."""
+    """Six of ten went well, so the share is 7 of 12 (one more of each); at the first place all four did."""
     odds = PlaceOdds()
     assert odds.ratio((0.0, 0.0)) == 1.0
     for place, good, bad in (((0.0, 0.0), 4, 0), ((50.0, 0.0), 2, 4)):

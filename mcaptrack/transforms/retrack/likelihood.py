@@ -184,7 +184,7 @@ class LikelihoodPass:
         place = state.mean[:2]
         is_shown = self._shown(read.passed, tick, row >= 0, tracks, place) & np.isfinite(place[0])
         names, is_shown = self._links(steps, tick, tracks, State(state.mean.T, state.cov.T), row >= 0, is_shown)
-        shown = np.flatnonzero(is_shown & np.isfinite(place[0]))
+        shown = np.flatnonzero(is_shown)
         shown = shown[np.lexsort((names[shown], tick[shown]))]
 
         rows = samples[last_sample[shown]].copy()

@@ -119,8 +119,9 @@ class OnlineLinks:
         first = np.full(len(known.ids), count)  # the row from which on a track is written in any case
         written = np.flatnonzero(is_written)
         np.minimum.at(first, which[written], written)
-        has_name = np.array([track in self._names for track in known.ids.tolist()], bool)
-        rows = np.flatnonzero((is_written | is_observed) & (np.arange(count) <= first[which]) & ~has_name[which])
+        rows = np.flatnonzero(
+            (is_written | is_observed) & (np.arange(count) <= first[which]) & ~self._are_named(known.ids)[which]
+        )
         of = which[rows]
         new = known.take(of)._replace(last=steps[tick[rows]], hits=tracks[HITS, rows], state=state.take(rows))
         over = np.flatnonzero(known.over < _NEVER)
@@ -171,12 +172,8 @@ class OnlineLinks:
             row, gap_s = row + low, np.asarray(gaps_s[row, one], np.float64)
             before, after = lost.state.take(one), new.state.take(row)
             is_near = linking.are_in_reach(before, after, gap_s)
-            one, row, gap_s, before, after = (
-                one[is_near],
-                row[is_near],
-                gap_s[is_near],
-                *(states.take(is_near) for states in (before, after)),
-            )
+            one, row, gap_s = one[is_near], row[is_near], gap_s[is_near]
+            before, after = before.take(is_near), after.take(is_near)
             # nothing is known of the velocity of what was observed once: it may be that of the lost one
             single = new.hits[row] == 1
             after.mean[single, 2:], after.cov[single, 2] = before.mean[single, 2:], before.cov[single, 2]
