@@ -16,8 +16,9 @@ from typing import Any, NamedTuple
 import pytest
 
 from mcaptrack import environment
+from mcaptrack.cli.group import ENTRIES
 from mcaptrack.cli.many import NAMES
-from mcaptrack.cli.most_used import FIRST_PANEL, LAST_PANELS, MOST_USED
+from mcaptrack.cli.most_used import FIRST_PANEL, LAST_PANELS
 from mcaptrack.cli.stages import shown_default
 from mcaptrack.transforms import STAGES
 from tests.commands import GROUP, call
@@ -45,6 +46,11 @@ class TestHelp:
     def test_the_first_page_names_every_command(self):
         words = call("--help").out
         assert [name for name in COMMANDS if not re.search(rf"│ {name} ", words)] == []
+
+    @EVERY_COMMAND
+    def test_the_line_of_a_command_on_the_first_page_is_the_first_of_its_own_help(self, command):
+        (line,) = (one.summary for one in ENTRIES if one.name == command)
+        assert line == " ".join(COMMANDS[command].help.split("\n\n")[0].split())
 
     @EVERY_COMMAND
     @pytest.mark.parametrize("width", one_in(2, ["80", "120"]))
@@ -91,7 +97,7 @@ class TestHelp:
     def test_the_options_that_most_people_need_come_first(self, command):
         """Commands with many options begin with the file to write, what is read, and the methods to choose from."""
         first = [option.name for option in shown(command) if option.rich_help_panel == FIRST_PANEL]
-        assert first == list(MOST_USED.get(command, ()))
+        assert first == list(COMMANDS[command].most_used)
         own = [option.name for option in shown(command) if option.rich_help_panel not in LAST_PANELS[1:]]
         choices = {"detector", "tracker", "retracker", "predictor", "output", "topic", "force", "truth", "profile"}
         if len(own) > 9:

@@ -6,11 +6,10 @@ import inspect
 import os
 import sys
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
 import pytest
 
-from mcaptrack.cli import app
 from mcaptrack.cli.inputs import refuse_url
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms import TRANSFORMS
@@ -24,9 +23,8 @@ STAGES = TRANSFORMS
 
 def takes_paths(command: str) -> list[Any]:
     """Return the parameters of a command that have type Path, except config, which is read earlier."""
-    callback = inspect.unwrap(next(c.callback for c in app.registered_commands if c.name == command))
-    hints = getattr(callback, "__annotations__", {}) if command in STAGES else get_type_hints(callback)
-    paths = {name for name, hint in hints.items() if "Path" in str(hint)} - {"config"}
+    parameters = inspect.signature(COMMANDS[command].callback).parameters
+    paths = {name for name, one in parameters.items() if "Path" in str(one.annotation)} - {"config"}
     return [p for p in COMMANDS[command].params if p.name in paths or (command, p.name) in WORDS]
 
 

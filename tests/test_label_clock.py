@@ -25,6 +25,7 @@ from mcap.writer import Writer
 from typer.testing import CliRunner
 
 from mcaptrack import foxglove, log
+from mcaptrack.choices import Role
 from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import FPS_RANGE
@@ -33,7 +34,7 @@ from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest import IngestOptions, ingest, label_frames
 from mcaptrack.sources.ingest.labels.box_rows import OTHERS
 from mcaptrack.sources.ingest.labels.camera import timeline_of
-from mcaptrack.sources.ingest.labels.content import FORMATS_3D, Format, Role
+from mcaptrack.sources.ingest.labels.content import FORMATS_3D, Format
 from mcaptrack.sources.ingest.labels.formats import READERS
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline

@@ -22,6 +22,7 @@ import pytest
 
 import mcaptrack
 from mcaptrack import log
+from mcaptrack.api.declared import bare, hints_of
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.many import NAMES
 from mcaptrack.errors import McaptrackError
@@ -341,7 +342,7 @@ class TestRefused:
     @pytest.mark.parametrize("name", FUNCTIONS)
     def test_text_that_is_not_a_choice_is_refused(self, name, place):
         function = getattr(mcaptrack, name)
-        hints = {} if name == "query" else typing.get_type_hints(function)
+        hints = {parameter: bare(hint) for parameter, hint in hints_of(function).items()}
         for parameter, hint in hints.items():
             kinds = [hint, *typing.get_args(hint)]
             if any(typing.get_origin(kind) is typing.Literal for kind in kinds) and str not in kinds:

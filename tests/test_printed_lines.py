@@ -905,7 +905,7 @@ class TestNamesOfPlugins:
     STAGE = STAGES["track"]
 
     def names(self, *files: ConfigFile) -> list[str]:
-        return _names_of_settings(self.STAGE, files, {"tracker": 1, "min-iou": 1})
+        return _names_of_settings(self.STAGE, files, lambda: ["tracker", "min-iou"])
 
     def test_files_and_environment_name_them_in_order_and_once(self, monkeypatch):
         trusted = ConfigFile(Path("u"), {"track": {"tracker": "mod:A"}, "run": {"tracker": "b"}}, True)

@@ -13,9 +13,9 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from mcaptrack import log
+from mcaptrack.choices import Role
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest import IngestOptions, ingest
-from mcaptrack.sources.ingest.labels.content import Role
 from mcaptrack.transforms import TRANSFORMS
 from tests.bags import camera_bag
 from tests.commands import call

@@ -1,7 +1,7 @@
 """Check the arguments of functions when they are called: choices, ranges of numbers, progress.
 
-The command line checks its options itself, by the same ranges. Without these checks ``form="parqet"`` would be an error
-of the program, or change nothing.
+Ranges stand in the annotations (``declared.Option``), from which the command line takes them, too. Without these checks
+``form="parqet"`` would be an error of the program, or change nothing.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from collections.abc import Callable, Iterable
 from difflib import get_close_matches
 from functools import cache, wraps
 from numbers import Integral, Real
-from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin
 
+from mcaptrack.api.declared import bare, hints_of, option_of
 from mcaptrack.errors import McaptrackError
 
 P = ParamSpec("P")
@@ -50,8 +51,8 @@ def checked(**ranges: tuple[float, float]) -> Callable[[Callable[P, T]], Callabl
                     _check_choice(name, value, choices)
                 if kinds and set(kinds) <= {str, type(None)} and not isinstance(value, tuple(kinds)):
                     raise McaptrackError(f"`{name}=` is text, not {value!r:.40}")
-                if name in ranges:
-                    _check_range(name, value, ranges[name], is_whole=float not in kinds)
+                if ends := ranges.get(name) or _ranges(function).get(name):
+                    _check_range(name, value, ends, is_whole=float not in kinds)
                 if name == "progress" and not callable(value):
                     raise McaptrackError(
                         f"`progress=` is called as progress(stage, done, total), which {value!r:.40} is not"
@@ -63,15 +64,32 @@ def checked(**ranges: tuple[float, float]) -> Callable[[Callable[P, T]], Callabl
     return decorate
 
 
+def declared(*, most_used: tuple[str, ...] = ()) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Declare a command: a function that is ``checked``. The options ``most_used`` come first in its help."""
+
+    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        call = checked()(function)
+        vars(call)["most_used"] = most_used
+        return call
+
+    return decorate
+
+
 @cache
 def _kinds(function: Callable[..., object]) -> dict[str, tuple[Any, ...]]:
     """The types that each parameter may have. That of the result is left out: it may be known to type checkers only."""
-    hints = {name: hint for name, hint in function.__annotations__.items() if name != "return"}
-    known = get_type_hints(types.SimpleNamespace(__annotations__=hints), function.__globals__)
+    known = {name: bare(hint) for name, hint in hints_of(function).items()}
     return {
         name: get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
         for name, hint in known.items()
     }
+
+
+@cache
+def _ranges(function: Callable[..., object]) -> dict[str, tuple[float, float]]:
+    """The ranges that the annotations of a function declare."""
+    options = {name: option_of(hint) for name, hint in hints_of(function).items()}
+    return {name: (one.least, one.most) for name, one in options.items() if one.is_bounded}
 
 
 def _check_choice(name: str, value: object, choices: list[Any]) -> None:

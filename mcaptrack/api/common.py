@@ -4,30 +4,23 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
 from mcaptrack import log as logs
 from mcaptrack import notices
+from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_special, refuse_url
 from mcaptrack.location import Location, Url, is_remote, parse
 from mcaptrack.notices import Notice
 
-PathLike = str | os.PathLike[str]
-#: Called with the name of a stage, the amount that is done, and the total (None if it is not known).
-Progress = Callable[[str, float, float | None], None]
-
 #: Where routine notes go ("/camera/tracks is missing: running track"): INFO, and DEBUG for details.
 _LOGGER: Final = logging.getLogger("mcaptrack")
 #: The largest offset of a clock, a day: more is no offset, but another recording.
 _MOST_OFFSET_S: Final = 86_400.0
-
-
-def no_progress(stage: str, done: float, total: float | None) -> None:
-    """Ignore the progress."""
 
 
 def as_path(path: PathLike) -> Path:

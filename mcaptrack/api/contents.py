@@ -9,7 +9,8 @@ from typing import Any, Literal
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.common import PathLike, as_location, warnings_about
+from mcaptrack.api.common import as_location, warnings_about
+from mcaptrack.api.options import PathLike
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.transform_series import TransformSeries
 from mcaptrack.location import Location

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import PathLike, as_location, names_of
+from mcaptrack.api.common import as_location, names_of
+from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
 from mcaptrack.notices import warn

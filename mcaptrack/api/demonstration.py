@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Final, Literal
 
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import Notes, PathLike, Progress, as_path, no_progress
+from mcaptrack.api.common import Notes, as_path
 from mcaptrack.api.ingesting import ingest
+from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.api.scores import Scores
 from mcaptrack.api.scoring import evaluate
 from mcaptrack.api.whole import run

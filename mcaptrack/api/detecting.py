@@ -3,27 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated
 
-from mcaptrack.api.checked import checked
-from mcaptrack.api.common import PathLike, Progress, no_progress
-from mcaptrack.api.running import Option, RunResult, run_stage, transform_of
+from mcaptrack.api.checked import declared
+from mcaptrack.api.declared import PYTHON_ONLY
+from mcaptrack.api.options import Camera, EachLog, Force, Output, Reports, Sidecar, To, Topic, Value, no_progress
 from mcaptrack.transforms import Transform
 
+if TYPE_CHECKING:
+    from mcaptrack.api.running import RunResult
 
-@checked()
+#: Transforms of other stages, for channels that are missing.
+Stages = Annotated[Mapping[str, str | Transform] | None, PYTHON_ONLY]
+
+
+@declared(most_used=("detector", "threshold", "classes", "min_score", "output", "topic", "to", "camera", "force"))
 def detect(
-    log: PathLike,
+    log: EachLog,
     *,
     detector: str | Transform | None = None,
-    topic: str | None = None,
-    to: str | None = None,
-    camera: str | None = None,
-    output: PathLike | None = None,
-    sidecar: bool | None = None,
-    force: bool = False,
-    stages: Mapping[str, str | Transform] | None = None,
-    progress: Progress = no_progress,
-    **options: Option,
+    topic: Topic = None,
+    to: To = None,
+    camera: Camera = None,
+    output: Output = None,
+    sidecar: Sidecar = None,
+    force: Force = False,
+    stages: Stages = None,
+    progress: Reports = no_progress,
+    **options: Value,
 ) -> RunResult:
     """Detect what moves in the video of a log.
 
@@ -66,11 +73,17 @@ def detect(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack detect log.mcap --detector median
+
     >>> import mcaptrack
     >>> mcaptrack.detect("log.mcap", detector="mog2", output="boxes.mcap").stages
     ('detect',)
 
     """
+    from mcaptrack.api.running import run_stage, transform_of
+
     return run_stage(
         "detect",
         transform_of("detect", detector, options),
@@ -86,20 +99,20 @@ def detect(
     )
 
 
-@checked()
+@declared(most_used=("output", "topic", "to", "camera", "force"))
 def motion(
-    log: PathLike,
+    log: EachLog,
     *,
-    transform: Transform | None = None,
-    topic: str | None = None,
-    to: str | None = None,
-    camera: str | None = None,
-    output: PathLike | None = None,
-    sidecar: bool | None = None,
-    force: bool = False,
-    stages: Mapping[str, str | Transform] | None = None,
-    progress: Progress = no_progress,
-    **options: Option,
+    transform: Annotated[Transform | None, PYTHON_ONLY] = None,
+    topic: Topic = None,
+    to: To = None,
+    camera: Camera = None,
+    output: Output = None,
+    sidecar: Sidecar = None,
+    force: Force = False,
+    stages: Stages = None,
+    progress: Reports = no_progress,
+    **options: Value,
 ) -> RunResult:
     """Estimate how the camera moves, from picture to picture.
 
@@ -144,11 +157,17 @@ def motion(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack motion log.mcap
+
     >>> import mcaptrack
     >>> mcaptrack.motion("log.mcap", output="motion.mcap").stages
     ('motion',)
 
     """
+    from mcaptrack.api.running import run_stage, transform_of
+
     return run_stage(
         "motion",
         transform_of("motion", transform, options),

@@ -9,18 +9,9 @@ from typing import Literal, cast
 
 from mcaptrack import log as logs
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import (
-    PathLike,
-    Progress,
-    as_location,
-    log_location,
-    names_of,
-    no_progress,
-    optional_path,
-    warn_unused,
-    warnings_about,
-)
+from mcaptrack.api.common import as_location, log_location, names_of, optional_path, warn_unused, warnings_about
 from mcaptrack.api.delta import add_to_delta
+from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, place_of
 from mcaptrack.location import Location

@@ -9,7 +9,8 @@ from typing import Final
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import Notes, PathLike, Progress, clock_offsets, no_progress, split_names
+from mcaptrack.api.common import Notes, clock_offsets, split_names
+from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.api.running import RunResult, Where, change, transform_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.fixed_frame import BoxesRead

@@ -7,37 +7,35 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from mcaptrack import log as logs
-from mcaptrack.api.checked import checked
-from mcaptrack.api.common import (
-    PathLike,
-    Progress,
-    as_path,
-    log_output,
-    no_progress,
-    optional_path,
-    paths_of,
-    warn_unused,
-    warnings_about,
-)
+from mcaptrack.api.checked import declared
+from mcaptrack.api.declared import OneOfMany, Option
+from mcaptrack.api.options import FILES, LABELS, PathLike, Reports, Sidecar, no_progress, output
+from mcaptrack.choices import ImageFormat, InputRole, LabelFormat, LengthUnit, Point
 from mcaptrack.errors import McaptrackError, call
-from mcaptrack.evaluation.corrections import changes_in
-from mcaptrack.files import is_same_file, refuse_overwrite
-from mcaptrack.geometry import boxes, clocks
-from mcaptrack.geometry.plane import Point
 from mcaptrack.notices import Notice, warn
-from mcaptrack.sources.corrections import CORRECTED
-from mcaptrack.sources.ingest import Format, ImageFormat, IngestOptions, IngestReport, InputRole
-from mcaptrack.sources.ingest import ingest as make_log
-from mcaptrack.sources.ingest.bags.metadata_update import update_metadata
-from mcaptrack.sources.ingest.calibration import LengthUnit
-from mcaptrack.sources.ingest.labels.columns import check_keys, parse_columns
-from mcaptrack.sources.ingest.labels.wanted import WantedClasses
-from mcaptrack.sources.ingest.sidecar import SidecarChoice
+
+if TYPE_CHECKING:
+    from mcaptrack.sources.ingest import IngestReport
 
 _EPOCH: Final = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
+#: Headings in the help: how pictures are stored, and how label files are read.
+_PICTURES: Final = "Pictures"
+_READING: Final = "Reading of label files"
+#: What a file in the working folder may give for ``fps``.
+_FPS: Final = r"[0-9]+([.][0-9]+)?(/[0-9]+)?"
+
+Source = Annotated[
+    PathLike,
+    OneOfMany(
+        "inputs",
+        "INPUT",
+        "Videos, folders of images, ROS bags, MCAP files, or label files (YOLO: a folder), patterns, or - for a list "
+        "of these on stdin; each becomes a log.",
+    ),
+]
+_Labels = Annotated[PathLike | None, Option(LABELS)]
 
 
 @dataclass(frozen=True)
@@ -77,109 +75,132 @@ class IngestResult:
     changes: Mapping[str, Any] | None = None
 
 
-@checked(quality=(1, 100), keyframe_interval_s=(0.01, 60), first_frame=(0, 10**12), frames=(1, 10_000_000))
+@declared(
+    most_used=("output", "into", "role", "ground_plane", "truth", "detections", "fps", "camera", "force"),
+)
 def ingest(
-    source: PathLike,
-    output: PathLike | None = None,
+    source: Source,
+    output: Annotated[PathLike | None, output("INPUT.mcap in the working folder")] = None,
     *,
-    camera: str = "camera",
-    fps: float | str | Fraction | None = None,
-    start_time: float | str | dt.datetime | None = None,
-    image_format: ImageFormat = "auto",
-    quality: int | None = None,
-    keyframe_interval_s: float | None = None,
-    ground_plane: PathLike | None = None,
-    calibration: PathLike | Sequence[PathLike] | None = None,
-    calibration_name: str | None = None,
-    calibration_unit: LengthUnit = "auto",
-    point: Point = "foot",
-    detections: PathLike | None = None,
-    tracks: PathLike | None = None,
-    truth: PathLike | None = None,
-    motion: PathLike | None = None,
-    label_format: Format = "auto",
-    first_frame: int | None = None,
-    frames: int | None = None,
-    columns: str | Mapping[str, str] | None = None,
-    size: str | tuple[int, int] | None = None,
-    classes: str | None = None,
-    frame: str | None = None,
-    scene: str | None = None,
-    role: InputRole | None = None,
-    into: PathLike | None = None,
-    sidecar: bool | None = None,
-    force: bool = False,
-    progress: Progress = no_progress,
+    camera: Annotated[str, Option(FILES)] = "camera",
+    fps: Annotated[float | str | Fraction | None, Option(_PICTURES, tuning=_FPS, shown=False)] = None,
+    start_time: Annotated[float | str | dt.datetime | None, Option(_PICTURES)] = None,
+    image_format: Annotated[ImageFormat, Option(_PICTURES, tuning=True)] = "auto",
+    quality: Annotated[int | None, Option(_PICTURES, 1, 100, tuning=True)] = None,
+    keyframe_interval_s: Annotated[float | None, Option(_PICTURES, 0.01, 60, tuning=True)] = None,
+    ground_plane: _Labels = None,
+    calibration: Annotated[PathLike | Sequence[PathLike] | None, Option(LABELS, metavar="FILE", shown=False)] = None,
+    calibration_name: Annotated[str | None, Option(LABELS, metavar="NAME")] = None,
+    calibration_unit: Annotated[LengthUnit, Option(LABELS, tuning=True)] = "auto",
+    point: Annotated[Point, Option(LABELS, tuning=True)] = "foot",
+    detections: _Labels = None,
+    tracks: _Labels = None,
+    truth: _Labels = None,
+    motion: Annotated[PathLike | None, Option(_PICTURES)] = None,
+    label_format: Annotated[LabelFormat, Option(_READING, flag="format", tuning=True)] = "auto",
+    first_frame: Annotated[int | None, Option(_READING, 0, 10**12, tuning=True)] = None,
+    frames: Annotated[int | None, Option(_READING, 1, 10_000_000, tuning=True)] = None,
+    columns: Annotated[str | Mapping[str, str] | None, Option(_READING)] = None,
+    size: Annotated[str | tuple[int, int] | None, Option(_READING, shown=False)] = None,
+    classes: Annotated[str | None, Option(_READING)] = None,
+    frame: Annotated[str | None, Option(_READING)] = None,
+    scene: Annotated[str | None, Option(_READING, shown=False)] = None,
+    role: Annotated[InputRole | None, Option(LABELS, flag="as")] = None,
+    into: Annotated[PathLike | None, Option(FILES)] = None,
+    sidecar: Sidecar = None,
+    force: Annotated[bool, Option(FILES)] = False,
+    progress: Reports = no_progress,
 ) -> IngestResult:
     """Make a log of a video, a folder of images, a ROS bag, an MCAP file, or a label file.
+
+    Writes /camera/video, /camera/ground_plane, /camera/calibration, /camera/detections, /camera/tracks, /camera/truth
+    and /camera/motion, as far as they are given. Streams that viewers can play (H.264, VP9, AV1) are copied without
+    re-encoding; others are re-encoded as H.264, and a note says why. Timestamps are those of the file, exact to the
+    nanosecond.
+
+    From a ROS 1 bag, a rosbag2 folder or database, or an MCAP file every message is copied unchanged, with its
+    timestamps; labels belong to its only camera, or to the one that ``camera`` names.
 
     Parameters
     ----------
     source : path
         The input.
     output : path, optional
-        The log to write, by default SOURCE.mcap in the working folder.
+        Write to this file; the input stays unchanged.
     camera : str, default "camera"
-        Name of the camera; its topics begin with /NAME.
+        Name of the camera; its channels begin with /NAME.
     fps : float, str or Fraction, optional
-        Frames per second, such as 25 or "30000/1001", instead of the timestamps of the file.
+        Frames per second, such as 25 or 30000/1001, instead of the file's own times.
     start_time : float, str or datetime, optional
-        When the recording began: seconds since 1970, or 2026-05-01T12:00:00Z. By default as the file says, or 0.
+        When the recording began (2026-05-01T12:00:00Z, or seconds since 1970); by default as the file says, or 0.
     image_format : {"auto", "h264", "h265", "jpeg", "png"}, default "auto"
-        How pictures are stored.
+        How pictures are stored. auto: H.264, VP9 and AV1 as they are where viewers play them, otherwise H.264; h264:
+        H.264 alone; h265: like auto, and H.265 as it is; jpeg, png: one image per picture.
     quality : int, optional
-        Quality of encoding: for H.264 the constant rate factor, 1 (best) to 51; for JPEG 1 to 100 (best).
+        Quality of encoding: for H.264 the constant rate factor, 1 (best) to 51; for JPEG 1 to 100 (best); by default
+        23, of JPEG 90.
     keyframe_interval_s : float, optional
-        Longest time between keyframes in seconds.
+        Longest time between keyframes, in seconds; streams with longer gaps are re-encoded; by default 2 if copied, 1
+        if encoded.
     ground_plane : path, optional
         File with a 3x3 homography from pixels to metres on the ground.
     calibration : path or sequence of path, optional
-        Files with the calibration of the camera, of OpenCV (XML, YAML or JSON), ROS (``camera_info``) or Kalibr:
-        intrinsics and, in the same file or another one, its pose in the world, from which the ground plane follows
-        (z = 0).
+        File with the calibration of the camera, of OpenCV, ROS (camera_info) or Kalibr; two if intrinsics and the pose
+        in the world are two files. The ground plane (z = 0) follows from both.
     calibration_name : str, optional
-        Which camera, if a file has several, such as "cam1"; by default the one of this topic or name.
+        Which camera of a calibration of several, such as cam1; by default the one of the same topic or name.
     calibration_unit : {"auto", "m", "cm", "mm"}, default "auto"
-        Unit of lengths of the pose. By default the one in which the camera has a usual height, with a warning if that
-        isn't metres.
+        Unit of lengths of the pose. auto: that in which the camera has a usual height.
+
+        A warning says so if that isn't metres.
     point : {"foot", "center"}, default "foot"
         Which point of a box touches the ground.
-    detections, tracks, truth : path, optional
-        Label files with detections, tracks and ground truth.
+    detections : path, optional
+        Label file with detections: boxes without ids.
+    tracks : path, optional
+        Label file with tracks: boxes or positions with ids.
+    truth : path, optional
+        Label file with ground truth: boxes or positions with true ids.
     motion : path, optional
         File with the motion of the camera: a row per frame, of its number (from 0) and the 2x3 transform from pixels of
         the frame before.
     label_format : {"auto", "mot", "kitti", "sdd", "trajnet", "obsmat", "coco", "cvat", "yolo", "supervision", ...}
-        Format of the label files, by default "auto": as their content tells. "csv" is any table with a header. Those of
-        3D boxes are "csv", "kitti-3d", "nuscenes" and "argoverse".
+        Format of the label files. auto: as the content tells; csv: any table with a header.
+
+        Those of 3D boxes are "csv", "kitti-3d", "nuscenes" and "argoverse".
     first_frame : int, optional
-        Number of the first picture in label files.
+        Number of the first picture in label files; by default 1 in MOTChallenge, otherwise 0.
     frames : int, optional
-        Number of frames, if there are labels but no pictures.
-    columns : dict of str to str, or str, optional
-        Names of the columns of label files with a header, by what they hold: ``{"x": "left", "frame": "n"}`` or
-        "x=left,frame=n". There are x, y, w, h, x2, y2, cx, cy, frame, t (seconds), score, class, name (of the class)
-        and id; of 3D boxes x_m, y_m, z_m, length_m, width_m, height_m, heading_rad or heading_deg, qw, qx, qy, qz,
-        vx_m_per_s and vy_m_per_s.
-    size : tuple of int, or str, optional
-        Width and height of the pictures, (1920, 1080) or "1920x1080", if there are only labels in shares of them.
+        Number of frames, if there are labels but no pictures; by default as seqinfo.ini says, otherwise up to the last
+        label.
+    columns : str or dict of str to str, optional
+        Columns of label files with a header: x=left,y=top,w=width,h=height,frame=n. Also x2, y2, cx, cy, t (seconds),
+        score, class, name (of the class), id; 3D boxes: x_m, y_m, z_m, length_m, width_m, height_m, heading_rad,
+        heading_deg, qw to qz; by default guessed from the header.
+
+        A dict has what they hold as keys: ``{"x": "left", "frame": "n"}``.
+    size : str or tuple of int, optional
+        Width and height of the pictures, like 1920x1080, if there are only labels in shares of them.
     classes : str, optional
-        Classes of tracks and ground truth, by name or number with commas between them, or "all"; by default "person",
-        and all of 3D boxes. Detections keep all.
+        Classes of tracks and ground truth, by name or number, as in person,car; all for every one; by default person,
+        of 3D boxes all.
+
+        Detections keep all.
     frame : str, optional
-        Frame of reference of 3D boxes; by default that of the format, or else the root of the log's transforms.
+        Frame of reference of 3D boxes; by default that of the format, or the root of the log's transforms.
     scene : str, optional
-        Name of the scene, if the labels are of nuScenes.
+        Name of the scene, of nuScenes.
     role : {"detections", "tracks", "truth", "corrections", "motion", "calibration"}, optional
-        What ``source`` holds, if it is a label file; by default as its ids tell. The motion of a camera, its
-        calibration and corrections of its tracks go ``into`` a log; ``run`` then takes corrected tracks in place of
-        those that it found.
+        What the input holds, if it is a label file. corrections: tracks of the log that a person has corrected; run
+        then takes them over; by default as its ids tell.
+
+        The motion of a camera, its calibration and corrections of its tracks go ``into`` a log.
     into : path, optional
-        Add to this log instead of making a new one.
+        Add to this log, instead of making a new one.
     sidecar : bool, optional
         With ``into``: write into LOG.results.mcap beside the log (True) or into the log (False).
     force : bool, default False
-        Overwrite the log; with ``into``, replace the channels that it has already.
+        Overwrite the log; with ``into``, replace the channels it has already.
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
 
@@ -195,12 +216,26 @@ def ingest(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack ingest video.mp4 --ground-plane homography.txt --truth gt.txt -o log.mcap
+
     >>> import mcaptrack
     >>> result = mcaptrack.ingest("video.mp4", "new.mcap", ground_plane="plane.txt", truth="truth.txt")
     >>> sorted(result.messages)
     ['/camera/ground_plane', '/camera/truth', '/camera/video']
 
     """
+    from mcaptrack import log as logs
+    from mcaptrack.api.common import as_path, log_output, optional_path, paths_of, warn_unused, warnings_about
+    from mcaptrack.files import is_same_file, refuse_overwrite
+    from mcaptrack.sources.ingest import IngestOptions
+    from mcaptrack.sources.ingest import ingest as make_log
+    from mcaptrack.sources.ingest.bags.metadata_update import update_metadata
+    from mcaptrack.sources.ingest.labels.columns import check_keys, parse_columns
+    from mcaptrack.sources.ingest.labels.wanted import WantedClasses
+    from mcaptrack.sources.ingest.sidecar import SidecarChoice
+
     if into is not None and output is not None:
         raise McaptrackError("`into=` adds to a log in place; it does not go with `output=`")
     if into is None and sidecar is not None:
@@ -279,6 +314,10 @@ def ingest(
 
 def _changes(path: Path, report: IngestReport) -> dict[str, Any] | None:
     """Compare corrections that were written with their tracks, and say in a line of the report what they changed."""
+    from mcaptrack import log as logs
+    from mcaptrack.evaluation.corrections import changes_in
+    from mcaptrack.sources.corrections import CORRECTED
+
     (topic,) = (topic for topic in report.messages if topic.endswith(f"/{CORRECTED}"))
     with logs.read(path) as opened:
         found = changes_in(opened, topic)
@@ -296,6 +335,8 @@ def default_log(source: Path) -> Path:
 
 def parse_fps(fps: float | str | Fraction | None) -> Fraction | None:
     """Return frames per second as a fraction, from 25, "29.97" or "30000/1001"."""
+    from mcaptrack.geometry import clocks
+
     try:
         return None if fps is None else clocks.parse_fps(str(fps))
     except ValueError:
@@ -306,6 +347,8 @@ def parse_fps(fps: float | str | Fraction | None) -> Fraction | None:
 
 def parse_size(size: str | tuple[int, int] | None) -> tuple[int, int] | None:
     """Return width and height from "1920x1080" or two numbers."""
+    from mcaptrack.geometry import boxes
+
     if size is None:
         return None
     found = boxes.parse_size(size if isinstance(size, str) else "x".join(map(str, size)))
@@ -316,6 +359,8 @@ def parse_size(size: str | tuple[int, int] | None) -> tuple[int, int] | None:
 
 def parse_start_time(time: float | str | dt.datetime | None) -> int | None:
     """Return nanoseconds since 1970 from ISO 8601, seconds since 1970, or a datetime (UTC unless it says otherwise)."""
+    from mcaptrack.geometry import clocks
+
     if time is None:
         return None
     try:

@@ -9,17 +9,9 @@ from typing import Any, Final
 
 from mcaptrack import log as logs
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import (
-    PathLike,
-    Progress,
-    detail,
-    locations_of,
-    log_location,
-    no_progress,
-    optional_path,
-    warn_unused,
-)
+from mcaptrack.api.common import detail, locations_of, log_location, optional_path, warn_unused
 from mcaptrack.api.fleet_page import page_about
+from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, publish_bytes, refuse_overwrite
 from mcaptrack.location import Location, local_name

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from mcaptrack import log as logs
 from mcaptrack import tables
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import Progress, names_of, no_progress
+from mcaptrack.api.common import names_of
 from mcaptrack.api.fetching import FetchedMessage, fetch_message, shown_pictures
 from mcaptrack.api.notebook import Choice, Player, show_log, show_tables
+from mcaptrack.api.options import Progress, no_progress
 from mcaptrack.api.supervision import supervision_of
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.location import Location, Url

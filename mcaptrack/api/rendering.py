@@ -4,36 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
-from mcaptrack import log as logs
-from mcaptrack import pipeline
-from mcaptrack.api.checked import checked
-from mcaptrack.api.common import (
-    PathLike,
-    Progress,
-    log_location,
-    names_of,
-    no_progress,
-    optional_path,
-    warn_unused,
-    warnings_about,
-)
+from mcaptrack.api.checked import declared
+from mcaptrack.api.declared import Option
+from mcaptrack.api.options import Camera, EachLog, Force, PathLike, Reports, no_progress, output
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import is_same_file, refuse_overwrite
-from mcaptrack.foxglove.views import SCENE_SUFFIX, SUFFIX
-from mcaptrack.location import Location, local_name
+from mcaptrack.location import Location
 from mcaptrack.notices import Notice
-from mcaptrack.sources.cameras import camera_at
-from mcaptrack.viewing.blur.recording import blurrable, write_blurred_log
-from mcaptrack.viewing.comparing import compare as draw_comparison
-from mcaptrack.viewing.comparing import find_panels
-from mcaptrack.viewing.heat_map import draw_heat_map
-from mcaptrack.viewing.rendering import RenderOptions
-from mcaptrack.viewing.rendering import render as draw_video
-from mcaptrack.viewing.rendering import render_from_above as draw_from_above
+
+if TYPE_CHECKING:
+    from mcaptrack import log as logs
+
+_PICTURE: Final = "Pictures"
 
 
 @dataclass(frozen=True)
@@ -65,67 +49,74 @@ class RenderResult:
     blurred: tuple[str, ...] = ()
 
 
-@checked(width=(16, 16384), max_fps=(0.01, 1000), start_s=(0, 1e9), end_s=(0, 1e9))
+@declared(
+    most_used=("output", "topic", "compare", "heatmap", "blur", "width", "start_s", "end_s", "force"),
+)
 def render(
-    log: PathLike,
-    output: PathLike | None = None,
+    log: EachLog,
+    output: Annotated[PathLike | None, output("LOG.mp4 or LOG.gif beside the log")] = None,
     *,
-    topic: str | Sequence[str] | None = None,
-    compare: bool = False,
-    heatmap: bool = False,
-    blur: Literal["people"] | None = None,
-    width: int | None = None,
-    max_fps: float | None = None,
-    start_s: float = 0.0,
-    end_s: float | None = None,
-    gif: bool = False,
-    camera: str | None = None,
-    force: bool = False,
-    progress: Progress = no_progress,
+    topic: Annotated[str | Sequence[str] | None, Option(_PICTURE, shown="as in the layout")] = None,
+    compare: Annotated[bool, Option(_PICTURE)] = False,
+    heatmap: Annotated[bool, Option(_PICTURE)] = False,
+    blur: Annotated[Literal["people"] | None, Option(_PICTURE, shown="off")] = None,
+    width: Annotated[int | None, Option(_PICTURE, 16, 16384, tuning=True)] = None,
+    max_fps: Annotated[float | None, Option(_PICTURE, 0.01, 1000, tuning=True)] = None,
+    start_s: Annotated[float, Option(_PICTURE, 0, 1e9, tuning=True)] = 0.0,
+    end_s: Annotated[float | None, Option(_PICTURE, 0, 1e9, tuning=True)] = None,
+    gif: Annotated[bool, Option(_PICTURE)] = False,
+    camera: Camera = None,
+    force: Force = False,
+    progress: Reports = no_progress,
 ) -> RenderResult:
-    """Draw boxes, trails and predictions on the video of a log, or from above if it has none.
+    """Draw boxes, trails and predictions on the video of a log: LOG.mp4, or a GIF.
 
-    Tracks of 3D boxes are drawn on the pictures of a calibrated camera; without one, they are seen from above in their
-    frame of reference, around the robot.
+    Draws the views that Foxglove and Lichtblick show, in the same colours. Tracks of 3D boxes are drawn on the pictures
+    of a calibrated camera; without one, they are seen from above in their frame of reference, around the robot.
 
     With ``compare`` SORT's tracks, re-tracked ones and the ground truth stand side by side. With ``heatmap`` it is a
-    picture of where people spend their time.
+    picture (.png, .jpg) of where people spend their time.
 
-    With ``blur="people"`` all people that any channel of the log has boxes of are hidden, also while they are missed
-    for a few pictures. To a name that ends with .mcap this writes a copy of the log with such pictures, in which
-    everything else is as before.
+    With ``blur`` people all people that any channel of the log has boxes of are hidden, also while they are missed for
+    a few pictures, and nothing is drawn unless ``topic`` names it. To a name that ends with .mcap this writes a copy of
+    the log with such pictures, in which everything else is as before. What may still show people is listed: other
+    cameras, point clouds, attachments.
 
     Parameters
     ----------
     log : path
         The log.
     output : path, optional
-        The video, .mp4 or .gif; by default LOG.mp4 beside the log, LOG.compared.mp4 with ``compare``, LOG.blurred.mp4
-        with ``blur``. With ``blur`` it may be a log, .mcap. With ``heatmap`` it is a picture, .png or .jpg, by default
-        LOG.heatmap.png.
+        Write to this file: a video (.mp4 or .gif), with ``blur`` also a log (.mcap), with ``heatmap`` a picture.
+
+        By default LOG.mp4 beside the log, LOG.compared.mp4 with ``compare``, LOG.blurred.mp4 with ``blur``,
+        LOG.heatmap.png with ``heatmap``.
     topic : str or sequence of str, optional
-        Draw these views; by default those that the layout shows, or none with ``blur``. With ``heatmap``, count these
-        tracks.
+        Draw these views.
+
+        By default those that the layout shows, or none with ``blur``. With ``heatmap``, count these tracks.
     compare : bool, default False
-        Draw SORT's tracks, re-tracked ones and the ground truth side by side, with counters, a clock, events and the
-        ground.
+        Draw SORT, re-tracked and ground truth side by side, with counters of identity switches.
     heatmap : bool, default False
-        Draw a picture of where people spend their time.
-    blur : str, optional
-        "people" hides people.
+        Draw one picture of where people spend their time: LOG.heatmap.png.
+    blur : {"people"}, optional
+        Hide people: in a video, or with an ``output`` that ends with .mcap in a copy of the log.
     width : int, optional
         Width in pixels; by default that of the video, or 960 from above.
     max_fps : float, optional
         Largest number of pictures per second; by default all, in a GIF 10.
-    start_s, end_s : float, optional
-        Begin and end at these times of the log, in seconds.
+    start_s : float, default 0
+        Begin at this time of the log, in seconds.
+    end_s : float, optional
+        End at this time of the log, in seconds; by default the end.
     gif : bool, default False
-        Write LOG.gif if ``output`` names no file.
+        Write LOG.gif instead of LOG.mp4, if ``output`` names no file.
     camera : str, optional
-        Name of the camera, if the log has several. A log is written with the people hidden in the pictures of all
-        cameras.
+        Which camera, if the log has several.
+
+        A log is written with the people hidden in the pictures of all cameras.
     force : bool, default False
-        Overwrite the output if it exists.
+        Overwrite the output file if it exists.
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
 
@@ -141,6 +132,10 @@ def render(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack render log.mcap -o walk.gif --width 480 --start-s 2 --end-s 8
+
     >>> import mcaptrack
     >>> mcaptrack.render("log.mcap", "walk.gif", width=160, end_s=1.0).pictures > 1
     True
@@ -148,6 +143,23 @@ def render(
     ('/camera/video',)
 
     """
+    from functools import partial
+
+    from mcaptrack import log as logs
+    from mcaptrack import pipeline
+    from mcaptrack.api.common import log_location, names_of, optional_path, warn_unused, warnings_about
+    from mcaptrack.files import is_same_file, refuse_overwrite
+    from mcaptrack.foxglove.views import SCENE_SUFFIX, SUFFIX
+    from mcaptrack.location import local_name
+    from mcaptrack.sources.cameras import camera_at
+    from mcaptrack.viewing.blur.recording import blurrable, write_blurred_log
+    from mcaptrack.viewing.comparing import compare as draw_comparison
+    from mcaptrack.viewing.comparing import find_panels
+    from mcaptrack.viewing.heat_map import draw_heat_map
+    from mcaptrack.viewing.rendering import RenderOptions
+    from mcaptrack.viewing.rendering import render as draw_video
+    from mcaptrack.viewing.rendering import render_from_above as draw_from_above
+
     path = log_location(log)
     refuse_both(compare=compare, heatmap=heatmap, blur=blur is not None)
     suffix = default_suffix(compare=compare, heatmap=heatmap, blur=blur, gif=gif)
@@ -201,6 +213,9 @@ def render(
 
 def _one_of(opened: logs.Log, pictures: Sequence[str], camera: str | None) -> str:
     """Return the channel of pictures of a video: the only one, or that of the camera with results."""
+    from mcaptrack import pipeline
+    from mcaptrack.sources.cameras import camera_at
+
     if len(pictures) == 1 or camera is not None:
         return pictures[0]
     chosen = camera_at(opened, pipeline.find_camera(opened)).pictures

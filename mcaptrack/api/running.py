@@ -9,14 +9,16 @@ from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from time import monotonic
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from mcaptrack import log as logs
 from mcaptrack import notices, pipeline
-from mcaptrack.api.common import Notes, PathLike, Progress, as_location, log_output, no_progress, warnings_about
+from mcaptrack.api.common import Notes, as_location, log_output, warnings_about
+from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.api.several import Act, CameraResult, Done, EveryCamera, refuse_failed, together
+from mcaptrack.choices import Mode
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation.zones import ZoneTotals
 from mcaptrack.files import is_same_file, publish_bytes, refuse_overwrite
@@ -31,7 +33,6 @@ from mcaptrack.transforms import FUSION, STAGES, Transform
 
 #: The value of a transform's option.
 Option = float | int | bool | str | None
-Mode = Literal["both", "offline", "online"]
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ from html import escape
 from pathlib import Path
 from typing import Any, Final
 
-from mcaptrack.api.common import PathLike, as_path
+from mcaptrack.api.common import as_path
+from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import COMBINED, EvaluationRow
 from mcaptrack.files import publish_bytes, refuse_overwrite

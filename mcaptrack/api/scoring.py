@@ -14,21 +14,11 @@ import numpy as np
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import (
-    Notes,
-    PathLike,
-    Progress,
-    as_path,
-    detail,
-    locations_of,
-    names_of,
-    no_progress,
-    optional_path,
-    paths_of,
-    warn_unused,
-)
+from mcaptrack.api.common import Notes, as_path, detail, locations_of, names_of, optional_path, paths_of, warn_unused
 from mcaptrack.api.ingesting import parse_fps
+from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.api.scores import Scores
+from mcaptrack.choices import Point
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation import (
     DEFAULT_GATES_M,
@@ -43,7 +33,6 @@ from mcaptrack.evaluation.aligned import IOU_THRESHOLD, Similarity
 from mcaptrack.evaluation.metrics import Rules
 from mcaptrack.evaluation.smoothing import smoothed_predictions
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.geometry.plane import Point
 from mcaptrack.location import Location
 from mcaptrack.notices import collected, warn
 from mcaptrack.pipeline.rebuild import rebuild

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from mcaptrack import log as logs
 from mcaptrack import notices, pipeline
-from mcaptrack.api.common import Notes, Progress
+from mcaptrack.api.common import Notes
+from mcaptrack.api.options import Progress
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish
 from mcaptrack.location import Location

@@ -2,30 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from mcaptrack.api.checked import checked
-from mcaptrack.api.common import PathLike, Progress, no_progress
-from mcaptrack.api.running import Mode, Option, RunResult, run_stage, transform_of
+from mcaptrack.api.checked import declared
+from mcaptrack.api.declared import PYTHON_ONLY, Option
+from mcaptrack.api.detecting import Stages
+from mcaptrack.api.options import Camera, EachLog, Force, Frame, Output, Reports, Sidecar, To, Topic, Value, no_progress
+from mcaptrack.choices import Mode
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms import PROFILES, Transform
 
+if TYPE_CHECKING:
+    from mcaptrack.api.running import RunResult
 
-@checked()
+
+@declared(most_used=("tracker", "max_age_s", "min_hits_s", "min_iou", "min_score", "output", "topic", "to", "force"))
 def track(
-    log: PathLike,
+    log: EachLog,
     *,
     tracker: str | Transform | None = None,
-    topic: str | None = None,
-    to: str | None = None,
-    camera: str | None = None,
-    frame: str | None = None,
-    output: PathLike | None = None,
-    sidecar: bool | None = None,
-    force: bool = False,
-    stages: Mapping[str, str | Transform] | None = None,
-    progress: Progress = no_progress,
-    **options: Option,
+    topic: Topic = None,
+    to: To = None,
+    camera: Camera = None,
+    frame: Frame = None,
+    output: Output = None,
+    sidecar: Sidecar = None,
+    force: Force = False,
+    stages: Stages = None,
+    progress: Reports = no_progress,
+    **options: Value,
 ) -> RunResult:
     """Track detections: give each object an id that it keeps from frame to frame.
 
@@ -44,7 +49,7 @@ def track(
     camera : str, optional
         Name of the camera, if the log has several.
     frame : str, optional
-        Bring boxes in space (3D) to this frame; by default to the root of the tree of frames, such as map.
+        Bring boxes in space (3D) to this frame, such as map; by default to the root of the tree of frames.
     output : path, optional
         Write to this file instead; the log stays unchanged.
     sidecar : bool, optional
@@ -71,12 +76,18 @@ def track(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack track log.mcap --tracker bytetrack
+
     >>> import mcaptrack
     >>> result = mcaptrack.track("log.mcap", tracker="bytetrack", max_age_s=1.0, output="tracks.mcap")
     >>> list(result.tracks)
     ['/camera/tracks']
 
     """
+    from mcaptrack.api.running import run_stage, transform_of
+
     return run_stage(
         "track",
         None if tracker is None else transform_of("track", tracker, options),
@@ -94,20 +105,20 @@ def track(
     )
 
 
-@checked()
+@declared(most_used=("rate_hz", "max_gap_s", "output", "topic", "to", "camera", "force"))
 def sample(
-    log: PathLike,
+    log: EachLog,
     *,
-    transform: Transform | None = None,
-    topic: str | None = None,
-    to: str | None = None,
-    camera: str | None = None,
-    output: PathLike | None = None,
-    sidecar: bool | None = None,
-    force: bool = False,
-    stages: Mapping[str, str | Transform] | None = None,
-    progress: Progress = no_progress,
-    **options: Option,
+    transform: Annotated[Transform | None, PYTHON_ONLY] = None,
+    topic: Topic = None,
+    to: To = None,
+    camera: Camera = None,
+    output: Output = None,
+    sidecar: Sidecar = None,
+    force: Force = False,
+    stages: Stages = None,
+    progress: Reports = no_progress,
+    **options: Value,
 ) -> RunResult:
     """Resample tracks to a fixed rate and project them to the ground plane.
 
@@ -149,11 +160,17 @@ def sample(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack sample log.mcap --rate-hz 2.5
+
     >>> import mcaptrack
     >>> mcaptrack.sample("log.mcap", rate_hz=5.0, output="samples.mcap").channels
     ('/camera/samples',)
 
     """
+    from mcaptrack.api.running import run_stage, transform_of
+
     return run_stage(
         "sample",
         transform_of("sample", transform, options),
@@ -169,20 +186,20 @@ def sample(
     )
 
 
-@checked()
+@declared(most_used=("predictor", "horizon_s", "min_history", "output", "topic", "to", "camera", "force"))
 def predict(
-    log: PathLike,
+    log: EachLog,
     *,
-    predictor: str | Transform | None = None,
-    topic: str | None = None,
-    to: str | None = None,
-    camera: str | None = None,
-    output: PathLike | None = None,
-    sidecar: bool | None = None,
-    force: bool = False,
-    stages: Mapping[str, str | Transform] | None = None,
-    progress: Progress = no_progress,
-    **options: Option,
+    predictor: Annotated[str | Transform | None, PYTHON_ONLY] = None,
+    topic: Topic = None,
+    to: To = None,
+    camera: Camera = None,
+    output: Output = None,
+    sidecar: Sidecar = None,
+    force: Force = False,
+    stages: Stages = None,
+    progress: Reports = no_progress,
+    **options: Value,
 ) -> RunResult:
     """Predict the future positions of tracks, with covariance.
 
@@ -225,11 +242,17 @@ def predict(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack predict log.mcap --predictor cv
+
     >>> import mcaptrack
     >>> mcaptrack.predict("log.mcap", predictor="kalman", output="predictions.mcap").channels
     ('/camera/predictions',)
 
     """
+    from mcaptrack.api.running import run_stage, transform_of
+
     return run_stage(
         "predict",
         transform_of("predict", predictor, options),
@@ -245,22 +268,22 @@ def predict(
     )
 
 
-@checked()
+@declared(most_used=("profile", "mode", "retracker", "predictor", "max_age_s", "output", "topic", "to", "force"))
 def retrack(
-    log: PathLike,
+    log: EachLog,
     *,
     retracker: str | Transform | None = None,
-    profile: str | None = None,
-    mode: Mode = "both",
-    topic: str | None = None,
-    to: str | None = None,
-    camera: str | None = None,
-    output: PathLike | None = None,
-    sidecar: bool | None = None,
-    force: bool = False,
-    stages: Mapping[str, str | Transform] | None = None,
-    progress: Progress = no_progress,
-    **options: Option,
+    profile: Annotated[Literal["default", "paper", "authors"] | None, Option(tuning=True, shown="default")] = None,
+    mode: Annotated[Mode, Option(tuning=True)] = "both",
+    topic: Topic = None,
+    to: To = None,
+    camera: Camera = None,
+    output: Output = None,
+    sidecar: Sidecar = None,
+    force: Force = False,
+    stages: Stages = None,
+    progress: Reports = no_progress,
+    **options: Value,
 ) -> RunResult:
     """Re-track by prediction: link and repair tracks, and leave out false ones.
 
@@ -271,10 +294,11 @@ def retrack(
     retracker : str or Transform, optional
         "likelihood" (the default), "consistency", the name of an installed re-tracker, "module:Class", or a transform.
     profile : {"default", "paper", "authors"}, optional
-        Values of all options, and the re-tracker that they are of: those of this project, those of the paper (Yu and
-        Zhou, IROS 2021), or those of its authors' program.
+        Values of all parameters: mcaptrack's own (default), the paper's, or those of its authors' program.
+
+        They name the re-tracker, too. The paper is Yu and Zhou, IROS 2021.
     mode : {"both", "offline", "online"}, default "both"
-        Write tracks that use the whole log (offline), those that use the past alone (online), or both.
+        Write tracks that use the whole log (offline), the past alone (online), or both.
     topic : str, optional
         Read this channel instead of the usual one, /camera/samples.
     to : str, optional
@@ -307,14 +331,18 @@ def retrack(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack retrack log.mcap --profile authors
+
     >>> import mcaptrack
     >>> result = mcaptrack.retrack("log.mcap", profile="paper", output="retracks.mcap")
     >>> result.channels[:2]
     ('/camera/retracks', '/camera/retracks/online')
 
     """
-    if profile is not None and profile not in PROFILES:
-        raise McaptrackError(f"there is no profile {profile}; there are {', '.join(PROFILES)}")
+    from mcaptrack.api.running import run_stage, transform_of
+
     if profile is not None and retracker is not None:
         raise McaptrackError(f"the profile {profile} names a retracker; give one of them")
     if retracker is None:

@@ -11,10 +11,11 @@ from typing import Final, Literal
 
 from mcaptrack import __version__
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import Notes, PathLike, Progress, as_path, no_progress, optional_path, paths_of
+from mcaptrack.api.common import Notes, as_path, optional_path, paths_of
 from mcaptrack.api.ingesting import parse_fps
+from mcaptrack.api.options import PathLike, Progress, no_progress
+from mcaptrack.choices import Point
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.plane import Point
 from mcaptrack.notices import Notice, collected
 from mcaptrack.training.recipe import RECIPES, Recipe
 from mcaptrack.training.sources import SYNTHETIC, SourceOptions, read_scenes, split, synthetic, windows_of

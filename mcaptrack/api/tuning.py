@@ -12,15 +12,16 @@ from typing import Final, Literal
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import Notes, PathLike, Progress, detail, no_progress, optional_path, paths_of
+from mcaptrack.api.common import Notes, detail, optional_path, paths_of
 from mcaptrack.api.ingesting import parse_fps
+from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.api.running import Option, transform_of
+from mcaptrack.choices import Point
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions, ground_truth_of_log
 from mcaptrack.evaluation import tuning as searching
 from mcaptrack.evaluation.aligned import Similarity
 from mcaptrack.evaluation.tuning import Metric, Range, Task, Trial, declared_ranges, uses_optuna
-from mcaptrack.geometry.plane import Point
 from mcaptrack.notices import Notice, collected
 from mcaptrack.registry import blamed
 from mcaptrack.schema import DETECTIONS

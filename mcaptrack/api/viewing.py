@@ -13,7 +13,8 @@ from typing import Final, Self
 
 from mcaptrack import log as logs
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import Notes, PathLike, as_path, log_file
+from mcaptrack.api.common import Notes, as_path, log_file
+from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import Notice, collected, warn

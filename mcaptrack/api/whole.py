@@ -8,7 +8,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import PathLike, Progress, as_location, names_of, no_progress, split_names, warn_unused
+from mcaptrack.api.common import as_location, names_of, split_names, warn_unused
+from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.api.running import Fusing, RunResult, Where, transform_of, transforms_of, work
 from mcaptrack.api.several import unfitting
 from mcaptrack.api.zoning import ZonesLike, zones_of

@@ -9,7 +9,8 @@ from typing import Any, Final
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import PathLike, Progress, as_path, log_location, names_of, no_progress, optional_path
+from mcaptrack.api.common import as_path, log_location, names_of, optional_path
+from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.api.running import RunResult, Where, work
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.zones import ZoneOptions

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 import typer
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperCommand
 
 from mcaptrack.cli.flags import RUNNING
-from mcaptrack.cli.most_used import LAST_PANELS, arrange
+from mcaptrack.cli.most_used import LAST_PANELS, MOST_USED, arrange
 from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, gather
 from mcaptrack.cli.text import log_format, refuse_usage, say
 from mcaptrack.notices import warn
@@ -33,7 +33,7 @@ _NOT: Final = {
 
 
 @contextmanager
-def _usage_in_one_line(command: str = "") -> Iterator[None]:
+def usage_in_one_line(command: str = "") -> Iterator[None]:
     """Refuse a wrong command line with one line of text instead of Typer's box."""
     try:
         yield
@@ -75,26 +75,6 @@ def _options_of(command: Any) -> list[str]:
     return [name for option in command.params if not getattr(option, "hidden", False) for name in option.opts]
 
 
-class Group(TyperGroup):
-    """The group of all commands."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the options before the command; refuse an unknown one in one line."""
-        if not args:
-            return super().parse_args(ctx, args)  # which prints the help
-        from mcaptrack.cli.plugins import with_plugins
-
-        self._own = getattr(self, "_own", None) or dict(self.commands)
-        self.commands = with_plugins(self._own, args)
-        with _usage_in_one_line():
-            return super().parse_args(ctx, args)
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the command; refuse an unknown one in one line."""
-        with _usage_in_one_line():
-            return super().resolve_command(ctx, args)
-
-
 class Command(TyperCommand):
     """A command. ``settings`` has its options by name, and those that were renamed also by their old names.
 
@@ -117,7 +97,8 @@ class Command(TyperCommand):
             self.params.append(hidden)
             first = targets[0]
             self.settings[old] = Setting(name, old, hidden.name, first.kind, first.many, first.declared)
-        arrange(name, self.params)
+        self.most_used: tuple[str, ...] = getattr(given["callback"], "most_used", ()) or MOST_USED.get(name, ())
+        arrange(self.most_used, self.params)
         config = parameters["config"]
         config.envvar = now["config"].variable  # the others are read with the files, once this is known
 
@@ -135,7 +116,7 @@ class Command(TyperCommand):
 
     def _parse(self, ctx: Any, args: list[str]) -> list[str]:
         given = list(args)  # parsing may take words away
-        with _usage_in_one_line(self.name or ""):
+        with usage_in_one_line(self.name or ""):
             left = super().parse_args(ctx, args)
         for option in self.params:
             if option.name == "topic" and not option.multiple:
@@ -256,8 +237,8 @@ def read_config(context: typer.Context, path: Path | None) -> Path | None:
     if context.resilient_parsing or context.parent is None:
         return path
     group: Any = context.parent.command
-    commands: dict[str, Command] = group.commands
-    gather({name: command.settings for name, command in commands.items()}, path)
+    commands: Mapping[str, Command] = group.commands
+    gather(commands, path)
     context.default_map = converted(context, context.info_name or "")
     return path
 

@@ -22,7 +22,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, ParamSpec, get_ty
 import typer
 
 from mcaptrack import SCHEMA_VERSION, notices
-from mcaptrack.cli.command import Command, Reading, check_ranges, is_on_command_line, read_config
+from mcaptrack.cli.command import check_ranges, is_on_command_line, read_config
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.inputs import check_paths
 from mcaptrack.cli.most_used import LAST_PANELS
@@ -32,7 +32,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish_bytes, refuse_overwrite
 from mcaptrack.location import Location
 from mcaptrack.notices import Code, Notice
-from mcaptrack.transforms.protocol import limits
+from mcaptrack.ranges import limits
 
 P = ParamSpec("P")
 
@@ -144,19 +144,6 @@ Logs = Annotated[
         metavar="LOG", help="Logs, folders of logs, patterns, or - for a list of logs on stdin.", show_default=False
     ),
 ]
-
-
-def register(
-    app: typer.Typer, panel: str, name: str, command: Callable[..., None], words: str | None = None, reads: bool = False
-) -> None:
-    """Add a command below the heading ``panel`` of the help; ``words`` are its help, by default its docstring.
-
-    A command that ``reads`` changes no file except the one that -o names.
-    """
-    settings = {"help_option_names": ["--help", "-h"]}
-    app.command(name, cls=Reading if reads else Command, help=words, context_settings=settings, rich_help_panel=panel)(
-        command
-    )
 
 
 class Talk:

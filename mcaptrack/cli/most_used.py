@@ -6,7 +6,7 @@ The other options of a command stand below their themes, then input and output, 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 #: The first heading, that of options without a theme below it, and the last ones.
@@ -16,20 +16,12 @@ LAST_PANELS: Final = ("Input and output", "Many logs", "Options of all commands"
 
 #: The options of a command that come first, in order, by the names of its parameters. Commands with few have none.
 MOST_USED: Final[Mapping[str, tuple[str, ...]]] = {
-    "ingest": ("output", "into", "role", "ground_plane", "truth", "detections", "fps", "camera", "force"),
     "run": ("output", "topic", "camera", "detector", "tracker", "retracker", "predictor", "zones", "force"),
-    "detect": ("detector", "threshold", "classes", "min_score", "output", "topic", "to", "camera", "force"),
-    "motion": ("output", "topic", "to", "camera", "force"),
-    "track": ("tracker", "max_age_s", "min_hits_s", "min_iou", "min_score", "output", "topic", "to", "force"),
-    "sample": ("rate_hz", "max_gap_s", "output", "topic", "to", "camera", "force"),
-    "retrack": ("profile", "mode", "retracker", "predictor", "max_age_s", "output", "topic", "to", "force"),
-    "predict": ("predictor", "horizon_s", "min_history", "output", "topic", "to", "camera", "force"),
     "events": ("topic", "similarity", "gate_m", "output", "force"),
     "fuse": ("to", "cameras", "clock_offset_s", "min_score", "output", "force"),
     "calibrate": ("reference", "cameras", "dry_run", "clock_offset_s", "output", "force"),
     "zones": ("zones", "topic", "camera", "output", "force"),
     "evaluate": ("truth", "topic", "similarity", "gate_m", "rules", "fail_under", "csv", "output", "force"),
-    "render": ("output", "topic", "compare", "heatmap", "blur", "width", "start_s", "end_s", "force"),
     "export": ("form", "topic", "output", "delta", "force"),
     "query": ("file", "form", "rows", "tables", "output", "force"),
     "tune": ("truth", "stage", "tracker", "metric", "trials", "search", "topic", "output", "force"),
@@ -39,9 +31,8 @@ MOST_USED: Final[Mapping[str, tuple[str, ...]]] = {
 _THOSE: Final = re.compile(r"\((.+)\)$|^Options of (.+)$")
 
 
-def arrange(command: str, parameters: list[Any]) -> None:
-    """Put the parameters of a command into the order of its help, below its headings."""
-    first = MOST_USED.get(command, ())
+def arrange(first: Sequence[str], parameters: list[Any]) -> None:
+    """Put the parameters of a command into the order of its help, below its headings; ``first`` come first."""
     for one in parameters:
         if one.param_type_name != "option":
             continue

@@ -8,18 +8,17 @@ has, all that installed packages declare as entry points.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, Final
 
 import typer
-from typer.main import get_command
 
 from mcaptrack.cli import common
 from mcaptrack.cli.config import ConfigFile, read_files
-from mcaptrack.cli.stages import stage_command, stage_help
+from mcaptrack.cli.stages import stage_command
 from mcaptrack.cli.text import say, stdout_to_stderr
 from mcaptrack.environment import PREFIX
 from mcaptrack.errors import McaptrackError
@@ -30,26 +29,26 @@ from mcaptrack.transforms import STAGES, Stage, Transform
 _HELP: Final = ("--help", "-h")
 
 
-def with_plugins(commands: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
-    """Return the commands; those of stages have the options of the plug-ins that this call chooses for them.
+def commands_with_plugins(commands: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
+    """Return the commands of stages that have options of plug-ins which this call chooses for them.
 
     A plug-in on the command line that can't be loaded ends the command with exit code 1.
     """
     called = next((word for word in words if not word.startswith("-")), "")
     if called not in commands:
-        return dict(commands)
+        return {}
     files = [] if set(words) & set(_HELP) else _files(called, words)
-    found = dict(commands)
+    found: dict[str, Any] = {}
     for stage in STAGES.values():
         if not stage.option:
             continue
         try:
             with stdout_to_stderr(), listening(lambda notice: say(notice.message, "warning")):
                 plugins = dict(_of_words(stage, words)) if called in (stage.name, "run") else {}
-                plugins |= _of_settings(stage, files, commands[stage.name].settings)
+                plugins |= _of_settings(stage, files, commands)
             plugins = {name: cls for name, cls in plugins.items() if cls is not stage.default}
             if plugins:
-                found[stage.name] = _command(stage, plugins, commands[stage.name].rich_help_panel)
+                found[stage.name] = stage_command(stage, plugins)
         except McaptrackError as error:
             say(str(error), "error")
             raise typer.Exit(common.REFUSED) from None
@@ -78,16 +77,16 @@ def _of_words(stage: Stage, words: Sequence[str]) -> Iterator[tuple[str, type[Tr
             yield name, stage.choose(name)
 
 
-def _of_settings(stage: Stage, files: Sequence[ConfigFile], known: Mapping[str, Any]) -> dict[str, type[Transform]]:
+def _of_settings(stage: Stage, files: Sequence[ConfigFile], commands: Mapping[str, Any]) -> dict[str, type[Transform]]:
     """Return the plug-ins that environment and files name for a stage; the stage that uses it reports a missing one."""
     out = {}
-    for name in _names_of_settings(stage, files, known):
+    for name in _names_of_settings(stage, files, lambda: commands[stage.name].settings):
         with suppress(McaptrackError):
             out[name] = stage.choose(name)
     return out
 
 
-def _names_of_settings(stage: Stage, files: Sequence[ConfigFile], known: Mapping[str, Any]) -> list[str]:
+def _names_of_settings(stage: Stage, files: Sequence[ConfigFile], known: Callable[[], Collection[str]]) -> list[str]:
     """Return the names of plug-ins that environment and files give for a stage.
 
     A file in the working folder can't name modules.
@@ -106,13 +105,6 @@ def _names_of_settings(stage: Stage, files: Sequence[ConfigFile], known: Mapping
         options |= {key.replace("_", "-") for key in table} if isinstance(table, dict) else set()
     start = f"{PREFIX}{stage.name}_".upper()
     options |= {name.removeprefix(start).lower().replace("_", "-") for name in os.environ if name.startswith(start)}
-    if options - set(known):
+    if options and options - set(known()):
         found += names(kind)
     return [name for name in dict.fromkeys(found) if name and stage.split(name)[0] not in BUILT_IN[kind]]
-
-
-def _command(stage: Stage, plugins: Mapping[str, type[Transform]], panel: str) -> Any:
-    """Return the command of a stage with the options of plug-ins."""
-    app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
-    common.register(app, panel, stage.name, common.one_line(stage_command(stage, plugins)), stage_help(stage, plugins))
-    return get_command(app)

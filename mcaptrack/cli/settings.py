@@ -13,17 +13,18 @@ import os
 import re
 import reprlib
 import shlex
-from collections.abc import Iterable, Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Any, Final, Literal, NamedTuple, Protocol, get_args, get_origin, get_type_hints
 
 from mcaptrack.cli.config import NAME, ConfigFile, read_files, user_file
 from mcaptrack.cli.text import refuse_usage
 from mcaptrack.environment import PREFIX, VARIABLES
 from mcaptrack.errors import McaptrackError
-from mcaptrack.transforms.protocol import limits
+from mcaptrack.ranges import limits
 
 #: Options that only the command line can set.
 CALL_ONLY: Final = ("config", "help")
@@ -132,9 +133,15 @@ class Setting:
         return all(re.fullmatch(pattern, str(member)) is not None for member in members)
 
 
-#: Options by command and name; renamed options also by their old names.
-Settings = Mapping[str, Mapping[str, Setting]]
-_KNOWN: Final[ContextVar[tuple[Settings, dict[str, dict[str, Given]]]]] = ContextVar("known")
+class HasSettings(Protocol):
+    """A command: ``settings`` are its options by name; renamed options also by their old names."""
+
+    settings: dict[str, Setting]
+
+
+#: Commands by name. One is made when it is looked up, so only those are that the environment and files name.
+Commands = Mapping[str, HasSettings]
+_KNOWN: Final[ContextVar[tuple[Commands, dict[str, dict[str, Given]]]]] = ContextVar("known")
 
 
 def declared_settings(command: str, function: Any, parameters: Iterable[Any]) -> dict[str, Setting]:
@@ -156,29 +163,39 @@ def declared_settings(command: str, function: Any, parameters: Iterable[Any]) ->
     return out
 
 
-def gather(settings: Settings, config: Path | None) -> dict[str, dict[str, Given]]:
+def may_be_set(words: Sequence[str]) -> bool:
+    """Whether the environment or a file may set options in a call with these words; quick, and never wrongly False."""
+    is_named = any(word.startswith("--config") for word in words)
+    return (
+        is_named or any(name.startswith(PREFIX) for name in os.environ) or Path(NAME).exists() or user_file().exists()
+    )
+
+
+def gather(commands: Commands, config: Path | None) -> dict[str, dict[str, Given]]:
     """Return the values that environment and files set, by command and option; the strongest source wins.
 
     An unknown name, a value of the wrong type, and an option that a file may not set end the command with exit code 2.
     """
-    found: dict[str, dict[str, Given]] = {command: {} for command in settings}
-    for command, setting, given in _from_environment(settings):
+    found: dict[str, dict[str, Given]] = defaultdict(dict)
+    for command, setting, given in _from_environment(commands):
         found[command][setting.name] = given
     for file in read_files(config):
-        for command, setting, given in _from_file(settings, file):
+        for command, setting, given in _from_file(commands, file):
             found[command].setdefault(setting.name, given)
-    _KNOWN.set((settings, found))
+    _KNOWN.set((commands, found))
     return found
 
 
-def _from_environment(settings: Settings) -> Iterable[tuple[str, Setting, Given]]:
-    by_variable = {setting.variable: setting for options in settings.values() for setting in options.values()}
+def _from_environment(commands: Commands) -> Iterable[tuple[str, Setting, Given]]:
     for name, text in os.environ.items():
         if not name.startswith(PREFIX) or name in VARIABLES:
             continue
-        setting = by_variable.get(name)
+        command = name.removeprefix(PREFIX).partition("_")[0].lower()
+        own = commands[command].settings.values() if command in commands else ()
+        setting = next((one for one in own if one.variable == name), None)
         if setting is None:
-            refuse_usage(f"the environment variable {name} names no option{_nearest(name, [*by_variable, *VARIABLES])}")
+            known = [one.variable for command in commands for one in commands[command].settings.values()]
+            refuse_usage(f"the environment variable {name} names no option{_nearest(name, [*known, *VARIABLES])}")
         if not text or setting.name in CALL_ONLY:
             continue
         try:
@@ -188,13 +205,13 @@ def _from_environment(settings: Settings) -> Iterable[tuple[str, Setting, Given]
         yield setting.command, setting, Given(value, name, 1)
 
 
-def _from_file(settings: Settings, file: ConfigFile) -> Iterable[tuple[str, Setting, Given]]:
+def _from_file(commands: Commands, file: ConfigFile) -> Iterable[tuple[str, Setting, Given]]:
     for command, values in file.tables.items():
-        if command not in settings:
-            refuse_usage(f"{file.path}: there is no command {command}{_nearest(command, settings)}")
+        if command not in commands:
+            refuse_usage(f"{file.path}: there is no command {command}{_nearest(command, commands)}")
         if not isinstance(values, dict):
             refuse_usage(f"{file.path}: {command} is a command; write its options below [{command}]")
-        known = {name: setting for name, setting in settings[command].items() if name not in CALL_ONLY}
+        known = {name: setting for name, setting in commands[command].settings.items() if name not in CALL_ONLY}
         for key, value in values.items():
             name = key.replace("_", "-")
             if name not in known:
@@ -214,14 +231,21 @@ def _from_file(settings: Settings, file: ConfigFile) -> Iterable[tuple[str, Sett
 
 def found_of(command: str) -> dict[str, tuple[Setting, Given]]:
     """Return the options of a command that environment and files set, with their values, by parameter."""
-    settings, found = _KNOWN.get()
-    return {settings[command][name].parameter: (settings[command][name], one) for name, one in found[command].items()}
+    commands, found = _KNOWN.get()
+    if not found.get(command):
+        return {}
+    settings = commands[command].settings
+    return {settings[name].parameter: (settings[name], one) for name, one in found[command].items()}
 
 
 def old_names(command: str) -> dict[str, str]:
     """Return the old names of a command's options, by their new names."""
-    settings, _ = _KNOWN.get()
-    return {one.name: one.declared.was for one in settings[command].values() if one.declared.was not in ("", one.name)}
+    commands, _ = _KNOWN.get()
+    return {
+        one.name: one.declared.was
+        for one in commands[command].settings.values()
+        if one.declared.was not in ("", one.name)
+    }
 
 
 def _nearest(name: str, known: Iterable[str]) -> str:

@@ -10,30 +10,22 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field
 from functools import partial
 from types import MappingProxyType
-from typing import Annotated, Any, Final, Literal, get_args, get_type_hints
+from typing import Annotated, Any, Final, get_args, get_type_hints
 
-import typer
-
+import mcaptrack
+from mcaptrack.api.declared import options_of as options_of_function
+from mcaptrack.api.declared import words_of
 from mcaptrack.cli import common
 from mcaptrack.cli.chosen import Maker, configured, is_open, listed, options_of
-from mcaptrack.cli.many import NAMES, takes_many
+from mcaptrack.cli.declared import annotation_of, command
+from mcaptrack.cli.many import NAMES
 from mcaptrack.cli.running import run_on_logs
 from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, Kind, names
-from mcaptrack.schema import DETECTIONS
 from mcaptrack.transforms import STAGES, Stage, Transform
 from mcaptrack.transforms.protocol import choices, member_type
 
-#: Examples for the help, by command.
-_EXAMPLES: Final = {
-    "detect": "Example: mcaptrack detect log.mcap --detector median",
-    "motion": "Example: mcaptrack motion log.mcap",
-    "track": "Example: mcaptrack track log.mcap --tracker bytetrack",
-    "sample": "Example: mcaptrack sample log.mcap --rate-hz 2.5",
-    "predict": "Example: mcaptrack predict log.mcap --predictor cv",
-    "retrack": "Example: mcaptrack retrack log.mcap --profile authors",
-}
 Topic = Annotated[
     str | None, common.option("--topic", panel=common.FILES, help="Read this channel instead of the default one.")
 ]
@@ -61,14 +53,26 @@ def chooser(
     )
 
 
-#: Names of options that every stage has beside those of its own.
-RESERVED: Final = ("help", *(name.replace("_", "-") for name in NAMES))
+#: Options that every command has beside those of its function.
+RESERVED: Final = (
+    "help",
+    "logs",
+    "json",
+    "quiet",
+    "verbose",
+    "config",
+    "log-format",
+    *(n.replace("_", "-") for n in NAMES),
+)
 
 
-def add_stages(app: typer.Typer, panel: str) -> None:
-    """Add a command for each stage below the heading ``panel`` of the help."""
-    for stage in STAGES.values():
-        common.register(app, panel, stage.name, common.one_line(stage_command(stage)), stage_help(stage))
+class StageCommand:
+    """The commands of stages: declared by their functions, with the parameters of their transforms as options."""
+
+    @staticmethod
+    def function_of(name: str) -> Callable[..., None]:
+        """Return the function of the command of a stage."""
+        return stage_command(STAGES[name])
 
 
 def stage_help(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> str:
@@ -77,7 +81,9 @@ def stage_help(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingPro
     others = [f"{name}: {text}" for name, one in plugins.items() if (text := _own_doc(one))]
     docs = [*others, *(inspect.cleandoc(one.__doc__ or "") for one in stage.built_in().values())]
     words = [re.split(r"\n\n\w+\n---", doc)[0] for doc in docs]  # without the sections on use from Python
-    return "\n\n".join([*words, where, _EXAMPLES[stage.name]])
+    return "\n\n".join(
+        [*words, where, *(f"Example: {line}" for line in words_of(getattr(mcaptrack, stage.name)).examples)]
+    )
 
 
 def _own_doc(cls: type[Transform]) -> str:
@@ -94,7 +100,7 @@ def _panel(theme: str, of: Sequence[str]) -> str:
     return f"{theme} ({those})" if theme else f"Options of {those}"
 
 
-def _option(field: Field[Any], annotation: Any, of: Sequence[str] = ()) -> inspect.Parameter:
+def _option(field: Field[Any], annotation: Any, of: Sequence[str] = ()) -> Any:
     """Return the option for a parameter. Its value is None unless it is set; its help shows the default.
 
     ``of`` are the names of the transforms that have the parameter; none if all have it.
@@ -106,7 +112,7 @@ def _option(field: Field[Any], annotation: Any, of: Sequence[str] = ()) -> inspe
     words = f"parameter {field.name} of {' and '.join(of)}"
     info = option_of(field, switch, _panel(about.get("theme", ""), of), tuning, words)
     values: Any = list[kind] if is_tuple else kind  # type: ignore[valid-type]
-    return _parameter(field.name, Annotated[values | None, info], None)
+    return Annotated[values | None, info]
 
 
 def option_of(field: Field[Any], switch: str, panel: str, tuning: Any = True, otherwise: str = "") -> Any:
@@ -142,80 +148,48 @@ def shown_default(default: Any) -> str:
     return str(default).lower() if isinstance(default, bool) else f"{default}"
 
 
-def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-
-
-def _flags(parameter: inspect.Parameter) -> set[str]:
+def _flags(parameter: str, annotation: Any) -> set[str]:
     """The names that an option has on the command line, without the dashes; also those that it had before."""
-    about = get_args(parameter.annotation)[1]
+    about = get_args(annotation)[1]
     # Typer takes the first name for a default until it reads the annotation.
     names = (about.default, *(about.param_decls or ()))
     given = [part for name in names if isinstance(name, str) for part in name.split("/")]
     was = about.declared.was if hasattr(about, "declared") else ""
-    return {name.removeprefix("--") for name in (*given, was, parameter.name.replace("_", "-")) if name}
+    return {name.removeprefix("--") for name in (*given, was, parameter.replace("_", "-")) if name}
 
 
 def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> Callable[..., None]:
-    """Return the function of a stage's command, with a signature that is made of the parameters of its transforms.
+    """Return the function of a stage's command: the options of its function, and the parameters of its transforms.
 
     The options of ``plugins``, transforms of other packages, are added.
     """
+    declared = getattr(mcaptrack, stage.name)
     kinds = {**plugins, **stage.built_in()}
     own = {name: options_of(kind) for name, kind in kinds.items()}
-    parameters = [_parameter("logs", common.Logs, inspect.Parameter.empty)]
-    if stage.kind:
-        usual = stage.entry(stage.default).name
-        which = chooser(stage.kind, stage.was, shown=usual if stage.profiles else True)
-        # None where a profile may choose the transform.
-        annotation = Annotated[str | None, which] if stage.profiles else Annotated[str, which]
-        parameters.append(_parameter(stage.kind, annotation, None if stage.profiles else usual))
-    if stage.profiles:
-        words = common.option(
-            "--profile",
-            tuning=True,
-            help="Values of all parameters: mcaptrack's own (default), the paper's, or those of its authors' program.",
-            show_default="default",
-        )
-        parameters.append(_parameter("profile", Annotated[Literal[tuple(stage.profiles)] | None, words], None))
-    if stage.modes:
-        words = common.option(
-            "--mode",
-            tuning=True,
-            help="Write tracks that use the whole log (offline), the past alone (online), or both.",
-        )
-        parameters.append(_parameter("mode", Annotated[Literal[tuple(stage.modes)], words], "both"))
     owners: dict[str, list[str]] = {}
     for name, found in own.items():
         for option in found:
             owners.setdefault(option, []).append(name)
     built_in = set(stage.built_in())
+    more: dict[str, tuple[Any, Any]] = {}
     for option, having in owners.items():
-        name = having[0]
-        is_shared = built_in <= set(having)
-        hint = get_type_hints(kinds[name])[option]
-        parameters.append(_option(own[name][option], hint, () if is_shared else having))
-    to = common.option("--to", panel=common.FILES, help="Write to this channel instead of the default one.")
-    parameters += [
-        _parameter("topic", Topic, None),
-        _parameter("to", Annotated[str | None, to], None),
-        _parameter("camera", common.Camera, None),
-        *([_parameter("frame", Frame, None)] if stage.default.reads is DETECTIONS else []),
-        _parameter("output", common.Output, None),
-        _parameter("sidecar", common.Sidecar, None),
-        _parameter("force", common.Force, False),
-        _parameter("json", common.Json, False),
-        _parameter("quiet", common.Quiet, False),
-        _parameter("verbose", common.Verbose, False),
-        _parameter("config", common.Config, None),
-    ]
-
-    flags = Counter(flag for parameter in parameters for flag in _flags(parameter)) + Counter(RESERVED)
+        hint = get_type_hints(kinds[having[0]])[option]
+        more[option] = _option(own[having[0]][option], hint, () if built_in <= set(having) else having), None
+    taken = {one.name: annotation_of(one) for one in options_of_function(declared)}
+    if stage.kind:
+        usual = stage.entry(stage.default).name
+        which = chooser(stage.kind, stage.was, shown=usual if stage.profiles else True)
+        # None where a profile may choose the transform.
+        taken[stage.kind] = Annotated[str | None, which] if stage.profiles else Annotated[str, which]
+    pairs = [*taken.items(), *((option, hint) for option, (hint, _) in more.items())]
+    flags = Counter(flag for option, hint in pairs for flag in _flags(option, hint)) + Counter(RESERVED)
     if twice := {flag.replace("-", "_") for flag, count in flags.items() if count > 1}:
         words = f"{' and '.join(plugins)} can't have a parameter {' or '.join(sorted(twice))}"
         raise McaptrackError(f"{words}: that is the name of an option of {stage.name}")
+    if stage.kind:
+        more[stage.kind] = taken[stage.kind], None if stage.profiles else usual
 
-    def command(**given: Any) -> None:
+    def run(given: Mapping[str, Any]) -> None:
         wanted = {option: given[option] for option in owners if given[option] is not None}
 
         from mcaptrack.api.running import run_stage
@@ -227,7 +201,6 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
             options |= {"stages": configured(), "mode": given["mode"] if stage.modes else None, "make": make}
         run_on_logs(given, stage.name, partial(run_stage, stage.name, transform), options)
 
-    command.__name__ = stage.name
-    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    return takes_many()(command)
+    made: Any = command(stage.name, declared, run, more)
+    made.help = stage_help(stage, plugins)
+    return made  # type: ignore[no-any-return]

@@ -10,14 +10,13 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from mcaptrack.choices import Point
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.affine import IDENTITY, compose, invert
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.pinhole import Lens
 from mcaptrack.geometry.ragged import run_starts
-
-Point = Literal["foot", "center"]
 
 #: The height of a person, for guessing the scale of a scene from its boxes.
 PERSON_HEIGHT_M = 1.7

@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import tables
+from mcaptrack.choices import Point, Role
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.geometry.assignment import solve
 from mcaptrack.geometry.boxes import iou
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.geometry.plane import GroundPlane, Point
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import Frame
 from mcaptrack.schema.classes import PERSON
 from mcaptrack.schema.framing import split_rows
@@ -32,7 +33,7 @@ from mcaptrack.sources.ingest.boxes_3d_job import FRAME, Boxes3DJob
 from mcaptrack.sources.ingest.job import IngestOptions
 from mcaptrack.sources.ingest.label_job import LabelJob
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
-from mcaptrack.sources.ingest.labels.content import IgnoredBoxes, Labels, Role
+from mcaptrack.sources.ingest.labels.content import IgnoredBoxes, Labels
 from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX
 from mcaptrack.sources.ingest.labels.label_rows import label_rows
 from mcaptrack.sources.ingest.labels.long_files import LabelFile

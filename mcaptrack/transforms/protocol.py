@@ -28,6 +28,7 @@ from types import MappingProxyType, UnionType
 from typing import Any, ClassVar, Final, Literal, NamedTuple, Protocol, get_args, get_origin, get_type_hints
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.ranges import limits
 from mcaptrack.registry import KINDS, Kind
 from mcaptrack.schema import Frame, Schema
 
@@ -320,14 +321,3 @@ def _check_value(name: str, value: Any, kind: Any, about: Mapping[str, Any]) -> 
     least, most = about.get("least", -math.inf), about.get("most", math.inf)
     if kind in (int, float) and not least <= value <= most:
         raise McaptrackError(f"{name} has to be {limits(least, most) or 'a number'}, not {value}")
-
-
-def limits(least: float, most: float) -> str:
-    """The text of a range, as in "from 0 to 1"; "" if it has no ends."""
-    if most == math.inf:
-        return "" if least == -math.inf else f"at least {_number(least)}"
-    return f"at most {_number(most)}" if least == -math.inf else f"from {_number(least)} to {_number(most)}"
-
-
-def _number(value: float) -> str:
-    return f"{value:.15g}"

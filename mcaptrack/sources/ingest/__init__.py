@@ -15,19 +15,19 @@ from mcaptrack.sources.ingest.bags.opening import open_recording
 from mcaptrack.sources.ingest.boxes_3d_job import Boxes3DJob
 from mcaptrack.sources.ingest.calibration import is_calibration
 from mcaptrack.sources.ingest.calibration_job import CalibrationJob
-from mcaptrack.sources.ingest.job import MOTION, IngestJob, IngestOptions, IngestReport, InputRole, Progress
+from mcaptrack.sources.ingest.job import MOTION, IngestJob, IngestOptions, IngestReport, Progress
 from mcaptrack.sources.ingest.label_job import LabelJob, label_frames
 from mcaptrack.sources.ingest.labels.box_rows import OTHERS
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
-from mcaptrack.sources.ingest.labels.content import Format, Role
+from mcaptrack.sources.ingest.labels.content import Format
 from mcaptrack.sources.ingest.labels.cvat_files import is_cvat
 from mcaptrack.sources.ingest.labels.yolo import is_label_folder
 from mcaptrack.sources.ingest.motion_job import MotionJob
 from mcaptrack.sources.ingest.recording_job import RecordingJob
 from mcaptrack.sources.ingest.video_job import VideoJob
-from mcaptrack.sources.video import IMAGE_SUFFIXES, ImageFormat
+from mcaptrack.sources.video import IMAGE_SUFFIXES
 
-__all__ = ["Format", "ImageFormat", "IngestOptions", "IngestReport", "InputRole", "Role", "ingest", "label_frames"]
+__all__ = ["Format", "IngestOptions", "IngestReport", "ingest", "label_frames"]
 
 VIDEO_SUFFIXES: Final = (
     ".mp4",

@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack import log
+from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.clocks import NS_PER_S
@@ -26,7 +27,6 @@ from mcaptrack.sources.ingest.job import SCHEMA_OF, IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import read_boxes_3d
 from mcaptrack.sources.ingest.labels.boxes_3d.rows import BoxRows3D, TimedLabels
 from mcaptrack.sources.ingest.labels.camera import DEFAULT
-from mcaptrack.sources.ingest.labels.content import Role
 from mcaptrack.sources.ingest.labels.timeline import frame_times_ns
 
 #: The frame of reference of boxes, if neither the user nor the format nor the log names one.

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from mcaptrack import foxglove, log
+from mcaptrack.choices import Point
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.plane import GroundPlane, Point
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema.encodings import Encoding
 from mcaptrack.schema.provenance import INGEST, Provenance, digest
 from mcaptrack.sources.calibrations import is_rectified_topic

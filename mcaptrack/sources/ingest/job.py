@@ -10,11 +10,12 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Final, Literal, Self, TypeAlias
+from typing import Any, Final, Self
 
 from mcaptrack import log
+from mcaptrack.choices import ImageFormat, InputRole, LengthUnit, Point, Role
 from mcaptrack.errors import McaptrackError, call
-from mcaptrack.geometry.plane import GroundPlane, Point
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import Notice, warn
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import classes_beside_rows, only_class, without_class
@@ -23,18 +24,18 @@ from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance, digest
 from mcaptrack.sources.cameras import corrected_plane
 from mcaptrack.sources.corrections import CORRECTED
-from mcaptrack.sources.ingest.calibration import GivenCalibration, LengthUnit
+from mcaptrack.sources.ingest.calibration import GivenCalibration
 from mcaptrack.sources.ingest.ground import PLANE, GivenGround
 from mcaptrack.sources.ingest.labels.box_rows import OTHERS, fitted
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
-from mcaptrack.sources.ingest.labels.content import Format, Labels, Role
+from mcaptrack.sources.ingest.labels.content import Format, Labels
 from mcaptrack.sources.ingest.labels.label_rows import frames_of_labels
 from mcaptrack.sources.ingest.labels.long_files import LabelFile, read_labels_of_any_length
 from mcaptrack.sources.ingest.labels.motions import motion_frames, read_motions
 from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline
 from mcaptrack.sources.ingest.labels.wanted import ONLY_PEOPLE, WantedClasses, describe_classes
 from mcaptrack.sources.ingest.sidecar import encoding_for
-from mcaptrack.sources.video import ImageFormat, VideoOptions
+from mcaptrack.sources.video import VideoOptions
 
 Progress = Callable[[str, int, int], None]
 #: A function that yields frames, from the beginning with each call.
@@ -51,8 +52,6 @@ SCHEMA_OF: Final[Mapping[Role, Schema]] = {
 TOPIC_OF: Final[Mapping[Role, str]] = {"corrections": CORRECTED}
 #: The role of a file with the motion of the camera, and the last part of its topic.
 MOTION: Final = "motion"
-#: What an input that is a text file can hold.
-InputRole: TypeAlias = Role | Literal["motion", "calibration"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,10 +14,11 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack import log
+from mcaptrack.choices import Point, Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
-from mcaptrack.geometry.plane import GroundPlane, Point
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import warn
 from mcaptrack.schema import Frame
 from mcaptrack.schema.provenance import CLOCK
@@ -35,7 +36,7 @@ from mcaptrack.sources.ingest.labels.camera import (
     picture_size,
     timeline_of,
 )
-from mcaptrack.sources.ingest.labels.content import Format, Labels, Role
+from mcaptrack.sources.ingest.labels.content import Format, Labels
 from mcaptrack.sources.ingest.labels.long_files import LabelFile
 from mcaptrack.sources.ingest.labels.timeline import MAX_FRAMES, Timeline, count_frames
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses

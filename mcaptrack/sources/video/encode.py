@@ -10,13 +10,13 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
+from mcaptrack.choices import ImageFormat
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.sources.video.container import writing
 
-ImageFormat = Literal["auto", "h264", "h265", "jpeg", "png"]
 StillFormat = Literal["jpeg", "png"]
 
 _MP4_BASE: Final = Fraction(1, 90_000)

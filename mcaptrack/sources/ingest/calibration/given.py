@@ -5,20 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack import foxglove
+from mcaptrack.choices import LengthUnit, Point
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.pinhole import Lens
-from mcaptrack.geometry.plane import GroundPlane, Point
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import warn
 from mcaptrack.sources.calibrations import calibration_of
 from mcaptrack.sources.ingest.calibration.content import CameraFile, read_cameras
 
-LengthUnit = Literal["auto", "m", "cm", "mm"]
 _METRES: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 #: Heights of a camera, as numbers, that are taken for metres (up to), centimetres and millimetres (between).
 _IN_M, _IN_CM, _IN_MM = 30.0, (30.0, 1500.0), (3000.0, 30_000.0)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import log
+from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import parse_fps
@@ -19,7 +20,6 @@ from mcaptrack.schema.framing import joined_parts
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.foreign.flatten import message_type_of
-from mcaptrack.sources.ingest.labels.content import Role
 from mcaptrack.sources.ingest.labels.timeline import Timeline
 from mcaptrack.sources.pictures import size_of_pictures
 from mcaptrack.sources.video import is_video_codec, read_head

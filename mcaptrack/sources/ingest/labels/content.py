@@ -7,33 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.choices import LabelFormat
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.notices import Code
 
-Format = Literal[
-    "auto",
-    "mot",
-    "kitti",
-    "sdd",
-    "trajnet",
-    "obsmat",
-    "coco",
-    "cvat",
-    "yolo",
-    "supervision",
-    "csv",
-    "kitti-3d",
-    "nuscenes",
-    "argoverse",
-]
+Format = LabelFormat
 #: Formats that hold 3D boxes alone; tables ("csv") may hold either.
 FORMATS_3D: Final[tuple[str, ...]] = ("kitti-3d", "nuscenes", "argoverse")
-Role = Literal["detections", "tracks", "truth", "corrections"]
 ClassIds = NDArray[np.uint32]
 
 NO_ID: Final = -1

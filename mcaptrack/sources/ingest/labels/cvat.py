@@ -19,11 +19,12 @@ from xml.parsers import expat
 
 import numpy as np
 
+from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.schema.classes import PERSON, is_person
 from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows
-from mcaptrack.sources.ingest.labels.content import NO_ID, Labels, Role
+from mcaptrack.sources.ingest.labels.content import NO_ID, Labels
 from mcaptrack.sources.ingest.labels.cvat_files import opened_xml
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 

@@ -15,12 +15,13 @@ from typing import Any, Final
 
 import numpy as np
 
+from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.schema.classes import PERSON, is_person
 from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows, FrameNames, TrackIds
 from mcaptrack.sources.ingest.labels.columns import choose_columns
-from mcaptrack.sources.ingest.labels.content import NO_ID, Format, Labels, Role
+from mcaptrack.sources.ingest.labels.content import NO_ID, Format, Labels
 from mcaptrack.sources.ingest.labels.formats import ClassNames
 from mcaptrack.sources.ingest.labels.number_table import Lines, NumberTable, lines_of
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses

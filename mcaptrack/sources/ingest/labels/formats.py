@@ -24,10 +24,11 @@ from typing import Final
 
 import numpy as np
 
+from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.schema.classes import PERSON
-from mcaptrack.sources.ingest.labels.content import NO_ID, ClassIds, Format, IgnoredBoxes, Labels, Role
+from mcaptrack.sources.ingest.labels.content import NO_ID, ClassIds, Format, IgnoredBoxes, Labels
 from mcaptrack.sources.ingest.labels.number_table import Lines, NumberTable
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 

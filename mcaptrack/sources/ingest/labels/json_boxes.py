@@ -15,6 +15,7 @@ from typing import Any, Final, NoReturn
 import numpy as np
 
 from mcaptrack import files
+from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import read_beginning, refuse_special
 from mcaptrack.geometry.arrays import Floats
@@ -25,7 +26,7 @@ from mcaptrack.sources.ingest.labels.box_rows import (
     TrackIds,
     numbers_of_names,
 )
-from mcaptrack.sources.ingest.labels.content import NO_ID, Format, Labels, Role
+from mcaptrack.sources.ingest.labels.content import NO_ID, Format, Labels
 from mcaptrack.sources.ingest.labels.delimited import read_rows
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 

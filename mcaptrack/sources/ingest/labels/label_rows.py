@@ -8,10 +8,11 @@ from typing import Final
 
 import numpy as np
 
+from mcaptrack.choices import Role
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Rows
-from mcaptrack.sources.ingest.labels.content import Labels, Role
+from mcaptrack.sources.ingest.labels.content import Labels
 from mcaptrack.sources.ingest.labels.timeline import Placed
 
 #: The number of frames of a block, for which times are converted together.

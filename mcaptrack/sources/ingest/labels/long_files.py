@@ -18,10 +18,11 @@ from typing import Any, ClassVar, Final, TypeAlias, TypeVar
 
 import numpy as np
 
+from mcaptrack.choices import Role
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.notices import Code
 from mcaptrack.schema.spill import SpillFile, Stored
-from mcaptrack.sources.ingest.labels.content import ClassIds, Format, Labels, Role, step_of
+from mcaptrack.sources.ingest.labels.content import ClassIds, Format, Labels, step_of
 from mcaptrack.sources.ingest.labels.cvat_files import is_cvat
 from mcaptrack.sources.ingest.labels.formats import READERS
 from mcaptrack.sources.ingest.labels.json_boxes import is_json

@@ -9,10 +9,11 @@ from typing import Final, get_args
 
 import numpy as np
 
+from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
 from mcaptrack.sources.ingest.labels.columns import choose_columns
-from mcaptrack.sources.ingest.labels.content import FORMATS_3D, Format, Labels, Role
+from mcaptrack.sources.ingest.labels.content import FORMATS_3D, Format, Labels
 from mcaptrack.sources.ingest.labels.cvat import read_cvat
 from mcaptrack.sources.ingest.labels.cvat_files import is_cvat
 from mcaptrack.sources.ingest.labels.delimited import MAX_LINE, SUPERVISION, comment_header, header_of, read_csv

@@ -12,12 +12,13 @@ from typing import Any, Final
 
 import numpy as np
 
+from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.notices import Code
 from mcaptrack.sources.ingest.bags import plain_yaml
 from mcaptrack.sources.ingest.labels.box_rows import BoxRows, numbers_of_names
-from mcaptrack.sources.ingest.labels.content import NO_ID, Labels, Role
+from mcaptrack.sources.ingest.labels.content import NO_ID, Labels
 from mcaptrack.sources.ingest.labels.number_table import NumberTable, lines_of
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 from mcaptrack.sources.video.image_folder import IMAGE_SUFFIXES, natural_order

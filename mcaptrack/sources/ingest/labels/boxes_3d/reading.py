@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
 from mcaptrack.sources.ingest.labels.boxes_3d.argoverse import is_argoverse, read_argoverse
@@ -13,7 +14,7 @@ from mcaptrack.sources.ingest.labels.boxes_3d.kitti import read_kitti_3d
 from mcaptrack.sources.ingest.labels.boxes_3d.nuscenes import read_nuscenes, tables_folder
 from mcaptrack.sources.ingest.labels.boxes_3d.rows import BoxRows3D
 from mcaptrack.sources.ingest.labels.boxes_3d.table import holds_boxes_3d, read_table
-from mcaptrack.sources.ingest.labels.content import FORMATS_3D, Format, Role
+from mcaptrack.sources.ingest.labels.content import FORMATS_3D, Format
 from mcaptrack.sources.ingest.labels.delimited import MAX_LINE
 from mcaptrack.sources.ingest.labels.number_table import lines_of
 

@@ -15,13 +15,14 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.angles import wrapped
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import Code
 from mcaptrack.schema.classes import PEOPLE, PERSON, UNKNOWN
-from mcaptrack.sources.ingest.labels.content import ClassIds, Format, Role
+from mcaptrack.sources.ingest.labels.content import ClassIds, Format
 from mcaptrack.sources.ingest.labels.formats import MAX_FRAME, MAX_PLACE, MAX_SCORE
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 

@@ -1,0 +1,34 @@
+"""Names that options and parameters accept. This module imports nothing, so that declaring a command costs nothing."""
+
+from __future__ import annotations
+
+from typing import Literal, TypeAlias
+
+#: How pictures are stored.
+ImageFormat = Literal["auto", "h264", "h265", "jpeg", "png"]
+#: Formats of label files.
+LabelFormat = Literal[
+    "auto",
+    "mot",
+    "kitti",
+    "sdd",
+    "trajnet",
+    "obsmat",
+    "coco",
+    "cvat",
+    "yolo",
+    "supervision",
+    "csv",
+    "kitti-3d",
+    "nuscenes",
+    "argoverse",
+]
+#: Units of lengths in a calibration.
+LengthUnit = Literal["auto", "m", "cm", "mm"]
+#: Which point of a box touches the ground.
+Point = Literal["foot", "center"]
+#: What a label file holds, and what an input that is a text file can hold.
+Role = Literal["detections", "tracks", "truth", "corrections"]
+InputRole: TypeAlias = Role | Literal["motion", "calibration"]
+#: Which tracks re-tracking writes.
+Mode = Literal["both", "offline", "online"]
