@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import Field, dataclass, fields, replace
 from types import MappingProxyType
-from typing import Any, get_type_hints
+from typing import Any, Final, get_type_hints
 
 from mcaptrack.cli.command import is_on_command_line, settings_of
 from mcaptrack.cli.flags import RUNNING
@@ -13,7 +14,19 @@ from mcaptrack.cli.text import say
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS
 from mcaptrack.transforms import STAGES, Stage, Transform
-from mcaptrack.transforms.protocol import member_type
+from mcaptrack.transforms.protocol import bare_type, member_type
+
+_SWITCH: Final = {
+    "true": True,
+    "yes": True,
+    "on": True,
+    "1": True,
+    "false": False,
+    "no": False,
+    "off": False,
+    "0": False,
+}
+_KIND_WORDS: Final = {bool: "true or false", int: "a whole number", float: "a number"}
 
 
 def listed(names: Sequence[str]) -> str:
@@ -24,6 +37,56 @@ def listed(names: Sequence[str]) -> str:
 def options_of(kind: type[Transform]) -> dict[str, Field[Any]]:
     """Return the parameters of a transform that are options, by name."""
     return {f.name: f for f in fields(kind) if not f.metadata.get("context")}
+
+
+def has_flag(field: Field[Any]) -> bool:
+    """Return whether a parameter has an option of its own, beside ``--set name=value``."""
+    return bool(field.metadata.get("flag", True))
+
+
+def values_set(texts: Sequence[str] | None, kinds: Mapping[str, type[Transform]]) -> dict[str, Any]:
+    """Return the values of ``--set name=value`` by parameter of the transforms ``kinds``, which have names.
+
+    Raises
+    ------
+    McaptrackError
+        For a text without a value, a parameter that no transform has, or a value that isn't of its type.
+    """
+    owners = {option: kind for kind in reversed(kinds.values()) for option in options_of(kind)}
+    out: dict[str, Any] = {}
+    for text in texts or ():
+        written, equals, value = text.partition("=")
+        name = written.strip().lstrip("-").replace("-", "_")
+        if not equals:
+            raise McaptrackError(f"--set needs name=value, as in --set {name}=0.5, not {text!r}")
+        if name not in owners:
+            alike = difflib.get_close_matches(name, owners, 1)
+            hint = f"; did you mean {alike[0]}?" if alike else f"; there are {listed(sorted(owners))}"
+            raise McaptrackError(f"--set {text}: there is no parameter {name}{hint}")
+        if name in out:
+            raise McaptrackError(f"--set gives {name} twice")
+        out[name] = _read_value(text, value.strip(), get_type_hints(owners[name])[name])
+    return out
+
+
+def _read_value(text: str, value: str, hint: Any) -> Any:
+    """The value that a text of ``--set`` gives a parameter of this type."""
+    if value.lower() == "none" and bare_type(hint) is not hint:
+        return None
+    kind, is_tuple = member_type(hint)
+    try:
+        members = [_read_member(member.strip(), kind) for member in (value.split(",") if is_tuple else [value])]
+    except ValueError:
+        raise McaptrackError(f"--set {text}: {value!r} is not {_KIND_WORDS[kind]}") from None
+    return tuple(members) if is_tuple else members[0]
+
+
+def _read_member(value: str, kind: Any) -> Any:
+    if kind is bool:
+        if value.lower() not in _SWITCH:
+            raise ValueError
+        return _SWITCH[value.lower()]
+    return kind(value) if kind in (int, float) else value
 
 
 def is_open(stage: Stage, given: Mapping[str, Any]) -> bool:
@@ -50,7 +113,11 @@ def make_transform(
     own = options_of(cls)
     for option in wanted:
         if option in owners and option not in own and option in typed:
-            flag = "--" + option.replace("_", "-")
+            fields_there = [
+                options_of(kind)[option] for kind in stage.built_in().values() if option in options_of(kind)
+            ]
+            is_flag = all(map(has_flag, fields_there))
+            flag = f"--{option.replace('_', '-')}" if is_flag else f"--set {option}"
             chosen = name or wanted.get(stage.option) or stage.choice(stage.default())
             raise McaptrackError(f"{flag} is an option of {listed(owners[option])}, not of {chosen}")
     hints = get_type_hints(cls)
@@ -88,7 +155,8 @@ class Maker:
     ) -> Maker:
         """Return a maker for the running command."""
         chosen = {name: given[name] for name in (stage.kind, "profile") if name and name in given}
-        return cls(stage.name, chosen, wanted, owners, tuple(filter(is_on_command_line, wanted)))
+        typed = [name for name in wanted if is_on_command_line(name if name in given else "set")]
+        return cls(stage.name, chosen, wanted, owners, tuple(typed))
 
     def __call__(self, name: str) -> Transform:
         """Make the transform of this name; for "" the one that the user chose, or the default one."""
@@ -129,6 +197,9 @@ def configured(chosen: Mapping[str, str] = MappingProxyType({})) -> dict[str, Tr
         own = {option for kind in stage.built_in().values() for option in options_of(kind)}
         settings |= {kind: name for kind, name in chosen.items() if kind == stage.option}
         wanted = {option: value for option, value in settings.items() if value is not None}
+        chosen_plugin = settings.get(stage.kind) if stage.kind else None
+        kinds = dict(stage.built_in()) | ({chosen_plugin: stage.find(chosen_plugin).cls} if chosen_plugin else {})
+        wanted |= values_set(wanted.pop("set", None), kinds)
         if wanted.keys() & {*own, stage.option, "profile"}:
             out[stage.name] = make_transform(stage, settings, wanted)
     return out

@@ -16,7 +16,8 @@ import mcaptrack
 from mcaptrack.api.declared import options_of as options_of_function
 from mcaptrack.api.declared import words_of
 from mcaptrack.cli import common
-from mcaptrack.cli.chosen import Maker, configured, is_open, listed, options_of
+from mcaptrack.cli.chosen import Maker, configured, has_flag, is_open, listed, options_of, values_set
+from mcaptrack.cli.command import is_on_command_line
 from mcaptrack.cli.declared import annotation_of, command
 from mcaptrack.cli.many import NAMES
 from mcaptrack.cli.running import run_on_logs
@@ -31,6 +32,16 @@ Topic = Annotated[
 ]
 Frame = Annotated[
     str | None, common.option("--frame", panel=common.FILES, help="Bring boxes in space to this frame, such as map.")
+]
+Set = Annotated[
+    list[str] | None,
+    common.option(
+        "--set",
+        tuning=r"[A-Za-z0-9_-]+=[A-Za-z0-9_.,+ -]*",
+        metavar="NAME=VALUE",
+        help="Set a parameter that has no option of its own, as often as needed; `mcaptrack docs options` lists them.",
+        show_default=False,
+    ),
 ]
 #: Names that files in the working folder may give: built-in or installed ones, but not ``module:Class``.
 _NAME: Final = r"[A-Za-z0-9_-]+"
@@ -173,8 +184,12 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
     built_in = set(stage.built_in())
     more: dict[str, tuple[Any, Any]] = {}
     for option, having in owners.items():
+        if not has_flag(own[having[0]][option]):
+            continue
         hint = get_type_hints(kinds[having[0]])[option]
         more[option] = _option(own[having[0]][option], hint, () if built_in <= set(having) else having), None
+    if len(more) < len(owners):
+        more["set"] = Set, None
     taken = {one.name: annotation_of(one) for one in options_of_function(declared)}
     if stage.kind:
         usual = stage.entry(stage.default).name
@@ -190,7 +205,11 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
         more[stage.kind] = taken[stage.kind], None if stage.profiles else usual
 
     def run(given: Mapping[str, Any]) -> None:
-        wanted = {option: given[option] for option in owners if given[option] is not None}
+        wanted = {option: given[option] for option in owners if given.get(option) is not None}
+        for option, value in values_set(given.get("set"), kinds).items():
+            if option in wanted and is_on_command_line(option):
+                raise McaptrackError(f"--set {option} and the option of this name are both given; give one of them")
+            wanted[option] = value
 
         from mcaptrack.api.running import run_stage
 

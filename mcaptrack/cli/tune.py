@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import typer
 
 from mcaptrack.cli import common, labels
+from mcaptrack.cli.chosen import has_flag, options_of
 from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.config import NAME, read_toml, write_settings
 from mcaptrack.cli.inputs import expand
@@ -154,7 +155,11 @@ def tune(
         if done.best == 0:
             talk.say(f"nothing that was tried beats the defaults ({metric} {before:.4f}); {output} stays")
         else:
-            named = {name.replace("_", "-"): value for name, value in done.settings.items()}
+            kinds = STAGES[stage].built_in().values()
+            flagless = {name for kind in kinds for name, field in options_of(kind).items() if not has_flag(field)}
+            named = {name.replace("_", "-"): value for name, value in done.settings.items() if name not in flagless}
+            if set_ := [f"{name}={value}" for name, value in done.settings.items() if name in flagless]:
+                named["set"] = set_
             write_settings(output, stage, named, old_names(stage))
             talk.say(f"{output}: {metric} {before:.4f} with the defaults, {score:.4f} now")
     if json:

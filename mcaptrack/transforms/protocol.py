@@ -171,6 +171,7 @@ def option(
     theme: str = "",
     was: str = "",
     pattern: str = "",
+    flag: bool = True,
 ) -> Any:
     """Declare a parameter of a transform, as a field of its dataclass.
 
@@ -193,6 +194,9 @@ def option(
         Former name, which is accepted for one release.
     pattern : str
         Regular expression of a text that a settings file in the working folder may set; "" for none.
+    flag : bool
+        Whether the command has an option of its own for it. Without one it is set by ``--set name=value``: parameters
+        whose value follows from an experiment, as those of a method of a paper, and not from the task of a user.
 
     Returns
     -------
@@ -210,7 +214,7 @@ def option(
     if most is None:
         most = math.inf if least == -math.inf else LARGEST
     about = {"help": help, "least": least, "most": most, "search": search, "kind": kind, "theme": theme}
-    about |= {"was": was, "pattern": pattern}
+    about |= {"was": was, "pattern": pattern, "flag": flag}
     return field(default=default, metadata=about)
 
 
