@@ -68,7 +68,9 @@ def start(*words: object, folder: Path | None = None) -> subprocess.Popen[str]:
 def toml_value(value: object) -> str:
     """A value as TOML has it."""
     return (
-        str(value).lower()
+        f"[{', '.join(map(toml_value, value))}]"
+        if isinstance(value, list)
+        else str(value).lower()
         if isinstance(value, bool)
         else repr(value)
         if isinstance(value, int | float)

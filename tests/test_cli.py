@@ -61,13 +61,13 @@ class TestCommands:
 
     def test_another_tracker_replaces_the_tracks(self, finished, tmp_path):
         path = tmp_path / "other.mcap"
-        printed("track", finished, "--tracker", "bytetrack", "--new-score", 0.3, "-o", path)
+        printed("track", finished, "--tracker", "bytetrack", "--set", "new_score=0.3", "-o", path)
         channels = {c["topic"]: c for c in json.loads(printed("info", path, "--json")[0])["results"][0]["channels"]}
         assert channels["/camera/tracks"]["parameters"]["tracker"] == "bytetrack"
         assert channels["/camera/tracks"]["parameters"]["new_score"] == 0.3
-        code, _, err = call("track", path, "--tracker", "ocsort", "--new-score", 0.3)
+        code, _, err = call("track", path, "--tracker", "ocsort", "--set", "new_score=0.3")
         assert code == 1
-        assert err == "mcaptrack: --new-score is an option of bytetrack, not of ocsort\n"
+        assert err == "mcaptrack: --set new_score is an option of bytetrack, not of ocsort\n"
 
     def test_a_stage_runs_missing_inputs_and_says_so(self, fresh):
         _, err = printed("track", fresh)
@@ -129,7 +129,16 @@ class TestCommands:
     def test_output_profile_and_mode_of_retrack(self, finished, tmp_path):
         before = finished.read_bytes()
         printed(
-            "retrack", finished, "--profile", "paper", "--sigma-m", "2", "--mode", "offline", "-o", tmp_path / "p.mcap"
+            "retrack",
+            finished,
+            "--profile",
+            "paper",
+            "--set",
+            "sigma_m=2",
+            "--mode",
+            "offline",
+            "-o",
+            tmp_path / "p.mcap",
         )
         assert finished.read_bytes() == before
         (result,) = json.loads(printed("info", tmp_path / "p.mcap", "--json")[0])["results"]
@@ -250,7 +259,7 @@ class TestEvaluate:
 class TestConfig:
     def test_the_command_line_overrides_options_of_the_file(self, fresh, tmp_path):
         (tmp_path / "mcaptrack.toml").write_text(
-            '[track]\nmax-age-s = 2.5\nmin_iou = 0.4\n[detect]\ndetector = "mog2"\n'
+            '[track]\nmax-age-s = 2.5\nmin_iou = 0.4\n[detect]\ndetector = "knn"\n'
         )
 
         def made(*words, environment=None):
@@ -263,7 +272,7 @@ class TestConfig:
         assert made(environment=environment)["min_iou"] == 0.33
         assert made("--min-iou", "0.1", environment=environment)["min_iou"] == 0.1
         (tmp_path / "other.toml").write_text("[track]\nmin-iou = 0.6\n")
-        (tmp_path / "third.toml").write_text('[track]\ntracker = "ocsort"\ninertia = 0.3\n')
+        (tmp_path / "third.toml").write_text('[track]\ntracker = "ocsort"\nset = ["inertia=0.3"]\n')
         assert made("--config", "third.toml")["inertia"] == 0.3
         assert "inertia" not in made("--config", "third.toml", "--tracker", "sort")  # what is ocsort's alone stays out
         assert made("--config", "other.toml")["min_iou"] == 0.6
@@ -377,9 +386,9 @@ class TestErrors:
         [
             (["--predictor", "red"], "no such option: --predictor (run, predict, retrack have it); `"),
             (["--min_iou", "0.5"], "no such option: --min_iou; did you mean --min-iou? `"),
-            (["--max-age", "2"], "no such option: --max-age; did you mean --max-age-s or --max-age-frames? `"),
+            (["--max-age", "2"], "no such option: --max-age; did you mean --max-age-s? `"),
             (["--max-age-s", "2s"], "invalid value for '--max-age-s': '2s' is not a number; `"),
-            (["--max-age-frames", "2.5"], "invalid value for '--max-age-frames': '2.5' is not a whole number; `"),
+            (["--min-hits-frames", "2.5"], "invalid value for '--min-hits-frames': '2.5' is not a whole number; `"),
         ],
     )
     def test_a_wrong_option_is_refused_with_the_nearest_one(self, place, words, said):

@@ -316,5 +316,5 @@ class TestPage:
         }
         numbers -= {(command, name) for command in COMMANDS if command != "run" for name in NAMES}  # see above
         assert bounded < numbers
-        scores = {("track", name) for name in ("min-score", "high-score", "new-score")}  # each detector has its own
+        scores = {("track", name) for name in ("min-score",)}  # each detector has its own
         assert numbers - bounded == scores

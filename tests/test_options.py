@@ -19,6 +19,7 @@ from mcaptrack import log
 from mcaptrack.predictors import NAMES
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS
+from mcaptrack.transforms import STAGES as STAGES_OF_LOGS
 from mcaptrack.transforms.protocol import bare_type, choices
 from tests.commands import call, done, toml_value
 from tests.tiers import one_in, thorough
@@ -88,13 +89,28 @@ STAGES = [
 ]
 
 
+def as_settings(values: dict[str, Any], transform: Any) -> dict[str, Any]:
+    """Parameters as settings: those without an option of their own are texts of ``set``."""
+    flagless = {field.name for field in fields(transform) if not field.metadata.get("flag", True)}
+    texts = [f"{name}={str(value).lower()}" for name, value in values.items() if name in flagless]
+    return {name: value for name, value in values.items() if name not in flagless} | ({"set": texts} if texts else {})
+
+
 def flags(values: dict[str, Any]) -> list[str]:
-    """Write values as options of a command line."""
+    """Write settings as options of a command line."""
     out = []
     for name, value in values.items():
+        if name == "set":
+            out += [word for text in value for word in ("--set", text)]
+            continue
         flag = name.replace("_", "-")
         out += [f"--{flag}" if value else f"--no-{flag}"] if isinstance(value, bool) else [f"--{flag}", str(value)]
     return out
+
+
+def text_of(value: Any) -> str:
+    """Write a setting as the value of an environment variable."""
+    return " ".join(value) if isinstance(value, list) else str(value)
 
 
 def toml(command: str, values: dict[str, Any]) -> str:
@@ -106,26 +122,28 @@ def toml(command: str, values: dict[str, Any]) -> str:
 @pytest.mark.parametrize("stage", STAGES, ids=lambda stage: "-".join([stage.command, *dict(stage.chosen).values()]))
 @pytest.mark.parametrize("way", one_in(3, ["flag", "environment", "file"]))
 def test_every_parameter_of_a_stage_arrives_in_the_provenance(stage, way, folder, monkeypatch):
-    values = stage.others()
-    assert len(values) == len(stage.parameters())
+    values = as_settings(stage.others(), stage.transform)
     words = [stage.command, "a.mcap", "-o", "b.mcap", *flags(dict(stage.chosen))]
     if way == "flag":
         words += flags(values)
     elif way == "environment":
         for name, value in values.items():
-            monkeypatch.setenv(f"MCAPTRACK_{stage.command}_{name}".upper(), str(value))
+            monkeypatch.setenv(f"MCAPTRACK_{stage.command}_{name}".upper(), text_of(value))
     else:
         Path("mcaptrack.toml").write_text(toml(stage.command, values))
     code, _, err = call(*words)
     assert code == 0, err
-    assert stage.made(folder / "b.mcap") == values
+    assert stage.made(folder / "b.mcap") == stage.others()
+    assert len(stage.others()) == len(stage.parameters())
 
 
 @pytest.mark.parametrize("stage", STAGES, ids=lambda stage: "-".join([stage.command, *dict(stage.chosen).values()]))
 def test_giving_the_default_changes_nothing(stage, folder):
     """Also ``--smooth`` where it is on and ``--no-confirm`` where it is off."""
     values = {name: value for name, value in stage.parameters().items() if value is not None}
-    code, _, err = call(stage.command, "a.mcap", "-o", "b.mcap", *flags(dict(stage.chosen) | values))
+    code, _, err = call(
+        stage.command, "a.mcap", "-o", "b.mcap", *flags(dict(stage.chosen) | as_settings(values, stage.transform))
+    )
     assert code == 0, err
     assert stage.made(folder / "b.mcap") == stage.parameters()
 
@@ -138,10 +156,10 @@ def test_giving_the_default_changes_nothing(stage, folder):
 )
 def test_parameters_reach_the_stages_that_run_makes(stage, way, folder, monkeypatch):
     """``run --force`` applies them where the channel exists; without it a warning says that they are not applied."""
-    values = stage.others() | dict(stage.chosen)
+    values = as_settings(stage.others(), stage.transform) | dict(stage.chosen)
     if way == "environment":
         for name, value in values.items():
-            monkeypatch.setenv(f"MCAPTRACK_{stage.command}_{name}".upper(), str(value))
+            monkeypatch.setenv(f"MCAPTRACK_{stage.command}_{name}".upper(), text_of(value))
     else:
         Path("mcaptrack.toml").write_text(toml(stage.command, values))
     before = (folder / "a.mcap").read_bytes()
@@ -181,3 +199,33 @@ def _content(path: Path) -> dict[str, tuple[dict[str, str], list[tuple[int, byte
             for topic, channel in opened.channels.items()
             if not topic.endswith("/view/tf")
         }
+
+
+def test_a_parameter_has_an_option_in_all_transforms_of_a_stage_or_in_none():
+    for command in STAGES_OF_LOGS.values():
+        has_flag: dict[str, set[bool]] = {}
+        for kind in command.built_in().values():
+            for field in fields(kind):
+                has_flag.setdefault(field.name, set()).add(field.metadata.get("flag", True))
+        assert {name for name, values in has_flag.items() if len(values) > 1} == set()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--set", "alpha"], "--set needs name=value, as in --set alpha=0.5, not 'alpha'"),
+        (["--set", "alhpa=1"], "--set alhpa=1: there is no parameter alhpa; did you mean alpha?"),
+        (["--set", "alpha=x"], "--set alpha=x: 'x' is not a number"),
+        (["--set", "min_hits=1.5"], "--set min_hits=1.5: '1.5' is not a whole number"),
+        (["--set", "trim_ends=maybe"], "--set trim_ends=maybe: 'maybe' is not true or false"),
+        (["--set", "alpha=1", "--set", "alpha=2"], "--set gives alpha twice"),
+        (["--set", "link_s=1", "--link-s", "2"], "--set link_s and the option of this name are both given; give one"),
+        (["--profile", "paper", "--set", "alpha=2"], "alpha has to be from 0 to 1, not 2.0"),
+    ],
+)
+def test_set_refuses_what_is_no_parameter_or_no_value(words, message, folder):
+    before = (folder / "a.mcap").read_bytes()
+    code, out, err = call("retrack", "a.mcap", *words)
+    assert (code, out, err.count("\n")) == (1, "", 1)
+    assert err.startswith(f"mcaptrack: {message}")
+    assert (folder / "a.mcap").read_bytes() == before

@@ -70,7 +70,7 @@ def test_old_names_are_accepted_in_a_file_in_the_environment_and_on_the_command_
 def test_a_profile_names_its_method_and_distance_implies_it(walked):
     assert call("retrack", "a.mcap", "--profile", "authors").code == 0
     assert made(walked / "a.mcap")["retracker"] == "consistency"
-    result = call("retrack", "a.mcap", "--distance", "now")
+    result = call("retrack", "a.mcap", "--set", "distance=now")
     assert result.code == 0
     assert "--retracker consistency" in result.err
     assert (made(walked / "a.mcap")["retracker"], made(walked / "a.mcap")["distance"]) == ("consistency", "now")
@@ -79,8 +79,8 @@ def test_a_profile_names_its_method_and_distance_implies_it(walked):
         1,
         "mcaptrack: the profile authors is of the retracker consistency, not of likelihood\n",
     )
-    result = call("retrack", "a.mcap", "--profile", "paper", "--coast-s", "1")
-    assert (result.code, result.err) == (1, "mcaptrack: --coast-s is an option of likelihood, not of consistency\n")
+    result = call("retrack", "a.mcap", "--profile", "paper", "--set", "coast_s=1")
+    assert (result.code, result.err) == (1, "mcaptrack: --set coast_s is an option of likelihood, not of consistency\n")
 
 
 @pytest.mark.parametrize("profile", PROFILES)

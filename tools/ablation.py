@@ -49,23 +49,23 @@ STEPS: dict[str, tuple[str, Retracking]] = {
     "paper": ("--profile paper", PAPER),
     "authors": ("--profile authors", AUTHORS),
     "distance of current positions": (
-        "--profile authors --distance now --priority-distance 0 --birth raw --no-interpolated --min-history 2 "
-        "--backfill unclaimed --no-trim-ends",
+        "--profile authors --set distance=now --set priority_distance=0 --set birth=raw --set interpolated=false "
+        "--set min_history=2 --set backfill=unclaimed --set trim_ends=false",
         _NOW,
     ),
     "computed covariance": (
-        "... --covariance predictor --predictor kalman --gate-m 3 --alpha 1 --beta 0",
+        "... --set covariance=predictor --predictor kalman --set gate_m=3 --set alpha=1 --set beta=0",
         replace(_NOW, covariance="predictor", predictor="kalman", gate_m=3.0, alpha=1.0, beta=0.0),
     ),
     "likelihood, estimated noise": (
-        "--link-s 0 --no-resolve-swaps --no-smooth --track-confidence 0",
+        "--link-s 0 --set resolve_swaps=false --no-smooth --set track_confidence=0",
         replace(DEFAULT, **_PLAIN),
     ),
     "+ false-track removal": (
-        "--link-s 0 --no-resolve-swaps --no-smooth",
+        "--link-s 0 --set resolve_swaps=false --no-smooth",
         replace(DEFAULT, **_PLAIN | {"track_confidence": 0.5}),
     ),
-    "+ offline linking": ("--no-resolve-swaps --no-smooth", replace(DEFAULT, resolve_swaps=False, smooth=False)),
+    "+ offline linking": ("--set resolve_swaps=false --no-smooth", replace(DEFAULT, resolve_swaps=False, smooth=False)),
     "+ identity swaps at encounters": ("--no-smooth", replace(DEFAULT, smooth=False)),
     "+ smoothing (the default)": ("", DEFAULT),
 }
@@ -89,11 +89,18 @@ def _parts() -> dict[str, tuple[str, Retracking]]:
     out: dict[str, tuple[str, Retracking]] = {"the default": ("", DEFAULT)}
     for field in fields(DEFAULT):
         flag = field.name.replace("_", "-")
+        has_flag = field.metadata.get("flag", True)
         name = f"no {_NAMES.get(field.name, field.name.replace('_', ' '))}"
         if field.name in _OFF:
-            out[name] = f"--{flag} {_OFF[field.name]:g}", replace(DEFAULT, **{field.name: _OFF[field.name]})
+            out[name] = (
+                (f"--{flag} " if has_flag else f"--set {field.name}=") + f"{_OFF[field.name]:g}",
+                replace(DEFAULT, **{field.name: _OFF[field.name]}),
+            )
         elif field.name in _NAMES and getattr(DEFAULT, field.name) is True:  # others don't concern tracks
-            out[name] = f"--no-{flag}", replace(DEFAULT, **{field.name: False})
+            out[name] = (
+                f"--no-{flag}" if has_flag else f"--set {field.name}=false",
+                replace(DEFAULT, **{field.name: False}),
+            )
     return out
 
 

@@ -89,7 +89,8 @@ def _row(made: Any, field: Any) -> str:
         or f"{_KINDS[kind]} {limits(field.metadata['least'], field.metadata['most'])}"
     )
     words = field.metadata["help"]
-    return f"| `--{field.name.replace('_', '-')}` | {values.strip()} | {shown} | {words[:1].upper()}{words[1:]} |"
+    name = f"--{field.name.replace('_', '-')}" if field.metadata["flag"] else f"--set {field.name}="
+    return f"| `{name}` | {values.strip()} | {shown} | {words[:1].upper()}{words[1:]} |"
 
 
 def renamed() -> str:

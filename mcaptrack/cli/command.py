@@ -64,6 +64,9 @@ def _unknown_option(error: Any) -> str:
     theirs = {command: _options_of(found) for command, found in context.parent.command.commands.items()}
     if having := [command for command, options in theirs.items() if name in options]:
         words += f" ({', '.join(having)} {'has' if len(having) == 1 else 'have'} it)"
+    parameter = name.removeprefix("--").removeprefix("no-").replace("-", "_")
+    if parameter in getattr(context.command, "settable", ()):
+        return f"{words}; did you mean --set {parameter}=VALUE?"
     known = theirs.get(context.info_name, [])
     stem = name.replace("_", "-")
     alike = [option for option in known if option == stem or option.startswith(f"{stem}-")]
@@ -99,6 +102,7 @@ class Command(TyperCommand):
             self.settings[old] = Setting(name, old, hidden.name, first.kind, first.many, first.declared)
         self.most_used: tuple[str, ...] = getattr(given["callback"], "most_used", ()) or MOST_USED.get(name, ())
         arrange(self.most_used, self.params)
+        self.settable: tuple[str, ...] = getattr(given["callback"], "settable", ())
         config = parameters["config"]
         config.envvar = now["config"].variable  # the others are read with the files, once this is known
 

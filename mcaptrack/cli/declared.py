@@ -124,6 +124,7 @@ def command(
     )
     call.__name__, call.__annotations__ = name, {n: hint for n, (hint, _) in annotations.items()}
     made: Any = common.one_line(takes_many()(call) if each else call)
+    made.settable = ()
     made.help, made.most_used = help_of(declared), getattr(declared, "most_used", ())
     return made  # type: ignore[no-any-return]
 

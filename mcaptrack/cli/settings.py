@@ -215,7 +215,9 @@ def _from_file(commands: Commands, file: ConfigFile) -> Iterable[tuple[str, Sett
         for key, value in values.items():
             name = key.replace("_", "-")
             if name not in known:
-                refuse_usage(f"{file.path}: {command} has no option {key}{_nearest(name, known)}")
+                settable = key.replace("-", "_") in getattr(commands[command], "settable", ())
+                hint = f'; write set = ["{key}={value}"]' if settable else _nearest(name, known)
+                refuse_usage(f"{file.path}: {command} has no option {key}{hint}")
             where = f"{file.path}: [{command}] {key}"
             try:
                 taken = known[name].from_toml(value)

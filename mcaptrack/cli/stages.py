@@ -222,4 +222,5 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
 
     made: Any = command(stage.name, declared, run, more)
     made.help = stage_help(stage, plugins)
+    made.settable = tuple(option for option in owners if option not in more)
     return made  # type: ignore[no-any-return]

@@ -48,11 +48,15 @@ class MotionDetector:
     threshold: float | None = option(
         None, "difference from the background that counts as motion; each detector has its own default", least=0.0
     )
-    history_s: float = option(60.0, "memory of the background model, in seconds", least=0.1)
+    history_s: float = option(60.0, "memory of the background model, in seconds", least=0.1, flag=False)
     max_pixels: int = option(
-        1_000_000, "pictures are halved until they have no more pixels than this", least=1_000, most=1_000_000_000
+        1_000_000,
+        "pictures are halved until they have no more pixels than this",
+        least=1_000,
+        most=1_000_000_000,
+        flag=False,
     )
-    stabilise: bool = option(True, "compensate the motion of a shaking camera")
+    stabilise: bool = option(True, "compensate the motion of a shaking camera", flag=False)
 
     method: ClassVar[Method]
     colour: ClassVar[Colour] = "grey"

@@ -78,15 +78,29 @@ class MedianDetector:
     threshold: float = option(
         MIN_THRESHOLD, "difference of colour (0 to 255) that counts as motion at least", least=0.0
     )
-    history_s: float = option(600.0, "length of the blocks of time that have one background, in seconds", least=0.1)
-    max_pixels: int = option(
-        1_000_000, "pictures are halved until they have no more pixels than this", least=1_000, most=1_000_000_000
+    history_s: float = option(
+        600.0, "length of the blocks of time that have one background, in seconds", least=0.1, flag=False
     )
-    stabilise: bool = option(True, "compensate the motion of a shaking camera")
-    remove_shadows: bool = option(True, "leave out what is darker than the background, but of the same colour")
-    separate: bool = option(True, "separate people who are one region, by the height and shape of people in the scene")
+    max_pixels: int = option(
+        1_000_000,
+        "pictures are halved until they have no more pixels than this",
+        least=1_000,
+        most=1_000_000_000,
+        flag=False,
+    )
+    stabilise: bool = option(True, "compensate the motion of a shaking camera", flag=False)
+    remove_shadows: bool = option(
+        True, "leave out what is darker than the background, but of the same colour", flag=False
+    )
+    separate: bool = option(
+        True, "separate people who are one region, by the height and shape of people in the scene", flag=False
+    )
     least_visible: float = option(
-        0.5, "share of a person that has to be seen for a box of their own beside others", least=0.05, most=1.0
+        0.5,
+        "share of a person that has to be seen for a box of their own beside others",
+        least=0.05,
+        most=1.0,
+        flag=False,
     )
 
     colour: ClassVar[Colour] = "bgr"

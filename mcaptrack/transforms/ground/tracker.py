@@ -114,12 +114,14 @@ class GroundTracker:
         "results that depend on the past alone",
         least=0.0,
         theme=_LIFE,
+        flag=False,
     )
     link_s: float = option(
         8.0,
         "a new track continues a lost one that it fits, up to this many seconds after its last detection; 0 for never",
         least=0.0,
         theme=_LIFE,
+        flag=False,
     )
     confirm_score: float = option(
         0.9,
@@ -127,6 +129,7 @@ class GroundTracker:
         least=0.0,
         search=(0.3, 4.0),
         theme=_LIFE,
+        flag=False,
     )
     birth_score: float = option(
         0.2,
@@ -135,22 +138,29 @@ class GroundTracker:
         most=1.0,
         search=(0.0, 0.8),
         theme=_LIFE,
+        flag=False,
     )
     cost: Cost = option(
         "metres",
         "how detections and tracks are compared: distance of their centres, or overlap of their boxes seen from above",
         theme=_ASSOCIATION,
+        flag=False,
     )
     min_iou: float = option(
         0.05,
-        "with --cost iou: least overlap (IoU) of a detection with a track's predicted box",
+        "with cost iou: least overlap (IoU) of a detection with a track's predicted box",
         least=0.0,
         most=1.0,
         theme=_ASSOCIATION,
     )
     min_score: float | None = option(None, "ignore detections with a lower score", theme=_DETECTIONS)
     class_id: int | None = option(
-        None, "ignore detections of other classes", least=0, most=2**31 - 1, theme=_DETECTIONS
+        None,
+        "ignore detections of other classes",
+        least=0,
+        most=2**31 - 1,
+        theme=_DETECTIONS,
+        flag=False,
     )
     across_classes: bool = option(
         False,

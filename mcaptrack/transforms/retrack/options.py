@@ -48,6 +48,7 @@ class RetrackOptions:
         least=1,
         most=100,
         theme=_PREDICTIONS,
+        flag=False,
     )
     noise_m: float | None = option(
         None,
@@ -61,6 +62,7 @@ class RetrackOptions:
         "expected speed of tracks without a history: standard deviation per axis in metres per second",
         least=0.0,
         theme=_MOTION,
+        flag=False,
     )
     drift_m_per_s: float = option(
         0.12,
@@ -68,6 +70,7 @@ class RetrackOptions:
         least=0.0,
         theme=_MOTION,
         was="drift",
+        flag=False,
     )
     drift_ratio: float = option(
         0.08,
@@ -75,6 +78,7 @@ class RetrackOptions:
         least=0.0,
         theme=_MOTION,
         was="drift_share",
+        flag=False,
     )
     same_id_bonus: float = option(
         12.0,
@@ -83,6 +87,7 @@ class RetrackOptions:
         least=0.0,
         theme=_ASSOCIATION,
         was="same_source",
+        flag=False,
     )
     max_age_s: float = option(
         2.0,
@@ -91,10 +96,18 @@ class RetrackOptions:
         theme=_LIFE,
     )
     interpolated: bool = option(
-        False, "use interpolated samples as observations, too", theme=_ASSOCIATION, was="filled"
+        False,
+        "use interpolated samples as observations, too",
+        theme=_ASSOCIATION,
+        was="filled",
+        flag=False,
     )
     min_track_s: float = option(
-        2.0, "leave out tracks that last less than this many seconds (probation)", least=0.0, theme=_LIFE
+        2.0,
+        "leave out tracks that last less than this many seconds (probation)",
+        least=0.0,
+        theme=_LIFE,
+        flag=False,
     )
     link_s: float = option(
         20.0,
@@ -111,12 +124,14 @@ class RetrackOptions:
         most=0.99,
         theme=_OFFLINE,
         was="link_certainty",
+        flag=False,
     )
     resolve_swaps: bool = option(
         True,
         "decide again which track is which where two tracks met, from what was before and after (identity switches)",
         theme=_OFFLINE,
         was="part",
+        flag=False,
     )
     track_confidence: float = option(
         0.5,
@@ -125,6 +140,7 @@ class RetrackOptions:
         most=1.0,
         theme=_OFFLINE,
         was="min_certainty",
+        flag=False,
     )
     across_classes: bool = option(
         False,
@@ -233,6 +249,7 @@ class LikelihoodOptions(RetrackOptions):
         least=0.0,
         theme=_ASSOCIATION,
         was="share_m",
+        flag=False,
     )
     merge_timeout_s: float = option(
         3.0,
@@ -240,6 +257,7 @@ class LikelihoodOptions(RetrackOptions):
         least=0.0,
         theme=_ASSOCIATION,
         was="share_s",
+        flag=False,
     )
     confirm_s: float = option(
         1.2,
@@ -248,20 +266,23 @@ class LikelihoodOptions(RetrackOptions):
         least=0.0,
         theme=_LIFE,
         was="sure_s",
+        flag=False,
     )
     coast_s: float = option(
         1.2,
         "online, a track is written for up to this many seconds without an observation",
         least=0.0,
         theme=_LIFE,
+        flag=False,
     )
     adapt_online: bool = option(
         True,
         "online, follow the log so far: write new tracks at once if most tracks last, and lost ones only as long as it "
         "is likely that they come back",
         theme=_LIFE,
+        flag=False,
     )
-    adapt: bool = option(True, ADAPT_HELP, theme=_PREDICTIONS)
+    adapt: bool = option(True, ADAPT_HELP, theme=_PREDICTIONS, flag=False)
     appearance: bool | None = option(
         None,
         "compare the colours of what people wear before and after gaps and encounters; by default where the log has "
@@ -293,12 +314,14 @@ class ConsistencyOptions(RetrackOptions):
         "how a track and an observation are compared: mean, max or first distance between their predicted steps, or "
         "that between expected and measured position (now)",
         theme=_ASSOCIATION,
+        flag=False,
     )
     max_distance: float = option(
         3.0,
         "gate: pairs further apart, in standard deviations of their predictions (d_min in the paper), are not matched",
         least=0.0,
         theme=_ASSOCIATION,
+        flag=False,
     )
     gate_m: float | None = option(
         3.0,
@@ -306,6 +329,7 @@ class ConsistencyOptions(RetrackOptions):
         least=0.0,
         theme=_ASSOCIATION,
         was="max_jump_m",
+        flag=False,
     )
     priority_distance: float = option(
         0.0,
@@ -313,33 +337,59 @@ class ConsistencyOptions(RetrackOptions):
         least=0.0,
         theme=_ASSOCIATION,
         was="certain_distance",
+        flag=False,
     )
     covariance: Covariance = option(
-        "predictor", "covariance of predictions: the predictor's, or the paper's (u - t) sigma^2", theme=_PREDICTIONS
+        "predictor",
+        "covariance of predictions: the predictor's, or the paper's (u - t) sigma^2",
+        theme=_PREDICTIONS,
+        flag=False,
     )
-    sigma_m: float = option(1.0, "sigma of the paper's covariance, in metres", least=1e-6, theme=_PREDICTIONS)
+    sigma_m: float = option(
+        1.0, "sigma of the paper's covariance, in metres", least=1e-6, theme=_PREDICTIONS, flag=False
+    )
     alpha: float = option(
-        1.0, "smoothing of displacements (Eq. 3 of the paper); 1 for none", least=0.0, most=1.0, theme=_PREDICTIONS
+        1.0,
+        "smoothing of displacements (Eq. 3 of the paper); 1 for none",
+        least=0.0,
+        most=1.0,
+        theme=_PREDICTIONS,
+        flag=False,
     )
     beta: float = option(
-        0.0, "smoothing of the trend of displacements (Eq. 3 of the paper)", least=0.0, most=1.0, theme=_PREDICTIONS
+        0.0,
+        "smoothing of the trend of displacements (Eq. 3 of the paper)",
+        least=0.0,
+        most=1.0,
+        theme=_PREDICTIONS,
+        flag=False,
     )
     birth: Literal["raw", "smoothed"] = option(
-        "raw", "what a new track predicts from: its past as observed, or smoothed", theme=_PREDICTIONS
+        "raw",
+        "what a new track predicts from: its past as observed, or smoothed",
+        theme=_PREDICTIONS,
+        flag=False,
     )
     min_hits: int = option(
-        1, "online, a track is written from this many matches in a row", least=0, most=1000, theme=_LIFE
+        1,
+        "online, a track is written from this many matches in a row",
+        least=0,
+        most=1000,
+        theme=_LIFE,
+        flag=False,
     )
     trim_ends: bool = option(
         False,
         "offline, leave out what a track matched after its last min_hits matches in a row",
         theme=_LIFE,
         was="confirm",
+        flag=False,
     )
     backfill: Literal["none", "unclaimed", "all"] = option(
         "unclaimed",
         "whether a new track gets the past of its first observation: not at all, what no other track has, or all",
         theme=_OFFLINE,
+        flag=False,
     )
 
     @property

@@ -38,15 +38,21 @@ class ByteTrack(Sort):
     """
 
     high_score: float = option(
-        0.5, "detections with at least this score, or without a score, are matched first", search=(0.2, 0.9)
+        0.5,
+        "detections with at least this score, or without a score, are matched first",
+        search=(0.2, 0.9),
+        flag=False,
     )
-    new_score: float = option(0.6, "detections with at least this score may begin a track", search=(0.2, 0.9))
+    new_score: float = option(
+        0.6, "detections with at least this score may begin a track", search=(0.2, 0.9), flag=False
+    )
     low_min_iou: float = option(
         0.5,
         "least overlap (IoU) for detections with a low score, which are matched second",
         least=0.0,
         most=1.0,
         search=(0.2, 0.8),
+        flag=False,
     )
 
     def _associate(self, step: AssociationInput) -> tuple[Indices, Indices]:

@@ -55,12 +55,19 @@ class OcSort(Sort):
     J. Cao et al., "Observation-Centric SORT: Rethinking SORT for Robust Multi-Object Tracking", CVPR 2023.
     """
 
-    inertia: float = option(0.2, "weight of the direction of motion, beside overlap", least=0.0, search=(0.0, 0.6))
-    direction_frames: int = option(
-        3, "number of frames over which the direction of motion is measured", least=2, most=100, search=(2, 10)
+    inertia: float = option(
+        0.2, "weight of the direction of motion, beside overlap", least=0.0, search=(0.0, 0.6), flag=False
     )
-    recover: bool = option(True, "match lost tracks once more by their last detection")
-    reupdate: bool = option(True, "recompute the filter over the gap when a track is found again")
+    direction_frames: int = option(
+        3,
+        "number of frames over which the direction of motion is measured",
+        least=2,
+        most=100,
+        search=(2, 10),
+        flag=False,
+    )
+    recover: bool = option(True, "match lost tracks once more by their last detection", flag=False)
+    reupdate: bool = option(True, "recompute the filter over the gap when a track is found again", flag=False)
 
     def _empty_tracks(self) -> Tracks:
         return Tracks(_CENTRES - SHARED_ROWS + 2 * (self.direction_frames + 1))

@@ -114,6 +114,7 @@ class Sort:
         "a track ends after this many frames without a detection, instead of --max-age-s",
         least=0,
         theme=_LIFE,
+        flag=False,
     )
     min_hits_s: float = option(
         0.3,
@@ -132,6 +133,7 @@ class Sort:
         "iou",
         "how detections and tracks are compared: overlap of boxes (iou), or distance in pixels or in metres",
         theme=_ASSOCIATION,
+        flag=False,
     )
     min_iou: float = option(
         0.2,
@@ -143,19 +145,26 @@ class Sort:
     )
     max_distance_px: float = option(
         60.0,
-        "with --cost pixels: largest distance of a box's centre from the predicted one, in pixels",
+        "with cost pixels: largest distance of a box's centre from the predicted one, in pixels",
         least=0.0,
         theme=_ASSOCIATION,
+        flag=False,
     )
     max_distance_m: float = option(
         1.0,
-        "with --cost metres: largest distance on the ground from the predicted position, in metres",
+        "with cost metres: largest distance on the ground from the predicted position, in metres",
         least=0.0,
         theme=_ASSOCIATION,
+        flag=False,
     )
     min_score: float | None = option(None, "ignore detections with a lower score", theme=_DETECTIONS)
     class_id: int | None = option(
-        None, "ignore detections of other classes", least=0, most=2**31 - 1, theme=_DETECTIONS
+        None,
+        "ignore detections of other classes",
+        least=0,
+        most=2**31 - 1,
+        theme=_DETECTIONS,
+        flag=False,
     )
     across_classes: bool = option(
         False,

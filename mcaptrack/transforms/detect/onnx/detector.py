@@ -87,7 +87,12 @@ class OnnxDetector:
         "1x1", "columns and rows of tiles that each picture is cut into, as in 3x2, for small objects", theme=_BOXES
     )
     overlap: float = option(
-        0.2, "how much of its width or height a tile shares with the next one", least=0.0, most=0.5, theme=_BOXES
+        0.2,
+        "how much of its width or height a tile shares with the next one",
+        least=0.0,
+        most=0.5,
+        theme=_BOXES,
+        flag=False,
     )
     classes: str = option(
         "person", "classes to detect, by name or index with commas between them; `all` for every one", theme=_BOXES
@@ -102,6 +107,7 @@ class OnnxDetector:
         most=1.0,
         search=(0.3, 0.8),
         theme=_BOXES,
+        flag=False,
     )
 
     reads: ClassVar[Schema] = VIDEO
