@@ -13,7 +13,6 @@ from mcaptrack import __version__
 from mcaptrack.cli.calibrate import calibrate
 from mcaptrack.cli.command import Group
 from mcaptrack.cli.common import register
-from mcaptrack.cli.delta import delta
 from mcaptrack.cli.demo import demo
 from mcaptrack.cli.docs import docs
 from mcaptrack.cli.doctor import doctor
@@ -78,7 +77,6 @@ register(app, _LOOK, "render", render)
 register(app, _LOOK, "report", report)
 register(app, _LOOK, "query", query, reads=True)
 register(app, _LOOK, "export", export)
-register(app, _LOOK, "delta", delta)
 register(app, _LOOK, "docs", docs, reads=True)
 register(app, _MEASURE, "evaluate", evaluate, reads=True)
 register(app, _MEASURE, "events", events)

@@ -210,7 +210,6 @@ class LogWork(Generic[T]):
         Whether all logs have one output, a folder.
     names_output : bool
         Whether each input always has an output of its own, by default in the working folder.
-    then : callable, called with each log that is done, now or before
     """
 
     name: str
@@ -224,7 +223,6 @@ class LogWork(Generic[T]):
     writes_objects: bool = True
     shares_output: bool = False
     names_output: bool = False
-    then: Callable[[Location], None] = lambda _: None
 
 
 def process(
@@ -257,7 +255,6 @@ def process(
             work.show(path, result)
         state = "up-to-date" if getattr(result, "is_up_to_date", False) else "done"
         talk.event(f"{path}: {state}", "log", log=str(path), state=state)
-        work.then(path)
         return [result], {}
     from mcaptrack.fleet import run as run_fleet
 
@@ -303,8 +300,6 @@ class _Printer(Generic[T]):
     def hear(self, outcome: LogOutcome[T]) -> None:
         """Print what became of a log."""
         self.ended += 1
-        if outcome.is_good:
-            self._work.then(outcome.log)
         for line in outcome.printed.splitlines():
             self._talk.say(f"{outcome.log}: {line}")
         for notice in outcome.warnings:
