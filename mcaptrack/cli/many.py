@@ -204,8 +204,6 @@ class LogWork(Generic[T]):
         Returns a result as values of JSON.
     writes : bool
         Whether logs, or files beside them, are changed.
-    writes_objects : bool
-        Whether what is made of a log in a store goes beside it, and not into the working folder.
     shares_output : bool
         Whether all logs have one output, a folder.
     names_output : bool
@@ -220,7 +218,6 @@ class LogWork(Generic[T]):
     line: Callable[[T], str] | None = None
     suffix: str = ".mcap"
     writes: bool = True
-    writes_objects: bool = True
     shares_output: bool = False
     names_output: bool = False
 
@@ -270,7 +267,6 @@ def process(
                 output_dir=folder,
                 suffix=work.suffix,
                 writes=work.writes,
-                writes_objects=work.writes_objects,
                 on_outcome=listener.hear,
                 on_status=lambda status: listener.watch(status, table),
                 on_note=talk.say,

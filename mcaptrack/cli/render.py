@@ -157,7 +157,6 @@ def render(
             data=data,
             line=line,
             suffix=suffix,
-            writes_objects=False,
         )
         results, totals = process(find_logs(logs), work, talk, output)
     if json:

@@ -296,7 +296,6 @@ def export(
             data,
             rows,
             ".rosbag2" if form.startswith("rosbag2") else ends_with(form),
-            writes_objects=False,
             shares_output=is_table,
         )
         results, totals = process(found, work, talk, output)
