@@ -142,13 +142,13 @@ def test_a_log_of_many_has_one_line():
 
 
 def test_what_becomes_of_logs_is_printed_when_it_is_known_and_results_in_their_order(capsys, command):
-    shown, good = [], []
-    work = LogWork("check", None, {}, show=lambda *one: shown.append(one), data=str, then=good.append)
+    shown = []
+    work = LogWork("check", None, {}, show=lambda *one: shown.append(one), data=str)
     printer = _Printer(work, talk(), [A, B, C])
     printer.hear(LogOutcome(B, "done", "two", printed="hello\nworld"))
-    assert (shown, good, printer.ended) == ([], [B], 1)
+    assert (shown, printer.ended) == ([], 1)
     printer.hear(LogOutcome(A, "skipped"))
-    assert (shown, good) == ([(B, "two")], [B, A])
+    assert shown == [(B, "two")]
     printer.hear(LogOutcome(C, "failed", error="it is cut off", detail="a trace"))
     assert (shown, printer.ended) == ([(B, "two")], 3)
     assert capsys.readouterr().err.splitlines() == [
