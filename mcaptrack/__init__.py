@@ -8,7 +8,6 @@ _PARTS = {
     "calibrating": ["CalibrateResult", "CameraCorrection", "calibrate"],
     "catalogue": ["Model", "get_model", "models"],
     "contents": ["ChannelInfo", "FrameInfo", "LogInfo", "info"],
-    "delta": ["DeltaState", "DeltaTableInfo", "delta"],
     "detecting": ["detect", "motion"],
     "demonstration": ["DemoResult", "demo"],
     "fetching": ["FetchedMessage"],

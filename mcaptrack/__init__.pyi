@@ -8,9 +8,6 @@ from mcaptrack.api.contents import ChannelInfo as ChannelInfo
 from mcaptrack.api.contents import FrameInfo as FrameInfo
 from mcaptrack.api.contents import LogInfo as LogInfo
 from mcaptrack.api.contents import info as info
-from mcaptrack.api.delta import DeltaState as DeltaState
-from mcaptrack.api.delta import DeltaTableInfo as DeltaTableInfo
-from mcaptrack.api.delta import delta as delta
 from mcaptrack.api.demonstration import DemoResult as DemoResult
 from mcaptrack.api.demonstration import demo as demo
 from mcaptrack.api.detecting import detect as detect
@@ -68,8 +65,6 @@ __all__ = [
     "CameraCorrection",
     "ChannelInfo",
     "ColumnInfo",
-    "DeltaState",
-    "DeltaTableInfo",
     "DemoResult",
     "DoctorResult",
     "DropResult",
@@ -97,7 +92,6 @@ __all__ = [
     "TuneResult",
     "calibrate",
     "check",
-    "delta",
     "demo",
     "detect",
     "detections",

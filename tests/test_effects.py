@@ -106,9 +106,6 @@ def template(template, tmp_path_factory) -> Path:
     for path in [*(folder / "taken").glob("*/recording=fresh")]:
         path.rename(path.with_name("recording=a"))
     (folder / "taken" / "demo.mcap").write_text("")
-    done("export", folder / "fresh.mcap", "-o", folder / "some", "--delta", folder / "kept")
-    shutil.copytree(folder / "kept", folder / "scattered")
-    done("export", folder / "robot.mcap", "-o", folder / "some", "--delta", folder / "scattered")
     done("tune", folder / "a.mcap", "--trials", 2, "--study", folder / "old.jsonl", "-o", folder / "x.toml")
     return folder
 

@@ -421,7 +421,6 @@ class TestCommand:
             ({"topic": "/camera/video"}, "/camera/video has no detections and no tracks"),
             ({"topic": "/nothing"}, "/nothing"),
             ({"topic": ["/camera/tracks", "/camera/truth"]}, "of one channel, not of"),
-            ({"delta": "lake"}, "Delta tables are made of tables"),
             ({"output": "there"}, "is a folder"),
         ],
     )

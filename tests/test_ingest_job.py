@@ -1,18 +1,15 @@
-"""What a job of `ingest` says and decides before it writes: topics, names, sizes, parameters; and errors of stores."""
+"""What a job of `ingest` says and decides before it writes: topics, names, sizes, parameters."""
 
 from __future__ import annotations
 
 from fractions import Fraction
 from pathlib import Path
 
-import deltalake
 import pytest
 
-import mcaptrack
 from mcaptrack import log
 from mcaptrack.cli.inputs import expand, only_one_output
 from mcaptrack.errors import McaptrackError
-from mcaptrack.location import parse
 from mcaptrack.notices import collected
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.sources.ingest.job import IngestJob, IngestOptions
@@ -21,9 +18,8 @@ from mcaptrack.sources.ingest.labels.motions import read_motions
 from mcaptrack.sources.ingest.labels.timeline import Timeline
 from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 from mcaptrack.tables.compared import pair_files
-from mcaptrack.tables.delta.opening import DeltaFolder, reporting
 from tests.logs import add_rows, some_log
-from tests.worlds import boxes_at, tracks_at, write_clip
+from tests.worlds import boxes_at, tracks_at
 
 MOT = "".join(
     f"{frame},{who},{10 * who},20,9,30,1,{kind},1\n" for frame in (1, 7, 13) for who, kind in ((1, 1), (2, 3))
@@ -203,52 +199,3 @@ def test_folders_are_taken_as_logs_or_as_a_whole(place):
     only_one_output([Path("a"), Path("b")], None)
     with pytest.raises(McaptrackError, match=r"2 inputs can't all be written to b; give one input, or no name"):
         only_one_output([Path("a"), Path("c")], Path("b"))
-
-
-def test_errors_of_tables_are_one_line(tmp_path):
-    exceptions = deltalake.exceptions
-    for where in (tmp_path, parse("s3://bucket/lake")):
-        for error, words in (
-            (OSError("Permission denied (os error 13)"), "it may not be written here (permission denied)"),
-            (exceptions.DeltaError("No space left on device"), "the disk is full"),
-            (ValueError("Read-only file system"), "the file system is read-only"),
-            (exceptions.DeltaError("broken   log\n 3: <unknown> trace Help: call"), "broken log"),
-            (OSError(""), "OSError"),
-            (Exception("odd Debug source: x"), "odd"),
-            (
-                exceptions.DeltaProtocolError("version 99"),
-                "it uses features that this version of deltalake doesn't know",
-            ),
-        ):
-            with pytest.raises(McaptrackError) as said, reporting(where, "written"):
-                raise error
-            assert f"the Delta table {where} can't be written: " in str(said.value)
-            assert words in str(said.value)
-            assert "unknown>" not in str(said.value)
-            assert "Help" not in str(said.value)
-            assert len(str(said.value).splitlines()) == 1
-        for kept in (
-            exceptions.CommitFailedError("x"),
-            exceptions.TableNotFoundError("x"),
-            McaptrackError("x"),
-            KeyError("x"),
-        ):
-            with pytest.raises(type(kept)), reporting(where, "written"):
-                raise kept
-    long = "x" * 400
-    with pytest.raises(McaptrackError) as said, reporting(tmp_path, "read"):
-        raise OSError(long)
-    assert str(said.value) == f"the Delta table {tmp_path} can't be read: {long[:300]}"
-    assert str(DeltaFolder(tmp_path).location("topics/50%/a")) == str(tmp_path / "topics" / "50+" / "a")
-    with pytest.raises(McaptrackError, match="their paths are URLs, in which % has a meaning"):
-        DeltaFolder(tmp_path / "a%20b")
-
-
-@pytest.mark.parametrize(("fps", "is_said"), [("30000/1001", False), ("29.97", False), ("29.9", True), ("10", True)])
-def test_another_rate_than_that_of_the_video_is_said(tmp_path, fps, is_said):
-    write_clip(tmp_path / "a.mp4", 4, fps=Fraction(30000, 1001))
-    with collected() as notices:
-        mcaptrack.ingest(tmp_path / "a.mp4", output=tmp_path / "a.mcap", fps=fps)
-    said = [one.message for one in notices if "frames a second; its pictures are written at" in one.message]
-    assert bool(said) == is_said
-    assert not said or said[0].endswith(f"has 29.97 frames a second; its pictures are written at {fps} by `fps=`")

@@ -67,8 +67,6 @@ LOGS = {
     )
 }
 LOGS |= {("query", "words"), ("evaluate", "inputs")}
-#: Arguments that are Delta tables, which may be in a store.
-DELTA = {("export", "delta"), ("delta", "location")}
 
 
 @pytest.mark.parametrize(("name", "parameter"), PATHS, ids=[f"{name} {p.name}" for name, p in PATHS])
@@ -78,8 +76,6 @@ def test_only_logs_are_read_from_a_store(tmp_path, monkeypatch, name, parameter)
     said = said_of(name, parameter, "s3://bucket/a/b.mcap")
     if (name, parameter.name) in LOGS:
         assert said.startswith("s3://bucket/a/b.mcap is in Amazon S3, which needs obstore, ")
-    elif (name, parameter.name) in DELTA:
-        assert said.startswith("the Delta table s3://bucket/a/b.mcap/")
     else:
         assert said.startswith("s3://bucket/a/b.mcap is in a store, ")
 

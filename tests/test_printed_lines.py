@@ -605,7 +605,6 @@ OWN = {
     "tables",
     "study",
     "output",
-    "delta",
 }
 OF_FUNCTIONS = ("demo", "drop", "evaluate", "events", "export", "ingest", "recover", "render", "report", "train")
 

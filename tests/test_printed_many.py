@@ -15,7 +15,6 @@ import pytest
 from mcaptrack.api.several import CameraResult
 from mcaptrack.cli import common, live, many, running, text
 from mcaptrack.cli.many import LogWork, ManyOptions, _Printer, _seconds, _summarise
-from mcaptrack.cli.show import _DeltaWork
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import FleetResult, FleetStatus, LogOutcome, Running
 from mcaptrack.fleet.expansion import NamedLog
@@ -143,13 +142,13 @@ def test_a_log_of_many_has_one_line():
 
 
 def test_what_becomes_of_logs_is_printed_when_it_is_known_and_results_in_their_order(capsys, command):
-    shown, good = [], []
-    work = LogWork("check", None, {}, show=lambda *one: shown.append(one), data=str, then=good.append)
+    shown = []
+    work = LogWork("check", None, {}, show=lambda *one: shown.append(one), data=str)
     printer = _Printer(work, talk(), [A, B, C])
     printer.hear(LogOutcome(B, "done", "two", printed="hello\nworld"))
-    assert (shown, good, printer.ended) == ([], [B], 1)
+    assert (shown, printer.ended) == ([], 1)
     printer.hear(LogOutcome(A, "skipped"))
-    assert (shown, good) == ([(B, "two")], [B, A])
+    assert shown == [(B, "two")]
     printer.hear(LogOutcome(C, "failed", error="it is cut off", detail="a trace"))
     assert (shown, printer.ended) == ([(B, "two")], 3)
     assert capsys.readouterr().err.splitlines() == [
@@ -297,7 +296,7 @@ def test_a_table_is_shown_unless_results_are_printed_or_nothing_is(options, word
     assert asked == [is_hidden]
 
 
-# Progress, and Delta tables
+# Progress
 
 
 def test_progress_of_a_stage_is_said_now_and_then_as_json(capsys, monkeypatch):
@@ -311,41 +310,6 @@ def test_progress_of_a_stage_is_said_now_and_then_as_json(capsys, monkeypatch):
     first, second = lines_of_json(capsys.readouterr().err)
     assert (first["message"], first["stage"], first["done"], first["total"]) == ("detect: 3.5 of 9", "detect", 3.5, 9)
     assert (second["message"], second["total"]) == ("detect: 3.5", None)
-
-
-class Batches:
-    """What adds logs to Delta tables, and says how that ended."""
-
-    where = "lake"
-
-    def __init__(self, **changed: Any) -> None:
-        plain = dict.fromkeys(("notes", "added", "replaced", "unchanged"), ()) | {"failed": {}}
-        self.done = SimpleNamespace(**plain | {"transactions": 7, "conflicts": 0} | changed)
-
-    def finish(self) -> SimpleNamespace:
-        return self.done
-
-
-def finished(batches: Batches, is_single: bool = False, **words: bool) -> dict[str, Any]:
-    work = _DeltaWork.__new__(_DeltaWork)
-    work._batches, work._folder, work._talk = batches, None, talk(**words)
-    with work._talk.open():
-        return work.finish(is_single)
-
-
-def test_what_became_of_delta_tables_is_said(capsys):
-    assert finished(Batches()) == {
-        "location": "lake", "added": 0, "replaced": 0, "unchanged": 0, "transactions": 7,
-    }  # fmt: skip
-    assert capsys.readouterr().err.splitlines() == ["lake: nothing added in 7 transactions"]
-    busy = Batches(notes=["tracks is left out"], added=[1, 2], unchanged=[3], failed={A: "it is cut off"}, conflicts=4)
-    assert finished(busy, verbose=True)["added"] == 2
-    assert capsys.readouterr().err.splitlines() == [
-        "warning: tracks is left out", "mcaptrack: a.mcap: it is cut off", "lake: 2 added, 1 unchanged in 7 transactions",
-        "4 transactions were repeated, because other processes were quicker",
-    ]  # fmt: skip
-    with pytest.raises(McaptrackError, match=r"^it is cut off$"):
-        finished(busy, is_single=True)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from tests.logs import READING
 from tests.tiers import one_in
 
 #: Those that read no log.
-OTHERS = {"calibrate", "delta", "demo", "docs", "doctor", "models"} | ({"train"} - READING.keys())
+OTHERS = {"calibrate", "demo", "docs", "doctor", "models"} | ({"train"} - READING.keys())
 pytestmark = pytest.mark.usefixtures("never_waits")
 
 

@@ -118,7 +118,7 @@ def _interrupted(*_: object, **__: object) -> None:
 @pytest.mark.usefixtures("no_hanging")
 @pytest.mark.parametrize("beside", one_in(2, SURROUNDINGS), ids=lambda one: one.__name__)
 @pytest.mark.parametrize(
-    "command", sorted(set(GROUP.commands) - {"calibrate", "delta", "demo", "models", "train"})
+    "command", sorted(set(GROUP.commands) - {"calibrate", "demo", "models", "train"})
 )  # train needs torch, and calibrate several cameras
 def test_commands_that_read_change_nothing(
     command: str, beside: Callable[[Path], None], template: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -111,7 +111,6 @@ def on_recording(path: Path, elsewhere: Path) -> dict[str, list[object]]:
         "train": [],  # needs torch, and opens logs like all others
         "demo": [],  # takes no log
         "models": [],  # takes no log
-        "delta": [],  # takes no log
         "calibrate": [],  # takes several cameras
         "fuse": [],  # takes several cameras
         "docs": [],

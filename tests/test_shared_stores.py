@@ -1,4 +1,4 @@
-"""Stores that several commands use at once: claims, what ``doctor`` says of a store, and faults during a whole run."""
+"""Stores that several commands use at once: what ``doctor`` says of a store, and faults during a whole run."""
 
 from __future__ import annotations
 
@@ -15,24 +15,12 @@ import pytest
 import mcaptrack
 from mcaptrack import fleet, objects
 from mcaptrack.errors import McaptrackError
-from mcaptrack.fleet import object_claims
-from mcaptrack.fleet.claims import Claims, claim_name
 from mcaptrack.location import parse
 from tests import fleet_tasks
 from tests.commands import call, done
 from tests.tiers import one_in, thorough
 
 NIGHT = parse("s3://bucket/night")
-LOG = "s3://bucket/night/x.mcap"
-CLAIM = NIGHT / claim_name(LOG)
-
-
-def claims_on(host: str, stale_s: float = 60.0) -> Claims:
-    """The claims of a process on another machine."""
-    made = Claims()
-    made._in_stores._me |= {"host": host}
-    made._in_stores._stale_s = stale_s
-    return made
 
 
 def test_of_two_writers_one_succeeds(store):
@@ -50,86 +38,20 @@ def test_of_two_writers_one_succeeds(store):
     assert objects.find(url) is None
 
 
-class TestClaims:
-    def test_a_log_is_claimed_by_one_fleet_until_it_gives_it_up(self, store):
-        one, other = claims_on("one"), claims_on("other")
-        assert one.take(LOG, NIGHT) == (True, "")
-        assert [str(url) for url, _ in objects.list_objects(NIGHT)] == [CLAIM]
-        assert not other.take(LOG, NIGHT).is_mine
-        other.release(LOG)
-        assert not other.take(LOG, NIGHT).is_mine
-        one.release(LOG)
-        assert other.take(LOG, NIGHT).is_mine
-        other.release_all()
-        assert store.names() == []
-
-    def test_a_fleet_that_shows_no_life_loses_its_claim(self, store, monkeypatch):
-        monkeypatch.setattr(object_claims, "BEAT_S", 0.0)
-        one, other = claims_on("one"), claims_on("other", stale_s=0.05)
-        one.take(LOG, NIGHT)
-        assert not other.take(LOG, NIGHT).is_mine
-        for _ in range(3):  # the time begins again with each sign of life
-            time.sleep(0.06)
-            one.beat()
-            assert not other.take(LOG, NIGHT).is_mine
-        time.sleep(0.06)
-        taken = other.take(LOG, NIGHT)
-        assert taken.is_mine
-        assert taken.note.startswith(f"{LOG}: taken over from process ")
-        assert taken.note.endswith(" on one, which has ended")
-        one.beat()
-        one.release(LOG)
-        assert objects.find(CLAIM) is not None
-        other.release(LOG)
-        assert objects.find(CLAIM) is None
-
-    def test_a_claim_that_was_taken_over_is_not_given_up_by_its_former_fleet(self, store):
-        """It doesn't know yet that it has lost it."""
-        one, other = claims_on("one"), claims_on("other", stale_s=0.0)
-        one.take(LOG, NIGHT)
-        assert [other.take(LOG, NIGHT).is_mine for _ in range(2)] == [False, True]
-        one.release(LOG)
-        assert store.names() == [CLAIM.key]
-        other.release(LOG)
-        assert store.names() == []
-
-    def test_a_process_of_this_machine_that_has_ended_loses_its_claim_at_once(self, store):
-        gone = Claims()
-        gone._in_stores._me |= {"pid": 2**22 - 1}
-        gone.take(LOG, NIGHT)
-        assert Claims().take(LOG, NIGHT).is_mine
-
-    def test_an_answer_that_is_lost_takes_no_claim_away(self, store):
-        mine = claims_on("one")
-        with store.failing(lambda request: "lost" if request.method == "PUT" and not store.names() else ""):
-            assert mine.take(LOG, NIGHT).is_mine
-        mine.release(LOG)
-        assert store.names() == []
-
-    def test_a_store_that_cant_be_written_has_no_claims(self, store):
-        with store.failing(lambda request: "denied" if request.method == "PUT" else ""):
-            assert Claims().take(LOG, NIGHT).is_mine
-
-    def test_what_is_no_claim_is_left_alone(self, store):
-        objects.put_if_unchanged(CLAIM, b"text", None)
-        assert not Claims().take(LOG, NIGHT).is_mine
-        assert objects.read(CLAIM) == b"text"
-
-
 @thorough
 @pytest.mark.usefixtures("never_waits")
-def test_two_fleets_over_one_bucket_do_no_log_twice(store):
+def test_two_fleets_over_one_bucket_with_one_ledger_do_no_log_twice(store, tmp_path):
     for number in range(5):
         store.put(f"night/{number}.mcap", b"x")
     found = []
 
     def work() -> None:
-        found.append(fleet.run(fleet_tasks.mark, "s3://bucket/night"))
+        found.append(fleet.run(fleet_tasks.mark, "s3://bucket/night", ledger=tmp_path / "night.jsonl"))
 
     fleets = [Thread(target=work) for _ in range(2)]
     for each in fleets:
         each.start()
-    while sum(name.endswith(".claim") for name in store.names()) < 2:
+    while len([*tmp_path.glob(".*.claim")]) < 2:
         time.sleep(0.02)
     store.put("night/go", b"go")
     for each in fleets:
@@ -137,8 +59,8 @@ def test_two_fleets_over_one_bucket_do_no_log_twice(store):
     times = Counter(name.split(".")[0] for name in store.names() if len(name.rpartition(".")[2]) == 32)
     assert times == {f"night/{number}": 1 for number in range(5)}
     states = [one.state for result in found for one in result.outcomes]
-    assert Counter(states) == {"done": 5, "up-to-date": 5}
-    assert not any("claim" in name for name in store.names())
+    assert Counter(states) == {"done": 5, "skipped": 5}
+    assert not [*tmp_path.glob(".*.claim")]
 
 
 class TestDoctor:
@@ -174,7 +96,7 @@ class TestDoctor:
         code, access, err = self.access(str(NIGHT))
         assert code == 1
         assert [name for name, why in access.items() if why] == ["put-if-absent", "replace"]
-        assert "two commands at once may do a log twice" in err
+        assert "two commands at once may both write the first results of a log" in err
         assert store.names() == []
 
     @pytest.mark.parametrize(

@@ -22,7 +22,6 @@ SIGNALS = {"Ctrl-C": signal.SIGINT, "kill": signal.SIGTERM}
 #: What is looked at of a command, where it is not the reading, and the writing and publishing of those that write.
 DEEDS = {
     "demo": ["write"],
-    "delta": [],  # its files are those of deltalake
     "doctor": ["write"],
     "calibrate": [],  # it has no log of several cameras here
     "fuse": [],  # it has no log of several cameras here

@@ -9,8 +9,7 @@ from typing import Literal, cast
 
 from mcaptrack import log as logs
 from mcaptrack.api.checked import checked
-from mcaptrack.api.common import as_location, log_location, names_of, optional_path, warn_unused, warnings_about
-from mcaptrack.api.delta import add_to_delta
+from mcaptrack.api.common import log_location, names_of, optional_path, warn_unused, warnings_about
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, place_of
@@ -46,8 +45,6 @@ class ExportResult:
         file, its channel.
     warnings : tuple of mcaptrack.Notice
         What was left out.
-    delta : {"added", "replaced", "unchanged"} or None
-        What became of the log in the Delta tables; None if none were named.
 
     """
 
@@ -56,7 +53,6 @@ class ExportResult:
     rows: Mapping[str, int]
     written: tuple[str, ...]
     warnings: tuple[Notice, ...]
-    delta: Literal["added", "replaced", "unchanged"] | None = None
 
     @property
     def is_up_to_date(self) -> bool:
@@ -72,7 +68,6 @@ def export(
     form: Format | Literal["rosbag2", "rosbag2-sqlite3"] | ExchangeFormat = "parquet",
     topic: str | Sequence[str] | None = None,
     blobs: bool = False,
-    delta: PathLike | None = None,
     force: bool = False,
     progress: Progress = no_progress,
 ) -> ExportResult:
@@ -100,9 +95,6 @@ def export(
         Also write a table of all messages of these channels; the channel with the boxes for a file.
     blobs : bool, default False
         With ``topic``: include binary fields, such as pictures and point clouds.
-    delta : path, optional
-        A folder, or its URL in a store, with Delta tables of many logs: the log is added to them, or replaced. Needs
-        deltalake.
     force : bool, default False
         Write all tables again, also over those of another log of this name; replace a bag or a file.
     progress : callable, optional
@@ -127,15 +119,9 @@ def export(
     """
     path = log_location(log)
     if form in EXCHANGE_FORMATS:
-        if delta is not None:
-            raise McaptrackError(f"Delta tables are made of tables, and {form} writes none; leave `form=` out")
         return _export_file(path, optional_path(output), form, names_of(topic), blobs, force, progress)
     if form in _BAGS:
-        if delta is not None:
-            raise McaptrackError(f"Delta tables are made of tables, and {form} writes none; leave `form=` out")
         return _export_bag(path, optional_path(output), _BAGS[form], topic, blobs, force, progress)
-    if delta is not None and form != "parquet":
-        raise McaptrackError(f"Delta tables are made of tables in Parquet, not in {form}; leave `form=` out")
     folder = optional_path(output) or default_folder(path)
     if folder.exists() and not folder.is_dir():
         raise McaptrackError(f"{folder} is a file; tables go to a folder")
@@ -146,10 +132,9 @@ def export(
             done = write_tables(
                 opened, folder, progress, form=cast("Format", form), topics=names_of(topic), blobs=blobs, force=force
             )
-        state = None if delta is None else add_to_delta(as_location(delta), path, folder, force)
         for words in done.notes:
             warn(words, "left-out")
-    return ExportResult(path, folder, done.rows, tuple(done.written), tuple(dict.fromkeys(warnings)), state)
+    return ExportResult(path, folder, done.rows, tuple(done.written), tuple(dict.fromkeys(warnings)))
 
 
 def _export_bag(

@@ -8,12 +8,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from mcaptrack.location import Location, local_name, parse
+from mcaptrack.location import local_name, parse
 from mcaptrack.tables.catalogue import read_catalogue
 from mcaptrack.viewing import report as pages
 
 
-def page_about(where: Location, folder: Path) -> tuple[bytes, dict[str, Any]]:
+def page_about(where: Path, folder: Path) -> tuple[bytes, dict[str, Any]]:
     """Return the page about all logs in a folder of tables, and its numbers; it links to pages from ``folder``."""
     rows = read_catalogue(where)
     data = pages.fleet_data(rows)

@@ -14,7 +14,7 @@ from mcaptrack.api.fleet_page import page_about
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, publish_bytes, refuse_overwrite
-from mcaptrack.location import Location, local_name
+from mcaptrack.location import local_name
 from mcaptrack.notices import Notice, collected
 from mcaptrack.tables.catalogue import is_folder_of_tables
 from mcaptrack.viewing import report as pages
@@ -77,7 +77,7 @@ def report(
     Parameters
     ----------
     log : path or sequence of paths
-        The log, or several; or a folder of tables, or the URL of one with Delta tables.
+        The log, or several; or a folder of tables.
     output : path, optional
         The page, by default LOG.report.html beside the log, or in the working folder if that is in a store; several
         logs need a name, and so do tables.
@@ -106,8 +106,13 @@ def report(
 
     """
     places = locations_of(log)
-    if any(is_folder_of_tables(place) for place in places):
-        return _report_on_tables(places, optional_path(output), camera, force)
+    for place in places:
+        if isinstance(place, Path) and is_folder_of_tables(place):
+            if len(places) != 1:
+                raise McaptrackError(
+                    f"{places[0]} and others: a page is about logs, or about one folder of tables; give one"
+                )
+            return _report_on_tables(place, optional_path(output), camera, force)
     paths = [log_location(path) for path in places]
     if not paths:
         raise McaptrackError("there is no log to report on; give one, or several")
@@ -130,15 +135,13 @@ def report(
     return ReportResult(target, len(content), pages.data(reports), tuple(dict.fromkeys(warnings)))
 
 
-def _report_on_tables(places: Sequence[Location], output: Path | None, camera: str | None, force: bool) -> ReportResult:
+def _report_on_tables(folder: Path, output: Path | None, camera: str | None, force: bool) -> ReportResult:
     """Write the page about all logs in a folder of tables."""
-    if len(places) != 1:
-        raise McaptrackError(f"{places[0]} and others: a page is about logs, or about one folder of tables; give one")
     if output is None:
-        raise McaptrackError(f"the page about all logs in {places[0]} needs a name; give one with `output=`")
+        raise McaptrackError(f"the page about all logs in {folder} needs a name; give one with `output=`")
     refuse_overwrite(output, force)
     with collected() as warnings:
         warn_unused("the page is about all cameras of all logs", camera=camera is not None)
-        content, data = page_about(places[0], output.parent)
+        content, data = page_about(folder, output.parent)
         publish_bytes(output, content)
     return ReportResult(output, len(content), data, tuple(dict.fromkeys(warnings)))

@@ -21,7 +21,7 @@ _TRIED: Final = {
     "list": "objects can't be listed",
     "write": "objects can't be written",
     "read": "objects can't be read",
-    "put-if-absent": "two commands at once may do a log twice",
+    "put-if-absent": "two commands at once may both write the first results of a log",
     "replace": "results of two commands at once may replace each other",
     "delete": "objects can't be removed",
 }

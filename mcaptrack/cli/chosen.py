@@ -52,7 +52,7 @@ def values_set(texts: Sequence[str] | None, kinds: Mapping[str, type[Transform]]
     McaptrackError
         For a text without a value, a parameter that no transform has, or a value that isn't of its type.
     """
-    owners = {option: kind for kind in reversed(kinds.values()) for option in options_of(kind)}
+    owners = {option: kind for kind in reversed(list(kinds.values())) for option in options_of(kind)}
     out: dict[str, Any] = {}
     for text in texts or ():
         written, equals, value = text.partition("=")

@@ -29,7 +29,7 @@ class EachLog(Generic[T]):
     """
 
     #: As in ``LogWork``.
-    writes_objects, names_output = True, False
+    names_output = False
 
     def __init__(self, given: Mapping[str, Any]) -> None:
         self.given = given
@@ -87,7 +87,6 @@ class EachLog(Generic[T]):
                 data=self.data,
                 line=self.line,
                 suffix=self.suffix(),
-                writes_objects=self.writes_objects,
                 names_output=self.names_output,
             )
             results, totals = process(logs, work, talk, given["output"])

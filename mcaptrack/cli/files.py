@@ -143,9 +143,7 @@ def recover(
 
     found = find_logs(logs, each=True, leave_out=_RECOVERED)
     with common.Talk(quiet, verbose).open() as talk:
-        work = LogWork(
-            "recover", mcaptrack.recover, {"force": force}, show, data, line, _RECOVERED, writes_objects=False
-        )
+        work = LogWork("recover", mcaptrack.recover, {"force": force}, show, data, line, _RECOVERED)
         reports, totals = process(found, work, talk, output)
     if json:
         common.print_json({"results": [data(report) for report in reports], **totals})

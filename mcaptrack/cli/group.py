@@ -107,12 +107,6 @@ ENTRIES: Final = (
         "Write a log as tables (Parquet), one row per object and frame, as a ROS 2 bag, or for other programs.",
         "show:export",
     ),
-    Listed(
-        "delta",
-        _LOOK,
-        "List the Delta tables that logs were exported to; remove logs from them, and tidy their files up.",
-        "delta:delta",
-    ),
     Listed("docs", _LOOK, "List the pages of the documentation, or print one.", "docs:docs", reads=True),
     Listed("evaluate", _MEASURE, "Score tracks and predictions against ground truth.", "evaluate:evaluate", reads=True),
     Listed(

@@ -10,8 +10,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special, refuse_url
 from mcaptrack.location import Location, is_remote, parse
 
-#: Arguments that name logs, or tables of many logs, which may be in a store.
-_LOGS: Final = ("logs", "path", "inputs", "delta", "location")
+#: Arguments that name logs, which may be in a store.
+_LOGS: Final = ("logs", "path", "inputs")
 
 
 def check_paths(given: Mapping[str, Any]) -> None:

@@ -204,13 +204,10 @@ class LogWork(Generic[T]):
         Returns a result as values of JSON.
     writes : bool
         Whether logs, or files beside them, are changed.
-    writes_objects : bool
-        Whether what is made of a log in a store goes beside it, and not into the working folder.
     shares_output : bool
         Whether all logs have one output, a folder.
     names_output : bool
         Whether each input always has an output of its own, by default in the working folder.
-    then : callable, called with each log that is done, now or before
     """
 
     name: str
@@ -221,10 +218,8 @@ class LogWork(Generic[T]):
     line: Callable[[T], str] | None = None
     suffix: str = ".mcap"
     writes: bool = True
-    writes_objects: bool = True
     shares_output: bool = False
     names_output: bool = False
-    then: Callable[[Location], None] = lambda _: None
 
 
 def process(
@@ -257,7 +252,6 @@ def process(
             work.show(path, result)
         state = "up-to-date" if getattr(result, "is_up_to_date", False) else "done"
         talk.event(f"{path}: {state}", "log", log=str(path), state=state)
-        work.then(path)
         return [result], {}
     from mcaptrack.fleet import run as run_fleet
 
@@ -273,7 +267,6 @@ def process(
                 output_dir=folder,
                 suffix=work.suffix,
                 writes=work.writes,
-                writes_objects=work.writes_objects,
                 on_outcome=listener.hear,
                 on_status=lambda status: listener.watch(status, table),
                 on_note=talk.say,
@@ -303,8 +296,6 @@ class _Printer(Generic[T]):
     def hear(self, outcome: LogOutcome[T]) -> None:
         """Print what became of a log."""
         self.ended += 1
-        if outcome.is_good:
-            self._work.then(outcome.log)
         for line in outcome.printed.splitlines():
             self._talk.say(f"{outcome.log}: {line}")
         for notice in outcome.warnings:

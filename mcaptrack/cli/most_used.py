@@ -22,7 +22,7 @@ MOST_USED: Final[Mapping[str, tuple[str, ...]]] = {
     "calibrate": ("reference", "cameras", "dry_run", "clock_offset_s", "output", "force"),
     "zones": ("zones", "topic", "camera", "output", "force"),
     "evaluate": ("truth", "topic", "similarity", "gate_m", "rules", "fail_under", "csv", "output", "force"),
-    "export": ("form", "topic", "output", "delta", "force"),
+    "export": ("form", "topic", "output", "force"),
     "query": ("file", "form", "rows", "tables", "output", "force"),
     "tune": ("truth", "stage", "tracker", "metric", "trials", "search", "topic", "output", "force"),
     "train": ("recipe", "epochs", "device", "validate", "topic", "output", "force"),

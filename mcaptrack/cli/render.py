@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 class Render(EachLog["RenderResult"]):
     """Draw the annotated video."""
 
-    writes_objects = False
-
     def arguments(self, names: Sequence[str]) -> dict[str, Any]:
         """Return the arguments; in ``--output-dir`` the name of the output says what is written."""
         given = super().arguments(names)

@@ -33,7 +33,7 @@ def report(
 
     The page needs no network and has no scripts; it contains its numbers as JSON, which --json prints. Scores are those
     of `mcaptrack evaluate`; without ground truth in the log there are none. Only reads logs; `mcaptrack run` runs
-    stages that are missing. Of a folder that logs were exported to, with --output-dir or --delta, the page has totals,
+    stages that are missing. Of a folder that logs were exported to, with --output-dir, the page has totals,
     trends, the worst logs, outliers and warnings.
 
     Example: mcaptrack report log.mcap -o report.html

@@ -5,11 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from mcaptrack import notices
 from mcaptrack.cli import common
 from mcaptrack.cli.many import LogWork, many_options, process, takes_many
-from mcaptrack.cli.text import console, printable, stdout_to_stderr
-from mcaptrack.errors import McaptrackError
+from mcaptrack.cli.text import console, printable
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:
@@ -240,16 +238,6 @@ def export(
             help="With --topic: include binary fields, such as pictures and point clouds.",
         ),
     ] = False,
-    delta: Annotated[
-        Path | None,
-        common.option(
-            "--delta",
-            panel=common.FILES,
-            metavar="FOLDER",
-            help="Also add the tables to the Delta tables in this folder or URL, or replace the log there.",
-            show_default=False,
-        ),
-    ] = None,
     force: Annotated[
         bool,
         common.option(
@@ -275,8 +263,6 @@ def export(
     Example: mcaptrack export log.mcap --format cvat -o boxes.xml
 
     Example: mcaptrack export robot.mcap --topic /imu --format csv
-
-    Example: mcaptrack export log.mcap --delta lake/
     """
     import mcaptrack
     from mcaptrack.api.exporting import refuse_same_tables
@@ -289,8 +275,6 @@ def export(
     folder = output or many_options().output_dir
     if is_table:
         refuse_same_tables([one.path for one in found], folder)
-    if delta is not None and form != "parquet":
-        raise McaptrackError(f"--delta takes tables in Parquet, not --format {form}; leave one of them out")
 
     def rows(done: ExportResult) -> str:
         return ", ".join(f"{name} {count}" for name, count in done.rows.items())
@@ -304,7 +288,6 @@ def export(
 
     options: dict[str, Any] = {"form": form, "topic": topic, "blobs": blobs, "force": force}
     with common.Talk(quiet, verbose).open() as talk:
-        batches = _DeltaWork(delta, folder, force, talk) if delta is not None else None
         work = LogWork(
             "export",
             mcaptrack.export,
@@ -313,48 +296,10 @@ def export(
             data,
             rows,
             ".rosbag2" if form.startswith("rosbag2") else ends_with(form),
-            writes_objects=False,
             shares_output=is_table,
-            then=batches.add if batches else lambda _: None,
         )
         results, totals = process(found, work, talk, output)
         if folder is not None and form == "parquet" and len(found) > 1:
             refresh(folder)
-        if batches:
-            totals |= {"delta": batches.finish(len(found) == 1)}
     if json:
         common.print_json({"results": [data(one) for one in results], **totals})
-
-
-class _DeltaWork:
-    """Adds the logs of a command to Delta tables, in batches."""
-
-    def __init__(self, where: Path, folder: Path | None, force: bool, talk: common.Talk) -> None:
-        from mcaptrack.api.common import as_location
-        from mcaptrack.api.delta import DeltaBatches
-
-        self._folder, self._talk = folder, talk
-        self._batches = DeltaBatches(as_location(where), force)
-
-    def add(self, log: Location) -> None:
-        """Add a log that was exported, now or before."""
-        from mcaptrack.tables.export import default_folder
-
-        self._batches.add(log, self._folder or default_folder(log))
-
-    def finish(self, is_single: bool) -> dict[str, Any]:
-        """Commit the last batch, print what was done, and return it. Raises McaptrackError if a single log failed."""
-        with stdout_to_stderr():
-            done = self._batches.finish()
-        for words in done.notes:
-            notices.warn(words, "left-out")
-        for log, why in done.failed.items():
-            if is_single:
-                raise McaptrackError(why)
-            common.record_failure(log, why, "failed")
-        parts = {"added": len(done.added), "replaced": len(done.replaced), "unchanged": len(done.unchanged)}
-        words = ", ".join(f"{count} {what}" for what, count in parts.items() if count) or "nothing added"
-        self._talk.say(f"{self._batches.where}: {words} in {done.transactions} transactions")
-        if done.conflicts:
-            self._talk.detail(f"{done.conflicts} transactions were repeated, because other processes were quicker")
-        return {"location": str(self._batches.where), **parts, "transactions": done.transactions}

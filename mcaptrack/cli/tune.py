@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
@@ -157,7 +157,9 @@ def tune(
         else:
             kinds = STAGES[stage].built_in().values()
             flagless = {name for kind in kinds for name, field in options_of(kind).items() if not has_flag(field)}
-            named = {name.replace("_", "-"): value for name, value in done.settings.items() if name not in flagless}
+            named: dict[str, Any] = {
+                name.replace("_", "-"): value for name, value in done.settings.items() if name not in flagless
+            }
             if set_ := [f"{name}={value}" for name, value in done.settings.items() if name in flagless]:
                 named["set"] = set_
             write_settings(output, stage, named, old_names(stage))

@@ -43,7 +43,6 @@ def run(
     memory_limit: str | float | None = None,
     tries: int = 2,
     writes: bool = True,
-    writes_objects: bool = True,
     on_outcome: Callable[[LogOutcome[T]], None] | None = None,
     on_status: Watch | None = None,
     on_note: Callable[[str], None] | None = None,
@@ -88,10 +87,8 @@ def run(
         How often a log is tried that kills its worker, or exceeds a limit. Other failures are not tried again.
     writes : bool, default True
         Whether the function changes logs or writes beside them; then each log is claimed by a small file there while it
-        is processed, so that another fleet leaves it alone. A log in a store is claimed by a small object beside it.
-    writes_objects : bool, default True
-        Whether what the function makes of a log in a store goes beside it. If not (as tables and videos, which go to
-        the working folder), claims on such logs are files, too.
+        is processed, so that another fleet leaves it alone. A log in a store is claimed by a file beside the ledger,
+        or in the working folder, so that only fleets that share it leave it alone.
     on_outcome, on_status, on_note : callable, optional
         Called with a ``LogOutcome`` when a log has ended, with a ``FleetStatus`` several times a second, and with a
         line of text when something is tried again or taken over.
@@ -132,8 +129,8 @@ def run(
     outputs = outputs_in(folder, found, suffix) if folder is not None else []
     for number, one in enumerate(found):
         own = {"output": outputs[number]} if outputs else {}
-        place = _claimed_in(one.path, writes, writes_objects) if folder is None else None
-        work.append(QueuedLog(number, one.path, location_of(one.path), own, place or claims_in))
+        place = _claimed_in(one.path, claims_in) if writes and folder is None else claims_in
+        work.append(QueuedLog(number, one.path, location_of(one.path), own, place))
     for output in outputs:
         _make_folder(output.parent)
     limits = WorkerLimits(
@@ -155,13 +152,11 @@ def run(
     return fleet.run()
 
 
-def _claimed_in(log: Location, writes: bool, writes_objects: bool) -> Location | None:
-    """Return where a log is claimed: beside what the function writes; None where that can't be written."""
-    if not writes:
-        return None
+def _claimed_in(log: Location, otherwise: Path | None) -> Path | None:
+    """Return the folder in which a log that is changed is claimed: its own, or another one if that can't be written."""
     if isinstance(log, Url):
-        return log.parent if writes_objects else Path.cwd()
-    return log.parent if os.access(log.parent, os.W_OK) else None
+        return otherwise or Path.cwd()
+    return log.parent if os.access(log.parent, os.W_OK) else otherwise
 
 
 def _crew(scheduler: str | None, limits: WorkerLimits, jobs: int | None) -> Crew:

@@ -1,4 +1,4 @@
-"""Claims: small files, or objects in a store, that keep several fleets from working on the same log."""
+"""Claims: small files that keep several fleets from working on the same log."""
 
 from __future__ import annotations
 
@@ -12,10 +12,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import monotonic, time
 from typing import Any, Final, NamedTuple
-
-from mcaptrack.errors import McaptrackError
-from mcaptrack.fleet.object_claims import ObjectClaims
-from mcaptrack.location import Location, Url
 
 #: Seconds between signs of life of a fleet, and without one after which its claims count as left behind.
 BEAT_S: Final = 10.0
@@ -38,17 +34,11 @@ class Claims:
         self._mine: dict[str, Path] = {}
         self._beaten = monotonic()
         self._me = {"host": _host(), "pid": os.getpid(), "started": _started(os.getpid())}
-        self._in_stores = ObjectClaims(self._me, _has_ended, STALE_S)
 
-    def take(self, location: str, folder: Location | None) -> Taken:
-        """Claim a log, by a file in ``folder`` or an object below it.
-
-        Without a folder, or where nothing can be written, there is no claim.
-        """
+    def take(self, location: str, folder: Path | None) -> Taken:
+        """Claim a log by a file in ``folder``; without one, or where nothing can be written, there is no claim."""
         if folder is None:
             return Taken(is_mine=True)
-        if isinstance(folder, Url):
-            return self._take_in_store(location, folder)
         path = folder / claim_name(location)
         content = json.dumps({"location": location, **self._me, "since": round(time(), 3)}).encode()
         try:
@@ -83,16 +73,8 @@ class Claims:
         self._mine[location] = path
         return Taken(is_mine=True, note=_taken_over(location, owner))
 
-    def _take_in_store(self, location: str, prefix: Url) -> Taken:
-        try:
-            is_mine, owner = self._in_stores.take(location, prefix / claim_name(location))
-        except McaptrackError:  # a store that can't be written or reached: the command says so, if it matters
-            return Taken(is_mine=True)
-        return Taken(is_mine, "" if owner is None else _taken_over(location, owner))
-
     def beat(self) -> None:
         """Give a sign of life, if it is time."""
-        self._in_stores.beat()
         if monotonic() - self._beaten >= BEAT_S:
             self._beaten = monotonic()
             for path in self._mine.values():
@@ -101,7 +83,6 @@ class Claims:
 
     def release(self, location: str) -> None:
         """Give a claim up."""
-        self._in_stores.release(location)
         path = self._mine.pop(location, None)
         if path is None:
             return
@@ -112,13 +93,12 @@ class Claims:
 
     def release_all(self) -> None:
         """Give all claims up."""
-        self._in_stores.release_all()
         for location in list(self._mine):
             self.release(location)
 
 
 def claim_name(location: str) -> str:
-    """Return the name of the file or object that claims a log."""
+    """Return the name of the file that claims a log."""
     return f".mcaptrack-{hashlib.sha256(os.fsencode(location)).hexdigest()[:24]}.claim"
 
 

@@ -30,8 +30,6 @@ T = TypeVar("T")
 #: Seconds between two looks at everything, and at logs that another fleet works on.
 _TICK_S: Final = 0.25
 _WAIT_S: Final = 1.0
-#: The same for logs in a store, where each look is a request or two.
-_WAIT_IN_STORE_S: Final = 3.0
 #: Seconds that workers get to end in order.
 _GRACE_S: Final = 3.0
 
@@ -64,7 +62,7 @@ class QueuedLog:
     log: Location
     location: str
     own: dict[str, Any]
-    claims_in: Location | None
+    claims_in: Path | None
     tries: int = 0
     wait_until: float = 0.0
 
@@ -124,7 +122,7 @@ class Fleet(Generic[T]):
         """Remove what fleets that were killed have left."""
         folders: dict[Path, set[str]] = {}
         for work in self._logs:
-            if isinstance(work.claims_in, Path):
+            if work.claims_in is not None:
                 folders.setdefault(work.claims_in, set()).add(work.location)
         for folder, locations in folders.items():
             claims.sweep(folder, locations)
@@ -152,7 +150,7 @@ class Fleet(Generic[T]):
             return False
         taken = self._claims.take(work.location, work.claims_in)
         if not taken.is_mine:
-            work.wait_until = monotonic() + (_WAIT_S if isinstance(work.claims_in, Path) else _WAIT_IN_STORE_S)
+            work.wait_until = monotonic() + _WAIT_S
             self._left.append(work)
             return False
         if taken.note:

@@ -74,11 +74,6 @@ def plain(words: str) -> str:
     return _COLOUR.sub("", _ARROW.sub(":", words))
 
 
-def is_of_store(words: str) -> bool:
-    """Whether a message of another library is about a request to a store."""
-    return any(sign in words for sign in ("Error performing", "error sending request", "NoSuchBucket"))
-
-
 def meaning_of(url: Url, error: Exception) -> str:
     """The meaning of a store's answer; "" if it is not known."""
     said = _text_of(url, error)

@@ -143,20 +143,3 @@ def _profile(given: Mapping[str, str]) -> str:
 def endpoint() -> str:
     """The address that the environment gives for S3; "" if it gives none."""
     return os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
-
-
-def settings_of(url: Url) -> dict[str, str]:
-    """The further settings of a program that reads AWS_..., GOOGLE_... and AZURE_... itself, for the same store.
-
-    Raises McaptrackError as for objects.
-    """
-    if url.scheme != "s3":
-        return {}
-    given = {name: value for name, value in os.environ.items() if name.startswith("AWS_")}
-    found = {f"AWS_{name.upper()}": value for name, value in _of_profile(given).items()}
-    address = endpoint() or found.pop("AWS_ENDPOINT", "")
-    if address:
-        found |= {"AWS_ENDPOINT_URL": address, "AWS_ALLOW_HTTP": str(address.startswith("http://")).lower()}
-    if not given.get("AWS_REGION") and given.get("AWS_DEFAULT_REGION"):
-        found["AWS_REGION"] = given["AWS_DEFAULT_REGION"]
-    return found

@@ -16,8 +16,6 @@ from typing import Any, Final
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish
-from mcaptrack.location import Location
-from mcaptrack.tables.delta import DeltaFolder, is_delta_folder
 from mcaptrack.tables.fields import RECORDING, TABLES
 from mcaptrack.tables.join import join
 
@@ -28,23 +26,14 @@ _MEMBERS: Final = b"mcaptrack.members"
 _PREFIX: Final = "recording="
 
 
-def is_folder_of_tables(where: Location) -> bool:
-    """Whether logs were exported to a folder, as Parquet files or as Delta tables."""
-    if isinstance(where, Path):
-        return (where / _TABLE).is_dir() and (is_delta_folder(where) or bool(_members(where)))
-    return where.suffix.lower() != ".mcap" and is_delta_folder(where)
+def is_folder_of_tables(folder: Path) -> bool:
+    """Whether logs were exported to a folder as Parquet files."""
+    return bool(_members(folder))
 
 
-def read_catalogue(where: Location) -> list[dict[str, Any]]:
+def read_catalogue(folder: Path) -> list[dict[str, Any]]:
     """The rows of ``recordings`` of all logs, by name. Raises McaptrackError if they can't be read."""
-    if is_delta_folder(where):
-        found = DeltaFolder(where).dataset(_TABLE)
-        table = join([], TABLES[_TABLE].arrow, [found]).to_table()
-    elif isinstance(where, Path):
-        table = _table(where, _members(where))
-    else:
-        raise McaptrackError(f"{where} has no Delta tables of logs")
-    rows: list[dict[str, Any]] = table.sort_by(RECORDING.name).to_pylist()
+    rows: list[dict[str, Any]] = _table(folder, _members(folder)).sort_by(RECORDING.name).to_pylist()
     return rows
 
 

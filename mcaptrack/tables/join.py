@@ -13,23 +13,17 @@ from mcaptrack.tables.fields import RECORDING
 _COLUMNS: Final = "these tables can't be one"
 
 
-def join(parts: Sequence[tuple[str, Any]], columns: Any = None, of_many: Sequence[Any] = ()) -> Any:
+def join(parts: Sequence[tuple[str, Any]], columns: Any = None) -> Any:
     """Join tables by the name of their log, each an Arrow table or the path of a Parquet file; adds ``recording``.
 
     ``columns`` is an Arrow schema with the first columns of the result. Columns that a part does not have are null.
-    ``of_many`` are datasets of many logs, which have the column ``recording``; one alone is read only as far as needed.
     The result is an Arrow table, or a dataset if files are among the parts. Raises McaptrackError if a file can't be
     read or if a column has two types.
     """
     import pyarrow as pa
     import pyarrow.dataset as ds
 
-    if len(of_many) == 1 and not parts:
-        return _completed(of_many[0], columns)
     loose = [with_recording(part, name) for name, part in parts if not isinstance(part, Path)]
-    loose += [
-        _with_dictionaries(dataset.to_table(), [columns, *(table.schema for table in loose)]) for dataset in of_many
-    ]
     files = [(name, part) for name, part in parts if isinstance(part, Path)]
     try:
         known = [columns] if columns is not None else []
@@ -47,26 +41,6 @@ def join(parts: Sequence[tuple[str, Any]], columns: Any = None, of_many: Sequenc
         return table
     read = _dataset(files, schema)
     return ds.UnionDataset(schema, [read, ds.dataset(table)]) if loose else read
-
-
-def _with_dictionaries(table: Any, schemas: Sequence[Any]) -> Any:
-    """A table with text as dictionaries where other tables have it so."""
-    import pyarrow as pa
-
-    named = {field.name for schema in schemas for field in schema or () if pa.types.is_dictionary(field.type)}
-    for at, field in enumerate(table.schema):
-        if field.name in (named | {RECORDING.name}) and pa.types.is_string(field.type):
-            table = table.set_column(at, field.name, table.column(at).dictionary_encode())
-    return table
-
-
-def _completed(dataset: Any, columns: Any) -> Any:
-    """A dataset with all columns; those that it does not have are null."""
-    import pyarrow as pa
-
-    missing = [field for field in columns or () if field.name not in dataset.schema.names]
-    fields = [field.with_nullable(True).remove_metadata() for field in (*dataset.schema, *missing)]
-    return dataset.replace_schema(pa.schema(fields))
 
 
 def _columns(path: Path) -> Any:

@@ -11,21 +11,19 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack, suppress
 from difflib import get_close_matches
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, Protocol, Self
 
 from mcaptrack import log, tables
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import place_of
-from mcaptrack.location import Location, Url
+from mcaptrack.location import Location
 from mcaptrack.log.paths import results_path
 from mcaptrack.tables import TABLES
-from mcaptrack.tables.delta import DeltaFolder, is_delta_folder, reason_of_store
 from mcaptrack.tables.export import TOPICS, LogTables, current_file, default_folder, topic_folder
 
 __all__ = ["Database"]
@@ -105,34 +103,13 @@ class _FolderTables:
         return [words["topic"] for words in known if "topic" in words]
 
 
-class _DeltaTables:
-    """The Delta tables of many logs in a folder or a store."""
-
-    def __init__(self, where: Location) -> None:
-        self.folder = DeltaFolder(where)
-
-    @cached_property
-    def recordings(self) -> list[str]:
-        return self.folder.recordings()
-
-    def rows(self, name: str) -> Any:
-        """One of ``TABLES``, or the table of a channel, as a dataset; None if it does not exist."""
-        return self.folder.dataset(name if name in TABLES else f"{TOPICS}/{topic_folder(name)}")
-
-    def channels(self) -> list[str]:
-        """The channels that have tables of their own."""
-        found = [self.folder.table(name) for name in self.folder.names() if name not in TABLES]
-        return sorted(table.metadata().name for table in found if table is not None)
-
-
 class Database:
     """A database with the tables of logs, and of folders as ``mcaptrack export`` writes them. A context manager.
 
     Parameters
     ----------
     paths : sequence of Path or Url
-        Logs, folders, and folders or URLs with Delta tables. The column ``recording`` has their names, with folders
-        where names are the same.
+        Logs, and folders of tables. The column ``recording`` has their names, with folders where names are the same.
     files : mapping of str to Path, optional
         More tables by name: CSV, JSON or Parquet. Queries read nothing else, and leave nothing behind.
 
@@ -149,10 +126,8 @@ class Database:
             #: The sources of the tables that were loaded, as text.
             self.notes: list[str] = []
             self._loaded: set[str] = set()
-            self._of_many: list[_DeltaTables] = []
             self._sources = [source for path in _unique_paths(paths) for source in self._opened(path, opening)]
             self._names = _unique_names(self._sources)
-            self._refuse_doubles()
             self._connection = opening.enter_context(self._duckdb.connect(":memory:", config=_CLOSED))
             for name, path in (files or {}).items():
                 self._load_file(name, path)
@@ -173,26 +148,12 @@ class Database:
     @property
     def recordings(self) -> tuple[str, ...]:
         """The names of the logs, as in the column ``recording``."""
-        return (*self._names, *(name for one in self._of_many for name in one.recordings))
+        return tuple(self._names)
 
     @property
     def channels(self) -> tuple[str, ...]:
         """The channels that are tables under their own names."""
-        return tuple(sorted({topic for topics in self._channels() for topic in topics}))
-
-    def _channels(self) -> Iterator[list[str]]:
-        yield from (source.channels() for source in self._sources)
-        yield from (one.channels() for one in self._of_many)
-
-    def _refuse_doubles(self) -> None:
-        """Raise McaptrackError if a log would be there twice: Delta tables say its name themselves."""
-        if not self._of_many or len(self._of_many) + len(self._sources) == 1:
-            return
-        twice = [name for name, count in Counter(self.recordings).items() if count > 1]
-        if twice:
-            raise McaptrackError(
-                f"{twice[0]} is the name of two logs, of which Delta tables have at least one; query them one by one"
-            )
+        return tuple(sorted({topic for source in self._sources for topic in source.channels()}))
 
     def ask(self, query: str) -> Any:
         """The answer of the last question in a query, an Arrow table; times are UTC in nanoseconds (DuckDB 2).
@@ -269,14 +230,12 @@ class Database:
             columns = None
             parts = [(at, source.channel(name)) for at, source in self._named()]
         parts = [(at, part) for at, part in parts if part is not None]
-        of_many = [rows for one in self._of_many if (rows := one.rows(name)) is not None]
-        if not parts and not of_many and columns is None:
+        if not parts and columns is None:
             return False
         for recording, part in parts:
             words = f"from {part}" if isinstance(part, Path) else "read from the log; exported tables would be quicker"
             self.notes.append(f"{recording}: {name} {words}")
-        self._connection.register(name, tables.join(parts, columns, of_many))
-        self.notes += [f"{name} from the Delta tables in {one.folder.where}" for one in self._of_many]
+        self._connection.register(name, tables.join(parts, columns))
         self._loaded.add(name)
         return True
 
@@ -284,10 +243,6 @@ class Database:
         return list(zip(self._names, self._sources, strict=True))
 
     def _opened(self, path: Location, opening: ExitStack) -> list[_TableSource]:
-        is_log = path.suffix.lower() == ".mcap" if isinstance(path, Url) else not path.is_dir()
-        if not is_log and is_delta_folder(path):
-            self._of_many.append(_DeltaTables(path))
-            return []
         if not isinstance(path, Path) or not path.is_dir():
             source = _LogTables(path)
             opening.enter_context(source.opened)
@@ -322,9 +277,6 @@ class Database:
 
     def _error_text(self, error: str, query: str) -> str:
         """A message of DuckDB in one line, with the tables that exist."""
-        for place in (one.folder.where for one in self._of_many):
-            if reason := reason_of_store(place, error):
-                return f"the Delta tables {place} can't be read: {reason}"
         if missing := _MISSING.search(error):
             name = missing.group(1)
             known = [*TABLES, *sorted(self._loaded - set(TABLES))]

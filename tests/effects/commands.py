@@ -208,7 +208,6 @@ CASES: dict[str, dict[str, Case]] = {
         format="--format csv",
         topic="--topic /others",
         blobs=("export a.mcap --topic /others", "--blobs"),
-        delta="--delta lake",
         force=("export a.mcap -o taken", "--force"),
     ),
     "query": common(
@@ -266,14 +265,6 @@ CASES: dict[str, dict[str, Case]] = {
         **{"from": ("models get yolox-nano", "--from known.onnx")},
     ),
     "doctor": common("doctor"),
-    "delta": common(
-        "delta kept",
-        remove="--remove fresh",
-        compact=("delta scattered", "--compact"),
-        keep_days="--keep-days 1",
-        quiet=("delta kept --keep-days 1", "-q"),
-        verbose=("delta kept --keep-days 1", "-v"),
-    ),
     "docs": common("docs", output="-o pages.txt", force=("docs -o clip.mp4", "--force")),
 }
 
