@@ -250,7 +250,7 @@ class TestEvaluate:
 class TestConfig:
     def test_the_command_line_overrides_options_of_the_file(self, fresh, tmp_path):
         (tmp_path / "mcaptrack.toml").write_text(
-            '[track]\nmax-age-s = 2.5\nmin_iou = 0.4\n[detect]\ndetector = "mog2"\n'
+            '[track]\nmax-age-s = 2.5\nmin_iou = 0.4\n[detect]\ndetector = "knn"\n'
         )
 
         def made(*words, environment=None):

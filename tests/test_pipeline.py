@@ -25,7 +25,6 @@ from mcaptrack.transforms import (
     STAGES,
     ByteTrack,
     KnnDetector,
-    Mog2Detector,
     OcSort,
     Predict,
     Retrack,
@@ -128,7 +127,7 @@ def test_running_a_stage_again_replaces_only_its_channels(fresh):
 def test_outdated_channels_are_reported_and_made_again_with_their_parameters(fresh):
     run_stage(fresh, "track", Sort(max_age_s=0.7))
     run_all(fresh)
-    report, _ = run_stage(fresh, "detect", Mog2Detector())
+    report, _ = run_stage(fresh, "detect", KnnDetector())
     assert report.stale == ["/camera/tracks"]
     with log.read(fresh) as opened:
         assert pipeline.is_stale(opened, "/camera/tracks")
@@ -139,7 +138,7 @@ def test_outdated_channels_are_reported_and_made_again_with_their_parameters(fre
     with log.read(fresh) as opened:
         made = {topic: Provenance.from_metadata(c.metadata) for topic, c in opened.channels.items()}
         assert made["/camera/tracks"].parameters["max_age_s"] == 0.7
-        assert made["/camera/detections"].parameters["detector"] == "mog2"
+        assert made["/camera/detections"].parameters["detector"] == "knn"
         assert [topic for topic in opened.channels if pipeline.is_stale(opened, topic)] == []
 
 
@@ -151,7 +150,7 @@ def test_tracks_are_made_again_by_the_same_tracker(fresh):
         made = Provenance.from_metadata(opened.channel("/camera/tracks").metadata).parameters
         assert (made["tracker"], made["inertia"]) == ("ocsort", 0.1)
         assert "low_min_iou" not in made
-    run_stage(fresh, "detect", Mog2Detector())
+    run_stage(fresh, "detect", KnnDetector())
     run_all(fresh)  # again, as before
     with log.read(fresh) as opened:
         made = Provenance.from_metadata(opened.channel("/camera/tracks").metadata).parameters
@@ -336,7 +335,7 @@ def test_new_detections_give_a_new_estimate_of_the_scale(footage, tmp_path):
     path = tmp_path / "a.mcap"
     ingest(footage.video, path, IngestOptions())
     run_all(path)
-    run_stage(path, "detect", Mog2Detector(threshold=400.0))
+    run_stage(path, "detect", KnnDetector(threshold=400.0))
     run_all(path)
     with log.read(path) as opened:
         (frame,) = opened.frames("/camera/ground_plane", GROUND_PLANE)
