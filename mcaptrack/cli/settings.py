@@ -41,17 +41,11 @@ class Declared:
     tuning : bool or str
         Whether a file in the working folder may set it: numbers, choices and switches that change how results are
         computed. For text, a pattern that the whole value has to match, because text could be a path.
-    was : str
-        The old name, without dashes.
-    was_if : (str, str) or None
-        If several options had this old name: another option and its value, for which the old name means this option.
     least, most : float
         The range of numbers.
     """
 
     tuning: bool | str = False
-    was: str = ""
-    was_if: tuple[str, str] | None = None
     least: float = -math.inf
     most: float = math.inf
 
@@ -132,7 +126,7 @@ class Setting:
         return all(re.fullmatch(pattern, str(member)) is not None for member in members)
 
 
-#: Options by command and name; renamed options also by their old names.
+#: Options by command and name.
 Settings = Mapping[str, Mapping[str, Setting]]
 _KNOWN: Final[ContextVar[tuple[Settings, dict[str, dict[str, Given]]]]] = ContextVar("known")
 
@@ -216,12 +210,6 @@ def found_of(command: str) -> dict[str, tuple[Setting, Given]]:
     """Return the options of a command that environment and files set, with their values, by parameter."""
     settings, found = _KNOWN.get()
     return {settings[command][name].parameter: (settings[command][name], one) for name, one in found[command].items()}
-
-
-def old_names(command: str) -> dict[str, str]:
-    """Return the old names of a command's options, by their new names."""
-    settings, _ = _KNOWN.get()
-    return {one.name: one.declared.was for one in settings[command].values() if one.declared.was not in ("", one.name)}
 
 
 def _nearest(name: str, known: Iterable[str]) -> str:

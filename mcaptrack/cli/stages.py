@@ -44,15 +44,12 @@ Frame = Annotated[
 _NAME: Final = r"[A-Za-z0-9_-]+"
 
 
-def chooser(
-    kind: Kind, was: str = "", words: str = "The {kind} to use", panel: str = "", shown: str | bool = True
-) -> Any:
+def chooser(kind: Kind, words: str = "The {kind} to use", panel: str = "", shown: str | bool = True) -> Any:
     """Return the option that chooses a detector, tracker or so on of the registry by name."""
     built_in = ", ".join(BUILT_IN[kind])
     return common.option(
         f"--{kind}",
         tuning=_NAME,
-        was=was,
         panel=panel,
         metavar="NAME",
         help=f"{words.format(kind=kind)}: {built_in}, one of an installed package, or module:Class.",
@@ -124,7 +121,6 @@ def option_of(field: Field[Any], switch: str, panel: str, tuning: Any = True, ot
         least=about.get("least", -math.inf),
         most=about.get("most", math.inf),
         show_default=shown_default(default_of(field)),
-        was=about.get("was", "").replace("_", "-"),
     )
 
 
@@ -147,13 +143,12 @@ def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
 
 
 def _flags(parameter: inspect.Parameter) -> set[str]:
-    """The names that an option has on the command line, without the dashes; also those that it had before."""
+    """The names that an option has on the command line, without the dashes."""
     about = get_args(parameter.annotation)[1]
     # Typer takes the first name for a default until it reads the annotation.
     names = (about.default, *(about.param_decls or ()))
     given = [part for name in names if isinstance(name, str) for part in name.split("/")]
-    was = about.declared.was if hasattr(about, "declared") else ""
-    return {name.removeprefix("--") for name in (*given, was, parameter.name.replace("_", "-")) if name}
+    return {name.removeprefix("--") for name in (*given, parameter.name.replace("_", "-")) if name}
 
 
 def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> Callable[..., None]:
@@ -166,7 +161,7 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
     parameters = [_parameter("logs", common.Logs, inspect.Parameter.empty)]
     if stage.kind:
         usual = stage.entry(stage.default).name
-        which = chooser(stage.kind, stage.was, shown=usual if stage.profiles else True)
+        which = chooser(stage.kind, shown=usual if stage.profiles else True)
         # None where a profile may choose the transform.
         annotation = Annotated[str | None, which] if stage.profiles else Annotated[str, which]
         parameters.append(_parameter(stage.kind, annotation, None if stage.profiles else usual))

@@ -168,7 +168,6 @@ def option(
     search: tuple[float, float] | None = None,
     kind: Kind | None = None,
     theme: str = "",
-    was: str = "",
     pattern: str = "",
 ) -> Any:
     """Declare a parameter of a transform, as a field of its dataclass.
@@ -188,8 +187,6 @@ def option(
         The value is a name of this kind in ``mcaptrack.registry``.
     theme : str
         Heading in the help of the command, shared by related parameters.
-    was : str
-        Former name, which is accepted for one release.
     pattern : str
         Regular expression of a text that a settings file in the working folder may set; "" for none.
 
@@ -209,7 +206,7 @@ def option(
     if most is None:
         most = math.inf if least == -math.inf else LARGEST
     about = {"help": help, "least": least, "most": most, "search": search, "kind": kind, "theme": theme}
-    about |= {"was": was, "pattern": pattern}
+    about["pattern"] = pattern
     return field(default=default, metadata=about)
 
 

@@ -67,14 +67,12 @@ class RetrackOptions:
         "how much velocities change within a second, in metres per second",
         least=0.0,
         theme=_MOTION,
-        was="drift",
     )
     drift_ratio: float = option(
         0.08,
         "how much velocities change within a second, as a share of the speed",
         least=0.0,
         theme=_MOTION,
-        was="drift_share",
     )
     same_id_bonus: float = option(
         12.0,
@@ -82,7 +80,6 @@ class RetrackOptions:
         "deviations (likelihood) or standard deviations (consistency); the paper ignores input ids",
         least=0.0,
         theme=_ASSOCIATION,
-        was="same_source",
     )
     max_age_s: float = option(
         2.0,
@@ -90,9 +87,7 @@ class RetrackOptions:
         least=0.0,
         theme=_LIFE,
     )
-    interpolated: bool = option(
-        False, "use interpolated samples as observations, too", theme=_ASSOCIATION, was="filled"
-    )
+    interpolated: bool = option(False, "use interpolated samples as observations, too", theme=_ASSOCIATION)
     min_track_s: float = option(
         2.0, "leave out tracks that last less than this many seconds (probation)", least=0.0, theme=_LIFE
     )
@@ -110,13 +105,11 @@ class RetrackOptions:
         least=0.01,
         most=0.99,
         theme=_OFFLINE,
-        was="link_certainty",
     )
     resolve_swaps: bool = option(
         True,
         "decide again which track is which where two tracks met, from what was before and after (identity switches)",
         theme=_OFFLINE,
-        was="part",
     )
     track_confidence: float = option(
         0.5,
@@ -124,7 +117,6 @@ class RetrackOptions:
         least=0.0,
         most=1.0,
         theme=_OFFLINE,
-        was="min_certainty",
     )
     across_classes: bool = option(
         False,
@@ -232,14 +224,12 @@ class LikelihoodOptions(RetrackOptions):
         "for never",
         least=0.0,
         theme=_ASSOCIATION,
-        was="share_m",
     )
     merge_timeout_s: float = option(
         3.0,
         "longest time that tracks stay merged into one detection, in seconds",
         least=0.0,
         theme=_ASSOCIATION,
-        was="share_s",
     )
     confirm_s: float = option(
         1.2,
@@ -247,7 +237,6 @@ class LikelihoodOptions(RetrackOptions):
         "not before",
         least=0.0,
         theme=_LIFE,
-        was="sure_s",
     )
     coast_s: float = option(
         1.2,
@@ -305,14 +294,12 @@ class ConsistencyOptions(RetrackOptions):
         "gate: a track is not matched further than this from its predicted current position, in metres",
         least=0.0,
         theme=_ASSOCIATION,
-        was="max_jump_m",
     )
     priority_distance: float = option(
         0.0,
         "pairs nearer than this, in standard deviations, are matched before all others; 0 for never",
         least=0.0,
         theme=_ASSOCIATION,
-        was="certain_distance",
     )
     covariance: Covariance = option(
         "predictor", "covariance of predictions: the predictor's, or the paper's (u - t) sigma^2", theme=_PREDICTIONS
@@ -334,7 +321,6 @@ class ConsistencyOptions(RetrackOptions):
         False,
         "offline, leave out what a track matched after its last min_hits matches in a row",
         theme=_LIFE,
-        was="confirm",
     )
     backfill: Literal["none", "unclaimed", "all"] = option(
         "unclaimed",
