@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import random
 import signal
-import struct
 import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -85,12 +84,6 @@ def killed(work: Callable[[], object], at: int, calls: Sequence[str] = CALLS) ->
     _, status = os.waitpid(child, 0)
     assert status in (0, signal.SIGKILL), status
     return status != 0
-
-
-def first_journal(start: int, size: int, before: bytes, old: bytes) -> bytes:
-    """A journal as version 0.1.0 wrote them."""
-    head = struct.pack("<QQII", start, size, zlib.crc32(before[-65536:]), zlib.crc32(old))
-    return b"mcaptrack journal 1\n" + head + zlib.crc32(head).to_bytes(4, "little") + old
 
 
 def interrupt(path: Path) -> None:

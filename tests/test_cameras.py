@@ -100,7 +100,7 @@ def test_outputs_belong_to_the_camera_of_their_source(path, stage, target):
 def test_a_channel_at_another_topic_is_made_again_with_its_input(path):
     done("track", path, "--to", "/elsewhere", "--max-age-s", 3, "-q")
     done("sample", path, "--topic", "/elsewhere", "-q")
-    done("detect", path, "--detector", "mog2", "-q")
+    done("detect", path, "--detector", "knn", "-q")
     said = done("run", path, "--no-tables").err
     assert "/elsewhere was made from an earlier /camera/detections: running track again, as before" in said
     with log.read(path) as opened:

@@ -13,7 +13,7 @@ import mcaptrack
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, VIDEO
 from mcaptrack.testing import check_transform
-from mcaptrack.transforms import STAGES, MotionDetector
+from mcaptrack.transforms import STAGES
 
 #: Blue, green and red of the pictures, which become BT.601 brightness.
 BGR = (200, 90, 30)
@@ -57,10 +57,6 @@ def test_a_detector_gets_colours_if_it_asks_for_them_and_brightness_otherwise(lo
         mcaptrack.detect(log, detector=detector, output=tmp_path / f"{type(detector).__name__}.mcap")
         assert [picture.shape for picture in detector.seen] == [(48, 64, 3)[: np.ndim(expected) + 2]] * 3
         assert np.abs(detector.seen[0].astype(float) - expected).max() < 6  # video is lossy
-
-
-def test_motion_detectors_say_that_they_need_brightness():
-    assert {cls.colour for cls in STAGES["detect"].built_in().values() if issubclass(cls, MotionDetector)} == {"grey"}
 
 
 @pytest.mark.parametrize(("detector", "axes"), [(Plain, 2), (Coloured, 3)])

@@ -25,7 +25,7 @@ import pytest
 from mcaptrack import __version__
 from tests.commands import GROUP, call, done
 from tests.tiers import thorough
-from tools import options_doc, pages, readme
+from tools import pages, readme
 from tools.pages import NOT_RUN, ROOT, Block
 
 README, ARCHITECTURE = (ROOT / name for name in ("README.md", "ARCHITECTURE.md"))
@@ -128,11 +128,6 @@ def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path):
         assert not re.search(
             r"(?:src|href)=\"(?:https?:)?//(?!github\.com|foxglove\.dev)[^\"]*\.(?:js|css|woff2?)", html
         )
-
-
-def test_options_with_another_name_before_are_listed_for_those_who_upgrade():
-    text = options_doc.UPGRADING.read_text()
-    assert options_doc.with_options(text, options_doc.renamed) == text, "run tools/options_doc.py"
 
 
 def test_the_readme_is_one_page():

@@ -62,7 +62,7 @@ def test_every_option_has_a_case():
     for command, known in GROUP.commands.items():
         if command == "train":  # needs torch: see test_training
             continue
-        options = {name for name, setting in known.settings.items() if not setting.parameter.startswith("old_")}
+        options = set(known.settings)
         options -= {"log-format", *(name.replace("_", "-") for name in NAMES)}  # see test_many_logs
         assert set(CASES[command]) | parameters(command) == options, command
 

@@ -215,7 +215,6 @@ LEARNED = Provenance("detect", {"detector": "onnx"}, "/camera/video")
         (Provenance("ingest", {}), "estimate-ground-plane"),
         (Provenance("detect", {"detector": "knn"}, "/camera/video"), "assume-ground-plane"),
         (Provenance("detect", {"detector": "median"}, "/camera/video"), "assume-ground-plane"),
-        (Provenance("detect", {"method": "mog2"}, "/camera/video"), "assume-ground-plane"),
     ],
 )
 def test_boxes_of_motion_detectors_are_not_used(tmp_path, provenance, transform):
@@ -489,7 +488,6 @@ class TestBesideThePictures:
             (LEARNED, False),
             (Provenance("detect", {}), True),  # the usual one
             (Provenance("detect", {"detector": "of another package"}), True),
-            (Provenance("detect", {"method": "mog2"}), True),
             (Provenance("detect", {"detector": "knn"}, plugins={"transform": None}), False),  # type: ignore[dict-item]
         ],
     )

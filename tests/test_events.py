@@ -593,7 +593,7 @@ def test_the_command_drop_and_tables_handle_events(place):
     assert (result["stages"], result["events"]["/camera/tracks"]["identity switch"]) == (["events"], 2)
     call("events", place, "--topic", "/camera/tracks")
     assert CliRunner().invoke(app, ["events", str(place), "--gate-m", "0"]).exit_code == 1
-    assert CliRunner().invoke(app, ["events", str(place), "--gate", "1.5", "--similarity", "iou"]).exit_code == 1
+    assert CliRunner().invoke(app, ["events", str(place), "--gate-m", "1.5", "--similarity", "iou"]).exit_code == 1
     (place.parent / "odd.toml").write_text('[events]\nsimilarity = "iou"\ngate = "much"\n')
     words = ["run", str(place), "--config", str(place.parent / "odd.toml")]
     odd = copy_context().run(CliRunner().invoke, app, words)  # what the file says is for this command alone

@@ -119,9 +119,8 @@ def test_the_usual_tracks_and_those_with_events_are_watched(tmp_path):
 ASKED: list[tuple[Any, tuple[Any, Any, Any]]] = [
     ({"similarity": "iou", "min_iou": 0.4}, ("iou", None, 0.4)),
     ({"similarity": "metres", "gate_m": 2, "min_iou": 0.5}, ("metres", 2, 0.5)),
-    ({"similarity": "iou", "gate": 0.4}, ("iou", None, 0.4)),
-    ({"similarity": "metres", "gate": 2.0}, ("metres", 2.0, None)),
-    ({"similarity": "strange", "gate": 2.0}, (None, 2.0, None)),
+    ({"similarity": "iou", "min_iou": 0.4}, ("iou", None, 0.4)),
+    ({"similarity": "strange", "gate_m": 2.0}, (None, 2.0, None)),
     ({"gate_m": True, "min_iou": 0}, (None, None, None)),
     ({"gate_m": 0.001, "min_iou": -1.0}, (None, 0.001, None)),
     ({"gate_m": "1"}, (None, None, None)),

@@ -394,7 +394,7 @@ def test_a_class_that_only_the_log_names_is_not_imported(path, stage, transform,
 
 def test_outdated_results_of_an_unnamed_class_can_be_replaced(path):
     run_stage(path, "track", Single())
-    done("detect", path, "--detector", "mog2", "-q")
+    done("detect", path, "--detector", "knn", "-q")
     said = call("run", path, "--no-tables", "-q").err  # these tests are part of mcaptrack, if it is installed from here
     assert re.search(r"tracker tests\.test_findings:Single (\(mcaptrack \S+\) )?made it", said)
     done("run", path, "--no-tables", "--tracker", "ocsort", "-q")

@@ -300,7 +300,7 @@ class TestPage:
     @EVERY_COMMAND
     def test_nan_is_refused(self, command):
         for setting in COMMANDS[command].settings.values():
-            if setting.kind is float and not setting.parameter.startswith("old_"):
+            if setting.kind is float:
                 chosen = next((case.chosen for case in BOUNDED if case[::2][:2] == (command, setting.name)), ())
                 words = [command, *WORDS[command], *chosen, f"--{setting.name}=nan"]
                 _, _, err = call(*words)
@@ -312,7 +312,7 @@ class TestPage:
             (command, setting.name)
             for command in COMMANDS
             for setting in COMMANDS[command].settings.values()
-            if setting.kind in (int, float) and not setting.parameter.startswith("old_")
+            if setting.kind in (int, float)
         }
         numbers -= {(command, name) for command in COMMANDS if command != "run" for name in NAMES}  # see above
         assert bounded < numbers

@@ -16,8 +16,8 @@ from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import in_place, journal
 from mcaptrack.log.byte_source import OpenFile
-from mcaptrack.log.journal import _read_version_1, journal_of
-from tests.interrupted import add_results, everything, first_journal, interrupt
+from mcaptrack.log.journal import journal_of
+from tests.interrupted import add_results, everything, interrupt
 from tests.logs import SCHEMA, write_log
 
 SOME = [("abc"[n % 3], n, n, bytes([n]) * 3000) for n in range(100)]
@@ -79,7 +79,6 @@ def anew(make: Callable[[Path], object]) -> Callable[[Path], object]:
 THINGS: dict[str, tuple[Callable[[Path], object], str]] = {
     "words": (lambda at: at.write_bytes(b"dear diary"), "is not a journal of mcaptrack"),
     "nothing in it": (lambda at: at.write_bytes(b""), "is not a journal of mcaptrack"),
-    "48 bytes that fit all": (lambda at: at.write_bytes(first_journal(0, 0, b"", b"")), "version 0.1.0"),
     "the first bytes": (lambda at: at.write_bytes(at.read_bytes()[:90]), "is an incomplete or damaged journal"),
     "a head": (lambda at: at.write_bytes(at.read_bytes()[:240]), "is an incomplete or damaged journal"),
     "a flipped head": (lambda at: flipped(at, 40), "is an incomplete or damaged journal"),
@@ -172,22 +171,17 @@ def test_a_journal_of_another_user_is_not_used(tmp_path, monkeypatch, owner, is_
 def test_a_file_that_is_no_log_is_never_written_to(path, tmp_path):
     text = tmp_path / "thesis.txt"
     for content in (b"", b"chapter one\n" * 1000, b"x" + path.read_bytes()[1:]):
-        for beside in (
-            first_journal(0, 0, b"", b""),
-            first_journal(0, 0, content, b""),
-            journal_of(path).read_bytes(),
-        ):
-            text.write_bytes(content)
-            journal_of(text).write_bytes(beside)
-            before = everything(tmp_path)
-            for verb in (look, log.check, lambda there: log.recover(there, tmp_path.parent / "no.mcap")):
-                with notices.collected(), notices.listening(lambda _: None):
-                    try:
-                        verb(text)
-                    except McaptrackError as error:
-                        assert "\n" not in str(error)
-                assert everything(tmp_path) == before
-            (tmp_path.parent / "no.mcap").unlink(missing_ok=True)
+        text.write_bytes(content)
+        journal_of(text).write_bytes(journal_of(path).read_bytes())
+        before = everything(tmp_path)
+        for verb in (look, log.check, lambda there: log.recover(there, tmp_path.parent / "no.mcap")):
+            with notices.collected(), notices.listening(lambda _: None):
+                try:
+                    verb(text)
+                except McaptrackError as error:
+                    assert "\n" not in str(error)
+            assert everything(tmp_path) == before
+        (tmp_path.parent / "no.mcap").unlink(missing_ok=True)
 
 
 def test_a_journal_that_fits_a_file_that_is_no_log_changes_nothing(tmp_path):
@@ -214,57 +208,6 @@ def test_what_another_program_wrote_into_a_half_written_log_is_not_undone(path):
         look(path)
     assert "has been changed since" in said[0].message
     assert everything(path.parent) == before
-
-
-def test_the_first_versions_journal_saves_a_log_to_another_file_and_is_not_put_back(tmp_path):
-    path, saved = tmp_path / "a.mcap", tmp_path / "saved.mcap"
-    write_log(path, SOME, "media")
-    whole = path.read_bytes()
-    with log.read(path) as opened:
-        start = opened.index.data_end
-    path.write_bytes(whole[:start] + b"half of something")
-    journal_of(path).write_bytes(first_journal(start, len(whole), whole[:start], whole[start:]))
-    before = everything(tmp_path)
-    with notices.collected() as said, notices.listening(said.append):
-        with pytest.raises(McaptrackError, match="can't be read as an MCAP file"):
-            log.read(path)
-        assert everything(tmp_path) == before
-        assert "If it was left half written, `mcaptrack.recover(" in said[0].message
-        assert log.recover(path, saved).lost == []
-    with log.read(saved) as one:
-        assert sum(channel.messages for channel in one.channels.values()) == len(SOME)
-    saved.unlink()
-    assert everything(tmp_path) == before
-    # A log that is whole is taken as it is, whatever the journal says.
-    path.write_bytes(whole)
-    journal_of(path).write_bytes(first_journal(8, 8, whole[:8], b""))
-    with notices.collected(), notices.listening(lambda _: None):
-        assert log.recover(path, saved).messages == len(SOME)
-
-
-def test_a_journal_of_the_first_version_is_used_whole_or_not_at_all(tmp_path):
-    path = tmp_path / "a.mcap"
-    write_log(path, SOME, "media")
-    whole = path.read_bytes()
-    with log.read(path) as opened:
-        start = opened.index.data_end
-    path.write_bytes(whole[:start] + b"half of something")
-    good = first_journal(start, len(whole), whole[:start], whole[start:])
-
-    def content(journal: bytes) -> bytes | None:
-        journal_of(path).write_bytes(journal)
-        found = _read_version_1(OpenFile.at(journal_of(path)), OpenFile.at(path))
-        return None if found is None else bytes(found[0 : len(found)])
-
-    assert content(good) == whole
-    begin, head = good.index(b"\n") + 1, len(good) - (len(whole) - start)
-    for at in range(begin, head + 1):
-        assert content(good[:at]) is None
-    for at in [*range(begin, head), head, len(good) - 1]:
-        assert content(good[:at] + bytes([good[at] ^ 1]) + good[at + 1 :]) is None, at
-    assert content(good + b"x") is None
-    path.write_bytes(whole[: start - 1] + b"!" + whole[start:])
-    assert content(good) is None
 
 
 def test_a_log_that_replaces_another_is_not_held_up_by_its_journal(path):

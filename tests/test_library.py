@@ -397,7 +397,7 @@ class TestChecked:
         gates = mcaptrack.evaluate("log.mcap", similarity="metres", gate_m=np.array([1.0, 2.0])).rows()
         assert {row["gate"] for row in gates} == {1.0, 2.0}
         mcaptrack.track("log.mcap", max_age_s=np.float32(0.5), output="a.mcap")
-        mcaptrack.track("log.mcap", max_age_s=0.5, output="b.mcap", stages={"detect": "mog2"})
+        mcaptrack.track("log.mcap", max_age_s=0.5, output="b.mcap", stages={"detect": "knn"})
         assert Path("a.mcap").read_bytes() == Path("b.mcap").read_bytes()
 
 

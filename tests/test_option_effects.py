@@ -14,7 +14,6 @@ from mcaptrack.transforms import (
     TRACKERS,
     TRANSFORMS,
     GroundTracker,
-    MotionDetector,
     OnnxDetector,
     RetrackByConsistency,
 )
@@ -43,14 +42,6 @@ def test_an_option_has_the_effect_that_its_scene_says(option: str, case: Case):
         assert all(more > 1.02 * less for less, more in pairwise(numbers)), found
     else:
         assert found == pytest.approx(case.wanted), case.scene
-
-
-def test_detectors_differ_in_how_long_they_see_people_who_stop():
-    found = {}
-    motion = {name: kind for name, kind in STAGES["detect"].built_in().items() if issubclass(kind, MotionDetector)}
-    for name, kind in motion.items():
-        found[name] = others.all_boxes([[frame for (frame,) in kind(stabilise=False)(others.STOPS)]])
-    assert found["frame-difference"] < found["mog2"] < found["knn"]
 
 
 def test_every_option_has_a_scene():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ import mcaptrack
 from mcaptrack import log, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions, evaluate, sequence_of_log
+from mcaptrack.notices import collected
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS
 from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.schema.provenance import Provenance
@@ -25,7 +27,6 @@ from mcaptrack.transforms import (
     STAGES,
     ByteTrack,
     KnnDetector,
-    Mog2Detector,
     OcSort,
     Predict,
     Retrack,
@@ -128,7 +129,7 @@ def test_running_a_stage_again_replaces_only_its_channels(fresh):
 def test_outdated_channels_are_reported_and_made_again_with_their_parameters(fresh):
     run_stage(fresh, "track", Sort(max_age_s=0.7))
     run_all(fresh)
-    report, _ = run_stage(fresh, "detect", Mog2Detector())
+    report, _ = run_stage(fresh, "detect", KnnDetector())
     assert report.stale == ["/camera/tracks"]
     with log.read(fresh) as opened:
         assert pipeline.is_stale(opened, "/camera/tracks")
@@ -139,7 +140,7 @@ def test_outdated_channels_are_reported_and_made_again_with_their_parameters(fre
     with log.read(fresh) as opened:
         made = {topic: Provenance.from_metadata(c.metadata) for topic, c in opened.channels.items()}
         assert made["/camera/tracks"].parameters["max_age_s"] == 0.7
-        assert made["/camera/detections"].parameters["detector"] == "mog2"
+        assert made["/camera/detections"].parameters["detector"] == "knn"
         assert [topic for topic in opened.channels if pipeline.is_stale(opened, topic)] == []
 
 
@@ -151,7 +152,7 @@ def test_tracks_are_made_again_by_the_same_tracker(fresh):
         made = Provenance.from_metadata(opened.channel("/camera/tracks").metadata).parameters
         assert (made["tracker"], made["inertia"]) == ("ocsort", 0.1)
         assert "low_min_iou" not in made
-    run_stage(fresh, "detect", Mog2Detector())
+    run_stage(fresh, "detect", KnnDetector())
     run_all(fresh)  # again, as before
     with log.read(fresh) as opened:
         made = Provenance.from_metadata(opened.channel("/camera/tracks").metadata).parameters
@@ -336,7 +337,7 @@ def test_new_detections_give_a_new_estimate_of_the_scale(footage, tmp_path):
     path = tmp_path / "a.mcap"
     ingest(footage.video, path, IngestOptions())
     run_all(path)
-    run_stage(path, "detect", Mog2Detector(threshold=400.0))
+    run_stage(path, "detect", KnnDetector(threshold=400.0))
     run_all(path)
     with log.read(path) as opened:
         (frame,) = opened.frames("/camera/ground_plane", GROUND_PLANE)
@@ -354,3 +355,22 @@ def test_a_log_of_many_channels_is_refused_in_few_words(tmp_path):
         with pytest.raises(McaptrackError, match="/sensor/0029 and 970 more") as error:
             stage(path)
         assert len(str(error.value)) < 1000
+
+
+def test_what_an_older_version_made_is_left_as_it_is_until_all_is_made_again(fresh, monkeypatch):
+    written = Provenance.to_metadata
+    with monkeypatch.context() as before:
+        before.setattr(Provenance, "to_metadata", lambda self: written(replace(self, version="0.2.0")))
+        run_stage(fresh, "track", Sort(max_age_s=0.7))
+        run_all(fresh)
+    was = fresh.read_bytes()
+    with collected() as warnings:
+        assert run_all(fresh)[0].stages == []
+    assert fresh.read_bytes() == was
+    (words,) = [one.message for one in warnings if one.code == "out-of-date"]
+    assert "was made by an older version (0.2.0)" in words
+    assert "force=True)` makes all again" in words
+    with log.read(fresh) as opened:
+        jobs = pipeline.plan_all(opened, "/camera", force=True)
+        assert [job.stage for job in jobs] == ["detect", "track", "sample", "predict", "retrack"]
+        assert jobs[1].transform == Sort()

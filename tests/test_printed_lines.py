@@ -958,16 +958,6 @@ def test_notes_are_printed_unless_quiet_and_details_with_verbose(command, tmp_pa
         assert last.endswith("stop")
 
 
-def test_old_names_of_options_of_stages_are_said_by_run(tmp_path, monkeypatch):
-    """A stage that `run` runs reads its own settings."""
-    monkeypatch.chdir(tmp_path)
-    Path("mcaptrack.toml").write_text("[sample]\nmax-hole-s = 1.5\n")
-    Path("x.mcap").write_bytes(b"no log")
-    outcome = call("run", "x.mcap")
-    words = "mcaptrack.toml: [sample] max-hole-s is called max-gap-s now; the old name goes with the next release"
-    assert outcome.err.splitlines().count(words) == 1
-
-
 def test_results_beside_a_log_are_recovered_by_themselves(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("a.mcap", "a.results.mcap"):

@@ -120,7 +120,7 @@ class Scene:
         text = "from mcaptrack.transforms import Sort\n\n\nclass Own(Sort):\n    pass\n"
         Path("own_tracker_of_a_scene.py").write_text(text)
         self.says("track", "LOG", "--tracker", "own_tracker_of_a_scene:Own")
-        self.says("detect", "LOG", "--detector", "mog2")
+        self.says("detect", "LOG", "--detector", "knn")
         return self.says("run", "LOG", "--no-tables")
 
     def timed(self, name: str) -> Scene:
@@ -174,7 +174,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "pipeline/following.py:_check_camera:run": Scene.followed,
     "pipeline/gathering.py:warn_disagreeing:calibrate": Scene.with_a_plane_off,
     "pipeline/fusing.py:_lack:detect": lambda s: s.without("/camera/[!vg]*").says("fuse", "LOG"),
-    "api/running.py:warn_stale:run": lambda s: s.says("detect", "LOG", "--detector", "mog2"),
+    "api/running.py:warn_stale:run": lambda s: s.says("detect", "LOG", "--detector", "knn"),
     "api/ingesting.py:_changes:run": lambda s: s.says("ingest", "truth.txt", "--as", "corrections", "--into", "LOG"),
     "api/running.py:change:export": lambda s: s.says("run", "s3://bucket/a.mcap"),
     "cli/train.py:_print:predict": lambda s: s.says(

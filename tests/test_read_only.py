@@ -12,7 +12,7 @@ import pytest
 
 from mcaptrack.log.journal import journal_of
 from tests.commands import GROUP, call, done, made_log
-from tests.interrupted import everything, first_journal, interrupt
+from tests.interrupted import everything, interrupt
 from tests.logs import READING
 from tests.tiers import one_in
 
@@ -89,7 +89,7 @@ def test_the_next_command_that_writes_restores_the_log_with_a_warning(half, whol
 
 
 BESIDE: dict[str, Callable[[Path], object]] = {
-    "48 bytes": lambda at: at.write_bytes(first_journal(0, 0, b"", b"")),
+    "48 bytes": lambda at: at.write_bytes(bytes(48)),
     "a pipe": os.mkfifo,
     "a folder": Path.mkdir,
 }

@@ -124,7 +124,7 @@ def check_whole(path: Path, recorded: list[Raw]) -> None:
 
 
 RUNS = {
-    "pictures": (record, ("--detector", "frame-difference")),
+    "pictures": (record, ("--detector", "knn")),
     "boxes": (drive, ("--topic", "/lidar/boxes")),
 }
 
@@ -219,7 +219,7 @@ def test_a_copy_holds_ros_messages_too(ran, tmp_path):
     done("drop", path, *ours(path))
     before = path.read_bytes()
     source = "/lidar/boxes" if ran["words"][0] == "--topic" else "/robot/front/image"
-    stage = ["track", "--topic", source] if "boxes" in source else ["detect", "--detector", "frame-difference"]
+    stage = ["track", "--topic", source] if "boxes" in source else ["detect", "--detector", "knn"]
     done(stage[0], path, *stage[1:], "-o", out)
     assert path.read_bytes() == before
     with out.open("rb") as stream:

@@ -89,7 +89,7 @@ def on_recording(path: Path, elsewhere: Path) -> dict[str, list[object]]:
     return {
         "ingest": [truth, "--into", path],
         "run": [path],
-        "detect": [path, "--detector", "frame-difference"],
+        "detect": [path, "--detector", "knn"],
         "motion": [path],
         "track": [path],
         "sample": [path],
@@ -150,13 +150,13 @@ def test_no_command_changes_a_recording_that_ros_tools_read(path, tmp_path):
 def test_mcap_ros2_reads_a_recording_that_has_results(path):
     before = by_mcap_ros2(path)
     assert before == by_rosbags(path.parent)
-    done("detect", path, "--detector", "frame-difference")
+    done("detect", path, "--detector", "knn")
     assert by_mcap_ros2(path) == before
 
 
 def test_what_was_written_where_and_why_stands_in_the_data(path):
     for why in ("--in-place writes into it all the same", "earlier results are there"):
-        method = "mog2" if "there" in why else "frame-difference"
+        method = "median" if "there" in why else "knn"
         (result,) = json.loads(done("detect", path, "--detector", method, "--json").out)["results"]
         assert result["written_to"] == str(path.with_name("drive.results.mcap"))
         assert why in result["written_there_because"]
@@ -165,7 +165,7 @@ def test_what_was_written_where_and_why_stands_in_the_data(path):
 
 
 def test_results_that_a_pattern_matches_too_are_part_of_their_log(path):
-    done("detect", path, "--detector", "frame-difference")
+    done("detect", path, "--detector", "knn")
     pattern = path.parent / "*.mcap"
     assert len(list(path.parent.glob("*.mcap"))) == 2
     (result,) = json.loads(done("track", pattern, "--json").out)["results"]
@@ -175,7 +175,7 @@ def test_results_that_a_pattern_matches_too_are_part_of_their_log(path):
 
 
 def test_in_place_insists_and_what_is_in_place_goes_on_there(path):
-    result = done("detect", path, "--in-place", "--detector", "frame-difference")
+    result = done("detect", path, "--in-place", "--detector", "knn")
     assert f"results are in {path}: --in-place was given; they are ROS messages, for it is named in" in result.err
     with path.open("rb") as stream:
         assert "/robot/front/detections" in {c.topic for c in make_reader(stream).get_summary().channels.values()}
@@ -191,7 +191,7 @@ def test_in_place_insists_and_what_is_in_place_goes_on_there(path):
 
 
 def test_in_place_is_refused_where_results_stand_beside(path):
-    done("detect", path, "--detector", "frame-difference")
+    done("detect", path, "--detector", "knn")
     before = on_disk(path.parent)
     result = call("track", path, "--in-place")
     assert result.code == 1
@@ -200,7 +200,7 @@ def test_in_place_is_refused_where_results_stand_beside(path):
 
 
 def test_a_copy_without_channels_has_its_results_beside_it(path, tmp_path):
-    done("detect", path, "--detector", "frame-difference")
+    done("detect", path, "--detector", "knn")
     before = on_disk(path.parent)
     out = tmp_path / "small.mcap"
     done("drop", path, "/robot/front/image", "/robot/front/detections/*", "-o", out)

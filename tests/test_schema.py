@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 import struct
 import subprocess
@@ -404,23 +403,6 @@ message Some {
 
 
 # Provenance
-
-
-def test_provenance_of_the_first_version_names_its_class():
-    """It had `implementation` and `distribution` instead of `plugins`."""
-    before = {"transform": "track", "implementation": "own:Single", "distribution": "own pkg 1.5"}
-    plugins = {"transform": {"name": "new", "implementation": "new:It"}, "predictor": {"name": "p"}, "odd": 3}
-    old, package = Plugin("own:Single", "own:Single", "own pkg", "1.5"), {"distribution": "alone"}
-    for changed, wanted in (
-        ({}, {"transform": old}),
-        (package, {"transform": old._replace(distribution="", version="alone")}),
-        ({"distribution": ""}, {"transform": old._replace(distribution="", version="")}),
-        ({"implementation": ""}, {}),
-        ({"plugins": json.dumps(plugins)}, {"transform": Plugin("new", "new:It"), "predictor": Plugin("p", "")}),
-        ({"plugins": "[1]"}, {"transform": old}),
-    ):
-        made = Provenance.from_metadata({f"mcaptrack.{key}": value for key, value in (before | changed).items()})
-        assert made.plugins == wanted
 
 
 def test_provenance_comes_back_from_its_metadata():

@@ -9,7 +9,6 @@ import difflib
 import os
 import re
 import shlex
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -37,9 +36,9 @@ def folder(tmp_path, monkeypatch) -> Path:
 
 
 def options_of(command: str) -> list[Setting]:
-    """Return the options of a command without old names."""
+    """Return the options of a command that settings may have."""
     now = COMMANDS[command].settings.values()
-    return [setting for setting in now if setting.name not in CALL_ONLY and not setting.parameter.startswith("old_")]
+    return [setting for setting in now if setting.name not in CALL_ONLY]
 
 
 def parsed(command: str, *words: str) -> dict[str, Any]:
@@ -349,61 +348,3 @@ class TestFiles:
                 monkeypatch.setenv(setting.variable, "much\x1b[2J")
                 assert setting.variable in refused(command, *ARGUMENTS.get(command, ["x.mcap"]))
                 monkeypatch.delenv(setting.variable)
-
-
-RENAMED = [
-    (command, setting, setting.declared.was, dict([setting.declared.was_if] if setting.declared.was_if else []))
-    for command in COMMANDS
-    for setting in options_of(command)
-    if setting.declared.was
-]
-
-
-@pytest.mark.parametrize(("command", "setting", "old", "beside"), RENAMED, ids=lambda part: getattr(part, "name", None))
-class TestRenamed:
-    """An old name works from every source, and a note gives the new one."""
-
-    def params(self, command: str, beside: dict[str, str], *words: str) -> dict[str, Any]:
-        others = [word for name, value in beside.items() for word in (f"--{name}", value)]
-        return {name: value for name, value in parsed(command, *others, *words).items() if name != "config"}
-
-    def test_the_old_name_means_the_same(self, command, setting, old, beside, folder, monkeypatch, capsys):
-        value = another(setting, None)
-        wanted = self.params(command, beside, *words_for(setting, value))
-        assert capsys.readouterr().err == ""
-        line = " is called {} now; the old name goes with the next release\n"
-        assert self.params(command, beside, *words_for(replace(setting, name=old), value)) == wanted
-        assert capsys.readouterr().err == f"--{old}" + line.format(f"--{setting.name}")
-        variable = f"MCAPTRACK_{command}_{old}".upper().replace("-", "_")
-        monkeypatch.setenv(variable, str(value))
-        assert self.params(command, beside) == wanted
-        assert capsys.readouterr().err == variable + line.format(setting.variable)
-        monkeypatch.delenv(variable)
-        put(folder / "mcaptrack.toml", f"[{command}]\n{old} = {toml_value(value)}\n")
-        assert self.params(command, beside) == wanted
-        assert capsys.readouterr().err == f"mcaptrack.toml: [{command}] {old}" + line.format(setting.name)
-        assert self.params(command, beside, "-q") == wanted | {"quiet": True}
-        assert capsys.readouterr().err == ""
-
-    def test_the_stronger_source_wins_under_either_name(self, command, setting, old, beside, folder, monkeypatch):
-        variable = f"MCAPTRACK_{command}_{old}".upper().replace("-", "_")
-        low, middle, high = ("a", "b", "c") if setting.kind is str else (0.25, 0.5, 0.75)
-        if setting.kind is bool:
-            low, middle, high = True, False, False
-        monkeypatch.setenv(variable, str(low))
-        assert self.params(command, beside, *words_for(setting, middle))[setting.parameter] == middle
-        put(folder / "mcaptrack.toml", f"[{command}]\n{setting.name} = {toml_value(high)}\n")
-        assert self.params(command, beside)[setting.parameter] == low
-
-    def test_both_names_at_once_are_refused(self, command, setting, old, beside):
-        others = [word for name, value in beside.items() for word in (f"--{name}", value)]
-        both = [
-            word for one in (replace(setting, name=old), setting) for word in words_for(one, another(setting, None))
-        ]
-        words = refused(command, "x.mcap", *others, *both)
-        assert f"--{old} is the old name of --{setting.name}; give one of them" in words
-
-    def test_the_help_shows_the_new_name_only(self, command, setting, old, beside):
-        words = call(command, "--help").out
-        assert f"--{setting.name} " in words
-        assert not re.search(rf"--{old}\b(?!-)", words)

@@ -18,7 +18,7 @@ from mcaptrack.transforms import STAGES
 from mcaptrack.transforms.protocol import Traits
 
 BUILT_IN_TRANSFORMS = {name: cls for stage in STAGES.values() for name, cls in stage.built_in().items()}
-PAPERS = {"sort": "Bewley", "bytetrack": "Zhang", "ocsort": "Cao", "knn": "Zivkovic", "mog2": "Zivkovic"}
+PAPERS = {"sort": "Bewley", "bytetrack": "Zhang", "ocsort": "Cao", "knn": "Zivkovic"}
 
 
 @pytest.mark.parametrize("name", BUILT_IN_TRANSFORMS)

@@ -18,10 +18,9 @@ from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO
 from mcaptrack.testing import LAWS, sample_frames
 from mcaptrack.transforms import (
     PROFILES,
-    STAGES,
     TRACKERS,
     TRANSFORMS,
-    MotionDetector,
+    KnnDetector,
     Retrack,
     RetrackByConsistency,
     Transform,
@@ -45,17 +44,13 @@ INPUTS = {
 }
 
 
-#: The motion detectors; those that need a network have tests of their own.
-MOTION = {name: kind for name, kind in STAGES["detect"].built_in().items() if issubclass(kind, MotionDetector)}
-
-
 def variants() -> list[tuple[str, Transform]]:
     """Every transform with its defaults, and with what changes its course."""
     out: list[tuple[str, Transform]] = [(name, kind()) for name, kind in TRANSFORMS.items()]
     out += [("retrack", profile) for profile in PROFILES.values()]
     out += [("retrack", RetrackByConsistency(distance="first", min_history=1, backfill="none", max_age_s=1.0))]
     out += [("predict", TRANSFORMS["predict"](predictor=name)) for name in ("cv", "holt-cv")]
-    out += [("detect", kind(stabilise=False)) for kind in MOTION.values()]
+    out += [("detect", KnnDetector(stabilise=False))]
     plane = {"ground_planes": ((0, PLANE),)}
     out += [("track", kind()) for kind in TRACKERS.values()]
     out += [("track", kind(max_age_frames=9, min_hits_frames=3, cost="metres", **plane)) for kind in TRACKERS.values()]

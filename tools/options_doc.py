@@ -1,11 +1,10 @@
-"""Write the tables of docs/options.md and of docs/upgrading.md anew, from what options declare.
+"""Write the tables of docs/options.md anew, from what options declare.
 
 .venv/bin/python tools/options_doc.py
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -18,7 +17,6 @@ from mcaptrack.cli.settings import Setting
 from mcaptrack.transforms import STAGES, Stage
 from mcaptrack.transforms.protocol import bare_type, choices, limits
 
-UPGRADING = Path(__file__).parent.parent / "docs" / "upgrading.md"
 DOCUMENT = Path(__file__).parent.parent / "docs" / "options.md"
 BEGIN, END = "<!-- options: begin, written by tools/options_doc.py -->", "<!-- options: end -->"
 _HEAD = "| option | values | default | meaning |\n|---|---|---|---|"
@@ -93,24 +91,11 @@ def _row(made: Any, field: Any) -> str:
     return f"| `{name}` | {values.strip()} | {shown} | {words[:1].upper()}{words[1:]} |"
 
 
-def renamed() -> str:
-    """The options that had other names before, as Markdown."""
-    rows: dict[str, list[str]] = {}
-    for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]
-        for one in command.settings.values():
-            if one.declared.was not in ("", one.name):
-                when = f" with `--{' '.join(one.declared.was_if)}`" if one.declared.was_if else ""
-                rows.setdefault(f"`--{one.declared.was}` | `--{one.name}`{when}", []).append(f"`{name}`")
-    lines = [f"| {', '.join(commands)} | {names} |" for names, commands in rows.items()]
-    return "\n".join(["| command | before | now |", "|---|---|---|", *lines])
-
-
-def with_options(text: str, made: Callable[[], str] = described) -> str:
-    """A document with its tables as they are now."""
+def with_options(text: str) -> str:
+    """The document with its tables as they are now."""
     before, _, rest = text.partition(BEGIN)
-    return f"{before}{BEGIN}\n\n{made()}\n\n{END}{rest.partition(END)[2]}"
+    return f"{before}{BEGIN}\n\n{described()}\n\n{END}{rest.partition(END)[2]}"
 
 
 if __name__ == "__main__":
     DOCUMENT.write_text(with_options(DOCUMENT.read_text()))
-    UPGRADING.write_text(with_options(UPGRADING.read_text(), renamed))

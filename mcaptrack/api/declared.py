@@ -40,8 +40,6 @@ class Option:
         What the help shows in place of the type, and of the default.
     names : callable or None
         Returns the values to complete.
-    was, was_if
-        The old name, which is accepted for one release; see ``cli.settings.Declared``.
     """
 
     panel: str = ""
@@ -54,8 +52,6 @@ class Option:
     metavar: str | None = None
     shown: str | bool | None = None
     names: Callable[[], Sequence[str]] | None = None
-    was: str = ""
-    was_if: tuple[str, str] | None = None
 
     @property
     def is_bounded(self) -> bool:

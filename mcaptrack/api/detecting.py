@@ -39,7 +39,7 @@ def detect(
     log : path
         The log.
     detector : str or Transform, optional
-        "median" (the default), "knn", "mog2", "frame-difference", "onnx:FILE", "yolox-nano" or another name that
+        "median" (the default), "knn", "onnx:FILE", "yolox-nano" or another name that
         `models` lists, the name of an installed detector, "module:Class", or a transform.
     topic : str, optional
         Read this channel instead of the usual one, /camera/video.
@@ -78,7 +78,7 @@ def detect(
         mcaptrack detect log.mcap --detector median
 
     >>> import mcaptrack
-    >>> mcaptrack.detect("log.mcap", detector="mog2", output="boxes.mcap").stages
+    >>> mcaptrack.detect("log.mcap", detector="knn", output="boxes.mcap").stages
     ('detect',)
 
     """

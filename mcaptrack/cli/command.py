@@ -1,11 +1,10 @@
-"""Typer commands. Their options can also be set in the environment and in files, and may have old names."""
+"""Typer commands. Their options can also be set in the environment and in files."""
 
 from __future__ import annotations
 
-import copy
 import difflib
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar, Final
@@ -79,7 +78,7 @@ def _options_of(command: Any) -> list[str]:
 
 
 class Command(TyperCommand):
-    """A command. ``settings`` has its options by name, and those that were renamed also by their old names.
+    """A command. ``settings`` has its options by name.
 
     A command that ``reads`` changes no file except the one that -o names.
     """
@@ -88,23 +87,12 @@ class Command(TyperCommand):
 
     def __init__(self, name: str, **given: Any) -> None:
         super().__init__(name, **given)
-        now = declared_settings(name, given["callback"], self.params)
-        self._renamed: dict[str, list[Setting]] = {}
-        for setting in now.values():
-            if setting.declared.was:
-                self._renamed.setdefault(setting.declared.was, []).append(setting)
-        self.settings: dict[str, Setting] = dict(now)
-        parameters = {parameter.name: parameter for parameter in self.params}
-        for old, targets in self._renamed.items():
-            hidden = _hidden(parameters[targets[0].parameter], old)
-            self.params.append(hidden)
-            first = targets[0]
-            self.settings[old] = Setting(name, old, hidden.name, first.kind, first.many, first.declared)
+        self.settings = declared_settings(name, given["callback"], self.params)
         self.most_used: tuple[str, ...] = getattr(given["callback"], "most_used", ()) or MOST_USED.get(name, ())
         arrange(self.most_used, self.params)
         self.settable: tuple[str, ...] = getattr(given["callback"], "settable", ())
-        config = parameters["config"]
-        config.envvar = now["config"].variable  # the others are read with the files, once this is known
+        config: Any = next(parameter for parameter in self.params if parameter.name == "config")
+        config.envvar = self.settings["config"].variable  # the others are read with the files, once this is known
 
     def get_help_option(self, ctx: Any) -> Any:
         """Put ``--help`` below the heading of the options that all commands have."""
@@ -114,7 +102,7 @@ class Command(TyperCommand):
         return option
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the command line, and move values of old names of options to the new ones."""
+        """Parse the command line; whatever is wrong with it ends the command in one line."""
         with log_format(_value_of(args, "--log-format"), self.name or ""):
             return self._parse(ctx, args)
 
@@ -125,31 +113,7 @@ class Command(TyperCommand):
         for option in self.params:
             if option.name == "topic" and not option.multiple:
                 _refuse_several(given, option.opts)
-        if not ctx.resilient_parsing:
-            found = found_of(self.name or "")
-            self.rename(ctx.params, lambda parameter: _rank(ctx, parameter, found), ctx.params.get("quiet"))
         return left
-
-    def rename(self, values: dict[str, Any], rank_of: Callable[[str], tuple[int, str]], quiet: Any = False) -> None:
-        """Move values from old names to new ones, unless a stronger source has set the new one.
-
-        ``rank_of`` returns how strong the source of a value is (0 is the strongest) and its description.
-        """
-        for old, targets in self._renamed.items():
-            value = values.pop(_python_name(old), None)
-            rank, where = rank_of(_python_name(old))
-            if rank == _DEFAULT:
-                continue
-            new = _now(targets, values)
-            new_rank, _ = rank_of(new.parameter)
-            if new_rank == rank:
-                refuse_usage(f"{where or f'--{old}'} is the old name of --{new.name}; give one of them")
-            if rank < new_rank:
-                values[new.parameter] = value
-            if not quiet:
-                name = new.variable if rank == 1 else new.name if rank == 2 else f"--{new.name}"
-                words = f"{where or f'--{old}'} is called {name} now; the old name goes with the next release"
-                say(words)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command; with --verbose first list the options that differ from the defaults, and their sources."""
@@ -213,26 +177,6 @@ def _rank(ctx: Any, parameter: str, found: Mapping[str, tuple[Setting, Given]]) 
     return (1, "the environment") if source.name == "ENVIRONMENT" else (0, "")
 
 
-def _python_name(name: str) -> str:
-    return "old_" + name.replace("-", "_")
-
-
-def _hidden(parameter: Any, old: str) -> Any:
-    """Return a hidden copy of an option with its old name."""
-    hidden = copy.copy(parameter)
-    hidden.name = _python_name(old)
-    hidden.opts = [f"--{old}"]
-    hidden.secondary_opts = [f"--no-{old}"] if parameter.secondary_opts else []
-    hidden.default, hidden.hidden = None, True
-    return hidden
-
-
-def _now(targets: list[Setting], values: Mapping[str, Any]) -> Setting:
-    """Return the option that an old name stands for, where several options had it."""
-    fitting = [s for s in targets if s.declared.was_if and values.get(s.declared.was_if[0]) == s.declared.was_if[1]]
-    return fitting[0] if fitting else next(s for s in targets if not s.declared.was_if)
-
-
 def read_config(context: typer.Context, path: Path | None) -> Path | None:
     """Use the values of environment and files as defaults of this command's options.
 
@@ -267,10 +211,9 @@ def settings_of(command: str) -> dict[str, Any]:
     context: Any = RUNNING.get()
     values, found = converted(context, command), found_of(command)
     other: Command = context.parent.command.commands[command]
-    places = {name: (given.rank, given.where) for name, (_, given) in found.items()}
-    other.rename(values, lambda name: places.get(name, (_DEFAULT, "")))
     for setting in other.settings.values():
-        setting.check(values.get(setting.parameter), places.get(setting.parameter, (0, ""))[1])
+        place = found[setting.parameter][1].where if setting.parameter in found else ""
+        setting.check(values.get(setting.parameter), place)
     return values
 
 

@@ -72,8 +72,6 @@ def option(
     *names: str,
     panel: str = "",
     tuning: bool | str = False,
-    was: str = "",
-    was_if: tuple[str, str] | None = None,
     least: float = -math.inf,
     most: float = math.inf,
     **given: Any,
@@ -90,7 +88,7 @@ def option(
     if panel in (COMMON, FILES):
         given.setdefault("show_default", False)
     made: Any = typer.Option(*names, show_envvar=False, **given)
-    made.declared = Declared(tuning, was.lstrip("-"), was_if, least, most)
+    made.declared = Declared(tuning, least, most)
     return made
 
 

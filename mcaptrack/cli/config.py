@@ -113,18 +113,18 @@ def read_toml(path: Path) -> Toml | None:
         raise McaptrackError(f"{path} is not valid TOML: {error}") from None
 
 
-def write_settings(path: Path, command: str, settings: Mapping[str, Any], was: Mapping[str, str]) -> None:
+def write_settings(path: Path, command: str, settings: Mapping[str, Any]) -> None:
     """Write settings of a command, such as ``{"max-age-s": 2.0}``, into a file of options.
 
-    The rest of the file stays as it is, with comments and line endings. ``was`` maps names of settings to their old
-    names, which are removed. Raises McaptrackError for a file that can't be read or edited.
+    The rest of the file stays as it is, with comments and line endings. Raises McaptrackError for a file that can't be
+    read or edited.
     """
     old = read_toml(path)
-    text = edited(path, old.text if old else "", command, settings, was)
+    text = edited(path, old.text if old else "", command, settings)
     publish_bytes(path, text.encode("utf-8"))
 
 
-def edited(path: Path, text: str, command: str, settings: Mapping[str, Any], was: Mapping[str, str]) -> str:
+def edited(path: Path, text: str, command: str, settings: Mapping[str, Any]) -> str:
     """Return the edited text of ``path``; see ``write_settings``."""
     import tomlkit
     from tomlkit.exceptions import TOMLKitError
@@ -145,8 +145,6 @@ def edited(path: Path, text: str, command: str, settings: Mapping[str, Any], was
             spelt = [key for key in wanted if key.replace("_", "-") == name]
             for key in spelt or [name]:
                 table[key] = wanted[key] = value
-            for key in [key for key in wanted if key.replace("_", "-") == was.get(name)]:
-                del table[key], wanted[key]
         new: str = tomlkit.dumps(document)
         if "\r\n" in text and not _BARE_NEWLINE.search(text):
             new = _BARE_NEWLINE.sub("\r\n", new)

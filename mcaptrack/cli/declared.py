@@ -140,8 +140,6 @@ def annotation_of(one: Parameter) -> Any:
         *one.flags,
         panel=about.panel,
         tuning=about.tuning,
-        was=about.was,
-        was_if=about.was_if,
         least=about.least,
         most=about.most,
         **given,

@@ -25,8 +25,8 @@ def events(
     similarity: Annotated[
         labels.SimilarityName | None, labels.similarity("iou at the video's rate, otherwise metres")
     ] = None,
-    gate_m: Annotated[float | None, labels.gate_m("1.0, and 2.0 for 3D boxes", was="--gate")] = None,
-    min_iou: Annotated[float | None, labels.min_iou(was="--gate", was_if=("similarity", "iou"))] = None,
+    gate_m: Annotated[float | None, labels.gate_m("1.0, and 2.0 for 3D boxes")] = None,
+    min_iou: Annotated[float | None, labels.min_iou()] = None,
     camera: common.Camera = None,
     output: common.Output = None,
     sidecar: common.Sidecar = None,

@@ -46,15 +46,14 @@ def similarity(shown: str) -> Any:
     return common.option("--similarity", panel=SCORES, tuning=True, help=words, show_default=shown)
 
 
-def gate_m(shown: str | bool = True, tuning: str | bool = True, was: str = "") -> Any:
+def gate_m(shown: str | bool = True, tuning: str | bool = True) -> Any:
     """Return the option --gate-m."""
     words = "Gate: largest distance in metres at which ground truth and a track match."
     ends: dict[str, Any] = {} if isinstance(tuning, str) else {"least": 0.001, "most": 1e6}  # text is several numbers
-    return common.option("--gate-m", panel=SCORES, tuning=tuning, was=was, help=words, show_default=shown, **ends)
+    return common.option("--gate-m", panel=SCORES, tuning=tuning, help=words, show_default=shown, **ends)
 
 
-def min_iou(was: str = "", was_if: tuple[str, str] | None = None) -> Any:
+def min_iou() -> Any:
     """Return the option --min-iou."""
     words = "Least overlap (IoU) at which ground truth and a track match."
-    about: dict[str, Any] = {"was": was, "was_if": was_if, "least": 0.001, "most": 1}
-    return common.option("--min-iou", panel=SCORES, tuning=True, help=words, show_default="0.5", **about)
+    return common.option("--min-iou", panel=SCORES, tuning=True, help=words, show_default="0.5", least=0.001, most=1)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
-from itertools import chain, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -67,10 +67,7 @@ def _values(words: Sequence[str], option: str) -> list[str]:
 
 
 def _of_words(stage: Stage, words: Sequence[str]) -> Iterator[tuple[str, type[Transform]]]:
-    given = [values for option in filter(None, (stage.option, stage.was)) if (values := _values(words, option))]
-    if len(given) > 1:
-        return  # both the old and the new name: the parser refuses that
-    for name in chain.from_iterable(given):
+    for name in _values(words, stage.option):
         if stage.split(name)[0] in BUILT_IN[stage.option]:
             continue
         with nullcontext() if stage.kind else suppress(McaptrackError):  # a predictor: the command reports the error

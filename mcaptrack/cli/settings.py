@@ -42,17 +42,11 @@ class Declared:
     tuning : bool or str
         Whether a file in the working folder may set it: numbers, choices and switches that change how results are
         computed. For text, a pattern that the whole value has to match, because text could be a path.
-    was : str
-        The old name, without dashes.
-    was_if : (str, str) or None
-        If several options had this old name: another option and its value, for which the old name means this option.
     least, most : float
         The range of numbers.
     """
 
     tuning: bool | str = False
-    was: str = ""
-    was_if: tuple[str, str] | None = None
     least: float = -math.inf
     most: float = math.inf
 
@@ -134,7 +128,7 @@ class Setting:
 
 
 class HasSettings(Protocol):
-    """A command: ``settings`` are its options by name; renamed options also by their old names."""
+    """A command: ``settings`` are its options by name."""
 
     settings: dict[str, Setting]
 
@@ -238,16 +232,6 @@ def found_of(command: str) -> dict[str, tuple[Setting, Given]]:
         return {}
     settings = commands[command].settings
     return {settings[name].parameter: (settings[name], one) for name, one in found[command].items()}
-
-
-def old_names(command: str) -> dict[str, str]:
-    """Return the old names of a command's options, by their new names."""
-    commands, _ = _KNOWN.get()
-    return {
-        one.name: one.declared.was
-        for one in commands[command].settings.values()
-        if one.declared.was not in ("", one.name)
-    }
 
 
 def _nearest(name: str, known: Iterable[str]) -> str:

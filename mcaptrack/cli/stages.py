@@ -47,15 +47,12 @@ Set = Annotated[
 _NAME: Final = r"[A-Za-z0-9_-]+"
 
 
-def chooser(
-    kind: Kind, was: str = "", words: str = "The {kind} to use", panel: str = "", shown: str | bool = True
-) -> Any:
+def chooser(kind: Kind, words: str = "The {kind} to use", panel: str = "", shown: str | bool = True) -> Any:
     """Return the option that chooses a detector, tracker or so on of the registry by name."""
     built_in = ", ".join(BUILT_IN[kind])
     return common.option(
         f"--{kind}",
         tuning=_NAME,
-        was=was,
         panel=panel,
         metavar="NAME",
         help=f"{words.format(kind=kind)}: {built_in}, one of an installed package, or module:Class.",
@@ -141,7 +138,6 @@ def option_of(field: Field[Any], switch: str, panel: str, tuning: Any = True, ot
         least=about.get("least", -math.inf),
         most=about.get("most", math.inf),
         show_default=shown_default(default_of(field)),
-        was=about.get("was", "").replace("_", "-"),
     )
 
 
@@ -160,13 +156,12 @@ def shown_default(default: Any) -> str:
 
 
 def _flags(parameter: str, annotation: Any) -> set[str]:
-    """The names that an option has on the command line, without the dashes; also those that it had before."""
+    """The names that an option has on the command line, without the dashes."""
     about = get_args(annotation)[1]
     # Typer takes the first name for a default until it reads the annotation.
     names = (about.default, *(about.param_decls or ()))
     given = [part for name in names if isinstance(name, str) for part in name.split("/")]
-    was = about.declared.was if hasattr(about, "declared") else ""
-    return {name.removeprefix("--") for name in (*given, was, parameter.replace("_", "-")) if name}
+    return {name.removeprefix("--") for name in (*given, parameter.replace("_", "-")) if name}
 
 
 def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> Callable[..., None]:
@@ -193,7 +188,7 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
     taken = {one.name: annotation_of(one) for one in options_of_function(declared)}
     if stage.kind:
         usual = stage.entry(stage.default).name
-        which = chooser(stage.kind, stage.was, shown=usual if stage.profiles else True)
+        which = chooser(stage.kind, shown=usual if stage.profiles else True)
         # None where a profile may choose the transform.
         taken[stage.kind] = Annotated[str | None, which] if stage.profiles else Annotated[str, which]
     pairs = [*taken.items(), *((option, hint) for option, (hint, _) in more.items())]

@@ -12,7 +12,6 @@ from mcaptrack.cli.chosen import has_flag, options_of
 from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.config import NAME, read_toml, write_settings
 from mcaptrack.cli.inputs import expand
-from mcaptrack.cli.settings import old_names
 from mcaptrack.cli.stages import chooser
 from mcaptrack.cli.text import console, show, stdout_to_stderr
 from mcaptrack.errors import McaptrackError
@@ -85,7 +84,7 @@ def tune(
     ] = None,
     similarity: Annotated[labels.SimilarityName | None, labels.similarity("iou; metres after track")] = None,
     gate_m: Annotated[float, labels.gate_m()] = 1.0,
-    min_iou: Annotated[float, labels.min_iou(was="--match-iou")] = 0.5,
+    min_iou: Annotated[float, labels.min_iou()] = 0.5,
     fps: labels.LabelFps = None,
     ground_plane: labels.GroundPlane = None,
     point: labels.Point = "foot",
@@ -162,7 +161,7 @@ def tune(
             }
             if set_ := [f"{name}={value}" for name, value in done.settings.items() if name in flagless]:
                 named["set"] = set_
-            write_settings(output, stage, named, old_names(stage))
+            write_settings(output, stage, named)
             talk.say(f"{output}: {metric} {before:.4f} with the defaults, {score:.4f} now")
     if json:
         row = {"stage": stage, "metric": metric, "settings": done.settings, "trials": done.trials, "best": done.best}

@@ -38,7 +38,6 @@ from mcaptrack.log.records import MAGIC, Damaged
 
 State = Literal["busy", "old", "new", "between"]
 
-_MAGIC_1: Final = b"mcaptrack journal 1\n"
 _MAGIC: Final = b"mcaptrack journal 2\n"
 #: The length of the journal up to the end of the old tail; device, file system and inode of the log; the size of the
 #: log and the offset of its old tail; digests of the bytes before the old tail (see ``_identity``) and of the old tail.
@@ -48,8 +47,6 @@ _PIECE_HEAD: Final = struct.Struct("<QQQ")
 _NOT_LAST: Final = 2**64 - 1
 _DIGEST_SIZE: Final = 32
 _HEAD_SIZE: Final = len(_MAGIC) + _HEAD.size + _DIGEST_SIZE
-#: The head of version 1: offset of the old tail, size of the log, CRC of the bytes before it, CRC of the old tail.
-_HEAD_1: Final = struct.Struct("<QQII")
 #: The first bytes of a log and the bytes before its old tail identify it: this many of each.
 _IDENTITY_BYTES: Final = 64 * 2**10
 #: Pieces are compared in rows of one disk sector, the unit in which disks write.
@@ -268,7 +265,7 @@ def is_left_behind(path: Path) -> bool:
 
 
 def load_old_content(path: Path, log: OpenFile) -> ByteSource | None:
-    """The old content of the log by any journal with matching checksums: also of version 1, or of a copied log.
+    """The old content of the log by any journal with matching checksums: also of a copied log.
 
     None if there is none. Only for writing the content to another file, because it does not prove that the journal
     belongs to this file.
@@ -277,8 +274,6 @@ def load_old_content(path: Path, log: OpenFile) -> ByteSource | None:
         file = _open(journal_of(path), log)
         if file is None:
             return None
-        if bytes(ByteSource.of(file)[0 : len(_MAGIC)]) == _MAGIC_1:
-            return _read_version_1(file, log)
         return _read(file, log)[0].old_content()
     except (UnusableJournal, Damaged):
         return None
@@ -307,10 +302,6 @@ def _read(file: OpenFile, log: OpenFile) -> tuple[Journal, bool]:
     """A journal, and whether it names this file. Raises UnusableJournal if it is invalid or the log has changed."""
     source = ByteSource.of(file)
     head = bytes(source[0:_HEAD_SIZE])
-    if head.startswith(_MAGIC_1):
-        raise UnusableJournal(
-            "was left by version 0.1.0; journals of that version don't name the file that they belong to"
-        )
     if not head.startswith(_MAGIC):
         raise UnusableJournal("is not a journal of mcaptrack")
     incomplete = UnusableJournal("is an incomplete or damaged journal of mcaptrack")
@@ -353,22 +344,6 @@ def _read_pieces(journal: Journal, source: ByteSource, at: int, digest: bytes) -
         journal.written_to = place + size
         journal.final = None if final == _NOT_LAST else final
         at = end + _DIGEST_SIZE
-
-
-def _read_version_1(file: OpenFile, log: OpenFile) -> ByteSource | None:
-    """The old content of the log by a journal of version 1, if its checksums are right."""
-    source = ByteSource.of(file)
-    begin = len(_MAGIC_1) + _HEAD_1.size + 4
-    head = bytes(source[len(_MAGIC_1) : begin])
-    if len(head) < begin - len(_MAGIC_1) or zlib.crc32(head[:-4]).to_bytes(4, "little") != head[-4:]:
-        return None
-    start, size, before, old = _HEAD_1.unpack_from(head)
-    if not len(MAGIC) <= start <= size or len(source) - begin != size - start:
-        return None
-    journal = Journal(file, log, start, size, at=begin)
-    first = max(0, start - _IDENTITY_BYTES)
-    is_right = zlib.crc32(log.read(first, start - first)) == before
-    return journal.old_content() if is_right and zlib.crc32(bytes(source[begin : len(source)])) == old else None
 
 
 def _identity(handle: int, start: int) -> bytes:

@@ -213,8 +213,6 @@ def _options_for(opened: log.Log, topic: str, given: EventOptions) -> EventOptio
     similarity = asked.get("similarity")
     if similarity not in get_args(Similarity):
         similarity = None
-    if "gate" in asked:  # version 0.1 had one parameter for both
-        asked = {"min_iou" if similarity == "iou" else "gate_m": asked["gate"]}
     gates = {name: gate for name in ("gate_m", "min_iou") if _is_gate(gate := asked.get(name))}
     return EventOptions(similarity, **gates)
 

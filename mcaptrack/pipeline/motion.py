@@ -72,7 +72,7 @@ def detects_motion(made: Provenance | None) -> bool:
     stage = STAGES.get(made.transform) if made and "transform" not in made.plugins else None
     if made is None or stage is None or stage.default.reads is not VIDEO:
         return False
-    name = made.parameters.get("detector", made.parameters.get(stage.was, ""))
+    name = made.parameters.get("detector", "")
     return traits_of(stage.built_in().get(str(name), stage.default)).needs_still_camera
 
 

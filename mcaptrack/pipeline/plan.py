@@ -18,7 +18,7 @@ from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, first_stage, superseded
 from mcaptrack.pipeline.corrections import is_of_corrections
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, read_planes, warn_unused
-from mcaptrack.pipeline.rebuild import MissingPluginError, differing, fuser_of, rebuild
+from mcaptrack.pipeline.rebuild import MissingPluginError, OlderVersionError, differing, fuser_of, rebuild
 from mcaptrack.pipeline.spaces import check_spaces, suited_tracker
 from mcaptrack.pipeline.staleness import is_stale
 from mcaptrack.schema import DETECTIONS, SIGHTINGS, VIDEO
@@ -131,6 +131,7 @@ class _Planner:
         self._notes: list[str] = []
         self._unnamed: dict[str, MissingPluginError] = {}
         self._differing: set[str] = set()
+        self._is_of_older_version = False
 
     def take_as_changed(self, topics: Collection[str], renewed: Collection[str]) -> None:
         """Plan all that is made from these topics, and those in ``renewed``."""
@@ -197,11 +198,22 @@ class _Planner:
         found = (provenance_of(self._opened, one) for one in topics)
         return next((made for made in found if made and made.transform == stage), None)
 
-    def _make(self, stage: str, topic: str) -> bool:
+    def _make_anew(self, made: Provenance, stage: str, topic: str) -> bool:
+        """Plan the stage of a channel of an older version from scratch, with ``force``; or else say that it stays."""
+        if self._force:
+            return self._make(stage, topic, f"was made by version {made.version}")
+        if not self._is_of_older_version:
+            self._is_of_older_version = True
+            force = call("run", self._opened.path, force=True)
+            words = f"made by an older version ({made.version}), and left as it is; {force} makes all again"
+            warn(f"{topic} was {words}", "out-of-date")
+        return False
+
+    def _make(self, stage: str, topic: str, why: str = "is missing") -> bool:
         """Plan the job for a missing channel. Returns True: the channel will change."""
         source = self.source_of(stage)
         self.ensure(source)
-        self._notes.append(f"{topic} is missing: running {stage}")
+        self._notes.append(f"{topic} {why}: running {stage}")
         chosen = self._defaults.get(stage) or self._suited(stage, source) or STAGES[stage].default()
         transform = self._with_choice(chosen)
         self.ensure_motion(transform, source)
@@ -260,6 +272,8 @@ class _Planner:
         is_due = any(is_changed) or is_missing or is_stale(self._opened, topic) or source != had
         is_due = is_due or topic in self._renewed
         before, why_not = self._before(stage, made)
+        if isinstance(why_not, OlderVersionError):
+            return self._make_anew(made, stage, topic)
         main = _main(self._opened, stage, topic)
         # A result at another topic keeps the parameters that it was requested with.
         is_usual = main == f"{self._prefix}/{STAGES[stage].output_topic}"

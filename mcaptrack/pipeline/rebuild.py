@@ -37,6 +37,10 @@ class MissingPluginError(McaptrackError):
         self.options = options
 
 
+class OlderVersionError(McaptrackError):
+    """A channel was made by a version before this one, whose parameters have other names or meanings."""
+
+
 def plugins_of(stage: Stage, transform: Transform) -> dict[str, Plugin]:
     """Return the classes of other packages in a transform: "transform" for itself, "predictor" for its predictor."""
     cls = type(transform)
@@ -53,10 +57,14 @@ def rebuild(stage: Stage, made: Provenance, known: Mapping[str, Transform]) -> T
     """Return the transform that made a channel, with the same parameters.
 
     ``known`` are the transforms that the user named, by stage; their classes may be used in addition to installed ones.
-    Raises MissingPluginError if a class of another package is not available, and McaptrackError for parameters that no
-    longer exist.
+    Raises OlderVersionError if an older version made it, MissingPluginError if a class of another package is not
+    available, and McaptrackError for parameters that no longer exist.
     """
-    parameters = stage.upgrade(made.parameters)
+    if made.is_of_older_version:
+        raise OlderVersionError(
+            f"it was made by an older version ({made.version}), of which parameters aren't taken over"
+        )
+    parameters = dict(made.parameters)
     cls = _class_of(stage, made, parameters, known)
     plugin, name = made.plugins.get("predictor"), parameters.get("predictor")
     if plugin is None and isinstance(name, str) and _is_of_a_module(name):
@@ -67,8 +75,6 @@ def rebuild(stage: Stage, made: Provenance, known: Mapping[str, Transform]) -> T
             _installed("predictor", plugin, find)
     cls = stage.with_part(cls, parameters.get(stage.parameter))
     types = {f.name: f for f in fields(cls)}
-    renamed = {was: name for name, f in types.items() if (was := f.metadata.get("was"))}
-    parameters = {renamed.get(name, name): value for name, value in parameters.items()}
     unknown = sorted(set(parameters) - set(types))
     if unknown:
         name = stage.entry(cls) if "transform" in made.plugins else cls.__name__
@@ -112,7 +118,7 @@ def _class_of(
     stage: Stage, made: Provenance, parameters: dict[str, Any], known: Mapping[str, Transform]
 ) -> type[Transform]:
     """Return the class of the transform; removes the parameter that names it from ``parameters``."""
-    name = str(parameters.pop(stage.kind, parameters.pop(stage.was, ""))) if stage.kind else ""
+    name = str(parameters.pop(stage.kind, "")) if stage.kind else ""
     plugin = made.plugins.get("transform")
     if plugin is None:
         built_in = stage.built_in()

@@ -58,8 +58,6 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
         "detector": {
             "median": "mcaptrack.transforms.detect.median:MedianDetector",
             "knn": "mcaptrack.transforms.detect.background:KnnDetector",
-            "mog2": "mcaptrack.transforms.detect.background:Mog2Detector",
-            "frame-difference": "mcaptrack.transforms.detect.background:FrameDifferenceDetector",
             "onnx": "mcaptrack.transforms.detect.onnx.detector:OnnxDetector",
             "yolox-nano": "mcaptrack.transforms.detect.onnx.catalogued:YoloxNano",
             "yolox-tiny": "mcaptrack.transforms.detect.onnx.catalogued:YoloxTiny",

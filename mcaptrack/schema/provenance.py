@@ -19,6 +19,8 @@ _PREFIX: Final = "mcaptrack."
 INGEST, VIEW, FUSE, REFINE = "ingest", "view", "fuse", "calibrate"
 #: The metadata record with the start time of a log's cameras, ``start_ns``.
 CLOCK: Final = "mcaptrack.clock"
+#: Beginnings of the versions whose results are read, but not made again with the same parameters.
+_OLDER: Final = ("0.1.", "0.2.")
 
 
 class Plugin(NamedTuple):
@@ -61,6 +63,11 @@ class Provenance:
     version: str = __version__
     zones: Mapping[str, str] = field(default_factory=dict)
     continued: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def is_of_older_version(self) -> bool:
+        """Whether a version made it whose parameters have other names or meanings than those of this version."""
+        return self.version.startswith(_OLDER)
 
     def made_from(self) -> dict[str, str]:
         """The topics that it was made from and compared with, and their digests."""
@@ -139,15 +146,8 @@ def _is_warning(value: object) -> bool:
 
 
 def _plugins(values: dict[str, str]) -> dict[str, Plugin]:
-    """Take the classes of other packages out of the metadata ``values``.
-
-    Version 0.1 had ``implementation`` ("module:Class") and ``distribution`` ("name 1.2").
-    """
+    """Take the classes of other packages out of the metadata ``values``."""
     found = _read(values.pop("plugins", ""), dict)
-    before, package = values.pop("implementation", ""), values.pop("distribution", "")
-    if before:
-        name, _, version = package.rpartition(" ")
-        found.setdefault("transform", Plugin(before, before, name, version)._asdict())
     return {
         key: Plugin(**{name: str(one.get(name, "")) for name in Plugin._fields})
         for key, one in found.items()

@@ -11,11 +11,8 @@ from types import MappingProxyType
 from typing import Final
 
 from mcaptrack.transforms.detect import (
-    FrameDifferenceDetector,
     KnnDetector,
     MedianDetector,
-    Mog2Detector,
-    MotionDetector,
     OnnxDetector,
 )
 from mcaptrack.transforms.ground import GroundTracker
@@ -36,12 +33,9 @@ __all__ = [
     "TRANSFORMS",
     "ByteTrack",
     "EstimateMotion",
-    "FrameDifferenceDetector",
     "GroundTracker",
     "KnnDetector",
     "MedianDetector",
-    "Mog2Detector",
-    "MotionDetector",
     "OcSort",
     "OnnxDetector",
     "Predict",

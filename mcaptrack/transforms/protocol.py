@@ -169,7 +169,6 @@ def option(
     search: tuple[float, float] | None = None,
     kind: Kind | None = None,
     theme: str = "",
-    was: str = "",
     pattern: str = "",
     flag: bool = True,
 ) -> Any:
@@ -190,8 +189,6 @@ def option(
         The value is a name of this kind in ``mcaptrack.registry``.
     theme : str
         Heading in the help of the command, shared by related parameters.
-    was : str
-        Former name, which is accepted for one release.
     pattern : str
         Regular expression of a text that a settings file in the working folder may set; "" for none.
     flag : bool
@@ -214,7 +211,7 @@ def option(
     if most is None:
         most = math.inf if least == -math.inf else LARGEST
     about = {"help": help, "least": least, "most": most, "search": search, "kind": kind, "theme": theme}
-    about |= {"was": was, "pattern": pattern, "flag": flag}
+    about |= {"pattern": pattern, "flag": flag}
     return field(default=default, metadata=about)
 
 

@@ -47,9 +47,7 @@ class Sample:
     """
 
     rate_hz: float = option(2.5, "samples per second", least=0.1, most=1000.0)
-    max_gap_s: float = option(
-        2.0, "gaps in a track of up to this many seconds are interpolated", least=0.0, was="max_hole_s"
-    )
+    max_gap_s: float = option(2.0, "gaps in a track of up to this many seconds are interpolated", least=0.0)
     start_ns: int | None = context(lambda: None)
     ground_planes: Planes = context(tuple)
 

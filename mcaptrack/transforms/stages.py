@@ -22,7 +22,7 @@ from mcaptrack.transforms.fuse import FootFuser
 from mcaptrack.transforms.motion import EstimateMotion
 from mcaptrack.transforms.predict import Predict, predict_with
 from mcaptrack.transforms.protocol import Transform, check_options, option_problem, trait_problem
-from mcaptrack.transforms.retrack import PROFILES, Retrack, upgrade_parameters
+from mcaptrack.transforms.retrack import PROFILES, Retrack
 from mcaptrack.transforms.sample import Sample
 from mcaptrack.transforms.sort import Sort
 
@@ -49,8 +49,6 @@ class Stage:
     kind : Kind or None
         The kind of its transforms in the registry, which is also the name of the option that chooses one; None if there
         is one transform only.
-    was : str
-        The former name of this option.
     parameter : Kind or ""
         The parameter of its transform that names an entry of the registry, such as its predictor; ``run`` has an option
         of the same name.
@@ -72,8 +70,6 @@ class Stage:
         Outputs that are made wherever the main one is, also again in logs that lack them.
     implied : Mapping[str, str]
         Options that belong to one transform and choose it, by its name, if none is named.
-    upgrade : Callable
-        Converts parameters of earlier versions to current ones.
     """
 
     name: str
@@ -82,7 +78,6 @@ class Stage:
     output_topic: str
     rows: str
     kind: Kind | None = None
-    was: str = ""
     parameter: Kind | Literal[""] = ""
     variant: Callable[[str], type[Transform]] | None = None
     on_demand: bool = False
@@ -93,7 +88,6 @@ class Stage:
     modes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     beside: tuple[str, ...] = ()
     implied: Mapping[str, str] = field(default_factory=dict)
-    upgrade: Callable[[Mapping[str, Any]], dict[str, Any]] = dict
 
     def outputs(self, target: str) -> tuple[str, ...]:
         """The topics that the stage writes if its main output is ``target``."""
@@ -251,7 +245,6 @@ _STAGES: Final = (
         name="detect",
         default=MedianDetector,
         kind="detector",
-        was="method",
         input_topic="video",
         output_topic="detections",
         rows="boxes",
@@ -304,7 +297,6 @@ _STAGES: Final = (
         ),
         beside=("decisions", "appearance"),
         implied=MappingProxyType({"distance": "consistency"}),
-        upgrade=upgrade_parameters,
     ),
 )
 #: All stages by name, in the order in which they run.

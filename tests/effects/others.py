@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mcaptrack.schema import Frame
-from mcaptrack.transforms import EstimateMotion, FrameDifferenceDetector, KnnDetector, MedianDetector, Predict, Sample
+from mcaptrack.transforms import EstimateMotion, KnnDetector, MedianDetector, Predict, Sample
 from tests import drawn
 from tests.effects import Case, Outputs, change_of_forecasts, forecast_steps, line, rows, shaky, spread_of_last
 from tests.worlds import ns, tracks_at
@@ -130,10 +130,10 @@ case(
     "detect",
     "threshold",
     pale.__doc__,
-    FrameDifferenceDetector(stabilise=False),
+    KnnDetector(stabilise=False),
     film(pale),
     last_boxes,
-    {10.0: 1, 20.0: 0},
+    {100.0: 1, 800.0: 0},
 )
 case("detect", "history_s", stops.__doc__, STEADY, STOPS, all_boxes, {0.5: "least", 2.0: "more", 60.0: "most"})
 case(

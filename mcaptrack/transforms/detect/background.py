@@ -1,4 +1,4 @@
-"""Motion detectors: pictures -> boxes around what differs from the background.
+"""A motion detector: pictures -> boxes around what differs from a background that is learned from the past.
 
 Each picture is halved until it is small enough, registered to a reference picture, and compared with the background.
 The mask of differing pixels is cleaned, and its connected regions become boxes, in pixels of the picture before halving
@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,6 @@ from mcaptrack.geometry.affine import IDENTITY, move_boxes
 from mcaptrack.geometry.arrays import Floats, Image, Ints
 from mcaptrack.geometry.clocks import FrameClock
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
-from mcaptrack.transforms.detect.foreground import Method, make_foreground_model
 from mcaptrack.transforms.detect.registration import Registration
 from mcaptrack.transforms.detect.steadiness import Steadiness
 from mcaptrack.transforms.protocol import Colour, check_options, option
@@ -39,66 +38,13 @@ _MIN_AREA_PX: Final = 20.0
 _INITIAL_HEIGHT_PX: Final = 20.0
 _MIN_REGIONS: Final = 10
 _PERSON_CLASS: Final = 1
+#: Squared distance of brightness that counts as motion, if no other is given.
+_THRESHOLD: Final = 800.0
+_FOREGROUND: Final = 255  # OpenCV marks shadows with 127
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotionDetector:
-    """Base of the motion detectors, which differ in their foreground model (``method``)."""
-
-    threshold: float | None = option(
-        None, "difference from the background that counts as motion; each detector has its own default", least=0.0
-    )
-    history_s: float = option(60.0, "memory of the background model, in seconds", least=0.1, flag=False)
-    max_pixels: int = option(
-        1_000_000,
-        "pictures are halved until they have no more pixels than this",
-        least=1_000,
-        most=1_000_000_000,
-        flag=False,
-    )
-    stabilise: bool = option(True, "compensate the motion of a shaking camera", flag=False)
-
-    method: ClassVar[Method]
-    colour: ClassVar[Colour] = "grey"
-    needs_still_camera: ClassVar[bool] = True
-    reads: ClassVar[Schema] = VIDEO
-    writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": DETECTIONS})
-    latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": 0.0})
-
-    def __post_init__(self) -> None:
-        check_options(self)
-
-    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        steadiness = Steadiness()
-        yield from self.detect(frames, steadiness)
-        steadiness.check()
-
-    def detect(self, frames: Iterable[Frame], steadiness: Steadiness) -> Iterator[tuple[Frame]]:
-        """The detections of pictures; ``steadiness`` takes how the camera moved."""
-        clock, camera, height = FrameClock(), Registration(), _PersonHeight()
-        foreground = make_foreground_model(self.method, self.threshold, self.history_s)
-        size: tuple[int, ...] = ()
-        for frame in frames:
-            clock.tick(frame.t_ns)
-            image, halvings = halve(frame.rows, self.max_pixels)
-            to_reference, is_new = camera.register(image) if self.stabilise else (IDENTITY, image.shape != size)
-            size = image.shape
-            steadiness.update(frame.t_ns, camera.view, is_new)
-            if is_new:  # another view has another background
-                foreground = make_foreground_model(self.method, self.threshold, self.history_s)
-            mask = clear_border(foreground.mask(warp(image, to_reference), clock), to_reference)
-            if np.count_nonzero(mask) > MAX_FOREGROUND * mask.size:
-                mask = np.zeros_like(mask)
-            boxes = _find_boxes(mask, height.update(mask))
-            yield (Frame(frame.t_ns, frame.index, boxes_to_rows(unwarp_boxes(boxes, to_reference) * 2**halvings)),)
-
-    def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
-        """Why there are no detections, for a warning."""
-        return f"no motion in its {len(made)} pictures exceeds the threshold"
-
-
-@dataclass(frozen=True, kw_only=True)
-class KnnDetector(MotionDetector):
+class KnnDetector:
     """Detect what moves, by subtracting a background model (k nearest neighbours).
 
     Reads video, writes detections: one box for each connected region that differs from the background.
@@ -122,31 +68,55 @@ class KnnDetector(MotionDetector):
     background subtraction", Pattern Recognition Letters 27, 2006.
     """
 
-    method: ClassVar[Method] = "knn"
+    threshold: float | None = option(
+        None, "difference from the background that counts as motion; each detector has its own default", least=0.0
+    )
+    history_s: float = option(60.0, "memory of the background model, in seconds", least=0.1, flag=False)
+    max_pixels: int = option(
+        1_000_000,
+        "pictures are halved until they have no more pixels than this",
+        least=1_000,
+        most=1_000_000_000,
+        flag=False,
+    )
+    stabilise: bool = option(True, "compensate the motion of a shaking camera", flag=False)
 
+    colour: ClassVar[Colour] = "grey"
+    needs_still_camera: ClassVar[bool] = True
+    reads: ClassVar[Schema] = VIDEO
+    writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": DETECTIONS})
+    latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": 0.0})
 
-@dataclass(frozen=True, kw_only=True)
-class Mog2Detector(MotionDetector):
-    """With `--detector mog2` the background model is a mixture of Gaussians (Zivkovic, ICPR 2004).
+    def __post_init__(self) -> None:
+        check_options(self)
 
-    References
-    ----------
-    Z. Zivkovic, "Improved adaptive Gaussian mixture model for background subtraction", ICPR 2004.
-    """
+    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
+        steadiness = Steadiness()
+        yield from self.detect(frames, steadiness)
+        steadiness.check()
 
-    method: ClassVar[Method] = "mog2"
+    def detect(self, frames: Iterable[Frame], steadiness: Steadiness) -> Iterator[tuple[Frame]]:
+        """The detections of pictures; ``steadiness`` takes how the camera moved."""
+        clock, camera, height = FrameClock(), Registration(), _PersonHeight()
+        foreground = _BackgroundModel(self.threshold, self.history_s)
+        size: tuple[int, ...] = ()
+        for frame in frames:
+            clock.tick(frame.t_ns)
+            image, halvings = halve(frame.rows, self.max_pixels)
+            to_reference, is_new = camera.register(image) if self.stabilise else (IDENTITY, image.shape != size)
+            size = image.shape
+            steadiness.update(frame.t_ns, camera.view, is_new)
+            if is_new:  # another view has another background
+                foreground = _BackgroundModel(self.threshold, self.history_s)
+            mask = clear_border(foreground.mask(warp(image, to_reference), clock), to_reference)
+            if np.count_nonzero(mask) > MAX_FOREGROUND * mask.size:
+                mask = np.zeros_like(mask)
+            boxes = _find_boxes(mask, height.update(mask))
+            yield (Frame(frame.t_ns, frame.index, boxes_to_rows(unwarp_boxes(boxes, to_reference) * 2**halvings)),)
 
-
-@dataclass(frozen=True, kw_only=True)
-class FrameDifferenceDetector(MotionDetector):
-    """With `--detector frame-difference` pictures are compared with those just before them, as in the paper.
-
-    References
-    ----------
-    R. Yu and Z. Zhou, "Towards Robust Human Trajectory Prediction in Raw Videos", IROS 2021.
-    """
-
-    method: ClassVar[Method] = "frame-difference"
+    def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
+        """Why there are no detections, for a warning."""
+        return f"no motion in its {len(made)} pictures exceeds the threshold"
 
 
 def halve(image: Image, max_pixels: int) -> tuple[Image, int]:
@@ -245,3 +215,27 @@ def boxes_to_rows(boxes: Floats, people: Ints | None = None) -> NDArray[np.void]
     x, y, w, h = boxes[order].T
     count = np.zeros(len(boxes), np.int64) if people is None else people[order]
     return DETECTIONS.rows(x_px=x, y_px=y, w_px=w, h_px=h, class_id=np.full(len(boxes), _PERSON_CLASS), people=count)
+
+
+class _BackgroundModel:
+    """Background subtraction with OpenCV's KNN, which learns over ``history_s``, and faster at first."""
+
+    def __init__(self, threshold: float | None, history_s: float) -> None:
+        import cv2
+
+        # Annotated loosely: the stubs of OpenCV 4 and 5 differ.
+        make: Any = cv2.createBackgroundSubtractorKNN
+        self._model = make(500, _THRESHOLD if threshold is None else threshold, True)
+        self._history_s = history_s
+        self._count = 0
+
+    def mask(self, image: Image, clock: FrameClock) -> Image:
+        """255 where ``image`` (height, width) shows foreground."""
+        import cv2
+
+        self._count += 1
+        # KNN draws from OpenCV's random number generator; without a seed results would differ from run to run.
+        cv2.setRNGSeed(self._count)
+        rate = 1 / min(2 * self._count, max(clock.frames(self._history_s), 2))
+        found = self._model.apply(image, learningRate=rate)
+        return np.where(np.asarray(found) == _FOREGROUND, np.uint8(255), np.uint8(0))

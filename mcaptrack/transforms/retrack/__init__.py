@@ -10,7 +10,7 @@ is guessed and can't be right (``poor_scale``), tracks keep their ids, and
 
 from __future__ import annotations
 
-from mcaptrack.transforms.retrack.methods import PROFILES, Retrack, RetrackByConsistency, Retracking, upgrade_parameters
+from mcaptrack.transforms.retrack.methods import PROFILES, Retrack, RetrackByConsistency, Retracking
 from mcaptrack.transforms.retrack.options import RetrackOptions
 
-__all__ = ["PROFILES", "Retrack", "RetrackByConsistency", "RetrackOptions", "Retracking", "upgrade_parameters"]
+__all__ = ["PROFILES", "Retrack", "RetrackByConsistency", "RetrackOptions", "Retracking"]

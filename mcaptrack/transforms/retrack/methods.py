@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import repeat
 from types import MappingProxyType
-from typing import Any, ClassVar, Final, Protocol, TypeAlias, TypeVar
+from typing import ClassVar, Final, Protocol, TypeAlias, TypeVar
 
 from mcaptrack.predictors import warn_if_weak
 from mcaptrack.schema import APPEARANCE, DECISIONS, TRACKS, Frame, Rows
@@ -242,20 +242,3 @@ PROFILES: Final[Mapping[str, Retracking]] = MappingProxyType(
         ),
     }
 )
-
-
-def upgrade_parameters(had: Mapping[str, Any]) -> dict[str, Any]:
-    """Parameters of version 0.1, where ``distance`` chose the method and both had all options, as those of today."""
-    if "retracker" in had or "distance" not in had:
-        return dict(had)
-    is_likelihood = had["distance"] == "likelihood"
-    own, other = (RetrackByConsistency, Retrack)[::-1] if is_likelihood else (RetrackByConsistency, Retrack)
-    unused = _names(other) - _names(own)
-    return {name: value for name, value in had.items() if name not in unused} | {
-        "retracker": "likelihood" if is_likelihood else "consistency"
-    }
-
-
-def _names(cls: type[RetrackOptions]) -> set[str]:
-    """The parameters of a method under the names that they had before."""
-    return {field.metadata.get("was") or field.name for field in fields(cls)}

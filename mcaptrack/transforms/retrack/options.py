@@ -69,7 +69,6 @@ class RetrackOptions:
         "how much velocities change within a second, in metres per second",
         least=0.0,
         theme=_MOTION,
-        was="drift",
         flag=False,
     )
     drift_ratio: float = option(
@@ -77,7 +76,6 @@ class RetrackOptions:
         "how much velocities change within a second, as a share of the speed",
         least=0.0,
         theme=_MOTION,
-        was="drift_share",
         flag=False,
     )
     same_id_bonus: float = option(
@@ -86,7 +84,6 @@ class RetrackOptions:
         "deviations (likelihood) or standard deviations (consistency); the paper ignores input ids",
         least=0.0,
         theme=_ASSOCIATION,
-        was="same_source",
         flag=False,
     )
     max_age_s: float = option(
@@ -95,13 +92,7 @@ class RetrackOptions:
         least=0.0,
         theme=_LIFE,
     )
-    interpolated: bool = option(
-        False,
-        "use interpolated samples as observations, too",
-        theme=_ASSOCIATION,
-        was="filled",
-        flag=False,
-    )
+    interpolated: bool = option(False, "use interpolated samples as observations, too", theme=_ASSOCIATION, flag=False)
     min_track_s: float = option(
         2.0,
         "leave out tracks that last less than this many seconds (probation)",
@@ -123,14 +114,12 @@ class RetrackOptions:
         least=0.01,
         most=0.99,
         theme=_OFFLINE,
-        was="link_certainty",
         flag=False,
     )
     resolve_swaps: bool = option(
         True,
         "decide again which track is which where two tracks met, from what was before and after (identity switches)",
         theme=_OFFLINE,
-        was="part",
         flag=False,
     )
     track_confidence: float = option(
@@ -139,7 +128,6 @@ class RetrackOptions:
         least=0.0,
         most=1.0,
         theme=_OFFLINE,
-        was="min_certainty",
         flag=False,
     )
     across_classes: bool = option(
@@ -248,7 +236,6 @@ class LikelihoodOptions(RetrackOptions):
         "for never",
         least=0.0,
         theme=_ASSOCIATION,
-        was="share_m",
         flag=False,
     )
     merge_timeout_s: float = option(
@@ -256,7 +243,6 @@ class LikelihoodOptions(RetrackOptions):
         "longest time that tracks stay merged into one detection, in seconds",
         least=0.0,
         theme=_ASSOCIATION,
-        was="share_s",
         flag=False,
     )
     confirm_s: float = option(
@@ -265,7 +251,6 @@ class LikelihoodOptions(RetrackOptions):
         "not before",
         least=0.0,
         theme=_LIFE,
-        was="sure_s",
         flag=False,
     )
     coast_s: float = option(
@@ -328,7 +313,6 @@ class ConsistencyOptions(RetrackOptions):
         "gate: a track is not matched further than this from its predicted current position, in metres",
         least=0.0,
         theme=_ASSOCIATION,
-        was="max_jump_m",
         flag=False,
     )
     priority_distance: float = option(
@@ -336,7 +320,6 @@ class ConsistencyOptions(RetrackOptions):
         "pairs nearer than this, in standard deviations, are matched before all others; 0 for never",
         least=0.0,
         theme=_ASSOCIATION,
-        was="certain_distance",
         flag=False,
     )
     covariance: Covariance = option(
@@ -382,7 +365,6 @@ class ConsistencyOptions(RetrackOptions):
         False,
         "offline, leave out what a track matched after its last min_hits matches in a row",
         theme=_LIFE,
-        was="confirm",
         flag=False,
     )
     backfill: Literal["none", "unclaimed", "all"] = option(

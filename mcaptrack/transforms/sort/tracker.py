@@ -170,7 +170,6 @@ class Sort:
         False,
         "a track may continue with a detection of another class; it then has the class of most of its detections",
         theme=_DETECTIONS,
-        was="mix_classes",
     )
     camera_motion: CameraMotionUse = option(
         "auto",
