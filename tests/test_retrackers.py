@@ -38,5 +38,5 @@ def test_a_profile_names_its_method_and_distance_implies_it(walked):
         1,
         "mcaptrack: the profile authors is of the retracker consistency, not of likelihood\n",
     )
-    result = call("retrack", "a.mcap", "--profile", "paper", "--coast-s", "1")
-    assert (result.code, result.err) == (1, "mcaptrack: --coast-s is an option of likelihood, not of consistency\n")
+    result = call("retrack", "a.mcap", "--profile", "paper", "--set", "coast_s=1")
+    assert (result.code, result.err) == (1, "mcaptrack: --set coast_s is an option of likelihood, not of consistency\n")
