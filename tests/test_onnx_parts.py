@@ -16,7 +16,7 @@ from mcaptrack.transforms.detect.onnx.convention import Contest, refuse_if_misre
 from mcaptrack.transforms.detect.onnx.layouts import LAYOUTS
 from mcaptrack.transforms.detect.onnx.nms import Boxes
 from mcaptrack.transforms.detect.onnx.outputs import MisreadError
-from tests.onnx_graphs import FLOAT, INT64, field, model, node, tensor, value
+from tests.onnx_graphs import FLOAT, INT64, model, node, tensor, value
 
 WIDE, HIGH = 96, 68  # the height fits no stride
 SIZE = (WIDE, HIGH)

@@ -175,7 +175,11 @@ class Network:
         with self._blamed():
             if _runs_apart(is_trusted):
                 self._session = Child(lanes, device, limits.memory_bytes, limits.seconds)
-        self.open()
+        try:
+            self.open()
+        except BaseException:
+            self.close()
+            raise
         if self.facts["is_without_gpu"]:
             warn("ONNX Runtime has CUDA but can't use it here; detecting on the CPU", "device")
 
@@ -209,6 +213,8 @@ class Network:
             yield
         except SessionError as error:
             kind = NetworkLimitError if error.limit else McaptrackError
+            if error.limit:
+                self.close()
             raise kind(f"{self._file.path} {self._limits.in_words(error)}") from None
 
 

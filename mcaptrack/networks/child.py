@@ -95,6 +95,9 @@ class Child:
         self._most_resident = self._base + self._memory_bytes + 2 * len(data)
         request = {"device": self._device, "memory_bytes": self._memory_bytes, "resize": resize}
         facts: Facts = self._ask({}, request, data)[0]["facts"]
+        for values in (facts["inputs"], facts["outputs"]):
+            values[:] = [(name, shape, kind) for name, shape, kind in values]  # which are lists in JSON
+        facts["sizes"] = {name: (width, height) for name, (width, height) in facts["sizes"].items()}
         return facts
 
     def run(self, inputs: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:

@@ -45,8 +45,16 @@ class Onnx:
     @classmethod
     @lru_cache(maxsize=4)
     def _of(cls, file: NetworkFile, limits: Limits) -> Self:
-        path, sha256 = file.path, file.sha256
         network = Network(file, limits)
+        try:
+            return cls._tried(file, network)
+        except BaseException:
+            network.close()
+            raise
+
+    @classmethod
+    def _tried(cls, file: NetworkFile, network: Network) -> Self:
+        path, sha256 = file.path, file.sha256
         shape = next((shape for _, shape, _ in network.facts["inputs"]), [])
         if len(shape) != 3 or not isinstance(shape[1], int) or shape[2] != 2:
             raise McaptrackError(f"{path}: its first input has to be B x L x 2 with a fixed L, not {shape}")
