@@ -56,6 +56,11 @@ def whole_number(name: str, otherwise: int) -> int:
     return int(text)
 
 
+def without(name: str) -> dict[str, str]:
+    """The environment for another process, without one of its variables."""
+    return {own: text for own, text in os.environ.items() if own != name}
+
+
 def cache_folder() -> Path:
     """The user's folder for files that can be fetched again."""
     usual = Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")

@@ -23,7 +23,7 @@ from mcaptrack.processes import resident_bytes_with_children
 
 #: What a new process runs. Its path of modules is that of its parent, without the working folder of ``-c``.
 _CODE: Final = (
-    "import json, sys; sys.path[:], *handles = json.loads(sys.argv[1]); "
+    "import json, sys; *handles, sys.path[:] = json.loads(sys.argv[1]); "
     "from mcaptrack.fleet.worker import serve; serve(*handles)"
 )
 #: Seconds between two looks at a busy worker.
@@ -137,7 +137,7 @@ class Child:
         life, its_life = Pipe()
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-c", _CODE, json.dumps([sys.path, its.fileno(), its_life.fileno()])],
+                [sys.executable, "-c", _CODE, json.dumps([its.fileno(), its_life.fileno(), sys.path])],
                 stdin=subprocess.DEVNULL,
                 stdout=self._output,
                 stderr=self._output,

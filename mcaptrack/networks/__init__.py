@@ -50,7 +50,7 @@ class NetworkLimitError(McaptrackError):
 
 @dataclass(frozen=True)
 class Limits:
-    """What a network may take, beside its file, which may be as large.
+    """Limits of a network; its file, which may be as large, does not count.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class Limits:
         return cls(memory_mb * 1_000_000, environment.whole_number(_TIME, _TIME_S), setting, hint)
 
     def in_words(self, error: SessionError) -> str:
-        """What is wrong with a network, to follow its name."""
+        """The error as words that follow the name of the network."""
         if error.limit == "memory":
             hint = f"; {self.hint}" if self.hint else ""
             return f"needs more than {self.memory_bytes / 1e6:,.0f} MB of memory; {self.setting} allows more{hint}"

@@ -18,6 +18,7 @@ from typing import Any, Final
 
 from numpy.typing import NDArray
 
+from mcaptrack.environment import without
 from mcaptrack.networks.serving import Lane
 from mcaptrack.networks.session import Device, Facts, Resize, SessionError
 from mcaptrack.processes import resident_bytes
@@ -59,7 +60,6 @@ class Child:
         pairs = [Pipe() for _ in range(lanes)]
         memories = [_shared_memory(size) for _ in range(lanes)]
         handles = [(its.fileno(), memory) for (_, its), memory in zip(pairs, memories, strict=True)]
-        environment = {name: text for name, text in os.environ.items() if name != "ORT_LOAD_CONFIG_FROM_MODEL"}
         path = [os.path.abspath(folder) for folder in sys.path]
         try:
             own = [Lane(connection, memory, size) for (connection, _), memory in zip(pairs, memories, strict=True)]
@@ -69,7 +69,7 @@ class Child:
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 cwd="/",  # relative names lead nowhere
-                env=environment,
+                env=without("ORT_LOAD_CONFIG_FROM_MODEL"),  # a network must not set options of ONNX Runtime
                 pass_fds=[its_life.fileno(), *(handle for pair in handles for handle in pair)],
                 process_group=0,  # Ctrl-C at the terminal is for this process, which ends the other
             )

@@ -86,7 +86,7 @@ def parse(data: bytes) -> Any:
 
 
 def reach(model: Any) -> str:
-    """How a network reaches out of its file, in words that follow its name; "" if it doesn't.
+    """Return why a network needs more than its file, as words that follow its name; "" if it doesn't.
 
     Whatever holds a tensor or a node is looked at: the graph, branches and bodies of loops, functions, attributes,
     sparse tensors, the graphs of a training. The protobuf runtime has refused messages in more than 100 others.

@@ -32,7 +32,7 @@ class SessionError(Exception):
 
 
 class Facts(TypedDict):
-    """What is known of an open network; all of it can be written as JSON."""
+    """Facts of an open network, which can be written as JSON."""
 
     inputs: list[Value]
     outputs: list[Value]
