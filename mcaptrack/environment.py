@@ -28,6 +28,8 @@ VARIABLES: Final[Mapping[str, str]] = MappingProxyType(
     {
         "MCAPTRACK_MAX_CHUNK_MIB": "chunks of a log with a larger stated size are refused, in MiB",
         "MCAPTRACK_MAX_MEGAPIXELS": "pictures with a larger stated size are refused, in millions of pixels",
+        "MCAPTRACK_MAX_NETWORK_MB": "a predictor in ONNX format that takes more memory is ended, in MB",
+        "MCAPTRACK_MAX_NETWORK_S": "a network in ONNX format that takes longer for one picture or batch is ended, in seconds",
         "MCAPTRACK_MAX_UNPACKED_MIB": "compressed data that unpacks to more is refused, in MiB",
         "MCAPTRACK_MODELS": "the folder of fetched weights of detectors",
         "MCAPTRACK_DATA": "a folder with reference recordings, for the tests",
@@ -52,6 +54,11 @@ def whole_number(name: str, otherwise: int) -> int:
     if not (text.isascii() and text.isdecimal() and len(text) <= 9 and int(text) > 0):
         raise McaptrackError(f"{name} needs a whole number from 1 to 999999999, not {text[:20]!r}")
     return int(text)
+
+
+def without(name: str) -> dict[str, str]:
+    """The environment for another process, without one of its variables."""
+    return {own: text for own, text in os.environ.items() if own != name}
 
 
 def cache_folder() -> Path:

@@ -40,6 +40,14 @@ def field(number: int, value: int | str | bytes) -> bytes:
     return varint(number << 3 | 2) + varint(len(data)) + data
 
 
+class Graph(bytes):
+    """An encoded graph, as an attribute."""
+
+
+class Sparse(bytes):
+    """An encoded sparse tensor, as an attribute."""
+
+
 def tensor(values: object, name: str = "", kind: int = FLOAT) -> bytes:
     array = np.asarray(values, "<f4" if kind == FLOAT else "<i8")
     dims = b"".join(field(1, size) for size in array.shape)
@@ -47,11 +55,15 @@ def tensor(values: object, name: str = "", kind: int = FLOAT) -> bytes:
 
 
 def node(op: str, inputs: Sequence[str], outputs: Sequence[str], **attributes: object) -> bytes:
-    """A node; an attribute is a whole number, a list of them, or an encoded tensor."""
+    """A node; an attribute is a whole number, a list of them, or an encoded tensor, graph or sparse tensor."""
     out = b"".join(field(1, name) for name in inputs) + b"".join(field(2, name) for name in outputs) + field(4, op)
     for name, value in attributes.items():
         if isinstance(value, int):
             part = field(3, value) + field(20, 2)
+        elif isinstance(value, Graph):
+            part = field(6, value) + field(20, 5)
+        elif isinstance(value, Sparse):
+            part = field(22, value) + field(20, 11)
         elif isinstance(value, bytes):
             part = field(5, value) + field(20, 4)
         else:
@@ -66,6 +78,14 @@ def value(name: str, shape: Sequence[int | str] | None, kind: int = FLOAT) -> by
     return field(1, name) + field(2, field(1, field(1, kind) + (field(2, dims) if shape is not None else b"")))
 
 
+def graph(
+    nodes: Sequence[bytes], inputs: Sequence[bytes], outputs: Sequence[bytes], constants: Mapping[str, bytes] = {}
+) -> Graph:
+    encoded = b"".join(field(1, one) for one in nodes) + field(2, "graph")
+    encoded += b"".join(field(5, one) for one in constants.values())
+    return Graph(encoded + b"".join(field(11, one) for one in inputs) + b"".join(field(12, one) for one in outputs))
+
+
 def model(
     nodes: Sequence[bytes],
     inputs: Sequence[bytes],
@@ -73,11 +93,8 @@ def model(
     constants: Mapping[str, bytes] = {},
     metadata: Mapping[str, str] = {},
 ) -> bytes:
-    graph = b"".join(field(1, one) for one in nodes) + field(2, "graph")
-    graph += b"".join(field(5, one) for one in constants.values())
-    graph += b"".join(field(11, one) for one in inputs) + b"".join(field(12, one) for one in outputs)
     pairs = b"".join(field(14, field(1, key) + field(2, text)) for key, text in metadata.items())
-    return field(1, 8) + field(7, graph) + field(8, field(2, 13)) + pairs
+    return field(1, 8) + field(7, graph(nodes, inputs, outputs, constants)) + field(8, field(2, 13)) + pairs
 
 
 def giving(

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import mcaptrack
-from mcaptrack import notices
+from mcaptrack import networks, notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import Frame
 from mcaptrack.schema.provenance import Provenance
@@ -30,6 +30,12 @@ SIZE = (160, 128)
 #: A picture as large as the input, with a block on a cell of the grid; and the box of the block.
 BLOCK = (64, 32, 32, 32)
 PICTURE = blue_blocks(SIZE, BLOCK)
+
+
+@pytest.fixture(autouse=True)
+def _here(monkeypatch):
+    """Networks run in this process, which takes less time; tests/test_strange_networks.py has the other one."""
+    monkeypatch.setattr(networks, "_runs_apart", lambda is_trusted: False)
 
 
 @pytest.fixture
@@ -274,7 +280,10 @@ OTHERS = {
     "four pictures": (constant((4, 420, 85), inputs=[value("x", [4, 3, 128, 160])]), "takes 4 pictures at a time"),
     "not a number": (constant((1, 420, 85), float("nan")), "not finite at 0 ns (frame 0)"),
     "infinite": (constant((1, 420, 85), float("inf")), "not finite at 0 ns (frame 0)"),
-    "a gigabyte": (gigabyte(), "needs more than 1,000 MB at 160x128"),
+    "a gigabyte": (
+        gigabyte(),
+        "needs more than 1,000 MB of memory; `max_memory_mb=` allows more; a smaller `input_size=` takes less",
+    ),
     "text": (b"no network at all", "is no ONNX file, or is damaged or incomplete"),
     "nothing": (b"", "is no ONNX file"),
     "an unknown node": (

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.transforms.detect.onnx import graph, outputs
+from mcaptrack.networks import graph
+from mcaptrack.transforms.detect.onnx import outputs
 from mcaptrack.transforms.detect.onnx.convention import Contest, refuse_if_misread
 from mcaptrack.transforms.detect.onnx.layouts import LAYOUTS
 from mcaptrack.transforms.detect.onnx.nms import Boxes
 from mcaptrack.transforms.detect.onnx.outputs import MisreadError
-from tests.onnx_graphs import FLOAT, INT64, field, model, node, tensor, value
+from tests.onnx_graphs import FLOAT, INT64, model, node, tensor, value
 
 WIDE, HIGH = 96, 68  # the height fits no stride
 SIZE = (WIDE, HIGH)
@@ -315,14 +316,6 @@ def test_all_numbers_that_follow_from_the_size_are_changed_and_no_others():
     assert [one.op_type for one in parsed.graph.node] == [one.op_type for one in graph.parse(data).graph.node]
     scale = graph._constants(parsed)["scale"]
     assert np.frombuffer(scale.raw_data, "<f4").tolist() == [320, 80]
-
-
-def test_weights_in_other_files_are_seen_in_constants_too():
-    far = tensor([1.0], "far") + field(14, 1)
-    plain = [node("Identity", ["x"], ["y"])]
-    assert not graph.is_split(graph.parse(model(plain, [], [], {"w": tensor([1.0], "w")})))
-    assert graph.is_split(graph.parse(model(plain, [], [], {"w": tensor([1.0], "w"), "far": far})))
-    assert graph.is_split(graph.parse(model([*plain, node("Constant", [], ["c"], value=far)], [], [])))
 
 
 class TestContest:

@@ -12,10 +12,10 @@ from typing import Any
 from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import publish_bytes, refuse_special
+from mcaptrack.networks import digest_of
 from mcaptrack.notices import warn
 from mcaptrack.transforms.detect.onnx import catalogue
 from mcaptrack.transforms.detect.onnx.catalogue import Model
-from mcaptrack.transforms.detect.onnx.session import digest_of
 
 __all__ = ["Model", "get_model", "models"]
 

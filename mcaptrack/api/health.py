@@ -134,8 +134,8 @@ def doctor(store: str | None = None) -> DoctorResult:
     >>> mcaptrack.doctor().faults
     ()
     """
+    from mcaptrack.networks import providers
     from mcaptrack.sources.video.self_test import codec_faults
-    from mcaptrack.transforms.detect.onnx.session import providers
 
     url = None if store is None else url_of_store(store)
     with collected() as warnings:

@@ -16,14 +16,15 @@ from multiprocessing import Pipe
 from time import monotonic
 from typing import IO, Any, Final
 
-from mcaptrack.fleet.limits import environment_of_worker, resident_bytes
+from mcaptrack.fleet.limits import environment_of_worker
 from mcaptrack.fleet.results import State
 from mcaptrack.fleet.worker import Reply, Request
+from mcaptrack.processes import resident_bytes_with_children
 
 #: What a new process runs. Its path of modules is that of its parent, without the working folder of ``-c``.
 _CODE: Final = (
-    "import json, sys; handle, sys.path[:] = json.loads(sys.argv[1]); "
-    "from mcaptrack.fleet.worker import serve; serve(handle)"
+    "import json, sys; *handles, sys.path[:] = json.loads(sys.argv[1]); "
+    "from mcaptrack.fleet.worker import serve; serve(*handles)"
 )
 #: Seconds between two looks at a busy worker.
 _LOOK_S: Final = 0.1
@@ -55,6 +56,7 @@ class Child:
         self._limits = limits
         self._process: subprocess.Popen[bytes] | None = None
         self._connection: Any = None
+        self._life: Any = None
         self._output: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
         flags = fcntl.fcntl(self._output, fcntl.F_GETFL)
         fcntl.fcntl(self._output, fcntl.F_SETFL, flags | os.O_APPEND)  # what is printed starts at 0 again for each log
@@ -97,7 +99,7 @@ class Child:
                 return replace(message, printed=self._printed())
             if isinstance(message, tuple):
                 self.progress = message
-            self.resident = resident_bytes(self._process.pid)
+            self.resident = resident_bytes_with_children(self._process.pid)
             peak = max(peak, self.resident)
             if over := self._over(deadline, peak):
                 state, words = over
@@ -132,23 +134,26 @@ class Child:
 
     def _start(self) -> None:
         own, its = Pipe()
+        life, its_life = Pipe()
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-c", _CODE, json.dumps([its.fileno(), sys.path])],
+                [sys.executable, "-c", _CODE, json.dumps([its.fileno(), its_life.fileno(), sys.path])],
                 stdin=subprocess.DEVNULL,
                 stdout=self._output,
                 stderr=self._output,
                 cwd=self._limits.folder,
                 env=environment_of_worker(self._limits.workers),
-                pass_fds=[its.fileno()],
+                pass_fds=[its.fileno(), its_life.fileno()],
                 process_group=0,  # Ctrl-C at the terminal is for the parent alone
             )
         except BaseException:
             own.close()
+            life.close()
             raise
         finally:
             its.close()
-        self._connection = own
+            its_life.close()
+        self._connection, self._life = own, life
 
     def _died(self, request: Request) -> Reply:
         """Return the reply for a worker that ended before it replied."""
@@ -191,3 +196,4 @@ class Child:
             with suppress(OSError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
+            self._life.close()

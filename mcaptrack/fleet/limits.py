@@ -1,22 +1,15 @@
-"""Limits of workers: their threads, their memory, and their life, which ends with that of their parent."""
+"""Limits of workers: their threads and their memory."""
 
 from __future__ import annotations
 
 import os
 import re
-import signal
-import subprocess
-import sys
-from contextlib import suppress
-from pathlib import Path
 from typing import Final
 
 from mcaptrack.environment import THREADS, cores
 from mcaptrack.errors import McaptrackError
 
 _SIZE: Final = re.compile(r"([0-9]+(?:\.[0-9]+)?)\s*([kmgt]?)(i?)b?", re.IGNORECASE)
-_IS_LINUX: Final = sys.platform.startswith("linux")
-_PARENT_DIES: Final = 1  # PR_SET_PDEATHSIG of <sys/prctl.h>
 
 
 def environment_of_worker(workers: int) -> dict[str, str]:
@@ -40,25 +33,3 @@ def size_in_bytes(size: str | float | None, name: str) -> int | None:
     if amount < 1_000_000:
         raise McaptrackError(f"`{name}=` needs a size such as 2GB or 500MB, not {str(size)!r:.40}: that is too little")
     return amount
-
-
-def resident_bytes(pid: int) -> int:
-    """Return the resident memory of a process; 0 if it has ended."""
-    with suppress(OSError, ValueError, IndexError):
-        if _IS_LINUX:
-            return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-        listed = subprocess.run(["/bin/ps", "o", "rss=", "p", str(pid)], capture_output=True, check=False)
-        return int(listed.stdout) * 1024
-    return 0
-
-
-def killed_with_parent() -> bool:
-    """Let the system kill this process when the one that started it ends. Returns whether it can."""
-    if not _IS_LINUX:
-        return False
-    import ctypes
-
-    try:
-        return bool(ctypes.CDLL(None).prctl(_PARENT_DIES, signal.SIGKILL, 0, 0, 0) == 0)
-    except (OSError, AttributeError):
-        return False

@@ -7,7 +7,6 @@ its parent through one socket. What a log may do to it is the parent's to notice
 from __future__ import annotations
 
 import faulthandler
-import os
 import pickle
 import resource
 import signal
@@ -18,7 +17,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
-from threading import Thread
 from time import monotonic
 from types import FrameType
 from typing import Any, Final, NoReturn
@@ -29,6 +27,7 @@ from mcaptrack.fleet.digests import digest_of_log
 from mcaptrack.fleet.results import State
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice, about, listening
+from mcaptrack.processes import die_with
 
 #: Seconds between two messages about progress.
 _PROGRESS_S: Final = 0.2
@@ -89,15 +88,15 @@ def _taking(function: Any, progress: Any) -> dict[str, Any]:
     return {"progress": progress} if "progress" in inspect.signature(function).parameters else {}
 
 
-def serve(handle: int) -> None:
-    """Answer requests on a socket until the parent closes it or ends."""
+def serve(handle: int, life: int) -> None:
+    """Answer requests on a socket until the parent closes it or ends, which closes the socket ``life``, too."""
     connection: Connection[Any, Any] = Connection(handle)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends its workers
     signal.signal(signal.SIGTERM, _end)
     faulthandler.enable(sys.stderr)
     hush_libraries()
     share_allocator()
-    _die_with_parent(os.getppid())
+    die_with(life)
     sent = 0.0
 
     def progress(stage: str, done: float, total: float | None) -> None:
@@ -130,23 +129,6 @@ def _end(number: int, _: FrameType | None) -> NoReturn:
     """Unwind, so that what is half written is removed."""
     _ENDING.append(number)
     raise SystemExit(128 + number)
-
-
-def _die_with_parent(parent: int) -> None:
-    """End this process when its parent has ended, however that did: nothing that it does would count any more."""
-    from mcaptrack.fleet.limits import killed_with_parent
-
-    if killed_with_parent() and os.getppid() == parent:
-        return
-
-    def watch() -> None:
-        from time import sleep
-
-        while os.getppid() == parent:
-            sleep(0.5)
-        os.kill(os.getpid(), signal.SIGKILL)
-
-    Thread(target=watch, daemon=True).start()
 
 
 def _cpu_seconds() -> float:

@@ -7,17 +7,17 @@ Input: positions ``obs`` (B, L, 2) float32 in metres relative to the last one, a
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.geometry.histories import fill_gaps, last_positions
+from mcaptrack.networks import Limits, Network, NetworkFile, read_file
 from mcaptrack.predictors.forecast import Forecast
 from mcaptrack.predictors.linear import LinearPredictor
 
@@ -29,7 +29,7 @@ class Onnx:
     """A network in ONNX format (see the module). Without a covariance of its own it has that of ``kalman``."""
 
     path: Path
-    session: Any
+    network: Network
     past: int
     steps: int
     step_s: float
@@ -39,50 +39,44 @@ class Onnx:
     @classmethod
     def of(cls, path: Path) -> Self:
         """Open and test the network. Raises McaptrackError if it can't be run or has other inputs or outputs."""
-        try:
-            data = path.read_bytes()
-        except OSError as error:
-            raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
-        return cls._of(path, hashlib.sha256(data).hexdigest())
+        limits = Limits.of_environment()
+        return cls._of(read_file(path, limits), limits)
 
     @classmethod
     @lru_cache(maxsize=4)
-    def _of(cls, path: Path, sha256: str) -> Self:
+    def _of(cls, file: NetworkFile, limits: Limits) -> Self:
+        network = Network(file, limits)
         try:
-            import onnxruntime
-        except ImportError:
-            raise McaptrackError(
-                f"onnx:{path} needs ONNX Runtime, which is not installed; `pip install 'mcaptrack[onnx]'` installs it"
-            ) from None
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = 1  # a batch holds the tracks of one frame: too little for threads
-        options.log_severity_level = 4
-        try:
-            session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # ONNX Runtime has no common base class of its errors
-            raise McaptrackError(f"{path} can't be run by ONNX Runtime: {_first_line(error)}") from None
-        shape = session.get_inputs()[0].shape
+            return cls._tried(file, network)
+        except BaseException:
+            network.close()
+            raise
+
+    @classmethod
+    def _tried(cls, file: NetworkFile, network: Network) -> Self:
+        path, sha256 = file.path, file.sha256
+        shape = next((shape for _, shape, _ in network.facts["inputs"]), [])
         if len(shape) != 3 or not isinstance(shape[1], int) or shape[2] != 2:
             raise McaptrackError(f"{path}: its first input has to be B x L x 2 with a fixed L, not {shape}")
-        text = session.get_modelmeta().custom_metadata_map.get("step_s", "")
+        text = network.facts["metadata"].get("step_s", "")
         try:
             step_s = float(text or _STEP_S)
         except ValueError:
             step_s = 0.0
         if not 0 < step_s < float("inf"):
             raise McaptrackError(f"{path}: its metadata have step_s = {text!r}; a positive number of seconds is needed")
-        tried = cls(path, session, shape[1], 0, step_s, sha256)
+        tried = cls(path, network, shape[1], 0, step_s, sha256)
         outputs_by_batch = [
             tried._run(np.zeros((batch, shape[1], 2)), np.ones((batch, shape[1]), bool)) for batch in (1, 7)
         ]
         steps = {outputs[0].shape[1] for outputs in outputs_by_batch}
-        declared = session.get_outputs()[0].shape or []  # some declare none
+        declared = network.facts["outputs"][0][1]  # some declare none
         steps |= {size for size in declared[1:2] if isinstance(size, int)}
         if len(steps) > 1:
             raise McaptrackError(
                 f"{path} declares the output {declared}, and returns {sorted(steps)} steps, depending on the batch"
             )
-        return cls(path, session, shape[1], steps.pop(), step_s, sha256)
+        return cls(path, network, shape[1], steps.pop(), step_s, sha256)
 
     @cached_property
     def _covariance_model(self) -> LinearPredictor:
@@ -90,12 +84,13 @@ class Onnx:
 
     def _run(self, xy_m: Floats, valid: Bools) -> list[Floats]:
         given = (xy_m.astype(np.float32), valid)
-        inputs = {wanted.name: values for wanted, values in zip(self.session.get_inputs(), given, strict=False)}
+        inputs = {name: values for (name, _, _), values in zip(self.network.facts["inputs"], given, strict=False)}
         try:
-            outputs = [np.asarray(output, np.float64) for output in self.session.run(None, inputs)[:2]]
-        except Exception as error:  # as above
-            raise McaptrackError(f"{self.path} can't be run: {_first_line(error)}") from None
-        mean = outputs[0]
+            outputs = self.network.run(inputs)[:2]
+        except BaseException:  # it may have ended: the next who wants it opens it again
+            Onnx._of.cache_clear()
+            raise
+        mean = outputs[0] if outputs else np.empty(0)
         fits = mean.ndim == 3 and len(mean) == len(xy_m) and mean.shape[1] > 0 and mean.shape[2] == 2
         if fits and len(outputs) > 1:
             fits = outputs[1].shape == (*mean.shape, 2)
@@ -104,6 +99,7 @@ class Onnx:
             raise McaptrackError(
                 f"{self.path} has to return (B, T, 2), and may return (B, T, 2, 2); it returns {shapes}"
             )
+        outputs = [output.astype(np.float64) for output in outputs]
         if not all(np.isfinite(output).all() for output in outputs):
             raise McaptrackError(f"{self.path} returns numbers that are not finite")
         if len(outputs) > 1 and not are_covariances(outputs[1]):
@@ -130,7 +126,3 @@ def are_covariances(cov: Floats) -> bool:
     scale = np.sqrt(np.maximum(xx, 0)) * np.sqrt(np.maximum(yy, 0))  # the product of both may overflow
     is_symmetric = np.abs(xy - yx) <= 1e-4 * scale
     return bool((is_symmetric & (xx > 0) & (yy > 0) & (np.abs(xy + yx) / 2 <= scale)).all())
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0]

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 from math import sqrt
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.boxes import parse_size
+from mcaptrack.networks import Device, Limits, NetworkFile, digest_of, read_file
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.transforms.detect.onnx import classes as known_classes
@@ -31,7 +33,7 @@ from mcaptrack.transforms.detect.onnx.layouts import Layout, class_count, possib
 from mcaptrack.transforms.detect.onnx.nms import Boxes, join_tiles, suppress
 from mcaptrack.transforms.detect.onnx.outputs import MisreadError
 from mcaptrack.transforms.detect.onnx.placing import Size, Tile, place, tiles_of
-from mcaptrack.transforms.detect.onnx.session import DetectorNetwork, Device, digest_of, read_file, workers
+from mcaptrack.transforms.detect.onnx.session import DetectorNetwork, workers
 from mcaptrack.transforms.protocol import Colour, ModelCard, Suited, check_options, option
 
 LayoutChoice = Literal["auto", "yolox", "yolox-legacy", "nanodet", "rtdetr", "dfine", "rfdetr", "ultralytics"]
@@ -132,9 +134,13 @@ class OnnxDetector:
         first = next(frames, None)
         if first is None:
             return
-        run = _Run(self, first.rows)
-        for seen, boxes in run.detect(chain([first], frames)):
-            yield (Frame(seen.t_ns, seen.frame, run.to_rows(boxes, seen.size)),)
+        limits = Limits.with_memory(self.max_memory_mb, "`max_memory_mb=`", "a smaller `input_size=` takes less")
+        file = read_file(self.weights(), limits)
+        self.check_weights(file.sha256, len(file.data))
+        with closing(DetectorNetwork(file, _input_size(self, first.rows), self.device, limits)) as network:
+            run = _Run(self, file, network)
+            for seen, boxes in run.detect(chain([first], frames)):
+                yield (Frame(seen.t_ns, seen.frame, run.to_rows(boxes, seen.size)),)
         object.__setattr__(self, "_card", run.card())
 
     def weights(self) -> Path:
@@ -173,19 +179,16 @@ class _Seen(NamedTuple):
 
 
 class _Run:
-    """One run of a detector: its network, opened for the first picture, and which layout it has."""
+    """One run of a detector: its network, and which layout it has."""
 
-    def __init__(self, options: OnnxDetector, first: Image) -> None:
-        most_bytes = options.max_memory_mb * 1_000_000
-        file = read_file(options.weights(), most_bytes, options.check_weights)
-        self._options, self._path = options, file.path
+    def __init__(self, options: OnnxDetector, file: NetworkFile, network: DetectorNetwork) -> None:
+        self._options, self._path, self._sha256 = options, file.path, file.sha256
         self._grid = parse_size(options.tiles) or (1, 1)
-        self._network = DetectorNetwork(file, self._input_size(first), options.device, most_bytes)
-        self._sha256 = file.sha256
-        seen = self._network.signature
+        self._network = network
+        seen = network.signature
         layouts = choose(file.path, options.layout, seen)
         count = class_count(layouts[0], seen)
-        self._names, self._is_named = known_classes.names_of(file.names, count), bool(file.names)
+        self._names, self._is_named = known_classes.names_of(network.names, count), bool(network.names)
         self._unknown: Counter[int] = Counter()
         self._wanted = np.array(known_classes.wanted(self._names, options.classes, str(file.path)), np.int64)
         self._numbers = known_classes.numbers_of(self._names)
@@ -255,6 +258,7 @@ class _Run:
         count, batch = workers(), self._network.batch
         with ThreadPoolExecutor(count) as pool:
             running: deque[Future[list[tuple[Image, _Seen]]]] = deque()
+            is_done = False
             try:
                 while some := list(islice(frames, batch)):
                     running.append(pool.submit(self._look_at, some))
@@ -262,9 +266,12 @@ class _Run:
                         yield from running.popleft().result()
                 while running:
                     yield from running.popleft().result()
+                is_done = True
             finally:
                 for future in running:
                     future.cancel()
+                if not is_done:  # the pool waits for pictures that the network may never be done with
+                    self._network.close()
 
     def _look_at(self, frames: list[Frame]) -> list[tuple[Image, _Seen]]:
         found: list[dict[str, Found]] = [{} for _ in frames]
@@ -331,12 +338,13 @@ class _Run:
             words = f"{self._path}: {self._unknown.total()} boxes are of classes ({shown}) without a name"
             warn(f"{words} among the {len(self._names)} {which}; they are left out", "classes")
 
-    def _input_size(self, first: Image) -> Size | None:
-        if self._options.input_size != _AS_PICTURE:
-            return parse_size(self._options.input_size)
-        height, width = first.shape[:2]
-        x1, y1, x2, y2 = tiles_of(width, height, *self._grid, self._options.overlap)[0]
-        return size_for(x2 - x1, y2 - y1)
+
+def _input_size(options: OnnxDetector, first: Image) -> Size | None:
+    if options.input_size != _AS_PICTURE:
+        return parse_size(options.input_size)
+    height, width = first.shape[:2]
+    x1, y1, x2, y2 = tiles_of(width, height, *(parse_size(options.tiles) or (1, 1)), options.overlap)[0]
+    return size_for(x2 - x1, y2 - y1)
 
 
 def size_for(width: int, height: int) -> Size:

@@ -1,7 +1,7 @@
-"""Read an ONNX file without running it, and change its network for pictures of another size.
+"""Read an ONNX file without running it, refuse what reaches out of it, and change it for pictures of another size.
 
-Only the parts of the format (https://onnx.ai/onnx/repo-docs/IR.html) that are read or changed here are declared; the
-protobuf runtime keeps all others as they are.
+Only the parts of the format (https://onnx.ai/onnx/repo-docs/IR.html) that are read or changed here, or lead to tensors
+and nodes, are declared; the protobuf runtime keeps all others as they are.
 """
 
 from __future__ import annotations
@@ -15,10 +15,15 @@ import numpy as np
 
 #: The declared fields of each message: name, number, type; "*" marks a repeated one.
 _FIELDS: Final[Mapping[str, str]] = {
-    "Model": "graph 7 Graph, metadata_props 14 Pair*",
-    "Graph": "node 1 Node*, initializer 5 Tensor*, input 11 Value*, output 12 Value*, value_info 13 Value*",
+    "Model": "graph 7 Graph, metadata_props 14 Pair*, training_info 20 Training*, functions 25 Function*",
+    "Training": "initialization 1 Graph, algorithm 2 Graph",
+    "Function": "node 7 Node*, attribute_proto 11 Attribute*",
+    "Graph": "node 1 Node*, initializer 5 Tensor*, input 11 Value*, output 12 Value*, value_info 13 Value*, "
+    "sparse_initializer 15 Sparse*",
     "Node": "input 1 string*, output 2 string*, op_type 4 string, attribute 5 Attribute*",
-    "Attribute": "name 1 string, t 5 Tensor, ints 8 int64*",
+    "Attribute": "name 1 string, t 5 Tensor, g 6 Graph, ints 8 int64*, tensors 10 Tensor*, graphs 11 Graph*, "
+    "sparse_tensor 22 Sparse, sparse_tensors 23 Sparse*",
+    "Sparse": "values 1 Tensor, indices 2 Tensor",
     "Tensor": "dims 1 int64*, data_type 2 int32, int64_data 7 int64*, name 8 string, raw_data 9 bytes, "
     "external_data 13 Pair*, data_location 14 int32",
     "Value": "name 1 string, type 2 Type",
@@ -29,6 +34,8 @@ _FIELDS: Final[Mapping[str, str]] = {
     "Pair": "key 1 string, value 2 string",
 }
 _INT64: Final = 7
+#: Operators of ONNX Runtime, in some of its builds, that read a file or run code that the file of the network names.
+_REACHING: Final = frozenset({"EPContext", "ATen", "PyOp", "PythonOp", "PythonOpGrad", "TritonOp"})
 #: The steps, in pixels, of the grids that detectors place their boxes on.
 _STRIDES: Final = (4, 8, 16, 32, 64)
 #: Longer descriptions of classes are not read.
@@ -78,9 +85,22 @@ def parse(data: bytes) -> Any:
     return model
 
 
-def is_split(model: Any) -> bool:
-    """Whether weights are in other files (external data)."""
-    return any(tensor.data_location or tensor.external_data for tensor in _tensors(model))
+def reach(model: Any) -> str:
+    """Return why a network needs more than its file, as words that follow its name; "" if it doesn't.
+
+    Whatever holds a tensor or a node is looked at: the graph, branches and bodies of loops, functions, attributes,
+    sparse tensors, the graphs of a training. The protobuf runtime has refused messages in more than 100 others.
+    """
+    kinds = _classes()
+    for message in _messages(model):
+        if isinstance(message, kinds["Tensor"]) and (message.data_location or message.external_data):
+            return (
+                "keeps weights in other files (external data), which are not read; save it as one file with "
+                "onnx.save(onnx.load(path), path)"
+            )
+        if isinstance(message, kinds["Node"]) and message.op_type in _REACHING:
+            return f"has a node {message.op_type}, which reads files or runs other code; export it without"
+    return ""
 
 
 def class_names(model: Any) -> dict[int, str]:
@@ -136,10 +156,15 @@ def resized(data: bytes, name: str, old: Size, new: Size) -> bytes:
     return out
 
 
-def _tensors(model: Any) -> Iterator[Any]:
-    yield from model.graph.initializer
-    for node in model.graph.node:
-        yield from (attribute.t for attribute in node.attribute if attribute.HasField("t"))
+def _messages(root: Any) -> Iterator[Any]:
+    """All messages in a message, itself included."""
+    waiting = [root]
+    while waiting:
+        message = waiting.pop()
+        yield message
+        for field, value in message.ListFields():
+            if field.message_type is not None:
+                waiting.extend([value] if hasattr(value, "ListFields") else value)
 
 
 def _constants(model: Any) -> dict[str, Any]:

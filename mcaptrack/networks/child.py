@@ -1,0 +1,176 @@
+"""The process of a network, from the side of the process that needs it: started, asked, watched and ended."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import weakref
+from collections.abc import Mapping
+from contextlib import suppress
+from multiprocessing import Pipe
+from queue import SimpleQueue
+from time import monotonic
+from typing import Any, Final
+
+from numpy.typing import NDArray
+
+from mcaptrack.environment import without
+from mcaptrack.networks.serving import Lane
+from mcaptrack.networks.session import Device, Facts, Resize, SessionError
+from mcaptrack.processes import resident_bytes
+
+#: What a new process runs: with the path of modules of this one, and nothing from the working folder.
+_CODE: Final = (
+    "import json, sys; sys.path[:], *given = json.loads(sys.argv[1]); "
+    "from mcaptrack.networks.serving import serve; serve(*given)"
+)
+#: Seconds between two looks at a process that is at work; `ps` tells memory elsewhere than on Linux, and is slow.
+_LOOK_S: Final = 0.02 if sys.platform.startswith("linux") else 0.25
+#: Seconds that a process gets to start, before it has seen the network.
+_START_S: Final = 120.0
+#: The most memory that the arrays of one call may take together, in bytes.
+_LANE_BYTES: Final = 2**32
+#: Longer answers are none: they hold names and shapes.
+_LONGEST: Final = 2**24
+#: Seconds in which a process that has closed its connection has to be gone.
+_GONE_S: Final = 2.0
+
+
+class Child:
+    """A network in a process of its own.
+
+    It takes as many calls at a time as it has ``lanes``. A call that takes longer than ``seconds``, or memory beyond
+    ``memory_bytes``, ends the process, and so does an interruption of a call; ``failure`` says why it ended. What the
+    process takes before it has a network doesn't count.
+    """
+
+    def __init__(self, lanes: int, device: Device, memory_bytes: int, seconds: float) -> None:
+        """Start the process. Raises SessionError if that fails."""
+        self._device: Device = device
+        self._memory_bytes, self._seconds = memory_bytes, seconds
+        self._most_resident = sys.maxsize
+        #: Why the process ended, in words that follow the name of the network; "" while it runs.
+        self.failure: SessionError | None = None
+        size = min(memory_bytes, _LANE_BYTES)
+        life, its_life = Pipe()
+        pairs = [Pipe() for _ in range(lanes)]
+        memories = [_shared_memory(size) for _ in range(lanes)]
+        handles = [(its.fileno(), memory) for (_, its), memory in zip(pairs, memories, strict=True)]
+        path = [os.path.abspath(folder) for folder in sys.path]
+        try:
+            own = [Lane(connection, memory, size) for (connection, _), memory in zip(pairs, memories, strict=True)]
+            self._process = subprocess.Popen(
+                [sys.executable, "-I", "-c", _CODE, json.dumps([path, its_life.fileno(), handles, size, device])],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                cwd="/",  # relative names lead nowhere
+                env=without("ORT_LOAD_CONFIG_FROM_MODEL"),  # a network must not set options of ONNX Runtime
+                pass_fds=[its_life.fileno(), *(handle for pair in handles for handle in pair)],
+                process_group=0,  # Ctrl-C at the terminal is for this process, which ends the other
+            )
+        except OSError as error:
+            raise SessionError(f"can't be run: no process can be started for it ({error.strerror or error})") from None
+        finally:
+            its_life.close()
+            for _, its in pairs:
+                its.close()
+            for memory in memories:
+                os.close(memory)
+        self._life = life  # the other process ends when this is closed
+        self._finalizer = weakref.finalize(self, _end, self._process)
+        self._free: SimpleQueue[Lane] = SimpleQueue()
+        self._answer(own[0], _START_S)
+        self._base = resident_bytes(self._process.pid)
+        for lane in own:
+            self._free.put(lane)
+
+    def open(self, data: bytes, resize: Resize | None = None) -> Facts:
+        """Open a network, instead of the one before. Raises SessionError."""
+        # Beside what the network takes, its file is there, as it came and as ONNX Runtime reads it.
+        self._most_resident = self._base + self._memory_bytes + 2 * len(data)
+        request = {"device": self._device, "memory_bytes": self._memory_bytes, "resize": resize}
+        facts: Facts = self._ask({}, request, data)[0]["facts"]
+        for values in (facts["inputs"], facts["outputs"]):
+            values[:] = [(name, shape, kind) for name, shape, kind in values]  # which are lists in JSON
+        facts["sizes"] = {name: (width, height) for name, (width, height) in facts["sizes"].items()}
+        return facts
+
+    def run(self, inputs: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
+        """The outputs, in order. Raises SessionError."""
+        return self._ask(inputs)[1]
+
+    def end(self, failure: SessionError) -> None:
+        """End the process, and the calls that it is at work on."""
+        self.failure = self.failure or failure
+        self._finalizer()
+
+    def _ask(
+        self, inputs: Mapping[str, NDArray[Any]], request: dict[str, Any] | None = None, data: bytes = b""
+    ) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+        lane = self._free.get()
+        try:
+            if request is None:
+                request = {"inputs": lane.write(dict(inputs))}
+            with suppress(OSError):  # it has ended, which the answer tells
+                lane.connection.send_bytes(json.dumps(request).encode())
+                if "inputs" not in request:
+                    lane.connection.send_bytes(data)
+            reply = self._answer(lane, self._seconds)
+            if "error" in reply:
+                raise SessionError(reply["error"], reply["limit"])
+            return reply, [values.copy() for values in lane.read(reply.get("outputs", [])).values()]
+        except MemoryError:
+            raise SessionError("", "memory") from None
+        finally:
+            self._free.put(lane)
+
+    def _answer(self, lane: Lane, seconds: float) -> dict[str, Any]:
+        """Wait for the answer to a request, and see that limits are kept."""
+        deadline = monotonic() + seconds
+        try:
+            while not lane.connection.poll(_LOOK_S):
+                if resident_bytes(self._process.pid) > self._most_resident:
+                    self.end(SessionError("", "memory"))
+                elif monotonic() > deadline:
+                    self.end(SessionError("", "time"))
+            reply: dict[str, Any] = json.loads(lane.connection.recv_bytes(_LONGEST))
+            return reply
+        except (EOFError, OSError):
+            self.end(self._died())
+            assert self.failure is not None
+            raise self.failure from None
+        except BaseException:  # an interruption: the answer would be taken for that to the next request
+            self.end(SessionError("was interrupted"))
+            raise
+
+    def _died(self) -> SessionError:
+        code: int | None = None
+        with suppress(subprocess.TimeoutExpired):
+            code = self._process.wait(_GONE_S)
+        how = "closed its connection" if code is None else f"exited with code {code}"
+        if code is not None and code < 0:
+            how = f"was ended by signal {-code}"
+            with suppress(ValueError):
+                how = f"was ended by {signal.Signals(-code).name}"
+        return SessionError(f"can't be run: the process that ran it {how}")
+
+
+def _shared_memory(size: int) -> int:
+    """A handle of memory of ``size`` bytes, of which those that are written take room."""
+    if hasattr(os, "memfd_create"):
+        handle = os.memfd_create("mcaptrack")
+    else:
+        with tempfile.TemporaryFile() as file:
+            handle = os.dup(file.fileno())
+    os.ftruncate(handle, size)
+    return handle
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait()
