@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Callable
@@ -61,6 +62,10 @@ def run(folder: Path, **options: object) -> None:
     mcaptrack.run(folder / "a.mcap", **options)
 
 
+def bag(folder: Path) -> None:
+    mcaptrack.export(folder / "a.mcap", folder / "bag", form="rosbag2", force=True)
+
+
 def retrack(folder: Path) -> None:
     mcaptrack.retrack(folder / "a.mcap", retracker="consistency")
 
@@ -89,6 +94,7 @@ WORKS = {
         lambda folder: log_of(folder / "a.mcap"),
         *[lambda folder: mcaptrack.export(folder / "a.mcap", folder / "T", topic="/camera/tracks")] * 2,
     ),
+    "export to a bag": Work(lambda folder: bag(run(log_of(folder / "a.mcap").parent) or folder), bag, bag),
     "ingest": Work(labels, ingest_once, ingest_once),
 }
 
@@ -121,7 +127,37 @@ def leave_nothing_undone(work: Work, tmp_path: Path, step: int) -> None:
 
 @pytest.mark.parametrize("name", WORKS)
 def test_killed_at_some_calls_the_next_command_completes_what_is_owed(name, tmp_path):
-    leave_nothing_undone(WORKS[name], tmp_path, {"ingest": 2, "export": 29, "retrack": 5}.get(name, 41))
+    leave_nothing_undone(
+        WORKS[name], tmp_path, {"ingest": 2, "export": 29, "export to a bag": 5, "retrack": 5}.get(name, 41)
+    )
+
+
+def fleet_over(folder: Path) -> None:
+    done = fleet.run(mcaptrack.export, [folder / "a.mcap", folder / "b.mcap"], ledger=folder / "ledger.jsonl")
+    assert not done.failed
+
+
+@thorough
+def test_a_fleet_that_is_killed_at_any_call_is_completed_by_the_next(tmp_path):
+    for name in ("a", "b"):
+        log_of(tmp_path / "work" / f"{name}.mcap")
+    kept, folder = tmp_path / "kept", tmp_path / "work"
+    shutil.copytree(folder, kept)
+    fleet_over(folder)
+    whole = contents(folder)
+    kills = 0
+    for at in range(1, 1000):
+        restore(folder, kept)
+        if not killed(lambda: fleet_over(folder), at, EACH_CALL):
+            break
+        kills += 1
+        fleet_over(folder)
+        found = contents(folder)
+        assert found.keys() == whole.keys(), at
+        assert [name for name in whole if found[name] != whole[name] and name != "ledger.jsonl"] == [], at
+        done = [json.loads(line) for line in (folder / "ledger.jsonl").read_bytes().splitlines() if line.endswith(b"}")]
+        assert {Path(line["location"]).name for line in done} == {"a.mcap", "b.mcap"}
+    assert kills >= 2
 
 
 @thorough
