@@ -152,9 +152,9 @@ def temporary_folder() -> TemporaryDirectory[str]:
 
 
 def _remove_left(folder: Path, pattern: re.Pattern[str], name: str = "") -> None:
-    """Remove what a pattern matches in a folder if the process that it names has ended; for ``name``, if it is given.
+    """Remove the entries of a folder that a pattern matches, if the process in their names has ended.
 
-    What can't be removed stays: it is in nobody's way.
+    With ``name`` only those of this file. An entry that can't be removed stays.
     """
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:

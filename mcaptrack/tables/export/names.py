@@ -29,7 +29,7 @@ def recording_name(path: Location) -> str:
 
 
 def recording_key(name: str) -> str:
-    """What names of recordings have in common that some file systems take for one."""
+    """The name of a recording without capitals and composed letters, which some file systems don't tell apart."""
     return unicodedata.normalize("NFC", name).casefold()
 
 

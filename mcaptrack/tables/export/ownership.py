@@ -28,7 +28,7 @@ from mcaptrack.tables.files import FORMATS, Format
 #: The table that says which log the tables are of.
 _TABLE: Final = "recordings"
 _PREFIX: Final = "recording="
-#: The number of recorded channels whose digests are kept: those with pictures, then those with most messages.
+#: Digests of so many recorded channels are kept: channels with pictures first, then by their number of messages.
 _MOST_CHANNELS: Final = 16
 #: The parameter of channels that a user has written and may replace.
 _REPLACEABLE: Final = "written_with"
