@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import json
 import os
 import re
@@ -11,11 +10,15 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from shutil import rmtree
+from tempfile import TemporaryDirectory, gettempdir
+from time import time
 from typing import IO, Any, Final
 
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import SCHEMES, Location, Url, hide_secrets
+from mcaptrack.processes import MARK_DIGITS, has_ended, mark_of
 
 
 @contextmanager
@@ -25,7 +28,7 @@ def publish(path: Path) -> Iterator[Path]:
     The bytes are synced to disk before the file is renamed, so that an interruption at any time leaves the old file or
     the new one. If the block fails, the temporary file is removed.
     """
-    _sweep(path)
+    sweep(path.parent, path.name)
     part = _part_of(path)
     try:
         yield part
@@ -118,26 +121,53 @@ def can_replace(path: Path) -> bool:
             probe.unlink()
 
 
+#: A temporary file of ``publish``, and a temporary folder: what it is for, and the process that made it.
+_PART: Final = re.compile(rf"\.(.+)\.(\d+)\.([0-9a-f]{{{MARK_DIGITS}}})[0-9a-f]{{6}}\.part", re.DOTALL)
+_FOLDER: Final = re.compile(rf"mcaptrack-()(\d+)-([0-9a-f]{{{MARK_DIGITS}}})-.*")
+#: The most bytes of a name that its temporary file repeats: file systems allow 255 bytes in all.
+_NAME_BYTES: Final = 220
+#: Seconds without a change after which the files of a process of another machine, or container, count as left behind.
+_ABANDONED_S: Final = 3600.0
+
+
 def _part_of(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
+    pid = os.getpid()
+    return path.with_name(f".{_short(path.name)}.{pid}.{mark_of(pid)}{secrets.token_hex(3)}.part")
 
 
-def _sweep(path: Path) -> None:
-    """Remove temporary files beside ``path`` of processes that don't run any more."""
-    for left in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
-        process = left.name.removeprefix(f".{path.name}.").partition(".")[0]
-        if process.isdigit() and int(process) != os.getpid() and not _is_running(int(process)):
-            left.unlink(missing_ok=True)
+def _short(name: str) -> str:
+    return os.fsdecode(os.fsencode(name)[:_NAME_BYTES])
 
 
-def _is_running(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
-    return True
+def sweep(folder: Path, name: str = "") -> None:
+    """Remove from a folder the temporary files of processes that have ended: those of the file ``name``, or all."""
+    _remove_left(folder, _PART, _short(name))
+
+
+def temporary_folder() -> TemporaryDirectory[str]:
+    """A temporary folder, removed after its block or with the object; those of processes that have ended are, too."""
+    _remove_left(Path(gettempdir()), _FOLDER)
+    pid = os.getpid()
+    return TemporaryDirectory(prefix=f"mcaptrack-{pid}-{mark_of(pid)}-")
+
+
+def _remove_left(folder: Path, pattern: re.Pattern[str], name: str = "") -> None:
+    """Remove the entries of a folder that a pattern matches, if the process in their names has ended.
+
+    With ``name`` only those of this file. An entry that can't be removed stays.
+    """
+    with suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            parts = pattern.fullmatch(entry.name)
+            if parts is None or (name and parts[1] != name):
+                continue
+            ended = has_ended(int(parts[2]), parts[3])
+            with suppress(OSError):
+                if ended or (ended is None and time() - entry.stat(follow_symlinks=False).st_mtime > _ABANDONED_S):
+                    if entry.is_dir(follow_symlinks=False):
+                        rmtree(entry.path, ignore_errors=True)
+                    else:
+                        os.unlink(entry.path)
 
 
 def sync_folder(folder: Path) -> None:

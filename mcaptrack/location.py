@@ -12,12 +12,14 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Final, Self, TypeGuard
 
 from mcaptrack.errors import McaptrackError
 
-__all__ = ["SCHEMES", "Location", "Url", "hide_secrets", "is_remote", "join", "local_name", "parse"]
+__all__ = ["SCHEMES", "Location", "Url", "distinct_names", "hide_secrets", "is_remote", "join", "local_name", "parse"]
 
 #: The schemes of URLs of objects, and what they stand for.
 SCHEMES: Final = {"s3": "Amazon S3", "gs": "Google Cloud Storage", "az": "Azure Blob Storage"}
@@ -136,6 +138,39 @@ def join(base: Location, *names: str) -> Location:
 def local_name(location: Location, suffix: str) -> Path:
     """The default path of a file that is made of a log: beside a file, or for an object in the working folder."""
     return Path(location.name).with_suffix(suffix) if is_remote(location) else Path(location).with_suffix(suffix)
+
+
+def distinct_names(names: Sequence[str], places: Sequence[Location]) -> list[str]:
+    """The names of logs that are used together; equal ones get as many of their folders as make them differ.
+
+    ``places`` are the locations of the logs, without links. Raises McaptrackError if two have the same name even so:
+    their rows and scores would be taken for those of one log.
+
+    Examples
+    --------
+    >>> distinct_names(["walk", "walk", "run"], [Path("/a/walk.mcap"), Path("/b/walk.mcap"), Path("/a/run.mcap")])
+    ['a/walk', 'b/walk', 'run']
+    """
+    distinct = list(names)
+    for depth in range(1, 1 + max((len(place.parts) for place in places), default=0)):
+        again = {name for name, count in Counter(distinct).items() if count > 1}
+        if not again:
+            break
+        distinct = [
+            "/".join([*place.parts[:-1][-depth:], name]) if known in again else known
+            for name, known, place in zip(names, distinct, places, strict=True)
+        ]
+    first: dict[str, Location] = {}
+    for name, place in zip(distinct, places, strict=True):
+        if name in first:
+            if place == first[name]:
+                raise McaptrackError(f"{place} is named twice; name it once")
+            raise McaptrackError(
+                f"{first[name]} and {place} would both be {name.rpartition('/')[2]}, and their rows those of one log; "
+                "rename one of them, or take them one by one"
+            )
+        first[name] = place
+    return distinct
 
 
 def hide_secrets(url: str) -> str:

@@ -15,6 +15,7 @@ import pytest
 
 from mcaptrack.cli import common
 from mcaptrack.fleet import FleetStatus, Running
+from mcaptrack.pipeline import LAYOUTS, layout_path
 from tests.commands import call, done
 
 pytestmark = pytest.mark.usefixtures("never_waits")
@@ -26,6 +27,8 @@ def folder(template, tmp_path, monkeypatch) -> Path:
     (tmp_path / "logs" / "deep").mkdir(parents=True)
     for name in ("logs/a.mcap", "logs/deep/b.mcap"):
         shutil.copy(template, tmp_path / name)
+        for kind in LAYOUTS:
+            shutil.copy(layout_path(template, kind), layout_path(tmp_path / name, kind))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

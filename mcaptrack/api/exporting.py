@@ -18,7 +18,7 @@ from mcaptrack.notices import Notice, warn
 from mcaptrack.tables import Format
 from mcaptrack.tables.exchange import FORMATS as EXCHANGE_FORMATS
 from mcaptrack.tables.exchange import ExchangeFormat, default_file, write_boxes
-from mcaptrack.tables.export import default_folder, recording_name
+from mcaptrack.tables.export import default_folder, main_file, recording_key, recording_name
 from mcaptrack.tables.export import export as write_tables
 from mcaptrack.tables.rosbag2 import Storage, write_bag
 from mcaptrack.tables.rosbag2 import default_folder as default_bag
@@ -45,6 +45,8 @@ class ExportResult:
         file, its channel.
     warnings : tuple of mcaptrack.Notice
         What was left out.
+    files : tuple of pathlib.Path
+        What the export owes: the last of the tables, the bag, or the file.
 
     """
 
@@ -53,6 +55,7 @@ class ExportResult:
     rows: Mapping[str, int]
     written: tuple[str, ...]
     warnings: tuple[Notice, ...]
+    files: tuple[Path, ...] = ()
 
     @property
     def is_up_to_date(self) -> bool:
@@ -134,7 +137,8 @@ def export(
             )
         for words in done.notes:
             warn(words, "left-out")
-    return ExportResult(path, folder, done.rows, tuple(done.written), tuple(dict.fromkeys(warnings)))
+    owed = (main_file(path, folder, cast("Format", form)),)
+    return ExportResult(path, folder, done.rows, tuple(done.written), tuple(dict.fromkeys(warnings)), owed)
 
 
 def _export_bag(
@@ -154,7 +158,9 @@ def _export_bag(
             done = write_bag(opened, folder, progress, storage=storage, force=force)
         for words in done.notes:
             warn(words, "left-out")
-    return ExportResult(path, folder, done.messages, tuple(done.messages), tuple(dict.fromkeys(warnings)))
+    return ExportResult(
+        path, folder, done.messages, tuple(done.messages), tuple(dict.fromkeys(warnings)), files=(folder,)
+    )
 
 
 def _export_file(
@@ -178,14 +184,17 @@ def _export_file(
             done = write_boxes(opened, target, form, topics[0] if topics else None, progress, force=force)
         for words in done.notes:
             warn(words, "left-out")
-    return ExportResult(path, target, {done.topic: done.rows}, (done.topic,), tuple(dict.fromkeys(warnings)))
+    return ExportResult(
+        path, target, {done.topic: done.rows}, (done.topic,), tuple(dict.fromkeys(warnings)), files=(target,)
+    )
 
 
 def refuse_same_tables(logs_to_export: Sequence[Location], output: Path | None) -> None:
     """Raise McaptrackError if two different logs would have the same name in the tables of one folder."""
-    folders: dict[tuple[Path, str], Location] = {}
+    folders: dict[tuple[str, str], Location] = {}
     for path in logs_to_export:
-        other = folders.setdefault((output or default_folder(path), recording_name(path)), path)
+        folder = recording_key(str(output or default_folder(path)))
+        other = folders.setdefault((folder, recording_key(recording_name(path))), path)
         if place_of(other) != place_of(path):
             raise McaptrackError(
                 f"{other} and {path} would both be {recording_name(path)} in the tables; export them to two folders"

@@ -13,8 +13,8 @@ from mcaptrack.api.common import detail, locations_of, log_location, optional_pa
 from mcaptrack.api.fleet_page import page_about
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import is_same_file, publish_bytes, refuse_overwrite
-from mcaptrack.location import local_name
+from mcaptrack.files import is_same_file, place_of, publish_bytes, refuse_overwrite
+from mcaptrack.location import distinct_names, local_name
 from mcaptrack.notices import Notice, collected
 from mcaptrack.tables.catalogue import is_folder_of_tables
 from mcaptrack.viewing import report as pages
@@ -122,12 +122,14 @@ def report(
     if any(is_same_file(path, target) for path in paths):
         raise McaptrackError(f"{target} is a log; give the page another name with `output=`")
     refuse_overwrite(target, force)
+    real = [place_of(path) for path in paths]
+    files, names = (distinct_names(some, real) for some in ([p.name for p in paths], [p.stem for p in paths]))
     reports = []
     with collected() as warnings:
         for done, path in enumerate(paths):
             progress("report", done, len(paths))
             with logs.read(path) as opened:
-                reports.append(pages.gather(opened, camera, detail))
+                reports.append(pages.gather(opened, camera, detail, files[done], names[done]))
                 pages.draw(reports[-1], done, len(paths))
         content = pages.page(reports).encode("utf-8")
         publish_bytes(target, content)

@@ -17,18 +17,17 @@ from mcaptrack import log as logs
 from mcaptrack import notices, pipeline
 from mcaptrack.api.common import Notes, as_location, log_output, warnings_about
 from mcaptrack.api.options import PathLike, Progress, no_progress
+from mcaptrack.api.products import refuse_foreign_products, write_products
 from mcaptrack.api.several import Act, CameraResult, Done, EveryCamera, refuse_failed, together
 from mcaptrack.choices import Mode
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation.zones import ZoneTotals
-from mcaptrack.files import is_same_file, publish_bytes, refuse_overwrite
+from mcaptrack.files import is_same_file, refuse_overwrite
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice, warn
 from mcaptrack.pipeline import AS_BEFORE, Job, PlaneChoice, Summary, Watch, ZoneWatch
 from mcaptrack.sources.fixed_frame import BoxesRead
-from mcaptrack.sources.ingest.bags.metadata_update import update_metadata
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
-from mcaptrack.tables.export import default_folder, export
 from mcaptrack.transforms import FUSION, STAGES, Transform
 
 #: The value of a transform's option.
@@ -81,6 +80,10 @@ class RunResult:
         Why the cameras were not fused to a scene; "" if they were, and for one camera.
     continued : mcaptrack.pipeline.Continued or None
         How ids go on from those of the log before, if one was named.
+    files : tuple of pathlib.Path
+        All files beside the log that the run owes, written now or before: layouts, and the last of the tables.
+    written_tables : tuple of str
+        The tables that were written; the others were up to date.
 
     """
 
@@ -105,6 +108,8 @@ class RunResult:
     left_out: Mapping[str, str] = field(default_factory=dict)
     not_fused: str = ""
     continued: pipeline.Continued | None = None
+    files: tuple[Path, ...] = ()
+    written_tables: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         did, found = ", ".join(self.stages) or "up to date", self.summary
@@ -120,7 +125,7 @@ class RunResult:
     @property
     def is_up_to_date(self) -> bool:
         """Whether there was nothing to do."""
-        return not self.stages
+        return not (self.stages or self.layouts or self.written_tables)
 
 
 #: Plans the jobs for a log; takes the open log, the prefix of its camera, a function that takes notes, and the topics
@@ -229,6 +234,8 @@ def change(
         with logs.read(path, sidecar=None if output else place) as opened:
             if output is None:
                 opened.lock()  # a second process is refused before it computes anything
+            if tables and not where.force:
+                refuse_foreign_products(opened, target)
             has_several = each is not None and each.chooses(opened, notes)
             done = [] if has_several else [Done("", *act(opened, output, notes, boxes))]
             written_to = output or opened.parts[-1].path
@@ -240,13 +247,17 @@ def change(
             with logs.read(target) as opened:
                 report.stale = [topic for topic in report.stale if pipeline.is_stale(opened, topic)]
                 named = {topic: pipeline.camera_to_name(opened, topic) for topic in report.stale}
-        if written_to == path and isinstance(path, Path):
-            update_metadata(path)
-        layouts = write_layouts(target, report.layouts)
         for topic in report.stale:
             warn_stale(topic, target, named)
         with report.watch.part("tables") if tables else nullcontext():
-            rows = _export(target, where.force, progress, boxes) if tables and isinstance(target, Path) else {}
+            products = write_products(
+                target,
+                is_new=report.is_written,
+                tables=bool(tables),
+                force=where.force,
+                progress=progress,
+                boxes=boxes,
+            )
         if tables and not isinstance(target, Path):
             notes.say(
                 f"no tables are written, because {target} is in a store; {call('export', target)} writes them here"
@@ -273,8 +284,8 @@ def change(
         events=report.events,
         zones=counted,
         stale=tuple(report.stale),
-        layouts=tuple(layouts),
-        tables=rows,
+        layouts=tuple(products.layouts),
+        tables=products.rows,
         summary=None if scene is None else summaries.get(scene),
         written_to=written_to if report.stages else None,
         written_because=place.why,
@@ -285,32 +296,15 @@ def change(
         cameras={one.name: CameraResult.of(one, summaries[one.name]) for one in done} if has_several else {},
         left_out=dict(each.left_out) if each is not None else {},
         not_fused=each.not_fused if each is not None else "",
+        files=tuple(products.owed),
+        written_tables=tuple(products.tables),
     )
-
-
-def write_layouts(log: Location, layouts: Mapping[str, bytes]) -> list[Path]:
-    """Write the layouts of a log beside it; returns their paths. None beside an object: the log itself holds them."""
-    if not isinstance(log, Path):
-        return []
-    paths = [pipeline.layout_path(log, name) for name in layouts]
-    for path, content in zip(paths, layouts.values(), strict=True):
-        publish_bytes(path, content)
-    return paths
 
 
 def warn_stale(topic: str, log: Location, cameras: Mapping[str, str] = {}) -> None:
     """Warn of a channel that is out of date now; ``cameras`` are those to name, by topic."""
     again = call("run", log, camera=cameras[topic]) if cameras.get(topic) else call("run", log)
     warn(f"{topic} is out of date, because its input was replaced; {again} brings it up to date", "out-of-date")
-
-
-def _export(target: Path, force: bool, progress: Progress, boxes: BoxesRead) -> dict[str, int]:
-    """Write the tables beside a log; returns their numbers of rows."""
-    with logs.read(target) as opened:
-        exported = export(opened, default_folder(target), progress, force=force, boxes=boxes)
-    for words in exported.notes:
-        warn(words, "left-out")
-    return exported.rows
 
 
 def transform_of(stage: str, chosen: str | Transform | None, options: Mapping[str, Option]) -> Transform:

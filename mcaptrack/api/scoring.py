@@ -32,8 +32,9 @@ from mcaptrack.evaluation import evaluate as score_sequences
 from mcaptrack.evaluation.aligned import IOU_THRESHOLD, Similarity
 from mcaptrack.evaluation.metrics import Rules
 from mcaptrack.evaluation.smoothing import smoothed_predictions
+from mcaptrack.files import place_of
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.location import Location
+from mcaptrack.location import Location, distinct_names
 from mcaptrack.notices import collected, warn
 from mcaptrack.pipeline.rebuild import rebuild
 from mcaptrack.schema import TRACKS
@@ -172,7 +173,8 @@ def _from_logs(
     paths: Sequence[Location], camera: str | None, topics: tuple[str, ...], smoothed: bool
 ) -> list[EvaluationInput]:
     sequences = []
-    for path in paths:
+    names = distinct_names([path.stem for path in paths], [place_of(path) for path in paths])
+    for name, path in zip(names, paths, strict=True):
         if path.suffix.lower() in _FILES:
             raise McaptrackError(f"{path} is not a log; to score a file of tracks give the ground truth with `truth=`")
         with logs.read(path) as opened:
@@ -180,6 +182,7 @@ def _from_logs(
             sequence = sequence_of_log(opened, prefix, topics)
             if smoothed:
                 sequence.candidates = [*sequence.candidates, _smoothed(opened, prefix)]
+            sequence.name = name
             sequences.append(sequence)
     return sequences
 

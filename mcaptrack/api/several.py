@@ -207,7 +207,7 @@ def unfitting(
 
 
 def together(reports: Sequence[Report]) -> Report:
-    """Return the reports on several cameras as one; the layouts are those of the last that has any."""
+    """Return the reports on several cameras as one."""
     out = Report()
     for one in reports:
         out.stages += one.stages
@@ -215,7 +215,7 @@ def together(reports: Sequence[Report]) -> Report:
         out.rows |= one.rows
         out.tracks |= one.tracks
         out.events |= one.events
-        out.layouts = one.layouts or out.layouts
+        out.is_written |= one.is_written
         out.stale = [*dict.fromkeys([*out.stale, *one.stale])]
         out.warnings += one.warnings
         out.has_zones |= one.has_zones

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -13,8 +12,10 @@ from mcaptrack import pipeline
 from mcaptrack.api.class_names import checked_names
 from mcaptrack.api.columns import UNNUMBERED
 from mcaptrack.api.common import warnings_about
+from mcaptrack.api.options import no_progress
+from mcaptrack.api.products import write_products
 from mcaptrack.api.rows import frames_of
-from mcaptrack.api.running import warn_stale, write_layouts
+from mcaptrack.api.running import warn_stale
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.location import Location
@@ -23,7 +24,6 @@ from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.sources.camera_motion import path_of, tracks_topic
 from mcaptrack.sources.cameras import USUAL
-from mcaptrack.sources.ingest.bags.metadata_update import update_metadata
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
 
 #: What channels usually hold, by the end of their topic.
@@ -64,13 +64,11 @@ def write_rows(
         how = Provenance(INGEST, {"written_with": "mcaptrack.open"}, classes=names, frame_id=own_frame)
         made = Made.of(schema, frames, how)
         path_of_camera, _ = path_of(opened, prefix, tracks_topic(prefix))
-        layouts = write(opened, prefix, {name: made}, planes, {}, None, path_of_camera)
+        write(opened, prefix, {name: made}, planes, {}, None, path_of_camera)
         stale = pipeline.outdated_by(opened, {name: made.provenance.digest})
-        write_layouts(path, layouts)
         for topic_of_stage in stale:
             warn_stale(topic_of_stage, path, {topic_of_stage: pipeline.camera_to_name(opened, topic_of_stage)})
-        if opened.results is None and isinstance(path, Path):
-            update_metadata(path)
+    write_products(path, is_new=True, progress=no_progress)
     return len(frames)
 
 

@@ -149,7 +149,10 @@ def _print(result: RunResult, shows_events: bool, talk: common.Talk) -> None:
 
 def _did(result: RunResult) -> str:
     """Return the stages that ran, and how long they took."""
-    return f"{', '.join(dict.fromkeys(result.stages))} in {result.seconds:.1f} s" if result.stages else _UP_TO_DATE
+    if result.stages:
+        return f"{', '.join(dict.fromkeys(result.stages))} in {result.seconds:.1f} s"
+    again = [*(path.name for path in result.layouts), *(["tables"] if result.written_tables else [])]
+    return f"the log is up to date; made again from it: {', '.join(again)}" if again else _UP_TO_DATE
 
 
 def _slow_parts(result: RunResult) -> str:

@@ -6,12 +6,13 @@ import fcntl
 import hashlib
 import json
 import os
-import platform
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import monotonic, time
 from typing import Any, Final, NamedTuple
+
+from mcaptrack.processes import host, is_running, started
 
 #: Seconds between signs of life of a fleet, and without one after which its claims count as left behind.
 BEAT_S: Final = 10.0
@@ -33,7 +34,7 @@ class Claims:
     def __init__(self) -> None:
         self._mine: dict[str, Path] = {}
         self._beaten = monotonic()
-        self._me = {"host": _host(), "pid": os.getpid(), "started": _started(os.getpid())}
+        self._me = {"host": host(), "pid": os.getpid(), "started": started(os.getpid())}
 
     def take(self, location: str, folder: Path | None) -> Taken:
         """Claim a log by a file in ``folder``; without one, or where nothing can be written, there is no claim."""
@@ -111,8 +112,8 @@ def _write(handle: int, content: bytes) -> bool:
 
 
 def _taken_over(location: str, owner: Mapping[str, Any]) -> str:
-    host, pid = str(owner.get("host", "?")).partition("/")[0], owner.get("pid", "?")
-    return f"{location}: taken over from process {pid} on {host}, which has ended"
+    machine, pid = str(owner.get("host", "?")).partition("/")[0], owner.get("pid", "?")
+    return f"{location}: taken over from process {pid} on {machine}, which has ended"
 
 
 def sweep(folder: Path, locations: set[str]) -> None:
@@ -144,44 +145,16 @@ def _owner(handle: int) -> tuple[dict[str, Any], bool]:
     age = time() - os.fstat(handle).st_mtime
     try:
         owner = json.loads(os.pread(handle, 65536, 0))
-        host, pid, started = owner["host"], owner["pid"], owner["started"]
+        whole = {key: owner[key] for key in ("host", "pid", "started")}
     except (ValueError, TypeError, KeyError):
         return {}, age > _EMPTY_S
-    ended = _has_ended({"host": host, "pid": pid, "started": started})
+    ended = _has_ended(whole)
     return owner, age > STALE_S if ended is None else ended
 
 
 def _has_ended(owner: Mapping[str, Any]) -> bool | None:
     """Whether the process of a claim has ended; None if it is on another machine, or unknown."""
-    pid, started = owner.get("pid"), owner.get("started")
-    if owner.get("host") != _host() or not isinstance(pid, int):
+    pid, since = owner.get("pid"), owner.get("started")
+    if owner.get("host") != host() or not isinstance(pid, int):
         return None
-    return _started(pid) != started if started is not None else not _is_running(pid)
-
-
-def _is_running(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
-    return True
-
-
-def _started(pid: int) -> str | None:
-    """Return when a process was started, in the system's own count; None where that is unknown or it has ended."""
-    try:
-        text = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
-    except OSError:
-        return None
-    return None if text[0] in ("Z", "X") else text[19]
-
-
-def _host() -> str:
-    """Return a name of this machine since its start, and of the space of process ids: containers have their own."""
-    parts = [platform.node()]
-    for file in ("/proc/sys/kernel/random/boot_id", "/proc/self/ns/pid"):
-        with suppress(OSError):
-            parts.append(os.readlink(file) if file.endswith("pid") else Path(file).read_text().strip())
-    return "/".join(parts)
+    return started(pid) != since if since is not None else not is_running(pid)

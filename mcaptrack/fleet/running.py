@@ -196,7 +196,7 @@ class Fleet(Generic[T]):
                 warnings=[{"code": one.code, "message": one.message} for one in reply.warnings],
                 error=reply.error or None,
                 detail=reply.detail or None,
-                outputs=[os.path.abspath(work.own["output"])] if "output" in work.own else [],
+                outputs=[*([os.path.abspath(work.own["output"])] if "output" in work.own else []), *reply.files],
                 version=__version__,
             )
         if reply.state in AGAIN and work.tries < self._most_tries:

@@ -7,6 +7,7 @@ its parent through one socket. What a log may do to it is the parent's to notice
 from __future__ import annotations
 
 import faulthandler
+import os
 import pickle
 import resource
 import signal
@@ -44,7 +45,10 @@ class Request:
 
 @dataclass(frozen=True)
 class Reply:
-    """The outcome of one try, as in ``LogOutcome``; ``result`` is pickled; ``digest`` is that of the log afterwards."""
+    """The outcome of one try, as in ``LogOutcome``; ``result`` is pickled; ``digest`` is that of the log afterwards.
+
+    ``files`` are those beside the log that the function owes, by what its result says.
+    """
 
     state: State
     result: bytes = b""
@@ -56,6 +60,7 @@ class Reply:
     warnings: tuple[Notice, ...] = ()
     digest: str = ""
     printed: str = ""
+    files: tuple[str, ...] = ()
 
 
 def do(request: Request, progress: Callable[[str, float, float | None], None]) -> Reply:
@@ -67,7 +72,7 @@ def do(request: Request, progress: Callable[[str, float, float | None], None]) -
         with listening(warnings.append), about(request.own.get("output") or request.log):
             result = function(request.log, **options, **request.own, **_taking(function, progress))
         state: State = "up-to-date" if getattr(result, "is_up_to_date", False) else "done"
-        reply = Reply(state, result=pickle.dumps(result), digest=digest_of_log(request.log))
+        reply = Reply(state, result=pickle.dumps(result), digest=digest_of_log(request.log), files=_files_of(result))
     except McaptrackError as error:
         reply = Reply("failed", error=" ".join(str(error).split()))
     except MemoryError:
@@ -79,6 +84,11 @@ def do(request: Request, progress: Callable[[str, float, float | None], None]) -
     seconds, cpu = round(monotonic() - began, 3), round(_cpu_seconds() - used, 3)
     found = tuple(dict.fromkeys(warnings))
     return replace(reply, seconds=seconds, cpu_seconds=cpu, peak_bytes=_peak_bytes(), warnings=found)
+
+
+def _files_of(result: object) -> tuple[str, ...]:
+    """Return the files beside a log that a result says are owed: without them the log isn't done."""
+    return tuple(os.path.abspath(file) for file in getattr(result, "files", ()) if isinstance(file, Path))
 
 
 def _taking(function: Any, progress: Any) -> dict[str, Any]:

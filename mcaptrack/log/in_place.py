@@ -16,7 +16,7 @@ from typing import Final
 
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import keep_attributes, publish
+from mcaptrack.files import keep_attributes, publish, sweep
 from mcaptrack.log import journal
 from mcaptrack.log.byte_source import OpenFile
 from mcaptrack.log.journal import Journal, UnusableJournal, journal_of
@@ -42,6 +42,12 @@ def lock(path: Path, handle: int) -> None:
         same = False
     if not same:
         raise McaptrackError(f"{path} was replaced while it was being read; try again")
+
+
+def sweep_left(path: Path) -> None:
+    """Remove what processes that were killed have left of new contents of a locked log, and of its journal."""
+    for name in (path.name, journal_of(path).name):
+        sweep(path.parent, name)
 
 
 def resolve_journal(path: Path, handle: int, file: OpenFile) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from mcaptrack import objects
+from mcaptrack.files import temporary_folder
 from mcaptrack.location import Location, Url
 from mcaptrack.log.paths import RESULTS_SUFFIX, results_path
 from mcaptrack.log.reader import Channel, Log
@@ -81,7 +81,7 @@ def _attach_remote(log: Log, results: Url, sidecar: bool | None) -> None:
     except AbsentError:
         if not sidecar:
             return
-        made = TemporaryDirectory(prefix="mcaptrack-")
+        made = temporary_folder()
         with create(Path(made.name, results.name)):
             pass
         log.attach_results(Log(results, made), is_new=True)

@@ -134,6 +134,7 @@ class Log:
                 ) from None
             try:
                 in_place.lock(self.real_path, handle)
+                in_place.sweep_left(self.real_path)
                 in_place.resolve_journal(self.real_path, handle, self.snapshot.file)
                 if not self.snapshot.is_on_disk(os.fstat(handle)):
                     raise McaptrackError(f"{self.path} was replaced while it was being read; try again")

@@ -11,11 +11,11 @@ from bisect import bisect_right, insort
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import IO, Final
 
 from mcaptrack import objects
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import temporary_folder
 from mcaptrack.location import Url
 from mcaptrack.log.byte_source import GAP_BYTES, MIN_AHEAD, Signature
 from mcaptrack.log.paths import RESULTS_SUFFIX
@@ -178,7 +178,7 @@ def publish_object(url: Url, before: Version | None) -> Iterator[IO[bytes]]:
 
     The bytes go to a temporary file first. Raises McaptrackError if the object has another version by then.
     """
-    with TemporaryDirectory(prefix="mcaptrack-") as folder:
+    with temporary_folder() as folder:
         part = Path(folder, url.name)
         with part.open("xb") as stream:
             yield stream

@@ -85,7 +85,8 @@ def fuse_cameras(
             )
     with collected() as warnings:
         out = _fuse(opened, names, prefix, fuser, clock_offset_s, progress, is_asked)
-    report = Report(stages=[FUSE], layouts=write(opened, prefix, out, (), {}, output), warnings=list(warnings))
+    write(opened, prefix, out, (), {}, output)
+    report = Report(stages=[FUSE], is_written=True, warnings=list(warnings))
     for topic, channel in out.items():
         report.count(topic, channel)
     report.stale = outdated_by(opened, {topic: channel.provenance.digest for topic, channel in out.items()})

@@ -54,7 +54,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass
 class Report:
-    """The result of a run: its stages; the frames, rows and tracks of each topic they made; layout files by name.
+    """The result of a run: its stages; the frames, rows and tracks of each topic they made; whether it wrote the log.
 
     ``stale`` are the channels that are out of date, because this run replaced their input. ``events`` are the numbers
     of events of each kind by channel of tracks. ``warnings`` report what was assumed, left out or looks unusual.
@@ -66,7 +66,7 @@ class Report:
     frames: dict[str, int] = field(default_factory=dict)
     rows: dict[str, int] = field(default_factory=dict)
     tracks: dict[str, int] = field(default_factory=dict)
-    layouts: dict[str, bytes] = field(default_factory=dict)
+    is_written: bool = False
     stale: list[str] = field(default_factory=list)
     events: dict[str, dict[str, int]] = field(default_factory=dict)
     warnings: list[Notice] = field(default_factory=list)
@@ -168,7 +168,8 @@ def _run(
         with part("write"):
             path, _ = path_with(opened, prefix, tracks_topic(prefix), made)
             gone = {topic for job in jobs if job.target in made for topic in superseded(opened, job)}
-            report.layouts = write(opened, prefix, made, planes or (), stamps, output, path, boxes.in_space(), gone)
+            write(opened, prefix, made, planes or (), stamps, output, path, boxes.in_space(), gone)
+            report.is_written = True
     provenances = {topic: channel.provenance for topic, channel in made.items()}
     warn_findings(opened, prefix, provenances, planes or (), is_all=watch is not None or not jobs)
     report.stale = outdated_by(opened, {topic: channel.provenance.digest for topic, channel in made.items()})

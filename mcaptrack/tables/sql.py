@@ -10,7 +10,6 @@ log. Each channel is a table, too, under its name in double quotes. Only this mo
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack, suppress
@@ -21,7 +20,7 @@ from typing import Any, Final, Protocol, Self
 from mcaptrack import log, tables
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import place_of
-from mcaptrack.location import Location
+from mcaptrack.location import Location, distinct_names, join
 from mcaptrack.log.paths import results_path
 from mcaptrack.tables import TABLES
 from mcaptrack.tables.export import TOPICS, LogTables, current_file, default_folder, topic_folder
@@ -72,7 +71,7 @@ class _LogTables:
         self.opened = log.read(path)
         self.contents = LogTables(self.opened)
         self.recording = self.contents.recording
-        self.where: Location = place_of(path).parent
+        self.where: Location = place_of(path)
 
     def part(self, name: str) -> Any:
         return current_file(self.contents, default_folder(self.opened.path), name) or self.contents.table(name)
@@ -87,7 +86,7 @@ class _LogTables:
 class _FolderTables:
     def __init__(self, folder: Path, recording: str) -> None:
         self.folder, self.recording = folder, recording
-        self.where: Location = place_of(folder)
+        self.where: Location = join(place_of(folder), recording)
         self._member = Path(f"recording={recording}", "part-0.parquet")
 
     def part(self, name: str) -> Any:
@@ -127,7 +126,8 @@ class Database:
             self.notes: list[str] = []
             self._loaded: set[str] = set()
             self._sources = [source for path in _unique_paths(paths) for source in self._opened(path, opening)]
-            self._names = _unique_names(self._sources)
+            named = [(source.recording, source.where) for source in self._sources]
+            self._names = distinct_names([name for name, _ in named], [where for _, where in named])
             self._connection = opening.enter_context(self._duckdb.connect(":memory:", config=_CLOSED))
             for name, path in (files or {}).items():
                 self._load_file(name, path)
@@ -316,20 +316,6 @@ def _unique_paths(paths: Sequence[Location]) -> list[Location]:
         by_place.setdefault(place_of(path), path)
     results = {results_path(place) for place in by_place}
     return [path for place, path in by_place.items() if place not in results]
-
-
-def _unique_names(sources: Sequence[_TableSource]) -> list[str]:
-    """Names of logs; equal ones get as many of their folders as make them differ."""
-    names = [source.recording for source in sources]
-    for depth in range(1, 1 + max((len(source.where.parts) for source in sources), default=0)):
-        again = {name for name, count in Counter(names).items() if count > 1}
-        if not again:
-            break
-        names = [
-            "/".join([*source.where.parts[-depth:], source.recording]) if name in again else name
-            for name, source in zip(names, sources, strict=True)
-        ]
-    return names
 
 
 def _refuse_writing(kinds: Sequence[str]) -> None:

@@ -9,6 +9,7 @@ of the log, all tables are up to date.
 
 from __future__ import annotations
 
+import glob
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -16,12 +17,13 @@ from pathlib import Path
 from typing import Final
 
 from mcaptrack import __version__, log, tables
-from mcaptrack.errors import McaptrackError
+from mcaptrack.files import sweep
 from mcaptrack.location import Location, local_name
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.tables import TABLES, Format
 from mcaptrack.tables.export.contents import LogTables
-from mcaptrack.tables.export.names import file_name, recording_name, topic_folder
+from mcaptrack.tables.export.names import file_name, recording_key, recording_name, topic_folder
+from mcaptrack.tables.export.ownership import claimed, owner_words, refuse_tables_of_another
 
 __all__ = [
     "TOPICS",
@@ -30,7 +32,10 @@ __all__ = [
     "current_file",
     "default_folder",
     "export",
+    "main_file",
+    "recording_key",
     "recording_name",
+    "refuse_tables_of_another",
     "topic_folder",
 ]
 
@@ -51,6 +56,11 @@ class Exported:
 def default_folder(path: Location) -> Path:
     """The default folder for the tables of a log: log.mcap -> log.tables beside it."""
     return local_name(path, ".tables")
+
+
+def main_file(path: Location, folder: Path, form: Format = "parquet") -> Path:
+    """The file of a log in a folder that is written last: where it stands, all tables do."""
+    return folder / "recordings" / f"recording={recording_name(path)}" / f"part-0.{form}"
 
 
 def current_file(contents: LogTables, folder: Path, name: str) -> Path | None:
@@ -104,6 +114,18 @@ def export(
     for topic in topics:
         opened.channel(topic)
     job = _Job(contents, folder, form, force, Exported())
+    if not force:
+        refuse_tables_of_another(opened, opened.path, folder)
+    with claimed(folder, contents.recording):
+        if not force:  # once more, because another process may have written them meanwhile
+            refuse_tables_of_another(opened, opened.path, folder)
+        job.tidy()
+        _write_all(job, topics, blobs, progress)
+    return job.done
+
+
+def _write_all(job: _Job, topics: Sequence[str], blobs: bool, progress: Callable[[str, int, int], None]) -> None:
+    opened = job.contents.opened
     *names, last = TABLES
     known = job.known_topics()
     wanted = sorted({*topics, *(topic for topic in known if topic in opened.channels)})
@@ -117,7 +139,6 @@ def export(
     job.remove([topic for topic in known if topic not in wanted])
     job.table(last)
     progress("export", total, total)
-    return job.done
 
 
 @dataclass
@@ -134,6 +155,7 @@ class _Job:
     def table(self, name: str) -> None:
         """Update one of ``TABLES``."""
         words = {"lineage": self.contents.lineage(name), "source": self.contents.source(name)}
+        words |= owner_words(self.contents.opened, self.folder) if name == "recordings" else {}
         path = self.path(name)
         if not self._stands(name, path, words["source"]):
             made = self.contents.pieces(name)
@@ -159,12 +181,6 @@ class _Job:
         if self.force:
             return False
         known = tables.file_metadata(path, self.form) or {}
-        file = file_name(self.contents.opened.path)
-        if known.get("recording", file) != file:
-            raise McaptrackError(
-                f"{path.parent} holds the tables of {known['recording']}, not of {file}; give another folder with "
-                "`output=`"
-            )
         if (known.get("source"), known.get("table_version")) != (source, tables.TABLE_VERSION):
             return False
         self.done.rows[name] = int(known["rows"])
@@ -191,6 +207,20 @@ class _Job:
         folder = self.folder / TOPICS
         members = sorted(folder.iterdir()) if folder.is_dir() else []
         yield from (path for member in members if (path := member.joinpath(*tail)).is_file())
+
+    def tidy(self) -> None:
+        """Remove what processes that were killed have left: temporary files, and folders of channels without a file."""
+        sweep(self.folder)
+        member = f"recording={self.contents.recording}"
+        for path in (*self.folder.glob(f"*/{glob.escape(member)}"), *self._topic_folders()):
+            sweep(path)
+        for path in self._topic_folders():
+            with suppress(OSError):
+                path.rmdir()
+                path.parent.rmdir()
+
+    def _topic_folders(self) -> list[Path]:
+        return sorted((self.folder / TOPICS).glob(f"*/{glob.escape(f'recording={self.contents.recording}')}"))
 
     def remove(self, topics: Sequence[str]) -> None:
         """Remove tables of channels that are gone, and folders that are empty then."""

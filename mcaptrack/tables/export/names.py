@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import unicodedata
 from typing import Final
 
 from mcaptrack.location import Location
@@ -25,6 +26,11 @@ def recording_name(path: Location) -> str:
     name = _cut(re.sub(r"[^\w.\-]+", "_", path.stem).lstrip(".") or "log")
     is_text = re.search(r"[^\W\d_]", name) and not re.fullmatch(r"[-\d._]*e[-\d]+", name, re.IGNORECASE)
     return name if is_text and name.lower().lstrip("-") not in _NO_TEXT else f"log-{name}"
+
+
+def recording_key(name: str) -> str:
+    """The name of a recording without capitals and composed letters, which some file systems don't tell apart."""
+    return unicodedata.normalize("NFC", name).casefold()
 
 
 def file_name(path: Location) -> str:

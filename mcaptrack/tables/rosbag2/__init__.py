@@ -108,7 +108,7 @@ def write_bag(
         # The file of messages has the name of its folder.
         _write(part / folder.name, streams, storage, done, lambda count: progress("export", count, job.total))
         if folder.exists():
-            shutil.rmtree(folder)
+            folder.rename(part / "before")  # removed in one step: half of a bag would be taken for no bag
         (part / folder.name).rename(folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)

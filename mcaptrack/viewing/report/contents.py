@@ -127,13 +127,22 @@ class LogReport:
         return " Metres are guessed from the size of people: the ground was not measured."
 
 
-def gather(opened: log.Log, camera: str | None, progress: Callable[[str], None] = lambda _: None) -> LogReport:
+def gather(
+    opened: log.Log,
+    camera: str | None,
+    progress: Callable[[str], None] = lambda _: None,
+    file: str = "",
+    name: str = "",
+) -> LogReport:
     """Read and compute everything about one camera of a log.
+
+    ``file`` and ``name`` tell it from the other logs of a page; by default those of its file, with and without suffix.
 
     Raises McaptrackError for a damaged log, and for one with several cameras if none is chosen.
     """
     prefix = pipeline.find_camera(opened, camera)
-    out = LogReport(opened.path.name, opened.path.stem, prefix, opened.start_ns, opened.end_ns)
+    file, name = file or opened.path.name, name or opened.path.stem
+    out = LogReport(file, name, prefix, opened.start_ns, opened.end_ns)
     _read(opened, out)
     progress(f"{opened.path}: scores")
     _score(opened, out)
@@ -210,6 +219,7 @@ def _score(opened: log.Log, out: LogReport) -> None:
         return
     try:
         out.sequence = sequence_of_log(opened, out.prefix, ())
+        out.sequence.name = out.name
         outcome = evaluate([out.sequence], EvaluateOptions())
     except DamagedError:
         raise

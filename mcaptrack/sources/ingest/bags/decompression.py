@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from mcaptrack import environment
@@ -86,13 +84,6 @@ def decompress_pieces(
     if not ended():
         raise NotUnpackedError("it is cut off")
     return b"".join(parts)
-
-
-@contextmanager
-def temporary_folder() -> Iterator[Path]:
-    """A temporary folder, removed afterwards."""
-    with TemporaryDirectory(prefix="mcaptrack-") as name:
-        yield Path(name)
 
 
 def unzstd_file(path: Path, out: Path) -> None:

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import follow_links, refuse_special
+from mcaptrack.files import follow_links, refuse_special, temporary_folder
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.ingest.bags import decompression
@@ -102,7 +102,7 @@ def _decompressed_file(path: Path, opened: ExitStack) -> Path:
     """The file, or its decompressed copy if it is compressed as a whole."""
     if not _first_bytes(path).startswith(_ZSTD_MAGIC):
         return path
-    out = opened.enter_context(decompression.temporary_folder()) / path.name.removesuffix(".zstd")
+    out = Path(opened.enter_context(temporary_folder())) / path.name.removesuffix(".zstd")
     decompression.unzstd_file(path, out)
     return out
 

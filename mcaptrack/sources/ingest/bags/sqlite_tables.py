@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import follow_links, refuse_special
+from mcaptrack.files import follow_links, refuse_special, temporary_folder
 from mcaptrack.sources.ingest.bags import decompression
 
 #: Virtual machine steps of SQLite between two checks for signals: a few milliseconds.
@@ -84,7 +84,7 @@ class SqliteTables:
         journals = [path.with_name(path.name + end) for end in ("-wal", "-journal")]
         left = [other for other in journals if other.is_file() and other.stat().st_size]
         if left:
-            folder = self._close.enter_context(decompression.temporary_folder())
+            folder = Path(self._close.enter_context(temporary_folder()))
             for other in (path, *left):
                 decompression.copy(other, folder / other.name)
                 if other.name.endswith("-journal"):
