@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.ragged import cross_pairs, group_index, ragged_range
 
 #: Points of a group from which on only neighbours are compared.
 _MANY: Final = 256
 #: Pairs that are compared at once, to limit memory.
 _PAIRS_AT_ONCE: Final = 2**18
+#: Larger tables of pairs are not made.
+_LARGE_TABLE: Final = 2**20
 
 
 def near_pairs(group: Ints, xy: Floats, distance: float) -> tuple[Ints, Ints]:
@@ -120,6 +123,44 @@ def touching_pairs(a: Floats, b: Floats, a_group: Ints, b_group: Ints) -> tuple[
     first, second = (np.concatenate(side) for side in zip(*found, strict=True))
     order = np.lexsort((second, first))
     return a_at[first[order]], b_at[second[order]]
+
+
+class Pairing:
+    """Pairs of M points with N others: a table (M, N) of all, or of very many points only of those within reach, (P,).
+
+    Formulas on ``of_first`` and ``of_second`` are the same for both.
+
+    Parameters
+    ----------
+    first, second : (2, M) and (2, N)
+        Positions, in any unit.
+    reach : (M,)
+        In the same unit; points of ``second`` that are farther away are no pair, or one that the caller leaves out.
+    """
+
+    def __init__(self, first: Floats, second: Floats, reach: Floats) -> None:
+        self.shape = (first.shape[1], second.shape[1])
+        self._pairs: tuple[Ints, Ints] | None = None
+        if self.shape[0] * self.shape[1] > _LARGE_TABLE:
+            around = np.clip(np.nan_to_num(reach, nan=0.0), 0, 1e9) * (1 + 1e-9)
+            boxes = np.concatenate([first - around, first + around]).T
+            groups = (np.zeros(count, np.int64) for count in self.shape)
+            self._pairs = touching_pairs(boxes, np.concatenate([second, second]).T, *groups)
+
+    def of_first(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Values (..., M) of the first points, for each pair."""
+        return values[..., None] if self._pairs is None else values[..., self._pairs[0]]
+
+    def of_second(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Values (..., N) of the others, for each pair."""
+        return values[..., None, :] if self._pairs is None else values[..., self._pairs[1]]
+
+    def chosen(self, which: Bools) -> tuple[Ints, Ints]:
+        """The points of the pairs that a mask chooses, ordered by the first ones."""
+        if self._pairs is None:
+            first, second = np.nonzero(which)
+            return first, second
+        return self._pairs[0][which], self._pairs[1][which]
 
 
 def _cell(xy: Floats, low: Floats, cell: Floats, count: Ints) -> Ints:
