@@ -121,7 +121,8 @@ def classes(folder: Path, count: int) -> list[str]:
             stream.write("t,id,name,x,y,w,h,score\n")
             for frame in range(5):
                 stream.writelines(
-                    f"{frame / 10},{n + 1 if name == 'gt' else ''},kind{n},{40 * (n % side) + r:.2f},{60 * (n // side)},16,36,.9\n"
+                    f"{frame / 10},{n + 1 if name == 'gt' else ''},kind{n},"
+                    f"{40 * (n % side) + r:.2f},{60 * (n // side)},16,36,.9\n"
                     for n, r in enumerate(rng.random(count).tolist())
                 )
     return ["ingest det.csv --as detections --truth gt.csv -o a.mcap", *SCORED]
@@ -322,7 +323,7 @@ def measured(line: str, folder: Path, limit_s: int) -> Cost:
             env=environment,
             stdout=said,
             stderr=said,
-            preexec_fn=limited,
+            preexec_fn=limited,  # noqa: PLW1509 - this process has one thread
         )
         _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
@@ -331,7 +332,7 @@ def measured(line: str, folder: Path, limit_s: int) -> Cost:
 
 
 def power(costs: list[float], rest: float) -> str:
-    """By which power of the size the last cost grew, less the ``rest`` that any log costs; - where that is lost in it."""
+    """By which power of the size the last cost grew, less the ``rest`` that any log costs; - if that is more."""
     if len(costs) < 2:
         return "-"
     before, last = (cost - rest for cost in costs[-2:])
