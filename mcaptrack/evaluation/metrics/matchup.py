@@ -221,9 +221,9 @@ class Matchup:
             return self.similarity
         of_all = np.concatenate([np.empty(0), *(part.ravel() for part in self.similarity)])
         at = of_all.nonzero()[0]
-        pairs = (part[at] for part in cross_pairs(self.ground_truth_counts, self.track_counts))
-        ends = (np.append(0, np.cumsum(counts)) for counts in (self.ground_truth_counts, self.track_counts))
-        return SparseTables(*pairs, of_all[at], *ends)
+        frame, row, column = (part[at] for part in cross_pairs(self.ground_truth_counts, self.track_counts))
+        people, tracks = (np.append(0, np.cumsum(counts)) for counts in (self.ground_truth_counts, self.track_counts))
+        return SparseTables(frame, row, column, of_all[at], people, tracks)
 
     @cached_property
     def pairs(self) -> RowPairs:
