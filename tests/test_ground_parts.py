@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mcaptrack.geometry.neighbours import Pairing
 from mcaptrack.schema import Frame
 from mcaptrack.transforms.ground import state
 from mcaptrack.transforms.ground.association import _Apart, associate
@@ -88,10 +89,10 @@ class TestAssociation:
         rng = np.random.default_rng(seed)
         table, rows = tables(rng, 4, 5)
         known = Covariances(along_one_axis(rng, 4)[0])
-        apart = _Apart(table, rows, known)
         reach = rng.uniform(0.5, 4, 4)
+        apart = _Apart(table, rows, known, Pairing(table[state.PLACE], rows[state.PLACE], reach))
         within, (k, n) = apart.within(4.0, reach), np.indices((4, 5)).reshape(2, -1)
-        gain = apart.gain(k, n).reshape(4, 5)
+        gain = apart.gain(np.ones((4, 5), bool), k, n).reshape(4, 5)
         for i, j in np.ndindex(4, 5):
             xx, xy, yy = rows[state.COVARIANCE, j]
             spread = SEEN @ known.values[i] @ SEEN.T + [[xx, xy], [xy, yy]] + table[state.NOISE, i] ** 2 * np.eye(2)
@@ -109,11 +110,14 @@ class TestAssociation:
         table[state.PLACE], rows[state.PLACE] = 0.0, np.arange(8).reshape(2, 4) / 4
         spread = state.variance(table)
         np.testing.assert_allclose(spread, table[state._PP] + table[state.NOISE] ** 2)
-        apart, reach = _Apart(table, rows, None), np.array([1.2, 0.7, 9.0])
+        reach = np.array([1.2, 0.7, 9.0])
+        apart = _Apart(table, rows, None, Pairing(table[state.PLACE], rows[state.PLACE], reach))
         for i, j in np.ndindex(3, 4):
             squared = (rows[state.PLACE, j] ** 2).sum()
             assert apart.within(9.0, reach)[i, j] == (squared <= 9.0 * spread[i] and squared <= reach[i] ** 2)
-            (gain,) = apart.gain(np.array([i]), np.array([j]))
+            which = np.zeros((3, 4), bool)
+            which[i, j] = True
+            (gain,) = apart.gain(which, np.array([i]), np.array([j]))
             assert gain == pytest.approx(30 - squared / spread[i] - 2 * np.log(spread[i]))
 
     @pytest.mark.parametrize(

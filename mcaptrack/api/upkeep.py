@@ -275,7 +275,9 @@ def _chosen(opened: logs.Log, patterns: Sequence[str]) -> set[str]:
     """
     chosen: set[str] = set()
     for pattern in patterns:
-        found = {topic for topic in opened.channels if topic == pattern or fnmatchcase(topic, pattern)}
+        found = {pattern} & opened.channels.keys()
+        if any(letter in pattern for letter in "*?["):  # most are names, and there may be thousands
+            found |= {topic for topic in opened.channels if fnmatchcase(topic, pattern)}
         if not found:
             opened.channel(pattern)  # raises, with the channels that there are
         chosen |= found

@@ -17,8 +17,9 @@ from mcaptrack.evaluation.metrics.matchup import SparseTables
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes, iou_of_pairs
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.geometry.neighbours import touching_pairs
 from mcaptrack.geometry.oriented_boxes import bev_iou_of_pairs, columns_to_oriented_boxes, iou_3d_of_pairs
-from mcaptrack.geometry.ragged import cross_pairs
+from mcaptrack.geometry.ragged import cross_pairs, group_index
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.framing import frame_times, join_frames, split_rows
 from mcaptrack.schema.resampling import is_observed_at, resample
@@ -234,7 +235,14 @@ def _similarities(
 
     Pairs of different ``classes`` have none.
     """
-    frame, row, column = cross_pairs(np.diff(a_ends), np.diff(b_ends))
+    a_counts, b_counts = np.diff(a_ends), np.diff(b_ends)
+    if a_counts.dot(b_counts) > _PAIRS_AT_ONCE:
+        of = group_index(a_counts), group_index(b_counts)
+        sides = (_reach(part[ends[0] : ends[-1]], similarity, gate) for part, ends in ((a, a_ends), (b, b_ends)))
+        row, column = touching_pairs(*sides, *of)
+        frame = of[0][row]
+    else:
+        frame, row, column = cross_pairs(a_counts, b_counts)
     row, column = row + a_ends[0], column + b_ends[0]
     if similarity != "metres":
         alike = _OVERLAPS[similarity](a[row], b[column])
@@ -245,3 +253,12 @@ def _similarities(
         alike = np.where(classes[0][row] == classes[1][column], alike, 0.0)
     at = alike.nonzero()[0]
     return frame[at], row[at], column[at], alike[at]
+
+
+def _reach(places: Floats, similarity: Similarity, gate: float) -> Floats:
+    """The rectangles (N, 4) around boxes or positions that those of all alike ones touch."""
+    if similarity == "iou":
+        return np.concatenate([places[:, :2], places[:, :2] + places[:, 2:]], axis=1)
+    around = np.full(len(places), gate) if similarity == "metres" else np.hypot(places[:, 3], places[:, 4]) / 2
+    around = (around * (1 + 1e-9))[:, None]
+    return np.concatenate([places[:, :2] - around, places[:, :2] + around], axis=1)

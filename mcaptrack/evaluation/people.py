@@ -17,8 +17,9 @@ from mcaptrack.evaluation.aligned import align, compare_rows, sides_without
 from mcaptrack.evaluation.by_class import share_classes
 from mcaptrack.evaluation.events import MatchRule
 from mcaptrack.evaluation.metrics.clear import is_switch, matches
+from mcaptrack.evaluation.metrics.identity import best_tracks
 from mcaptrack.geometry.arrays import Floats, Ints
-from mcaptrack.geometry.assignment import solve
+from mcaptrack.geometry.assignment import LARGE_TABLE
 from mcaptrack.schema import Frame
 from mcaptrack.schema.framing import frame_times
 
@@ -99,14 +100,10 @@ def person_scores(
         return None
     matchup, people, found = compare_rows(shared.ground_truth, shared.tracks, *rule, by_class=bool(shared.names))
     pairs = matches(matchup)
-    count, tracked = len(people.ids), len(found.ids)
-    near = matchup.pairs.similarity >= matchup.threshold
-    cell = matchup.pairs.person[near] * tracked + matchup.pairs.track[near]
-    together = np.bincount(cell, minlength=count * tracked).reshape(count, tracked).astype(float)
+    count = len(people.ids)
+    tracked, frames = best_tracks(matchup, LARGE_TABLE)
     hits = np.zeros(count, np.int64)
-    if together.size:
-        rows, columns = solve(-together)
-        hits[rows] = together[rows, columns].astype(np.int64)
+    hits[tracked] = frames.astype(np.int64)
     frame_ns = frame_times(shared.ground_truth)
     matched = np.bincount(pairs.person, minlength=count)
     return PersonScores(

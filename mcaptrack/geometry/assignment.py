@@ -15,6 +15,8 @@ Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 #: Up to so many pairs, solving the whole is faster than finding the part that needs a solver.
 _SMALL: Final = 600
+#: Larger tables are not made: of so many rows and columns most pairs are no candidates.
+LARGE_TABLE: Final = 2**20
 
 
 def solve(cost: Floats) -> Pairs:
@@ -124,6 +126,8 @@ def _solved(
     rows: NDArray[np.intp], columns: NDArray[np.intp], weight: Floats, shape: tuple[int, int]
 ) -> tuple[Pairs, Floats]:
     """The pairs that the solver chooses among candidates (P,), and their weights."""
+    if shape[0] * shape[1] > LARGE_TABLE:
+        return assign_pairs_by_gain((rows, columns), weight, shape)
     dense = np.zeros(shape)
     dense[rows, columns] = weight
     chosen = solve(-dense)

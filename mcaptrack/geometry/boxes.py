@@ -6,10 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Floats, Indices
+from mcaptrack.geometry.neighbours import touching_pairs
 from mcaptrack.geometry.ragged import group_index, ragged_range
 
-#: From so many pairs on, finding those that can overlap first is faster.
+#: From so many pairs on, finding those that can overlap first is faster; and from so many on, finding them by cells.
 _MANY = 1500
+_VERY_MANY = 250_000
 
 
 def columns_to_boxes(rows: NDArray[np.void]) -> Floats:
@@ -64,7 +66,12 @@ def overlapping(a: Floats, b: Floats, area_a: Floats, area_b: Floats) -> tuple[I
     ``a`` (P,), rising, those into ``b`` (P,), and the intersection over union (P,).
     """
     if a.shape[1] * b.shape[1] > _MANY:
-        first, second = _sweep(a, b)
+        is_large = a.shape[1] * b.shape[1] > _VERY_MANY
+        first, second = (
+            touching_pairs(a.T, b.T, *(np.zeros(n, np.int64) for n in (a.shape[1], b.shape[1])))
+            if is_large
+            else _sweep(a, b)
+        )
         extent = np.minimum(a[2:].take(first, axis=1), b[2:].take(second, axis=1))
         extent -= np.maximum(a[:2].take(first, axis=1), b[:2].take(second, axis=1))
         np.maximum(extent, 0.0, out=extent)

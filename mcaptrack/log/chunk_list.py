@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.ragged import ragged_range
 from mcaptrack.log.records import ChunkIndexRecord
 
 #: The numbers of an entry in the order of their columns, and how many there are.
@@ -29,6 +30,9 @@ _NUMBERS: Final = (
 )
 _WIDTH: Final = len(_NUMBERS)
 _START, _END, _OFFSET, _LENGTH, _INDEX_LENGTH = range(5)
+#: Entries of chunks with so many channels are kept, and how many of them.
+_MANY_CHANNELS: Final = 256
+_MOST_KEPT: Final = 8
 
 
 class ChunkList:
@@ -44,12 +48,16 @@ class ChunkList:
         self._ends = array("Q")  # for each chunk, the end of its channels in the following two
         self._channels = array("H")
         self._indexes = array("Q")  # offsets of message indexes
+        #: Entries of large chunks that were asked for last: each of their channels asks again.
+        self._kept: dict[int, ChunkIndexRecord] = {}
+        self._by_channel: tuple[Ints, Ints] | None = None
         for chunk in chunks:
             self.append(chunk)
 
     def append(self, chunk: ChunkIndexRecord) -> None:
         """Add an entry."""
         first, last, offset, length, indexes, index_length, compression, stored, opened = chunk
+        self._by_channel = None
         if compression not in self._names:
             self._names.append(compression)
         self._compression.append(self._names.index(compression))
@@ -76,6 +84,15 @@ class ChunkList:
 
     def _entry(self, row: int) -> ChunkIndexRecord:
         low, high = self._ends[row - 1] if row else 0, self._ends[row]
+        if high - low < _MANY_CHANNELS:
+            return self._made(row, low, high)
+        if row not in self._kept:
+            if len(self._kept) == _MOST_KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[row] = self._made(row, low, high)
+        return self._kept[row]
+
+    def _made(self, row: int, low: int, high: int) -> ChunkIndexRecord:
         first, last, offset, length, index_length, stored, opened = self._numbers[row * _WIDTH : (row + 1) * _WIDTH]
         indexes = dict(zip(self._channels[low:high], self._indexes[low:high], strict=True))
         compression = self._names[self._compression[row]]
@@ -102,9 +119,29 @@ class ChunkList:
 
     def rows_with(self, channels: Collection[int]) -> Ints:
         """The numbers of entries of chunks with messages of any of these channels, ascending."""
-        listed = np.flatnonzero(np.isin(np.frombuffer(self._channels, np.uint16), np.fromiter(channels, np.int64)))
-        rows = np.searchsorted(np.frombuffer(self._ends, np.uint64).astype(np.int64), listed, "right")
-        return np.unique(rows)
+        order, rows = self._rows_by_channel()
+        wanted = np.unique(np.fromiter(channels, np.int64))
+        low, high = order.searchsorted(wanted, "left"), order.searchsorted(wanted, "right")
+        return np.unique(rows[ragged_range(low, high - low)])
+
+    def first_rows(self, channels: Collection[int]) -> dict[int, list[int]]:
+        """The channels of these that have messages, by the number of the first entry of a chunk that holds them."""
+        order, rows = self._rows_by_channel()
+        out: dict[int, list[int]] = {}
+        for channel in channels:
+            at = int(order.searchsorted(channel))
+            if at < len(order) and order[at] == channel:
+                out.setdefault(int(rows[at]), []).append(channel)
+        return out
+
+    def _rows_by_channel(self) -> tuple[Ints, Ints]:
+        """All channels of all entries, ascending, and the number of the entry of each, ascending within a channel."""
+        if self._by_channel is None:
+            listed = np.array(self._channels, np.int64)
+            order = np.argsort(listed, kind="stable")
+            ends = np.array(self._ends, np.int64)
+            self._by_channel = listed[order], np.searchsorted(ends, order, "right")
+        return self._by_channel
 
     def with_channels(self, channels: Collection[int]) -> Iterator[ChunkIndexRecord]:
         """The entries of chunks with messages of any of these channels."""

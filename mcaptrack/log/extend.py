@@ -9,9 +9,10 @@ permissions or extended attributes. A log without a usable summary, or with mess
 from __future__ import annotations
 
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import IO
@@ -30,6 +31,7 @@ from mcaptrack.log.records import (
     BLOCK,
     MAGIC,
     Bytes,
+    ChannelRecord,
     ChunkIndexRecord,
     Damaged,
     Opcode,
@@ -178,7 +180,7 @@ class _Rewrite:
         places += [chunk.offset for chunk in islice(index.chunks.with_channels(dropped), 1)]  # the first in the file
         places += [listed.offset for listed in index.metadata if listed.name in metadata]
         places += [listed.offset for listed in index.attachments if listed.name in attachments]
-        undescribed = {channel for channel in dropped if not change._first_chunk_describes(channel)}
+        undescribed = dropped - change._described_by_first_chunk()
         if undescribed:
             for record in walk(log.snapshot.source.sequential(), len(MAGIC), index.data_end):
                 if record.opcode == Opcode.CHANNEL:
@@ -189,11 +191,20 @@ class _Rewrite:
         change.cut = len(MAGIC) if undescribed else min(places)
         return change
 
-    def _first_chunk_describes(self, channel_id: int) -> bool:
-        """Whether the first chunk with messages of a channel describes it: then no record outside of chunks does."""
-        for chunk in self.index.chunks.with_channels([channel_id]):
-            return channel_id in _described_in(open_chunk(self.source, chunk_record(self.source, chunk)))[0]
-        return False
+    def _described_by_first_chunk(self) -> set[int]:
+        """The dropped channels that their first chunk with messages describes: no record outside of chunks does."""
+        out: set[int] = set()
+        for row, channels in self.index.chunks.first_rows(self.dropped).items():
+            chunk = self.index.chunks[row]
+            out |= _described_in(open_chunk(self.source, chunk_record(self.source, chunk)))[0].intersection(channels)
+        return out
+
+    @cached_property
+    def dropped_schemas(self) -> set[int]:
+        """The schemas of dropped channels that no kept channel has."""
+        channels = self.index.channels.values()
+        kept = {channel.schema_id for channel in channels if channel.id not in self.dropped}
+        return {channel.schema_id for channel in channels if channel.id in self.dropped} - kept
 
     def is_better_in_place(self, path: Path) -> bool:
         """Whether writing the tail twice (to the journal and in place) is less work than writing everything once, or
@@ -215,9 +226,7 @@ class _Rewrite:
         """The index of the kept records before the cut."""
         index = self.index
         channels = {number: channel for number, channel in index.channels.items() if number not in self.dropped}
-        only_dropped = {index.channels[number].schema_id for number in self.dropped}
-        only_dropped -= {channel.schema_id for channel in channels.values()}
-        schemas = {number: schema for number, schema in index.schemas.items() if number not in only_dropped}
+        schemas = {number: schema for number, schema in index.schemas.items() if number not in self.dropped_schemas}
         if self.cut <= len(MAGIC):
             return Index(schemas=schemas, channels=channels)
         counts = dict(index.counts)
@@ -244,14 +253,13 @@ class _Rewrite:
             raise error.moved(base) from None
 
     def _copy_kept(self, writer: LogWriter, buffer: Bytes, base: int) -> None:
-        described = writer.chunks.channels
-        undescribed_channels: dict[int, None] = {}  # kept channels that a dropped chunk described
+        lost = _Descriptions(writer.chunks.channels)
         for record in walk(buffer, self.cut - base, len(buffer)):
             if record.opcode == Opcode.CHUNK:
                 known = self.index.chunks.at(base + record.start)
                 if known is None:
                     raise Damaged("a chunk is missing in the index", record.start)
-                self._copy_kept_chunk(writer, buffer, base, record, known, undescribed_channels, described)
+                self._copy_kept_chunk(writer, buffer, base, record, known, lost)
             elif record.opcode == Opcode.MESSAGE:
                 channel, _, t_ns, _ = message_head(buffer, record)
                 if channel not in self.dropped:
@@ -264,14 +272,12 @@ class _Rewrite:
                     writer.copy_metadata(whole)
                 else:
                     writer.write(whole)
-        for channel in undescribed_channels:
+        for channel in lost.of(writer.channels.values()):
             writer.write_description(channel)
 
     def _is_kept(self, buffer: Bytes, record: Record) -> bool:
         if record.opcode == Opcode.SCHEMA:
-            schema = records.read_schema(buffer, record).id
-            users = {channel.id for channel in self.index.channels.values() if channel.schema_id == schema}
-            return not users or not users <= self.dropped
+            return records.read_schema(buffer, record).id not in self.dropped_schemas
         if record.opcode == Opcode.CHANNEL:
             return records.read_channel(buffer, record).id not in self.dropped
         if record.opcode == Opcode.ATTACHMENT:
@@ -287,28 +293,27 @@ class _Rewrite:
         base: int,
         record: Record,
         known: ChunkIndexRecord,
-        undescribed_channels: dict[int, None],
-        described: set[int],
+        lost: _Descriptions,
     ) -> None:
         holds = set(known.message_index_offsets)
         content = None
-        if self.open_all or not holds.isdisjoint(self.dropped) or not holds.isdisjoint(undescribed_channels):
+        undescribed = lost.of(writer.channels[channel] for channel in sorted(holds) if channel in writer.channels)
+        if self.open_all or not holds.isdisjoint(self.dropped) or undescribed:
             content = open_chunk(buffer, record)
             channels, schemas = _described_in(content)
             if holds and holds <= self.dropped:
-                about = {c.id for c in writer.channels.values() if c.id in channels or c.schema_id in schemas}
-                undescribed_channels |= dict.fromkeys(about - described)
+                lost.channels |= channels
+                lost.schemas |= schemas
                 return
             if not self.dropped.isdisjoint(holds | channels):
                 kind = "rows" if known.compression else "media"
                 writer.write_kept_records(kind, self._kept_records(content))  # type: ignore[arg-type]
                 return
-            for channel in sorted(holds & undescribed_channels.keys()):
-                if channel not in channels or writer.channels[channel].schema_id not in {0, *schemas}:
+            schemas.add(0)  # none
+            for channel in undescribed:
+                if channel not in channels or writer.channels[channel].schema_id not in schemas:
                     writer.write_description(channel)
-        for channel in holds:
-            undescribed_channels.pop(channel, None)
-        described |= holds
+        lost.described |= holds
         indexes: dict[int, bytes] = {}
         if self.index.regular:
             for offset in known.message_index_offsets.values():
@@ -333,6 +338,23 @@ class _Rewrite:
                     yield channel, t_ns, whole
             elif self._is_kept(content, inner):
                 yield -1, 0, whole
+
+
+@dataclass
+class _Descriptions:
+    """Channels that kept chunks hold and so ``described``; and what chunks described that were dropped."""
+
+    described: set[int]
+    channels: set[int] = field(default_factory=set)
+    schemas: set[int] = field(default_factory=set)
+
+    def of(self, channels: Iterable[ChannelRecord]) -> list[int]:
+        """Those of some kept channels whose description was dropped, and that no kept chunk holds so far."""
+        return [
+            one.id
+            for one in channels
+            if (one.id in self.channels or one.schema_id in self.schemas) and one.id not in self.described
+        ]
 
 
 def _described_in(content: Bytes) -> tuple[set[int], set[int]]:

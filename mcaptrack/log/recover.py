@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import re
 from bisect import bisect_right
-from collections import Counter
-from collections.abc import Callable, Mapping
+from collections import ChainMap, Counter
+from collections.abc import Callable, Mapping, MutableMapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -297,7 +297,8 @@ class _Recovery:
         key = (head.end - record.start, crc_of(self._buffer, record.body, head.end))
         if key in self._seen_chunks:
             raise Damaged("an exact copy of an earlier chunk")
-        schemas, channels = dict(self._schemas), dict(self._channels)
+        schemas: ChainMap[int, SchemaRecord] = ChainMap({}, self._schemas)
+        channels: ChainMap[int, ChannelRecord] = ChainMap({}, self._channels)
         described = set()
         for inner in walk(content, 0, len(content)):
             if inner.opcode == Opcode.SCHEMA:
@@ -308,9 +309,10 @@ class _Recovery:
                 described.add(channel.id)
         entries = scan_entries(content)
         for number in entries.keys() | described:
-            if number not in channels or channels[number].schema_id not in {0, *schemas}:
+            if number not in channels or not _has_schema(channels[number], schemas):
                 raise Damaged(f"messages of channel {number}, which has no intact channel record")
-        self._schemas, self._channels = schemas, channels
+        self._schemas |= schemas.maps[0]
+        self._channels |= channels.maps[0]
         self._seen_chunks.add(key)
         if not entries:
             for number in described:
@@ -349,7 +351,7 @@ class _Recovery:
     def _add_channel(self, number: int) -> ChannelRecord:
         """Add a channel to the new log; the chunks that are copied describe it."""
         channel = self._channels.get(number)
-        if channel is None or channel.schema_id not in {0, *self._schemas}:
+        if channel is None or not _has_schema(channel, self._schemas):
             raise Damaged(f"a message of channel {number}, which has no intact channel record")
         if channel.schema_id:
             self._writer.schemas[channel.schema_id] = self._schemas[channel.schema_id]
@@ -392,7 +394,11 @@ class _Recovery:
 _ANY: Final = re.compile(_CHUNK.pattern + b"|" + _MESSAGE.pattern, re.DOTALL)
 
 
-def _register(known: dict[int, Described], record: Described) -> None:
+def _has_schema(channel: ChannelRecord, schemas: Mapping[int, SchemaRecord]) -> bool:
+    return not channel.schema_id or channel.schema_id in schemas
+
+
+def _register(known: MutableMapping[int, Described], record: Described) -> None:
     """Register a schema or channel. Raises Damaged if its id belongs to a different one."""
     if known.setdefault(record.id, record) != record:
         raise Damaged(f"schema or channel {record.id} differs from another record with the same id")

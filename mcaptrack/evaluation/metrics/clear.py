@@ -146,7 +146,13 @@ class _LastTracks:
         else:
             start = low + int(np.searchsorted(easy.frame[low:high], before))
             last[easy.person[start:high]] = easy.track[start:high]
-        people, tracks, similarity = matchup.ground_truth[number], matchup.tracks[number], matchup.similarity[number]
+        people, tracks = matchup.ground_truth[number], matchup.tracks[number]
+        if matchup.tables.is_large(number):
+            rows, columns, similarity = matchup.tables.pairs_of(number)
+            score = similarity + 1000.0 * (tracks[columns] == last[people[rows]])
+            score[similarity < matchup.threshold - _EPS] = 0
+            return self._decided(number, *matchup.tables.best(number, score))
+        similarity = matchup.tables[number]
         score = similarity + 1000.0 * (tracks[None, :] == last[people][:, None])
         score[similarity < matchup.threshold - _EPS] = 0
         rows, columns = solve(-score)
@@ -158,7 +164,10 @@ class _LastTracks:
         matchup = self._matchup
         self._last[self._persons] = self._tracks
         self._last[easy.person[low:high]] = easy.track[low:high]  # the last one of several counts
-        people, tracks, similarity = matchup.ground_truth[number], matchup.tracks[number], matchup.similarity[number]
+        people, tracks = matchup.ground_truth[number], matchup.tracks[number]
+        if matchup.tables.is_large(number):
+            return self._decided(number, *self._largest_motmetrics(number, people, tracks))
+        similarity = matchup.tables[number]
         ok = similarity >= matchup.threshold
         kept_rows, kept_columns = np.nonzero(ok & (tracks[None, :] == self._last[people][:, None]))
         # Two people may have had the same track last; the first in order keeps it.
@@ -169,3 +178,15 @@ class _LastTracks:
         cost[:, kept_columns] = np.inf
         rows, columns = assign(cost, np.finfo(float).max)
         return self._decided(number, np.concatenate([kept_rows, rows]), np.concatenate([kept_columns, columns]))
+
+    def _largest_motmetrics(self, number: int, people: Indices, tracks: Indices) -> tuple[Indices, Indices]:
+        """The same for a frame whose table is not made."""
+        tables = self._matchup.tables
+        rows, columns, similarity = tables.pairs_of(number)
+        ok = similarity >= self._matchup.threshold
+        kept = np.flatnonzero(ok & (tracks[columns] == self._last[people[rows]]))
+        kept = kept[np.unique(columns[kept], return_index=True)[1]]
+        ok &= ~np.isin(rows, rows[kept]) & ~np.isin(columns, columns[kept])
+        # One more pair gains more than all similarities together.
+        more_rows, more_columns = tables.best(number, np.where(ok, len(people) + 1.0 + similarity, 0.0))
+        return np.concatenate([rows[kept], more_rows]), np.concatenate([columns[kept], more_columns])

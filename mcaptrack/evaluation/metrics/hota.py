@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from mcaptrack.evaluation.metrics.matchup import Matchup, SparseTables
 from mcaptrack.geometry.arrays import Indices
-from mcaptrack.geometry.assignment import solve
 
 ALPHAS: Final = np.arange(0.05, 0.99, 0.05)
 _EPS: Final = float(np.finfo(float).eps)
@@ -60,7 +59,7 @@ def hota(matchup: Matchup) -> dict[str, NDArray[np.float64]]:
     gains = SparseTables(pairs.frame, pairs.row, pairs.column, gain, *ends)
 
     def solve_frame(number: int, *_: object) -> tuple[Indices, Indices]:
-        return solve(-gains[number])
+        return gains.best(number)
 
     found = matchup.assigned(pairs, solve_frame)
     # The number of thresholds that each match passes; from that, the matches that pass each threshold.

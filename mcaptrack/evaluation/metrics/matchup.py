@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Floats, Indices
+from mcaptrack.geometry.assignment import LARGE_TABLE, assign_pairs_by_gain, solve
 from mcaptrack.geometry.ragged import cross_pairs
 
 
@@ -95,6 +96,42 @@ class SparseTables(Sequence[Floats]):
             self._table[self.row[here] - top, self.column[here] - left] = self.similarity[here]
             self._last = number
         return self._table
+
+    def is_large(self, number: int) -> bool:
+        """Whether the table of a frame is better not made."""
+        (top, bottom), (left, right) = self._row_ends[number : number + 2], self._column_ends[number : number + 2]
+        return bool((bottom - top) * (right - left) > LARGE_TABLE)
+
+    def pairs_of(self, number: int) -> tuple[Indices, Indices, Floats]:
+        """The rows, columns and similarities above 0 of the table of a frame."""
+        here = slice(*self._ends[number : number + 2])
+        return (
+            self.row[here] - self._row_ends[number],
+            self.column[here] - self._column_ends[number],
+            self.similarity[here],
+        )
+
+    def best(self, number: int, gain: Floats | None = None) -> tuple[Indices, Indices]:
+        """The assignment of rows and columns of a frame with the largest total similarity, or ``gain`` of its pairs.
+
+        Of a small table, pairs without a similarity may be among them.
+        """
+        if gain is None and not self.is_large(number):
+            return solve(-self[number])
+        rows, columns, similarity = self.pairs_of(number)
+        gain = similarity if gain is None else gain
+        shape = tuple(int(ends[number + 1] - ends[number]) for ends in (self._row_ends, self._column_ends))
+        return assign_pairs_by_gain((rows[gain > 0], columns[gain > 0]), gain[gain > 0], (shape[0], shape[1]))[0]
+
+    def at(self, number: int, rows: Indices, columns: Indices) -> Floats:
+        """The similarities of some pairs of a frame."""
+        if not self.is_large(number):
+            return self[number][rows, columns]
+        width = int(self._column_ends[number + 1] - self._column_ends[number])
+        known_rows, known_columns, similarity = self.pairs_of(number)
+        known, wanted = known_rows * width + known_columns, rows * width + columns
+        at = np.minimum(known.searchsorted(wanted), max(len(known) - 1, 0))
+        return np.where(known[at] == wanted, similarity[at], 0.0) if len(known) else np.zeros(len(rows))
 
     def of_columns(self, kept: NDArray[np.bool_]) -> SparseTables:
         """The tables with some of the columns of all frames (C,)."""
@@ -178,17 +215,22 @@ class Matchup:
         return np.array([len(ids) for ids in self.tracks], np.intp)
 
     @cached_property
+    def tables(self) -> SparseTables:
+        """The similarities above 0 of all frames."""
+        if isinstance(self.similarity, SparseTables):
+            return self.similarity
+        of_all = np.concatenate([np.empty(0), *(part.ravel() for part in self.similarity)])
+        at = of_all.nonzero()[0]
+        frame, row, column = (part[at] for part in cross_pairs(self.ground_truth_counts, self.track_counts))
+        people, tracks = (np.append(0, np.cumsum(counts)) for counts in (self.ground_truth_counts, self.track_counts))
+        return SparseTables(frame, row, column, of_all[at], people, tracks)
+
+    @cached_property
     def pairs(self) -> RowPairs:
         """The pairs with a similarity above 0."""
-        if isinstance(self.similarity, SparseTables):
-            given = self.similarity
-            frame, row, column, similarity = given.frame, given.row, given.column, given.similarity
-        else:
-            of_all = np.concatenate([np.empty(0), *(part.ravel() for part in self.similarity)])
-            at = of_all.nonzero()[0]
-            frame, row, column = (part[at] for part in cross_pairs(self.ground_truth_counts, self.track_counts))
-            similarity = of_all[at]
-        return RowPairs(frame, row, column, self.all_ground_truth[row], self.all_tracks[column], similarity)
+        tables = self.tables
+        people, tracks = self.all_ground_truth[tables.row], self.all_tracks[tables.column]
+        return RowPairs(tables.frame, tables.row, tables.column, people, tracks, tables.similarity)
 
     def assigned(self, candidates: RowPairs, solve_frame: SolveFrame) -> RowPairs:
         """Assign rows to columns in each frame, among the candidates; pairs come in no particular order.
@@ -205,7 +247,7 @@ class Matchup:
         low = 0
         for number, high in zip(numbers.tolist(), ends.tolist(), strict=True):
             rows, columns = solve_frame(number, easy, low, high)
-            found.append((rows, columns, self.similarity[number][rows, columns]))
+            found.append((rows, columns, self.tables.at(number, rows, columns)))
             low = high
         if not found:
             return easy

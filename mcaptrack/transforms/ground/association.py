@@ -14,9 +14,23 @@ import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Indices
 from mcaptrack.geometry.assignment import max_weight_matching
+from mcaptrack.geometry.neighbours import Pairing
 from mcaptrack.geometry.oriented_boxes import bev_iou_of_pairs
 from mcaptrack.transforms.ground.covariances import Covariances
-from mcaptrack.transforms.ground.state import BOX, CLASS, GATE_M, HITS, MISSED_S, NOISE, SCORE, X, Y, measured, variance
+from mcaptrack.transforms.ground.state import (
+    BOX,
+    CLASS,
+    GATE_M,
+    HITS,
+    MISSED_S,
+    NOISE,
+    SCORE,
+    X,
+    Y,
+    measured,
+    own_covariances,
+    variance,
+)
 
 Cost = Literal["metres", "iou"]
 
@@ -48,9 +62,10 @@ def associate(
     if not table.shape[1] or not found.shape[1]:
         nothing = np.empty(0, np.intp)
         return nothing, nothing, np.empty(0, bool)
-    apart = _Apart(table, found, covariances)
     reach = table[GATE_M] * (1 + table[MISSED_S])
-    same = table[CLASS, :, None] == found[CLASS]
+    pairs = Pairing(table[[X, Y]], found[[X, Y]], reach)
+    apart = _Apart(table, found, covariances, pairs)
+    same = pairs.of_first(table[CLASS]) == pairs.of_second(found[CLASS])
     near = apart.within(_GATE, reach)
     if across_classes:
         same = np.ones_like(same)
@@ -60,9 +75,9 @@ def associate(
         return track, row, is_same
     lost, free = table[HITS] >= _OTHER_HITS, np.ones(found.shape[1], bool)
     lost[track], free[row] = False, False
-    if not lost.any() or same.all():
+    if not lost.any() or len({*table[CLASS].tolist(), *found[CLASS].tolist()}) == 1:
         return track, row, is_same
-    other = near & lost[:, None] & free
+    other = near & pairs.of_first(lost) & pairs.of_second(free)
     if not other.any():
         return track, row, is_same
     nearer = apart.within(_OTHER_GATE, np.maximum(_OTHER_SHARE * reach, 3 * table[NOISE]))
@@ -72,17 +87,19 @@ def associate(
 
 
 class _Apart:
-    """Distances of detections (rows, N) from the predicted positions of tracks (rows, K)."""
+    """Distances of detections (rows, N) from the predicted positions of tracks (rows, K), for each of their pairs."""
 
-    def __init__(self, table: Floats, found: Floats, covariances: Covariances | None) -> None:
-        x, y = found[X] - table[X, :, None], found[Y] - table[Y, :, None]
+    def __init__(self, table: Floats, found: Floats, covariances: Covariances | None, pairs: Pairing) -> None:
+        self.pairs = pairs
+        x = pairs.of_second(found[X]) - pairs.of_first(table[X])
+        y = pairs.of_second(found[Y]) - pairs.of_first(table[Y])
         self._squared = x * x + y * y
         self._spread = variance(table)
         self._deviations: Floats | None = None
         if covariances is not None:
-            count = found.shape[1]
-            noise = np.stack([measured(np.full(count, one), found) for one in table[NOISE].tolist()])
-            xx, xy, yy = covariances.places()[:, :, None] + np.moveaxis(noise, 2, 0)
+            place = pairs.of_first(covariances.places())
+            noise = pairs.of_first(measured(table[NOISE], found[:0]).T) + pairs.of_second(own_covariances(found).T)
+            xx, xy, yy = place + noise
             #: Twice the log-odds that detections are true; their scores are probabilities.
             share = np.clip(np.where(np.isnan(found[SCORE]), 0.5, found[SCORE]), _LEAST_SCORE, 1 - _LEAST_SCORE)
             self._odds = 2 * np.log(share / (1 - share))
@@ -90,27 +107,27 @@ class _Apart:
             self._deviations = (yy * x * x - 2 * xy * x * y + xx * y * y) / self._area
 
     def within(self, gate: float, reach_m: Floats) -> Bools:
-        """Whether pairs (K, N) are within ``gate`` squared standard deviations, and ``reach_m`` of their track (K,)."""
+        """Whether pairs are within ``gate`` squared standard deviations, and ``reach_m`` of their track (K,)."""
         if self._deviations is None:
-            return np.asarray(self._squared <= np.minimum(gate * self._spread, reach_m * reach_m)[:, None])
-        return np.asarray((self._deviations <= gate) & (self._squared <= (reach_m * reach_m)[:, None]))
+            return np.asarray(self._squared <= self.pairs.of_first(np.minimum(gate * self._spread, reach_m * reach_m)))
+        return np.asarray((self._deviations <= gate) & (self._squared <= self.pairs.of_first(reach_m * reach_m)))
 
-    def gain(self, track: Indices, row: Indices) -> Floats:
-        """The gain of pairs (P,): twice the logarithm of their likelihood, but for a constant.
+    def gain(self, which: Bools, track: Indices, row: Indices) -> Floats:
+        """The gain of the chosen pairs (P,): twice the logarithm of their likelihood, but for a constant.
 
         Where detections have covariances it is twice that of a ratio: to the detection being false.
         """
         if self._deviations is None:
             s = self._spread[track]
-            return np.asarray(_GAIN - self._squared[track, row] / s - 2 * np.log(s))
-        return np.asarray(_GAIN - self._deviations[track, row] - np.log(self._area[track, row]) + self._odds[row])
+            return np.asarray(_GAIN - self._squared[which] / s - 2 * np.log(s))
+        return np.asarray(_GAIN - self._deviations[which] - np.log(self._area[which]) + self._odds[row])
 
 
 def _assigned(
     table: Floats, found: Floats, apart: _Apart, allowed: Bools, cost: Cost, min_iou: float
 ) -> tuple[Indices, Indices]:
-    """The best assignment of the allowed pairs (K, N)."""
-    track, row = allowed.nonzero()
+    """The best assignment of the allowed pairs."""
+    track, row = apart.pairs.chosen(allowed)
     if not len(track):
         return track, row
     if cost == "iou":
@@ -118,8 +135,8 @@ def _assigned(
         good = gain >= max(min_iou, 1e-6)
         track, row, gain = track[good], row[good], gain[good]
     else:
-        gain = apart.gain(track, row)
+        gain = apart.gain(allowed, track, row)
     if not len(track):
         return track, row
-    (track, row), _ = max_weight_matching((track, row), np.round(gain, 6), allowed.shape)
+    (track, row), _ = max_weight_matching((track, row), np.round(gain, 6), apart.pairs.shape)
     return track, row

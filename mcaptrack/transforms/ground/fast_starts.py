@@ -16,6 +16,7 @@ import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Indices
 from mcaptrack.geometry.assignment import max_weight_matching
+from mcaptrack.geometry.neighbours import Pairing
 from mcaptrack.transforms.ground.state import (
     CLASS,
     FIRST,
@@ -56,30 +57,36 @@ def fast_starts(
         return nothing, nothing
     first, left = is_free.nonzero()[0], is_left.nonzero()[0]
     old, new = table[:, first], found[:, left]
-    x, y = new[X] - old[FIRST][0][:, None], new[Y] - old[FIRST][1][:, None]
-    far, noise = np.hypot(x, y), _NOISE * old[NOISE][:, None]
-    can_be = far <= (old[MAX_SPEED] * old[MISSED_S])[:, None] + noise
+    reach = old[MAX_SPEED] * old[MISSED_S] + _NOISE * old[NOISE]
+    pairs = Pairing(old[FIRST], new[[X, Y]], reach)
+    x = pairs.of_second(new[X]) - pairs.of_first(old[FIRST][0])
+    y = pairs.of_second(new[Y]) - pairs.of_first(old[FIRST][1])
+    far, noise = np.hypot(x, y), _NOISE * pairs.of_first(old[NOISE])
+    can_be = far <= pairs.of_first(old[MAX_SPEED] * old[MISSED_S]) + noise
     if not across_classes:
-        can_be &= old[CLASS][:, None] == new[CLASS]
+        can_be &= pairs.of_first(old[CLASS]) == pairs.of_second(new[CLASS])
     if not can_be.any():
         return nothing, nothing
-    heading = old[HEADING][:, None]
+    heading, other_heading = pairs.of_first(old[HEADING]), pairs.of_second(new[HEADING])
     along, across = x * np.cos(heading) + y * np.sin(heading), np.abs(y * np.cos(heading) - x * np.sin(heading))
     cost = np.where(along < 0, _BACKWARDS * far, far)
-    has_heading = np.isfinite(heading) & np.isfinite(new[HEADING]) & (old[TURNS] == 1)[:, None]
+    has_heading = np.isfinite(heading) & np.isfinite(other_heading) & pairs.of_first(old[TURNS] == 1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        turned = np.abs(np.sin(heading - new[HEADING]))
-        longer = np.abs(np.log(old[LENGTH][:, None] / new[LENGTH]))
+        turned = np.abs(np.sin(heading - other_heading))
+        longer = np.abs(np.log(pairs.of_first(old[LENGTH]) / pairs.of_second(new[LENGTH])))
         is_along = (across <= noise + _ACROSS * far) & (turned <= np.sin(_TURNED_RAD)) & ~(longer > np.log(_LENGTHS))
-    can_be &= np.where(has_heading, is_along, _is_only(can_be))
-    i, j = can_be.nonzero()
+    can_be &= np.where(has_heading, is_along, _is_only(can_be, pairs))
+    i, j = pairs.chosen(can_be)
     if not len(i):
         return nothing, nothing
-    gain = cost[i, j].max() + 1 - cost[i, j]
-    (i, j), _ = max_weight_matching((i, j), np.round(gain, 6), can_be.shape)
+    gain = cost[can_be].max() + 1 - cost[can_be]
+    (i, j), _ = max_weight_matching((i, j), np.round(gain, 6), pairs.shape)
     return first[i], left[j]
 
 
-def _is_only(can_be: Bools) -> Bools:
-    """Pairs (K, N) of a track and a detection that have no other."""
-    return np.asarray(can_be & (can_be.sum(axis=0) == 1) & (can_be.sum(axis=1) == 1)[:, None])
+def _is_only(can_be: Bools, pairs: Pairing) -> Bools:
+    """Pairs of a track and a detection that have no other."""
+    track, row = pairs.chosen(can_be)
+    out = can_be.copy()
+    out[can_be] = (np.bincount(track)[track] == 1) & (np.bincount(row)[row] == 1)
+    return out

@@ -15,6 +15,7 @@ import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Indices
 from mcaptrack.geometry.assignment import max_weight_matching
+from mcaptrack.geometry.neighbours import Pairing
 from mcaptrack.transforms.ground.state import (
     AGE_S,
     CLASS,
@@ -68,23 +69,27 @@ def continuations(lost: Floats, new: Floats) -> tuple[Indices, Indices]:
     if not lost.shape[1] or not new.shape[1]:
         nothing = np.empty(0, np.intp)
         return nothing, nothing
-    gap = lost[MISSED_S, :, None] - new[AGE_S]
+    # Farther than twice the way of a second, from where a track was or would be, none of the two densities below is
+    # above that of new objects, however long the gap is.
+    longest = np.maximum(lost[MISSED_S] - new[AGE_S].min(), 1e-3)
+    pairs = Pairing(lost[LAST][:2], new[FIRST], 2 * lost[SPEED] + np.hypot(*lost[LAST_VELOCITY]) * longest)
+    gap = pairs.of_first(lost[MISSED_S]) - pairs.of_second(new[AGE_S])
     seconds = np.maximum(gap, 1e-3)
-    way = new[FIRST][:, None] - lost[LAST][:2, :, None]
-    velocity, usual = lost[LAST_VELOCITY][:, :, None], lost[SPEED, :, None]
+    way = pairs.of_second(new[FIRST]) - pairs.of_first(lost[LAST][:2])
+    velocity, usual = pairs.of_first(lost[LAST_VELOCITY]), pairs.of_first(lost[SPEED])
     speed = np.hypot(*velocity)
-    noise = 2 * lost[NOISE, :, None] ** 2
+    noise = 2 * pairs.of_first(lost[NOISE]) ** 2
     drift = _DRIFT_AT_REST * usual + _DRIFT_WITH_SPEED * speed
-    goes = noise + lost[LAST_SPREAD, :, None] * seconds**2 + drift**2 * seconds**3 / 3
+    goes = noise + pairs.of_first(lost[LAST_SPREAD]) * seconds**2 + drift**2 * seconds**3 / 3
     stays = noise + _CREEP_M**2 * seconds
     off = way - velocity * seconds
     share = np.where(speed < _REST * usual, _STAYS, 0.0)
     density = (1 - share) * np.exp(-(off * off).sum(0) / goes / 2) / goes
     density += share * np.exp(-(way * way).sum(0) / stays / 2) / stays
     gain = np.log(np.maximum(density / (2 * np.pi) * usual**2 / _NEW, 1e-12))
-    fits = (gain > 0) & (gap > 0) & (lost[CLASS, :, None] == new[CLASS])
-    i, j = fits.nonzero()
+    fits = (gain > 0) & (gap > 0) & (pairs.of_first(lost[CLASS]) == pairs.of_second(new[CLASS]))
+    i, j = pairs.chosen(fits)
     if not len(i):
         return i, j
-    (i, j), _ = max_weight_matching((i, j), np.round(gain[i, j], 6), gain.shape)
+    (i, j), _ = max_weight_matching((i, j), np.round(gain[fits], 6), pairs.shape)
     return i, j

@@ -235,9 +235,13 @@ def measured(noise_m: Floats, found: Floats) -> Floats:
     Their own covariance says how well the cameras place them; people and boxes sway by the noise of their class, too.
     """
     out = np.stack([noise_m**2, np.zeros_like(noise_m), noise_m**2], axis=-1)
-    if found.shape[0] > DETECTION_ROWS:
-        out += np.nan_to_num(found[COVARIANCE].T)
-    return out
+    return out + own_covariances(found) if found.shape[0] > DETECTION_ROWS else out
+
+
+def own_covariances(found: Floats) -> Floats:
+    """The covariances (N, 3) that detections (rows, N) came with; 0 where they have none."""
+    has = found.shape[0] > DETECTION_ROWS
+    return np.asarray(np.nan_to_num(found[COVARIANCE].T) if has else np.zeros((found.shape[1], 3)))
 
 
 def variance(table: Floats) -> Floats:

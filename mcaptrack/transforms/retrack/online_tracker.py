@@ -17,7 +17,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.assignment import assign_by_gain
+from mcaptrack.geometry.assignment import LARGE_TABLE, assign_by_gain, assign_pairs_by_gain
+from mcaptrack.geometry.neighbours import Pairing, near_pairs
 from mcaptrack.transforms.retrack.motion_model import MotionModel, StateRows, update
 
 #: Limits of the estimated noise of measured positions, in metres.
@@ -112,7 +113,7 @@ class OnlineTracker:
             self.tracks, self.state = self.tracks[:, kept], self.state.take(kept)
         if self.tracks.shape[1]:
             self.model.predict(self.state, passed * self.step_s, self.state)
-        track, row = assign_by_gain(self._gain(xy_m, source))
+        track, row = self._assigned(xy_m, source)
         observed = xy_m[:, row]
         occluded, occluder = self._merged_detections(track, observed)
         if len(occluded):
@@ -149,9 +150,15 @@ class OnlineTracker:
         if len(confirmed) == 0:
             return _NOTHING
         seen, expected = observed[:, confirmed], self.state.mean[:2, lost]
-        squared = _squared(expected[:, :, None] - seen[:, None])
-        nearest = squared.argmin(axis=1)
-        is_merged = squared.min(axis=1) < self.association.merge_distance_m**2
+        if len(lost) * len(confirmed) > LARGE_TABLE:
+            from scipy.spatial import cKDTree
+
+            distance, nearest = cKDTree(seen.T).query(expected.T)
+            is_merged = distance < self.association.merge_distance_m
+        else:
+            squared = _squared(expected[:, :, None] - seen[:, None])
+            nearest = squared.argmin(axis=1)
+            is_merged = squared.min(axis=1) < self.association.merge_distance_m**2
         if not is_merged.any():
             return _NOTHING
         lost, expected, nearest = lost[is_merged], expected[:, is_merged], nearest[is_merged]
@@ -205,24 +212,27 @@ class OnlineTracker:
         if self.estimate_noise:
             self.noise_m = min(self.noise_m, most_noise_m)
 
-    def _gain(self, xy_m: Floats, source: Ints) -> Floats:
-        """The gain of matching each pair (K, N); negative beyond the gate."""
+    def _assigned(self, xy_m: Floats, source: Ints) -> tuple[Ints, Ints]:
+        """Tracks and observations that belong together, (P,) each."""
         association, tracks = self.association, self.tracks
         if tracks.shape[1] == 0 or len(source) == 0:
-            return np.empty((tracks.shape[1], len(source)))
+            return _NOTHING
         s = self.state.cov[0] + self.noise_m**2 + association.extra_noise_m**2
-        squared = _squared(xy_m[:, None] - self.state.mean[:2, :, None])
-        squared /= s[:, None]
+        pairs = Pairing(self.state.mean[:2], xy_m, np.sqrt(association.gate * s))
+        squared = _squared(pairs.of_second(xy_m) - pairs.of_first(self.state.mean[:2]))
+        squared /= pairs.of_first(s)
         gain = association.unmatched - squared
-        gain -= (2 * np.log(s))[:, None]
-        near = _squared(xy_m[:, :, None] - xy_m[:, None]) < association.crowd_m**2
-        bonus = np.where(near.sum(axis=0) > 1, association.same_id_crowded, association.same_id)
-        gain += (tracks[SOURCE][:, None] == source) * bonus
+        gain -= pairs.of_first(2 * np.log(s))
+        bonus = np.where(_is_crowded(xy_m, association.crowd_m), association.same_id_crowded, association.same_id)
+        gain += (pairs.of_first(tracks[SOURCE]) == pairs.of_second(source)) * pairs.of_second(bonus)
         names = source.tolist()
         if not self.known_sources.issuperset(names):
             is_new = np.array([one not in self.known_sources for one in names])
-            gain -= association.new_id * (is_new & (tracks[MISSED] == 1)[:, None])
-        return np.where(squared <= association.gate, np.round(gain, 6), -1.0)
+            gain -= association.new_id * (pairs.of_second(is_new) & pairs.of_first(tracks[MISSED] == 1))
+        gain = np.where(squared <= association.gate, np.round(gain, 6), -1.0)
+        if gain.ndim == 2:
+            return assign_by_gain(gain)
+        return assign_pairs_by_gain(pairs.chosen(gain > 0), gain[gain > 0], pairs.shape)[0]
 
     def _start(self, xy_m: Floats, source: Ints) -> None:
         """Birth: start a track for each observation (2, N) that was not matched."""
@@ -234,6 +244,16 @@ class OnlineTracker:
         self.tracks = np.concatenate([self.tracks, born], axis=1)
         new = self.model.initial(xy_m, self.noise_m)
         self.state = StateRows(*(np.concatenate(both, axis=1) for both in zip(self.state, new, strict=True)))
+
+
+def _is_crowded(xy_m: Floats, crowd_m: float) -> Bools:
+    """Whether others are nearer than ``crowd_m`` to each position (2, N)."""
+    count = xy_m.shape[1]
+    if count * count > LARGE_TABLE:
+        pairs = np.concatenate(near_pairs(np.zeros(count, np.int64), xy_m.T, crowd_m))
+        return np.bincount(pairs, minlength=count) > 0
+    near = _squared(xy_m[:, :, None] - xy_m[:, None]) < crowd_m**2
+    return np.asarray(near.sum(axis=0) > 1)
 
 
 def _squared(off: Floats) -> Floats:

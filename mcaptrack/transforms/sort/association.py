@@ -9,6 +9,7 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats, Indices
 from mcaptrack.geometry.assignment import max_weight_matching, one_to_one
 from mcaptrack.geometry.boxes import overlapping
+from mcaptrack.geometry.neighbours import Pairing
 from mcaptrack.geometry.plane import GroundPlane
 
 Cost = Literal["iou", "pixels", "metres"]
@@ -46,9 +47,10 @@ def distance_pairs(boxes: Floats, predicted: Floats, gate: float, plane: GroundP
     Similarity is 1 at distance 0 and falls to 0 at the gate; gating excludes pairs beyond it.
     """
     here, there = (_positions(corners, plane) for corners in (boxes, predicted))
-    distance = np.hypot(here[0][:, None] - there[0][None, :], here[1][:, None] - there[1][None, :])
-    detection, track = np.nonzero(distance < gate)  # NaN, above the horizon, is beyond every gate
-    return CandidatePairs(detection, track, 1 - distance[detection, track] / gate, (len(distance), distance.shape[1]))
+    pairs = Pairing(here, there, np.full(here.shape[1], gate))
+    distance = np.hypot(*(pairs.of_first(here) - pairs.of_second(there)))
+    is_near = distance < gate  # NaN, above the horizon, is beyond every gate
+    return CandidatePairs(*pairs.chosen(is_near), 1 - distance[is_near] / gate, pairs.shape)
 
 
 def _positions(corners: Floats, plane: GroundPlane | None) -> Floats:
