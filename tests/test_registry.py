@@ -450,7 +450,7 @@ def test_an_exit_without_a_word_is_an_error_that_names_the_package(installed):
 
 
 def test_an_import_that_takes_long_is_named_meanwhile(installed, monkeypatch):
-    monkeypatch.setattr(registry, "_LONG_S", 0.05)
+    monkeypatch.setattr(registry.guard, "_LONG_S", 0.05)
     code = "import time\nfrom mcaptrack.notices import warn\ntime.sleep(0.3)\nwarn('the import ends')\n"
     (installed / "own_trackers" / "__init__.py").write_text(code + PLUGIN.replace("from __future__", "#"))
     with notices.collected() as warnings, notices.listening(warnings.append):

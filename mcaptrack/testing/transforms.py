@@ -15,7 +15,9 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.notices import collected
 from mcaptrack.registry import Entry
+from mcaptrack.registry.guard import Guard
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SIGHTINGS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.testing.error import LawError
 from mcaptrack.transforms.guarded import guarded
@@ -29,7 +31,8 @@ def check_transform(transform: Transform, frames: Sequence[Frame] | None = None,
 
     The laws: it declares what the protocol asks for; every output has the rows of its schema, at times that increase;
     the same input gives the same output, also while it runs on another input, and is not changed; the output of the
-    past does not depend on the future, but for ``latency_s``; shuffling the rows of a frame changes ids at most; frames
+    past does not depend on the future, but for ``latency_s``; it leaves the process that it runs in as it was (the
+    working folder, random state and so on); shuffling the rows of a frame changes ids at most; frames
     without rows, and no frames at all, are valid input; the parameters can be kept in a log and give the same transform
     again.
 
@@ -216,7 +219,7 @@ def declares(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
 
 
 def conforms(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
-    """Every output has the rows of its schema, at times that increase; and a run on a log takes it."""
+    """Every output has the rows of its schema, at times that increase; a run on a log takes it, and is left as it was."""
     for number, result in enumerate(transform(frames)):
         if not isinstance(result, tuple) or len(result) != len(transform.writes):
             raise LawError(f"conforms: result {number} is no tuple of {len(transform.writes)} frames, one an output")
@@ -232,11 +235,17 @@ def conforms(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
     reads_and_writes = (transform.reads, transform.writes[""])
     kind = {(VIDEO, DETECTIONS): "detector", (DETECTIONS, TRACKS): "tracker"}.get(reads_and_writes, "transform")
     cls = type(transform)
+    entry = Entry(cls.__name__, kind, cls, cls.__module__, "", "")
+    guard = Guard(str(entry))
     try:
-        for _ in guarded(Entry(cls.__name__, kind, cls, cls.__module__, "", ""), transform, frames):
+        for _ in guarded(entry, transform, frames, guard):
             pass
+        with collected():
+            guard.end()
     except McaptrackError as error:
         raise LawError(f"conforms: {error}") from None
+    if guard.changed:
+        raise LawError(f"conforms: it changes {' and '.join(guard.changed)} of the process that it runs in")
 
 
 def repeats(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
