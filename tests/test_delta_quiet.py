@@ -11,6 +11,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Url
 from mcaptrack.tables.delta.opening import reporting
 from mcaptrack.tables.delta.quiet import without_panics
+from tests.awaiting import until
 
 #: As it was printed when a store refused a file of a table.
 PANIC = b"""
@@ -49,10 +50,7 @@ def test_a_panic_that_leads_to_no_error_is_said(capfd):
 def test_a_progress_bar_is_passed_on_before_its_line_ends(capfd):
     with without_panics():
         os.write(2, b"\rhalf")
-        for _ in range(500):
-            if said := printed(capfd):
-                break
-            threading.Event().wait(0.01)
+        said = until(lambda: printed(capfd))
     assert said == "\rhalf"
 
 

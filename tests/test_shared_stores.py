@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import time
 from collections import Counter
 from itertools import count
 from threading import Thread
@@ -19,6 +18,7 @@ from mcaptrack.fleet import object_claims
 from mcaptrack.fleet.claims import Claims, claim_name
 from mcaptrack.location import parse
 from tests import fleet_tasks
+from tests.awaiting import until
 from tests.commands import call, done
 from tests.tiers import one_in, thorough
 
@@ -64,15 +64,17 @@ class TestClaims:
         assert store.names() == []
 
     def test_a_fleet_that_shows_no_life_loses_its_claim(self, store, monkeypatch):
+        now = [0.0]
         monkeypatch.setattr(object_claims, "BEAT_S", 0.0)
-        one, other = claims_on("one"), claims_on("other", stale_s=0.05)
+        monkeypatch.setattr(object_claims, "monotonic", lambda: now[0])
+        one, other = claims_on("one"), claims_on("other", stale_s=60.0)
         one.take(LOG, NIGHT)
         assert not other.take(LOG, NIGHT).is_mine
         for _ in range(3):  # the time begins again with each sign of life
-            time.sleep(0.06)
+            now[0] += 61
             one.beat()
             assert not other.take(LOG, NIGHT).is_mine
-        time.sleep(0.06)
+        now[0] += 61
         taken = other.take(LOG, NIGHT)
         assert taken.is_mine
         assert taken.note.startswith(f"{LOG}: taken over from process ")
@@ -129,8 +131,7 @@ def test_two_fleets_over_one_bucket_do_no_log_twice(store):
     fleets = [Thread(target=work) for _ in range(2)]
     for each in fleets:
         each.start()
-    while sum(name.endswith(".claim") for name in store.names()) < 2:
-        time.sleep(0.02)
+    until(lambda: sum(name.endswith(".claim") for name in store.names()) >= 2)
     store.put("night/go", b"go")
     for each in fleets:
         each.join()

@@ -181,7 +181,9 @@ def _gone(opened: log.Log, jobs: Sequence[Job], made: Mapping[str, Made]) -> set
     gone: set[str] = set()
     for job in jobs:
         if job.kept() & {*made}:
-            empty = [topic for topic in job.kept() if topic in opened.channels]  # no rows, no tracks at the video's rate
+            empty = [
+                topic for topic in job.kept() if topic in opened.channels
+            ]  # no rows, no tracks at the video's rate
             gone.update(superseded(opened, job))
             gone.update(topic for topic in empty if may_replace(opened, topic, job.stage))
     gone -= {*made}

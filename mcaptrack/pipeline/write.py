@@ -35,7 +35,17 @@ from mcaptrack.pipeline.drawing import (
 from mcaptrack.pipeline.picture_times import picture_clock
 from mcaptrack.pipeline.plots import highest_values
 from mcaptrack.pipeline.scene_views import scene_on_pictures
-from mcaptrack.schema import DETECTIONS, EVENTS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
+from mcaptrack.schema import (
+    DETECTIONS,
+    EVENTS,
+    FORECAST_SCORES,
+    GROUND_PLANE,
+    PREDICTIONS,
+    SCHEMAS,
+    TRACKS,
+    Frame,
+    Schema,
+)
 from mcaptrack.schema.classes import class_names, classes_beside_rows, has_classes, only_class, without_class
 from mcaptrack.schema.encodings import PROTOBUF, Encoding, encoded, record_of
 from mcaptrack.schema.frame_columns import collect

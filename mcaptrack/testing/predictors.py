@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from mcaptrack.predictors import PeopleSeen, Predictor, predict_among
 from mcaptrack.notices import collected
+from mcaptrack.predictors import PeopleSeen, Predictor, predict_among
 from mcaptrack.predictors.onnx import are_covariances
 from mcaptrack.registry.guard import Guard
 from mcaptrack.testing.error import LawError

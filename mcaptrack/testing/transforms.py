@@ -61,8 +61,16 @@ def check_transform(transform: Transform, frames: Sequence[Frame] | None = None,
     given = list(sample)
     if not given:
         raise LawError("there are no frames to check the transform with")
-    for law in LAWS.values():
-        law(transform, [frame._replace(rows=frame.rows.copy()) for frame in given], seed)
+    guard = Guard(type(transform).__name__)
+    try:
+        with guard.step():
+            for law in LAWS.values():
+                law(transform, [frame._replace(rows=frame.rows.copy()) for frame in given], seed)
+    finally:
+        with collected():
+            guard.end()
+    if guard.changed:
+        raise LawError(f"process: it changes {' and '.join(guard.changed)} of the process that it runs in")
 
 
 def sample_frames(schema: Schema, seed: int = 0, step_s: float = 0.0, colour: Colour = "grey") -> list[Frame]:
@@ -219,7 +227,7 @@ def declares(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
 
 
 def conforms(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
-    """Every output has the rows of its schema, at times that increase; a run on a log takes it, and is left as it was."""
+    """Every output has the rows of its schema, at times that increase; and a run on a log takes it."""
     for number, result in enumerate(transform(frames)):
         if not isinstance(result, tuple) or len(result) != len(transform.writes):
             raise LawError(f"conforms: result {number} is no tuple of {len(transform.writes)} frames, one an output")
@@ -235,17 +243,11 @@ def conforms(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
     reads_and_writes = (transform.reads, transform.writes[""])
     kind = {(VIDEO, DETECTIONS): "detector", (DETECTIONS, TRACKS): "tracker"}.get(reads_and_writes, "transform")
     cls = type(transform)
-    entry = Entry(cls.__name__, kind, cls, cls.__module__, "", "")
-    guard = Guard(str(entry))
     try:
-        for _ in guarded(entry, transform, frames, guard):
+        for _ in guarded(Entry(cls.__name__, kind, cls, cls.__module__, "", ""), transform, frames):
             pass
-        with collected():
-            guard.end()
     except McaptrackError as error:
         raise LawError(f"conforms: {error}") from None
-    if guard.changed:
-        raise LawError(f"conforms: it changes {' and '.join(guard.changed)} of the process that it runs in")
 
 
 def repeats(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
