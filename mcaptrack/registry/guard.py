@@ -33,7 +33,7 @@ class _Facet(NamedTuple):
 
     name: str
     read: Callable[[], Any]
-    write: Callable[[Any], None]
+    write: Callable[[Any], object]
     key: Callable[[Any], Any] = lambda value: value
 
 
@@ -74,8 +74,8 @@ def _write_numpy_random(state: Any) -> None:
 
 
 def _is_broad(entry: Any) -> bool:
-    """Whether a filter concerns warnings of all texts and modules: others only silence what their package causes."""
-    return entry[1] is None and entry[3] is None
+    """Whether a filter concerns Python's own warnings, of all texts and modules: others only serve their package."""
+    return entry[1] is None and entry[3] is None and entry[2].__module__ == "builtins"
 
 
 def _write_filters(before: _Filters) -> None:
@@ -129,18 +129,18 @@ class Guard:
 
     Attributes
     ----------
-    what : str
+    name : str
         Its name in the warning, as in ``tracker nearest (my-package 1.0)``.
     changed : list of str
         What it has changed so far.
     """
 
-    def __init__(self, what: str) -> None:
-        self.what = what
+    def __init__(self, name: str) -> None:
+        self.name = name
         self.changed: list[str] = []
         self._ours: dict[_Facet, Any] = {}
         self._theirs: dict[_Facet, Any] = {}
-        self._said = 0
+        self._warned = 0
 
     @contextmanager
     def step(self) -> Iterator[None]:
@@ -195,9 +195,9 @@ class Guard:
     def end(self) -> None:
         """End the run, and warn of what was changed since the last warning."""
         self._end(_RANDOM if _RANDOM[0] in self._ours else ())
-        if names := self.changed[self._said :]:
-            self._said = len(self.changed)
-            warn(f"{self.what} changed {' and '.join(names)}; this was undone")
+        if names := self.changed[self._warned :]:
+            self._warned = len(self.changed)
+            warn(f"{self.name} changed {' and '.join(names)}; this was undone")
 
 
 @contextmanager
