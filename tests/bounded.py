@@ -63,7 +63,7 @@ def commands() -> Iterator[Commands]:
         yield Commands(process)
     finally:
         process.stdin.close()
-        process.wait(timeout=60)
+        process.wait(timeout=600)
         process.stdout.close()
 
 

@@ -27,6 +27,11 @@ class Seen:
     is_up_to_date: bool = False
 
 
+def _never() -> None:
+    while True:
+        time.sleep(600)
+
+
 def touch(log, *, output=None, add="", progress=None) -> Seen:
     """Do what the text of a file says, then append to it, or write to ``output``."""
     text = Path(log).read_text(encoding="utf-8", errors="replace")
@@ -35,7 +40,7 @@ def touch(log, *, output=None, add="", progress=None) -> Seen:
         os.kill(os.getpid(), signal.SIGKILL)
     if word == "orphan":
         os.kill(os.getppid(), signal.SIGKILL)
-        time.sleep(600)
+        _never()
     if word == "leave":
         os._exit(7)
     if word == "crash":
@@ -46,10 +51,10 @@ def touch(log, *, output=None, add="", progress=None) -> Seen:
         os.kill(os.getpid(), signal.SIGKILL)
     if word == "hang":
         Path(log).with_suffix(".hangs").write_text(str(os.getpid()))
-        time.sleep(600)
+        _never()
     if word == "eat":
         kept = bytearray(_BLOCK)
-        time.sleep(600)
+        _never()
         del kept
     if word == "exit":
         sys.exit(3)

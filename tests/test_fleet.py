@@ -23,6 +23,7 @@ from mcaptrack.fleet.claims import Claims, claim_name
 from mcaptrack.fleet.ledger import Ledger
 from mcaptrack.log import read
 from tests import fleet_tasks
+from tests.awaiting import until
 
 pytestmark = pytest.mark.usefixtures("never_waits")
 
@@ -142,13 +143,15 @@ def test_workers_stay_warm_and_are_shared(folder):
 
 
 def test_logs_that_exceed_a_limit_are_ended_and_named(folder):
-    (folder / "hang.mcap").write_text("hang")
+    """What exceeds a limit never ends; the log that does is the only one with a limit of time, which others may miss."""
     (folder / "eat.mcap").write_text("eat")
-    done = fleet.run(fleet_tasks.touch, folder, jobs=3, timeout_s=2.0, memory_limit="200MB", tries=1)
-    assert states(done)["hang.mcap"] == "timed-out"
-    assert states(done)["eat.mcap"] == "out-of-memory"
-    assert {states(done)[f"{name}.mcap"] for name in "abc"} == {"done"}
-    assert not is_running(int((folder / "hang.hangs").read_text()))
+    done = fleet.run(fleet_tasks.touch, folder, jobs=3, memory_limit="200MB", tries=1)
+    assert states(done) == dict.fromkeys(("a.mcap", "b.mcap", "c.mcap"), "done") | {"eat.mcap": "out-of-memory"}
+    (folder / "hang.mcap").write_text("hang")
+    done = fleet.run(fleet_tasks.touch, folder / "hang.mcap", timeout_s=2.0, tries=1)
+    assert states(done) == {"hang.mcap": "timed-out"}
+    hung = folder / "hang.hangs"  # not there if a busy machine took all the time for imports
+    assert not hung.exists() or not is_running(int(hung.read_text()))
 
 
 class TestASecondTime:
@@ -223,8 +226,7 @@ def is_running(process: int) -> bool:
 
 
 def wait_for(path: Path) -> None:
-    while not path.exists() or not path.read_text():
-        time.sleep(0.02)
+    until(lambda: path.exists() and path.read_text())
 
 
 def test_a_fleet_that_is_killed_takes_its_workers_along_and_can_be_started_again(folder):
@@ -249,8 +251,7 @@ def test_two_fleets_share_the_work_and_do_no_log_twice(folder):
     for number in range(8):
         (folder / f"{number}.mcap").write_text(f"wait {folder / 'go'}")
     with start(folder) as one, start(folder) as other:
-        while len(list(folder.glob(".*.claim"))) < 4:
-            time.sleep(0.02)
+        until(lambda: len(list(folder.glob(".*.claim"))) >= 4)
         (folder / "go").write_text("go")
         outs = [one.communicate()[0], other.communicate()[0]]
     assert [one.returncode, other.returncode] == [0, 0]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import pickle
 import signal
-import time
 from pathlib import Path
 
 from mcaptrack import fleet
@@ -44,15 +43,15 @@ def test_a_worker_that_was_ended_while_it_waited_is_replaced(monkeypatch):
 
 def test_a_worker_that_does_not_start_is_named_as_that(monkeypatch):
     """Not as a log that took long."""
-    monkeypatch.setattr(child, "_CODE", "import time; time.sleep(60)")
+    monkeypatch.setattr(child, "_CODE", "import signal; signal.pause()")
     monkeypatch.setattr(child, "_START_S", 0.3)
     monkeypatch.setattr(child, "_GRACE_S", 0.2)
-    worker, began = Child(WorkerLimits(timeout_s=50)), time.monotonic()
+    worker = Child(WorkerLimits(timeout_s=3600))
     try:
         reply = worker.do(Request(Path("a.mcap"), b"", {}), lambda: False)
     finally:
         worker.close(0.0)
-    assert (reply.state, time.monotonic() - began < 30) == ("timed-out", True)
+    assert reply.state == "timed-out"
     assert reply.error == (
         "a.mcap: its worker process did not start within 0.3 s (the machine may be too busy), and was ended"
     )

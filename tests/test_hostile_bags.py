@@ -548,7 +548,7 @@ def test_a_signal_ends_ingesting_and_leaves_nothing(folder, tmp_path, make, sent
         assert process.poll() is None, process.communicate()
         time.sleep(0.005)
     process.send_signal(sent)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=600)
     assert process.returncode in (128 + sent, -sent)
     assert err == ""
     assert list(tmp_path.iterdir()) == [folder]

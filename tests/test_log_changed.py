@@ -214,4 +214,4 @@ def test_a_process_that_reads_outlives_whatever_happens_to_the_file(tmp_path):
             assert reader.stdout.readline() == "more\n"
         reader.stdin.write("stop\n")
         reader.stdin.close()
-        assert reader.wait(60) == 0
+        assert reader.wait(600) == 0

@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -16,6 +15,7 @@ import pytest
 import mcaptrack
 from mcaptrack import environment, log, notices, tables
 from mcaptrack.errors import McaptrackError
+from mcaptrack.pipeline import timing
 from mcaptrack.pipeline.ahead import Ahead
 from mcaptrack.pipeline.pictures import KeptPictures
 from mcaptrack.pipeline.spaces import spaces_of_boxes
@@ -27,6 +27,7 @@ from mcaptrack.tables import ordered, table_pieces
 from mcaptrack.transforms import PROFILES, Retrack
 from mcaptrack.transforms.retrack import identity_swaps, likelihood, online_forecasts
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
+from tests.awaiting import until
 from tests.memory import held
 
 PEOPLE = 12
@@ -203,11 +204,8 @@ def test_frames_are_made_ahead_and_read_as_often_as_wanted():
     frames = Ahead(Source())
     reading = iter(frames)
     next(reading)
-    for _ in range(200):
-        if len(made) > 2:
-            break
-        time.sleep(0.01)
-    assert 2 < len(made) < 8
+    until(lambda: len(made) > 2)
+    assert len(made) < 8
     assert [frame.index for frame in reading] == list(range(1, 20))
     assert [frame.index for frame in frames] == list(range(20))
 
@@ -236,13 +234,18 @@ def test_the_thread_ends_when_no_more_frames_are_wanted():
     assert threading.active_count() == before
 
 
-def test_time_counts_for_the_innermost_part():
+def test_time_counts_for_the_innermost_part(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(timing, "perf_counter", lambda: now[0])
+
+    def passes(seconds: float) -> None:
+        now[0] += seconds
+
     watch = Stopwatch()
     with watch.part("detect"):
-        for _ in watch.each("decode", (time.sleep(0.02) for _ in range(3))):
-            time.sleep(0.01)
-    assert 0.06 <= watch.seconds["decode"] < 0.5
-    assert 0.03 <= watch.seconds["detect"] < 0.5
+        for _ in watch.each("decode", (passes(2.0) for _ in range(3))):
+            passes(1.0)
+    assert watch.seconds == {"decode": 6.0, "detect": 3.0}
 
 
 # Allocators

@@ -208,7 +208,7 @@ def test_an_image_that_is_a_pipe_is_refused(tmp_path):
     (tmp_path / "seqinfo.ini").write_text("frameRate=5")
     os.mkfifo(tmp_path / "1.png")
     code = f"from pathlib import Path; from mcaptrack.sources.video import *; list(open_video(Path({str(tmp_path)!r}), VideoOptions(image_format='png')).pictures())"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600, check=False)
     assert "1.png is a pipe, not a file" in done.stderr
 
 
@@ -366,7 +366,7 @@ def test_places_that_are_empty_are_no_loss(tmp_path, suffix, keep):
     assert (len(made), video.lost) == (count, [])
     assert [picture.index for picture in made] == list(range(count))
     process = start("ingest", path, "-o", tmp_path / "a.mcap")
-    assert (process.communicate(timeout=60)[1].count("lost"), process.returncode) == (0, 0)
+    assert (process.communicate(timeout=600)[1].count("lost"), process.returncode) == (0, 0)
 
 
 @pytest.mark.parametrize("suffix", [".avi", ".ivf"])

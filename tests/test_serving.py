@@ -32,6 +32,7 @@ from mcaptrack import log
 from mcaptrack.api.viewing import LogServer
 from mcaptrack.errors import McaptrackError
 from mcaptrack.viewing.serving import Limits, Server, requested_range
+from tests.awaiting import until
 from tests.commands import call
 from tests.logs import SOME, stock_messages, write_log
 
@@ -55,7 +56,7 @@ def server(path) -> Iterator[Server]:
 
 def ask(address: str, method: str = "GET", **headers: str) -> tuple[int, dict[str, str], bytes]:
     where = urlsplit(address)
-    connection = http.client.HTTPConnection(where.hostname, where.port, timeout=10)
+    connection = http.client.HTTPConnection(where.hostname, where.port, timeout=600)
     try:
         connection.request(method, where.path, headers=headers)
         answer = connection.getresponse()
@@ -230,7 +231,7 @@ def serving(files: Mapping[str, Path | bytes], **limits: float) -> Iterator[Serv
 
 
 def connect(server: Server) -> socket.socket:
-    return socket.create_connection(server.server_address, timeout=10)
+    return socket.create_connection(server.server_address, timeout=600)
 
 
 def rest(connection: socket.socket) -> bytes:
@@ -266,8 +267,14 @@ def test_a_request_that_never_ends_is_closed_also_if_it_goes_on_byte_by_byte(pat
         with connect(server) as slow:
             slow.sendall(b"GET / HTTP/1.1\r\n")
             slow.settimeout(0.01)
-            assert any(drips(slow) == b"" for _ in range(1000))
-        assert ask(server.address(path.name))[0] == 200
+            until(lambda: drips(slow) == b"")
+
+        def is_answered() -> bool:
+            with suppress(OSError, http.client.HTTPException):  # a busy machine may miss the limit, too
+                return ask(server.address(path.name))[0] == 200
+            return False
+
+        until(is_answered)
 
 
 def test_a_viewer_that_does_not_read_is_disconnected(tmp_path):
@@ -278,8 +285,7 @@ def test_a_viewer_that_does_not_read_is_disconnected(tmp_path):
         where = urlsplit(server.address("large"))
         greedy.sendall(f"GET {where.path} HTTP/1.1\r\nHost: {where.netloc}\r\n\r\n".encode())
         assert greedy.recv(1) == b"H"  # otherwise it may not have been taken yet
-        while connections(server):
-            threading.Event().wait(0.01)
+        until(lambda: not connections(server))
         assert len(rest(greedy)) < 2**28 - 1
 
 
@@ -288,8 +294,7 @@ def test_connections_end_with_the_server(path):
         with serving({path.name: path}) as server:
             held = [stack.enter_context(connect(server)) for _ in range(3)]
             held[0].sendall(b"GET / HT")
-            while connections(server) < 3:
-                threading.Event().wait(0.01)
+            until(lambda: connections(server) >= 3)
         assert [rest(connection) for connection in held] == [b""] * 3
 
 
@@ -324,8 +329,7 @@ def test_the_number_of_connections_is_limited(tmp_path):
         assert ask(server.address("large"), "HEAD")[0] == 503
         for connection in busy:
             connection.close()
-        while connections(server):
-            threading.Event().wait(0.01)
+        until(lambda: not connections(server))
         assert ask(server.address("large"), "HEAD")[0] == 200
 
 
@@ -365,12 +369,10 @@ def test_viewers_that_disconnect_cause_no_output(path, capfd):
         for begun in (b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: local"):
             hasty = connect(server)
             hasty.sendall(begun)
-            while not connections(server):
-                threading.Event().wait(0.01)
+            until(lambda: connections(server))
             hasty.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # a reset, not an end
             hasty.close()
-            while connections(server):
-                threading.Event().wait(0.01)
+            until(lambda: not connections(server))
     assert capfd.readouterr() == ("", "")
 
 
@@ -475,10 +477,10 @@ def test_view_prints_working_links_and_serves_until_ctrl_c(tmp_path):
         assert said["warnings"] == []
         where = urlsplit(said["log"])
         with ExitStack() as stack:  # Ctrl-C does not wait for viewers: some idle, one within a request
-            held = [stack.enter_context(socket.create_connection((where.hostname, where.port), 10)) for _ in range(20)]
+            held = [stack.enter_context(socket.create_connection((where.hostname, where.port), 600)) for _ in range(20)]
             held[0].sendall(b"GET / HT")
             process.send_signal(signal.SIGINT)
-            _, err = process.communicate(timeout=20)
+            _, err = process.communicate(timeout=600)
             assert all(rest(connection) == b"" for connection in held)
         assert process.returncode == 0
         assert err == f"{OPENED}\nserving until Ctrl-C ...\ndone\n"
@@ -503,7 +505,7 @@ def test_layout_files_are_served_as_they_were_edited(tmp_path):
         unusable = f"{broken} can't be served (it is not JSON); the log's own layout is used"
         assert [warning["message"] for warning in said["warnings"]] == [unusable]
         process.send_signal(signal.SIGTERM)
-        _, err = process.communicate(timeout=20)
+        _, err = process.communicate(timeout=600)
         assert process.returncode == 128 + signal.SIGTERM
         assert err.splitlines() == [
             f"{edited} differs from the layout in the log; the file is served",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import time
 from collections import Counter
 from itertools import count
 from threading import Thread
@@ -17,6 +16,7 @@ from mcaptrack import fleet, objects
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import parse
 from tests import fleet_tasks
+from tests.awaiting import until
 from tests.commands import call, done
 from tests.tiers import one_in, thorough
 
@@ -51,8 +51,7 @@ def test_two_fleets_over_one_bucket_with_one_ledger_do_no_log_twice(store, tmp_p
     fleets = [Thread(target=work) for _ in range(2)]
     for each in fleets:
         each.start()
-    while len([*tmp_path.glob(".*.claim")]) < 2:
-        time.sleep(0.02)
+    until(lambda: len([*tmp_path.glob(".*.claim")]) >= 2)
     store.put("night/go", b"go")
     for each in fleets:
         each.join()

@@ -311,4 +311,4 @@ def test_a_decoder_that_is_let_go_while_its_threads_work_does_not_wait_for_ever(
         "    frames.close()\n"
         "    del frames\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=600)

@@ -370,7 +370,7 @@ def run_stage(
     Without a transform ``make`` makes it, by the name of the one that suits the input, or the default one by "".
     """
     modes = STAGES[stage].modes
-    keep = modes[mode or "both"] if modes else None
+    keep = modes[mode or "both"] or None if modes else None
     before = transforms_of(stages)
 
     def plan(opened: logs.Log, prefix: str, say: Callable[[str], None], *_: Collection[str]) -> list[Job]:

@@ -17,7 +17,7 @@ from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, frame_id_of
 from mcaptrack.sources import foreign
-from mcaptrack.sources.cameras import USUAL, chain_of
+from mcaptrack.sources.cameras import USUAL, chain_of, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.transforms import FULL, STAGES, Transform
 from mcaptrack.transforms.protocol import check_options
@@ -44,15 +44,27 @@ class Job(NamedTuple):
 
     def kept(self) -> set[str]:
         """Return the topics that are written to the log."""
-        kept = {f"{self.target}/{suffix}".rstrip("/") for suffix in self.keep or self.transform.writes}
+        suffixes = [suffix for suffix in self.transform.writes if not self.keep or suffix in self.keep]
+        kept = {f"{self.target}/{suffix}".rstrip("/") for suffix in suffixes}
         return kept | {self.target + FULL} if STAGES[self.stage].at_video_rate and self.target in kept else kept
 
 
 def superseded(opened: log.Log, job: Job) -> list[str]:
     """Return results that the job's stage made before, beside those of now, and that its transform doesn't make."""
-    now = {*job.outputs(), job.target + FULL}
-    before = (topic for topic in STAGES[job.stage].outputs(job.target) if topic not in now and topic in opened.channels)
-    return [topic for topic in before if may_replace(opened, topic, job.stage)]
+    now, stage = {*job.outputs(), job.target + FULL}, job.stage
+    before = (topic for topic in opened.channels if topic not in now and topic.startswith(job.target + "/"))
+    own = (topic for topic in before if may_replace(opened, topic, stage))
+    return sorted(topic for topic in own if main_topic(opened, stage, topic) == job.target)
+
+
+def main_topic(opened: log.Log, stage: str, topic: str) -> str:
+    """Return the main output topic of the stage that makes ``topic``: itself, or the topic above its last part."""
+    made = provenance_of(opened, topic)
+    if made and made.output:
+        return topic.removesuffix("/" + made.output)
+    above = topic.rpartition("/")[0]
+    has_outputs = any(below in opened.channels for below in STAGES[stage].outputs(topic)[1:])
+    return above if topic in STAGES[stage].outputs(above)[1:] and not has_outputs else topic
 
 
 def check_inputs(opened: log.Log, prefix: str, jobs: Sequence[Job]) -> None:
@@ -67,6 +79,9 @@ def check_inputs(opened: log.Log, prefix: str, jobs: Sequence[Job]) -> None:
                 f"{type(job.transform).__qualname__} is no dataclass; the fields of a transform are its parameters"
             )
         check_options(job.transform)  # also for transforms of other packages
+        if job.keep and not {*job.keep} & {*job.transform.writes}:
+            entry = STAGES[job.stage].entry(type(job.transform))
+            raise McaptrackError(f"{entry} has no output {' or '.join(job.keep)}, so it can't run in this `mode=`")
         if job.source in coming:
             name, is_read = coming[job.source].name, coming[job.source] is job.transform.reads
         elif job.source in opened.channels:

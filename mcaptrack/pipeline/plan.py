@@ -15,7 +15,7 @@ from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.plane import is_assumed
 from mcaptrack.notices import warn
 from mcaptrack.pipeline import motion
-from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, first_stage, superseded
+from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, first_stage, main_topic, superseded
 from mcaptrack.pipeline.corrections import is_of_corrections
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, read_planes, warn_unused
 from mcaptrack.pipeline.rebuild import MissingPluginError, OlderVersionError, differing, fuser_of, rebuild
@@ -128,6 +128,7 @@ class _Planner:
         self._shared, self._plane, self._frame_id = shared, plane, frame_id
         self._changes: dict[str, bool] = {}
         self._renewed: Collection[str] = ()
+        self._gone: set[str] = set()
         self._notes: list[str] = []
         self._unnamed: dict[str, MissingPluginError] = {}
         self._differing: set[str] = set()
@@ -194,7 +195,7 @@ class _Planner:
 
     def _sibling(self, stage: str, topic: str) -> Provenance | None:
         """Return the provenance of another output of the stage that makes ``topic``; None if there is none."""
-        topics = STAGES[stage].outputs(_main(self._opened, stage, topic)) if stage else ()
+        topics = STAGES[stage].outputs(main_topic(self._opened, stage, topic)) if stage else ()
         found = (provenance_of(self._opened, one) for one in topics)
         return next((made for made in found if made and made.transform == stage), None)
 
@@ -217,7 +218,7 @@ class _Planner:
         chosen = self._defaults.get(stage) or self._suited(stage, source) or STAGES[stage].default()
         transform = self._with_choice(chosen)
         self.ensure_motion(transform, source)
-        self.add(Job(stage, transform, source, _main(self._opened, stage, topic), frame_id=self._frame_id))
+        self.add(Job(stage, transform, source, main_topic(self._opened, stage, topic), frame_id=self._frame_id))
         return True
 
     def _suited(self, stage: str, source: str) -> Transform | None:
@@ -274,7 +275,7 @@ class _Planner:
         before, why_not = self._before(stage, made)
         if isinstance(why_not, OlderVersionError):
             return self._make_anew(made, stage, topic)
-        main = _main(self._opened, stage, topic)
+        main = main_topic(self._opened, stage, topic)
         # A result at another topic keeps the parameters that it was requested with.
         is_usual = main == f"{self._prefix}/{STAGES[stage].output_topic}"
         is_open = is_usual and stage not in self._defaults and self._is_made_by_another(source)
@@ -289,6 +290,11 @@ class _Planner:
         if not is_due and not self._force and not is_replaced:
             return False
         transform = wanted if self._force or is_replaced else before
+        if transform and is_missing and topic not in Job(stage, transform, source, main).kept():
+            return False  # a class of another package doesn't make all outputs of the built-in ones
+        if source in self._gone or (source not in self._opened.channels and not self._changes[source]):
+            warn(f"{topic} stays as it is: {source}, which it was made from, is gone", "out-of-date")
+            return False
         if transform is None:
             if isinstance(why_not, MissingPluginError) and why_not.options:
                 self._unnamed[topic] = why_not
@@ -320,7 +326,11 @@ class _Planner:
         there = [f"{main}/{suffix}".rstrip("/") for suffix in transform.writes]
         kept = [one == topic or one in self._opened.channels for one in there]
         beside = STAGES[stage].beside if topic == main or main in self._opened.channels else ()
-        kept = [is_kept or suffix in beside for suffix, is_kept in zip(transform.writes, kept, strict=True)]
+        possible = before.writes if before else (*transform.writes,)[:1]  # what the former class didn't make is new
+        kept = [
+            is_kept or suffix in beside or suffix not in possible
+            for suffix, is_kept in zip(transform.writes, kept, strict=True)
+        ]
         keep = tuple(suffix for suffix, is_kept in zip(transform.writes, kept, strict=True) if is_kept)
         self.add(Job(stage, transform, source, main, None if all(kept) else keep, frame_id=self._frame_id))
         return True
@@ -389,6 +399,7 @@ class _Planner:
         self.jobs.append(job)
         gone, entry = superseded(self._opened, job), STAGES[job.stage].choice(job.transform)
         self._changes |= dict.fromkeys((*job.kept(), *gone), True)
+        self._gone |= {*gone}
         self._notes += [f"{topic} is removed: {job.stage} by {entry} makes none" for topic in gone]
 
     def _not_made(self, stage: str, topic: str) -> str:
@@ -398,12 +409,3 @@ class _Planner:
             f"{self._opened.path}: {topic} is there and {describe_origin(self._opened, topic)}; leave `topic=` out to "
             f"go on from it, or run {other}"
         )
-
-
-def _main(opened: log.Log, stage: str, topic: str) -> str:
-    """Return the main output topic of the stage that makes ``topic``: itself, or the topic above its last part."""
-    for suffix in STAGES[stage].default.writes:
-        if suffix and topic.endswith("/" + suffix):
-            below = [one for one in STAGES[stage].outputs(topic)[1:] if one in opened.channels]
-            return topic if below else topic.removesuffix("/" + suffix)
-    return topic

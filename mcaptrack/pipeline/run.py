@@ -16,7 +16,7 @@ from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes, scene_planes
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline.appearance import with_descriptors
-from mcaptrack.pipeline.checks import Job, check_inputs, read_named_frames, superseded
+from mcaptrack.pipeline.checks import Job, check_inputs, may_replace, read_named_frames, superseded
 from mcaptrack.pipeline.context import in_context
 from mcaptrack.pipeline.corrections import corrected_input, fixed_in
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
@@ -39,7 +39,7 @@ from mcaptrack.schema.camera_motion import to_pictures, to_scene
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import row_ends, unique_values
-from mcaptrack.schema.provenance import FUSE, Provenance
+from mcaptrack.schema.provenance import FUSE, VIEW, Provenance
 from mcaptrack.sources.camera_motion import tracks_topic
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.fixed_frame import BoxesRead
@@ -164,16 +164,35 @@ def _run(
         report.frames |= {topic: channel.size() for topic, channel in counted.items()}
         report.stages += [ZONES_STAGE] if counted else []
         report.has_zones = True
+    gone = _gone(opened, jobs, made)
     if made or output is not None:
         with part("write"):
             path, _ = path_with(opened, prefix, tracks_topic(prefix), made)
-            gone = {topic for job in jobs if job.target in made for topic in superseded(opened, job)}
             write(opened, prefix, made, planes or (), stamps, output, path, boxes.in_space(), gone)
             report.is_written = True
     provenances = {topic: channel.provenance for topic, channel in made.items()}
     warn_findings(opened, prefix, provenances, planes or (), is_all=watch is not None or not jobs)
-    report.stale = outdated_by(opened, {topic: channel.provenance.digest for topic, channel in made.items()})
+    late = outdated_by(opened, {topic: channel.provenance.digest for topic, channel in made.items()})
+    report.stale = [topic for topic in late if topic not in gone]
     return report
+
+
+def _gone(opened: log.Log, jobs: Sequence[Job], made: Mapping[str, Made]) -> set[str]:
+    """Return earlier results of jobs that have run which these don't make now, and what was made of them."""
+    gone: set[str] = set()
+    for job in jobs:
+        if job.kept() & {*made}:
+            empty = [
+                topic for topic in job.kept() if topic in opened.channels
+            ]  # no rows, no tracks at the video's rate
+            gone.update(superseded(opened, job))
+            gone.update(topic for topic in empty if may_replace(opened, topic, job.stage))
+    gone -= {*made}
+    for topic in sorted(opened.channels, key=len):  # what is made of a channel has a longer topic
+        known = Provenance.from_metadata(opened.channels[topic].metadata)
+        if known and known.transform in (EVENTS_STAGE, ZONES_STAGE, VIEW) and known.input in gone:
+            gone.add(topic)
+    return gone - {*made}
 
 
 def outdated_by(opened: log.Log, digests: Mapping[str, str]) -> list[str]:
@@ -297,8 +316,13 @@ def _run_job(
     seen: Channels = channels
     if not traits_of(transform).keeps_unseen:
         seen = without_unseen(channels, lambda: picture_size(opened, camera_at(opened, prefix).pictures))
+    usual = STAGES[job.stage].outputs(job.target)
     return {
-        topic: Made.of(schema, frames, provenance) for topic, (schema, frames) in seen.items() if topic in job.kept()
+        topic: Made.of(
+            schema, frames, replace(provenance, output="" if topic in usual else topic.removeprefix(job.target + "/"))
+        )
+        for topic, (schema, frames) in seen.items()
+        if topic in job.kept()
     }
 
 

@@ -35,7 +35,17 @@ from mcaptrack.pipeline.drawing import (
 from mcaptrack.pipeline.picture_times import picture_clock
 from mcaptrack.pipeline.plots import highest_values
 from mcaptrack.pipeline.scene_views import scene_on_pictures
-from mcaptrack.schema import DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
+from mcaptrack.schema import (
+    DETECTIONS,
+    EVENTS,
+    FORECAST_SCORES,
+    GROUND_PLANE,
+    PREDICTIONS,
+    SCHEMAS,
+    TRACKS,
+    Frame,
+    Schema,
+)
 from mcaptrack.schema.classes import class_names, classes_beside_rows, has_classes, only_class, without_class
 from mcaptrack.schema.encodings import PROTOBUF, Encoding, encoded, record_of
 from mcaptrack.schema.frame_columns import collect
@@ -175,13 +185,14 @@ def write(
         warn(f"no view at {topic}, which {describe_origin(opened, topic)}", "left-out")
     # Read everything before anything is written, because the log is changed in place.
     start_ns = _start_ns(opened, camera, shown, picture_ns)
-    eye = layouts.eye_on(_positions(opened, prefix, shown), planes, start_ns)
-    last_step, is_truth_known = _last_step(opened, prefix, shown), _is_truth_known(opened, prefix, shown)
+    known = shown | {topic: _nothing(opened, topic) for topic in gone}
+    eye = layouts.eye_on(_positions(opened, prefix, known), planes, start_ns)
+    last_step, is_truth_known = _last_step(opened, prefix, known), _is_truth_known(opened, prefix, known)
     sources = recorded_sources(opened, [*camera.topics, *(one.provenance.input for one in made.values())])
     follow = robot_frame(opened, sources, tree, frame_id) if tree and frame_id else ""
     by_viewers = recorded_drawings(opened, sources) if frame_id else {}
-    floor_m = _floor_m(opened, prefix, shown) if frame_id else 0.0
-    highest = highest_values(prefix, lambda topic, schema: _frames(opened, shown, topic, schema))
+    floor_m = _floor_m(opened, prefix, known) if frame_id else 0.0
+    highest = highest_values(prefix, lambda topic, schema: _frames(opened, known, topic, schema))
     # Write views of unchanged channels first, so that channels made again keep their place and the log its bytes.
     first, last = ({t: c for t, c in shown.items() if (t in made) is is_made} for is_made in (False, True))
     drawn_first = [view for view in drawn.views(first, start_ns) if view.topic not in recorded]
@@ -252,6 +263,11 @@ def _channels_to_draw(opened: log.Log, camera: Camera, made: Mapping[str, Made])
         if one.schema is PREDICTIONS:
             shown[topic] = one._replace(bodies=_bodies(opened, shown, topic, inputs[topic]))
     return shown
+
+
+def _nothing(opened: log.Log, topic: str) -> ChannelToDraw:
+    """Return a channel that this run drops, as one without frames."""
+    return ChannelToDraw(SCHEMAS.get(opened.channel(topic).schema_name, EVENTS), (), "", "", {}, "")
 
 
 def _boxes_to_draw(opened: log.Log, boxes: Mapping[str, foreign.NamedFrames]) -> dict[str, ChannelToDraw]:

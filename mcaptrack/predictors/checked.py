@@ -16,6 +16,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.predictors.forecast import Forecast, PeopleSeen, uses_people
 from mcaptrack.predictors.onnx import are_covariances
 from mcaptrack.registry import Entry, blamed, failure
+from mcaptrack.registry.guard import Guard
 
 Floats = NDArray[np.float64]
 _WRONG = (TypeError, ValueError, OverflowError)
@@ -34,11 +35,13 @@ class CheckedPredictor:
     steps: int
     step_s: float
     past: int
+    guard: Guard
 
     @classmethod
     def of(cls, entry: Entry, parameters: Mapping[str, Any]) -> Self:
         """Make the predictor. Raises McaptrackError if that fails, or if what comes of it is no predictor."""
-        with blamed(entry, f"could not be made with {', '.join(parameters)}"):
+        guard = Guard(str(entry))
+        with blamed(entry, f"could not be made with {', '.join(parameters)}", guard):
             inner = entry.cls(**parameters)
         if not callable(getattr(inner, "predict", None)):
             raise McaptrackError(f"{entry} has no method predict, so it is no predictor")
@@ -51,7 +54,7 @@ class CheckedPredictor:
                 f"{entry} has steps={steps}, step_s={step_s:g}, past={past}; all have to be above 0, steps and past at "
                 f"most {_MOST}"
             )
-        return cls(entry, inner, steps, step_s, past)
+        return cls(entry, inner, steps, step_s, past, guard)
 
     @property
     def name(self) -> str:
@@ -59,13 +62,13 @@ class CheckedPredictor:
 
     @property
     def weights_sha256(self) -> str | None:
-        with blamed(self.entry, "could not say its weights_sha256"):
+        with blamed(self.entry, "could not say its weights_sha256", self.guard):
             found = getattr(self.inner, "weights_sha256", None)
             return None if found is None else str(found)
 
     @property
     def uses_people(self) -> bool:
-        with blamed(self.entry, "could not say whether it uses_people"):
+        with blamed(self.entry, "could not say whether it uses_people", self.guard):
             return uses_people(self.inner)
 
     def predict(self, xy_m: Floats, valid: NDArray[np.bool_], people: PeopleSeen | None = None) -> Forecast:
@@ -73,7 +76,7 @@ class CheckedPredictor:
         batch = len(valid)
         if batch == 0:
             return Forecast(np.empty((0, self.steps, 2)), np.empty((0, self.steps, 2, 2)))
-        with blamed(self.entry, f"failed on {batch} {'track' if batch == 1 else 'tracks'}"):
+        with blamed(self.entry, f"failed on {batch} {'track' if batch == 1 else 'tracks'}", self.guard):
             among = {} if people is None else {"people": people.copied()}
             given = self.inner.predict(xy_m.copy(), valid.copy(), **among)
         if not isinstance(given, tuple | list) or len(given) != 2:
@@ -96,7 +99,7 @@ class CheckedPredictor:
         return Forecast(mean, cov)
 
     def _numbers(self, given: Any) -> Floats:
-        with blamed(self.entry, "gave what can't be read as numbers"):
+        with blamed(self.entry, "gave what can't be read as numbers", self.guard):
             array = np.asarray(given)
             if array.dtype.kind not in "fiu":
                 raise TypeError(f"an array of {array.dtype}")

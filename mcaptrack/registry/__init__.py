@@ -23,32 +23,27 @@ entry: a line in ``BUILT_IN``.
 from __future__ import annotations
 
 import difflib
-import os
 import signal
 import sys
-import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from contextvars import copy_context
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from traceback import extract_tb
 from types import MappingProxyType
-from typing import Any, Final, Literal, NoReturn, get_args
+from typing import Any, Final, Literal, get_args
 
 from mcaptrack import __version__
 from mcaptrack.errors import McaptrackError
-from mcaptrack.notices import warn
 from mcaptrack.registry.distributions import distribution_of, entry_points, package_of
+from mcaptrack.registry.guard import Guard, contained_import
 
 Kind = Literal["detector", "tracker", "predictor", "retracker", "fuser"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 _OWN: Final = "mcaptrack"
 _FOLDER: Final = Path(__file__).parent.parent
-#: After so long the import of another package is said to take long.
-_LONG_S: Final = 10.0
 #: Exit codes of processes that end by a signal.
 _SIGNALLED: Final = frozenset(128 + number for number in (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", 1)))
 
@@ -208,13 +203,19 @@ def is_installed(kind: Kind, name: str) -> bool:
 
 
 @contextmanager
-def blamed(entry: Entry, what: str) -> Iterator[None]:
+def blamed(entry: Entry, what: str, guard: Guard | None = None) -> Iterator[None]:
     """Run the code of another package: whatever it raises becomes a McaptrackError that names it.
 
+    What it changes in this process is undone, with a warning; ``guard`` remembers that for all calls of one object.
     Interruptions pass as they are: Ctrl-C, and the exit that a signal asks for.
     """
+    guard = guard or Guard(str(entry))
     try:
-        yield
+        try:
+            with guard.step():
+                yield
+        finally:
+            guard.end()
     except BaseException as error:
         if is_interruption(error):
             raise
@@ -244,7 +245,7 @@ def _words(error: BaseException) -> str:
 
 def _is(point: EntryPoint, cls: type) -> bool:
     try:
-        with _contained(f"the package of {point.name}"):
+        with contained_import(f"the package of {point.name}"):
             return point.load() is cls
     except BaseException as error:  # an entry point that can't be imported is another class
         if is_interruption(error):
@@ -259,7 +260,7 @@ def _load(what: str, reference: str) -> Any:
     if not all(part.isidentifier() for part in (*module.strip().split("."), *parts)):
         raise McaptrackError(f"{what}: {reference} is not of the form module:Class")
     try:
-        with nullcontext() if module.startswith(f"{_OWN}.") else _contained(what):
+        with nullcontext() if module.startswith(f"{_OWN}.") else contained_import(what):
             found: Any = import_module(module.strip())
     except BaseException as error:  # code of other packages may raise anything
         if is_interruption(error):
@@ -272,45 +273,6 @@ def _load(what: str, reference: str) -> Any:
     if not callable(found) or not hasattr(found, "__qualname__"):
         raise McaptrackError(f"{what}: {path} in {module} is no class but of type {type(found).__name__}")
     return found
-
-
-@contextmanager
-def _contained(what: str) -> Iterator[None]:
-    """Import code of other packages: what it changes in this process is undone, with a warning.
-
-    That is the working folder, to which paths are relative, and the handling of Ctrl-C and SIGTERM. ``os._exit``, which
-    would end the command without a word, raises an exception instead. An import that doesn't end can't be ended from
-    here, but a warning names it.
-    """
-    here, process, leave = os.path.realpath("."), os.getpid(), os._exit
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def refuse(status: int) -> NoReturn:
-        if os.getpid() != process:  # child processes end like this
-            leave(status)
-        raise RuntimeError(f"it called os._exit({status})")
-
-    words = f"the import of {what} has taken {_LONG_S:g} s and goes on; Ctrl-C ends it"
-    waiting = threading.Timer(_LONG_S, copy_context().run, (warn, words))
-    waiting.daemon = True
-    os._exit = refuse
-    waiting.start()
-    try:
-        yield
-    finally:
-        waiting.cancel()
-        os._exit = leave
-        changed = []
-        if os.path.realpath(".") != here:
-            os.chdir(here)
-            changed.append("the working folder")
-        if threading.current_thread() is threading.main_thread():  # others can't set handlers
-            for number, handler in handlers.items():
-                if handler is not None and signal.getsignal(number) is not handler:
-                    signal.signal(number, handler)
-                    changed.append(f"the handling of {number.name}")
-        if changed:
-            warn(f"the import of {what} changed {' and '.join(changed)}; this was undone")
 
 
 @contextmanager

@@ -45,6 +45,7 @@ class Provenance:
     has frames. ``zones`` are the names of the zones in its rows by ``zone_id``. ``model`` is what its network turned
     out to be. ``warnings`` are the warnings when it was made, with code and message. ``continued`` says from which
     channel of the log before its ids go on (``after``, a digest), and the largest id so far (``last_id``).
+    ``output`` is the end of the topic of an output that only the class of another package has, below its main output.
     """
 
     transform: str
@@ -63,6 +64,7 @@ class Provenance:
     version: str = __version__
     zones: Mapping[str, str] = field(default_factory=dict)
     continued: Mapping[str, str] = field(default_factory=dict)
+    output: str = ""
 
     @property
     def is_of_older_version(self) -> bool:
@@ -82,6 +84,7 @@ class Provenance:
             "input": self.input,
             "input_digest": self.input_digest,
             "digest": self.digest,
+            "output": self.output,
             "weights_sha256": self.weights_sha256,
             "references": json.dumps(dict(self.references), sort_keys=True, separators=(",", ":")),
             "plugins": json.dumps({key: one._asdict() for key, one in self.plugins.items()}, sort_keys=True),

@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from mcaptrack.notices import collected
 from mcaptrack.predictors import PeopleSeen, Predictor, predict_among
 from mcaptrack.predictors.onnx import are_covariances
+from mcaptrack.registry.guard import Guard
 from mcaptrack.testing.error import LawError
 
 
@@ -17,7 +19,7 @@ def check_predictor(predictor: Predictor, *, rotates: bool = False, seed: int = 
     The laws: forecasts are finite, of the declared number of steps, with symmetric covariances and variances above
     0; the same input gives the same output, and is not changed; positions that are not known have no influence,
     nor has the order of tracks or of people, nor have people of another time or the other tracks of a batch;
-    forecasts move with the positions.
+    forecasts move with the positions; the process is left as it was (working folder, random state and so on).
 
     Parameters
     ----------
@@ -52,7 +54,13 @@ def check_predictor(predictor: Predictor, *, rotates: bool = False, seed: int = 
         mean, cov = predict_among(predictor, people.xy_m[people.row], people.valid[people.row], people)
         return np.asarray(mean), np.asarray(cov)
 
-    mean, cov = ask(people)
+    guard = Guard("")
+    with guard.step():
+        mean, cov = ask(people)
+    with collected():
+        guard.end()
+    if guard.changed:
+        raise LawError(f"process: it changes {' and '.join(guard.changed)} of the process that it runs in")
     shapes = ((5, predictor.steps, 2), (5, predictor.steps, 2, 2))
     if (mean.shape, cov.shape) != shapes:
         raise LawError(f"forecasts: shapes are {mean.shape} and {cov.shape}, not {shapes[0]} and {shapes[1]}")

@@ -15,7 +15,9 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.notices import collected
 from mcaptrack.registry import Entry
+from mcaptrack.registry.guard import Guard
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SIGHTINGS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.testing.error import LawError
 from mcaptrack.transforms.guarded import guarded
@@ -29,7 +31,8 @@ def check_transform(transform: Transform, frames: Sequence[Frame] | None = None,
 
     The laws: it declares what the protocol asks for; every output has the rows of its schema, at times that increase;
     the same input gives the same output, also while it runs on another input, and is not changed; the output of the
-    past does not depend on the future, but for ``latency_s``; shuffling the rows of a frame changes ids at most; frames
+    past does not depend on the future, but for ``latency_s``; it leaves the process that it runs in as it was (the
+    working folder, random state and so on); shuffling the rows of a frame changes ids at most; frames
     without rows, and no frames at all, are valid input; the parameters can be kept in a log and give the same transform
     again.
 
@@ -58,8 +61,16 @@ def check_transform(transform: Transform, frames: Sequence[Frame] | None = None,
     given = list(sample)
     if not given:
         raise LawError("there are no frames to check the transform with")
-    for law in LAWS.values():
-        law(transform, [frame._replace(rows=frame.rows.copy()) for frame in given], seed)
+    guard = Guard(type(transform).__name__)
+    try:
+        with guard.step():
+            for law in LAWS.values():
+                law(transform, [frame._replace(rows=frame.rows.copy()) for frame in given], seed)
+    finally:
+        with collected():
+            guard.end()
+    if guard.changed:
+        raise LawError(f"process: it changes {' and '.join(guard.changed)} of the process that it runs in")
 
 
 def sample_frames(schema: Schema, seed: int = 0, step_s: float = 0.0, colour: Colour = "grey") -> list[Frame]:

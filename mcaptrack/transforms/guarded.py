@@ -1,4 +1,7 @@
-"""Run a transform of another package: its errors become one line that names it, and its output is checked."""
+"""Run a transform of another package: its errors become one line that names it, and its output is checked.
+
+What it changes in this process is undone after each step (see ``mcaptrack.registry.guard``).
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.registry import Entry, failure, is_interruption
+from mcaptrack.registry.guard import Guard
 from mcaptrack.schema import SCORES_NEEDED, Frame, Schema
 from mcaptrack.schema.impossible import first_impossible
 from mcaptrack.transforms.protocol import Transform, traits_of
@@ -19,9 +23,13 @@ from mcaptrack.transforms.protocol import Transform, traits_of
 _ONE_FOR_EACH: Final = ("detector", "tracker", "fuser")
 #: Above the largest time in nanoseconds, and above the largest frame number, that a log can hold.
 _END_NS, _END_INDEX = 2**63, 2**32
+#: What a transform that has ended gives.
+_END: Final = object()
 
 
-def guarded(entry: Entry, transform: Transform, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
+def guarded(
+    entry: Entry, transform: Transform, frames: Iterable[Frame], guard: Guard | None = None
+) -> Iterator[tuple[Frame, ...]]:
     """Run a transform and check each of its outputs.
 
     Parameters
@@ -31,6 +39,8 @@ def guarded(entry: Entry, transform: Transform, frames: Iterable[Frame]) -> Iter
     transform : Transform
     frames : iterable of Frame
         Its input.
+    guard : Guard, optional
+        Keeps what it changes in this process; by default this becomes a warning.
 
     Yields
     ------
@@ -43,20 +53,29 @@ def guarded(entry: Entry, transform: Transform, frames: Iterable[Frame]) -> Iter
         order of time; also if a detector or tracker yields a frame that was not in its input. The message names the
         transform and the frame. Exceptions of ``frames`` are passed on unchanged.
     """
-    source = _Source(frames, traits_of(transform).passes)
+    if guard is None:
+        guard = Guard(str(entry))
+        try:
+            yield from guarded(entry, transform, frames, guard)
+        finally:
+            guard.end()
+        return
+    source = _Source(frames, traits_of(transform).passes, guard)
     try:
-        made = iter(transform(source))
+        with guard.step():
+            made = iter(transform(source))
     except BaseException as error:  # code of other packages may raise anything
         raise source.error_of(entry, error) from error
     last_ns: int | None = None
     low, high = 0.0, 1.0
     while True:
         try:
-            result = next(made)
-        except StopIteration:
-            break
+            with guard.step():
+                result = next(made, _END)
         except BaseException as error:
             raise source.error_of(entry, error) from error
+        if result is _END:
+            break
         checked = _checked(entry, transform, result, last_ns, source.where)
         main = checked[list(transform.writes).index("")]
         if entry.kind in _ONE_FOR_EACH and not source.answered(main):
@@ -83,8 +102,8 @@ def guarded(entry: Entry, transform: Transform, frames: Iterable[Frame]) -> Iter
 class _Source:
     """The input of a transform: notes the frames that were taken and not answered, and an exception of the input."""
 
-    def __init__(self, frames: Iterable[Frame], passes: int) -> None:
-        self._all, self._passes = frames, passes
+    def __init__(self, frames: Iterable[Frame], passes: int, guard: Guard) -> None:
+        self._all, self._passes, self._guard = frames, passes, guard
         self._frames = iter(frames)
         self._is_begun = False
         self._error: BaseException | None = None
@@ -104,12 +123,13 @@ class _Source:
     def __next__(self) -> Frame:
         self._is_begun = True
         try:
-            frame = next(self._frames)
-        except StopIteration:
-            raise
+            with self._guard.pause():  # the input is not its code
+                frame = next(self._frames, None)
         except BaseException as error:
             self._error = error
             raise
+        if frame is None:
+            raise StopIteration
         self.where = f"at frame {frame.index} ({frame.t_ns} ns)"
         self._open[frame.t_ns, frame.index] += 1
         self.count += 1

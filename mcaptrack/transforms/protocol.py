@@ -6,6 +6,10 @@ Calling it with an iterable of frames gives an iterator of tuples of frames, one
 
 Further class attributes are optional: ``Traits`` declares all of them, with their defaults.
 
+A transform of another package needs the main output "" only; the others of the built-in transforms of its stage may be
+missing, or be further ones, but that a fuser has both. An output that has the name of a built-in one has its schema.
+Results that a former transform of a stage made and this one doesn't make are removed, with what was made of them.
+
 All transforms obey these laws; ``mcaptrack.testing.check_transform`` tests them:
 
 * Schema: the rows of every output have the columns of its schema, with valid values.
@@ -15,6 +19,8 @@ All transforms obey these laws; ``mcaptrack.testing.check_transform`` tests them
 * Purity: the same input gives the same output, also for two runs at the same time.
 * Order: another order of the rows of a frame changes nothing but track ids.
 * Empty frames: frames without rows are accepted anywhere.
+* Process: the working folder, the handling of signals and warnings, NumPy's handling of errors, the recursion limit,
+  the locale and the random states are as before (``mcaptrack.registry.guard`` undoes such changes, with a warning).
 """
 
 from __future__ import annotations

@@ -28,6 +28,8 @@ from mcaptrack.transforms.sort import Sort
 
 #: Suffix of the topic of tracks at the video's rate (``Stage.at_video_rate``).
 FULL: Final = "/full"
+#: Last parts of topics that outputs can't have: these are made of the results of stages.
+RESERVED: Final = frozenset({"full", "view", "events", "counts", "errors", "scores", "zones"})
 #: The field for the file that a name may end with, as in ``onnx:FILE``.
 _FILE: Final = "file"
 
@@ -65,7 +67,7 @@ class Stage:
     profiles : Mapping[str, Transform]
         Values of all parameters by the name of the profile.
     modes : Mapping[str, tuple[str, ...]]
-        Outputs to write, by the name of the mode.
+        Outputs to write, by the name of the mode; empty for all.
     beside : tuple[str, ...]
         Outputs that are made wherever the main one is, also again in logs that lack them.
     implied : Mapping[str, str]
@@ -216,10 +218,18 @@ class Stage:
                 f"writes {wanted.writes[''].name} as its main output, as in writes = {{'': ...}}"
             )
         for suffix, schema in outputs.items():
-            if not isinstance(suffix, str) or schema not in SCHEMAS.values():
+            is_name = isinstance(suffix, str) and (not suffix or suffix.isidentifier())
+            if not is_name or schema not in SCHEMAS.values():
                 raise McaptrackError(
                     f"{entry} has writes with {suffix!r}: {schema!r}; it maps ends of topics to schemas of rows, as in "
                     "writes = {'': TRACKS, 'debug': DETECTIONS}"
+                )
+            if suffix in RESERVED:
+                raise McaptrackError(f"{entry} has an output {suffix!r}, which is a name of what is made of results")
+            if schema is not wanted.writes.get(suffix, schema):
+                raise McaptrackError(
+                    f"{entry} has an output {suffix!r} of {schema.name}; that of a {entry.kind} has "
+                    f"{wanted.writes[suffix].name}"
                 )
         for suffix, schema in wanted.writes.items():
             if self.kind == "fuser" and outputs.get(suffix) is not schema:
@@ -290,7 +300,7 @@ _STAGES: Final = (
         profiles=PROFILES,
         modes=MappingProxyType(
             {
-                "both": ("", "online", "predictions", "decisions", "appearance"),
+                "both": (),
                 "offline": ("", "decisions", "appearance"),
                 "online": ("online", "predictions"),
             }
