@@ -7,12 +7,15 @@ from itertools import chain
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+import mcaptrack
+from mcaptrack import log
 from mcaptrack.evaluation.forecasts import find_forecast_errors
-from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame
+from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.transforms import STAGES
+from tests.logs import write_stock
 
 HOUR_NS = 3_600 * 10**9
 YEARS_NS = 56 * 365 * 24 * HOUR_NS
@@ -26,7 +29,7 @@ TRANSFORMS = {
 }
 
 
-def walkers(schema, rate_hz, seconds=12):
+def walkers(schema, rate_hz, seconds=8):
     """Three people who walk side by side for some seconds, each seen a little beside where they are."""
     noise = np.random.default_rng(1)
     for number in range(round(seconds * rate_hz)):
@@ -78,7 +81,7 @@ def peak_bytes(transform, frames, after_ns):
 
 
 @pytest.mark.parametrize("name", TRANSFORMS)
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=2, deadline=None)
 @example(YEARS_NS)
 @given(JUMPS_NS)
 def test_results_depend_on_no_jump_beyond_an_hour(name, jump_ns):
@@ -116,12 +119,12 @@ def test_memory_is_independent_of_the_jump(name):
     assert long < 1.2 * short
 
 
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=2, deadline=None)
 @example(YEARS_NS)
 @given(JUMPS_NS)
 def test_errors_of_forecasts_depend_on_no_jump(jump_ns):
     def errors(jump_ns):
-        samples, after_ns = recording(STAGES["predict"], jump_ns)
+        samples, _ = recording(STAGES["predict"], jump_ns)
         forecasts = [frame for (frame,) in STAGES["predict"].make(predictor="cv")(samples)]
         people, _ = recording(STAGES["sample"], jump_ns - 300_000_000)  # at 10 Hz, up to the same time
         found = find_forecast_errors(forecasts, samples, people, samples)
@@ -132,9 +135,32 @@ def test_errors_of_forecasts_depend_on_no_jump(jump_ns):
     assert errors(jump_ns) == expected
 
 
-def log_with_times(path, times_ns):
-    with log.create(path) as writer:
-        channel = writer.add_channel("/camera/tracks", TRACKS)
-        for number, t_ns in enumerate(times_ns):
-            writer.write(channel, Frame(t_ns, number, TRACKS.empty()))
-    return path
+@pytest.mark.parametrize("chunk_size", [1, 10**6])
+@given(
+    cuts=st.lists(st.tuples(st.integers(5, 30), st.integers(61 * 10**9, YEARS_NS // 8)), max_size=2), late=st.booleans()
+)
+@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_jumps_are_found_by_the_index_and_by_a_check(tmp_path, chunk_size, cuts, late):
+    """Of parts of some messages at 10 Hz, in the order of time or with the last part first: the clock was set back."""
+    t_ns, parts, jumps = 10**9, [], []
+    for count, jump_ns in (*cuts, (20, 0)):
+        parts.append([t_ns + 10**8 * number for number in range(count)])
+        jumps.append((parts[-1][-1], parts[-1][-1] + jump_ns))
+        t_ns = jumps[-1][1]
+    messages = [("a", t_ns, 0, b"x") for part in (parts[::-1] if late else parts) for t_ns in part]
+    expected = jumps[:-1] if len(cuts) * 10 <= len(messages) else []
+    write_stock(path := tmp_path / "a.mcap", messages, chunk_size=chunk_size)
+    with log.read(path) as opened:
+        assert log.clock_jumps(opened) == expected
+    named = [finding for finding in log.check(path).findings if finding.kind == "clock-jump"]
+    assert [finding.times for finding in named] == ([len(expected)] if expected else [])
+
+
+def test_a_run_and_info_say_where_the_clock_jumps(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_stock(
+        path, [("a", t_ns, 0, b"x") for start in (0, 3 * HOUR_NS) for t_ns in range(start, start + 10**9, 10**8)]
+    )
+    (warning,) = mcaptrack.info(path).warnings
+    assert warning.code == "clock-jump"
+    assert "no message for 3.0 hours after 0.900 s" in warning.message
