@@ -41,7 +41,7 @@ class RegularClock(NamedTuple):
         """The number of the tick next to each time, (T,)."""
         anchor_ns = self.anchor_ns[self._part(t_ns)]
         steps = np.rint((anchor_ns - self.anchor_ns[0]) / self.step_ns) + np.rint((t_ns - anchor_ns) / self.step_ns)
-        return steps.astype(np.int64)
+        return np.asarray(steps.astype(np.int64))
 
     def ticks(self, frame_ns: Ints, limit_ns: int) -> Ints:
         """The times of ticks at frames (F,), and between those that are at most ``limit_ns`` apart.
