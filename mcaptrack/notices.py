@@ -27,6 +27,7 @@ Code = Literal[
     "chosen-camera",
     "classes",
     "clock",
+    "clock-jump",
     "device",
     "ellipses",
     "estimated-ground-plane",

@@ -210,6 +210,7 @@ def info(log: PathLike, *, frames: bool = False) -> LogInfo:
     """
     path = as_location(log)
     with warnings_about(path) as warnings, logs.read(path) as opened:
+        pipeline.warn_clock_jumps(opened)
         every = [(channel, part) for part in opened.parts for channel in part.recorded]
         every.sort(key=lambda found: (found[0].topic, found[1] is opened, found[0].id))
         names = names_by_topic(opened)

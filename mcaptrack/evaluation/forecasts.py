@@ -23,11 +23,11 @@ from mcaptrack.evaluation.metrics.pairing import Forecasts, PairedForecasts, Pos
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.mixtures import Tails
+from mcaptrack.geometry.ticks import RegularClock
 from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_numbers, frame_times, join_frames, row_ends, spans_of, split_rows
 from mcaptrack.schema.predictions import tails_of
-from mcaptrack.schema.resampling import is_observed_at
 
 #: The channels of forecasts, below the camera's prefix, and the tracks from which each is made.
 FORECAST_INPUTS: Final[Mapping[str, str]] = {"predictions": "samples", "retracks/predictions": "retracks/online"}
@@ -42,14 +42,16 @@ _MEASURES: Final = ("ade_m", "fde_m", "error_1s_m", "within_95")
 
 
 class _PredictionClock(NamedTuple):
-    """The regular clock of predictions, which starts with the first frame of the tracks."""
+    """The regular clock of predictions, which starts with the first frame of the tracks and ends with the last."""
 
-    start_ns: int
+    regular: RegularClock
     last_ns: int
     step_s: float
 
-    def to_step(self, t_ns: Ints) -> Ints:
-        return np.rint((t_ns - self.start_ns) / (self.step_s * NS_PER_S)).astype(np.int64)
+    @classmethod
+    def of(cls, track_ns: Ints, step_s: float) -> _PredictionClock:
+        regular = RegularClock.of(track_ns, int(track_ns[0]), step_s * NS_PER_S)
+        return cls(regular, int(track_ns[-1]), step_s)
 
     def positions(
         self, frames: Sequence[Frame], span: tuple[int, int] | None = None, forecasts: Forecasts | None = None
@@ -65,17 +67,13 @@ class _PredictionClock(NamedTuple):
             low, high = np.searchsorted(frame_times(frames), [since_ns, until_ns]).tolist()
         joined = join_frames(TRACKS, frames, low, high)
         ids = joined.rows["track_id"].astype(np.int64)
-        return Positions(self.to_step(joined.row_ns), ids, on_ground(joined.rows))
+        return Positions(self.regular.to_step(joined.row_ns), ids, on_ground(joined.rows))
 
     def resampled(self, ground_truth: Sequence[Frame]) -> Positions:
         """The positions of tracks with other times, resampled to the ticks that their frames cover."""
-        last = int(self.to_step(np.array([self.last_ns]))[0])
-        ticks = self.start_ns + np.rint(np.arange(last + 1) * (self.step_s * NS_PER_S)).astype(np.int64)
-        return self.positions(
-            resample_frames(
-                ground_truth, ticks[is_observed_at(frame_times(ground_truth), ticks, seconds_to_ns(MAX_GAP_S))]
-            )
-        )
+        ticks = self.regular.ticks(frame_times(ground_truth), seconds_to_ns(MAX_GAP_S))
+        end_ns = self.last_ns + self.regular.step_ns / 2
+        return self.positions(resample_frames(ground_truth, ticks[ticks <= end_ns]))
 
 
 class _ForecastArrays(NamedTuple):
@@ -91,8 +89,7 @@ def _clock(frames: Sequence[Frame], tracks: Sequence[Frame]) -> _PredictionClock
     first = next((frame.rows[0] for frame in frames if len(frame.rows)), None)
     if first is None or not len(tracks):
         return None
-    track_ns, step_s = frame_times(tracks), float(first["ahead_s"]) / int(first["step"])
-    return _PredictionClock(int(track_ns.min()), int(track_ns.max()), step_s)
+    return _PredictionClock.of(frame_times(tracks), float(first["ahead_s"]) / int(first["step"]))
 
 
 def _arrays(
@@ -108,11 +105,10 @@ def _arrays(
     if len(rows) % horizon or not (rows["step"].reshape(-1, horizon) == np.arange(1, horizon + 1)).all():
         raise McaptrackError(f"{name}: not all forecasts have {horizon} steps")
     if clock is None:
-        track_ns, step_s = frame_times(tracks), float(rows["ahead_s"][0]) / int(rows["step"][0])
-        clock = _PredictionClock(int(track_ns.min()), int(track_ns.max()), step_s)
+        clock = _PredictionClock.of(frame_times(tracks), float(rows["ahead_s"][0]) / int(rows["step"][0]))
     cov = np.stack([rows["cov_xx_m2"], rows["cov_xy_m2"], rows["cov_xy_m2"], rows["cov_yy_m2"]], axis=-1)
     forecasts = Forecasts(
-        clock.to_step(frame_times(frames)[message[::horizon]]),
+        clock.regular.to_step(frame_times(frames)[message[::horizon]]),
         rows["track_id"][::horizon].astype(np.int64),
         on_ground(rows).reshape(-1, horizon, 2),
         cov.reshape(-1, horizon, 2, 2),
@@ -124,7 +120,7 @@ def _arrays(
 _NOTHING: Final = _ForecastArrays(
     np.empty(0, np.int64),
     Forecasts(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 1, 2)), np.empty((0, 1, 2, 2))),
-    _PredictionClock(0, 0, 1.0),
+    _PredictionClock.of(np.zeros(1, np.int64), 1.0),
 )
 
 

@@ -1,4 +1,7 @@
-"""Time in integer nanoseconds, and how many frames have passed when frames arrive at irregular times."""
+"""Time in integer nanoseconds: how many frames or steps have passed when frames arrive at irregular times.
+
+No work may grow with the time that a log covers: a clock may be set from 1970 to today between two frames.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,10 @@ from fractions import Fraction
 from typing import Final
 
 NS_PER_S: Final = 1_000_000_000
+#: A longer time without frames is a jump of the clock, or a pause: nothing goes on after it, and its length has no
+#: effect. By default stages bridge at most 24 s (links by appearance); 60 s leaves room for options. An option that
+#: bridges more moves the limit.
+JUMP_S: Final = 60.0
 #: The last time that 64-bit nanoseconds since 1970 can represent, in 2262.
 LAST_NS: Final = 2**63 - 1
 #: Frame rates: from one picture a day (time lapse) to ten thousand a second.
@@ -53,6 +60,15 @@ def parse_ns(text: str) -> int | None:
 def seconds_to_ns(seconds: float) -> int:
     """Seconds -> nanoseconds, to the nearest."""
     return round(seconds * NS_PER_S)
+
+
+def steps_passed(passed_ns: int, rate_hz: float, bridged_s: float = 0.0) -> int:
+    """The number of steps at ``rate_hz`` in the time between two frames, at least 1.
+
+    The time counts up to ``JUMP_S``, or ``bridged_s`` if it is longer.
+    """
+    longest_ns = seconds_to_ns(max(JUMP_S, bridged_s))
+    return max(1, round(min(passed_ns, longest_ns) * rate_hz / NS_PER_S))
 
 
 class FrameClock:

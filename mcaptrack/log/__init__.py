@@ -10,6 +10,7 @@ recover(path, output)                   write what is intact to a new log
 from mcaptrack.log.check import CheckResult, check
 from mcaptrack.log.check_summary import Finding
 from mcaptrack.log.extend import extend, refuse_to_replace_recorded
+from mcaptrack.log.jumps import ClockJump, clock_jumps, jumps_text
 from mcaptrack.log.messages import ChannelRows, Message, MessageLocations
 from mcaptrack.log.opening import find_results, read, topics_with_schema
 from mcaptrack.log.paths import results_path
@@ -24,6 +25,7 @@ __all__ = [
     "Channel",
     "ChannelRows",
     "CheckResult",
+    "ClockJump",
     "Finding",
     "Log",
     "LogWriter",
@@ -31,11 +33,13 @@ __all__ = [
     "MessageLocations",
     "RecoverResult",
     "check",
+    "clock_jumps",
     "copy_attachments_and_metadata",
     "create",
     "extend",
     "find_results",
     "header",
+    "jumps_text",
     "read",
     "recover",
     "refuse_non_mcap",

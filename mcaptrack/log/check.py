@@ -32,6 +32,7 @@ from mcaptrack.log.chunks import (
 from mcaptrack.log.index import Index, attachment_entry, ends_with_magic, metadata_entry, starts_with_magic
 from mcaptrack.log.journal import journal_of, load_old_content
 from mcaptrack.log.journal_check import changed, find_journal
+from mcaptrack.log.jumps import Span, joined, jumps_between, jumps_text, spans_of
 from mcaptrack.log.records import (
     MAGIC,
     Bytes,
@@ -158,6 +159,8 @@ class _Checker:
             None  # the last chunk, and the offsets of its message indexes
         )
         self._latest: dict[int, int] = {}  # latest log time by channel
+        self._spans: list[Span] = []  # times with messages, without jumps of the clock
+        self._places: dict[int, int] = {}  # of records, by the first time of a span
 
     def check_all(self) -> None:
         buffer = self._buffer
@@ -173,6 +176,7 @@ class _Checker:
         except Damaged as error:
             self._find("structure", 0, f"{error}; what follows can't be checked")
         self._close_chunk()
+        self._find_jumps()
         if ends_well:
             check_summary(buffer, self.found, self.findings)
 
@@ -285,6 +289,22 @@ class _Checker:
         place = (record.start, record.end - record.start, dict(indexes), last - record.end)
         self.found.chunks.append(ChunkIndexRecord(head.start_ns, head.end_ns, *place, *sizes))
 
+    def _add_spans(self, entries: Mapping[int, Entries], where: int) -> None:
+        """Note when there are messages; those of one record, by channel."""
+        edges = [int(edge) for listed in entries.values() for edge in (listed[:, 0].min(), listed[:, 0].max())]
+        for span in spans_of((min(edges), max(edges)), entries) if edges else ():
+            if self._spans and (both := joined(self._spans[-1], span)):
+                self._spans[-1] = both
+            else:
+                self._spans.append(span)
+                self._places.setdefault(span[0], where)
+
+    def _find_jumps(self) -> None:
+        jumps = jumps_between(self._spans, sum(self.found.counts.values()))
+        if jumps:
+            where = self._places.get(jumps[0].after_ns, 0)
+            self._find("clock-jump", where, jumps_text(jumps, self.found.start_ns), "warning", len(jumps))
+
     def _describe_all(self, content: Bytes, where: int) -> None:
         for inner in walk(content, 0, len(content)):
             if inner.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -324,6 +344,7 @@ class _Checker:
 
     def _count(self, entries: Mapping[int, Entries], where: int) -> None:
         """Add messages, in file order, to ``found``."""
+        self._add_spans({channel: listed for channel, listed in entries.items() if len(listed)}, where)
         for channel, listed in entries.items():
             if not len(listed):
                 continue

@@ -6,6 +6,7 @@ transform and its parameters.
 
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.pipeline.events import Watch
+from mcaptrack.pipeline.findings import warn_clock_jumps
 from mcaptrack.pipeline.following import Before, Continued, begins_here
 from mcaptrack.pipeline.fusing import fusable, fuse_again, fuse_cameras
 from mcaptrack.pipeline.plan import plan_all, plan_stage
@@ -57,4 +58,5 @@ __all__ = [
     "run",
     "scenes_of",
     "summarise",
+    "warn_clock_jumps",
 ]

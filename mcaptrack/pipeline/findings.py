@@ -41,6 +41,15 @@ def warn_no_rows(stage: str, source: str, transform: Transform, given: Sequence[
     warn(f"no {STAGES[stage].rows} of {source}: {reason}", "nothing-found")
 
 
+def warn_clock_jumps(opened: log.Log) -> None:
+    """Warn if the clock of a log jumps, or if nothing was recorded for long."""
+    if words := log.jumps_text(log.clock_jumps(opened), opened.start_ns):
+        warn(
+            f"{opened.path}: {words}: the clock jumps, or the recording paused; tracks and forecasts end there",
+            "clock-jump",
+        )
+
+
 def warn_memory(frames: Sequence[Frame]) -> None:
     """Warn if the stages that follow need more memory for these boxes than is free."""
     boxes, steps = int(row_ends(frames)[-1]), np.diff(frame_times(frames))

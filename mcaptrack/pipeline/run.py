@@ -21,7 +21,7 @@ from mcaptrack.pipeline.context import in_context
 from mcaptrack.pipeline.corrections import corrected_input, fixed_in
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
-from mcaptrack.pipeline.findings import warn_findings, warn_memory, warn_no_rows
+from mcaptrack.pipeline.findings import warn_clock_jumps, warn_findings, warn_memory, warn_no_rows
 from mcaptrack.pipeline.following import Before, led, numbers_of, warn_unfollowed
 from mcaptrack.pipeline.motion import path_with, side_inputs
 from mcaptrack.pipeline.pictures import pictures_of
@@ -103,6 +103,8 @@ def run(
     The log is replaced as a whole, after everything was computed.
     """
     with collected() as warnings:
+        if jobs:
+            warn_clock_jumps(opened)
         report = _run(opened, prefix, jobs, output, progress, watch, plane, boxes or BoxesRead(), zones, fused, before)
     report.warnings = list(dict.fromkeys(warnings))
     return report

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.clocks import steps_passed
 from mcaptrack.geometry.histories import Histories
 from mcaptrack.geometry.mixtures import Tails, normal_tails
 from mcaptrack.geometry.ragged import run_starts
@@ -188,7 +188,7 @@ class Forecaster:
     def _passed(self, t_ns: int) -> int:
         """The number of steps from the frame before to this one, at least 1."""
         last_ns, self._last_ns = self._last_ns, t_ns
-        return 1 if last_ns is None else max(1, round((t_ns - last_ns) * self._rate_hz / NS_PER_S))
+        return 1 if last_ns is None else steps_passed(t_ns - last_ns, self._rate_hz)
 
     def _made(self, rows: Rows, past: Floats, known: Bools, people: PeopleSeen | None) -> _Made:
         """The forecasts of tracks (N,) as the predictor makes them, in metres."""

@@ -1,6 +1,7 @@
 """Resample tracks: from the times of the video to a fixed rate, and from pixels to metres on the ground.
 
-Sample times start at the first frame of the log. Later stages depend neither on the frame rate nor on pixels.
+Sample times start at the first frame of the log, and again at the first one after a jump of its clock. Later stages
+depend neither on the frame rate nor on pixels.
 """
 
 from __future__ import annotations
@@ -13,11 +14,10 @@ from typing import ClassVar
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.plane import Planes, plane_at
-from mcaptrack.geometry.ragged import ragged_range
+from mcaptrack.geometry.ticks import RegularClock
 from mcaptrack.schema import TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_numbers, frame_times, split_rows
@@ -70,7 +70,9 @@ class Sample:
         if not len(in_metres):
             return
         frame_ns, indices = frame_times(in_metres), frame_numbers(in_metres)
-        tick_ns = self._ticks(frame_ns, int(frame_ns[0]) if self.start_ns is None else self.start_ns)
+        start_ns, step_ns = int(frame_ns[0]) if self.start_ns is None else self.start_ns, NS_PER_S / self.rate_hz
+        limit_ns = max(seconds_to_ns(self.max_gap_s), round(2 * step_ns))  # longer gaps have no ticks
+        tick_ns = RegularClock.of(frame_ns, start_ns, step_ns, limit_ns / NS_PER_S).ticks(frame_ns, limit_ns)
         picture = indices[np.searchsorted(frame_ns, tick_ns, "right") - 1]  # the last one at each sample time
         for first, last, rows, at in resample_parts(in_metres, tick_ns, seconds_to_ns(self.max_gap_s)):
             rows["source_id"] = rows["track_id"]
@@ -81,23 +83,6 @@ class Sample:
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
         """Why there are no samples, for a warning."""
         return "no track lasts for two sample times, or none stands on the ground plane"
-
-    def _ticks(self, frame_ns: Ints, start: int) -> Ints:
-        """Sample times between consecutive frames that are at most ``max_gap_s`` apart.
-
-        Sample k is at start + k / rate, to the nanosecond. There are none in longer gaps, which may be years.
-        """
-        period = NS_PER_S / self.rate_hz
-        limit = max(seconds_to_ns(self.max_gap_s), round(2 * period))
-        ends = np.append(frame_ns[1:], frame_ns[-1])
-        ends = np.where(ends - frame_ns <= limit, ends, frame_ns)
-        low = np.maximum(np.ceil((frame_ns - start) / period - 0.5).astype(np.int64), 0)
-        high = np.maximum(np.floor((ends - start) / period + 0.5).astype(np.int64), -1)
-        count = np.maximum(high - low + 1, 0)  # one too many at either end is removed below
-        ticks = ragged_range(low, count)
-        tick_ns = start + np.rint(ticks * period).astype(np.int64)
-        inside = (tick_ns >= np.repeat(frame_ns, count)) & (tick_ns <= np.repeat(ends, count))
-        return np.unique(tick_ns[inside])
 
 
 def _in_metres(frame: Frame, planes: Planes) -> Rows:

@@ -23,6 +23,8 @@ from mcaptrack.geometry.ragged import cross_pairs, group_index, ragged_range, ru
 
 #: The number of pairs compared at once, to limit memory.
 _PAIRS_AT_ONCE: Final = 200_000
+#: Gaps of more steps are not interpolated: an id may go on after a jump of the clock by years.
+_MOST_FILLED: Final = 600
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class _SortedPositions(NamedTuple):
 
 
 def _sorted_positions(path: Positions, fill: bool) -> _SortedPositions:
-    """Sort positions; with ``fill`` gaps are interpolated linearly."""
+    """Sort positions; with ``fill`` gaps are interpolated linearly, if they are not longer than any past needs."""
     known = np.isfinite(path.xy_m).all(axis=1)
     ids, slot = np.unique(path.id[known], return_inverse=True)
     step, xy_m = path.step[known], path.xy_m[known]
@@ -77,7 +79,8 @@ def _sorted_positions(path: Positions, fill: bool) -> _SortedPositions:
     last = run_ends(run_starts(slot, step))
     slot, step, xy_m = slot[last], step[last], xy_m[last]
     if fill and len(slot) > 1:
-        ahead = np.append(np.where(slot[1:] == slot[:-1], np.diff(step), 1), 1)
+        gap = np.diff(step)
+        ahead = np.append(np.where((slot[1:] == slot[:-1]) & (gap <= _MOST_FILLED), gap, 1), 1)
         row, within = group_index(ahead), ragged_range(0, ahead)
         inside, share = within > 0, within / ahead[row]
         filled = xy_m[row]

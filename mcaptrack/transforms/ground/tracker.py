@@ -14,7 +14,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats
-from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.clocks import JUMP_S, NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.schema import COVARIANCE_M2, DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.framing import join_frames
@@ -220,6 +220,8 @@ class _Run:
         self._last_ns = frame.t_ns
         if len(found) > DETECTION_ROWS:
             tracks.expect_covariances()
+        if dt > max(JUMP_S, options.max_age_s, options.link_s):
+            tracks.keep(np.zeros(len(tracks), bool))
         tracks.predict(dt)
         self._lost.wait(dt)
         track, row, is_same = associate(

@@ -17,7 +17,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Indices, Ints
 from mcaptrack.geometry.assignment import assign
-from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.clocks import steps_passed
 from mcaptrack.geometry.histories import Histories, Holt
 from mcaptrack.predictors import Forecast, Predictor, make, predict_together
 from mcaptrack.schema import Frame
@@ -63,7 +63,7 @@ class ConsistencyPass:
         """One step: associate, update, age, start and terminate tracks."""
         passed = 1
         if self._last_ns is not None:
-            passed = max(1, round((frame.t_ns - self._last_ns) * self._options.rate_hz / NS_PER_S))
+            passed = steps_passed(frame.t_ns - self._last_ns, self._options.rate_hz, self._options.bridged_s)
         self._last_ns = frame.t_ns
         step = self.steps[-1] + passed if self.steps else 0
         self.steps.append(step)

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from mcaptrack.geometry.arrays import Floats, Ints
-from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.clocks import steps_passed
 from mcaptrack.geometry.ragged import group_index
 from mcaptrack.predictors import Predictor, make
 from mcaptrack.schema import TRACKS, Frame, Rows
@@ -102,7 +102,7 @@ class LikelihoodPass:
         """One step: association, update, birth and termination of tracks."""
         passed = 1
         if self.steps:
-            passed = max(1, round((frame.t_ns - self._last_ns) * self._options.rate_hz / NS_PER_S))
+            passed = steps_passed(frame.t_ns - self._last_ns, self._options.rate_hz, self._options.bridged_s)
         self.steps.append(self.steps[-1] + passed if self.steps else 0)
         self._last_ns = frame.t_ns
         self._frames.append(frame)

@@ -154,6 +154,11 @@ class RetrackOptions:
     )
     latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": float("inf"), "online": 0.0, "predictions": 0.0})
 
+    @property
+    def bridged_s(self) -> float:
+        """The longest time without a sample that a track may bridge."""
+        return self.max_age_s + self.link_s
+
     def __post_init__(self) -> None:
         check_options(self)
         read_limits(self.class_limits)

@@ -247,7 +247,7 @@ class Sort:
             tracks.keep(tracks.table[SINCE_UPDATE] <= run.max_age + run.frame_age)
         if run.clock.stretch != 1.0:
             kalman.stretch(tracks.state, run.clock.stretch)
-        for _ in range(frames):  # predict through missing frames, too
+        for _ in range(frames if len(tracks) else 0):  # predict through missing frames, too
             kalman.predict(tracks.state)
 
     def _compensate(self, tracks: Tracks, motion: Floats | None) -> None:
