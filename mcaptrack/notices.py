@@ -32,6 +32,7 @@ Code = Literal[
     "estimated-ground-plane",
     "extrapolated",
     "few-pictures",
+    "heights",
     "held-back",
     "journal",
     "left-out",

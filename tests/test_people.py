@@ -18,7 +18,7 @@ from mcaptrack.transforms.detect.person_model import (
     _scaled,
     region_boxes,
     regions,
-    typical_height,
+    typical_heights,
 )
 
 ROWS = 24
@@ -98,7 +98,8 @@ def test_parts_above_each_other_are_joined_up_to_the_height_of_one_person(seed):
     corner, size = rng.integers(0, 25, (count, 2)), rng.integers(1, 24, (count, 2))
     found = np.column_stack([corner, size, size.prod(axis=1)])
     expected = rng.choice([20.0, 20.0, 30.0], count)
-    groups = _joined_parts(found, expected)
+    alone, several = _joined_parts(found, expected)
+    groups = [np.array([at]) for at in alone] + several
     assert {frozenset(group.tolist()) for group in groups} == joined(found, expected)
     assert sorted(np.concatenate(groups).tolist()) == list(range(count))
 
@@ -120,7 +121,8 @@ def test_parts_above_each_other_are_joined_up_to_the_height_of_one_person(seed):
 )
 def test_parts_at_the_ends_of_the_distances(lower, is_one):
     found = np.array([(10, 9, 4, 9, 36), (*lower, lower[2] * lower[3])])
-    assert len(_joined_parts(found, np.array([20.0, 20.0]))) == (1 if is_one else 2)
+    alone, groups = _joined_parts(found, np.array([20.0, 20.0]))
+    assert (len(alone), len(groups)) == ((0, 1) if is_one else (2, 0))
 
 
 class TestRegions:
@@ -146,14 +148,23 @@ class TestRegions:
         assert (len(found), int(labels.max())) == (rows * columns,) * 2
 
     def test_the_typical_height_is_the_median_weighted_by_area(self):
-        assert typical_height([]) == typical_height([drawn((100, 100), (5, 5, 19, 1))]) == 20
-        assert typical_height([drawn((100, 100), (5, 5, 5, 4))]) == 4
+        def height(*masks):
+            return typical_heights(masks)[0]
+
+        assert height() == height(drawn((100, 100), (5, 5, 19, 1))) == 20
+        assert height(drawn((100, 100), (5, 5, 5, 4))) == 4
         # 6 x 10 and 5 x 12 have the same area; 8 x 15 = 120 is half of all.
         low, middle, high = (5, 5, 6, 10), (30, 5, 5, 12), (50, 5, 8, 15)
-        assert typical_height([drawn((100, 100), low, middle, high)]) == 12
-        assert typical_height([drawn((100, 100), low), drawn((100, 100), high)]) == 15
-        assert typical_height([drawn((100, 100), low, (30, 5, 2, 50))]) == 10  # half the picture is no person
-        assert typical_height([drawn((100, 100), low, (30, 5, 2, 49))]) == 49
+        assert height(drawn((100, 100), low, middle, high)) == 12
+        assert height(drawn((100, 100), low), drawn((100, 100), high)) == 15
+        assert height(drawn((100, 100), low, (30, 5, 2, 50))) == 10  # half the picture is no person
+        assert height(drawn((100, 100), low, (30, 5, 2, 49))) == 49
+
+    @pytest.mark.parametrize(("far", "wanted"), [(3, (40, 40)), (4, (40, 10)), (16, (40, 10)), (17, (10, 10))])
+    def test_far_people_decide_by_their_outline_before_they_do_by_their_area(self, far, wanted):
+        """One of 16 x 40 pixels has the area of 16 people of 4 x 10, and the outline of four."""
+        boxes = [(2 + 5 * n, 5, 4, 10) for n in range(far)]
+        assert typical_heights([drawn((100, 100), (20, 40, 16, 40), *boxes)]) == wanted
 
 
 class TestLearning:
