@@ -176,7 +176,7 @@ class Separator:
         tall = self._person.height(y0 + h)
         scale = ROWS / self._person.height(y0 + h - max(h - tall, 0) / 4)
         self._work += _REGION_WORK
-        pixels = float(np.prod(np.multiply(region.shape, scale) + (ROWS, self._columns)))
+        pixels = float(np.prod(np.multiply(region.shape, scale) + np.array([ROWS, self._columns])))
         is_group = np.count_nonzero(region) * scale**2 <= _MOST_PEOPLE * self._shape.sum()
         if not is_group or self._work + 3 * pixels > self._most_work:
             return None

@@ -144,7 +144,7 @@ def regions(mask: Image, join_px: int) -> tuple[Labels, Ints]:
         np.ascontiguousarray(mask[y : y + h, x : x + w]), connectivity=8, ltype=kind
     )
     labels[y : y + h, x : x + w] = inner
-    return cast("Labels", labels), np.asarray(found[1:], np.int64) + (x, y, 0, 0, 0)
+    return cast("Labels", labels), np.asarray(found[1:], np.int64) + np.array([x, y, 0, 0, 0])
 
 
 def typical_heights(masks: Sequence[Image]) -> tuple[float, float]:
@@ -204,7 +204,7 @@ class Learner:
         return self._checked(smaller if self._fitting(smaller) > self._fitting(usual) else usual)
 
     def _judged(self, person: Person) -> tuple[Ints, Ints, Bools, Bools]:
-        """Rows of the feet and areas (N,) of regions, and which fit the heights of people, and which contradict them."""
+        """Rows of the feet and areas (N,) of regions, which fit the heights of people, and which contradict them."""
         x, y, w, h, area = np.concatenate([*self._seen, np.empty((0, 5), np.int64)]).T
         height, width = self._size
         is_cut = (x <= 1) | (y <= 1) | (x + w >= width - 1) | (y + h >= height - 1)
