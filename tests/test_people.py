@@ -523,7 +523,8 @@ class TestWork:
         learner = Learner()
         for n in range(20):
             far = [(20 + 25 * k + n, 40 + 2 * k, 10, 25 + k // 4) for k in range(14)]
-            learner.add([drawn((300, 400), *far, (30 + 10 * n, 120, 120, 175))], 175.0, 26.0)
+            close = [(30 + 10 * n, 120, 120, 175)] if n % 2 else []
+            learner.add([drawn((300, 400), *far, *close)], 175.0, 26.0)
         person = learner.person()
         assert person.height(80) == pytest.approx(26, abs=2)
         assert person.holds(np.array([65, 94, 295])).tolist() == [True, True, False]
