@@ -48,7 +48,7 @@ def of_height(share: float) -> Paint:
 
 
 def close(image: Any, number: int, rng: Any) -> None:
-    """People far away, and from a third of the time on somebody close, legs out of the picture."""
+    """People far away, and from a third of the time on a close person, legs out of the picture."""
     height, width = image.shape[:2]
     walkers(image, number, height / 18)
     if number > PICTURES // 3:

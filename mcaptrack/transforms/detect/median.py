@@ -290,7 +290,7 @@ def _warn_of_short(views: Sequence[_View]) -> None:
 
 
 def _warn_of_heights(views: Sequence[_View]) -> None:
-    """Warn where the learned heights of people are not used, because what moves contradicts them."""
+    """Warn where the learned heights of people are not used, because moving regions contradict them."""
     share = max((view.person.contradicted for view in views if view.person), default=0.0)
     if share >= _CONTRADICTED:
         warn(

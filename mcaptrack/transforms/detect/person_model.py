@@ -3,7 +3,7 @@
 The height is learned as a line over the row of the feet, from regions of a foreground mask that stand alone; the shape
 is the mean of these regions, scaled to one height: the probability that a pixel belongs to a person who stands there.
 
-The line is not right everywhere: somebody close to a low camera is ten times as tall as those far away, and their feet
+The line is not right everywhere: a person close to a low camera is ten times as tall as those far away, and their feet
 are out of the picture. Regions that are too tall for the line and shaped like one person contradict it; where they
 cover more pixels than the regions that fit, the line does not hold.
 
@@ -151,7 +151,7 @@ def typical_heights(masks: Sequence[Image]) -> tuple[float, float]:
     """The height of regions of masks, in pixels: the medians weighted by their area, and by their outline.
 
     Both are the same where people are about as tall everywhere. One person close to the camera covers more pixels than
-    all those far away, whose outlines are longer together.
+    all those far away, but their outlines are longer together.
     """
     sizes: list[tuple[int, int]] = []
     for mask in masks:
