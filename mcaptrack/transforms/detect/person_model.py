@@ -214,7 +214,7 @@ class Learner:
         return y + h, area, fits, contradicts & (area >= _LEAST_FILL * w * h)
 
     def _fitting(self, person: Person | None) -> float:
-        """How much of the outline of all regions fits the heights of people."""
+        """Sum the square roots of the areas of regions that fit the heights of people, in pixels."""
         if person is None:
             return 0.0
         _, area, fits, _ = self._judged(person)
