@@ -47,7 +47,7 @@ _EXPLAINED: Final = 0.5
 _ROUNDS: Final = 3
 #: The share of a person, in log-likelihood, that must be seen to be counted.
 _COUNTED: Final = 0.3
-#: The work for a picture is at most this many pixels and as many as it has itself. Places are looked for again as long
+#: The work for a picture is at most this many pixels plus twice its own. Places are looked for again as long
 #: as half of it is left. Ordinary scenes take a tenth to a fifth of it.
 _LEAST_WORK: Final = 200_000
 _PASSES: Final = 2
