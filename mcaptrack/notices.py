@@ -33,6 +33,7 @@ Code = Literal[
     "estimated-ground-plane",
     "extrapolated",
     "few-pictures",
+    "heights",
     "held-back",
     "journal",
     "left-out",

@@ -18,7 +18,7 @@ from mcaptrack.transforms.detect.person_model import (
     _scaled,
     region_boxes,
     regions,
-    typical_height,
+    typical_heights,
 )
 
 ROWS = 24
@@ -98,7 +98,8 @@ def test_parts_above_each_other_are_joined_up_to_the_height_of_one_person(seed):
     corner, size = rng.integers(0, 25, (count, 2)), rng.integers(1, 24, (count, 2))
     found = np.column_stack([corner, size, size.prod(axis=1)])
     expected = rng.choice([20.0, 20.0, 30.0], count)
-    groups = _joined_parts(found, expected)
+    alone, several = _joined_parts(found, expected)
+    groups = [np.array([at]) for at in alone] + several
     assert {frozenset(group.tolist()) for group in groups} == joined(found, expected)
     assert sorted(np.concatenate(groups).tolist()) == list(range(count))
 
@@ -120,7 +121,8 @@ def test_parts_above_each_other_are_joined_up_to_the_height_of_one_person(seed):
 )
 def test_parts_at_the_ends_of_the_distances(lower, is_one):
     found = np.array([(10, 9, 4, 9, 36), (*lower, lower[2] * lower[3])])
-    assert len(_joined_parts(found, np.array([20.0, 20.0]))) == (1 if is_one else 2)
+    alone, groups = _joined_parts(found, np.array([20.0, 20.0]))
+    assert (len(alone), len(groups)) == ((0, 1) if is_one else (2, 0))
 
 
 class TestRegions:
@@ -146,14 +148,23 @@ class TestRegions:
         assert (len(found), int(labels.max())) == (rows * columns,) * 2
 
     def test_the_typical_height_is_the_median_weighted_by_area(self):
-        assert typical_height([]) == typical_height([drawn((100, 100), (5, 5, 19, 1))]) == 20
-        assert typical_height([drawn((100, 100), (5, 5, 5, 4))]) == 4
+        def height(*masks):
+            return typical_heights(masks)[0]
+
+        assert height() == height(drawn((100, 100), (5, 5, 19, 1))) == 20
+        assert height(drawn((100, 100), (5, 5, 5, 4))) == 4
         # 6 x 10 and 5 x 12 have the same area; 8 x 15 = 120 is half of all.
         low, middle, high = (5, 5, 6, 10), (30, 5, 5, 12), (50, 5, 8, 15)
-        assert typical_height([drawn((100, 100), low, middle, high)]) == 12
-        assert typical_height([drawn((100, 100), low), drawn((100, 100), high)]) == 15
-        assert typical_height([drawn((100, 100), low, (30, 5, 2, 50))]) == 10  # half the picture is no person
-        assert typical_height([drawn((100, 100), low, (30, 5, 2, 49))]) == 49
+        assert height(drawn((100, 100), low, middle, high)) == 12
+        assert height(drawn((100, 100), low), drawn((100, 100), high)) == 15
+        assert height(drawn((100, 100), low, (30, 5, 2, 50))) == 10  # half the picture is no person
+        assert height(drawn((100, 100), low, (30, 5, 2, 49))) == 49
+
+    @pytest.mark.parametrize(("far", "wanted"), [(3, (40, 40)), (5, (40, 10)), (15, (40, 10)), (17, (10, 10))])
+    def test_far_people_decide_by_their_outline_before_they_do_by_their_area(self, far, wanted):
+        """One of 16 x 40 pixels has the area of 16 people of 4 x 10, and the outline of four."""
+        boxes = [(2 + 8 * n, 5, 4, 10) for n in range(far)]
+        assert typical_heights([drawn((100, 160), (20, 40, 16, 40), *boxes)]) == wanted
 
 
 class TestLearning:
@@ -467,3 +478,54 @@ class TestBackground:
         np.testing.assert_array_equal(passing.highest, plain.highest)
         np.testing.assert_array_equal(swaying.lowest[:, 60:], plain.lowest[:, 60:])
         assert (swaying.median == plain.median).all()
+
+
+class TestWork:
+    """Work is counted in filtered pixels; the bound is a multiple of the picture's pixels, whatever is expected."""
+
+    @pytest.mark.parametrize("tall", [1.0, 12.0, 30.0, 90.0, 400.0])
+    @pytest.mark.parametrize("half", [1, 4])
+    @pytest.mark.parametrize("what", ["everything", "person", "vehicle", "column", "rain", "noise"])
+    def test_the_work_for_a_picture_is_bounded_by_its_pixels(self, monkeypatch, tall, half, what):
+        mask = {
+            "everything": lambda: drawn((300, 400), (0, 0, 400, 300)),
+            "person": lambda: drawn((300, 400), (100, 60, 90, 230)),
+            "vehicle": lambda: drawn((300, 400), (50, 100, 300, 120)),
+            "column": lambda: drawn((300, 400), *((9 * k % 380, 100 + k, 8, 24) for k in range(120))),
+            "rain": lambda: drawn((300, 400), *((x, y, 2, 12) for x in range(0, 400, 4) for y in range(0, 290, 14))),
+            "noise": lambda: (np.random.default_rng(1).random((300, 400)) < 0.4).astype(np.uint8) * 255,
+        }[what]()
+        filtered, plain = [], cv2.filter2D
+
+        def counted(image, *arguments, **options):
+            filtered.append(image.size)
+            return plain(image, *arguments, **options)
+
+        monkeypatch.setattr(cv2, "filter2D", counted)
+        separator = Separator(Person(0.0, tall, template(half)), 0.5)
+        boxes, _ = separator.boxes(mask)
+        assert sum(filtered) <= 200_000 + 2 * mask.size
+        separator.counts(mask, boxes)
+        assert sum(filtered) <= 2 * (200_000 + 2 * mask.size)
+
+    def test_somebody_close_is_one_box_where_the_heights_do_not_hold(self):
+        """A person of 230 pixels where 30 are expected, a bag within their box, and somebody far away."""
+        rows = np.arange(301) < 150
+        separator = Separator(Person(0.0, 30.0, template(), rows), 0.5)
+        mask = drawn((300, 400), (100, 60, 30, 230), (135, 250, 8, 20), (100, 280, 60, 10), (300, 100, 10, 30))
+        boxes, people = separator.boxes(mask)
+        assert boxes.tolist() == [[300, 100, 10, 30], [100, 60, 60, 230]]
+        assert people.tolist() == [1, 1]
+        assert separator.counts(mask, boxes).tolist() == [1, 1]
+
+    def test_heights_that_what_moves_contradicts_do_not_hold_there(self):
+        """Fourteen people far away, and one close: both heights are learned where they are seen."""
+        learner = Learner()
+        for n in range(20):
+            far = [(20 + 25 * k + n, 40 + 2 * k, 10, 25 + k // 4) for k in range(14)]
+            close = [(30 + 10 * n, 120, 120, 175)] if n % 2 else []
+            learner.add([drawn((300, 400), *far, *close)], 175.0, 26.0)
+        person = learner.person()
+        assert person.height(80) == pytest.approx(26, abs=2)
+        assert person.holds(np.array([65, 94, 295])).tolist() == [True, True, False]
+        assert person.contradicted > 0.5

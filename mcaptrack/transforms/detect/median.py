@@ -33,7 +33,7 @@ from mcaptrack.transforms.detect.background import (
 )
 from mcaptrack.transforms.detect.median_background import MIN_THRESHOLD, Background, Sampler
 from mcaptrack.transforms.detect.people import Separator
-from mcaptrack.transforms.detect.person_model import Learner, Person, region_boxes, typical_height
+from mcaptrack.transforms.detect.person_model import Learner, Person, region_boxes, typical_heights
 from mcaptrack.transforms.detect.registration import Registration
 from mcaptrack.transforms.detect.steadiness import Steadiness
 from mcaptrack.transforms.protocol import Colour, check_options, option
@@ -43,6 +43,11 @@ _MIN_SPAN_S: Final = 1.8
 _MIN_PICTURES: Final = 10
 #: Pictures in a row without a place in a view that are kept, because they may belong to the next one.
 _MAX_UNKNOWN: Final = 30
+#: People are of two sizes, close ones and far ones, where half of the outline of all regions belongs to ones that are
+#: lower by this factor than those with half of the area.
+_APART: Final = 1.5
+#: The heights of people are called contradicted from this share of the moving pixels on.
+_CONTRADICTED: Final = 0.1
 #: The same as ``MAX_FOREGROUND``, where the picture could not be registered.
 _MAX_FOREGROUND_LOST: Final = 0.2
 
@@ -120,6 +125,7 @@ class MedianDetector:
         for view, part in _with_views(frames, views):
             yield from view.detect(part, self)
         _warn_of_short(views)
+        _warn_of_heights(views)
 
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
         """Why there are no detections, for a warning."""
@@ -239,10 +245,12 @@ class _View:
             return  # the background before it holds on, if there is one
         background = Background.of(samples, detector.threshold)
         masks = [background.mask(image, detector.remove_shadows) for image in samples]
-        person_px = typical_height(masks)
-        background = background.swaying(samples, person_px)
-        self._learner.add([background.mask(image, detector.remove_shadows) for image in samples], person_px)
-        self._person_px = person_px
+        person_px, smaller_px = typical_heights(masks)
+        is_apart = smaller_px * _APART < person_px
+        self._person_px = smaller_px if is_apart else person_px
+        background = background.swaying(samples, self._person_px)
+        masks = [background.mask(image, detector.remove_shadows) for image in samples]
+        self._learner.add(masks, person_px, smaller_px if is_apart else None)
         self._blocks.append((start_ns, replace(background)))  # a copy without the ranges that were computed
 
     def close(self, detector: MedianDetector) -> None:
@@ -292,6 +300,18 @@ def _warn_of_short(views: Sequence[_View]) -> None:
             f"{where} pictures are in views or blocks of less than {_MIN_SPAN_S} s or {_MIN_PICTURES} pictures: too few"
             " for a median as the background; detections there are by the detector knn",
             "few-pictures",
+        )
+
+
+def _warn_of_heights(views: Sequence[_View]) -> None:
+    """Warn where the learned heights of people are not used, because moving regions contradict them."""
+    share = max((view.person.contradicted for view in views if view.person), default=0.0)
+    if share >= _CONTRADICTED:
+        warn(
+            f"the heights of people that were learned don't hold everywhere: {share:.0%} of the moving pixels are of "
+            "regions more than twice as tall and shaped like one person or vehicle. Where these prevail, each is one "
+            "box, and people close to each other there are not separated",
+            "heights",
         )
 
 

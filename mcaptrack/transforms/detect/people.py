@@ -4,6 +4,10 @@ A region that is taller or wider than one person is explained by as few people a
 enough: greedily, each place being looked for again when another person is added. People with too little in sight for
 a box of their own are counted in the box of the person who hides them.
 
+Work is bounded by the pixels of the picture, whatever height is expected. It is counted in pixels of filtered crops;
+regions that would exceed the budget of a picture, need more people than a group has, or contradict the heights where
+they stand, are one box.
+
 Letters: N boxes (x, y, w, h).
 """
 
@@ -15,7 +19,17 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Image, Ints
-from mcaptrack.transforms.detect.person_model import JOIN, MIN_AREA, MIN_AREA_PX, ROWS, Map, Person, odd, regions
+from mcaptrack.transforms.detect.person_model import (
+    JOIN,
+    MIN_AREA,
+    MIN_AREA_PX,
+    ROWS,
+    Map,
+    Person,
+    is_too_tall,
+    odd,
+    regions,
+)
 
 #: A region of one person is at most this much taller and wider than expected.
 _TALL: Final = 1.25
@@ -33,6 +47,18 @@ _EXPLAINED: Final = 0.5
 _ROUNDS: Final = 3
 #: The share of a person, in log-likelihood, that must be seen to be counted.
 _COUNTED: Final = 0.3
+#: The work for a picture is at most this many pixels plus twice its own. Places are looked for again as long
+#: as half of it is left. Ordinary scenes take a tenth to a fifth of it.
+_LEAST_WORK: Final = 200_000
+_PASSES: Final = 2
+#: What a region costs in addition to its filtered pixels, in pixels.
+_REGION_WORK: Final = 5_000
+#: A region that more people would have to fill is no group of people that its outline could tell apart.
+_MOST_PEOPLE: Final = 32
+#: More regions in a picture than this are noise, such as rain: they are not compared with each other.
+_MOST_PARTS: Final = 500
+#: A region with this share of its box inside the box of something large is a part of it.
+_INSIDE: Final = 0.8
 
 #: x, y, w, h of a box, and the number of people in it; 0 if unknown.
 _Counted = tuple[float, float, float, float, int]
@@ -58,6 +84,7 @@ class Separator:
         wide = np.flatnonzero(shape.max(axis=0) > 0.35)
         self._half = (wide[-1] - wide[0] + 1) / 2 if len(wide) else self._columns / 4
         self._anchor = (self._columns // 2, ROWS - 1)
+        self._work, self._most_work = 0, 0
 
     def boxes(self, mask: Image) -> tuple[Floats, Ints]:
         """Boxes (N, 4) of people in a mask, and the number of people in each (N,); 0 if unknown."""
@@ -75,49 +102,92 @@ class Separator:
         expected = self._person.heights(found[:, 1] + found[:, 3])
         is_large = found[:, 4] >= MIN_AREA * expected**2
         numbers, found, expected = numbers[is_large], found[is_large], expected[is_large]
+        large, is_rest = self._contradicting(found, expected)
+        numbers, found, expected = numbers[is_rest], found[is_rest], expected[is_rest]
+        alone, groups = _joined_parts(found, expected)
+        is_one = self._is_one(found[alone, 2], found[alone, 3], expected[alone])
+        groups += [np.array([at]) for at in alone[~is_one]]
+        one, tall = found[alone[is_one]], expected[alone[is_one]]
+        is_cut = (one[:, :2] <= 1).any(axis=1) | (one[:, :2] + one[:, 2:4] >= (width - 1, height - 1)).any(axis=1)
+        is_seen = is_cut | (one[:, 4] >= 3 * MIN_AREA * tall**2) | (one[:, 3] >= 0.5 * tall)
         boxes: list[_Counted] = []
-        for members in _joined_parts(found, expected):
+        self._begin(mask)
+        groups.sort(key=lambda members: int(found[members, 4].sum()))  # one large region must not use up the work
+        for members in groups:
             some = found[members]
             x0, y0 = some[:, :2].min(axis=0).tolist()
             x1, y1 = (some[:, :2] + some[:, 2:4]).max(axis=0).tolist()
-            tall, wide, high = self._person.height(y1), x1 - x0, y1 - y0
-            if len(members) == 1 and self._is_one(wide, high, tall):
-                is_cut = x0 <= 1 or y0 <= 1 or x1 >= width - 1 or y1 >= height - 1
-                if is_cut or some[0, 4] >= 3 * MIN_AREA * tall**2 or high >= 0.5 * tall:
-                    boxes.append((x0, y0, wide, high, 1))
-                continue
             is_member[numbers[members] + 1] = True
             region = is_member[labels[y0 - y : y1 - y, x0 - x : x1 - x]] & (mask[y0:y1, x0:x1] > 0)
             is_member[numbers[members] + 1] = False
             boxes.extend(self._separate(region, x0, y0, (width, height)))
-        out = np.array(boxes, np.float64).reshape(-1, 5)
+        separated = np.array(boxes, np.float64).reshape(-1, 5)
+        out = np.concatenate([np.insert(one[is_seen, :4], 4, 1, axis=1), large, separated])
         return out[:, :4], out[:, 4].astype(np.int64)
+
+    def _contradicting(self, found: Ints, expected: Floats) -> tuple[Ints, Bools]:
+        """Boxes and counts (M, 5) of regions (N, 5) that are no group of people as tall as expected, and the others.
+
+        What lies inside of the box of such a region, such as a shoe or a bag, is a part of it and no person beside it.
+        The second array (N,) is false for both.
+        """
+        is_large = is_too_tall(found[:, 3], expected) & ~self._person.holds(found[:, 1] + found[:, 3])
+        large, is_rest = found[is_large], ~is_large
+        for x, y, w, h in large[:, :4].tolist():
+            wide = np.minimum(found[:, 0] + found[:, 2], x + w) - np.maximum(found[:, 0], x)
+            high = np.minimum(found[:, 1] + found[:, 3], y + h) - np.maximum(found[:, 1], y)
+            shared = np.maximum(wide, 0) * np.maximum(high, 0)
+            is_rest &= shared < _INSIDE * found[:, 2] * found[:, 3]
+        count = (large[:, 2] <= large[:, 3]).astype(np.int64)  # who is wider than tall may be anything
+        return np.column_stack([large[:, :4], count]), is_rest
 
     def counts(self, mask: Image, boxes: Floats) -> Ints:
         """Count the people in each box (N, 4) around a region of a mask, (N,); 0 if unknown."""
         size = (mask.shape[1], mask.shape[0])
-        out = np.zeros(len(boxes), np.int64)
-        for at, (x, y, w, h) in enumerate(boxes.astype(np.int64).tolist()):
-            if self._is_one(w, h, self._person.height(y + h)):
-                out[at] = 1
-            elif (found := self._explained(mask[y : y + h, x : x + w] > 0, x, y, size)).is_by_people:
+        x, y, w, h = boxes.astype(np.int64).reshape(-1, 4).T
+        expected = self._person.heights(y + h)
+        is_one = self._is_one(w, h, expected)
+        out = is_one.astype(np.int64)
+        contradicts = is_too_tall(h, expected) & ~self._person.holds(y + h)
+        out[contradicts] = w[contradicts] <= h[contradicts]
+        self._begin(mask)
+        rest = np.flatnonzero(~is_one & ~contradicts)
+        for at in rest[np.argsort((w * h)[rest], kind="stable")].tolist():
+            region = mask[y[at] : y[at] + h[at], x[at] : x[at] + w[at]] > 0
+            found = self._explained(region, int(x[at]), int(y[at]), size)
+            if found and found.is_by_people:
                 out[at] = len(found.people) + len(found.hidden)
         return out
 
-    def _is_one(self, wide: float, high: float, tall: float) -> bool:
-        """Whether a region is no larger than a person of this height."""
-        return high <= _TALL * tall and wide <= 2 * _WIDE * self._half / ROWS * tall
+    def _is_one(self, wide: Ints, high: Ints, tall: Floats) -> Bools:
+        """Which regions are no larger than a person of this height."""
+        return np.asarray((high <= _TALL * tall) & (wide <= 2 * _WIDE * self._half / ROWS * tall), np.bool_)
 
-    def _explained(self, region: Bools, x0: int, y0: int, size: tuple[int, int]) -> _Explanation:
-        """The people who explain a region of a picture of this size (width, height), at x0, y0."""
+    def _begin(self, mask: Image) -> None:
+        """Begin to count the work for a picture."""
+        self._work, self._most_work = 0, _LEAST_WORK + _PASSES * mask.size
+
+    def _explained(self, region: Bools, x0: int, y0: int, size: tuple[int, int]) -> _Explanation | None:
+        """The people who explain a region of a picture of this size (width, height), at x0, y0.
+
+        None if they would be more than a group has, or if looking for them exceeds the work for a picture.
+        """
         h = region.shape[0]
         tall = self._person.height(y0 + h)
         scale = ROWS / self._person.height(y0 + h - max(h - tall, 0) / 4)
+        self._work += _REGION_WORK
+        pixels = float(np.prod(np.multiply(region.shape, scale) + np.array([ROWS, self._columns])))
+        is_group = np.count_nonzero(region) * scale**2 <= _MOST_PEOPLE * self._shape.sum()
+        if not is_group or self._work + 3 * pixels > self._most_work:
+            return None
         crop = _Crop(region, scale, (self._columns // 2 + 1, ROWS // 2))
         ink = crop.ink
         unknown = crop.beyond(x0, y0, size)
         paper = self._filter(np.where(unknown, np.float32(0), 1 - ink), self._miss)
-        people, hidden = self._places(ink, paper)
+        places = self._places(ink, paper)
+        if places is None:
+            return None
+        people, hidden = places
         drawn = np.zeros((len(people), *ink.shape), np.float32)
         for layer, place in zip(drawn, people, strict=True):
             where, shape = self._patch(place, ink.shape)
@@ -131,7 +201,11 @@ class Separator:
         """Boxes of the people in a region of a picture of this size (width, height), at x0, y0."""
         h, w = region.shape
         tall = self._person.height(y0 + h)
-        crop, people, hidden, drawn, is_by_people = self._explained(region, x0, y0, size)
+        explanation = self._explained(region, x0, y0, size)
+        if explanation is None:
+            yield x0, y0, w, h, 0
+            return
+        crop, people, hidden, drawn, is_by_people = explanation
         if not is_by_people:
             is_plausible = (0.4 * tall <= h <= 1.5 * tall and w < tall) or h * w > 4 * self._half / ROWS * tall**2
             if people or is_plausible:
@@ -155,21 +229,30 @@ class Separator:
             if c > a and d > b:
                 yield a, b, c - a, d - b, int(count[number])
 
-    def _places(self, ink: Map, paper: Map) -> tuple[list[_Place], list[_Place]]:
-        """Column and row of the feet of the people who explain the ink, and of those who are counted only."""
+    def _places(self, ink: Map, paper: Map) -> tuple[list[_Place], list[_Place]] | None:
+        """Column and row of the feet of the people who explain the ink, and of those who are counted only.
+
+        None if that exceeds the work for a picture.
+        """
         people: list[_Place] = []
-        most = int(np.ceil(ink.sum() / (0.4 * self._shape.sum()))) + 1
+        most = min(int(np.ceil(ink.sum() / (0.4 * self._shape.sum()))) + 1, 2 * _MOST_PEOPLE)
         while len(people) < most:
+            if self._work + ink.size > self._most_work:
+                return None
             place, gain = self._best(ink, paper, people)
             if gain < self._least:
                 return people, self._hidden(ink, paper, people, place, gain)
             people.append(place)
             for _ in range(_ROUNDS if len(people) > 1 else 0):
+                if not self._is_affordable(ink, people):
+                    break
                 before = list(people)
                 for at in range(len(people)):
                     people[at] = self._best(ink, paper, people[:at] + people[at + 1 :])[0]
                 if people == before:
                     break
+            if not self._is_affordable(ink, people):
+                continue
             gains = [
                 float(self._gains(ink, paper, people[:at] + people[at + 1 :])[row, column])
                 for at, (column, row) in enumerate(people)
@@ -179,10 +262,14 @@ class Separator:
                 return people, [place] if min(gains) >= self._counted and people else []
         return people, []
 
+    def _is_affordable(self, ink: Map, people: Sequence[_Place]) -> bool:
+        """Whether half of the work for a picture is enough to look at each person once more."""
+        return self._work + len(people) * ink.size <= self._most_work // 2
+
     def _hidden(self, ink: Map, paper: Map, people: Sequence[_Place], place: _Place, gain: float) -> list[_Place]:
         """Places of people with too little in sight for a box; ``place`` is the likeliest, with its ``gain``."""
         hidden: list[_Place] = []
-        while gain >= self._counted and len(hidden) < len(people):
+        while gain >= self._counted and len(hidden) < len(people) and self._work + ink.size <= self._most_work:
             hidden.append(place)
             place, gain = self._best(ink, paper, [*people, *hidden])
         return hidden
@@ -204,6 +291,7 @@ class Separator:
     def _filter(self, image: Map, kernel: Map) -> Map:
         import cv2
 
+        self._work += image.size
         return np.asarray(
             cv2.filter2D(image, -1, kernel, anchor=self._anchor, borderType=cv2.BORDER_CONSTANT), np.float32
         )
@@ -266,13 +354,12 @@ class _Explanation(NamedTuple):
     is_by_people: bool
 
 
-def _joined_parts(found: Ints, expected: Floats) -> list[Ints]:
-    """Groups of regions (N, 5) that may be parts of one person, which something stands before."""
+def _joined_parts(found: Ints, expected: Floats) -> tuple[Ints, list[Ints]]:
+    """Regions (N, 5) that stand alone, and groups of those that may be parts of a person behind something."""
     count = len(found)
-    alone = [np.array([at]) for at in range(count)]
     is_part = found[:, 3] < _PART * expected
-    if count < 2 or not is_part.any():
-        return alone
+    if count < 2 or count > _MOST_PARTS or not is_part.any():
+        return np.arange(count), []
     x0, y0 = found[:, 0], found[:, 1]
     x1, y1 = x0 + found[:, 2], y0 + found[:, 3]
     aside, gap = _PART_ASIDE * expected, _PART_GAP * expected
@@ -283,11 +370,12 @@ def _joined_parts(found: Ints, expected: Floats) -> list[Ints]:
     near = beside & above & is_one & (is_part[:, None] | is_part)
     near |= near.T
     np.fill_diagonal(near, False)
-    if not near.any():
-        return alone
-    group = np.arange(count)
-    while True:  # each takes the lowest number of those near it, until that changes nothing
-        lowest = np.minimum(group, np.where(near, group, count).min(axis=1))
+    has_near = near.any(axis=1)
+    some, near = np.flatnonzero(has_near), near[has_near][:, has_near]
+    group = np.arange(len(some))
+    while len(some):  # each takes the lowest number of those near it, until that changes nothing
+        lowest = np.minimum(group, np.where(near, group, len(some)).min(axis=1))
         if (lowest == group).all():
-            return [np.flatnonzero(group == first) for first in np.unique(group)]
-        group = lowest
+            break
+        group = lowest[lowest]
+    return np.flatnonzero(~has_near), [some[group == first] for first in np.unique(group)]
