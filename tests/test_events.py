@@ -593,12 +593,12 @@ def test_the_command_drop_and_tables_handle_events(place):
     assert (result["stages"], result["events"]["/camera/tracks"]["identity switch"]) == (["events"], 2)
     call("events", place, "--topic", "/camera/tracks")
     assert CliRunner().invoke(app, ["events", str(place), "--gate-m", "0"]).exit_code == 1
-    assert CliRunner().invoke(app, ["events", str(place), "--gate-m", "1.5", "--similarity", "iou"]).exit_code == 1
-    (place.parent / "odd.toml").write_text('[events]\nsimilarity = "iou"\ngate = "much"\n')
+    assert CliRunner().invoke(app, ["events", str(place), "--min-iou", "1.5", "--similarity", "iou"]).exit_code == 1
+    (place.parent / "odd.toml").write_text('[events]\nsimilarity = "iou"\nmin-iou = "much"\n')
     words = ["run", str(place), "--config", str(place.parent / "odd.toml")]
     odd = copy_context().run(CliRunner().invoke, app, words)  # what the file says is for this command alone
     assert odd.exit_code == 2
-    assert "[events] gate needs a number, not 'much'" in odd.output
+    assert "[events] min-iou needs a number, not 'much'" in odd.output
     call("export", place, "-o", place.parent / "tables")
     table = pq.read_table(place.parent / "tables" / "events" / "recording=a" / "part-0.parquet").to_pylist()
     assert [(row["topic"], row["kind"], row["truth_id"]) for row in table if row["kind"] == SWITCH] == [

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from mcaptrack import log
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.errors import McaptrackError, command
 from mcaptrack.schema import TRACKS
+from mcaptrack.schema.provenance import Provenance
 from mcaptrack.training.sources import SourceOptions, read_scenes
 from mcaptrack.viewing import serving
 from tests import places
@@ -113,6 +115,13 @@ class Scene:
 
     def of_a_later_version(self) -> str:
         Path("mcaptrack.toml").write_text("[track]\nmax-age-s = 7.0\n")
+        return self.says("run", "LOG", "--no-tables")
+
+    def of_an_older_version(self) -> str:
+        written = Provenance.to_metadata
+        with pytest.MonkeyPatch.context() as before:
+            before.setattr(Provenance, "to_metadata", lambda made: written(replace(made, version="0.2.0")))
+            self.says("detect", "LOG")
         return self.says("run", "LOG", "--no-tables")
 
     def by_own_tracker(self) -> str:
@@ -218,6 +227,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "pipeline/planes.py:plane_in_words:ingest": Scene.side_view,
     "pipeline/findings.py:warn_findings:retrack": Scene.side_view,
     "pipeline/plan.py:_warn_settings:run": Scene.of_a_later_version,
+    "pipeline/plan.py:_replace_older:run": Scene.of_an_older_version,
     "pipeline/plan.py:_refusal:run": Scene.by_own_tracker,
     "pipeline/plan.py:_not_made:*": Scene.elsewhere,
     "pipeline/shown.py:find_views:run": lambda s: s.untracked().says("render", "LOG"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import sys
@@ -132,38 +131,6 @@ def test_modules_of_installed_packages_are_of_what_importlib_says():
         top: (wanted[top][0], version(wanted[top][0])) for top in some
     }
     assert registry.distribution_of(f"{some[0]}_of_nobody") == ("", "")
-
-
-@pytest.mark.parametrize("layout", ["", "src"])
-@pytest.mark.parametrize("is_editable", [True, False])
-def test_a_package_that_is_installed_as_editable_is_known_by_its_modules(
-    installed, tmp_path, monkeypatch, layout, is_editable
-):
-    """What pip leaves of it: metadata among the installed packages, and its folder on the path."""
-    project = tmp_path / "a project"
-    place = project / layout / "own_trackers_edited"
-    place.mkdir(parents=True)
-    (place / "__init__.py").write_text("")
-    (place / "part.py").write_text(PLUGIN)
-    environment = project / ".venv" / "packages"
-    environment.mkdir(parents=True)
-    (environment / "beside_the_project.py").write_text(PLUGIN)
-    for folder in (place.parent, environment):
-        monkeypatch.syspath_prepend(str(folder))
-    package(installed, "own-edited", "0.7", "mcaptrack.trackers", {"edited": "own_trackers_edited.part:Nearest"})
-    info = installed / "own_edited-0.7.dist-info"
-    (info / "top_level.txt").unlink()  # hatchling and others write none
-    (info / "RECORD").write_text("_own_edited.pth,,\n")
-    url = {"url": project.as_uri(), "dir_info": {"editable": True} if is_editable else {}}
-    (info / "direct_url.json").write_text(json.dumps(url))
-    known = ("own-edited", "0.7") if is_editable else ("", "")
-    by_class, by_name = find("tracker", "own_trackers_edited.part:Nearest"), find("tracker", "edited")
-    assert (by_class.distribution, by_class.version) == known
-    assert (by_name.module, by_name.distribution, by_name.version) == (by_class.module, "own-edited", "0.7")
-    other = find("tracker", "beside_the_project:Nearest")
-    assert (other.distribution, other.version) == ("", "")
-    for name in ("own_trackers_edited", "own_trackers_edited.part", "beside_the_project"):
-        del sys.modules[name]
 
 
 def test_an_entry_point_may_name_extras(installed):

@@ -199,8 +199,8 @@ class _Planner:
         found = (provenance_of(self._opened, one) for one in topics)
         return next((made for made in found if made and made.transform == stage), None)
 
-    def _make_anew(self, made: Provenance, stage: str, topic: str) -> bool:
-        """Plan the stage of a channel of an older version from scratch, with ``force``; or else say that it stays."""
+    def _replace_older(self, made: Provenance, stage: str, topic: str) -> bool:
+        """With ``force`` plan the stage of a channel of an older version by its defaults; or else say that it stays."""
         if self._force:
             return self._make(stage, topic, f"was made by version {made.version}")
         if not self._is_of_older_version:
@@ -274,8 +274,13 @@ class _Planner:
         is_due = is_due or topic in self._renewed
         before, why_not = self._before(stage, made)
         if isinstance(why_not, OlderVersionError):
+<<<<<<< ours
             return self._make_anew(made, stage, topic)
         main = main_topic(self._opened, stage, topic)
+=======
+            return self._replace_older(made, stage, topic)
+        main = _main(self._opened, stage, topic)
+>>>>>>> theirs
         # A result at another topic keeps the parameters that it was requested with.
         is_usual = main == f"{self._prefix}/{STAGES[stage].output_topic}"
         is_open = is_usual and stage not in self._defaults and self._is_made_by_another(source)

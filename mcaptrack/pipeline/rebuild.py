@@ -38,7 +38,7 @@ class MissingPluginError(McaptrackError):
 
 
 class OlderVersionError(McaptrackError):
-    """A channel was made by a version before this one, whose parameters have other names or meanings."""
+    """A channel was made by a version with other parameters than this one."""
 
 
 def plugins_of(stage: Stage, transform: Transform) -> dict[str, Plugin]:
@@ -61,9 +61,7 @@ def rebuild(stage: Stage, made: Provenance, known: Mapping[str, Transform]) -> T
     available, and McaptrackError for parameters that no longer exist.
     """
     if made.is_of_older_version:
-        raise OlderVersionError(
-            f"it was made by an older version ({made.version}), of which parameters aren't taken over"
-        )
+        raise OlderVersionError(f"it was made by an older version ({made.version}); `force=True` makes it again")
     parameters = dict(made.parameters)
     cls = _class_of(stage, made, parameters, known)
     plugin, name = made.plugins.get("predictor"), parameters.get("predictor")

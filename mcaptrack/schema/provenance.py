@@ -19,7 +19,7 @@ _PREFIX: Final = "mcaptrack."
 INGEST, VIEW, FUSE, REFINE = "ingest", "view", "fuse", "calibrate"
 #: The metadata record with the start time of a log's cameras, ``start_ns``.
 CLOCK: Final = "mcaptrack.clock"
-#: Beginnings of the versions whose results are read, but not made again with the same parameters.
+#: Beginnings of older versions: their results are read, but not made again with the same parameters.
 _OLDER: Final = ("0.1.", "0.2.")
 
 
@@ -68,7 +68,7 @@ class Provenance:
 
     @property
     def is_of_older_version(self) -> bool:
-        """Whether a version made it whose parameters have other names or meanings than those of this version."""
+        """Whether it was made by a version with other parameters than this one."""
         return self.version.startswith(_OLDER)
 
     def made_from(self) -> dict[str, str]:
