@@ -274,13 +274,8 @@ class _Planner:
         is_due = is_due or topic in self._renewed
         before, why_not = self._before(stage, made)
         if isinstance(why_not, OlderVersionError):
-<<<<<<< ours
-            return self._make_anew(made, stage, topic)
-        main = main_topic(self._opened, stage, topic)
-=======
             return self._replace_older(made, stage, topic)
-        main = _main(self._opened, stage, topic)
->>>>>>> theirs
+        main = main_topic(self._opened, stage, topic)
         # A result at another topic keeps the parameters that it was requested with.
         is_usual = main == f"{self._prefix}/{STAGES[stage].output_topic}"
         is_open = is_usual and stage not in self._defaults and self._is_made_by_another(source)
