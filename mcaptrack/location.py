@@ -94,7 +94,7 @@ def is_remote(location: object) -> TypeGuard[Url]:
 def parse(text: str | os.PathLike[str]) -> Location:
     """The location that a text or a path names.
 
-    Raises McaptrackError for a URL that can't be the name of an object. URLs of other schemes become paths, which
+    Raises McaptrackError for an empty name, and for a URL that can't be the name of an object. URLs of other schemes become paths, which
     ``files.refuse_url`` refuses.
 
     Examples
@@ -106,6 +106,8 @@ def parse(text: str | os.PathLike[str]) -> Location:
     """
     if isinstance(text, Url):
         return text
+    if not os.fspath(text):
+        raise McaptrackError("an empty name is no file or folder; give its name, or . for the working folder")
     found = _URL.fullmatch(os.fspath(text))
     if found is None or found[1].lower() not in SCHEMES:
         return Path(text)

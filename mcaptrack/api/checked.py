@@ -1,4 +1,4 @@
-"""Check the arguments of functions when they are called: choices, ranges of numbers, progress.
+"""Check the arguments of functions when they are called: names of files, choices, ranges of numbers, progress.
 
 The command line checks its options itself, by the same ranges. Without these checks ``form="parqet"`` would be an error
 of the program, or change nothing.
@@ -7,8 +7,9 @@ of the program, or change nothing.
 from __future__ import annotations
 
 import inspect
+import os
 import types
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import cache, wraps
 from numbers import Integral, Real
@@ -21,7 +22,7 @@ T = TypeVar("T")
 
 
 def checked(**ranges: tuple[float, float]) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Check parameters before a function runs: those of a ``Literal``, those with a range here, and ``progress``.
+    """Check parameters before a function runs: paths, those of a ``Literal``, those with a range, and ``progress``.
 
     Parameters
     ----------
@@ -31,8 +32,8 @@ def checked(**ranges: tuple[float, float]) -> Callable[[Callable[P, T]], Callabl
     Returns
     -------
     callable
-        A decorator. The function raises McaptrackError, and does nothing, if a value is none of the choices or out of
-        its range.
+        A decorator. The function raises McaptrackError, and does nothing, if a value is an empty name of a file, none
+        of the choices, or out of its range.
 
     """
 
@@ -46,6 +47,8 @@ def checked(**ranges: tuple[float, float]) -> Callable[[Callable[P, T]], Callabl
                     continue
                 kinds = _kinds(function).get(name, ())
                 choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
+                if "" in map(_name_of, _paths_in(value, kinds)):
+                    raise McaptrackError(f"`{name}=` is an empty name; give the name of a file or folder")
                 if choices:
                     _check_choice(name, value, choices)
                 if kinds and set(kinds) <= {str, type(None)} and not isinstance(value, tuple(kinds)):
@@ -72,6 +75,24 @@ def _kinds(function: Callable[..., object]) -> dict[str, tuple[Any, ...]]:
         name: get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
         for name, hint in known.items()
     }
+
+
+def _paths_in(value: Any, kinds: Iterable[Any]) -> Iterable[Any]:
+    """The paths among the value of a parameter of these types: itself, members of a sequence, values of a mapping."""
+    if isinstance(value, Mapping):
+        return value.values() if any(get_origin(kind) is Mapping and _holds_paths(kind) for kind in kinds) else ()
+    if not any(map(_holds_paths, kinds)):
+        return ()
+    return value if isinstance(value, Sequence) and not isinstance(value, str) else (value,)
+
+
+def _holds_paths(kind: Any) -> bool:
+    whole = get_origin(kind) or kind
+    return (isinstance(whole, type) and issubclass(whole, os.PathLike)) or any(map(_holds_paths, get_args(kind)))
+
+
+def _name_of(path: Any) -> Any:
+    return os.fspath(path) if isinstance(path, os.PathLike) else path
 
 
 def _check_choice(name: str, value: object, choices: list[Any]) -> None:

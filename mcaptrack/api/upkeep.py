@@ -196,6 +196,7 @@ class DropResult:
     warnings: tuple[Notice, ...]
 
 
+@checked()
 def drop(
     log: PathLike,
     topics: str | Sequence[str],

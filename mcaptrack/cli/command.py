@@ -118,6 +118,8 @@ class Command(TyperCommand):
             first = targets[0]
             self.settings[old] = Setting(name, old, hidden.name, first.kind, first.many, first.declared)
         arrange(name, self.params)
+        for parameter in self.params:
+            parameter.process_value = _refusing_empty(parameter.process_value)
         config = parameters["config"]
         config.envvar = now["config"].variable  # the others are read with the files, once this is known
 
@@ -184,6 +186,17 @@ class Command(TyperCommand):
                 words = " ".join(map(str, value)) if setting.many else str(value)
                 parts.append(f"{setting.name}={words} ({where or 'command line'})")
         return f"options: {', '.join(parts)}"
+
+
+def _refusing_empty(process: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """Return ``process_value`` of a parameter, which refuses empty text: as a path it would be the working folder."""
+
+    def processed(ctx: Any, value: Any) -> Any:
+        if "" in (value if isinstance(value, list | tuple) else [value]):
+            raise typer.BadParameter("it is empty, as a variable that is not set; give a value, or leave it out")
+        return process(ctx, value)
+
+    return processed
 
 
 def _refuse_several(words: Sequence[str], options: Sequence[str]) -> None:

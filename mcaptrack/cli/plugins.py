@@ -71,7 +71,7 @@ def _of_words(stage: Stage, words: Sequence[str]) -> Iterator[tuple[str, type[Tr
     given = [values for option in filter(None, (stage.option, stage.was)) if (values := _values(words, option))]
     if len(given) > 1:
         return  # both the old and the new name: the parser refuses that
-    for name in chain.from_iterable(given):
+    for name in filter(None, chain.from_iterable(given)):  # the parser refuses an empty one
         if stage.split(name)[0] in BUILT_IN[stage.option]:
             continue
         with nullcontext() if stage.kind else suppress(McaptrackError):  # a predictor: the command reports the error

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from mcaptrack.api.checked import checked
 from mcaptrack.api.common import as_location
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import place_of, refuse_special, refuse_url
@@ -32,6 +33,7 @@ class NamedLog:
     below: Path
 
 
+@checked()
 def find_logs(
     arguments: Iterable[str | os.PathLike[str]],
     *,
