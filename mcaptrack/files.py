@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import glob
 import json
 import os
@@ -15,7 +16,10 @@ from typing import IO, Any, Final
 
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
-from mcaptrack.location import SCHEMES, Location, Url, hide_secrets
+from mcaptrack.location import SCHEMES, Location, Url, hide_secrets, shortened
+
+#: How much of a name the name of a temporary file begins with, in bytes.
+_PART_BYTES: Final = 200
 
 
 @contextmanager
@@ -119,13 +123,19 @@ def can_replace(path: Path) -> bool:
 
 
 def _part_of(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
+    return path.with_name(f"{_part_name(path)}{os.getpid()}.{secrets.token_hex(4)}.part")
+
+
+def _part_name(path: Path) -> str:
+    """How the names of temporary files beside ``path`` begin: there is room for the rest."""
+    return shortened(f".{path.name}", _PART_BYTES) + "."
 
 
 def _sweep(path: Path) -> None:
     """Remove temporary files beside ``path`` of processes that don't run any more."""
-    for left in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
-        process = left.name.removeprefix(f".{path.name}.").partition(".")[0]
+    beginning = _part_name(path)
+    for left in path.parent.glob(f"{glob.escape(beginning)}*.part"):
+        process = left.name.removeprefix(beginning).partition(".")[0]
         if process.isdigit() and int(process) != os.getpid() and not _is_running(int(process)):
             left.unlink(missing_ok=True)
 
@@ -199,11 +209,15 @@ def read_json(path: Path, what: str, most_bytes: int) -> Any:
 
 
 def refuse_special(path: Path) -> None:
-    """Raise McaptrackError for a pipe, a device or a socket: reading one may never end."""
+    """Raise McaptrackError for a pipe, a device or a socket (reading may never end), and an impossible name."""
     try:
         mode = path.stat().st_mode
-    except OSError:
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise McaptrackError(f"{path} can't be opened: {error.strerror}") from None
         return  # opening it reports the reason
+    except ValueError:
+        raise McaptrackError(f"{path} can't be the name of a file: it has a zero byte") from None
     kinds = {stat.S_ISFIFO: "a pipe", stat.S_ISCHR: "a device", stat.S_ISBLK: "a device", stat.S_ISSOCK: "a socket"}
     for is_kind, what in kinds.items():
         if is_kind(mode):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -27,6 +28,7 @@ from mcaptrack.evaluation.corrections import changes_in
 from mcaptrack.files import is_same_file, refuse_overwrite
 from mcaptrack.geometry import boxes, clocks
 from mcaptrack.geometry.plane import Point
+from mcaptrack.location import sibling
 from mcaptrack.notices import Notice, warn
 from mcaptrack.sources.corrections import CORRECTED
 from mcaptrack.sources.ingest import Format, ImageFormat, IngestOptions, IngestReport, InputRole
@@ -291,7 +293,8 @@ def _changes(path: Path, report: IngestReport) -> dict[str, Any] | None:
 
 def default_log(source: Path) -> Path:
     """Return the default path of the log of an input: in the working folder."""
-    return Path((source.name if source.is_dir() else source.stem) + ".mcap")
+    whole = Path(os.path.abspath(source))  # "." has no name
+    return sibling(Path(whole.name or "log"), ".mcap", of=whole.name if source.is_dir() else whole.stem)
 
 
 def parse_fps(fps: float | str | Fraction | None) -> Fraction | None:

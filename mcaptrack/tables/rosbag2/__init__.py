@@ -22,7 +22,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.foxglove.views import ground
 from mcaptrack.foxglove.views.people import base_heights
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.location import Location, local_name
+from mcaptrack.location import Location, local_name, sibling
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import frame_id_of, input_of
@@ -101,7 +101,7 @@ def write_bag(
     if not streams:
         raise McaptrackError(f"{opened.path} has no detections, tracks or predictions to write as ROS messages")
     streams += job.transforms()
-    part = folder.with_name(f".{folder.name}.part")
+    part = sibling(folder, ".part", of=f".{folder.name}")
     shutil.rmtree(part, ignore_errors=True)
     try:
         part.mkdir(parents=True)
