@@ -99,5 +99,5 @@ def test_the_library_refuses_every_empty_name():
                 function(**{**others, parameter: empty})
         tried.add(f"{name}.{parameter}")
     assert {"open.path", "drop.log", "drop.output", "run.zones", "query.files", "train.sources", "save.path"} <= tried
-    with pytest.raises(McaptrackError, match="is an empty name|an empty name is no file"):
+    with pytest.raises(McaptrackError, match=r"is an empty name|an empty name is no file"):
         fleet.run(mcaptrack.check, (name for name in ["b.mcap", ""]))

@@ -115,8 +115,9 @@ def _opened(path: Path, local: Any) -> tuple[Any, ...]:
     """A file for Arrow: its name and file system, or for a name that is not UTF-8 the open file."""
     import pyarrow as pa
 
+    name = os.path.abspath(path) if ":" in str(path) else str(path)  # "http:x" would be taken for a URL
     try:
-        str(path).encode("utf-8")
+        name.encode("utf-8")
     except UnicodeEncodeError:
         return (pa.OSFile(os.fsencode(path)),)
-    return str(path), local
+    return name, local
