@@ -65,7 +65,7 @@ _PART_BYTES: Final = 200
 
 def default_folder(path: Location) -> Path:
     """The default folder for the bag of a log: log.mcap -> log.rosbag2 beside it."""
-    return local_name(path, ".rosbag2")
+    return local_name(path, ".rosbag2.mcap").with_suffix("")  # a file in it has its name, and a suffix
 
 
 def write_bag(
