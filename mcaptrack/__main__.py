@@ -59,7 +59,7 @@ def main() -> None:
         try:
             app()
         except SystemExit:
-            sys.stdout.flush()  # a command whose answer is lost has failed
+            sys.stdout.flush()  # output that is lost here makes the exit code 1
             raise
     except BrokenPipeError:  # whoever read our output has had enough
         sys.exit(1)

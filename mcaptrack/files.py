@@ -127,7 +127,7 @@ def _part_of(path: Path) -> Path:
 
 
 def _part_name(path: Path) -> str:
-    """How the names of temporary files beside ``path`` begin: there is room for the rest."""
+    """The prefix of the names of temporary files beside ``path``, short enough for the rest of such a name."""
     return shortened(f".{path.name}", _PART_BYTES) + "."
 
 

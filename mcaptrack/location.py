@@ -145,7 +145,7 @@ P = TypeVar("P", Path, Url, Location)
 
 
 def sibling(location: P, end: str, *, of: str | None = None) -> P:
-    """The location beside another whose name is ``of``, by default the name without its suffix, and then ``end``.
+    """The location beside another with the name ``of`` (by default the name without its suffix) and the suffix ``end``.
 
     A name that would be too long for file systems is shortened.
 

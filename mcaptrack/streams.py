@@ -1,4 +1,4 @@
-"""The standard streams of the command line, which may be closed, full, or read by nobody any more.
+"""The standard streams of the command line, also if they are closed, full, or pipes without a reader.
 
 A stream that is closed when the program starts is opened on the null device: otherwise the next file that is opened
 gets its number, and what is printed goes into it.
@@ -16,7 +16,7 @@ _STDOUT, _STDERR = 1, 2
 
 
 class LostOutputError(Exception):
-    """What a command answers can't be written to stdout."""
+    """The output of a command can't be written to stdout."""
 
 
 class _Output(io.FileIO):
@@ -25,7 +25,7 @@ class _Output(io.FileIO):
     is_broken = False
 
     def write(self, data: Any) -> int:
-        """Write bytes. On stdout the first fault is raised: OSError if nobody reads any more, else LostOutputError."""
+        """Write bytes. On stdout the first fault is raised: BrokenPipeError, or LostOutputError for all others."""
         if not self.is_broken:
             try:
                 return super().write(data)

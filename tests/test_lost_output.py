@@ -23,7 +23,11 @@ from tests.tiers import one_in
 _SERVER = """
 import io, json, os, sys
 from mcaptrack import __main__ as program
+import mcaptrack
 from mcaptrack.cli import app
+
+for name in mcaptrack.__all__:
+    getattr(mcaptrack, name)
 
 replies = os.fdopen(os.dup(1), "w", buffering=1)
 for line in sys.stdin:
