@@ -111,14 +111,15 @@ class Command(TyperCommand):
             if setting.declared.was:
                 self._renamed.setdefault(setting.declared.was, []).append(setting)
         self.settings: dict[str, Setting] = dict(now)
-        parameters = {parameter.name: parameter for parameter in self.params}
+        parameters: dict[str, Any] = {parameter.name: parameter for parameter in self.params}
         for old, targets in self._renamed.items():
             hidden = _hidden(parameters[targets[0].parameter], old)
             self.params.append(hidden)
+            parameters[hidden.name] = hidden
             first = targets[0]
             self.settings[old] = Setting(name, old, hidden.name, first.kind, first.many, first.declared)
         arrange(name, self.params)
-        for parameter in self.params:
+        for parameter in parameters.values():
             parameter.process_value = _refusing_empty(parameter.process_value)
         config = parameters["config"]
         config.envvar = now["config"].variable  # the others are read with the files, once this is known
