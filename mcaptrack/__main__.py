@@ -5,6 +5,8 @@ import sys
 from types import FrameType
 from typing import TYPE_CHECKING, Final, NoReturn
 
+from mcaptrack.streams import LostOutputError, open_streams
+
 if TYPE_CHECKING:
     from sys import UnraisableHookArgs
 
@@ -46,6 +48,7 @@ def main() -> None:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where the caller ignores it, as nohup does
         signal.signal(signal.SIGINT, _end)
     sys.unraisablehook = _once_more
+    open_streams()
     try:
         from mcaptrack.cli import app
         from mcaptrack.environment import hush_libraries, share_allocator
@@ -53,10 +56,18 @@ def main() -> None:
         hush_libraries()
         share_allocator()
 
-        app()
+        try:
+            app()
+        except SystemExit:
+            sys.stdout.flush()  # output that is lost here makes the exit code 1
+            raise
     except BrokenPipeError:  # whoever read our output has had enough
-        sys.stderr.close()
-        sys.exit(0)
+        sys.exit(1)
+    except LostOutputError as error:
+        from mcaptrack.cli.text import say
+
+        say(str(error), "error")
+        sys.exit(1)
     except BaseException as error:
         # Libraries turn a signal into errors of their own: one in the middle of an import becomes an ImportError.
         if _RECEIVED and not (isinstance(error, SystemExit) and error.code in (0, None)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -17,7 +18,7 @@ from typing import IO, Any, Final
 
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
-from mcaptrack.location import SCHEMES, Location, Url, hide_secrets
+from mcaptrack.location import SCHEMES, Location, Url, hide_secrets, shortened
 from mcaptrack.processes import MARK_DIGITS, has_ended, mark_of
 
 
@@ -125,7 +126,7 @@ def can_replace(path: Path) -> bool:
 _PART: Final = re.compile(rf"\.(.+)\.(\d+)\.([0-9a-f]{{{MARK_DIGITS}}})[0-9a-f]{{6}}\.part", re.DOTALL)
 _FOLDER: Final = re.compile(rf"mcaptrack-()(\d+)-([0-9a-f]{{{MARK_DIGITS}}})-.*")
 #: The most bytes of a name that its temporary file repeats: file systems allow 255 bytes in all.
-_NAME_BYTES: Final = 220
+_NAME_BYTES: Final = 200
 #: Seconds without a change after which the files of a process of another machine, or container, count as left behind.
 _ABANDONED_S: Final = 3600.0
 
@@ -136,7 +137,7 @@ def _part_of(path: Path) -> Path:
 
 
 def _short(name: str) -> str:
-    return os.fsdecode(os.fsencode(name)[:_NAME_BYTES])
+    return shortened(name, _NAME_BYTES)
 
 
 def sweep(folder: Path, name: str = "") -> None:
@@ -229,11 +230,15 @@ def read_json(path: Path, what: str, most_bytes: int) -> Any:
 
 
 def refuse_special(path: Path) -> None:
-    """Raise McaptrackError for a pipe, a device or a socket: reading one may never end."""
+    """Raise McaptrackError for a pipe, a device or a socket (reading may never end), and an impossible name."""
     try:
         mode = path.stat().st_mode
-    except OSError:
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise McaptrackError(f"{path} can't be opened: {error.strerror}") from None
         return  # opening it reports the reason
+    except ValueError:
+        raise McaptrackError(f"{path} can't be the name of a file: it has a zero byte") from None
     kinds = {stat.S_ISFIFO: "a pipe", stat.S_ISCHR: "a device", stat.S_ISBLK: "a device", stat.S_ISSOCK: "a socket"}
     for is_kind, what in kinds.items():
         if is_kind(mode):

@@ -10,19 +10,26 @@ takes an object for a file.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
-from typing import Final, Self, TypeGuard
+from typing import Final, Self, TypeGuard, TypeVar
 
 from mcaptrack.errors import McaptrackError
 
-__all__ = ["SCHEMES", "Location", "Url", "distinct_names", "hide_secrets", "is_remote", "join", "local_name", "parse"]
+__all__ = [
+    "SCHEMES", "Location", "Url", "distinct_names", "hide_secrets", "is_remote", "join", "local_name", "parse",
+    "shortened", "sibling",
+]  # fmt: skip
 
 #: The schemes of URLs of objects, and what they stand for.
 SCHEMES: Final = {"s3": "Amazon S3", "gs": "Google Cloud Storage", "az": "Azure Blob Storage"}
+#: The longest name of a file in bytes.
+_LONGEST: Final = 255
+_DIGEST: Final = 16
 #: A URL, also one that has become a path: "s3://bucket/a" is "s3:/bucket/a" then.
 _URL: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(?:/+(.*))?", re.DOTALL)
 
@@ -96,8 +103,8 @@ def is_remote(location: object) -> TypeGuard[Url]:
 def parse(text: str | os.PathLike[str]) -> Location:
     """The location that a text or a path names.
 
-    Raises McaptrackError for a URL that can't be the name of an object. URLs of other schemes become paths, which
-    ``files.refuse_url`` refuses.
+    Raises McaptrackError for an empty name, and for a URL that can't be the name of an object. URLs of other schemes
+    become paths, which ``files.refuse_url`` refuses.
 
     Examples
     --------
@@ -108,6 +115,8 @@ def parse(text: str | os.PathLike[str]) -> Location:
     """
     if isinstance(text, Url):
         return text
+    if not os.fspath(text):
+        raise McaptrackError("an empty name is no file or folder; give its name, or . for the working folder")
     found = _URL.fullmatch(os.fspath(text))
     if found is None or found[1].lower() not in SCHEMES:
         return Path(text)
@@ -135,9 +144,41 @@ def join(base: Location, *names: str) -> Location:
     return base
 
 
+P = TypeVar("P", Path, Url, Location)
+
+
+def sibling(location: P, end: str, *, of: str | None = None) -> P:
+    """The location beside another with the name ``of`` (by default the name without its suffix) and the suffix ``end``.
+
+    A name that would be too long for file systems is shortened.
+
+    Examples
+    --------
+    >>> sibling(Path("runs/a.mcap"), ".report.html")
+    PosixPath('runs/a.report.html')
+    >>> len(sibling(Path("a" * 250 + ".mcap"), ".report.html").name)
+    255
+    """
+    stem = location.stem if of is None else of
+    is_long = len(_raw(stem + end)) > _LONGEST
+    return location.with_name((shortened(stem, _LONGEST - _DIGEST - 1 - len(_raw(end))) if is_long else stem) + end)
+
+
+def shortened(name: str, most_bytes: int) -> str:
+    """A name, of which no more than this is kept if it is longer, with a digest of the whole name after it."""
+    raw = _raw(name)
+    if len(raw) <= most_bytes:
+        return name
+    return raw[:most_bytes].decode("utf-8", "ignore") + "-" + hashlib.sha256(raw).hexdigest()[:_DIGEST]
+
+
+def _raw(name: str) -> bytes:
+    return name.encode("utf-8", "surrogatepass")
+
+
 def local_name(location: Location, suffix: str) -> Path:
     """The default path of a file that is made of a log: beside a file, or for an object in the working folder."""
-    return Path(location.name).with_suffix(suffix) if is_remote(location) else Path(location).with_suffix(suffix)
+    return sibling(Path(location.name) if isinstance(location, Url) else location, suffix)
 
 
 def distinct_names(names: Sequence[str], places: Sequence[Location]) -> list[str]:

@@ -301,7 +301,7 @@ class TestRefused:
             ),
             "no channels": (lambda: mcaptrack.drop("log.mcap", []), "name the channels to remove with `topics=`"),
             "no logs": (lambda: mcaptrack.report([], "a.html"), "there is no log to report on"),
-            "a folder to check": (lambda: mcaptrack.check(""), ". is a folder, not an MCAP file"),
+            "a folder to check": (lambda: mcaptrack.check("."), ". is a folder, not an MCAP file"),
             "a folder to export": (lambda: mcaptrack.export("."), ". is a folder, not an MCAP file"),
             "a folder to render": (lambda: mcaptrack.render("."), ". is a folder, not an MCAP file"),
             "a folder to recover": (lambda: mcaptrack.recover("."), ". is a folder, not an MCAP file"),

@@ -9,6 +9,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
+from mcaptrack.api.checked import checked
 from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import publish_bytes, refuse_special
@@ -53,6 +54,7 @@ def models(name: str | None = None) -> tuple[Model, ...]:
     return (catalogue.find(name),) if name else tuple(catalogue.CATALOGUE.values())
 
 
+@checked()
 def get_model(name: str, *, source: PathLike | None = None) -> Path:
     """Fetch the weights of a detector of the catalogue, once, into the user's folder of caches.
 

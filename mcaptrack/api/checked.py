@@ -1,4 +1,4 @@
-"""Check the arguments of functions when they are called: choices, ranges of numbers, progress.
+"""Check the arguments of functions when they are called: names of files, choices, ranges of numbers, progress.
 
 Ranges stand in the annotations (``declared.Option``), from which the command line takes them, too. Without these checks
 ``form="parqet"`` would be an error of the program, or change nothing.
@@ -7,8 +7,9 @@ Ranges stand in the annotations (``declared.Option``), from which the command li
 from __future__ import annotations
 
 import inspect
+import os
 import types
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import cache, wraps
 from numbers import Integral, Real
@@ -22,7 +23,7 @@ T = TypeVar("T")
 
 
 def checked(**ranges: tuple[float, float]) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Check parameters before a function runs: those of a ``Literal``, those with a range here, and ``progress``.
+    """Check parameters before a function runs: paths, those of a ``Literal``, those with a range, and ``progress``.
 
     Parameters
     ----------
@@ -32,8 +33,8 @@ def checked(**ranges: tuple[float, float]) -> Callable[[Callable[P, T]], Callabl
     Returns
     -------
     callable
-        A decorator. The function raises McaptrackError, and does nothing, if a value is none of the choices or out of
-        its range.
+        A decorator. The function raises McaptrackError, and does nothing, if a value is an empty name of a file, none
+        of the choices, or out of its range.
 
     """
 
@@ -47,6 +48,8 @@ def checked(**ranges: tuple[float, float]) -> Callable[[Callable[P, T]], Callabl
                     continue
                 kinds = _kinds(function).get(name, ())
                 choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
+                if "" in map(_name_of, _paths_in(value, kinds)):
+                    raise McaptrackError(f"`{name}=` is an empty name; give the name of a file or folder")
                 if choices:
                     _check_choice(name, value, choices)
                 if kinds and set(kinds) <= {str, type(None)} and not isinstance(value, tuple(kinds)):
@@ -90,6 +93,24 @@ def _ranges(function: Callable[..., object]) -> dict[str, tuple[float, float]]:
     """The ranges that the annotations of a function declare."""
     options = {name: option_of(hint) for name, hint in hints_of(function).items()}
     return {name: (one.least, one.most) for name, one in options.items() if one.is_bounded}
+
+
+def _paths_in(value: Any, kinds: Iterable[Any]) -> Iterable[Any]:
+    """The paths among the value of a parameter of these types: itself, members of a sequence, values of a mapping."""
+    if isinstance(value, Mapping):
+        return value.values() if any(get_origin(kind) is Mapping and _holds_paths(kind) for kind in kinds) else ()
+    if not any(map(_holds_paths, kinds)):
+        return ()
+    return value if isinstance(value, Sequence) and not isinstance(value, str) else (value,)
+
+
+def _holds_paths(kind: Any) -> bool:
+    whole = get_origin(kind) or kind
+    return (isinstance(whole, type) and issubclass(whole, os.PathLike)) or any(map(_holds_paths, get_args(kind)))
+
+
+def _name_of(path: Any) -> Any:
+    return os.fspath(path) if isinstance(path, os.PathLike) else path
 
 
 def _check_choice(name: str, value: object, choices: list[Any]) -> None:

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
+from mcaptrack.api.checked import checked
 from mcaptrack.api.common import as_location, warnings_about
 from mcaptrack.api.options import PathLike
 from mcaptrack.geometry.clocks import NS_PER_S
@@ -176,6 +177,7 @@ class LogInfo:
         return out | {"channels": list(out["channels"]), "frames": None if self.frames is None else list(out["frames"])}
 
 
+@checked()
 def info(log: PathLike, *, frames: bool = False) -> LogInfo:
     """Return the channels of a log, their number of messages, and what was made from what.
 

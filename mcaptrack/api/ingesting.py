@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -14,6 +15,7 @@ from mcaptrack.api.declared import OneOfMany, Option
 from mcaptrack.api.options import FILES, LABELS, PathLike, Reports, Sidecar, no_progress, output
 from mcaptrack.choices import ImageFormat, InputRole, LabelFormat, LengthUnit, Point
 from mcaptrack.errors import McaptrackError, call
+from mcaptrack.location import sibling
 from mcaptrack.notices import Notice, warn
 
 if TYPE_CHECKING:
@@ -330,7 +332,8 @@ def _changes(path: Path, report: IngestReport) -> dict[str, Any] | None:
 
 def default_log(source: Path) -> Path:
     """Return the default path of the log of an input: in the working folder."""
-    return Path((source.name if source.is_dir() else source.stem) + ".mcap")
+    whole = Path(os.path.abspath(source))  # "." has no name
+    return sibling(Path(whole.name or "log"), ".mcap", of=whole.name if source.is_dir() else whole.stem)
 
 
 def parse_fps(fps: float | str | Fraction | None) -> Fraction | None:

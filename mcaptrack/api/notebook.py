@@ -16,6 +16,7 @@ import numpy as np
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline, tables
+from mcaptrack.api.checked import checked
 from mcaptrack.api.common import as_path, warn_unused, warnings_about
 from mcaptrack.api.options import PathLike, Progress
 from mcaptrack.errors import McaptrackError
@@ -108,6 +109,7 @@ class Player:
         what = "scenes" if self.is_above else "pictures"
         return f"{shown}, {self.first_s:.1f} to {self.last_s:.1f} s: {count} {what}{step}"
 
+    @checked()
     def save(self, path: PathLike, *, force: bool = False) -> Path:
         """Write it as a page that needs no other file.
 

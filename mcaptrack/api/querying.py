@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from mcaptrack.api.checked import checked
 from mcaptrack.api.common import as_path, detail, locations_of
 from mcaptrack.api.options import PathLike
 from mcaptrack.tables import RECORDING, TABLES
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
+@checked()
 def query(
     log: PathLike | Sequence[PathLike],
     sql: str,
@@ -117,6 +119,7 @@ class TableList:
     channels: tuple[str, ...]
 
 
+@checked()
 def list_tables(log: PathLike | Sequence[PathLike] = (), *, files: Mapping[str, PathLike] | None = None) -> TableList:
     """List the tables that queries can name, with their columns, units and meanings.
 

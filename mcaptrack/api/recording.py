@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from mcaptrack import log as logs
+from mcaptrack.api.checked import checked
 from mcaptrack.api.common import as_location, log_output
 from mcaptrack.api.reading import LogReader
 from mcaptrack.errors import McaptrackError
@@ -100,6 +101,7 @@ class Recording(LogReader):
         return count
 
 
+@checked()
 def open(path: str | Path, *, create: bool = False) -> Recording:  # noqa: A001  # mcaptrack.open is its name
     """Open a log, with its results if they stand beside it.
 

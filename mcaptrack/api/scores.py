@@ -8,6 +8,7 @@ from html import escape
 from pathlib import Path
 from typing import Any, Final
 
+from mcaptrack.api.checked import checked
 from mcaptrack.api.common import as_path
 from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError
@@ -158,6 +159,7 @@ class Scores:
             raise McaptrackError(f"no class {of_class!r:.60} was scored by itself; there are {there or 'none'}")
         return [row for row in rows if row["sequence"] == COMBINED] or rows
 
+    @checked()
     def draw_curves(self, output: PathLike, force: bool = False) -> Path:
         """Draw the error of predictions (ADE) over recall, in metres and squared, as an SVG.
 

@@ -188,6 +188,7 @@ class DropResult:
     warnings: tuple[Notice, ...]
 
 
+@checked()
 def drop(
     log: PathLike,
     topics: str | Sequence[str],

@@ -17,6 +17,7 @@ from mcaptrack.api.common import Notes, as_path, log_file
 from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.location import sibling
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path
 from mcaptrack.viewing import moments
@@ -241,7 +242,7 @@ def _opening(opened: logs.Log, events: Sequence[LinkedEvent], at_s: float | None
 
 def _report(path: Path, opened: logs.Log, notes: Notes) -> tuple[str, bytes] | None:
     """Return name and content of the report beside a log, if it is about the log as it is now."""
-    file = path.with_suffix(".report.html")
+    file = sibling(path, ".report.html")
     try:
         page = file.read_bytes() if file.is_file() else None
     except OSError as error:

@@ -16,7 +16,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.zones import ZoneOptions
 from mcaptrack.files import publish_bytes, refuse_overwrite
 from mcaptrack.geometry.zones import Zone
-from mcaptrack.location import Url
+from mcaptrack.location import local_name
 from mcaptrack.pipeline import Job, ZoneWatch
 from mcaptrack.sources.zones import parse_zones, read_zones
 from mcaptrack.viewing.zones_page import zones_page
@@ -161,9 +161,7 @@ def draw_zones(
 
     """
     path = log_location(log)
-    page = optional_path(output) or Path(
-        f"{path.stem}.zones.html" if isinstance(path, Url) else path.with_suffix(_PAGE)
-    )
+    page = optional_path(output) or local_name(path, _PAGE)
     if page.suffix.lower() not in (".html", ".htm"):
         raise McaptrackError(f"{page} is not a name for a page; give one that ends with .html")
     refuse_overwrite(page, force)

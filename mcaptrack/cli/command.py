@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar, Final
@@ -91,7 +91,10 @@ class Command(TyperCommand):
         self.most_used: tuple[str, ...] = getattr(given["callback"], "most_used", ()) or MOST_USED.get(name, ())
         arrange(self.most_used, self.params)
         self.settable: tuple[str, ...] = getattr(given["callback"], "settable", ())
-        config: Any = next(parameter for parameter in self.params if parameter.name == "config")
+        parameters: dict[str, Any] = {parameter.name or "": parameter for parameter in self.params}
+        for parameter in parameters.values():
+            parameter.process_value = _refusing_empty(parameter.process_value)
+        config = parameters["config"]
         config.envvar = self.settings["config"].variable  # the others are read with the files, once this is known
 
     def get_help_option(self, ctx: Any) -> Any:
@@ -133,6 +136,17 @@ class Command(TyperCommand):
                 words = " ".join(map(str, value)) if setting.many else str(value)
                 parts.append(f"{setting.name}={words} ({where or 'command line'})")
         return f"options: {', '.join(parts)}"
+
+
+def _refusing_empty(process: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """Return ``process_value`` of a parameter, which refuses empty text: as a path it would be the working folder."""
+
+    def processed(ctx: Any, value: Any) -> Any:
+        if "" in (value if isinstance(value, list | tuple) else [value]):
+            raise typer.BadParameter("it is empty, as a variable that is not set; give a value, or leave it out")
+        return process(ctx, value)
+
+    return processed
 
 
 def _refuse_several(words: Sequence[str], options: Sequence[str]) -> None:

@@ -33,6 +33,7 @@ from mcaptrack.files import publish_bytes, refuse_overwrite
 from mcaptrack.location import Location
 from mcaptrack.notices import Code, Notice
 from mcaptrack.ranges import limits
+from mcaptrack.streams import LostOutputError
 
 P = ParamSpec("P")
 
@@ -262,7 +263,7 @@ def one_line(command: Callable[P, None]) -> Callable[P, None]:
             check_ranges(kwargs)
             with notices.listening(_show_warning):
                 command(*args, **kwargs)
-        except McaptrackError as error:
+        except (McaptrackError, LostOutputError) as error:
             say(str(error).strip(), "error")
             raise typer.Exit(REFUSED) from None
         except typer.Exit:

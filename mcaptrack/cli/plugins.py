@@ -67,7 +67,7 @@ def _values(words: Sequence[str], option: str) -> list[str]:
 
 
 def _of_words(stage: Stage, words: Sequence[str]) -> Iterator[tuple[str, type[Transform]]]:
-    for name in _values(words, stage.option):
+    for name in filter(None, _values(words, stage.option)):  # the parser refuses an empty one
         if stage.split(name)[0] in BUILT_IN[stage.option]:
             continue
         with nullcontext() if stage.kind else suppress(McaptrackError):  # a predictor: the command reports the error

@@ -15,6 +15,7 @@ from mcaptrack.cli.inputs import expand
 from mcaptrack.cli.stages import chooser
 from mcaptrack.cli.text import console, show, stdout_to_stderr
 from mcaptrack.errors import McaptrackError
+from mcaptrack.location import sibling
 from mcaptrack.schema import DETECTIONS
 from mcaptrack.transforms import STAGES
 
@@ -128,7 +129,7 @@ def tune(
                 trials=trials,
                 search=ranges,
                 seed=seed,
-                study=study or output.with_name(f"{output.stem}.{which}.trials.jsonl"),
+                study=study or sibling(output, f".{which}.trials.jsonl"),
                 similarity=similarity,
                 gate_m=gate_m,
                 min_iou=min_iou,

@@ -238,8 +238,10 @@ def _similarities(
     a_counts, b_counts = np.diff(a_ends), np.diff(b_ends)
     if a_counts.dot(b_counts) > _PAIRS_AT_ONCE:
         of = group_index(a_counts), group_index(b_counts)
-        sides = (_reach(part[ends[0] : ends[-1]], similarity, gate) for part, ends in ((a, a_ends), (b, b_ends)))
-        row, column = touching_pairs(*sides, *of)
+        a_reach, b_reach = (
+            _reach(part[ends[0] : ends[-1]], similarity, gate) for part, ends in ((a, a_ends), (b, b_ends))
+        )
+        row, column = touching_pairs(a_reach, b_reach, *of)
         frame = of[0][row]
     else:
         frame, row, column = cross_pairs(a_counts, b_counts)

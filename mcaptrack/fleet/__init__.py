@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+from mcaptrack.api.checked import checked
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet.child import WorkerLimits
 from mcaptrack.fleet.digests import digest_of_settings
@@ -27,6 +28,7 @@ T = TypeVar("T")
 __all__ = ["FleetResult", "FleetStatus", "LogOutcome", "NamedLog", "Running", "find_logs", "run"]
 
 
+@checked()
 def run(
     function: Callable[..., T],
     logs: str | os.PathLike[str] | Iterable[str | os.PathLike[str] | NamedLog],

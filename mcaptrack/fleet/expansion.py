@@ -10,11 +10,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from mcaptrack.api.checked import checked
 from mcaptrack.api.common import as_location
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import place_of, refuse_special, refuse_url
 from mcaptrack.fleet.in_store import logs_in_store
-from mcaptrack.location import Location, Url
+from mcaptrack.location import Location, Url, sibling
 from mcaptrack.log import results_path
 from mcaptrack.log.recording_files import refuse_non_mcap
 from mcaptrack.notices import warn
@@ -32,6 +33,7 @@ class NamedLog:
     below: Path
 
 
+@checked()
 def find_logs(
     arguments: Iterable[str | os.PathLike[str]],
     *,
@@ -119,7 +121,7 @@ def outputs_in(folder: Path, logs: Sequence[NamedLog], suffix: str) -> list[Path
     names: dict[Path, Location] = {}
     for one in logs:
         stem = one.below.name.removesuffix(one.below.suffix) if one.below.suffix.lower() == _SUFFIX else one.below.name
-        name = folder / one.below.with_name(stem + suffix)
+        name = folder / sibling(one.below, suffix, of=stem)
         other = names.setdefault(name, one.path)
         if other != one.path:
             raise McaptrackError(

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import sync_folder
+from mcaptrack.location import sibling
 from mcaptrack.log.byte_source import ByteSource, OpenFile, Piece, file_type, read_exactly
 from mcaptrack.log.chunks import chunk_record, open_chunk
 from mcaptrack.log.index import read_index, starts_with_magic
@@ -63,7 +64,7 @@ class UnusableJournal(Exception):
 
 def journal_of(path: Path) -> Path:
     """The path of the journal of a log."""
-    return path.with_name(path.name + ".journal")
+    return sibling(path, ".journal", of=path.name)
 
 
 def remove_hint(path: Path) -> str:

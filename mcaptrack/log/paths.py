@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final
 
-from mcaptrack.location import Location, Url
-
-P = TypeVar("P", Path, Url, Location)
+from mcaptrack.location import P, sibling
 
 #: Suffix of a sidecar: a log that holds the results of another.
 RESULTS_SUFFIX: Final = ".results.mcap"
@@ -15,4 +12,4 @@ RESULTS_SUFFIX: Final = ".results.mcap"
 
 def results_path(path: P) -> P:
     """The location of the sidecar of a log, which holds its results if they are not in the log itself."""
-    return path.with_name(path.name.removesuffix(".mcap") + RESULTS_SUFFIX)
+    return sibling(path, RESULTS_SUFFIX, of=path.name.removesuffix(".mcap"))

@@ -17,6 +17,7 @@ from mcaptrack.foxglove.views import layouts
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes, moved_planes
+from mcaptrack.location import sibling
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import describe_origin, may_replace
 from mcaptrack.pipeline.drawing import (
@@ -369,7 +370,7 @@ def _write_by_time(writer: log.LogWriter, streams: Iterable[Iterator[Numbered]])
 
 def layout_path(path: Path, name: str) -> Path:
     """Return the path for the layout of this name, beside the log."""
-    return path.with_suffix(layouts.FILES[name])
+    return sibling(path, layouts.FILES[name])
 
 
 def attachment_of(name: str) -> str:

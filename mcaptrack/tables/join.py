@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -48,7 +49,8 @@ def _columns(path: Path) -> Any:
     import pyarrow.parquet as pq
 
     try:
-        return pq.read_schema(path).remove_metadata()
+        with path.open("rb") as stream:  # a name with a colon would be taken for a URL
+            return pq.read_schema(stream).remove_metadata()
     except (OSError, pa.ArrowException) as error:
         raise McaptrackError(f"{path} can't be read as Parquet: {str(error).splitlines()[0]}") from None
 
@@ -77,7 +79,19 @@ def _dataset(files: Sequence[tuple[str, Path]], schema: Any) -> Any:
     )
     local = pa.fs.LocalFileSystem()
     pieces = [
-        form.make_fragment(str(path), local, partition_expression=pc.field(RECORDING.name) == pa.scalar(name))
+        form.make_fragment(*_opened(path, local), partition_expression=pc.field(RECORDING.name) == pa.scalar(name))
         for name, path in files
     ]
     return ds.FileSystemDataset(pieces, schema, form, local)
+
+
+def _opened(path: Path, local: Any) -> tuple[Any, ...]:
+    """A file for Arrow: its name and file system, or for a name that is not UTF-8 the open file."""
+    import pyarrow as pa
+
+    name = os.path.abspath(path) if ":" in str(path) else str(path)  # "http:x" would be taken for a URL
+    try:
+        name.encode("utf-8")
+    except UnicodeEncodeError:
+        return (pa.OSFile(os.fsencode(path)),)
+    return name, local

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -90,6 +91,6 @@ def _parquet(path: Path) -> Any:
     import pyarrow.parquet as pq
 
     try:
-        return pq.ParquetFile(path)
+        return pq.ParquetFile(pa.OSFile(os.fsencode(path)))  # a name with a colon would be taken for a URL
     except (OSError, pa.ArrowException) as error:
         raise McaptrackError(f"{path} can't be read as Parquet: {error}") from None

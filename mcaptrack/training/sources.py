@@ -18,6 +18,7 @@ from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes
+from mcaptrack.location import sibling
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.framing import join_frames
 from mcaptrack.sources.ingest import label_frames
@@ -74,7 +75,7 @@ def _files(path: Path) -> list[Path]:
     kinds = (".txt", ".parquet", ".mcap")
     found = sorted(file for file in path.rglob("*") if file.suffix.lower() in kinds and file.is_file())
     # Only tables of tracks, and none that repeat the log beside them.
-    logs = {file.with_suffix(".tables") for file in found if file.suffix.lower() == ".mcap"}
+    logs = {sibling(file, ".tables") for file in found if file.suffix.lower() == ".mcap"}
     found = [file for file in found if not logs & set(file.parents)]
     found = [file for file in found if file.suffix.lower() != ".parquet" or tables.holds_tracks(file)]
     if not found:

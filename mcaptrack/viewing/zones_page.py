@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from base64 import b64encode
 from collections.abc import Sequence
 from hashlib import sha256
@@ -83,7 +84,7 @@ def zones_page(opened: log.Log, prefix: str, file: str) -> str:
         jpeg=background.jpeg if background else b"",
         data=data,
         left_out=left_out,
-        nonce=b64encode(sha256(opened.path.name.encode()).digest()[:12]).decode(),
+        nonce=b64encode(sha256(os.fsencode(opened.path.name)).digest()[:12]).decode(),
     )
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import unicodedata
 from typing import Final
 
-from mcaptrack.location import Location
+from mcaptrack.location import Location, shortened
 
 #: Longer names are cut, with a digest of the whole name; file systems allow 255 bytes.
 _MAX_BYTES: Final = 200
@@ -23,7 +22,7 @@ def recording_name(path: Location) -> str:
 
     Names that readers would take for numbers or dates (0001 would become 1) get "log-" before them.
     """
-    name = _cut(re.sub(r"[^\w.\-]+", "_", path.stem).lstrip(".") or "log")
+    name = shortened(re.sub(r"[^\w.\-]+", "_", path.stem).lstrip(".") or "log", _MAX_BYTES)
     is_text = re.search(r"[^\W\d_]", name) and not re.fullmatch(r"[-\d._]*e[-\d]+", name, re.IGNORECASE)
     return name if is_text and name.lower().lstrip("-") not in _NO_TEXT else f"log-{name}"
 
@@ -46,15 +45,8 @@ def topic_folder(topic: str) -> str:
     )
     name = ".".join(parts)
     name = name or "%2F" * len(topic)
-    return _cut(name if topic.startswith("/") and name.strip(".") else "~" + name)
+    return shortened(name if topic.startswith("/") and name.strip(".") else "~" + name, _MAX_BYTES)
 
 
 def _escaped(character: str) -> str:
     return "".join(f"%{byte:02X}" for byte in character.encode("utf-8", "surrogatepass"))
-
-
-def _cut(name: str) -> str:
-    raw = name.encode("utf-8", "surrogatepass")
-    if len(raw) <= _MAX_BYTES:
-        return name
-    return raw[:_MAX_BYTES].decode("utf-8", "ignore") + "-" + hashlib.sha256(raw).hexdigest()[:16]

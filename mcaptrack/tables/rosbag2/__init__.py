@@ -22,7 +22,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.foxglove.views import ground
 from mcaptrack.foxglove.views.people import base_heights
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.location import Location, local_name
+from mcaptrack.location import Location, local_name, shortened
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import frame_id_of, input_of
@@ -59,9 +59,13 @@ class _Stream(NamedTuple):
     is_latched: bool = False
 
 
+#: How much of a name the name of a temporary folder begins with, in bytes; files in it have longer ones.
+_PART_BYTES: Final = 200
+
+
 def default_folder(path: Location) -> Path:
     """The default folder for the bag of a log: log.mcap -> log.rosbag2 beside it."""
-    return local_name(path, ".rosbag2")
+    return local_name(path, ".rosbag2.mcap").with_suffix("")  # a file in it has its name, and a suffix
 
 
 def write_bag(
@@ -101,7 +105,7 @@ def write_bag(
     if not streams:
         raise McaptrackError(f"{opened.path} has no detections, tracks or predictions to write as ROS messages")
     streams += job.transforms()
-    part = folder.with_name(f".{folder.name}.part")
+    part = folder.with_name(shortened(f".{folder.name}", _PART_BYTES) + ".part")
     shutil.rmtree(part, ignore_errors=True)
     try:
         part.mkdir(parents=True)

@@ -114,7 +114,8 @@ def _table(path: Path, columns: tuple[str, ...]) -> dict[str, Any]:
     from pyarrow import feather
 
     try:
-        table = feather.read_table(path)
+        with path.open("rb") as stream:
+            table = feather.read_table(stream)
     except OSError as error:
         raise McaptrackError(f"{path} can't be read: {error.strerror or str(error).splitlines()[0]}") from None
     except (pa.ArrowException, ValueError) as error:
