@@ -45,6 +45,16 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(100_000, 20, 50)
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Iterator[None]:
+    """Let reports hold UTF-8 only, as they have to between processes: names of files in captured output may not be."""
+    report = yield
+    report.sections = [
+        tuple(text.encode("utf-8", "backslashreplace").decode() for text in part) for part in report.sections
+    ]
+    return report
+
+
 def pytest_unconfigure() -> None:
     gc.unfreeze()
 
