@@ -22,6 +22,12 @@ def parsed(flags: str, before):
         made, words = before, words[1:]
     while words:
         name = words.pop(0).removeprefix("--").replace("-", "_")
+        if name == "set":
+            name, text = words.pop(0).split("=")
+            kind = type(getattr(made, name))
+            value = text if kind is str else text == "true" if kind is bool else float(text)
+            made = replace(made, **{name: int(value) if kind is int else value})
+            continue
         if name.startswith("no_") and name[3:] in {one.name for one in fields(made)}:
             made = replace(made, **{name[3:]: False})
         else:

@@ -53,7 +53,7 @@ def parameters(command: str) -> set[str]:
         field
         for kind in STAGES[command].built_in().values()
         for field in fields(kind)
-        if not field.metadata.get("context")
+        if not field.metadata.get("context") and field.metadata["flag"]
     ]
     return {field.name.replace("_", "-") for field in declared}
 

@@ -210,9 +210,9 @@ def test_a_network_can_open_no_file_even_if_nothing_was_checked(monkeypatch):
     monkeypatch.setattr(child, "_CODE", start + code)
     monkeypatch.setattr(child.subprocess, "Popen", _in_folder(subprocess.Popen, os.getcwd()))
     Path("strange.onnx").write_bytes(data)
-    limits = networks.Limits.of_environment()
+    limits = networks.NetworkLimits.of_environment()
     with pytest.raises(McaptrackError, match=f"can't be run by ONNX Runtime: .*{errno.EMFILE}$"):
-        networks.Network(networks.read_file(Path("strange.onnx"), limits), limits)
+        networks.OnnxNetwork(networks.read_file(Path("strange.onnx"), limits), limits)
 
 
 def _in_folder(popen, folder):
@@ -258,10 +258,10 @@ def test_signals_end_a_command_and_its_network(use, number, template, folder):
 @pytest.mark.parametrize("layout", INPUTS)
 def test_the_outputs_of_detectors_are_those_of_this_process_to_the_bit(layout):
     Path("net.onnx").write_bytes(detector(layout, SIZE))
-    limits = networks.Limits.with_memory(1000, "")
+    limits = networks.NetworkLimits.with_memory(1000, "")
     file = networks.read_file(Path("net.onnx"), limits)
-    here = networks.Network(file, limits, is_trusted=True)
-    apart = networks.Network(file, limits, lanes=3)
+    here = networks.OnnxNetwork(file, limits, is_trusted=True)
+    apart = networks.OnnxNetwork(file, limits, lanes=3)
     assert here.facts == apart.facts
     pixels = np.random.default_rng(1).uniform(0, 255, (1, 3, *SIZE[::-1])).astype(np.float32)
     given = {name: pixels if len(shape) == 4 else np.array([SIZE]) for name, shape, _ in here.facts["inputs"]}

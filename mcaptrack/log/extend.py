@@ -349,7 +349,7 @@ class _Descriptions:
     schemas: set[int] = field(default_factory=set)
 
     def of(self, channels: Iterable[ChannelRecord]) -> list[int]:
-        """Those of some kept channels whose description was dropped, and that no kept chunk holds so far."""
+        """The ids of kept channels that need a new description: no kept chunk holds one so far."""
         return [
             one.id
             for one in channels

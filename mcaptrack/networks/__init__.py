@@ -21,16 +21,16 @@ from numpy.typing import NDArray
 
 from mcaptrack import environment
 from mcaptrack.errors import McaptrackError
-from mcaptrack.networks.child import Child
+from mcaptrack.networks.child import NetworkProcess
 from mcaptrack.networks.session import Device, Facts, Resize, Session, SessionError, Value, is_installed, providers
 from mcaptrack.notices import warn
 
 __all__ = [
     "Device",
-    "Limits",
-    "Network",
     "NetworkFile",
     "NetworkLimitError",
+    "NetworkLimits",
+    "OnnxNetwork",
     "Value",
     "digest_of",
     "providers",
@@ -49,7 +49,7 @@ class NetworkLimitError(McaptrackError):
 
 
 @dataclass(frozen=True)
-class Limits:
+class NetworkLimits:
     """Limits of a network; its file, which may be as large, does not count.
 
     Attributes
@@ -108,7 +108,7 @@ def digest_of(path: Path) -> str:
         raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
 
 
-def read_file(path: Path, limits: Limits) -> NetworkFile:
+def read_file(path: Path, limits: NetworkLimits) -> NetworkFile:
     """Read a file, once. Raises McaptrackError if that can't be done, or if it is larger than a network may be."""
     try:
         if path.stat().st_size > limits.memory_bytes:
@@ -122,7 +122,7 @@ def read_file(path: Path, limits: Limits) -> NetworkFile:
     return NetworkFile(path, data, hashlib.sha256(data).hexdigest())
 
 
-class Network:
+class OnnxNetwork:
     """A network that is ready to run.
 
     Attributes
@@ -137,7 +137,7 @@ class Network:
     def __init__(
         self,
         file: NetworkFile,
-        limits: Limits,
+        limits: NetworkLimits,
         *,
         device: Device = "cpu",
         is_trusted: bool = False,
@@ -149,7 +149,7 @@ class Network:
         ----------
         file : NetworkFile
             Its file.
-        limits : Limits
+        limits : NetworkLimits
             What it may take. A trusted network is held to the memory that it computes in, and to no time.
         device : {"auto", "cpu", "cuda"}
             Where it runs.
@@ -167,14 +167,14 @@ class Network:
 
         """
         self._file, self._limits, self._device = file, limits, device
-        self._session: Session | Child | None = None
+        self._session: Session | NetworkProcess | None = None
         if not is_installed():
             raise McaptrackError(
                 f"{file.path} needs ONNX Runtime, which is not installed; `pip install 'mcaptrack[onnx]'` installs it"
             )
         with self._blamed():
             if _runs_apart(is_trusted):
-                self._session = Child(lanes, device, limits.memory_bytes, limits.seconds)
+                self._session = NetworkProcess(lanes, device, limits.memory_bytes, limits.seconds)
         try:
             self.open()
         except BaseException:
@@ -186,7 +186,7 @@ class Network:
     def open(self, resize: Resize | None = None) -> None:
         """Open it again, for pictures of another size. Raises as at first."""
         with self._blamed():
-            if isinstance(self._session, Child):
+            if isinstance(self._session, NetworkProcess):
                 self.facts = self._session.open(self._file.data, resize)
             else:
                 self._session = Session(self._file.data, self._device, self._limits.memory_bytes, resize)
@@ -204,7 +204,7 @@ class Network:
 
     def close(self) -> None:
         """End it, and the calls that it is at work on."""
-        if isinstance(self._session, Child):
+        if isinstance(self._session, NetworkProcess):
             self._session.end(SessionError("was ended"))
 
     @contextmanager

@@ -40,7 +40,7 @@ _LONGEST: Final = 2**24
 _GONE_S: Final = 2.0
 
 
-class Child:
+class NetworkProcess:
     """A network in a process of its own.
 
     It takes as many calls at a time as it has ``lanes``. A call that takes longer than ``seconds``, or memory beyond

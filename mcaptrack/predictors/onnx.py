@@ -17,7 +17,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.geometry.histories import fill_gaps, last_positions
-from mcaptrack.networks import Limits, Network, NetworkFile, read_file
+from mcaptrack.networks import NetworkFile, NetworkLimits, OnnxNetwork, read_file
 from mcaptrack.predictors.forecast import Forecast
 from mcaptrack.predictors.linear import LinearPredictor
 
@@ -29,7 +29,7 @@ class Onnx:
     """A network in ONNX format (see the module). Without a covariance of its own it has that of ``kalman``."""
 
     path: Path
-    network: Network
+    network: OnnxNetwork
     past: int
     steps: int
     step_s: float
@@ -39,13 +39,13 @@ class Onnx:
     @classmethod
     def of(cls, path: Path) -> Self:
         """Open and test the network. Raises McaptrackError if it can't be run or has other inputs or outputs."""
-        limits = Limits.of_environment()
+        limits = NetworkLimits.of_environment()
         return cls._of(read_file(path, limits), limits)
 
     @classmethod
     @lru_cache(maxsize=4)
-    def _of(cls, file: NetworkFile, limits: Limits) -> Self:
-        network = Network(file, limits)
+    def _of(cls, file: NetworkFile, limits: NetworkLimits) -> Self:
+        network = OnnxNetwork(file, limits)
         try:
             return cls._tried(file, network)
         except BaseException:
@@ -53,7 +53,7 @@ class Onnx:
             raise
 
     @classmethod
-    def _tried(cls, file: NetworkFile, network: Network) -> Self:
+    def _tried(cls, file: NetworkFile, network: OnnxNetwork) -> Self:
         path, sha256 = file.path, file.sha256
         shape = next((shape for _, shape, _ in network.facts["inputs"]), [])
         if len(shape) != 3 or not isinstance(shape[1], int) or shape[2] != 2:

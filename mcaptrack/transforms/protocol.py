@@ -198,8 +198,8 @@ def option(
     pattern : str
         Regular expression of a text that a settings file in the working folder may set; "" for none.
     flag : bool
-        Whether the command has an option of its own for it. Without one it is set by ``--set name=value``: parameters
-        whose value follows from an experiment, as those of a method of a paper, and not from the task of a user.
+        Whether the command has an option of its own for it. Without one it is set by ``--set name=value``: this
+        is for values that follow from an experiment, as in a paper, and not from the task of a user.
 
     Returns
     -------

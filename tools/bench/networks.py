@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from mcaptrack.geometry.boxes import parse_size
-from mcaptrack.networks import Limits, Network, NetworkFile, read_file
+from mcaptrack.networks import NetworkFile, NetworkLimits, OnnxNetwork, read_file
 
 
 def used_s() -> float:
@@ -22,11 +22,11 @@ def used_s() -> float:
 
 
 def measure(
-    file: NetworkFile, limits: Limits, size: tuple[int, int], count: int, is_trusted: bool
+    file: NetworkFile, limits: NetworkLimits, size: tuple[int, int], count: int, is_trusted: bool
 ) -> tuple[float, str]:
     """Seconds to open a network, run it on so many pictures and end it; and the sum of all that it gives."""
     began = used_s()
-    network = Network(file, limits, is_trusted=is_trusted)
+    network = OnnxNetwork(file, limits, is_trusted=is_trusted)
     (name, _, _), *_ = network.facts["inputs"]
     own = network.facts["sizes"][name]
     if own != size and None not in own:
@@ -46,7 +46,7 @@ def main() -> None:
     size = parse_size(options.size)
     if size is None:
         parser.error("--size takes width x height")
-    limits = Limits.of_environment()
+    limits = NetworkLimits.of_environment()
     file = read_file(options.file, limits)
     measure(file, limits, size, 1, True)  # what is loaded once
     rows = {}

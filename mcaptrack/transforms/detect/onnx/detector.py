@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.boxes import parse_size
-from mcaptrack.networks import Device, Limits, NetworkFile, digest_of, read_file
+from mcaptrack.networks import Device, NetworkFile, NetworkLimits, digest_of, read_file
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.transforms.detect.onnx import classes as known_classes
@@ -134,7 +134,7 @@ class OnnxDetector:
         first = next(frames, None)
         if first is None:
             return
-        limits = Limits.with_memory(self.max_memory_mb, "`max_memory_mb=`", "a smaller `input_size=` takes less")
+        limits = NetworkLimits.with_memory(self.max_memory_mb, "`max_memory_mb=`", "a smaller `input_size=` takes less")
         file = read_file(self.weights(), limits)
         self.check_weights(file.sha256, len(file.data))
         with closing(DetectorNetwork(file, _input_size(self, first.rows), self.device, limits)) as network:

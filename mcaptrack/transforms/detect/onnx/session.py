@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mcaptrack.environment import threads
 from mcaptrack.errors import McaptrackError
-from mcaptrack.networks import Device, Limits, Network, NetworkFile, NetworkLimitError, Value
+from mcaptrack.networks import Device, NetworkFile, NetworkLimitError, NetworkLimits, OnnxNetwork, Value
 from mcaptrack.transforms.detect.onnx.catalogue import CATALOGUE
 from mcaptrack.transforms.detect.onnx.layouts import NetworkSignature
 from mcaptrack.transforms.detect.onnx.outputs import Outputs
@@ -30,14 +30,14 @@ _CUDA_BATCH: Final = 8
 class DetectorNetwork:
     """A network for pictures of one size, ready to run; several threads may run it."""
 
-    def __init__(self, file: NetworkFile, size: Size | None, device: Device, limits: Limits) -> None:
+    def __init__(self, file: NetworkFile, size: Size | None, device: Device, limits: NetworkLimits) -> None:
         """Open it, and run it once on a grey picture.
 
         ``size`` is width and height of the input; None for the file's own. Raises McaptrackError if that can't be done.
         """
         self._file, self._limits = file, limits
         is_trusted = any(model.sha256 == file.sha256 for model in CATALOGUE.values())
-        self._network = Network(file, limits, device=device, is_trusted=is_trusted, lanes=workers())
+        self._network = OnnxNetwork(file, limits, device=device, is_trusted=is_trusted, lanes=workers())
         try:
             self._prepare(size)
         except BaseException:
