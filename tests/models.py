@@ -12,8 +12,8 @@ from time import sleep
 from types import MappingProxyType
 from typing import Any
 
-from mcaptrack.transforms.detect.onnx import catalogue
-from mcaptrack.transforms.detect.onnx.catalogue import Model
+from mcaptrack.transforms.detect.onnx import session
+from mcaptrack.transforms.detect.onnx.session import Model
 from tests.onnx_graphs import detector
 
 DATA = detector("yolox")
@@ -91,6 +91,6 @@ def stocked(monkeypatch: Any, folder: Path, *urls: str) -> Model:
         good_for="tests",
     )
     (folder / "known.onnx").write_bytes(DATA)
-    monkeypatch.setattr(catalogue, "CATALOGUE", MappingProxyType({NAME: model}))
+    monkeypatch.setattr(session, "CATALOGUE", MappingProxyType({NAME: model}))
     monkeypatch.setenv("MCAPTRACK_MODELS", str(folder / "models"))
     return model

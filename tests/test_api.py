@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 import mcaptrack
 from mcaptrack import log, pipeline, tables
 from mcaptrack.api.outputs import ReportResult
-from mcaptrack.api.scores import Scores
+from mcaptrack.api.scoring import Scores
 from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources import ingest

@@ -13,7 +13,7 @@ from mcaptrack.cli.running import _lines_of_summary
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.colour_histograms import BINS, LENGTH, at_border, describe, is_clear, mean_shares
 from mcaptrack.notices import collected
-from mcaptrack.pipeline.appearance import _nearest, with_descriptors
+from mcaptrack.pipeline.pictures import _nearest, with_descriptors
 from mcaptrack.pipeline.summary import summarise
 from mcaptrack.schema import APPEARANCE, TRACKS, Frame
 from mcaptrack.sources.cameras import provenance_of
@@ -208,7 +208,7 @@ def test_a_run_looks_at_every_clear_box_and_says_what_it_found(log_of_run):
 
 
 def test_samples_without_a_picture_take_none_of_the_others_away(log_of_run, monkeypatch):
-    monkeypatch.setattr("mcaptrack.pipeline.appearance._NEAR_NS", 1_000_000)
+    monkeypatch.setattr("mcaptrack.pipeline.pictures._NEAR_NS", 1_000_000)
     frames = list(log_of_run.frame_columns("/camera/samples", TRACKS))[:12]
 
     def seen(given):

@@ -19,7 +19,7 @@ from mcaptrack.geometry.histories import Histories, Holt, fill_gaps, rebuild_pos
 from mcaptrack.geometry.plane import GroundPlane, assumed_plane, plane_at
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.resampling import is_observed_at, resample
-from mcaptrack.sources.scenes import demo_scene
+from mcaptrack.sources.demo import demo_scene
 from tests.worlds import tracks_at
 
 BOXES = hnp.arrays(float, st.tuples(st.integers(0, 5), st.just(4)), elements=st.floats(0.5, 100))

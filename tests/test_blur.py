@@ -22,10 +22,10 @@ from mcaptrack import foxglove, log
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.sources.foreign import MessageType, picture_decoder
 from mcaptrack.sources.foreign.flatten import message_type_of
-from mcaptrack.sources.foreign.replaced_pictures import picture_replacer
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video.raw_pixels import RAW_ENCODINGS, PixelLayout, raw_bgr, raw_with
 from mcaptrack.viewing.blur.mosaic import hide
+from mcaptrack.viewing.blur.recording import picture_replacer
 from tests.commands import call, printed
 from tests.logs import add_rows
 from tests.robots import write_log
@@ -240,7 +240,7 @@ def test_a_video_is_written_too_and_results_stay_up_to_date(finished, tmp_path):
     with av.open(str(tmp_path / "a.mp4")) as container:
         clip = [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
     with log.read(finished) as one, log.read(tmp_path / "a.mcap") as other:
-        from mcaptrack.pipeline.staleness import is_stale
+        from mcaptrack.pipeline.plan import is_stale
 
         original = [frame.rows for frame in Pictures(one, "/camera/video").frames(range(len(clip)))]
         stored = [frame.rows for frame in Pictures(other, "/camera/video").frames(range(len(clip)))]

@@ -13,10 +13,9 @@ import pytest
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.labels import box_rows, delimited, json_boxes, yolo
 from mcaptrack.sources.ingest.labels.box_rows import fitted
-from mcaptrack.sources.ingest.labels.content import Labels
+from mcaptrack.sources.ingest.labels.content import Labels, WantedClasses
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline
-from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
 NAN = float("nan")
 

@@ -17,7 +17,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.transform_tree import Poses, PoseSamples, Recorded, TransformTree
 from mcaptrack.notices import collected
 from mcaptrack.schema import TRACKS, Frame
-from mcaptrack.sources import moved_tracks
+from mcaptrack.sources import camera_motion
 from mcaptrack.sources.fixed_frame import named_detections, rows_of_boxes
 from mcaptrack.sources.foreign import MessageType
 from mcaptrack.sources.foreign.boxes import Classes
@@ -133,13 +133,13 @@ def test_tracks_in_another_frame_are_as_boxes_brought_there(monkeypatch):
         count = len(stamps_ns)
         return Poses(np.tile(half, (count, 1, 1)), np.tile(shift, (count, 1)), np.zeros(count, np.int64), {})
 
-    monkeypatch.setattr(moved_tracks, "poses_at", poses_at)
+    monkeypatch.setattr(camera_motion, "poses_at", poses_at)
     nan = np.nan
     rows = TRACKS.rows(
         track_id=[1, 2, 3], x_m=[1.0, 2.0, 3.0], y_m=[0.0, 1.0, 2.0], z_m=[1.0, 2.0, nan], heading_rad=[0.0, 2.0, nan],
         vx_m_per_s=[1.0, 0.0, nan], vy_m_per_s=[0.0, -2.0, nan], observed=[True] * 3, source_id=[-1] * 3,
     )  # fmt: skip
-    (moved,) = moved_tracks.in_frame(None, "/truth", [Frame(START_NS, 0, rows)], "map", "city")
+    (moved,) = camera_motion.in_frame(None, "/truth", [Frame(START_NS, 0, rows)], "map", "city")
     boxes = [
         Box3d(START_NS, "city", (row["x_m"], row["y_m"], row["z_m"]), turn, (1.0, 1.0, 1.0), velocity=velocity)
         for row, turn, velocity in zip(

@@ -24,7 +24,7 @@ from mcaptrack.geometry.pinhole import Lens
 from mcaptrack.pipeline.write import Made, write
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.viewing.blur.in_space import outlines
+from mcaptrack.viewing.blur.people import outlines
 from tests.worlds import ns
 
 PX = 0.13  # coordinates are multiples of a quarter of a pixel

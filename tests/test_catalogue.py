@@ -15,7 +15,7 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.tables import catalogue
-from mcaptrack.tables.export.catalogue import about_channels, best_tracks, worst_score
+from mcaptrack.tables.export.contents import about_channels, best_tracks, worst_score
 from mcaptrack.tables.fields import TABLES
 from tests.logs import some_log
 

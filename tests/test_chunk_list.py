@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 
 from mcaptrack import log
 from mcaptrack.log.chunk_list import ChunkList
-from mcaptrack.log.fingerprint import Checksums, fingerprint
+from mcaptrack.log.messages import Checksums, fingerprint
 from mcaptrack.log.records import ChunkIndexRecord
 from mcaptrack.log.writer import LogWriter
 from tests.memory import held

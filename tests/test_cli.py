@@ -18,7 +18,7 @@ import pytest
 from mcaptrack import __version__, log
 from mcaptrack.cli.demo import _next_commands
 from mcaptrack.schema import COUNTS, EVENTS, EventKind
-from mcaptrack.sources import scenes
+from mcaptrack.sources import demo
 from mcaptrack.sources.demo import read_scores
 from tests.commands import call, printed, start
 from tests.tiers import thorough
@@ -483,7 +483,7 @@ def test_an_interruption_that_a_library_replaces_by_its_own_error_counts(sent):
 
 def test_the_demonstration(tmp_path, monkeypatch):
     """The test replaces the scene by a short one."""
-    monkeypatch.setitem(scenes.SCENES, "square", lambda seed: small_scene(seed=seed))
+    monkeypatch.setitem(demo.SCENES, "square", lambda seed: small_scene(seed=seed))
     monkeypatch.setattr(sys, "argv", ["mcaptrack", "demo"])
     folder = tmp_path / "d"
     shown, _ = printed("demo", "-o", folder)

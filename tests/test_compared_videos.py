@@ -12,7 +12,6 @@ import pytest
 
 import mcaptrack
 from mcaptrack import log, notices
-from mcaptrack.evaluation.occupancy import Occupancy
 from mcaptrack.foxglove import ANNOTATIONS
 from mcaptrack.foxglove.messages import message_class
 from mcaptrack.geometry.plane import GroundPlane
@@ -20,6 +19,7 @@ from mcaptrack.pipeline.write import Made, write
 from mcaptrack.schema import EVENTS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.viewing import comparing, from_above, heat_map
+from mcaptrack.viewing.heat_map import Occupancy
 from tests.commands import call, printed
 from tests.worlds import ns
 

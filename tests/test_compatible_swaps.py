@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcaptrack.notices import collected
-from mcaptrack.transforms.retrack import compatible_swaps, offline
-from mcaptrack.transforms.retrack.compatible_swaps import compatible
+from mcaptrack.transforms.retrack import identity_swaps, offline
+from mcaptrack.transforms.retrack.identity_swaps import compatible
 from mcaptrack.transforms.retrack.motion_model import MotionModel
 
 STEPS = 60
@@ -83,7 +83,7 @@ def test_the_solver_is_limited_by_nodes_which_are_the_same_on_every_machine(monk
     low = rng.integers(0, 60, 400)
     met = pairs, low, low + 30, rng.uniform(1, 9, 400)
     best = compatible(*met)
-    monkeypatch.setattr(compatible_swaps, "_NODES", 0)
+    monkeypatch.setattr(identity_swaps, "_NODES", 0)
     with collected() as said:
         found = compatible(*met)
     rows = [(pairs[k].tolist(), int(low[k]), 30, 0.0) for k in found.tolist()]
@@ -117,7 +117,7 @@ def test_who_meets_six_others_in_a_row_keeps_one_identity():
 def test_more_encounters_than_a_solver_should_get_at_once_are_decided_one_after_another(monkeypatch):
     met = [([1, 2], 0, 9, 4.0), ([2, 3], 5, 9, 5.0), ([3, 4], 10, 9, 4.0)]
     for most, wanted in ((3, [0, 2]), (2, [1])):
-        monkeypatch.setattr(compatible_swaps, "_MOST", most)
+        monkeypatch.setattr(identity_swaps, "_MOST", most)
         with collected() as said:
             assert chosen(met) == wanted
         assert len(said) == (most < 3)

@@ -18,10 +18,10 @@ from mcaptrack.evaluation.corrections import Changes, compare
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.framing import join_frames
 from mcaptrack.sources.corrections import fixed_ids, with_corrections, without_filled
-from mcaptrack.sources.ingest.correcting import with_new_ids
+from mcaptrack.sources.ingest.label_job import with_new_ids
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.transforms import Retrack
-from mcaptrack.transforms.retrack.fixed_tracks import fix_tracks
+from mcaptrack.transforms.retrack.offline import fix_tracks
 from mcaptrack.viewing.report import gather
 from tests.commands import done
 

@@ -6,8 +6,8 @@ import pytest
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.labels import cvat
+from mcaptrack.sources.ingest.labels.content import WantedClasses
 from mcaptrack.sources.ingest.labels.cvat import read_cvat
-from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
 ALL = WantedClasses("all")
 

@@ -11,7 +11,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from mcaptrack import log
-from mcaptrack.evaluation.track_lifecycle import lifecycle_of
+from mcaptrack.evaluation.events import lifecycle_of
 from mcaptrack.schema import DECISIONS, DecisionKind, EventKind, Frame
 from mcaptrack.transforms import PROFILES, Retrack
 from mcaptrack.transforms.retrack import joins as join_steps

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcaptrack.sources import demo
-from mcaptrack.sources.scenes import SCENES
+from mcaptrack.sources.demo import SCENES
 from tools.bench.demo import page
 
 ROOT = Path(__file__).parent.parent

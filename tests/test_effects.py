@@ -25,7 +25,7 @@ import pytest
 
 from mcaptrack import log
 from mcaptrack.cli.many import NAMES
-from mcaptrack.sources import scenes
+from mcaptrack.sources import demo
 from mcaptrack.transforms import STAGES
 from mcaptrack.viewing.serving import Server
 from tests.bags import plain
@@ -200,8 +200,8 @@ def work(template, tmp_path_factory) -> Work:
 @pytest.fixture
 def see(work, tmp_path, monkeypatch) -> Callable[[str], Seen]:
     """Run a command line in a folder that is as the template."""
-    monkeypatch.setitem(scenes.SCENES, "square", lambda seed: small_scene(2.0, seed=seed))
-    monkeypatch.setitem(scenes.SCENES, "crowd", lambda seed: small_scene(1.0, seed=seed))
+    monkeypatch.setitem(demo.SCENES, "square", lambda seed: small_scene(2.0, seed=seed))
+    monkeypatch.setitem(demo.SCENES, "crowd", lambda seed: small_scene(1.0, seed=seed))
     monkeypatch.setattr(Server, "serve_forever", _interrupted)
     monkeypatch.setattr(secrets, "token_urlsafe", lambda _: "secret")
     monkeypatch.setattr(webbrowser, "open", lambda address: print(f"opened {address}"))

@@ -20,8 +20,7 @@ from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate, sequence_of_log
 from mcaptrack.evaluation.event_text import describe, log_messages
-from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events
-from mcaptrack.evaluation.track_lifecycle import lifecycle_of
+from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events, lifecycle_of
 from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind, Frame
 from mcaptrack.schema.proto import parse
 from mcaptrack.schema.provenance import Provenance, digest

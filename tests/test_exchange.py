@@ -19,8 +19,8 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import TRACKS
+from mcaptrack.sources.ingest.labels.content import WantedClasses
 from mcaptrack.sources.ingest.labels.reading import read_labels
-from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 from mcaptrack.tables.exchange import _HOLDS, _WRITERS
 from mcaptrack.tables.exchange.boxes import BoxTable
 from mcaptrack.tables.exchange.cvat import KEYFRAME_PX, describe_classes

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.transforms import PROFILES
-from mcaptrack.transforms.retrack.false_tracks import log_odds_in_log
+from mcaptrack.transforms.retrack.false_tracks import FEATURES, features, log_odds_in_log, stand_throughout
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories, smooth
-from mcaptrack.transforms.retrack.track_features import FEATURES, features, stand_throughout
 from tests.references.false_tracks import log_odds_in_log as in_log
 from tests.references.false_tracks import person_features
 from tests.references.offline import Motion

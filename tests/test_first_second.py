@@ -19,7 +19,7 @@ from scipy.stats import chi2
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.spread import by_frame, radii_m
+from mcaptrack.evaluation.forecasts import by_frame, radii_m
 from mcaptrack.foxglove.views.layouts import limit_of
 from mcaptrack.geometry.mixtures import normal_tails
 from mcaptrack.viewing.links import utc_text

@@ -18,7 +18,7 @@ import pytest
 import mcaptrack
 from mcaptrack import environment, fleet
 from mcaptrack.errors import McaptrackError
-from mcaptrack.fleet import claims, digests, limits
+from mcaptrack.fleet import child, claims, digests
 from mcaptrack.fleet.claims import Claims, claim_name
 from mcaptrack.fleet.ledger import Ledger
 from mcaptrack.log import read
@@ -388,9 +388,9 @@ def test_lines_of_a_ledger_are_whole_though_many_write(tmp_path):
 def test_workers_share_the_cores(monkeypatch):
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(limits, "cores", lambda: 9)
+    monkeypatch.setattr(child, "cores", lambda: 9)
     assert environment.threads() == environment.cores()
-    given = [limits.environment_of_worker(workers) for workers in (1, 2, 20)]
+    given = [child.environment_of_worker(workers) for workers in (1, 2, 20)]
     assert [(one["OMP_NUM_THREADS"], one["OPENCV_FOR_THREADS_NUM"]) for one in given] == [
         ("9",) * 2,
         ("4",) * 2,
@@ -399,7 +399,7 @@ def test_workers_share_the_cores(monkeypatch):
     for said, wanted in (("3", 3), ("2,1", 2), ("0", environment.cores()), ("many", environment.cores())):
         monkeypatch.setenv("OMP_NUM_THREADS", said)
         assert environment.threads() == wanted
-        assert limits.environment_of_worker(2)["OMP_NUM_THREADS"] == said
+        assert child.environment_of_worker(2)["OMP_NUM_THREADS"] == said
 
 
 def test_a_log_that_another_process_writes_is_named(template, tmp_path):

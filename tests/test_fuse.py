@@ -24,7 +24,7 @@ from mcaptrack.schema import SIGHTINGS, Frame
 from mcaptrack.testing import check_transform
 from mcaptrack.transforms.fuse import CameraView, FootFuser, agreement
 from mcaptrack.transforms.fuse.grouping import Places, group, means
-from mcaptrack.transforms.fuse.joined import places_of
+from mcaptrack.transforms.fuse.view import places_of
 from tests.places import CAMERAS, HEIGHT, NS, PEOPLE, SECONDS, WIDTH, errors, fused, said, write_log
 from tests.references.joining import joined
 
@@ -291,7 +291,7 @@ def test_what_is_kept_of_comparing_changes_nothing(tmp_path: Path, monkeypatch: 
     mcaptrack.fuse(path)
     kept = fused(path)
     monkeypatch.setattr("mcaptrack.pipeline.gathering._KEPT_BYTES", 1500)  # some frames only
-    monkeypatch.setattr("mcaptrack.transforms.fuse.joined._BLOCK", 40)
+    monkeypatch.setattr("mcaptrack.transforms.fuse.view._BLOCK", 40)
     monkeypatch.setattr("mcaptrack.pipeline.gathering._TOGETHER", 3)
     mcaptrack.fuse(path)
     for t_ns, rows in fused(path).items():
@@ -430,7 +430,7 @@ class TestPersistence:
     def test_blocks_of_frames_are_seamless(self, monkeypatch: pytest.MonkeyPatch) -> None:
         drawn = [[0.0, 9.0], [0.4], [0.9, 9.3, 30.0], [], [1.0], [1.1, 9.0]]
         together = self.scores(drawn)
-        monkeypatch.setattr("mcaptrack.transforms.fuse.joined._BLOCK", 1)
+        monkeypatch.setattr("mcaptrack.transforms.fuse.view._BLOCK", 1)
         assert self.scores(drawn) == together
 
 

@@ -8,9 +8,9 @@ import pytest
 from mcaptrack.geometry.neighbours import Pairing
 from mcaptrack.schema import Frame
 from mcaptrack.transforms.ground import state
-from mcaptrack.transforms.ground.association import _Apart, associate
-from mcaptrack.transforms.ground.covariances import Covariances, along_axes
 from mcaptrack.transforms.ground.output import Waiting
+from mcaptrack.transforms.ground.state import Covariances, along_axes
+from mcaptrack.transforms.ground.tracker import _Apart, associate
 from tests.worlds import ns
 
 #: Of a state of x, its velocity and acceleration, then the same of y, the position.

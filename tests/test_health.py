@@ -14,7 +14,7 @@ import pytest
 
 import mcaptrack
 from mcaptrack import environment
-from mcaptrack.api import machine
+from mcaptrack.api import health
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import Frame
 from mcaptrack.sources.video.codecs import CODECS
@@ -106,13 +106,13 @@ def test_a_temporary_folder_that_is_missing_is_named(place, monkeypatch):
 
 def test_a_log_that_isnt_read_back_as_it_was_written_is_a_fault(place, monkeypatch):
     monkeypatch.setattr(
-        machine.log, "check", lambda _: SimpleNamespace(findings=[SimpleNamespace(words="a bit flipped")])
+        health.log, "check", lambda _: SimpleNamespace(findings=[SimpleNamespace(words="a bit flipped")])
     )
     assert "(a bit flipped)" in fault()
 
 
 def test_little_space_is_a_warning(monkeypatch):
-    monkeypatch.setattr(machine, "free_bytes", lambda _: 20_000_000)
+    monkeypatch.setattr(health, "free_bytes", lambda _: 20_000_000)
     outcome = done("doctor")
     assert "has only 20 MB free" in outcome.err
 
@@ -154,8 +154,8 @@ def test_limits_are_those_of_the_control_group_and_of_those_above_it(tmp_path):
     (tmp_path / "a" / "memory.max").write_text("2000000000\n")
     (inner / "memory.max").write_text("max\n")
     assert environment.cpu_quotas(tmp_path, "0::/a/b\n") == [1.5]
-    assert machine.memory_limits(tmp_path, "0::/a/b\n") == [2_000_000_000]
-    assert machine.memory_limits(tmp_path, "") == []
+    assert health.memory_limits(tmp_path, "0::/a/b\n") == [2_000_000_000]
+    assert health.memory_limits(tmp_path, "") == []
 
 
 def test_limits_of_the_first_version_of_control_groups(tmp_path):
@@ -167,6 +167,6 @@ def test_limits_of_the_first_version_of_control_groups(tmp_path):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
     assert environment.cpu_quotas(tmp_path, "") == [0.5]
-    assert machine.memory_limits(tmp_path, "") == [1_000_000_000]
+    assert health.memory_limits(tmp_path, "") == [1_000_000_000]
     (tmp_path / "memory/memory.limit_in_bytes").write_text("9223372036854771712")  # no limit
-    assert machine.memory_limits(tmp_path, "") == []
+    assert health.memory_limits(tmp_path, "") == []

@@ -7,9 +7,8 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from mcaptrack.geometry.mixtures import Tails, mass_within, squared_radius
-from mcaptrack.predictors.held_levels import correct, level_counts
-from mcaptrack.predictors.position_noise import NoiseOfErrors, PositionNoise, nonnegative
-from mcaptrack.predictors.running_sums import running
+from mcaptrack.predictors.position_noise import NoiseOfErrors, PositionNoise, nonnegative, running
+from mcaptrack.predictors.tail_calibration import correct, level_counts
 
 STEPS, STEP_S = 3, 0.4
 SHAPE = Tails(np.full(STEPS, 0.3), np.full(STEPS, 0.5), np.full(STEPS, 5.0))

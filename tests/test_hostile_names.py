@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from mcaptrack.cli.text import printable
-from mcaptrack.sources import scenes
+from mcaptrack.sources import demo
 from mcaptrack.viewing.serving import Server
 from tests.commands import GROUP, Outcome, call, done
 from tests.effects.commands import CASES
@@ -88,7 +88,7 @@ def _replaced(text: str) -> str:
 @pytest.fixture
 def run(template, tmp_path, monkeypatch):
     """Run a command line in a fresh copy of the template, with evil names for its files and channels."""
-    monkeypatch.setitem(scenes.SCENES, "square", lambda seed: small_scene(2.0, seed=seed))
+    monkeypatch.setitem(demo.SCENES, "square", lambda seed: small_scene(2.0, seed=seed))
     monkeypatch.setattr(Server, "serve_forever", _interrupted)
     folders = (tmp_path / str(number) for number in itertools.count())
 

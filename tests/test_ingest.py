@@ -13,9 +13,9 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
 from mcaptrack.schema.provenance import CLOCK, Provenance
+from mcaptrack.sources.demo import demo_scene
 from mcaptrack.sources.ingest import IngestOptions, ingest, label_frames
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
-from mcaptrack.sources.scenes import demo_scene
 from tests.worlds import ids, ns, write_clip
 
 MOT15 = "1,3,10,20,4,8,1,-1,-1,-1\n2,3,11,20,4,8,0.5,-1,-1,-1\n1,5,50,60,4,8,1,-1,-1,-1\n"

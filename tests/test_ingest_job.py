@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 
 from mcaptrack import log
-from mcaptrack.cli.inputs import expand, only_one_output
+from mcaptrack.cli.common import expand, only_one_output
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.sources.ingest.job import IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.camera import boxes_extent
-from mcaptrack.sources.ingest.labels.motions import read_motions
+from mcaptrack.sources.ingest.labels.content import WantedClasses
+from mcaptrack.sources.ingest.labels.number_table import read_motions
 from mcaptrack.sources.ingest.labels.timeline import Timeline
-from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 from mcaptrack.tables.compared import pair_files
 from tests.logs import add_rows, some_log
 from tests.worlds import boxes_at, tracks_at

@@ -25,7 +25,7 @@ from mcaptrack.sources.ingest import IngestOptions, IngestReport, ingest, label_
 from mcaptrack.sources.ingest.bags import decompression, plain_yaml
 from mcaptrack.sources.ingest.bags.metadata_yaml import read_metadata
 from mcaptrack.sources.ingest.bags.plain_yaml import Fields, UnsupportedYamlError
-from mcaptrack.sources.ingest.bags.ros_definitions import known_definition
+from mcaptrack.sources.ingest.bags.rosbag2 import known_definition
 from mcaptrack.sources.ingest.labels.camera import (
     CameraTopics,
     camera_prefix,

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcaptrack.transforms import PROFILES, Sample
-from mcaptrack.transforms.retrack.input_noise import InputNoise
-from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
+from mcaptrack.transforms.retrack.likelihood import InputNoise, LikelihoodPass
 from mcaptrack.transforms.retrack.motion_model import MotionModel
 from mcaptrack.transforms.retrack.online_tracker import Association, OnlineTracker
 from tests.references.online import Bends

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from mcaptrack.cli.inputs import refuse_url
+from mcaptrack.cli.common import refuse_url
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms import TRANSFORMS
 from tests.commands import GROUP, call

@@ -18,7 +18,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d, read_boxes_3d
 from mcaptrack.sources.ingest.labels.boxes_3d.rows import BoxRows3D, TimedLabels, headings, numbered
-from mcaptrack.sources.ingest.labels.wanted import WantedClasses
+from mcaptrack.sources.ingest.labels.content import WantedClasses
 
 USUAL = {
     "t_ns": "1000",

@@ -14,10 +14,9 @@ from hypothesis import strategies as st
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.labels import formats, number_table
-from mcaptrack.sources.ingest.labels.content import Labels
+from mcaptrack.sources.ingest.labels.content import Labels, WantedClasses
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline, count_frames
-from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
 NAN = float("nan")
 MOT = """3,2,10,20,4,8,0.5,1,1

@@ -29,7 +29,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.errors import call as proposed
 from mcaptrack.registry import BUILT_IN
 from mcaptrack.schema import TRACKS
-from mcaptrack.sources import scenes
+from mcaptrack.sources import demo
 from mcaptrack.transforms import STAGES, ByteTrack
 from tests.commands import GROUP, call, done
 from tests.worlds import small_scene
@@ -518,7 +518,7 @@ class TestDocumentation:
             return
         if name in NEEDS:
             pytest.importorskip(NEEDS[name], reason=f"{name} needs {NEEDS[name]}")
-        monkeypatch.setitem(scenes.SCENES, "crowd", lambda seed: small_scene(3.0, seed=seed))  # a short one
+        monkeypatch.setitem(demo.SCENES, "crowd", lambda seed: small_scene(3.0, seed=seed))  # a short one
         runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", mcaptrack.McaptrackWarning)

@@ -61,7 +61,7 @@ LIMITS = {
         "_MAX_CLASSES": 65_536,
     },
     f"{LABELS}.boxes_3d.rows": {"_LEAST_LENGTH_M": 0.05, "_MOST_LENGTH_M": 60.0},
-    "mcaptrack.sources.ingest.calibration.trees": {"_MAX_BYTES": MIB, "_MAX_DEPTH": 16, "_MAX_NODES": 20_000},
+    "mcaptrack.sources.ingest.calibration.content": {"_MAX_BYTES": MIB, "_MAX_DEPTH": 16, "_MAX_NODES": 20_000},
     f"{BAGS}.rosbag1": {"_MAX_HEADER_BYTES": MIB, "_MAX_DATA_BYTES": 256 * MIB},
     f"{BAGS}.metadata_update": {"_MOST_TRIES": 5},
     "mcaptrack.log.chunks": {
@@ -74,7 +74,7 @@ LIMITS = {
     "mcaptrack.tables.messages": {"_EXACT": 2**53, "_MAX_INT": 2**63, "_MAX_UINT": 2**64},
     "mcaptrack.networks.graph": {"_MAX_NAMES": 100_000},
     "mcaptrack.predictors.checked": {"_MOST": 10_000, "_LARGEST": 1e15},
-    "mcaptrack.tables.export.names": {"_MAX_BYTES": 200},
+    "mcaptrack.tables.export.contents": {"_MAX_BYTES": 200},
     "mcaptrack.cli.config": {"MAX_BYTES": MIB},
 }
 
@@ -108,8 +108,8 @@ AT_ONCE = {
     "mcaptrack.schema.frame_columns": {"BLOCK_BYTES": MIB, "_IN_MEMORY": 1, "_CACHED": 8, "_MOST_PARTS": 4096},
     "mcaptrack.schema.framing": {"PART_ROWS": 64 * KIB},
     "mcaptrack.tables.files": {"_ZSTD_LEVEL": 1, "_ROWS_READ": 16 * KIB},
-    "mcaptrack.tables.ordered": {"GROUP_ROWS": 32 * KIB, "_MOST_GROUPS": 256, "_BUFFER_BYTES": 64 * KIB},
-    "mcaptrack.tables.table_pieces": {"PIECE_ROWS": 128 * KIB},
+    "mcaptrack.tables.rows": {"GROUP_ROWS": 32 * KIB, "_MOST_GROUPS": 256, "_BUFFER_BYTES": 64 * KIB},
+    "mcaptrack.tables.build": {"PIECE_ROWS": 128 * KIB},
     "mcaptrack.tables.text": {"_PIECE": 16 * KIB},
     "mcaptrack.tables.exchange.text": {"_LINES": 4096},
     "mcaptrack.tables.exchange.coco": {"_ENTRIES": 1024},
@@ -128,14 +128,14 @@ SHOWN = {
     "mcaptrack.cli.show": {"_DEEPEST": 30, "_SHOWN": 3},
     "mcaptrack.cli.common": {"PROGRESS_S": 5.0},
     "mcaptrack.cli.text": {"_UNBROKEN": 100_000},
-    "mcaptrack.tables.results": {"_DIGITS": 6},
+    "mcaptrack.tables": {"_DIGITS": 6},
     f"{LABELS}.box_rows": {"_SHOWN": 8},
     f"{LABELS}.cvat_files": {"_SHOWN": 5},
     f"{LABELS}.number_table": {"_SHOWN": 60},
     f"{LABELS}.wanted": {"_SHOWN": 10, "_MAX_LISTED": 20},
     f"{LABELS}.boxes_3d.nuscenes": {"_SHOWN": 10},
     f"{LABELS}.boxes_3d.rows": {"_SHOWN": 8},
-    "mcaptrack.sources.ingest.boxes_3d_log": {"_LISTED": 8},
+    "mcaptrack.sources.ingest.boxes_3d_job": {"_LISTED": 8},
     "mcaptrack.transforms.detect.onnx.detector": {"_SHOWN": 8},
 }
 #: Numbers of formats: of MCAP, of bags, of ROS's markers and of our own rows, and exit codes of commands.

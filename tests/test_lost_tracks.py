@@ -11,8 +11,7 @@ from scipy.stats import multivariate_normal
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import GroundTracker
 from mcaptrack.transforms.ground import state
-from mcaptrack.transforms.ground.lost_tracks import LostTracks, continuations
-from mcaptrack.transforms.ground.tracker import _Run
+from mcaptrack.transforms.ground.tracker import LostTracks, _Run, continuations
 from tests.effects.ground import NAMES, Box, boxes
 
 GAP = range(20, 50)

@@ -180,7 +180,7 @@ def test_many_inputs_are_ingested_by_workers_and_once(folder, monkeypatch):
 def test_the_table_on_a_terminal_names_the_logs_that_run(folder):
     from rich.console import Console
 
-    from mcaptrack.cli.live import table_of
+    from mcaptrack.cli.many import table_of
 
     running = (Running(Path("logs/\x1b[31mx.mcap"), "detect", 3, 4, 12.3, 250_000_000), Running(Path("y.mcap")))
     console = Console(file=io.StringIO(), width=80)

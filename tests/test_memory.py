@@ -15,17 +15,16 @@ import pytest
 import mcaptrack
 from mcaptrack import environment, log, notices, tables
 from mcaptrack.errors import McaptrackError
-from mcaptrack.pipeline import timing
-from mcaptrack.pipeline.ahead import Ahead
-from mcaptrack.pipeline.pictures import KeptPictures
-from mcaptrack.pipeline.spaces import spaces_of_boxes
-from mcaptrack.pipeline.timing import Stopwatch
+from mcaptrack.pipeline import run
+from mcaptrack.pipeline.pictures import Ahead, KeptPictures
+from mcaptrack.pipeline.plan import spaces_of_boxes
+from mcaptrack.pipeline.run import Stopwatch
 from mcaptrack.schema import TRACKS, Frame, frame_columns, framing
 from mcaptrack.schema.frame_columns import FrameColumns, collect
 from mcaptrack.sources.ingest.labels.camera import boxes_extent
-from mcaptrack.tables import ordered, table_pieces
+from mcaptrack.tables import build, rows
 from mcaptrack.transforms import PROFILES, Retrack
-from mcaptrack.transforms.retrack import identity_swaps, likelihood, online_forecasts
+from mcaptrack.transforms.retrack import identity_swaps, likelihood
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
 from tests.awaiting import until
 from tests.memory import held
@@ -53,10 +52,10 @@ def walks(frames: int, people: int = PEOPLE) -> Iterator[Frame]:
 def small_blocks(monkeypatch):
     monkeypatch.setattr(frame_columns, "BLOCK_BYTES", 2**13)
     monkeypatch.setattr(framing, "PART_ROWS", 256)
-    monkeypatch.setattr(ordered, "GROUP_ROWS", 256)
-    monkeypatch.setattr(ordered, "_BUFFER_BYTES", 2**10)
-    monkeypatch.setattr(table_pieces, "PIECE_ROWS", 256)
-    monkeypatch.setattr(online_forecasts, "_BATCH", 128)
+    monkeypatch.setattr(rows, "GROUP_ROWS", 256)
+    monkeypatch.setattr(rows, "_BUFFER_BYTES", 2**10)
+    monkeypatch.setattr(build, "PIECE_ROWS", 256)
+    monkeypatch.setattr(likelihood, "_BATCH", 128)
     monkeypatch.setattr(likelihood, "_STEPS", 16)
     monkeypatch.setattr(likelihood, "_SAMPLES", 256)
     monkeypatch.setattr(identity_swaps, "_CELLS", 64)
@@ -141,12 +140,12 @@ def test_rows_that_were_divided_are_ordered_by_track_and_time():
         for n, k in enumerate(rng.integers(0, 40, 200))
     ]  # fmt: skip
     columns = collect(TRACKS, frames)
-    parts = list(ordered.ordered_rows(TRACKS, columns, by_track=True))
+    parts = list(rows.ordered_rows(TRACKS, columns, by_track=True))
     assert len(parts) > 3
-    rows = columns.rows()
-    order = np.argsort(rows["track_id"], kind="stable")
+    all_rows = columns.rows()
+    order = np.argsort(all_rows["track_id"], kind="stable")
     assert np.concatenate([part.place for part in parts]).tolist() == order.tolist()
-    assert np.concatenate([part.rows["x_m"] for part in parts]).tolist() == rows["x_m"][order].tolist()
+    assert np.concatenate([part.rows["x_m"] for part in parts]).tolist() == all_rows["x_m"][order].tolist()
     of_row = np.repeat(np.arange(len(frames)), [len(frame.rows) for frame in frames])
     assert np.concatenate([part.frame for part in parts]).tolist() == of_row[order].tolist()
 
@@ -236,7 +235,7 @@ def test_the_thread_ends_when_no_more_frames_are_wanted():
 
 def test_time_counts_for_the_innermost_part(monkeypatch):
     now = [0.0]
-    monkeypatch.setattr(timing, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(run, "perf_counter", lambda: now[0])
 
     def passes(seconds: float) -> None:
         now[0] += seconds

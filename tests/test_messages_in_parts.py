@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcaptrack import log
-from mcaptrack.tables import build, files, messages, table_pieces
-from mcaptrack.tables.table_pieces import TablePieces
+from mcaptrack.tables import build, files, messages
+from mcaptrack.tables.build import TablePieces
 from tests.memory import held
 from tests.references.message_types import column
 
@@ -51,7 +51,7 @@ def test_parts_give_the_table_of_all_messages(rows, blobs, count, size, piece, p
         patch.object(messages, "_PART_MESSAGES", count),
         patch.object(messages, "_PART_BYTES", size),
         patch.object(messages, "_PIECE_BYTES", piece),
-        patch.object(table_pieces, "PIECE_ROWS", piece_rows),
+        patch.object(build, "PIECE_ROWS", piece_rows),
     ):
         made, without = table_of(rows, blobs)
         found = pa.concat_tables(list(made))
@@ -104,7 +104,7 @@ def test_a_channel_of_pictures_is_exported_without_holding_them(tmp_path):
 def test_a_table_may_end_where_a_piece_ends(rows):
     """There was a fault of the program if nothing was left for the next piece."""
     table = pa.table({"a": np.arange(float(rows)), "b": pa.array(["x"] * rows, pa.string()).dictionary_encode()})
-    with patch.object(table_pieces, "PIECE_ROWS", 8):
+    with patch.object(build, "PIECE_ROWS", 8):
         parts = TablePieces(table.schema, rows, lambda: [table.slice(at, 4) for at in range(0, rows, 4)])
         assert pa.concat_tables(list(parts)).equals(table)
 

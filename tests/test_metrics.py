@@ -10,17 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaptrack.evaluation.metrics import (
-    Matchup,
-    clear,
-    combine,
-    distances,
-    metres_to_similarity,
-    recalls,
-    score,
-    summary,
-)
-from mcaptrack.evaluation.metrics import identity as one_identity
+from mcaptrack.evaluation import metrics
+from mcaptrack.evaluation import metrics as one_identity
+from mcaptrack.evaluation.metrics import Matchup, clear, combine, distances, metres_to_similarity, score, summary
 from mcaptrack.evaluation.metrics.displacement import combine_displacements, displacement
 from mcaptrack.evaluation.metrics.matchup import SparseTables
 from mcaptrack.geometry.boxes import iou
@@ -173,7 +165,7 @@ def test_tables_that_are_stored_sparsely_give_the_same_scores(rules, monkeypatch
         np.testing.assert_array_equal(one, two)
     wanted = score(dense, rules)
     kept = np.arange(9) % 3 > 0
-    some = [summary(score(recalls._of_tracks(one, kept), rules)) for one in (dense, other)]
+    some = [summary(score(metrics._of_tracks(one, kept), rules)) for one in (dense, other)]
     assert some[0] == some[1]
     assert some[0]["FP"] < summary(wanted)["FP"]
     monkeypatch.setitem(one_identity.__globals__, "_LARGE", 0)

@@ -14,7 +14,7 @@ from mcaptrack import Scores
 from mcaptrack.cli.evaluate import print_results
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
 from mcaptrack.evaluation.forecasts import score_forecasts
-from mcaptrack.evaluation.metrics.calibration import RELIABILITY_LEVELS, ellipse_levels, negative_log_likelihood
+from mcaptrack.evaluation.metrics.displacement import RELIABILITY_LEVELS, ellipse_levels, negative_log_likelihood
 from mcaptrack.foxglove.views.people import ellipses, forecasts
 from mcaptrack.geometry.mixtures import Tails, half_radius, mass_within, normal_tails, squared_radius
 from mcaptrack.predictors import Forecast

@@ -12,13 +12,12 @@ import pytest
 
 from mcaptrack import log, notices, pipeline
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.metrics.calibration import coverage, forecast_scores
+from mcaptrack.evaluation.metrics.displacement import coverage, forecast_scores
 from mcaptrack.geometry.mixtures import mahalanobis_squared
-from mcaptrack.predictors import PeopleSeen, make
+from mcaptrack.predictors import OnClock, PeopleSeen, make
 from mcaptrack.predictors.linear import LinearPredictor
 from mcaptrack.predictors.lstm import Lstm
 from mcaptrack.predictors.onnx import are_covariances
-from mcaptrack.predictors.own_clock import OnClock
 from mcaptrack.predictors.red import Red
 from mcaptrack.predictors.weights import SHIPPED, Weights, load, save
 from mcaptrack.schema.provenance import Provenance

@@ -20,7 +20,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 import mcaptrack
 from mcaptrack.errors import McaptrackError
-from mcaptrack.viewing.moments import LinkedEvent
+from mcaptrack.viewing.links import LinkedEvent
 from tests.commands import done
 
 CLOSED, PAIRS = 0, 2
@@ -399,7 +399,7 @@ def test_the_result_of_a_run_is_a_line_in_a_notebook(finished, tmp_path):
 def test_the_strokes_of_any_annotations_can_be_written_as_json():
     from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 
-    from mcaptrack.viewing.notebook.strokes import Strokes
+    from mcaptrack.viewing.notebook.pictures import Strokes
 
     black, clear = {"a": 1.0}, {"a": 0.0}
     message = json_format.ParseDict(

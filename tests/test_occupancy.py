@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaptrack.evaluation.occupancy import occupancy
+from mcaptrack.viewing.heat_map import occupancy
 
 S = 10**9
 
@@ -130,7 +130,7 @@ def slowly(t_ns, ids, xy, cell, span, gap_s=2.0):
     ("span", "gap_s"), [(None, 2.0), ((-3.0, 4.2, -1.1, 2.0), 2.0), (None, 0.5), ((1.0, 1.0, 1.0, 1.0), 2.0)]
 )
 def test_the_grid_is_that_of_a_slow_count(span, gap_s, part, monkeypatch):
-    monkeypatch.setattr("mcaptrack.evaluation.occupancy._PART", part)
+    monkeypatch.setattr("mcaptrack.viewing.heat_map._PART", part)
     rng = np.random.default_rng(5)
     count = 120
     ids = rng.integers(0, 5, count)

@@ -16,9 +16,8 @@ import pytest
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
 from mcaptrack.sources.video import VideoOptions, open_video
-from mcaptrack.sources.video.damage import Holes, transport_faults
-from mcaptrack.sources.video.picture_times import Clock
-from mcaptrack.sources.video.upright import orientation_of
+from mcaptrack.sources.video.passthrough import Holes, transport_faults
+from mcaptrack.sources.video.reader import Clock, orientation_of
 from tests.commands import call
 from tests.worlds import write_clip
 

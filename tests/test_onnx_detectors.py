@@ -20,7 +20,7 @@ from mcaptrack.schema.provenance import Provenance
 from mcaptrack.testing import check_transform
 from mcaptrack.transforms import OnnxDetector
 from mcaptrack.transforms.detect.onnx import session
-from mcaptrack.transforms.detect.onnx.classes import COCO, names_of, numbers_of, wanted
+from mcaptrack.transforms.detect.onnx.detector import COCO, names_of, numbers_of, wanted
 from mcaptrack.transforms.detect.onnx.layouts import LAYOUTS
 from tests import onnx_graphs
 from tests.commands import call, done

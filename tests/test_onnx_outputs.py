@@ -12,7 +12,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import OnnxDetector
 from mcaptrack.transforms.detect.onnx import outputs
-from mcaptrack.transforms.detect.onnx.classes import names_of, numbers_of
+from mcaptrack.transforms.detect.onnx.detector import names_of, numbers_of
 from tests.onnx_graphs import INT64, cells, giving, value
 
 SIZE = (160, 128)

@@ -12,7 +12,7 @@ import pytest
 from mcaptrack.errors import McaptrackError
 from mcaptrack.networks import graph
 from mcaptrack.transforms.detect.onnx import outputs
-from mcaptrack.transforms.detect.onnx.convention import Contest, refuse_if_misread
+from mcaptrack.transforms.detect.onnx.detector import Contest, refuse_if_misread
 from mcaptrack.transforms.detect.onnx.layouts import LAYOUTS
 from mcaptrack.transforms.detect.onnx.nms import Boxes
 from mcaptrack.transforms.detect.onnx.outputs import MisreadError

@@ -12,7 +12,7 @@ import pytest
 from mcaptrack import log
 from mcaptrack.geometry.boxes import columns_to_boxes, share_inside
 from mcaptrack.notices import collected
-from mcaptrack.pipeline.visible import without_unseen
+from mcaptrack.pipeline.planes import without_unseen
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from tests.commands import done
 from tests.worlds import write_clip

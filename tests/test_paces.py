@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcaptrack.transforms.retrack import offline
+from mcaptrack.transforms.retrack.identity_swaps import swapped_by_pace
 from mcaptrack.transforms.retrack.motion_model import MotionModel
-from mcaptrack.transforms.retrack.paces import swapped_by_pace
 from tests.references.offline import by_pace
 from tests.test_offline_reference import laid_out, models, with_gaps
 

@@ -15,10 +15,10 @@ import pytest
 from mcaptrack import foxglove, log, notices, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
-from mcaptrack.pipeline import drawing, findings
+from mcaptrack.pipeline import drawing, run
 from mcaptrack.pipeline import write as writing
 from mcaptrack.pipeline.checks import _lacks
-from mcaptrack.pipeline.spaces import check_spaces
+from mcaptrack.pipeline.plan import check_spaces
 from mcaptrack.schema import DECISIONS, DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, INGEST, VIEW, Provenance, digest
@@ -434,7 +434,7 @@ def test_what_was_odd_when_a_channel_was_made_is_said_for_what_runs_and_what_it_
 
         def said(made: dict[str, Provenance], is_all: bool) -> list[tuple[str, str]]:
             with notices.listening(lambda _: None), notices.collected() as heard:
-                findings.warn_findings(opened, "/camera", made, (), is_all)
+                run.warn_findings(opened, "/camera", made, (), is_all)
             return [(one.message, one.code) for one in heard]
 
         now = Provenance("predict", {}, "/camera/samples", warnings=[("strange", "odd now")])
@@ -463,7 +463,7 @@ def test_a_guessed_scale_is_said_of_what_is_in_metres(tmp_path, stage, assumed, 
         notices.listening(lambda _: None),
         notices.collected() as said,
     ):
-        findings.warn_findings(opened, "/camera", {"/camera/other": Provenance(stage, {})}, [(0, plane)], is_all=False)
+        run.warn_findings(opened, "/camera", {"/camera/other": Provenance(stage, {})}, [(0, plane)], is_all=False)
     assert [(one.message, one.code) for one in said] == [(GUESSED, "assumed-ground-plane")] * is_said
 
 
@@ -484,14 +484,14 @@ def test_tracks_that_are_only_linked_or_passed_on_are_said(tmp_path, parameters,
         f"along the ground. To insist: `mcaptrack.retrack('{path}', side_view=True)`"
     )
     with log.read(path) as opened, notices.listening(lambda _: None), notices.collected() as said:
-        findings.warn_findings(opened, "/camera", {"/camera/x": Provenance("retrack", parameters)}, (), is_all=False)
+        run.warn_findings(opened, "/camera", {"/camera/x": Provenance("retrack", parameters)}, (), is_all=False)
     assert [(one.message, one.code) for one in said] == [(words, "held-back")] * bool(done)
 
 
 def test_little_memory_is_said_in_numbers(monkeypatch):
-    monkeypatch.setattr(findings, "free_memory", lambda: 160_000_000)
+    monkeypatch.setattr(run, "free_memory", lambda: 160_000_000)
     with notices.listening(lambda _: None), notices.collected() as said:
-        findings.warn_memory([Frame(n * 40_000_000, n, DETECTIONS.empty(10)) for n in range(50_000)])
+        run.warn_memory([Frame(n * 40_000_000, n, DETECTIONS.empty(10)) for n in range(50_000)])
     assert [(one.message, one.code) for one in said] == [
         (
             "500,000 boxes, of people who are seen for 6 hours together, take about 0.5 GB of memory, and 0.2 GB are "
@@ -518,8 +518,8 @@ def test_free_memory_is_the_least_that_linux_grants(monkeypatch, files, free):
             raise FileNotFoundError
         return files[path.name]
 
-    monkeypatch.setattr(findings.Path, "read_text", read_text)
-    assert findings.free_memory() == free
+    monkeypatch.setattr(run.Path, "read_text", read_text)
+    assert run.free_memory() == free
 
 
 # What is drawn

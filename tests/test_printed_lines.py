@@ -18,7 +18,7 @@ import pytest
 
 import mcaptrack
 from mcaptrack.api.running import RunResult
-from mcaptrack.cli import common, inputs, running
+from mcaptrack.cli import common, running
 from mcaptrack.cli.calibrate import _words
 from mcaptrack.cli.config import MAX_BYTES, ConfigFile, read_toml
 from mcaptrack.cli.evaluate import _gates, _limit
@@ -514,7 +514,7 @@ def test_patterns_are_replaced_by_files_in_order_without_results_of_logs_that_ar
         Path(name).write_bytes(b"")
 
     def names(*words: str, each: bool = False) -> list[str]:
-        return [path.as_posix() for path in inputs.expand([Path(word) for word in words], each=each)]
+        return [path.as_posix() for path in common.expand([Path(word) for word in words], each=each)]
 
     assert names("*.mcap") == ["a.mcap", "b.mcap", "d[1].mcap", "other.results.mcap"]
     assert names("*.mcap", each=True) == ["a.mcap", "a.results.mcap", "b.mcap", "d[1].mcap", "other.results.mcap"]
@@ -524,10 +524,10 @@ def test_patterns_are_replaced_by_files_in_order_without_results_of_logs_that_ar
 
 
 def test_one_output_takes_one_input():
-    inputs.only_one_output([Path("a")], Path("x"))
-    inputs.only_one_output([Path("a"), Path("b")], None)
+    common.only_one_output([Path("a")], Path("x"))
+    common.only_one_output([Path("a"), Path("b")], None)
     with pytest.raises(McaptrackError, match=r"^2 inputs can't all be written to x;"):
-        inputs.only_one_output([Path("a"), Path("b")], Path("x"))
+        common.only_one_output([Path("a"), Path("b")], Path("x"))
 
 
 @pytest.mark.parametrize("more", [0, 1])

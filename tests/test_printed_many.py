@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from mcaptrack.api.several import CameraResult
-from mcaptrack.cli import common, live, many, running, text
+from mcaptrack.cli import common, many, running, text
 from mcaptrack.cli.many import LogWork, ManyOptions, _Printer, _seconds, _summarise
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import FleetResult, FleetStatus, LogOutcome, Running
@@ -237,7 +237,7 @@ def test_the_table_of_logs_that_run():
         Running(Path(f"a/long/path/{n}.mcap"), "track", n, 4 * n or None, 10.0 * n, n * 1_500_000_000) for n in range(3)
     ]
     console = Console(file=io.StringIO(), width=79)
-    console.print(live.table_of(FleetStatus(9, {"killed": 1, "done": 3}, tuple(busy), 61.4)))
+    console.print(many.table_of(FleetStatus(9, {"killed": 1, "done": 3}, tuple(busy), 61.4)))
     title, head, *rows = (line.rstrip() for line in console.file.getvalue().splitlines())
     assert title == "4 of 9 logs in 61 s: 3 done, 1 killed"
     assert head.split() == ["log", "stage", "done", "seconds", "MB"]
@@ -249,7 +249,7 @@ def test_the_table_of_logs_that_run():
         assert [row[end - 1] != " " and row[end : end + 1] in ("", " ") for end in ends] == [True] * 3
         assert row[head.index("stage") :].startswith("track")
     console = Console(file=io.StringIO(), width=60)
-    console.print(live.table_of(FleetStatus(9, seconds=3)))
+    console.print(many.table_of(FleetStatus(9, seconds=3)))
     assert console.file.getvalue().splitlines()[0].rstrip() == "0 of 9 logs in 3 s"
 
 
@@ -261,7 +261,7 @@ def test_a_table_is_shown_on_terminals(hidden, stream, is_shown, monkeypatch):
     monkeypatch.setattr("sys.stderr", stream)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "60")
-    with live.LiveTable.on_terminal(hidden) as table:
+    with many.LiveTable.on_terminal(hidden) as table:
         table.show(FleetStatus(9, {"done": 3}))
     assert ("3 of 9 logs in 0 s: 3 done" in stream.getvalue()) == is_shown
 
@@ -286,7 +286,7 @@ def test_a_table_is_shown_unless_results_are_printed_or_nothing_is(options, word
         raise KeyboardInterrupt
         yield
 
-    monkeypatch.setattr(live.LiveTable, "on_terminal", on_terminal)
+    monkeypatch.setattr(many.LiveTable, "on_terminal", on_terminal)
     monkeypatch.setattr(many, "RUNNING", SimpleNamespace(get=lambda: SimpleNamespace(params={})))
     token = many._OPTIONS.set(options)
     work = LogWork("check", print, {}, show=print, data=str, line=line)

@@ -174,7 +174,7 @@ class Scene:
 
 #: By module, function and verb: a scene in which the message comes.
 SCENES: dict[str, Callable[[Scene], str]] = {
-    "pipeline/shown.py:find_views:info": lambda s: s.without("/camera/video", "/camera/*/view/scene").says(
+    "pipeline/drawing.py:find_views:info": lambda s: s.without("/camera/video", "/camera/*/view/scene").says(
         "render", "LOG"
     ),
     "cli/running.py:_next:*": lambda s: s.says("run", "LOG", "--no-tables"),
@@ -199,13 +199,11 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "tables/compared.py:pair_files:ingest": lambda s: s.without("/camera/truth*").says(
         "evaluate", "LOG", "--truth", "truth.txt"
     ),
-    "log/journal_check.py:recover_command:recover": Scene.damaged,
+    "log/journal.py:recover_command:recover": Scene.damaged,
     "log/snapshot.py:reporting_bad_times:drop": Scene.late,
     "log/recording_files.py:refuse_non_mcap:ingest": Scene.bag,
-    "transforms/detect/onnx/catalogue.py:check:get_model": Scene.with_other_weights,
-    "transforms/detect/onnx/catalogue.py:stored:get_model": lambda s: s.says(
-        "detect", "LOG", "--detector", "yolox-nano"
-    ),
+    "transforms/detect/onnx/session.py:check:get_model": Scene.with_other_weights,
+    "transforms/detect/onnx/session.py:stored:get_model": lambda s: s.says("detect", "LOG", "--detector", "yolox-nano"),
     "api/catalogue.py:get_model:get_model": lambda s: s.says(
         "models", "get", "yolox-nano", "--from", "http://127.0.0.1:1/"
     ),
@@ -225,12 +223,12 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "run", "LOG", "--no-tables", "--zones", str(zones_file(Path()))
     ),
     "pipeline/planes.py:plane_in_words:ingest": Scene.side_view,
-    "pipeline/findings.py:warn_findings:retrack": Scene.side_view,
+    "pipeline/run.py:warn_findings:retrack": Scene.side_view,
     "pipeline/plan.py:_warn_settings:run": Scene.of_a_later_version,
     "pipeline/plan.py:_replace_older:run": Scene.of_an_older_version,
     "pipeline/plan.py:_refusal:run": Scene.by_own_tracker,
     "pipeline/plan.py:_not_made:*": Scene.elsewhere,
-    "pipeline/shown.py:find_views:run": lambda s: s.untracked().says("render", "LOG"),
+    "pipeline/drawing.py:find_views:run": lambda s: s.untracked().says("render", "LOG"),
     "viewing/blur/recording.py:blurrable:run": lambda s: s.ingested("clip.mp4").says(
         "render", "LOG", "--blur", "people", "-o", "c.mcap"
     ),

@@ -26,8 +26,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import EVENTS, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import demo
+from mcaptrack.sources.demo import demo_scene
 from mcaptrack.sources.ingest import IngestOptions, ingest
-from mcaptrack.sources.scenes import demo_scene
 from mcaptrack.tables.export import default_folder, export
 from mcaptrack.tables.sql import Database
 from tests.commands import GROUP, Outcome, call

@@ -13,7 +13,6 @@ from mcaptrack.geometry.camera_motion import CameraPose
 from mcaptrack.geometry.camera_path import Verdict
 from mcaptrack.notices import collected
 from mcaptrack.pipeline.rebuild import differing
-from mcaptrack.predictors.own_options import own_options
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.transforms import (
     KnnDetector,
@@ -26,10 +25,11 @@ from mcaptrack.transforms import (
     Sort,
     motion,
 )
-from mcaptrack.transforms.durations import longest_track_s
 from mcaptrack.transforms.ground import GroundTracker
 from mcaptrack.transforms.motion import EstimateMotion
+from mcaptrack.transforms.predict import own_options
 from mcaptrack.transforms.protocol import option
+from mcaptrack.transforms.retrack.options import longest_track_s
 from tests.worlds import ns, walk
 
 

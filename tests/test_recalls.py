@@ -8,7 +8,7 @@ import motmetrics as mm
 import numpy as np
 import pytest
 
-from mcaptrack.evaluation.averages import averages
+from mcaptrack.evaluation import averages
 from mcaptrack.evaluation.metrics import Matchup, ScoredMatchup, average_over_recalls, metres_to_similarity
 
 GATE_M = 2.0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mcaptrack import log
-from mcaptrack.evaluation.metrics.calibration import forecast_scores
+from mcaptrack.evaluation.metrics.displacement import forecast_scores
 from mcaptrack.log import records
 from mcaptrack.predictors import make
 from mcaptrack.training.recipe import RECIPES

@@ -25,8 +25,7 @@ from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import Predict
 from mcaptrack.viewing.report import ELEMENT, charts, data, gather, page, statistics
-from mcaptrack.viewing.report.formatting import plain
-from mcaptrack.viewing.report.html import environment
+from mcaptrack.viewing.report.formatting import environment, plain
 from mcaptrack.viewing.report.identity_events import SIDE_PX, add_thumbnails, most_important, summarize_events
 from mcaptrack.viewing.report.scene_map import simplified
 from tests.commands import call, done, printed

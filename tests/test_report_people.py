@@ -23,7 +23,7 @@ from mcaptrack import log
 from mcaptrack.evaluation.events import MatchRule
 from mcaptrack.evaluation.people import LEAST_PEOPLE, PersonScores, intervals, person_scores
 from mcaptrack.schema import Frame
-from mcaptrack.viewing.linked_report import is_about, with_links
+from mcaptrack.viewing.links import is_about, with_links
 from mcaptrack.viewing.report import LogReport, gather, page
 from mcaptrack.viewing.report import _comparison as comparison
 from mcaptrack.viewing.report.charts import Line

@@ -13,8 +13,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.histories import Holt
 from mcaptrack.predictors import Forecast
 from mcaptrack.transforms import PROFILES, Retrack, RetrackByConsistency
-from mcaptrack.transforms.retrack.active_tracks import SmoothedHistory
-from mcaptrack.transforms.retrack.distances import (
+from mcaptrack.transforms.retrack.consistency import SmoothedHistory
+from mcaptrack.transforms.retrack.options import (
     mahalanobis,
     metric_distances,
     paper_covariance,

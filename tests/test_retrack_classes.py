@@ -8,8 +8,8 @@ import pytest
 from mcaptrack.schema import DECISIONS, PREDICTIONS, TRACKS, Frame, framing
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.transforms import Retrack
-from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers, join_classes, movers_of, split_classes, usual_score
-from mcaptrack.transforms.retrack.kept_ids import KeptIds
+from mcaptrack.transforms.retrack.assignments import PEOPLE, Movers, join_classes, movers_of, split_classes, usual_score
+from mcaptrack.transforms.retrack.methods import KeptIds
 from tests.worlds import assert_same_rows, ns
 
 

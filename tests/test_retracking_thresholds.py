@@ -14,10 +14,10 @@ import pytest
 
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES
+from mcaptrack.transforms.retrack.false_tracks import FEATURES, features
 from mcaptrack.transforms.retrack.identity_swaps import find_encounters, resolve_swaps
 from mcaptrack.transforms.retrack.linking import candidates, link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
-from mcaptrack.transforms.retrack.track_features import FEATURES, features
 from tests.references.false_tracks import person_features
 from tests.references.offline import Motion, Path, encounters, exchanged, links
 from tests.references.online import OnlineTracker

@@ -12,8 +12,8 @@ import pytest
 import mcaptrack
 from mcaptrack.predictors.weights import load
 from mcaptrack.transforms.retrack import cut_links, false_tracks, joins, linking
+from mcaptrack.transforms.retrack.false_tracks import FEATURES
 from mcaptrack.transforms.retrack.motion_model import to_trajectories
-from mcaptrack.transforms.retrack.track_features import FEATURES
 from mcaptrack.transforms.retrack.weights import WEIGHTS, weights_of
 from tools import crowds
 from tools.corruptions import STEP_S

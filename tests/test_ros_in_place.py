@@ -25,7 +25,7 @@ from mcaptrack import log
 from mcaptrack.schema import SCHEMAS, TRACKS
 from mcaptrack.schema.encodings import CDR, cdr_codec, record_of
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.sources.ingest.bags import metadata_update
+from mcaptrack.sources.ingest.bags import metadata_yaml
 from tests.bags import MOT, T0, bag1, bag2
 from tests.commands import call, done
 from tests.space_logs import WAYS, Robot, write
@@ -283,7 +283,7 @@ def test_metadata_behind_a_link_is_brought_up_to_date_there(copied):
     elsewhere.write_bytes(copied.with_name("before.yaml").read_bytes())
     path.unlink()
     path.symlink_to(elsewhere)
-    metadata_update.update_metadata(copied)
+    metadata_yaml.update_metadata(copied)
     assert path.is_symlink()
     assert metadata(copied) == whole
 
@@ -298,12 +298,12 @@ def test_files_of_one_recording_may_be_written_at_once(copied, monkeypatch):
         path.write_bytes(before if len(published) == 1 else data)
         published.append(data)
 
-    monkeypatch.setattr(metadata_update, "publish_bytes", publish)
-    metadata_update.update_metadata(copied)
+    monkeypatch.setattr(metadata_yaml, "publish_bytes", publish)
+    metadata_yaml.update_metadata(copied)
     assert len(published) == 1
     assert metadata(copied) == whole
     copied.with_name("metadata.yaml").write_bytes(before)
-    metadata_update.update_metadata(copied)
+    metadata_yaml.update_metadata(copied)
     assert len(published) == 3
     assert metadata(copied) == whole
 

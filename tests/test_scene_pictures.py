@@ -17,10 +17,9 @@ from mcaptrack import McaptrackError, log, pipeline
 from mcaptrack.api import demonstration
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
-from mcaptrack.pipeline.picture_times import PictureClock
-from mcaptrack.pipeline.scene_views import SceneCamera, SceneOnPictures
+from mcaptrack.pipeline.scene_views import PictureClock, SceneCamera, SceneOnPictures
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, SIGHTINGS, TRACKS, Frame
-from mcaptrack.sources.scenes import PLACES, three_cameras
+from mcaptrack.sources.demo import PLACES, three_cameras
 from mcaptrack.sources.synthetic import Pedestrian, Pose, SyntheticScene
 from mcaptrack.sources.video import write_mp4
 from mcaptrack.transforms.fuse import CameraView

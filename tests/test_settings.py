@@ -167,7 +167,7 @@ READERS = (
     "environment.py",
     "cli/settings.py",
     "cli/plugins.py",
-    "fleet/limits.py",
+    "fleet/child.py",
     "objects/stores.py",
     "api/health.py",
 )

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from mcaptrack.geometry.hulls import GrowingHull
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES
+from mcaptrack.transforms.retrack.shown_tracks import GrowingHull
 from tests.worlds import places, walk
 
 #: Positions of people by their input ids, at each tick.

@@ -13,8 +13,8 @@ from scipy.optimize import linear_sum_assignment
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation.forecasts import smoothed_predictions
 from mcaptrack.evaluation.metrics.displacement import displacement
-from mcaptrack.evaluation.smoothing import smoothed_predictions
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import Predict

@@ -11,7 +11,7 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.transforms import TRACKERS
 from mcaptrack.transforms.sort import ByteTrack, OcSort, Sort
-from mcaptrack.transforms.sort.association import distance_pairs
+from mcaptrack.transforms.sort.state import distance_pairs
 from tests.worlds import boxes_at, detections, ids, ns
 
 FRAMES = {"max_age_frames": 2, "min_hits_frames": 2, "min_iou": 0.3}

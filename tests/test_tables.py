@@ -182,7 +182,7 @@ def test_rows_of_a_track_stand_together_and_the_file_says_in_which_order(tmp_pat
 
 @given(st.lists(st.integers(-(2**63), 2**63 - 1) | st.integers(-3, 70_000), max_size=40))
 def test_whole_numbers_are_ordered_as_a_stable_sort_does(values):
-    from mcaptrack.tables.ordered import stable_order
+    from mcaptrack.tables.rows import stable_order
 
     array = np.array(values, np.int64)
     assert stable_order(array).tolist() == np.argsort(array, kind="stable").tolist()

@@ -9,13 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mcaptrack.evaluation.metrics.calibration import ellipse_levels
+from mcaptrack.evaluation.metrics.displacement import ellipse_levels
 from mcaptrack.geometry.mixtures import Tails, squared_radius
 from mcaptrack.notices import Notice, listening
 from mcaptrack.predictors import NAMES, Forecast, make
 from mcaptrack.predictors.position_noise import PositionNoise
-from mcaptrack.predictors.tail_calibration import TailCalibration
-from mcaptrack.predictors.tails import TABLES, Learned, counts_of, fit_mixture, follow, table_of
+from mcaptrack.predictors.tail_calibration import (
+    TABLES,
+    Learned,
+    TailCalibration,
+    counts_of,
+    fit_mixture,
+    follow,
+    table_of,
+)
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.predictions import tails_of
 from mcaptrack.transforms import PROFILES

@@ -7,8 +7,7 @@ import pytest
 
 from mcaptrack.schema import TRACKS, Frame, framing
 from mcaptrack.schema.frame_columns import collect
-from mcaptrack.transforms.to_video_rate import to_video_rate
-from mcaptrack.transforms.track_ends import mended_ends
+from mcaptrack.transforms.to_video_rate import mended_ends, to_video_rate
 
 
 def moving(spans: dict[int, set[int]], count: int = 60, rate_hz: float = 10.0, **others: float) -> list[Frame]:

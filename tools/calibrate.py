@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mcaptrack.evaluation.metrics.calibration import forecast_scores
+from mcaptrack.evaluation.metrics.displacement import forecast_scores
 from mcaptrack.predictors import NAMES, make
 from mcaptrack.training.recipe import RECIPES
 from mcaptrack.training.sources import SourceOptions, read_scenes, synthetic, windows_of

@@ -37,7 +37,7 @@ from mcaptrack.evaluation.metrics import combine, score, summary
 from mcaptrack.geometry.assignment import assign, solve
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES, Sample
-from mcaptrack.transforms.retrack import cut_links, decisions, false_tracks, joins, linking, offline, track_features
+from mcaptrack.transforms.retrack import cut_links, false_tracks, joins, linking, offline
 from mcaptrack.transforms.retrack.false_tracks import probability
 from mcaptrack.transforms.retrack.joins import Joins, Tracked, find_joins, tracked_of
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
@@ -200,8 +200,8 @@ def people_of(run: Run) -> People:
     observed = np.isfinite(paths.xy_m[:, 0])
     count = np.add.reduceat(observed.astype(float), paths.first[:-1])
     own = np.add.reduceat((owners_of(run, paths) >= 0).astype(float), paths.first[:-1])
-    found = track_features.features(model, paths, smoothed, step_s)
-    throughout = track_features.stand_throughout(paths, smoothed, found, log, step_s)
+    found = false_tracks.features(model, paths, smoothed, step_s)
+    throughout = false_tracks.stand_throughout(paths, smoothed, found, log, step_s)
     return People(found, own / count, count, throughout)
 
 
@@ -259,7 +259,7 @@ def decisions_of(run: Run) -> tuple[Judged, Judged]:
     """The joins of the offline tracks of a scene, and which tracks are people."""
     decided, model, samples, _, step_s = reached("decision_rows", *run.args)
     xy_m = np.stack([samples.column(name)[decided.sample] for name in ("x_m", "y_m")], axis=-1)
-    made, owner = judged_joins(run, decided.tracked, decisions.find_kept_joins(decided, model, step_s), xy_m)
+    made, owner = judged_joins(run, decided.tracked, offline.find_kept_joins(decided, model, step_s), xy_m)
     _, track, count = np.unique(decided.tracked.track, return_inverse=True, return_counts=True)
     return made, Judged(decided.log_odds[:, None], np.bincount(track, owner >= 0) * 2 >= count)
 
@@ -325,7 +325,7 @@ def fit_people(parts: list[People]) -> dict[str, Any]:
     """
     features, share, count, throughout = (np.concatenate(members) for members in zip(*parts, strict=True))
     weights = logistic(features, share, count)
-    names = track_features.FEATURES
+    names = false_tracks.FEATURES
     found: dict[str, Any] = {"weights": named(names, weights[:-1]), "bias": round(float(weights[-1]), 3)}
     odds = (features @ weights[:-1] + weights[-1])[throughout]
     found["stands throughout"] = round(shift(odds, share[throughout], count[throughout]), 2)
@@ -359,8 +359,8 @@ def held(seeds: list[int], steps: int) -> None:
         row = summary(combine(side))
         print(f"{name:12}{100 * row['IDF1']:.1f} / {100 * row['MOTA']:.1f} / {row['IDSW']}")
     made, people = ([np.concatenate(both) for both in zip(*one, strict=True)] for one in zip(*outcomes, strict=True))
-    show_reliability("joins", decisions.join_probability(made[0]), made[1])
-    is_person = decisions.person_probability(people[0][:, 0])
+    show_reliability("joins", offline.join_probability(made[0]), made[1])
+    is_person = offline.person_probability(people[0][:, 0])
     is_right = np.where(is_person >= 0.5, people[1], ~people[1])
     show_reliability("people and false tracks", np.maximum(is_person, 1 - is_person), is_right)
 

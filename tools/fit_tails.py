@@ -31,7 +31,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories
 from mcaptrack.geometry.mixtures import Tails, mahalanobis_squared
 from mcaptrack.predictors import NAMES, Forecast, PeopleSeen, Predictor, make, predict_among
-from mcaptrack.predictors.tails import TABLES, counts_of, fit_mixture
+from mcaptrack.predictors.tail_calibration import TABLES, counts_of, fit_mixture
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.framing import join_frames
 from mcaptrack.training.walks import walks

@@ -25,7 +25,7 @@ from traffic import CLASSES, Faults, draw_traffic
 from mcaptrack import __version__
 from mcaptrack.geometry.mixtures import Tails, mahalanobis_squared, mass_within
 from mcaptrack.predictors import vehicle_tails as shipped
-from mcaptrack.predictors.tails import counts_of, fit_mixture
+from mcaptrack.predictors.tail_calibration import counts_of, fit_mixture
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.schema.predictions import tails_of
 from mcaptrack.transforms import GroundTracker, Retrack, Sample

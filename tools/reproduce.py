@@ -30,14 +30,14 @@ sys.path.insert(0, str(Path(__file__).parent))
 import wildtrack
 
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, EvaluationResult, evaluate
+from mcaptrack.evaluation.forecasts import smoothed_predictions
 from mcaptrack.evaluation.metrics import summary
 from mcaptrack.evaluation.metrics.displacement import Displacement
-from mcaptrack.evaluation.smoothing import smoothed_predictions
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.transforms import PROFILES, TRANSFORMS, Predict, Sample
 from mcaptrack.transforms.retrack import Retracking
-from mcaptrack.viewing.curves import curves_svg
+from mcaptrack.viewing.report.formatting import curves_svg
 
 RATE_HZ = 2.5
 

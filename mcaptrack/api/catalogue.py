@@ -15,8 +15,8 @@ from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import publish_bytes, refuse_special
 from mcaptrack.networks import digest_of
 from mcaptrack.notices import warn
-from mcaptrack.transforms.detect.onnx import catalogue
-from mcaptrack.transforms.detect.onnx.catalogue import Model
+from mcaptrack.transforms.detect.onnx import session
+from mcaptrack.transforms.detect.onnx.session import Model
 
 __all__ = ["Model", "get_model", "models"]
 
@@ -51,7 +51,7 @@ def models(name: str | None = None) -> tuple[Model, ...]:
     >>> [model.name for model in mcaptrack.models()]
     ['yolox-nano', 'yolox-tiny', 'yolox-s']
     """
-    return (catalogue.find(name),) if name else tuple(catalogue.CATALOGUE.values())
+    return (session.find(name),) if name else tuple(session.CATALOGUE.values())
 
 
 @checked()
@@ -86,7 +86,7 @@ def get_model(name: str, *, source: PathLike | None = None) -> Path:
     ...     print(str(error)[:38])
     log.mcap is not the file of yolox-nano
     """
-    model = catalogue.find(name)
+    model = session.find(name)
     text = "" if source is None else str(source)
     if text and not text.startswith(("http://", "https://")):
         data = _read(model, Path(text))
@@ -122,7 +122,7 @@ def _read(model: Model, path: Path) -> bytes:
             data, size = file.read(model.size_bytes + 1), path.stat().st_size
     except OSError as error:
         raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
-    catalogue.check(model, hashlib.sha256(data).hexdigest(), max(size, len(data)), path)
+    session.check(model, hashlib.sha256(data).hexdigest(), max(size, len(data)), path)
     return data
 
 

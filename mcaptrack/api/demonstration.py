@@ -11,13 +11,12 @@ from mcaptrack.api.checked import checked
 from mcaptrack.api.common import Notes, as_path
 from mcaptrack.api.ingesting import ingest
 from mcaptrack.api.options import PathLike, Progress, no_progress
-from mcaptrack.api.scores import Scores
-from mcaptrack.api.scoring import evaluate
+from mcaptrack.api.scoring import Scores, evaluate
 from mcaptrack.api.whole import run
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import Notice, collected
 from mcaptrack.sources import demo as drawing
-from mcaptrack.sources.scenes import PLACES, SCENES
+from mcaptrack.sources.demo import PLACES, SCENES
 from mcaptrack.sources.synthetic import SyntheticScene
 from mcaptrack.tables.export import default_folder
 

@@ -5,23 +5,259 @@ from __future__ import annotations
 import os
 import platform
 import re
-from collections.abc import Collection
+import shutil
+import tempfile
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import metadata
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final
+from uuid import uuid4
 
-from mcaptrack import __version__
-from mcaptrack.api import machine
-from mcaptrack.api.store_check import StoreCheck, check_store, url_of_store
-from mcaptrack.environment import THREADS, cache_folder, share_of_cores
+from mcaptrack import __version__, log, objects
+from mcaptrack.environment import CONTROL_GROUPS, THREADS, cache_folder, control_groups, share_of_cores
 from mcaptrack.errors import McaptrackError
+from mcaptrack.location import SCHEMES, Url, hide_secrets, parse
 from mcaptrack.notices import Notice, collected, warn
+from mcaptrack.objects import Version
+from mcaptrack.objects.stores import described
 
 #: Extras for people who work on mcaptrack itself, or read its examples.
 _NOT_SHOWN: Final = ("docs", "examples", "test")
 _LITTLE_BYTES: Final = 1_000_000_000
 _REQUIREMENT: Final = re.compile(r"([\w.-]+)\s*(?:\[[^]]*\])?\s*(?:[^;]*?>=\s*([\d.]+))?[^;]*(?:;(.*))?")
+
+
+# Limits of this process on its machine: memory and folders; and packages that lack something.
+
+
+#: Version 1 of control groups states a number beyond all memory where there is no limit.
+_NO_LIMIT: Final = 1 << 60
+
+
+def memory_bytes() -> int | None:
+    """Return how much memory this process may use: that of the machine, or the limit of its control group."""
+    found = memory_limits()
+    with suppress(ValueError, OSError, AttributeError):
+        found.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    return min(found, default=None)
+
+
+def memory_limits(root: Path = CONTROL_GROUPS, own: str | None = None) -> list[int]:
+    """Return the limits of memory of this process's control group and those above it, in bytes."""
+    found = []
+    for folder in control_groups(root, own):
+        with suppress(OSError, ValueError):
+            found.append(int((folder / "memory.max").read_text()))  # "max" is no number
+    with suppress(OSError, ValueError):
+        found.append(int((root / "memory/memory.limit_in_bytes").read_text()))
+    return [limit for limit in found if 0 < limit < _NO_LIMIT]
+
+
+def temporary_folder() -> tuple[Path | None, str]:
+    """Return the folder for temporary files, and why a log can't be written to it and read back ("" if it can)."""
+    folder = None
+    try:
+        folder = Path(tempfile.gettempdir())
+        with tempfile.TemporaryDirectory(prefix="mcaptrack-") as place:
+            path = Path(place) / "doctor.mcap"
+            with log.create(path) as writer:
+                channel = writer.add_channel("/doctor", ("", "", b""), "", {})
+                for number in range(3):
+                    writer.add_message(channel, number, number, bytes([number]))
+            wrong = log.check(path).findings
+            return folder, wrong[0].words if wrong else ""
+    except McaptrackError as error:
+        return folder, str(error)
+    except OSError as error:
+        return folder, error.strerror or str(error)
+
+
+# Try a bucket or a prefix in a store with a small hidden object, which is removed again.
+
+
+#: The operations, and the consequence of one that fails.
+_STORE_CHECK_TRIED: Final = {
+    "list": "objects can't be listed",
+    "write": "objects can't be written",
+    "read": "objects can't be read",
+    "put-if-absent": "two commands at once may both write the first results of a log",
+    "replace": "results of two commands at once may replace each other",
+    "delete": "objects can't be removed",
+}
+_REASON: Final = re.compile(r"^.*? can't be (?:read|written|removed): ")
+
+
+@dataclass(frozen=True)
+class StoreCheck:
+    """The operations that a bucket or a prefix allows.
+
+    Attributes
+    ----------
+    url : str
+        The bucket or prefix.
+    server, region : str
+        The address of the server, or the name of the service; and its region ("" where there are none).
+    credentials : str
+        Where they come from.
+    access : dict of str to str
+        Why each of "list", "write", "read", "put-if-absent" (write an object only if it is absent), "replace" (only if
+        it is unchanged) and "delete" fails; "" where it works. What could not be tried is not there.
+
+    """
+
+    url: str
+    server: str
+    region: str
+    credentials: str
+    access: dict[str, str]
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """One line for each reason."""
+        reasons: dict[str, list[str]] = {}
+        for name, why in self.access.items():
+            if why:
+                reasons.setdefault(why, []).append(_STORE_CHECK_TRIED[name])
+        return tuple(f"{self.url}: {' and '.join(words)}: {why}" for why, words in reasons.items())
+
+
+def url_of_store(store: str) -> Url:
+    """Return the URL of a bucket or prefix; that of a log stands for the prefix with it.
+
+    Raises McaptrackError for anything else, and if what reads the store is not installed.
+    """
+    url = parse(store)
+    if not isinstance(url, Url):
+        examples = ", ".join(f"{scheme}://" for scheme in SCHEMES)
+        name = hide_secrets(store) if "://" in store else store
+        raise McaptrackError(f"{name:.200} is no bucket or prefix in a store; give a URL with {examples}")
+    objects.library(url)
+    return url.parent if url.suffix.lower() == ".mcap" else url
+
+
+def check_store(url: Url) -> StoreCheck:
+    """Try the operations of a run on a store."""
+    server, region, credentials = described(url)
+    access = dict(_tries(url))
+    return StoreCheck(
+        str(url), server, region, credentials, {name: access[name] for name in _STORE_CHECK_TRIED if name in access}
+    )
+
+
+def _tries(url: Url) -> Iterator[tuple[str, str]]:
+    """Yield each operation, and why it failed; "" if it didn't."""
+    listed: list[Url] = []
+    yield "list", _why(lambda: listed.extend(found for found, _ in islice(objects.list_objects(url), 1)))
+    probe = url / f".mcaptrack-doctor-{uuid4().hex}"
+    texts = [f"{number} {uuid4().hex}".encode() for number in range(4)]
+    made: list[Version | None] = []
+    why = _why(lambda: made.append(objects.put_if_unchanged(probe, texts[0], None)))
+    yield "write", why
+    if why or made[0] is None:
+        if listed:
+            yield "read", _why(lambda: objects.read_end(listed[0], 1))
+        return
+    first = made[0]
+    try:
+        yield "read", _why(lambda: _compare(probe, first, texts[0]))
+        yield "put-if-absent", _why(lambda: _refuse(objects.put_if_unchanged(probe, texts[1], None)))
+        yield "replace", _why(lambda: _replace(probe, first, texts))
+    finally:
+        why = _why(lambda: objects.delete(probe))
+    yield "delete", why
+
+
+def _why(attempt: Callable[[], object]) -> str:
+    """Return why something can't be done; "" if it was."""
+    try:
+        attempt()
+    except McaptrackError as error:
+        return _REASON.sub("", str(error))
+    return ""
+
+
+def _compare(url: Url, version: Version, text: bytes) -> None:
+    if objects.read_ranges(url, version, [(0, len(text))]) != [text]:
+        raise McaptrackError("the store gives other bytes than were written")
+
+
+def _refuse(written: Version | None) -> None:
+    if written is not None:
+        raise McaptrackError("the store overwrites an object although it was asked not to")
+
+
+def _replace(url: Url, first: Version, texts: list[bytes]) -> None:
+    with suppress(McaptrackError):  # a store that overwrote it has another version now
+        first = objects.find(url) or first
+    second = objects.put_if_unchanged(url, texts[2], first)
+    if second is None:
+        raise McaptrackError("the store does not replace an object that is unchanged")
+    _refuse(objects.put_if_unchanged(url, texts[3], first))
+
+
+def broken_packages() -> dict[str, str]:
+    """Return what can't be done because files of an installed package are missing, and why, by package."""
+    out = {}
+    for name, (what, work) in _TRIED.items():
+        try:
+            work()
+        except Exception as error:
+            out[name] = f"{what} ({_first_line(error)})"
+    return out
+
+
+def _write_table() -> None:
+    import pyarrow as pa
+    import pyarrow.dataset  # queries and tables of many logs
+    import pyarrow.parquet as pq
+
+    stream = pa.BufferOutputStream()
+    table = pa.table({"recording": ["doctor"], "t_ns": [1]})
+    pq.write_table(table, stream, compression="zstd")
+    if pq.read_table(pa.BufferReader(stream.getvalue())) != table:
+        raise ValueError("it is read back as another one")
+
+
+def _assign() -> None:
+    from scipy.optimize import linear_sum_assignment
+
+    linear_sum_assignment([[1.0, 0.0], [0.0, 1.0]])
+
+
+def _resize() -> None:
+    import cv2
+    import numpy as np
+
+    cv2.resize(np.zeros((4, 4), np.uint8), (2, 2))
+
+
+def _first_line(error: Exception) -> str:
+    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
+
+
+#: What is tried of packages of which parts are often left out or not found: their names, what else can't be done, how.
+_TRIED: Final[Mapping[str, tuple[str, Callable[[], None]]]] = {
+    "pyarrow": ("no table can be written as Parquet and read back", _write_table),
+    "scipy": ("nothing can be assigned", _assign),
+    "opencv-python-headless": ("no picture can be worked on", _resize),
+}
+
+
+def free_bytes(folder: Path) -> int | None:
+    """Return the free space of the disk of a folder, which need not exist yet."""
+    for place in (folder, *folder.parents):
+        with suppress(OSError):
+            return shutil.disk_usage(place).free
+    return None
+
+
+def can_be_written(folder: Path) -> bool:
+    """Whether files can be made in a folder, or the folder itself."""
+    there = next(place for place in (folder, *folder.parents) if place.exists())
+    return there.is_dir() and os.access(there, os.W_OK | os.X_OK)
 
 
 @dataclass(frozen=True)
@@ -140,7 +376,7 @@ def doctor(store: str | None = None) -> DoctorResult:
     url = None if store is None else url_of_store(store)
     with collected() as warnings:
         packages, extras, faults = _packages()
-        broken = machine.broken_packages()
+        broken = broken_packages()
         faults += [
             f"{name}: {words}; install {name} again"
             for name, words in broken.items()
@@ -150,13 +386,13 @@ def doctor(store: str | None = None) -> DoctorResult:
         faults += [
             f"{name}: {_codec_words(name)} ({why}); `pip install av` brings it" for name, why in codecs.items() if why
         ]
-        folder, why = machine.temporary_folder()
+        folder, why = temporary_folder()
         if why:
             place = folder or "the temporary folder"
             faults.append(
                 f"{place}: a log can't be written there and read back ({why}); TMPDIR may name another folder"
             )
-        free = machine.free_bytes(folder) if folder else None
+        free = free_bytes(folder) if folder else None
         if free is not None and free < _LITTLE_BYTES:
             warn(f"{folder} has only {free / 1e6:,.0f} MB free; TMPDIR may name another folder")
         cache = cache_folder()
@@ -172,12 +408,12 @@ def doctor(store: str | None = None) -> DoctorResult:
             codecs=codecs,
             onnx_providers=providers(),
             cores=share_of_cores(),
-            memory_bytes=machine.memory_bytes(),
+            memory_bytes=memory_bytes(),
             threads=_threads(broken),
             temporary_folder=folder,
             temporary_bytes_free=free,
             cache_folder=cache,
-            cache_can_be_written=machine.can_be_written(cache),
+            cache_can_be_written=can_be_written(cache),
             plugins=plugins,
             faults=tuple(faults),
             store=checked,

@@ -24,10 +24,9 @@ from mcaptrack.files import publish_bytes, refuse_overwrite
 from mcaptrack.foxglove.views import SCENE_SUFFIX
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice
-from mcaptrack.viewing.moments import find_moments, opening_moment
-from mcaptrack.viewing.notebook.page import Still, player_html, still_html
+from mcaptrack.viewing.links import find_moments, opening_moment
+from mcaptrack.viewing.notebook.page import FIRST, LAST, ShownColumn, Still, player_html, still_html, table_html
 from mcaptrack.viewing.notebook.pictures import PLAYER_PX, PictureSource, still_jpeg
-from mcaptrack.viewing.notebook.table import FIRST, LAST, ShownColumn, table_html
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 from mcaptrack import log as logs
 from mcaptrack.api.checked import checked
 from mcaptrack.api.common import detail, locations_of, log_location, optional_path, warn_unused
-from mcaptrack.api.fleet_page import page_about
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, place_of, publish_bytes, refuse_overwrite
-from mcaptrack.location import distinct_names, local_name
+from mcaptrack.location import distinct_names, local_name, parse
 from mcaptrack.notices import Notice, collected
-from mcaptrack.tables.catalogue import is_folder_of_tables
+from mcaptrack.tables.catalogue import is_folder_of_tables, read_catalogue
 from mcaptrack.viewing import report as pages
 
 #: The largest page in bytes that notebooks show and keep.
@@ -135,6 +136,26 @@ def report(
         publish_bytes(target, content)
         progress("report", len(paths), len(paths))
     return ReportResult(target, len(content), pages.data(reports), tuple(dict.fromkeys(warnings)))
+
+
+# The page about all logs in a folder of tables.
+
+
+def page_about(where: Path, folder: Path) -> tuple[bytes, dict[str, Any]]:
+    """Return the page about all logs in a folder of tables, and its numbers; it links to pages from ``folder``."""
+    rows = read_catalogue(where)
+    data = pages.fleet_data(rows)
+    text = pages.fleet_page(rows, str(where), pages.ELEMENT, data, partial(_page_beside, folder))
+    return text.encode("utf-8"), data
+
+
+def _page_beside(folder: Path, row: Mapping[str, Any]) -> str:
+    """Return the page of a log if it stands beside the log, as seen from a folder; "" if it doesn't."""
+    location = parse(row.get("location") or "")
+    if not isinstance(location, Path) or not location.is_absolute():
+        return ""
+    page = local_name(location, ".report.html")
+    return os.path.relpath(page, folder.absolute()) if page.is_file() else ""
 
 
 def _report_on_tables(folder: Path, output: Path | None, camera: str | None, force: bool) -> ReportResult:

@@ -18,7 +18,7 @@ from mcaptrack.files import publish_bytes, sweep
 from mcaptrack.location import Location
 from mcaptrack.notices import warn
 from mcaptrack.sources.fixed_frame import BoxesRead
-from mcaptrack.sources.ingest.bags.metadata_update import update_metadata
+from mcaptrack.sources.ingest.bags.metadata_yaml import update_metadata
 from mcaptrack.tables.export import default_folder, export, main_file, refuse_tables_of_another
 
 

@@ -15,8 +15,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish
 from mcaptrack.location import Location
 from mcaptrack.notices import warn
-from mcaptrack.pipeline import Report, Summary
-from mcaptrack.pipeline.several import SCENE
+from mcaptrack.pipeline import SCENE, Report, Summary
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.sources.ingest.sidecar import SidecarChoice

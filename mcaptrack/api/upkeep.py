@@ -18,7 +18,7 @@ from mcaptrack.location import Location, local_name
 from mcaptrack.log import CheckResult, Finding
 from mcaptrack.notices import Notice
 from mcaptrack.schema.provenance import REFINE, Provenance
-from mcaptrack.sources.ingest.bags.metadata_update import update_metadata
+from mcaptrack.sources.ingest.bags.metadata_yaml import update_metadata
 from mcaptrack.sources.ingest.sidecar import recording_of
 
 

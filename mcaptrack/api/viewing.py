@@ -20,10 +20,8 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.location import sibling
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path
-from mcaptrack.viewing import moments
-from mcaptrack.viewing.linked_report import is_about, with_links
-from mcaptrack.viewing.links import LICHTBLICK, viewer_links
-from mcaptrack.viewing.moments import LinkedEvent
+from mcaptrack.viewing import links
+from mcaptrack.viewing.links import LICHTBLICK, LinkedEvent, is_about, viewer_links, with_links
 from mcaptrack.viewing.serving import Server
 
 #: The names of codecs of videos.
@@ -96,13 +94,13 @@ class LogServer:
         }
         self.links = links_to(first, contents.at_ns)
         self.events = tuple(
-            one._replace(link=links_to(first, moments.before(one.t_ns, contents.start_ns))["Lichtblick"])
+            one._replace(link=links_to(first, links.before(one.t_ns, contents.start_ns))["Lichtblick"])
             for one in contents.events
         )
         self.report = None
         if contents.report is not None:
             name, page = contents.report
-            lead = partial(moments.before, start_ns=contents.start_ns)
+            lead = partial(links.before, start_ns=contents.start_ns)
             page = with_links(page, lambda t_ns: links_to(first, lead(t_ns))["Lichtblick"])
             self.report = self._server.add(name, page)
         self.at_s = (contents.at_ns - contents.start_ns) / NS_PER_S
@@ -212,10 +210,10 @@ def view(
             )
         files = {part.path.name: Path(part.real_path) for part in opened.parts}
         layouts = _chosen_layouts(path, opened, layout, notes)
-        events = moments.find_moments(opened)
+        events = links.find_moments(opened)
         at_ns, why = _opening(opened, events, at_s, event)
         if opened.start_ns or opened.end_ns:
-            notes.say(f"viewers open at {moments.seconds_of(opened, at_ns):.1f} s, {why}")
+            notes.say(f"viewers open at {links.seconds_of(opened, at_ns):.1f} s, {why}")
         _say_trouble(opened, notes)
         contents = _Contents(files, layouts, events, _report(path, opened, notes), opened.start_ns, at_ns)
     server = LogServer(contents, port, lichtblick, tuple(notes), tuple(dict.fromkeys(warnings)))
@@ -227,7 +225,7 @@ def view(
 def _opening(opened: logs.Log, events: Sequence[LinkedEvent], at_s: float | None, event: int | None) -> tuple[int, str]:
     """Return the log time in ns at which viewers open, and why. Raises McaptrackError if the log has no such time."""
     if at_s is not None:
-        length_s = moments.seconds_of(opened, opened.end_ns)
+        length_s = links.seconds_of(opened, opened.end_ns)
         if at_s > length_s:
             raise McaptrackError(f"{opened.path} lasts {length_s:.1f} s, so viewers can't open it at {at_s:g} s")
         return opened.start_ns + round(at_s * NS_PER_S), "as asked"
@@ -236,8 +234,8 @@ def _opening(opened: logs.Log, events: Sequence[LinkedEvent], at_s: float | None
             there = f"the events 1 to {len(events)}" if events else "no identity switches and repairs"
             raise McaptrackError(f"{opened.path} has {there}, so viewers can't open at event {event}")
         chosen = events[event - 1]
-        return moments.before(chosen.t_ns, opened.start_ns), f"a second before event {event} ({chosen.text})"
-    return moments.opening_moment(opened, events)
+        return links.before(chosen.t_ns, opened.start_ns), f"a second before event {event} ({chosen.text})"
+    return links.opening_moment(opened, events)
 
 
 def _report(path: Path, opened: logs.Log, notes: Notes) -> tuple[str, bytes] | None:
@@ -259,7 +257,7 @@ def _report(path: Path, opened: logs.Log, notes: Notes) -> tuple[str, bytes] | N
 def _say_trouble(opened: logs.Log, notes: Notes) -> None:
     """Say where viewers may have trouble with the pictures of a log, and what helps."""
     topics: dict[str, list[str]] = {}
-    for topic, codec in moments.video_formats(opened).items():
+    for topic, codec in links.video_formats(opened).items():
         topics.setdefault(codec, []).append(topic)
     again = call("ingest", Path("VIDEO"), image_format="jpeg")
     for codec, those in topics.items():

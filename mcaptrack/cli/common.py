@@ -10,7 +10,7 @@ import math
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -22,15 +22,13 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, ParamSpec, get_ty
 import typer
 
 from mcaptrack import SCHEMA_VERSION, notices
-from mcaptrack.cli.command import check_ranges, is_on_command_line, read_config
+from mcaptrack.cli.command import LAST_PANELS, check_ranges, is_on_command_line, read_config
 from mcaptrack.cli.flags import with_flags
-from mcaptrack.cli.inputs import check_paths
-from mcaptrack.cli.most_used import LAST_PANELS
 from mcaptrack.cli.settings import Declared
 from mcaptrack.cli.text import Level, is_json, say
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import publish_bytes, refuse_overwrite
-from mcaptrack.location import Location
+from mcaptrack.files import publish_bytes, refuse_overwrite, refuse_special, refuse_url
+from mcaptrack.location import Location, is_remote, parse
 from mcaptrack.notices import Code, Notice
 from mcaptrack.ranges import limits
 from mcaptrack.streams import LostOutputError
@@ -244,6 +242,41 @@ def _printing_notes(talk: Talk) -> Iterator[None]:
     finally:
         logger.removeHandler(printer)
         logger.setLevel(level)
+
+
+# Which inputs a command line names. URLs, pipes and devices are refused before a command opens anything.
+
+
+#: Arguments that name logs, which may be in a store.
+_LOGS: Final = ("logs", "path", "inputs")
+
+
+def check_paths(given: Mapping[str, Any]) -> None:
+    """Raise McaptrackError if a path among the values of a command's options is a URL, a pipe or a device.
+
+    Logs may be URLs of objects in a store.
+    """
+    for name, value in given.items():
+        for path in value if isinstance(value, list | tuple) else [value]:
+            if isinstance(path, Path):
+                if name not in _LOGS or not is_remote(parse(path)):
+                    refuse_url(path)
+                refuse_special(path)
+
+
+def expand(paths: Sequence[Path], *, each: bool = False, folders: bool = False) -> list[Location]:
+    """Return the inputs that arguments name; see ``fleet.expansion.find_inputs``."""
+    from mcaptrack.fleet.expansion import find_inputs
+
+    return [one.path for one in find_inputs(paths, each=each, folders=folders)]
+
+
+def only_one_output(paths: Sequence[Location], output: Path | None) -> None:
+    """Raise McaptrackError if several inputs would be written to one output."""
+    if output is not None and len(paths) > 1:
+        raise McaptrackError(
+            f"{len(paths)} inputs can't all be written to {output}; give one input, or no name for the output"
+        )
 
 
 def one_line(command: Callable[P, None]) -> Callable[P, None]:

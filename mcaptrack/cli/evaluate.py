@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import typer
 
 from mcaptrack.cli import common, labels
-from mcaptrack.cli.inputs import expand
+from mcaptrack.cli.common import expand
 from mcaptrack.cli.text import console, printable, say
 from mcaptrack.errors import McaptrackError
 

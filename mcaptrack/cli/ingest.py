@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from mcaptrack.api.ingesting import default_log
 from mcaptrack.cli import common
+from mcaptrack.cli.common import expand, only_one_output
 from mcaptrack.cli.declared import EachLog
 from mcaptrack.cli.flags import with_flags
-from mcaptrack.cli.inputs import expand, only_one_output
 from mcaptrack.cli.many import many_options
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location

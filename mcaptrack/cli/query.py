@@ -12,7 +12,7 @@ import typer
 
 from mcaptrack.cli import common
 from mcaptrack.cli.command import warn_unused
-from mcaptrack.cli.inputs import expand
+from mcaptrack.cli.common import expand
 from mcaptrack.cli.text import console, printable, show
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_url

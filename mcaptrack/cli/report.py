@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from mcaptrack.cli import common
-from mcaptrack.cli.inputs import expand
+from mcaptrack.cli.common import expand
 
 
 @common.one_line

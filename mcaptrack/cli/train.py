@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from mcaptrack.cli import common, labels
-from mcaptrack.cli.inputs import expand
+from mcaptrack.cli.common import expand
 from mcaptrack.cli.text import console, show
 from mcaptrack.errors import command
 

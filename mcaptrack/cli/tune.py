@@ -10,8 +10,8 @@ import typer
 from mcaptrack.cli import common, labels
 from mcaptrack.cli.chosen import has_flag, options_of
 from mcaptrack.cli.command import warn_unused
+from mcaptrack.cli.common import expand
 from mcaptrack.cli.config import NAME, read_toml, write_settings
-from mcaptrack.cli.inputs import expand
 from mcaptrack.cli.stages import chooser
 from mcaptrack.cli.text import console, show, stdout_to_stderr
 from mcaptrack.errors import McaptrackError

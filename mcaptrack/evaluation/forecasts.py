@@ -8,26 +8,34 @@ Letters: N forecasts, P pairs, T future steps, F frames.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation import spread
 from mcaptrack.evaluation.aligned import MAX_GAP_S, on_ground, resample_frames
-from mcaptrack.evaluation.metrics.calibration import RELIABILITY_LEVELS
-from mcaptrack.evaluation.metrics.displacement import TAU_M2, Displacement, displacement, forecast_errors
+from mcaptrack.evaluation.metrics.displacement import (
+    RELIABILITY_LEVELS,
+    TAU_M2,
+    Displacement,
+    displacement,
+    forecast_errors,
+)
 from mcaptrack.evaluation.metrics.pairing import Forecasts, PairedForecasts, Positions, pair_forecasts
-from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
-from mcaptrack.geometry.mixtures import Tails
+from mcaptrack.geometry.histories import Holt
+from mcaptrack.geometry.mixtures import Tails, squared_radius
 from mcaptrack.geometry.ticks import RegularClock
 from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_numbers, frame_times, join_frames, row_ends, spans_of, split_rows
 from mcaptrack.schema.predictions import tails_of
+from mcaptrack.transforms import Predict
+from mcaptrack.transforms.retrack.consistency import SmoothedHistory
 
 #: The channels of forecasts, below the camera's prefix, and the tracks from which each is made.
 FORECAST_INPUTS: Final[Mapping[str, str]] = {"predictions": "samples", "retracks/predictions": "retracks/online"}
@@ -163,6 +171,76 @@ class ForecastErrorFrames(NamedTuple):
     scores: Sequence[Frame]
 
 
+# The spread of forecasts: one mean and one 90th percentile for each frame, which viewers can plot.
+#
+# Letters: N forecasts, F frames.
+
+
+#: The probability inside the ellipses, and the percentile of their sizes that is given beside the mean.
+LEVEL: Final = 0.95
+PERCENTILE: Final = 90.0
+
+
+def radii_m(cov_m2: Floats, tails: Tails) -> Floats:
+    """The longer half axes (N,) in m of the 95 % ellipses of forecasts.
+
+    Parameters
+    ----------
+    cov_m2 : array (N, 2, 2), m^2
+        Covariances of the forecasts.
+    tails : Tails
+        Shapes (N,) of their distributions.
+
+    Returns
+    -------
+    array (N,), m
+        NaN where a covariance is not known or not positive.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mcaptrack.geometry.mixtures import normal_tails
+    >>> radii_m(np.diag([1.0, 4.0])[None], normal_tails(1)).round(3).tolist()
+    [4.895]
+    """
+    xx, xy, yy = cov_m2[:, 0, 0], cov_m2[:, 0, 1], cov_m2[:, 1, 1]
+    half = np.hypot((xx - yy) / 2, xy)
+    larger, smaller = (xx + yy) / 2 + half, (xx + yy) / 2 - half
+    known = np.isfinite(larger) & (smaller >= -1e-9 * np.abs(larger))
+    squared = np.where(known, larger, np.nan) * squared_radius(LEVEL, tails)
+    return np.asarray(np.sqrt(squared), np.float64)
+
+
+def by_frame(values: Floats, frame: Ints, frames: int) -> tuple[Floats, Floats]:
+    """The mean and the 90th percentile (F,) of values (N,) in each frame, NaN where none is known.
+
+    ``frame`` (N,) is the index of each value's frame. Percentiles are interpolated linearly between values.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> mean, most = by_frame(np.array([1.0, 3.0, np.nan]), np.array([0, 0, 1]), 2)
+    >>> mean.tolist(), most.round(2).tolist()
+    ([2.0, nan], [2.8, nan])
+    """
+    known = np.isfinite(values)
+    values, frame = values[known], frame[known]
+    count = np.bincount(frame, minlength=frames)
+    if not len(values):
+        return np.full(frames, np.nan), np.full(frames, np.nan)
+    ordered = values[np.lexsort((values, frame))]
+    # Places within a frame, so that the rounding of a frame doesn't depend on those before it.
+    place = np.maximum(PERCENTILE / 100 * (count - 1), 0.0)
+    low = np.floor(place).astype(np.int64)
+    share = place - low
+    first = np.minimum(np.cumsum(count) - count + low, len(ordered) - 1)
+    second = np.minimum(first + 1, len(ordered) - 1)
+    most = ordered[first] + share * (ordered[second] - ordered[first])
+    total = np.bincount(frame, values, minlength=frames)
+    some = count > 0
+    return np.where(some, total / np.maximum(count, 1), np.nan), np.where(some, most, np.nan)
+
+
 def find_forecast_errors(
     frames: Sequence[Frame],
     tracks: Sequence[Frame],
@@ -208,7 +286,7 @@ def find_forecast_errors(
         of_part = scores[low:high]
         of_part["forecasts"] = np.bincount(arrays.message, minlength=high - low)
         radii_m = _radii_m(arrays.forecasts)
-        of_part["spread_mean_m"], of_part["spread_90_m"] = spread.by_frame(radii_m, arrays.message, high - low)
+        of_part["spread_mean_m"], of_part["spread_90_m"] = by_frame(radii_m, arrays.message, high - low)
         span = (int(times[low]), int(times[high - 1])) if len(parts) > 1 else None
         paths, offline = (arrays.clock.positions(some, span, arrays.forecasts) for some in (tracks, later))
         if has_truth:
@@ -230,7 +308,7 @@ def find_forecast_errors(
 def _radii_m(forecasts: Forecasts) -> Floats:
     """The longer half axes (N,) of the 95 % ellipses at the last step."""
     shapes = forecasts.shapes(np.arange(len(forecasts.id)))
-    return spread.radii_m(forecasts.cov_m2[:, -1], Tails(*(part[:, -1] for part in shapes)))
+    return radii_m(forecasts.cov_m2[:, -1], Tails(*(part[:, -1] for part in shapes)))
 
 
 def _compare(
@@ -275,3 +353,70 @@ def _so_far(count: Floats, mean: Floats) -> Floats:
     of_all = np.cumsum(count)
     total = np.cumsum(np.where(count > 0, count * np.nan_to_num(mean), 0.0))
     return np.where(of_all > 0, total / np.maximum(of_all, 1), np.nan)
+
+
+# Predictions from smoothed tracks: the ablation "SORT + smoothing" of the paper.
+#
+# Identities and positions stay as the tracker gave them. Only the displacements of each track's past are smoothed
+# by Eq. 3 before the same predictor predicts, so that the difference is the effect of smoothing alone.
+#
+# Letters: N tracks of a frame, L past positions.
+
+
+#: alpha = beta of Eq. 3, as in the paper.
+SMOOTHING: Final = 0.5
+
+
+@dataclass
+class SmoothedHistories:
+    """The smoothed pasts of all tracks that the frame before had: after a gap a past begins again."""
+
+    length: int
+
+    def __post_init__(self) -> None:
+        self._holt = Holt(SMOOTHING, SMOOTHING)
+        self._ids: Ints = np.empty(0, np.int64)
+        self._history = self._begin(np.empty((0, 2)))
+
+    def push(self, ids: Ints, xy_m: Floats, steps: int = 1) -> tuple[Floats, Bools]:
+        """Add the positions (N, 2) of the tracks of the next frame; returns pasts (N, L, 2) and what is known (N, L).
+
+        Positions are rebuilt backwards from the current one, which stays as it was measured.
+        """
+        history = self._begin(xy_m)
+        _, now, before = np.intersect1d(ids, self._ids, return_indices=True)
+        if steps == 1 and len(now):
+            kept = SmoothedHistory(*(getattr(self._history, one.name)[before] for one in fields(SmoothedHistory)))
+            kept.append(self._holt, xy_m[now], np.ones(len(now), np.int64))
+            for one in fields(SmoothedHistory):
+                getattr(history, one.name)[now] = getattr(kept, one.name)
+        self._ids, self._history = ids.astype(np.int64), history
+        past, known = history.positions()
+        return np.where(known[..., None], past, np.nan), known
+
+    def _begin(self, xy_m: Floats) -> SmoothedHistory:
+        """Pasts of one position each."""
+        count = len(xy_m)
+        known = np.arange(self.length) == self.length - 1
+        past = np.tile(xy_m[:, None].astype(float), (1, self.length, 1))
+        return SmoothedHistory.of_observations(self._holt, past, np.tile(known, (count, 1)))
+
+
+def smoothed_predictions(samples: Sequence[Frame], predict: Predict) -> Iterator[Frame]:
+    """Predictions as ``predict`` makes them of samples, but from smoothed pasts.
+
+    Parameters
+    ----------
+    samples : sequence of Frame
+        Rows of Tracks at the prediction rate.
+    predict : Predict
+        The predictor and its options.
+
+    Yields
+    ------
+    Frame
+        Rows of Predictions, one frame for each of ``samples``.
+    """
+    forecaster = predict.forecaster(SmoothedHistories)
+    for frame in samples:
+        yield frame._replace(rows=forecaster.predict(frame))

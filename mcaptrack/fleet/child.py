@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,7 +17,8 @@ from multiprocessing import Pipe
 from time import monotonic
 from typing import IO, Any, Final
 
-from mcaptrack.fleet.limits import environment_of_worker
+from mcaptrack.environment import THREADS, cores
+from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet.results import State
 from mcaptrack.fleet.worker import Reply, Request
 from mcaptrack.processes import resident_bytes_with_children
@@ -47,6 +49,35 @@ class WorkerLimits:
 
 class StoppedError(Exception):
     """The fleet is being ended, and this try with it."""
+
+
+# Limits of workers: their threads and their memory.
+
+
+_SIZE: Final = re.compile(r"([0-9]+(?:\.[0-9]+)?)\s*([kmgt]?)(i?)b?", re.IGNORECASE)
+
+
+def environment_of_worker(workers: int) -> dict[str, str]:
+    """Return the environment of a worker: each of them gets its share of the cores, unless the user said otherwise."""
+    share = str(max(1, cores() // workers))
+    return dict.fromkeys(THREADS, share) | dict(os.environ)
+
+
+def size_in_bytes(size: str | float | None, name: str) -> int | None:
+    """Return a size such as "2GB", "1.5 GiB" or a number of bytes; None for None.
+
+    Raises McaptrackError for text that is no size, and for less than a megabyte.
+    """
+    if size is None:
+        return None
+    found = _SIZE.fullmatch(str(size).strip())
+    if found is None:
+        raise McaptrackError(f"`{name}=` needs a size such as 2GB or 500MB, not {str(size)!r:.40}")
+    number, unit, binary = found.groups()
+    amount = int(float(number) * (1024 if binary else 1000) ** (" kmgt".index(unit.lower() or " ")))
+    if amount < 1_000_000:
+        raise McaptrackError(f"`{name}=` needs a size such as 2GB or 500MB, not {str(size)!r:.40}: that is too little")
+    return amount
 
 
 class Child:

@@ -30,7 +30,6 @@ from mcaptrack.foxglove.template import (
     nested,
     stamps,
 )
-from mcaptrack.foxglove.text_labels import by_length
 from mcaptrack.geometry.arrays import Floats, Ints
 
 #: Coordinates are multiples of a quarter of a pixel: numbers with few digits take few bytes of a compressed log.
@@ -38,6 +37,21 @@ PER_PX: Final = 4
 #: Types of a PointsAnnotation.
 DOTS, LINE_LOOP, LINE_LIST = 1, 2, 4
 _POINTS: Final = 2  # the field of ImageAnnotations
+
+
+# Labels as text, grouped by length, because messages with texts of one length have one length.
+
+
+def by_length(labels: NDArray[Any]) -> Iterator[tuple[int, Ints, NDArray[Any]]]:
+    """Group labels (N,), numbers or texts, by the length of their text: for each length the length in bytes, the
+    indices, and the texts as bytes.
+    """
+    known, which = np.unique(labels, return_inverse=True)
+    words = np.array([str(label).encode() for label in known.tolist()] or [b""])
+    lengths = np.char.str_len(words)[which] if len(labels) else np.empty(0, np.int64)
+    for length in np.unique(lengths).tolist():
+        chosen = np.flatnonzero(lengths == length)
+        yield length, chosen, words[which[chosen]]
 
 
 class Annotations:

@@ -16,9 +16,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.foxglove.annotations import by_length
 from mcaptrack.foxglove.messages import SCENE, message_class
 from mcaptrack.foxglove.template import STAMP, Each, MessageParts, Slot, Template, TextSlot, group, joined, stamps
-from mcaptrack.foxglove.text_labels import by_length
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 

@@ -7,18 +7,24 @@ check(path)                             find damage
 recover(path, output)                   write what is intact to a new log
 """
 
-from mcaptrack.log.check import CheckResult, check
+from collections.abc import Callable, Collection, Iterator, Sequence
+from pathlib import Path
+
+from mcaptrack import objects
+from mcaptrack.files import temporary_folder
+from mcaptrack.location import Location, Url
+from mcaptrack.log import records
+from mcaptrack.log.check import CheckResult, ClockJump, check, clock_jumps, jumps_text
 from mcaptrack.log.check_summary import Finding
+from mcaptrack.log.chunks import message_head, open_chunk
 from mcaptrack.log.extend import extend, refuse_to_replace_recorded
-from mcaptrack.log.jumps import ClockJump, clock_jumps, jumps_text
 from mcaptrack.log.messages import ChannelRows, Message, MessageLocations
-from mcaptrack.log.opening import find_results, read, topics_with_schema
-from mcaptrack.log.paths import results_path
 from mcaptrack.log.reader import Channel, Log
-from mcaptrack.log.recording_files import refuse_non_mcap, split_files_in
+from mcaptrack.log.recording_files import RESULTS_SUFFIX, refuse_non_mcap, results_path, split_files_in
+from mcaptrack.log.records import MAGIC, Bytes, Opcode, Record, walk
 from mcaptrack.log.recover import RecoverResult, recover
-from mcaptrack.log.stream import copy_attachments_and_metadata, header, stream
 from mcaptrack.log.writer import LIBRARY, LogWriter, create
+from mcaptrack.objects import AbsentError
 
 __all__ = [
     "LIBRARY",
@@ -49,3 +55,125 @@ __all__ = [
     "stream",
     "topics_with_schema",
 ]
+
+
+# Opening logs, with their sidecars, and finding channels in them.
+
+
+def read(path: Location, *, sidecar: bool | Callable[[Log], bool] | None = None) -> Log:
+    """Open a log.
+
+    Parameters
+    ----------
+    path : Path or Url
+        An MCAP file, or an object that is one.
+    sidecar : bool or callable, optional
+        Whether to open the log with its sidecar, LOG.results.mcap: by default if it exists; True creates it, False
+        ignores it. A callable gets the log alone and returns which.
+
+    Returns
+    -------
+    Log
+        Close it, or use it as a context manager.
+
+    Raises
+    ------
+    McaptrackError
+        If the file is missing, not an MCAP file, or damaged.
+    """
+    log = Log(path)
+    try:
+        if path.name.endswith(RESULTS_SUFFIX):
+            return log
+        if isinstance(path, Url):
+            _attach_remote(log, results_path(path), sidecar(log) if callable(sidecar) else sidecar)
+            return log
+        results = results_path(path)
+        if sidecar(log) if callable(sidecar) else sidecar or (sidecar is None and results.exists()):
+            is_new = not results.exists()
+            if is_new:
+                with create(results):
+                    pass
+            log.attach_results(Log(results), is_new)
+    except BaseException:
+        log.__exit__()
+        raise
+    return log
+
+
+def topics_with_schema(log: Log, names: Sequence[str]) -> list[Channel]:
+    """The channels with one of these schemas, sorted by topic."""
+    return [channel for _, channel in sorted(log.channels.items()) if channel.schema_name in names]
+
+
+def find_results(path: Location) -> Location | None:
+    """The sidecar of a log, if there is one."""
+    if path.name.endswith(RESULTS_SUFFIX):
+        return None
+    if isinstance(path, Url):
+        objects.library(path)
+        url = results_path(path)
+        return None if objects.find(url) is None else url
+    results = results_path(path)
+    return results if results.exists() else None
+
+
+def _attach_remote(log: Log, results: Url, sidecar: bool | None) -> None:
+    """Attach the sidecar of a log in a store: the one that is there, or with ``sidecar`` a new one."""
+    if sidecar is False:
+        return
+    try:
+        found = Log(results)
+    except AbsentError:
+        if not sidecar:
+            return
+        made = temporary_folder()
+        with create(Path(made.name, results.name)):
+            pass
+        log.attach_results(Log(results, made), is_new=True)
+    else:
+        log.attach_results(found, is_new=False)
+
+
+# All records of a log in file order, to copy them to another log.
+
+
+def stream(log: Log) -> Iterator[tuple[int, Message]]:
+    """All messages in file order, each with the id of its channel; one chunk in memory at a time.
+
+    Raises McaptrackError where the log is damaged, and at the end if it was changed meanwhile.
+    """
+    source = log.snapshot.source.sequential()
+    with log.snapshot.reporting_damage():
+        for record in walk(source, len(MAGIC), log.index.data_end):
+            if record.opcode == Opcode.MESSAGE:
+                yield _message(source, record)
+            elif record.opcode == Opcode.CHUNK:
+                content = open_chunk(source, record)
+                for inner in walk(content, 0, len(content)):
+                    if inner.opcode == Opcode.MESSAGE:
+                        yield _message(content, inner)
+        log.snapshot.confirm_file_unchanged()
+
+
+def _message(buffer: Bytes, record: Record) -> tuple[int, Message]:
+    channel, sequence, t_ns, publish_ns = message_head(buffer, record)
+    payload = bytes(buffer[record.body + records.MESSAGE_HEAD.size : record.end])
+    return channel, Message(t_ns, sequence, publish_ns, payload)
+
+
+def header(log: Log) -> tuple[str, str]:
+    """The profile and the library in the header of a log."""
+    with log.snapshot.reporting_damage():
+        whole = log.snapshot.record(len(MAGIC))
+        return records.read_header(whole, records.record_at(whole, 0))
+
+
+def copy_attachments_and_metadata(log: Log, writer: LogWriter, *, without: Collection[str] = ()) -> None:
+    """Copy the attachments of a log, and its metadata records except those named in ``without``."""
+    with log.snapshot.reporting_damage():
+        for listed in log.index.metadata:
+            if listed.name not in without:
+                writer.copy_metadata(bytes(log.snapshot.record(listed.offset)))
+        for listed in log.index.attachments:
+            writer.copy_attachment(bytes(log.snapshot.record(listed.offset)))

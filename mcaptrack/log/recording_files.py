@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from mcaptrack.errors import McaptrackError, call
-from mcaptrack.log.paths import RESULTS_SUFFIX
+from mcaptrack.location import P, sibling
 
 _BEGIN: Final = {b"#ROSBAG V": "a ROS 1 bag", b"SQLite format 3\0": "a database, as rosbag2 writes them"}
 _MATROSKA: Final = b"\x1a\x45\xdf\xa3"  # and WebM
@@ -38,6 +38,18 @@ def _folder(path: Path) -> str:
     parts = split_files_in(path)
     is_log = len(parts) == 1 and parts[0].suffix == ".mcap"  # which can be given itself
     return "a folder with a recording" if parts and not is_log else ""
+
+
+# Names of files that belong to a log.
+
+
+#: Suffix of a sidecar: a log that holds the results of another.
+RESULTS_SUFFIX: Final = ".results.mcap"
+
+
+def results_path(path: P) -> P:
+    """The location of the sidecar of a log, which holds its results if they are not in the log itself."""
+    return sibling(path, RESULTS_SUFFIX, of=path.name.removesuffix(".mcap"))
 
 
 def split_files_in(folder: Path) -> list[Path]:

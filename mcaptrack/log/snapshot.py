@@ -14,7 +14,7 @@ from mcaptrack.location import Location, Url
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource, OpenFile, ReadFile, Signature, open_file
 from mcaptrack.log.index import Index, read_index
-from mcaptrack.log.journal_check import changed, find_journal, recover_hint
+from mcaptrack.log.journal import changed, find_journal, recover_hint
 from mcaptrack.log.located import TimeOutOfRange
 from mcaptrack.log.messages import Messages
 from mcaptrack.log.records import Damaged

@@ -28,7 +28,7 @@ from mcaptrack.log.checksums import crc_of
 from mcaptrack.log.chunk_list import ChunkList
 from mcaptrack.log.chunks import LOG_MAX_NS
 from mcaptrack.log.index import Index, SummaryEntry, attachment_entry, metadata_entry, read_index
-from mcaptrack.log.paths import RESULTS_SUFFIX, results_path
+from mcaptrack.log.recording_files import RESULTS_SUFFIX, results_path
 from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, Damaged, Opcode, SchemaRecord
 
 #: The library name in the header record, before the version.

@@ -18,8 +18,16 @@ from typing import Any, Final, NamedTuple
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Url
-from mcaptrack.objects.faults import AbsentError, breaks_off, meaning_of, overtaken, replaced, reporting_faults
-from mcaptrack.objects.stores import library, store_of
+from mcaptrack.objects.stores import (
+    AbsentError,
+    breaks_off,
+    library,
+    meaning_of,
+    overtaken,
+    replaced,
+    reporting_faults,
+    store_of,
+)
 
 __all__ = [
     "AbsentError",

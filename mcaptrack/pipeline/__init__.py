@@ -4,21 +4,35 @@ A stage reads a channel of an existing log and adds its own channels to the log,
 transform and its parameters.
 """
 
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.pipeline.checks import Job
+from mcaptrack.pipeline.drawing import RobotPath, Shown, find_views, robot_path
 from mcaptrack.pipeline.events import Watch
-from mcaptrack.pipeline.findings import warn_clock_jumps
 from mcaptrack.pipeline.following import Before, Continued, begins_here
 from mcaptrack.pipeline.fusing import fusable, fuse_again, fuse_cameras
-from mcaptrack.pipeline.plan import plan_all, plan_stage
+from mcaptrack.pipeline.plan import is_stale, plan_all, plan_stage
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, read_planes
-from mcaptrack.pipeline.run import Report, input_of, outdated_by, run
-from mcaptrack.pipeline.several import begins_with, choose_cameras
-from mcaptrack.pipeline.shown import RobotPath, Shown, find_views, robot_path
-from mcaptrack.pipeline.staleness import is_stale
+from mcaptrack.pipeline.run import Report, input_of, outdated_by, run, warn_clock_jumps
 from mcaptrack.pipeline.summary import Summary, summarise
 from mcaptrack.pipeline.write import LAYOUTS, attachment_of, layout_path
 from mcaptrack.pipeline.zones import CountedZones, ZoneWatch, counted_zones
-from mcaptrack.sources.cameras import Camera, camera_at, camera_to_name, find_camera, scenes_of
+from mcaptrack.sources import foreign
+from mcaptrack.sources.cameras import (
+    Camera,
+    camera_at,
+    camera_to_name,
+    cameras,
+    find_camera,
+    has_own_channels,
+    provenance_of,
+    scenes_of,
+)
+from mcaptrack.sources.pictures import size_of_pictures
+from mcaptrack.transforms import STAGES
 
 __all__ = [
     "AS_BEFORE",
@@ -60,3 +74,94 @@ __all__ = [
     "summarise",
     "warn_clock_jumps",
 ]
+
+
+# The cameras that a run of a whole log works on, and the scenes that they are fused to.
+
+
+#: The scene that a run fuses cameras to.
+SCENE: Final = "/world"
+#: The channels that a run can begin with, if a camera has no pictures and no boxes of others.
+_BEGINNINGS: Final = tuple(STAGES[name].input_topic for name in ("track", "sample", "predict"))
+
+
+class ChosenCameras(NamedTuple):
+    """The cameras of a run, by prefix; the reasons why others are left out, by name; and the scenes that are named."""
+
+    prefixes: tuple[str, ...]
+    left_out: Mapping[str, str]
+    scenes: tuple[str, ...] = ()
+
+
+def choose_cameras(opened: log.Log, names: Sequence[str] = ()) -> ChosenCameras | None:
+    """Choose the cameras of a run: those with these names, or all that have pictures or boxes.
+
+    None if the log has one camera only, or sensors of boxes in space alone: then there is no choice. Raises
+    McaptrackError if no camera has anything to begin with, and for names that the log doesn't have, or that can't be
+    run.
+    """
+    known, scenes = cameras(opened), scenes_of(opened)
+    if names:
+        found = {name.strip("/"): camera for camera in known for name in camera.names}
+        for name in names:
+            if name.strip("/") not in found:
+                raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(found)) or 'none'}")
+        wanted = list(dict.fromkeys(found[name.strip("/")] for name in names))
+        wanted_scenes = tuple(camera.prefix for camera in wanted if camera.prefix in scenes)
+        wanted = [camera for camera in wanted if camera.prefix not in scenes]
+    else:
+        wanted_scenes = ()
+        wanted = [camera for camera in known if camera.prefix not in scenes and not _is_truth_of_scene(opened, camera)]
+        wanted = [camera for camera in wanted if not camera.in_space or has_own_channels(opened, camera)] or wanted
+        if len(wanted) + len(scenes) < 2 or all(camera.in_space for camera in wanted):
+            return None
+    lacks = {camera.prefix[1:]: why for camera in wanted if (why := _lack(opened, camera))}
+    chosen = tuple(camera.prefix for camera in wanted if camera.prefix[1:] not in lacks)
+    if not chosen and not wanted_scenes:
+        why = "; ".join(f"{name} {reason}" for name, reason in lacks.items())
+        raise McaptrackError(f"{opened.path} has no camera to begin with: {why}")
+    for name, reason in lacks.items() if names else ():
+        raise McaptrackError(f"{opened.path}: {name} {reason}; leave it out of `camera=`")
+    return ChosenCameras(chosen, lacks, wanted_scenes)
+
+
+def _is_truth_of_scene(opened: log.Log, camera: Camera) -> bool:
+    """Whether these are the labels of a scene that isn't made yet."""
+    return camera.prefix == SCENE and camera.pictures is None and camera.boxes is None and _is_bare(opened, camera)
+
+
+def _is_bare(opened: log.Log, camera: Camera) -> bool:
+    return not any(f"{camera.prefix}/{name}" in opened.channels for name in _BEGINNINGS)
+
+
+def _lack(opened: log.Log, camera: Camera) -> str:
+    """The reason why nothing can be made of a camera; "" if there is none."""
+    if camera.boxes or not _is_bare(opened, camera):
+        return ""
+    if camera.pictures is None:
+        there = sorted(one for one in camera.topics if foreign.holds_pictures(opened.channels[one]))
+        if there:
+            return f"has pictures in {list_names(there)}; `topic=` runs it on one of them"
+        has = sorted(topic for topic in camera.topics if "/view/" not in topic)
+        return f"has neither pictures nor boxes, but {list_names(has, 5)}"
+    if not opened.channels[camera.pictures].messages:
+        return f"has no pictures: {camera.pictures} has no messages"
+    try:
+        if size_of_pictures(opened, camera.pictures) is None:
+            return f"has no picture in {camera.pictures} that can be decoded"
+    except McaptrackError as error:
+        return f"has pictures that can't be read: {error}"
+    return ""
+
+
+def begins_with(opened: log.Log, prefix: str) -> str:
+    """Describe the input of the run of one of several cameras; "" for the usual one, pictures alone."""
+    camera, detections = camera_at(opened, prefix), f"{prefix}/{STAGES['detect'].output_topic}"
+    made = provenance_of(opened, detections)
+    if detections in opened.channels and (made is None or made.transform not in STAGES):
+        return f"{prefix[1:]} has detections in {detections} already: it is tracked from these, nothing is detected"
+    if camera.pictures is None and camera.boxes:
+        return f"{prefix[1:]} has no pictures: it is tracked from the boxes in {camera.boxes}"
+    if camera.pictures is None:
+        return f"{prefix[1:]} has neither pictures nor boxes, but tracks or samples: it is run from these"
+    return ""

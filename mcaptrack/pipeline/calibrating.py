@@ -28,10 +28,10 @@ from mcaptrack.pipeline.write import Made, digest_of
 from mcaptrack.schema import GROUND_PLANE, Frame
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import REFINE, Provenance, frame_id_of
+from mcaptrack.sources.camera_motion import planes_in
 from mcaptrack.sources.cameras import Camera, camera_at, given_plane, provenance_of, refined_plane, scenes_of
 from mcaptrack.sources.cameras import cameras as cameras_of
 from mcaptrack.sources.ingest.sidecar import check_topics, encoding_for
-from mcaptrack.sources.planes import planes_in
 from mcaptrack.transforms.fuse import FootFuser
 
 #: Cameras are compared by at most so many frames.

@@ -25,7 +25,7 @@ from mcaptrack.evaluation.forecasts import FORECAST_INPUTS, find_forecast_errors
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import describe_origin, may_replace
 from mcaptrack.pipeline.motion import ground_truth_with
-from mcaptrack.pipeline.staleness import is_stale
+from mcaptrack.pipeline.plan import is_stale
 from mcaptrack.pipeline.write import Made, digest_of
 from mcaptrack.schema import (
     COUNTS,

@@ -25,9 +25,8 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job, read_named_frames
-from mcaptrack.pipeline.planes import read_planes
-from mcaptrack.pipeline.staleness import is_stale
-from mcaptrack.pipeline.visible import picture_size
+from mcaptrack.pipeline.plan import is_stale
+from mcaptrack.pipeline.planes import picture_size, read_planes
 from mcaptrack.pipeline.write import digest_of
 from mcaptrack.schema import APPEARANCE, DECISIONS, DETECTIONS, PREDICTIONS, TRACKS, VIDEO, Frame, Rows, Schema
 from mcaptrack.schema.frame_columns import FrameCollector

@@ -21,10 +21,10 @@ from mcaptrack.pipeline.gathering import (
     read_sources,
     warn_disagreeing,
 )
+from mcaptrack.pipeline.plan import is_stale
 from mcaptrack.pipeline.planes import read_planes
 from mcaptrack.pipeline.rebuild import fuser_of, plugins_of
 from mcaptrack.pipeline.run import Report, outdated_by
-from mcaptrack.pipeline.staleness import is_stale
 from mcaptrack.pipeline.write import Made, write
 from mcaptrack.schema import DETECTIONS, SIGHTINGS, Frame, Schema
 from mcaptrack.schema.frame_columns import FrameCollector

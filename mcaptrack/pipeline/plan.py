@@ -6,9 +6,11 @@ transform with the same parameters, or left as it is, with a warning, if that is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
+
+import numpy as np
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
@@ -16,17 +18,19 @@ from mcaptrack.geometry.plane import is_assumed
 from mcaptrack.notices import warn
 from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, first_stage, main_topic, superseded
-from mcaptrack.pipeline.corrections import is_of_corrections
-from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, read_planes, warn_unused
+from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, planes_to_json, read_planes, warn_unused
 from mcaptrack.pipeline.rebuild import MissingPluginError, OlderVersionError, differing, fuser_of, rebuild
-from mcaptrack.pipeline.spaces import check_spaces, suited_tracker
-from mcaptrack.pipeline.staleness import is_stale
-from mcaptrack.schema import DETECTIONS, SIGHTINGS, VIDEO
-from mcaptrack.schema.provenance import FUSE, Provenance
+from mcaptrack.pipeline.write import Made, digest_of
+from mcaptrack.schema import DETECTIONS, SIGHTINGS, TRACKS, VIDEO, Frame
+from mcaptrack.schema.framing import joined_parts
+from mcaptrack.schema.provenance import FUSE, Provenance, frame_id_of
+from mcaptrack.sources.calibrations import holds_calibrations
 from mcaptrack.sources.camera_motion import motion_topic
-from mcaptrack.sources.cameras import USUAL, camera_at, provenance_of
+from mcaptrack.sources.cameras import USUAL, camera_at, chain_of, is_made_by_stage, is_plane, name_above, provenance_of
+from mcaptrack.sources.corrections import CORRECTED, corrections_of, fixed_ids, with_corrections, without_filled
+from mcaptrack.sources.fixed_frame import holds_boxes_3d
 from mcaptrack.transforms import FUSION, STAGES, Stage, Transform
-from mcaptrack.transforms.protocol import traits_of
+from mcaptrack.transforms.protocol import Space, traits_of
 
 Say = Callable[[str], None]
 
@@ -100,6 +104,162 @@ def plan_all(
     for topic in sorted(camera_at(opened, prefix).topics):  # including results at other topics than the usual ones
         planner.ensure(topic)
     return planner.checked(say)
+
+
+# Which tracker suits boxes: one for boxes in pictures, or one for positions in metres.
+
+
+_BOXES: Final = {"picture": "boxes in pixels", "ground": "positions in metres"}
+
+
+def spaces_of_boxes(opened: log.Log, topic: str) -> frozenset[Space]:
+    """Return in which spaces the boxes of a channel are; empty if it has no boxes or isn't there."""
+    channel = opened.channels.get(topic)
+    if channel is None:
+        return frozenset()
+    if holds_boxes_3d(opened, topic):
+        return frozenset({"ground"})
+    if channel.schema_name != DETECTIONS.name:
+        return frozenset({"picture"})
+    if not frame_id_of(channel.metadata) and is_made_by_stage(channel):
+        return frozenset({"picture"})
+    there: dict[Space, str] = {"picture": "x_px", "ground": "x_m"}
+    found = set[Space]()
+    for _, _, part in joined_parts(DETECTIONS, opened.frame_columns(topic, DETECTIONS)):
+        found |= {space for space, column in there.items() if np.isfinite(part.rows[column]).any()}
+        if len(found) == len(there):
+            break
+    return frozenset(found)
+
+
+def tracker_of(space: str) -> str:
+    """Return the name of the first tracker of a space. Raises McaptrackError if there is none."""
+    names = _trackers_of(space)
+    if not names:
+        raise McaptrackError(f"no tracker takes {_BOXES[space]}; `tracker=` names one of your own")
+    return names[0]
+
+
+def _trackers_of(space: str) -> list[str]:
+    return [name for name, cls in STAGES["track"].built_in().items() if traits_of(cls).space == space]
+
+
+def suited_tracker(opened: log.Log, stage: Stage, source: str) -> str:
+    """Return the tracker for boxes that the default one can't take; "" for others, and for other stages."""
+    if stage.default.reads is not DETECTIONS:
+        return ""
+    spaces, default = spaces_of_boxes(opened, source), traits_of(STAGES["track"].default).space
+    return tracker_of(next(iter(sorted(spaces)))) if spaces and default not in spaces else ""
+
+
+def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: str = "") -> None:
+    """Raise McaptrackError if a tracker can't take the boxes of its channel.
+
+    Warns if a frame is named and no boxes can be brought to it.
+    """
+    sources = {job.source for job in jobs if job.source in opened.channels}
+    is_calibrated = any(map(holds_calibrations, opened.channels.values()))
+    has_boxes = camera_at(opened, prefix).in_space or any(holds_boxes_3d(opened, one) for one in sources)
+    if frame_id and not has_boxes and not is_calibrated:
+        warn("`frame=` has no effect: only recorded 3D boxes are brought to a frame", "option-not-used")
+    for job in jobs:
+        if job.transform.reads is not DETECTIONS or job.transform.writes.get("") is not TRACKS:
+            continue
+        spaces, space = spaces_of_boxes(opened, job.source), traits_of(job.transform).space
+        if spaces and space not in spaces:
+            there = " and ".join(_BOXES[one] for one in sorted(spaces))
+            name, others = STAGES["track"].choice(job.transform), _trackers_of(next(iter(sorted(spaces))))
+            other = f"`tracker={others[0]!r}` takes these" if others else "no built-in one takes these"
+            raise McaptrackError(
+                f"{opened.path}: {job.source} has {there}, and the tracker {name} takes {_BOXES[space]}; " + other
+            )
+
+
+# Whether a channel is out of date.
+
+
+# Corrections by people in the pipeline: samples are of corrected tracks, and re-tracking keeps these as they are.
+
+
+#: The stage that takes corrections.
+_STAGE: Final = "sample"
+
+
+def are_new(opened: log.Log, prefix: str, made: Provenance) -> bool:
+    """Whether samples were made before their tracks were corrected."""
+    found = corrections_of(opened, camera_at(opened, prefix).prefix, made.input) if made.transform == _STAGE else None
+    return found is not None and found not in made.references
+
+
+def corrected_input(
+    opened: log.Log, prefix: str, job: Job, frames: Sequence[Frame]
+) -> tuple[Sequence[Frame], Mapping[str, str]]:
+    """The frames that a job samples, with corrections, and the digests of these by topic; all others as they are."""
+    topic = corrections_of(opened, prefix, job.source) if job.stage == _STAGE else None
+    if topic is None:
+        return frames, {}
+    return with_corrections(frames, opened.frame_columns(topic, TRACKS)), {topic: digest_of(opened, topic)}
+
+
+def corrected_tracks(opened: log.Log, prefix: str, source: str, tracks: Sequence[Frame]) -> Sequence[Frame]:
+    """The tracks at ``source`` with corrections, if they have any."""
+    topic = corrections_of(opened, prefix, source)
+    return tracks if topic is None else with_corrections(tracks, opened.frame_columns(topic, TRACKS))
+
+
+def without_filled_in(opened: log.Log, prefix: str, source: str, frames: Sequence[Frame]) -> Sequence[Frame]:
+    """Re-tracked tracks at the rate of those at ``source``, without boxes that corrections of these don't have."""
+    topic = corrections_of(opened, prefix, source)
+    return frames if topic is None else without_filled(frames, opened.frame_columns(topic, TRACKS))
+
+
+def is_of_corrections(opened: log.Log, prefix: str, made: Provenance) -> bool:
+    """Whether samples are out of date because corrections of their tracks are new, changed or gone."""
+    if made.transform != _STAGE:
+        return False
+    ending = f"/{CORRECTED}"
+    then = {topic: digest for topic, digest in made.references.items() if topic.endswith(ending)}
+    found = corrections_of(opened, camera_at(opened, prefix).prefix, made.input)
+    return then != ({} if found is None else {found: digest_of(opened, found)})
+
+
+def fixed_in(opened: log.Log, prefix: str, source: str, made: Mapping[str, Made]) -> tuple[int, ...]:
+    """The ids of corrected tracks in the samples at ``source``; () if they were made without corrections."""
+    how = made[source].provenance if source in made else provenance_of(opened, source)
+    topic = corrections_of(opened, prefix, how.input) if how and how.transform == _STAGE else None
+    if how is None or topic is None or topic not in how.references:
+        return ()
+    tracks = made[how.input].frames if how.input in made else opened.frame_columns(how.input, TRACKS)
+    return fixed_ids(tracks, opened.frame_columns(topic, TRACKS))
+
+
+def is_stale(opened: log.Log, topic: str) -> bool:
+    """Return whether an input or reference of ``topic``, or its ground plane, has changed since it was made."""
+    made = Provenance.from_metadata(opened.channel(topic).metadata)
+    if made is None:
+        return False
+    prefix = name_above(chain_of(opened, topic)[-1])
+    if "ground_planes" in made.parameters:
+        planes = read_planes(opened, prefix)
+        if planes_to_json(planes or ()) != made.parameters["ground_planes"]:
+            return True
+    if motion.is_motion_new(opened, prefix, made) or are_new(opened, prefix, made):
+        return True
+    if _has_other_planes(opened, made):
+        return True
+    if any((name in opened.channels) != bool(then) for name, then in made.references.items()):
+        return True
+    for name, then in made.made_from().items():
+        now = provenance_of(opened, name)
+        if now and now.digest and now.digest != then:
+            return True
+    return False
+
+
+def _has_other_planes(opened: log.Log, made: Provenance) -> bool:
+    """Return whether a camera of a scene has a corrected ground plane, or has none any more."""
+    planes = [name for name in made.references if made.transform == FUSE and is_plane(name)]
+    return any(camera_at(opened, name_above(name)).ground_plane != name for name in planes)
 
 
 class _Planner:

@@ -4,32 +4,42 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import count
 from pathlib import Path
-from typing import Any, NamedTuple
+from time import perf_counter
+from typing import Any, Final, NamedTuple, TypeVar
+
+import numpy as np
 
 from mcaptrack import log
 from mcaptrack.environment import release_memory
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.camera_path import CameraPath
-from mcaptrack.geometry.plane import Planes, scene_planes
-from mcaptrack.notices import Notice, collected, warn
-from mcaptrack.pipeline.appearance import with_descriptors
+from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
+from mcaptrack.geometry.plane import Planes, is_assumed, is_estimated, scene_planes
+from mcaptrack.notices import Notice, collected, known_code, warn
 from mcaptrack.pipeline.checks import Job, check_inputs, may_replace, read_named_frames, superseded
-from mcaptrack.pipeline.context import in_context
-from mcaptrack.pipeline.corrections import corrected_input, fixed_in
 from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
 from mcaptrack.pipeline.events import Watch, make_events, tally
-from mcaptrack.pipeline.findings import warn_clock_jumps, warn_findings, warn_memory, warn_no_rows
 from mcaptrack.pipeline.following import Before, led, numbers_of, warn_unfollowed
 from mcaptrack.pipeline.motion import path_with, side_inputs
-from mcaptrack.pipeline.pictures import pictures_of
-from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, planes_for, read_planes, recorded_planes
+from mcaptrack.pipeline.pictures import pictures_of, with_descriptors
+from mcaptrack.pipeline.plan import corrected_input, corrected_tracks, fixed_in, without_filled_in
+from mcaptrack.pipeline.planes import (
+    AS_BEFORE,
+    Channels,
+    PlaneChoice,
+    is_poor,
+    picture_size,
+    plane_in_words,
+    planes_for,
+    read_planes,
+    recorded_planes,
+    without_unseen,
+)
 from mcaptrack.pipeline.rebuild import plugins_of
-from mcaptrack.pipeline.timing import Stopwatch
-from mcaptrack.pipeline.video_rate import at_video_rate
-from mcaptrack.pipeline.visible import Channels, picture_size, without_unseen
 from mcaptrack.pipeline.write import Made, digest_of, write
 from mcaptrack.pipeline.zones import STAGE as ZONES_STAGE
 from mcaptrack.pipeline.zones import ZoneWatch, make_zones
@@ -38,18 +48,72 @@ from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.camera_motion import to_pictures, to_scene
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameCollector
-from mcaptrack.schema.framing import row_ends, unique_values
-from mcaptrack.schema.provenance import FUSE, VIEW, Provenance
+from mcaptrack.schema.framing import frame_times, row_ends, unique_values
+from mcaptrack.schema.provenance import CLOCK, FUSE, VIEW, Provenance
 from mcaptrack.sources.camera_motion import tracks_topic
-from mcaptrack.sources.cameras import camera_at
+from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead
-from mcaptrack.transforms import FULL, STAGES, Transform
+from mcaptrack.transforms import FULL, STAGES, Sample, Transform
 from mcaptrack.transforms.guarded import guarded
+from mcaptrack.transforms.motion_limits import ClassNames, unknown_limits
 from mcaptrack.transforms.protocol import ModelCard, traits_of
+from mcaptrack.transforms.retrack.offline_rows import settle_classes
 from mcaptrack.transforms.to_video_rate import linked_tracks, to_video_rate
-from mcaptrack.transforms.track_classes import settle_classes
 
 Progress = Callable[[str, int, int], None]
+
+
+# Measure the time that each part of a run takes.
+
+
+T = TypeVar("T")
+
+
+class Stopwatch:
+    """Seconds by part, such as a stage. The time of a part within another one counts for the inner one alone.
+
+    Examples
+    --------
+    >>> watch = Stopwatch()
+    >>> with watch.part("detect"):
+    ...     pictures = list(watch.each("decode", range(3)))
+    >>> list(watch.seconds)
+    ['detect', 'decode']
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._open: list[str] = []
+        self._since = perf_counter()
+
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        """Count the time of a block for a part."""
+        self._count()
+        self.seconds.setdefault(name, 0.0)
+        self._open.append(name)
+        try:
+            yield
+        finally:
+            self._count()
+            self._open.pop()
+
+    def each(self, name: str, items: Iterable[T]) -> Iterator[T]:
+        """Yield items, and count the time that making each takes for a part."""
+        source = iter(items)
+        while True:
+            with self.part(name):
+                try:
+                    item = next(source)
+                except StopIteration:
+                    return
+            yield item
+
+    def _count(self) -> None:
+        now = perf_counter()
+        if self._open:
+            self.seconds[self._open[-1]] += now - self._since
+        self._since = now
 
 
 @dataclass
@@ -78,6 +142,100 @@ class Report:
         self.frames[topic], self.rows[topic] = len(made.frames), int(row_ends(made.frames)[-1])
         if made.schema is TRACKS:
             self.tracks[topic] = len(unique_values(TRACKS, made.frames, "track_id"))
+
+
+# Warn about results that are empty or unreliable, and about memory that runs out.
+
+
+#: The stages with results in metres: all except those that read pictures.
+_IN_METRES: Final = {name for name, stage in STAGES.items() if stage.default.reads is not VIDEO}
+#: The memory that a run needs, in bytes: whatever its length, and for each second that a person is seen (re-tracking
+#: has all samples in memory).
+_BASE, _A_PERSON_SECOND = 400_000_000, 3_000
+
+
+def warn_no_rows(stage: str, source: str, transform: Transform, given: Sequence[Frame], made: Sequence[Frame]) -> None:
+    """Warn if a stage made no rows, with the likely reason.
+
+    ``given`` are the frames that the stage read, ``made`` those of its first output.
+    """
+    if row_ends(made)[-1]:
+        return
+    if transform.reads is not VIDEO and not row_ends(given)[-1]:
+        warn(f"{source} holds nothing, so nothing was made of it", "nothing-found")
+        return
+    reason = transform.why_empty(given, made) if hasattr(transform, "why_empty") else "the transform gave none"
+    warn(f"no {STAGES[stage].rows} of {source}: {reason}", "nothing-found")
+
+
+def warn_clock_jumps(opened: log.Log) -> None:
+    """Warn if the clock of a log jumps, or if nothing was recorded for long."""
+    if words := log.jumps_text(log.clock_jumps(opened), opened.start_ns):
+        warn(
+            f"{opened.path}: {words}: the clock jumps, or the recording paused; tracks and forecasts end there",
+            "clock-jump",
+        )
+
+
+def warn_memory(frames: Sequence[Frame]) -> None:
+    """Warn if the stages that follow need more memory for these boxes than is free."""
+    boxes, steps = int(row_ends(frames)[-1]), np.diff(frame_times(frames))
+    seen_s = boxes * (float(np.median(steps)) / NS_PER_S if len(steps) else 0.0)
+    needed, free = _BASE + seen_s * _A_PERSON_SECOND, free_memory()
+    if free is not None and needed > free:
+        warn(
+            f"{boxes:,} boxes, of people who are seen for {seen_s / 3600:,.0f} hours together, take about "
+            f"{needed / 1e9:.1f} GB of memory, and {free / 1e9:.1f} GB are free: re-tracking has all samples in memory",
+            "memory",
+        )
+
+
+def free_memory() -> int | None:
+    """Return the free memory for this process in bytes, as Linux reports it; None if it isn't known."""
+    found = []
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        found += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+        most, now = (Path(f"/sys/fs/cgroup/memory.{name}").read_text().strip() for name in ("max", "current"))
+        found += [int(most) - int(now)] if most != "max" else []
+    except (OSError, ValueError):
+        pass  # not Linux, or no memory limit for this process's control group
+    return min(found, default=None)
+
+
+def warn_findings(opened: log.Log, prefix: str, made: Mapping[str, Provenance], planes: Planes, is_all: bool) -> None:
+    """Repeat the warnings that channels carry in their provenance, and warn about an estimated scale.
+
+    This covers the channels in ``made``, by topic, and the channels that they were made from; with ``is_all`` it covers
+    all channels of the camera.
+    """
+    known = dict(made)
+    for topic in sorted(camera_at(opened, prefix).topics):
+        provenance = Provenance.from_metadata(opened.channels[topic].metadata)
+        if provenance is not None:
+            known.setdefault(topic, provenance)
+    topics = list(known) if is_all else list(made)
+    for topic in topics:
+        if known[topic].input in known and known[topic].input not in topics:
+            topics.append(known[topic].input)
+    stages = {known[topic].transform for topic in topics}
+    for topic in topics:
+        for code, message in known[topic].warnings:
+            warn(message, known_code(code))
+    if is_assumed(planes) and stages & _IN_METRES:
+        words = plane_in_words(planes, known.get(camera_at(opened, prefix).ground_plane))
+        warn(words, "estimated-ground-plane" if is_estimated(planes) else "assumed-ground-plane")
+    given = [known[topic].parameters for topic in topics]
+    held_back = [one for one in given if one.get("poor_scale") and not one.get("side_view")]
+    if held_back:
+        by_likelihood = [one for one in held_back if one.get("retracker", "likelihood") == "likelihood"]
+        is_linked = any(one.get("link_s") != 0 for one in by_likelihood)
+        done = "only linked over gaps, by their boxes in the picture" if is_linked else "not re-tracked but passed on"
+        warn(
+            f"tracks were {done}: without a measured ground plane, more needs a camera that looks down, and this one "
+            f"looks along the ground. To insist: {call('retrack', opened.path, side_view=True)}",
+            "held-back",
+        )
 
 
 def run(
@@ -241,6 +399,93 @@ class _Input(NamedTuple):
         """Return the same tracks with boxes in pixels of the reference picture."""
         moved = to_scene(self.frames, path)
         return self._replace(stream=moved, frames=moved)
+
+
+# Re-tracked tracks at the rate of the tracks that were sampled.
+
+
+def at_video_rate(
+    opened: log.Log,
+    prefix: str,
+    job: Job,
+    made: Mapping[str, Made],
+    retracked: Sequence[Frame],
+    planes: Planes,
+    path: CameraPath | None,
+    carry: Callable[[Sequence[Frame], Sequence[Frame], Planes], Sequence[Frame]],
+) -> Sequence[Frame]:
+    """Return re-tracked tracks at the rate of the tracks that were sampled; no frames if there are no such tracks.
+
+    ``carry`` gives these tracks the re-tracked ids. Where the camera moves by ``path``, ``planes`` and the boxes of
+    ``retracked`` are those of reference pictures.
+    """
+    samples = made[job.source].provenance if job.source in made else provenance_of(opened, job.source)
+    source = samples.input if samples else ""
+    if source in made:
+        tracks = made[source].frames if made[source].schema is TRACKS else ()
+    else:
+        there = source in opened.channels and opened.channels[source].schema_name == TRACKS.name
+        tracks = opened.frame_columns(source, TRACKS) if there else ()
+    tracks = corrected_tracks(opened, prefix, source, tracks) if len(tracks) else tracks
+    carried = without_filled_in(opened, prefix, source, carry(to_scene(tracks, path), retracked, planes))
+    return to_pictures(carried, path)
+
+
+# Context: the parameters of transforms that follow from the log, and not from the user.
+
+
+def in_context(
+    opened: log.Log,
+    prefix: str,
+    job: Job,
+    frames: Sequence[Frame],
+    planes: Planes,
+    classes: Mapping[str, str],
+) -> Transform:
+    """Return the transform with its context fields filled in.
+
+    They are the ground planes, the start of the clock in ns, the rate in Hz, and the names of classes by number.
+    """
+    names = {f.name for f in fields(job.transform) if f.metadata.get("context")}
+    known: dict[str, Any] = {}
+    if "ground_planes" in names:
+        known["ground_planes"] = tuple(planes)
+    if "class_names" in names:
+        known["class_names"] = tuple((int(number), name) for number, name in classes.items())
+        _warn_of_limits(str(getattr(job.transform, "class_limits", "")), known["class_names"])
+    if "start_ns" in names:
+        known["start_ns"] = _clock_start(opened, prefix)
+    if "rate_hz" in names:
+        steps = np.diff(frame_times(frames))
+        if (steps > 0).any():  # frames may share a time
+            known["rate_hz"] = round(NS_PER_S / float(np.median(steps[steps > 0])), 6)
+            usual = f"{prefix}/{STAGES[job.stage].input_topic}"
+            if job.source != usual and known["rate_hz"] > 2 * Sample().rate_hz:
+                warn(
+                    f"{job.source} has {known['rate_hz']:g} frames a second, and {job.stage} takes steps at that rate; "
+                    f"{usual} has {Sample().rate_hz:g} unless it was made otherwise",
+                    "clock",
+                )
+    if "poor_scale" in names and is_assumed(planes):
+        known["poor_scale"] = is_poor(frames)
+    return replace(job.transform, **known)
+
+
+def _warn_of_limits(class_limits: str, names: ClassNames) -> None:
+    """Warn of limits of classes that there are not."""
+    if unknown := unknown_limits(class_limits, names):
+        there = ", ".join(sorted({name for _, name in names if name})) or "none with a name"
+        words = f"`class_limits=` names {', '.join(unknown)}: no such class is in the table of limits or in the boxes"
+        warn(f"{words} (classes of these are: {there})", "option-not-used")
+
+
+def _clock_start(opened: log.Log, prefix: str) -> int | None:
+    """Return the start of the prediction clock in ns: from the log's metadata, or the time of the first picture."""
+    clock = opened.metadata(CLOCK)
+    if clock and (start := parse_ns(clock.get("start_ns", ""))) is not None:
+        return start
+    pictures = camera_at(opened, prefix).pictures
+    return min(opened.times(pictures).tolist(), default=None) if pictures else None
 
 
 def _run_job(

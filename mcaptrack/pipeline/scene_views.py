@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -20,13 +20,13 @@ from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import seconds_to_ns
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.pipeline.checks import read_frames
-from mcaptrack.pipeline.picture_times import PictureClock, picture_clock
 from mcaptrack.schema import BOX_PX, DETECTIONS, SIGHTINGS, TRACKS, Frame, Schema
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.framing import JoinedFrames, frame_numbers, frame_times, joined_parts
 from mcaptrack.schema.provenance import FUSE, Provenance
-from mcaptrack.sources.cameras import camera_at, detections_of, provenance_of
-from mcaptrack.sources.planes import planes_in
+from mcaptrack.sources import foreign
+from mcaptrack.sources.camera_motion import planes_in
+from mcaptrack.sources.cameras import VIDEO, camera_at, detections_of, provenance_of
 from mcaptrack.transforms import STAGES
 from mcaptrack.transforms.fuse import CameraView
 
@@ -34,6 +34,38 @@ from mcaptrack.transforms.fuse import CameraView
 _AT_M: Final = 1.0
 #: Boxes that a camera doesn't have are drawn if so much of their height and width is in the picture.
 _INSIDE: Final = 0.5
+
+
+# The times of a camera's pictures.
+
+
+class PictureClock(NamedTuple):
+    """The topic of a camera's pictures, None without any; their times, rising, and their stamps (M,) in ns."""
+
+    topic: str | None
+    t_ns: Ints
+    stamp_ns: Ints
+
+
+def picture_clock(opened: log.Log, prefix: str, stamps: Mapping[str, Sequence[int]]) -> PictureClock:
+    """Return the times of a camera's pictures; ``stamps`` as for ``write``."""
+    usual = f"{prefix}/{VIDEO}"
+    video = usual if usual in opened.channels else next(iter(stamps), None) or camera_at(opened, prefix).pictures
+    picture_ns = opened.times(video) if video else np.empty(0, np.int64)
+    video = video if len(picture_ns) else None
+    stamp_ns = _stamps(opened, video, stamps.get(video, ())) if video else picture_ns
+    return PictureClock(video, picture_ns, stamp_ns)
+
+
+def _stamps(opened: log.Log, topic: str, known: Sequence[int]) -> Ints:
+    """Return the capture times of a channel's pictures in ns, (M,) for M pictures.
+
+    ``known`` are times that were read before. Pictures that were ingested have their capture time as log time; in other
+    recordings the messages contain it.
+    """
+    if Provenance.from_metadata(opened.channel(topic).metadata):
+        return opened.times(topic)
+    return np.array(known, np.int64) if known else foreign.stamps(opened, topic)
 
 
 @dataclass(frozen=True)

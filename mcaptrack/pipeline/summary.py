@@ -15,7 +15,7 @@ from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M, are_3d
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.plane import origin_of
 from mcaptrack.notices import warn
-from mcaptrack.pipeline.corrections import corrected_tracks
+from mcaptrack.pipeline.plan import corrected_tracks
 from mcaptrack.pipeline.planes import fit_of, read_planes
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, PREDICTIONS, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.camera_motion import rows_to_verdict

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mcaptrack import foxglove, log
 from mcaptrack.foxglove import views
 from mcaptrack.foxglove.views import layouts
+from mcaptrack.foxglove.views.layouts import ERRORS, PEOPLE, SPREAD
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes, moved_planes
@@ -33,10 +34,9 @@ from mcaptrack.pipeline.drawing import (
     recorded_sources,
     robot_frame,
 )
-from mcaptrack.pipeline.picture_times import picture_clock
-from mcaptrack.pipeline.plots import highest_values
-from mcaptrack.pipeline.scene_views import scene_on_pictures
+from mcaptrack.pipeline.scene_views import picture_clock, scene_on_pictures
 from mcaptrack.schema import (
+    COUNTS,
     DETECTIONS,
     EVENTS,
     FORECAST_SCORES,
@@ -140,6 +140,41 @@ def digest_of(opened: log.Log, topic: str) -> str:
     if known and known.digest:
         return known.digest
     return digest((message.t_ns, message.sequence, message.payload) for message in opened.messages(topic))
+
+
+# The largest values that the plots of a layout show, so that their axes have room for all of them.
+
+
+#: The channels of each plot below the prefix of a camera, and the columns of each that it may show. Of forecasts, one
+#: channel is shown: the first with such values.
+_PLOTS: Final[Mapping[str, tuple[Schema, tuple[str, ...], tuple[str, ...]]]] = {
+    PEOPLE: (COUNTS, ("tracks/counts", "retracks/counts", "retracks/full/counts"), ("tracked", "people")),
+    ERRORS: (
+        FORECAST_SCORES,
+        ("predictions/scores", "retracks/predictions/scores"),
+        ("ade_m", "fde_m", "later_ade_m", "later_fde_m"),
+    ),
+    SPREAD: (FORECAST_SCORES, ("retracks/predictions/scores", "predictions/scores"), ("spread_mean_m", "spread_90_m")),
+}
+
+
+def highest_values(prefix: str, frames_of: Callable[[str, Schema], Sequence[Frame]]) -> dict[str, float]:
+    """Return the largest value of each plot, as far as it is known.
+
+    ``frames_of`` returns the frames of a topic with rows of a schema; empty if there are none.
+    """
+    out: dict[str, float] = {}
+    for plot, (schema, names, columns) in _PLOTS.items():
+        for name in names:
+            if plot == SPREAD and plot in out:
+                break
+            for _, _, joined in joined_parts(schema, frames_of(f"{prefix}/{name}", schema)):
+                for column in columns:
+                    values = np.asarray(joined.rows[column], np.float64)
+                    known = values[np.isfinite(values)]
+                    if len(known):
+                        out[plot] = max(out.get(plot, 0.0), float(known.max()))
+    return out
 
 
 def write(

@@ -20,8 +20,7 @@ from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation.event_text import SUFFIX
 from mcaptrack.evaluation.zone_places import PlacedZone, ground_height_m, place_zone, positions_of
-from mcaptrack.evaluation.zone_text import zone_messages
-from mcaptrack.evaluation.zones import ZoneOptions, ZoneTotals, find_zone_events, zone_totals
+from mcaptrack.evaluation.zones import ZoneOptions, ZoneTotals, find_zone_events, zone_messages, zone_totals
 from mcaptrack.foxglove import views
 from mcaptrack.foxglove.views import zones as drawn_zones
 from mcaptrack.foxglove.views.image import PictureTimes
@@ -30,9 +29,9 @@ from mcaptrack.geometry.zones import Zone
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import describe_origin, may_replace
 from mcaptrack.pipeline.motion import ground_truth_with, path_with
-from mcaptrack.pipeline.picture_times import PictureClock, picture_clock
+from mcaptrack.pipeline.plan import is_stale
 from mcaptrack.pipeline.planes import planes_to_json
-from mcaptrack.pipeline.staleness import is_stale
+from mcaptrack.pipeline.scene_views import PictureClock, picture_clock
 from mcaptrack.pipeline.write import DrawnMessages, Made, digest_of
 from mcaptrack.schema import TRACKS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS, Frame, Schema
 from mcaptrack.schema.classes import class_names

@@ -10,19 +10,19 @@ Letters: N forecasts, T future steps, L past positions, M comparisons, R fits, B
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.mixtures import Tails, mahalanobis_squared, squared_radius
+from mcaptrack.geometry.mixtures import Tails, half_radius, mahalanobis_squared, squared_radius
 from mcaptrack.notices import warn
 from mcaptrack.predictors.forecast import Forecast, Predictor
-from mcaptrack.predictors.held_levels import LEVELS, correct, level_counts
-from mcaptrack.predictors.position_noise import PAST, PositionNoise
-from mcaptrack.predictors.running_sums import running
-from mcaptrack.predictors.tails import BINS, Learned, TailTable, counts_of, follow, table_of
+from mcaptrack.predictors.position_noise import PAST, PositionNoise, running
 
 #: Comparisons count 1 / e after so many seconds.
 _MEMORY_S: Final = 300.0
@@ -74,6 +74,226 @@ class _Compared(NamedTuple):
         """Some of them."""
         step, ahead, fit, half, size_m2 = self
         return _Compared(step[which], ahead[which], fit[which], half[which], size_m2[which])
+
+
+# Corrects mixtures by what their ellipses have held in a log.
+#
+# The level of an error is the probability of the smallest ellipse that holds it. Levels are uniform if ellipses hold
+# what they say. Where they aren't, ellipses are made those of the level that did hold half of the errors, and nine
+# tenths.
+# This is calibrated regression (Kuleshov et al., 2018), for forecasts that are made one after another.
+#
+# Letters: T future steps, R times, M errors, B bins of levels.
+#
+# References
+# ----------
+# V. Kuleshov, N. Fenner, S. Ermon, "Accurate uncertainties for deep learning using calibrated regression", ICML 2018.
+
+
+#: Bins of levels.
+LEVELS: Final = 40
+#: The levels by which the narrow and the wide part are corrected.
+_MIDDLE, _OUTER = 0.5, 0.9
+
+
+# Calibrated forecasts: mixtures with ellipses that hold as many true positions as they say.
+#
+# The covariance of a predictor is scaled, and becomes that of a mixture of a narrow and a wide normal distribution.
+# Both begin as a table for each predictor, which was fitted on synthetic walks with the faults of trackers (noise,
+# gaps, short and merged tracks, switched ids), before and after re-tracking: ``tools/fit_tails.py`` makes the file.
+# While a log is read they follow it, because people and trackers differ: forecasts of a time that has come are
+# compared with where their tracks were observed then, and scale the distributions of the forecasts after them
+# (compare adaptive conformal inference: I. Gibbs and E. Candes, NeurIPS 2021; here the scales are shrunk towards
+# the table, so that few comparisons change little). What ellipses have held in the log so far corrects them
+# (``held_levels``), and the noise of positions is taken out of the comparisons (``position_noise``). Nothing is
+# known that was not known at the time of a forecast.
+#
+# The means of forecasts, and the covariances by which tracks are associated, are those of the predictor.
+#
+# Letters: N forecasts, T future steps, K times of a table, L past positions, M comparisons, B bins.
+
+
+TABLES: Final = Path(__file__).parent / "trained" / "tails.json"
+#: Edges and centres of bins of half the squared Mahalanobis distance, in which comparisons are counted.
+_EDGES: Final = np.geomspace(1e-4, 1e4, 49)
+_CENTRES: Final = np.sqrt(_EDGES[1:] * _EDGES[:-1])
+BINS: Final = len(_CENTRES)
+#: Counts (T, B) times this are their sums, and those of half the squared distances.
+_SUMS: Final = np.stack([np.ones(BINS), _CENTRES], axis=1)
+#: So many independent comparisons count as much as the table, for the size of errors at all steps together; as much as
+#: the size at all steps, for that at one step; and as much as the table, for the share of large errors.
+_TAILS_ALL_STEPS, _ONE_STEP, _WEIGHT = 1.0, 4.0, 20.0
+#: Large errors are rare and their size varies: for it the table counts so many times as much.
+_LARGE: Final = 20.0
+#: This share of the forecasts of tracks that are no longer observed is taken to have large errors, as in the table:
+#: people who turn or stop are lost more often than others.
+_LOST: Final = 0.005
+#: Errors of measured positions are no smaller than this share of the least ones of true positions.
+_LEAST_MEASURED: Final = 0.1
+#: Limits of the weight of the wide part.
+_LEAST_WIDE, _TAILS_MOST_WIDE = 0.02, 0.6
+
+
+class TailTable(NamedTuple):
+    """The calibration of a predictor, by the time ahead: ``ahead_s`` (K,), and with as many elements:
+
+    ``wide_weight``, ``narrow_scale``, ``wide_scale`` as in ``Tails``, relative to the predictor's covariance, and the
+    factors of the covariance for tracks with a short history and for those that coast.
+    """
+
+    ahead_s: Floats
+    wide_weight: Floats
+    narrow_scale: Floats
+    wide_scale: Floats
+    short: Floats
+    coasting: Floats
+
+    def at(self, ahead_s: Floats) -> TailTable:
+        """The table at other times, interpolated; beyond its ends as at the ends."""
+        weight = np.interp(ahead_s, self.ahead_s, self.wide_weight)
+        parts = (self.narrow_scale, self.wide_scale, self.short, self.coasting)
+        scales = [np.exp(np.interp(ahead_s, self.ahead_s, np.log(part))) for part in parts]
+        return TailTable(ahead_s, weight, *scales)
+
+
+@lru_cache(maxsize=1)
+def _tables() -> Mapping[str, Any]:
+    found: Mapping[str, Any] = json.loads(TABLES.read_text(encoding="utf-8"))["predictors"]
+    return found
+
+
+def table_of(name: str) -> TailTable | None:
+    """The table of a predictor by name; None for those of other packages, and for networks with other weights."""
+    found = _tables().get(name)
+    return None if found is None else TailTable(**{key: np.array(found[key], np.float64) for key in TailTable._fields})
+
+
+def fit_mixture(counts: Floats, start: Tails, iterations: int) -> Tails:
+    """The mixtures (T,) under which counts (T, B) of half the squared distances are likeliest.
+
+    By expectation and maximisation, ``iterations`` times from ``start``.
+    """
+    weight, narrow, wide = (part[:, None] for part in start)
+    total = counts.sum(axis=1, keepdims=True)
+    for _ in range(iterations):
+        one = (1 - weight) / narrow * np.exp(-_CENTRES / narrow)
+        two = weight / wide * np.exp(-_CENTRES / wide)
+        of_wide = counts * two / np.maximum(one + two, 1e-300)
+        sums = of_wide.sum(axis=1, keepdims=True)
+        wide = (of_wide @ _CENTRES)[:, None] / np.maximum(sums, 1e-9)
+        narrow = ((counts - of_wide) @ _CENTRES)[:, None] / np.maximum(total - sums, 1e-9)
+        weight = np.clip(sums / total, _LEAST_WIDE, _TAILS_MOST_WIDE)
+    return Tails(weight[:, 0], narrow[:, 0], wide[:, 0])
+
+
+def counts_of(step: Ints, half_squared: Floats, steps: int) -> Floats:
+    """The number (T, B) of half squared distances (M,) of each step (M,), the first of which is 0, in each bin."""
+    column = np.clip(np.searchsorted(_EDGES, half_squared) - 1, 0, len(_CENTRES) - 1)
+    flat = np.bincount(step * BINS + column, minlength=steps * BINS)
+    return np.asarray(flat.reshape(steps, BINS), np.float64)
+
+
+class Learned(NamedTuple):
+    """The errors of forecasts in a log so far, for T steps ahead.
+
+    ``counts`` (T, B) are independent comparisons by half the squared distance, ``lost`` (T,) independent forecasts of
+    tracks that were not observed then. ``noise`` and ``least`` (T,) are in units of the predictor's covariance: what
+    is added to the size of errors by comparing with measured positions, and their least size.
+    """
+
+    counts: Floats
+    lost: Floats
+    noise: Floats
+    least: Floats
+
+    @property
+    def least_measured(self) -> Floats:
+        """The least size (T,) of errors from measured positions."""
+        return np.maximum(_LEAST_MEASURED * self.least, 1e-6)
+
+    def measured(self, tails: Tails) -> Tails:
+        """The distributions (T,) of distances from measured positions, of those from true ones."""
+        least = self.least_measured
+        narrow, wide = (np.maximum(part + self.noise, least) for part in (tails.narrow_scale, tails.wide_scale))
+        return Tails(tails.wide_weight, narrow, wide)
+
+
+def follow(table: Tails, before: Tails, learned: Learned, iterations: int) -> Tails:
+    """The mixtures (T,) of a table after what a log says: steps of expectation and maximisation from ``before``.
+
+    Sizes of errors are scaled by a factor for all steps, so that what is known of the near future counts for the
+    distant one, too, and by one for each step. Both are geometric means of the table's and of the log's, by what either
+    counts.
+    """
+    share, scale = np.stack([1 - before.wide_weight, before.wide_weight]), np.stack(before[1:])  # (2, T): narrow, wide
+    given, mean = np.stack(table[1:]), float(table.wide_weight.mean())
+    odds_of_table = 1 / table.wide_weight - 1
+    trust, lost = np.array([[1.0], [_LARGE]]), np.zeros_like(scale)
+    lost[1] = _LOST * learned.lost  # those that are lost have the size of the table
+    all_sums = learned.counts @ _SUMS
+    least, least_seen = np.maximum(learned.least, 1e-4), learned.least_measured
+    for _ in range(iterations):
+        seen = np.maximum(scale + learned.noise, least_seen)
+        density = np.exp(-_CENTRES / seen[..., None]) * (share / seen)[..., None]
+        of_wide = (learned.counts * (density[1] / np.maximum(density[0] + density[1], 1e-300))) @ _SUMS
+        sums, total = np.stack([all_sums - of_wide, of_wide], axis=1).transpose(2, 1, 0)
+        change = np.log(np.maximum(total / np.maximum(sums, 1e-9) - learned.noise, least) / given) * (sums > 1e-6)
+        known, said = sums + lost, sums * change
+        shared = said.sum(axis=1, keepdims=True) / (trust * _TAILS_ALL_STEPS + known.sum(axis=1, keepdims=True))
+        scale = given * np.exp((trust * _ONE_STEP * shared + said) / (trust * _ONE_STEP + known))
+        many, few = known
+        odds = (_WEIGHT * mean + few.sum()) / (_WEIGHT * (1 - mean) + many.sum()) * ((1 - mean) / mean)
+        share[1] = (_WEIGHT / (1 + odds_of_table / odds) + few) / (_WEIGHT + few + many)
+        share[1] = np.minimum(np.maximum(share[1], _LEAST_WIDE), _TAILS_MOST_WIDE)
+        share[0] = 1 - share[1]
+        np.maximum(scale, learned.least, out=scale)
+        np.maximum(scale[1], scale[0], out=scale[1])
+    return Tails(share[1], *scale)
+
+
+#: So many independent errors of all steps together count as much as that levels are uniform, and as many of one step as
+#: much as those of all.
+_UNIFORM, _ALL_STEPS = 20.0, 40.0
+#: Levels of which half of the errors, or nine tenths, are smaller, lie between these.
+_LOWEST, _HIGHEST = 0.02, 0.995
+#: The correction isn't for what the fit of the mixture has still to learn: limits of the factors of the covariance.
+_LEAST_NARROW, _MOST_NARROW, _MOST_WIDE = 0.6, 2.0, 1.5
+
+
+def level_counts(cell: Ints, half_squared: Floats, tails: Tails, cells: int) -> Floats:
+    """The numbers (cells, B) of errors (M,) at each level: ``cell`` says where each counts, ``tails`` its mixture."""
+    weight, narrow, wide = tails
+    level = 1 - (1 - weight) * np.exp(-half_squared / narrow) - weight * np.exp(-half_squared / wide)
+    column = np.minimum((level * LEVELS).astype(np.int64), LEVELS - 1)
+    return np.bincount(cell * LEVELS + column, minlength=cells * LEVELS).reshape(cells, LEVELS).astype(np.float64)
+
+
+def correct(tails: Tails, counts: Floats) -> Tails:
+    """Mixtures (R, T) that hold what they say, after ``counts`` (R, T, B) of independent errors at each level.
+
+    The narrow part is scaled so that half of the errors are in the 50 % ellipse. The wide part, of rare errors, is
+    only made larger.
+    """
+    share = _shares(counts)
+    below = np.concatenate([np.zeros((*share.shape[:-1], 1)), np.cumsum(share, axis=-1)], axis=-1)
+    level = np.array([_MIDDLE, _OUTER])[:, None, None]
+    at = np.minimum((below <= level[..., None]).sum(axis=-1) - 1, LEVELS - 1)  # (2, R, T)
+    inside = level - np.take_along_axis(below[None], at[..., None], -1)[..., 0]
+    held = (at + inside / np.take_along_axis(share[None], at[..., None], -1)[..., 0]) / LEVELS
+    held = np.clip(held, _LOWEST, _HIGHEST)
+    now, wanted = half_radius(np.stack([held, np.broadcast_to(level, held.shape)]), tails)
+    middle, outer = now / wanted
+    narrow = tails.narrow_scale * np.clip(middle, _LEAST_NARROW, _MOST_NARROW)
+    wide = tails.wide_scale * np.clip(np.maximum(middle, outer), 1.0, _MOST_WIDE)
+    return Tails(tails.wide_weight, narrow, np.maximum(wide, narrow))
+
+
+def _shares(counts: Floats) -> Floats:
+    """The expected shares of errors in each bin of levels, (R, T, B)."""
+    of_all = counts.mean(axis=1, keepdims=True)
+    shared = (of_all + _UNIFORM / LEVELS) / (of_all.sum(axis=2, keepdims=True) + _UNIFORM)
+    own: Floats = (counts + _ALL_STEPS * shared) / (counts.sum(axis=2, keepdims=True) + _ALL_STEPS)
+    return own
 
 
 class TailCalibration:

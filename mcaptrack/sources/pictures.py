@@ -16,7 +16,7 @@ import numpy as np
 from mcaptrack import log
 from mcaptrack.errors import DamagedError, McaptrackError
 from mcaptrack.geometry.arrays import Ints
-from mcaptrack.log.journal_check import recover_command
+from mcaptrack.log.journal import recover_command
 from mcaptrack.schema import Frame
 from mcaptrack.sources import foreign
 from mcaptrack.sources.video import EncodedPicture, decode_bgr, decode_gray, read_head

@@ -10,8 +10,23 @@ write_answer(path, table, form)      the answer of a query as a file
 read_tracks(path), read_columns(...) files -> arrays and frames, also of files from other tools
 """
 
+import math
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.files import publish
+from mcaptrack.schema import Frame
+from mcaptrack.schema.framing import split_rows
+from mcaptrack.tables import text
 from mcaptrack.tables.build import (
     Pointers,
+    TablePieces,
     columns_of,
     frames_table,
     records_table,
@@ -21,14 +36,11 @@ from mcaptrack.tables.build import (
     table_to_frames,
     with_recording,
 )
+from mcaptrack.tables.catalogue import join
 from mcaptrack.tables.fields import RECORDING, TABLE_VERSION, TABLES, Field, Table
 from mcaptrack.tables.files import FORMATS, Format, file_metadata, verify, write
-from mcaptrack.tables.join import join
 from mcaptrack.tables.messages import messages_table
-from mcaptrack.tables.read import holds_tracks, read_columns, read_tracks
-from mcaptrack.tables.results import ANSWERS, cells, pieces, tidy, write_answer
 from mcaptrack.tables.rows import TrackNames, names_by_track, rows_in_pieces, rows_table, summary_table
-from mcaptrack.tables.table_pieces import TablePieces
 
 __all__ = [
     "ANSWERS",
@@ -67,3 +79,224 @@ __all__ = [
     "write",
     "write_answer",
 ]
+
+
+# Parquet files of mcaptrack or of other tools, as arrays and frames.
+
+
+def read_columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Columns of a Parquet file as arrays, missing numbers as NaN.
+
+    Raises McaptrackError if it is no Parquet file or lacks a column.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with path.open("rb") as stream:  # a single file: the names of its folders are no columns
+            table = pq.read_table(stream)
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror or error}") from None
+    except pa.ArrowException as error:
+        raise McaptrackError(f"{path} is no Parquet file that can be read: {str(error).splitlines()[0]}") from None
+    missing = [name for name in names if name not in table.column_names]
+    if missing:
+        raise McaptrackError(f"{path} has no column {', '.join(missing)}; an exported table of tracks has")
+    out = {}
+    for name in names:
+        column = table.column(name)
+        if pa.types.is_dictionary(column.type):
+            column = column.cast(pa.string())
+        if pa.types.is_floating(column.type):
+            column = column.fill_null(np.nan)
+        out[name] = column.to_numpy()
+    return out
+
+
+#: Required columns of tracks in metres; ``topic`` and ``observed`` are optional.
+_OF_TRACKS: Final = ("t_ns", "track_id", "x_m", "y_m")
+
+
+def holds_tracks(path: Path) -> bool:
+    """Whether a Parquet file holds rows of tracks in metres. Raises McaptrackError if it is no Parquet file."""
+    file = _parquet(path)
+    return set(_OF_TRACKS) <= set(file.schema_arrow.names) and file.metadata.num_rows > 0
+
+
+def read_tracks(path: Path) -> dict[str, list[Frame]]:
+    """The tracks of a Parquet file with these columns, as frames by topic ("" without topics).
+
+    Raises McaptrackError if it holds none.
+    """
+    from mcaptrack.schema import TRACKS
+
+    names = _parquet(path).schema_arrow.names
+    missing = [name for name in _OF_TRACKS if name not in names]
+    if missing:
+        raise McaptrackError(f"{path} has no column {', '.join(missing)}; tracks need {', '.join(_OF_TRACKS)}")
+    table = _parquet(path).read([*_OF_TRACKS, *(name for name in ("topic", "observed") if name in names)])
+    if table.num_rows == 0:
+        raise McaptrackError(f"{path} has no rows")
+    count = table.num_rows
+    t_ns, track_id = (np.asarray(table.column(name).to_numpy()).astype(np.int64) for name in _OF_TRACKS[:2])
+    x_m, y_m = (np.asarray(table.column(name).to_numpy(), np.float64) for name in _OF_TRACKS[2:])
+    topic = np.array(table.column("topic").to_pylist()) if "topic" in names else np.full(count, "")
+    observed = table.column("observed").to_numpy().astype(bool) if "observed" in names else np.ones(count, bool)
+    nowhere = np.full(count, np.nan)
+    out = {}
+    for name in np.unique(topic).tolist():
+        mine = np.flatnonzero((topic == name) & np.isfinite(x_m) & np.isfinite(y_m))
+        mine = mine[np.lexsort((track_id[mine], t_ns[mine]))]
+        given = {"track_id": track_id, "x_m": x_m, "y_m": y_m, "observed": observed, "source_id": np.full(count, -1)}
+        given |= dict.fromkeys(("x_px", "y_px", "w_px", "h_px", "score"), nowhere)
+        rows = TRACKS.rows(**{column: values[mine] for column, values in given.items()})
+        times, first = np.unique(t_ns[mine], return_index=True)
+        out[name] = split_rows(times, range(len(times)), rows, np.append(first[1:], len(mine)))
+    return out
+
+
+def _parquet(path: Path) -> Any:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        return pq.ParquetFile(pa.OSFile(os.fsencode(path)))  # a name with a colon would be taken for a URL
+    except (OSError, pa.ArrowException) as error:
+        raise McaptrackError(f"{path} can't be read as Parquet: {error}") from None
+
+
+# Answers of queries: Arrow tables of any types, as files, as text, and as cells for a terminal.
+#
+# Text has exact numbers and times; whole numbers of more than 64 bits, intervals and dates are text. Cells have six
+# decimals.
+
+
+#: The formats of answers.
+ANSWERS: Final = ("csv", "json", "jsonl", "parquet", "arrow")
+_DIGITS: Final = 6
+
+
+def tidy(table: Any) -> Any:
+    """An answer with unique column names and types that all formats support; sums of whole numbers become int64 if
+    possible.
+
+    The second of two columns ``a`` is ``a_1``; intervals become text.
+    """
+    import pyarrow as pa
+
+    names: list[str] = []
+    for name in table.schema.names:
+        unique = (f"{name}_{number}" if number else name for number in range(len(table.schema.names) + 1))
+        names.append(next(name for name in unique if name not in names))
+    columns = []
+    for column in table.columns:
+        kind = column.type
+        if pa.types.is_decimal(kind) and kind.scale == 0:
+            try:
+                column = column.cast(pa.int64())  # noqa: PLW2901
+            except pa.ArrowInvalid:
+                column = column.cast(pa.string())  # noqa: PLW2901
+        elif pa.types.is_decimal(kind):
+            column = column.cast(pa.float64())  # noqa: PLW2901
+        elif kind == pa.month_day_nano_interval():
+            column = pa.array([_interval(value) for value in column.to_pylist()], pa.string())  # noqa: PLW2901
+        columns.append(column)
+    return pa.table(columns, names=names)
+
+
+def pieces(table: Any, form: Literal["csv", "json", "jsonl"]) -> Iterator[bytes]:
+    """An answer as text; ``json`` is an array with an object for each row."""
+    flat = _for_text(table)
+    if form == "csv":
+        yield from text.csv(flat)
+    elif form == "jsonl":
+        yield from text.json_lines(flat)
+    else:
+        between = b"[\n "
+        for line in text.json_lines(flat):
+            yield between + line.rstrip(b"\n")
+            between = b",\n "
+        yield b"[]\n" if between == b"[\n " else b"\n]\n"
+
+
+def write_answer(path: Path, table: Any, form: str) -> None:
+    """Write an answer to a file, which appears when it is complete. Raises McaptrackError if it can't be written."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with publish(path) as part, part.open("xb") as stream:
+            if form == "parquet":
+                pq.write_table(table, stream, compression="zstd")
+            elif form == "arrow":
+                with pa.ipc.new_file(stream, table.schema) as writer:
+                    writer.write_table(table)
+            else:
+                for piece in pieces(table, form):  # type: ignore[arg-type]
+                    stream.write(piece)
+    except (OSError, pa.ArrowException) as error:
+        words = getattr(error, "strerror", None) or str(error).splitlines()[0]
+        raise McaptrackError(f"{path} can't be written: {words}") from error
+
+
+def cells(table: Any, limit: int) -> tuple[list[bool], list[list[str | None]]]:
+    """The first rows of an answer for a terminal: which columns are numbers, and the texts of each row, None for
+    null.
+    """
+    import pyarrow as pa
+
+    numbers = [pa.types.is_integer(field.type) or pa.types.is_floating(field.type) for field in table.schema]
+    rows = text.rows(_for_text(table.slice(0, limit)))
+    return numbers, [[_word(value) for value in row.values()] for row in rows]
+
+
+def _word(value: Any) -> str | None:
+    if value is None or isinstance(value, str):
+        return value
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        small = value != 0 and abs(value) < 10**-_DIGITS * 10
+        if small or abs(value) >= 1e15:
+            return f"{value:.{_DIGITS}g}"
+        return f"{value:.{_DIGITS}f}".rstrip("0").rstrip(".")
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(_word(member) or 'null' for member in value)}]"
+    if isinstance(value, dict):
+        members = [f"{name}: {_word(member) or 'null'}" for name, member in value.items()]
+        return f"{{{', '.join(members)}}}"
+    return str(value)
+
+
+def _for_text(table: Any) -> Any:
+    """Dates, times of day and lists of times as text; ``text`` handles the other types."""
+    import pyarrow as pa
+
+    for number, field in enumerate(table.schema):
+        column, kind = table.column(number), field.type
+        if pa.types.is_date(kind) or pa.types.is_time(kind) or pa.types.is_duration(kind):
+            column = column.cast(pa.string())
+        elif pa.types.is_list(kind) and pa.types.is_timestamp(kind.value_type):
+            column = column.cast(pa.list_(pa.string()))
+        else:
+            continue
+        table = table.set_column(number, field.name, column)
+    return table
+
+
+def _interval(value: Any) -> str | None:
+    """An interval as DuckDB prints it: 1 month 2 days 00:00:01.5."""
+    if value is None:
+        return None
+    words = [f"{count} {name}{'s' * (abs(count) != 1)}" for count, name in _calendar(value) if count]
+    sign, rest = "-" * (value.nanoseconds < 0), abs(value.nanoseconds)
+    if rest or not words:
+        seconds, nanos = divmod(rest, 10**9)
+        fraction = f".{nanos:09d}".rstrip("0") if nanos else ""
+        words.append(f"{sign}{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}{fraction}")
+    return " ".join(words)
+
+
+def _calendar(value: Any) -> Sequence[tuple[int, str]]:
+    years = math.trunc(value.months / 12)
+    return ((years, "year"), (value.months - 12 * years, "month"), (value.days, "day"))

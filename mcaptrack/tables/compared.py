@@ -33,12 +33,11 @@ from mcaptrack.sources.ingest.boxes_3d_job import FRAME, Boxes3DJob
 from mcaptrack.sources.ingest.job import IngestOptions
 from mcaptrack.sources.ingest.label_job import LabelJob
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
-from mcaptrack.sources.ingest.labels.content import IgnoredBoxes, Labels
+from mcaptrack.sources.ingest.labels.content import ONLY_PEOPLE, IgnoredBoxes, Labels, WantedClasses
 from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX
 from mcaptrack.sources.ingest.labels.label_rows import label_rows
 from mcaptrack.sources.ingest.labels.long_files import LabelFile
 from mcaptrack.sources.ingest.labels.reading import in_order, read_homography, read_labels
-from mcaptrack.sources.ingest.labels.wanted import ONLY_PEOPLE, WantedClasses
 
 #: Formats that give the frame number of each row.
 _COUNTING: Final = ("mot", "kitti", "parquet")

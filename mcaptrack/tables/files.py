@@ -18,8 +18,8 @@ import numpy as np
 from mcaptrack.environment import release_memory
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish
+from mcaptrack.tables.build import PIECE_ROWS, pieces_of
 from mcaptrack.tables.fields import TABLE_VERSION
-from mcaptrack.tables.table_pieces import PIECE_ROWS, pieces_of
 
 Format = Literal["parquet", "arrow", "csv", "jsonl"]
 FORMATS: Final[tuple[Format, ...]] = get_args(Format)

@@ -15,8 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from mcaptrack.schema.spill import SpillFile, Stored
-from mcaptrack.tables.build import Pointers, frames_table
-from mcaptrack.tables.table_pieces import TablePieces
+from mcaptrack.tables.build import Pointers, TablePieces, frames_table
 
 Path = tuple[str, ...]
 

@@ -21,7 +21,7 @@ from mcaptrack import log, tables
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import place_of
 from mcaptrack.location import Location, distinct_names, join
-from mcaptrack.log.paths import results_path
+from mcaptrack.log.recording_files import results_path
 from mcaptrack.tables import TABLES
 from mcaptrack.tables.export import TOPICS, LogTables, current_file, default_folder, topic_folder
 

@@ -19,11 +19,17 @@ from mcaptrack.notices import collected
 from mcaptrack.registry import Entry
 from mcaptrack.registry.guard import Guard
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SIGHTINGS, TRACKS, VIDEO, Frame, Schema
-from mcaptrack.testing.error import LawError
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.protocol import Colour, Transform, check_options, traits_of
 
 Result = list[tuple[Frame, ...]]
+
+
+# The error of a broken law.
+
+
+class LawError(AssertionError):
+    """A transform or a predictor breaks a law; the message says which one, and where."""
 
 
 def check_transform(transform: Transform, frames: Sequence[Frame] | None = None, *, seed: int = 0) -> None:

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.metrics.calibration import forecast_scores
+from mcaptrack.evaluation.metrics.displacement import forecast_scores
 from mcaptrack.files import publish_bytes
 from mcaptrack.geometry.mixtures import mahalanobis_squared
 from mcaptrack.predictors import make, red

@@ -22,15 +22,15 @@ from mcaptrack.foxglove import views
 from mcaptrack.geometry.arrays import Image, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.pipeline import RobotPath
-from mcaptrack.schema import EVENTS, TRACKS, EventKind
+from mcaptrack.schema import DETECTIONS, EVENTS, TRACKS, EventKind
 from mcaptrack.schema.framing import frame_times, joined_parts
+from mcaptrack.schema.provenance import Provenance
 from mcaptrack.schema.resampling import interval_ns
 from mcaptrack.sources.cameras import provenance_of
 from mcaptrack.sources.foreign.flatten import message_decoder
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import write_clip
-from mcaptrack.transforms import FULL
-from mcaptrack.viewing.names import tracker_name
+from mcaptrack.transforms import FULL, STAGES
 from mcaptrack.viewing.rendering import (
     RenderOptions,
     SceneDrawing,
@@ -73,6 +73,22 @@ class _Happened(NamedTuple):
     is_switch: list[bool]
     born_ns: Ints
     is_compared: bool
+
+
+# Names of trackers, in reports and videos.
+
+
+#: How trackers are called; channels of earlier versions that name none were made by the first.
+_TRACKERS: Final = {"sort": "SORT", "bytetrack": "ByteTrack", "ocsort": "OC-SORT"}
+_FIRST_TRACKER: Final = next(iter(_TRACKERS))
+
+
+def tracker_name(made: Provenance | None) -> str:
+    """Return the name of the tracker of a channel, by how it was made."""
+    stage = STAGES.get(made.transform) if made else None
+    if made is None or stage is None or stage.default.reads is not DETECTIONS:
+        return "tracks as given"
+    return _TRACKERS.get(str(made.parameters.get(stage.option, _FIRST_TRACKER)), "tracker")
 
 
 def find_panels(opened: log.Log, prefix: str, suffix: str = views.SUFFIX) -> list[Panel]:

@@ -20,7 +20,7 @@ from mcaptrack.schema import TRACKS
 from mcaptrack.schema.framing import join_frames, thinned
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.transforms import FULL
-from mcaptrack.viewing.report.html import render
+from mcaptrack.viewing.report.formatting import render
 from mcaptrack.viewing.report.scene_map import background_picture
 
 #: The channels of tracks with the places that are shown without pictures.

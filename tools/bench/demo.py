@@ -19,7 +19,7 @@ from typing import Any
 
 from mcaptrack import __version__
 from mcaptrack.sources import demo
-from mcaptrack.sources.scenes import SCENES
+from mcaptrack.sources.demo import SCENES
 
 ROOT = Path(__file__).parent.parent.parent
 PAGE = ROOT / "docs" / "demo.md"

@@ -14,11 +14,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.evaluation.metrics.clear import Rules, clear
-from mcaptrack.evaluation.metrics.hota import hota
-from mcaptrack.evaluation.metrics.identity import identity
-from mcaptrack.evaluation.metrics.matchup import Matchup, distances, metres_to_similarity
-from mcaptrack.evaluation.metrics.recalls import ScoredMatchup, average_over_recalls
+from mcaptrack.evaluation.metrics.clear import Rules, clear, is_switch, matches
+from mcaptrack.evaluation.metrics.matchup import Matchup, SparseTables, distances, metres_to_similarity
+from mcaptrack.geometry.arrays import Bools, Floats, Indices
+from mcaptrack.geometry.assignment import assign_pairs_by_gain, solve
 
 __all__ = [
     "Matchup",
@@ -38,11 +37,149 @@ __all__ = [
 RATES: Final = ("MOTA", "IDF1", "IDP", "IDR", "HOTA", "DetA", "AssA", "LocA")
 
 
+# HOTA: detection and association in one number, over a range of similarity thresholds.
+#
+# Letters: P pairs, M pairs of a person and a track that are matched at least once, A thresholds.
+
+
+ALPHAS: Final = np.arange(0.05, 0.99, 0.05)
+_EPS: Final = float(np.finfo(float).eps)
+
+
+def hota(matchup: Matchup) -> dict[str, NDArray[np.float64]]:
+    """Compute the parts of HOTA [1]_ of one sequence at the 19 thresholds ``ALPHAS``.
+
+    Parameters
+    ----------
+    matchup : Matchup
+        Ground truth and tracks of the sequence; its threshold is not used.
+
+    Returns
+    -------
+    dict of arrays (19,)
+        HOTA_TP, HOTA_FN, HOTA_FP: counts of rows. AssA: association accuracy. LocA: localisation accuracy.
+
+    References
+    ----------
+    .. [1] J. Luiten, A. Osep, P. Dendorfer, P. Torr, A. Geiger, L. Leal-Taixe, B. Leibe: HOTA: A Higher Order Metric
+    for
+       Evaluating Multi-Object Tracking. International Journal of Computer Vision 129, 2021.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mcaptrack.evaluation.metrics import Matchup
+    >>> first, second, same = np.array([0]), np.array([1]), np.ones((1, 1))
+    >>> found = hota(Matchup((first, first), (first, second), (same, same), 0.5, n_ground_truth=1, n_tracks=2))
+    >>> found["HOTA_TP"][0].item(), found["AssA"][0].item()
+    (2.0, 0.5)
+    """
+    n_ground_truth, n_tracks, pairs = matchup.n_ground_truth, matchup.n_tracks, matchup.pairs
+    truth_count = np.bincount(matchup.all_ground_truth, minlength=n_ground_truth)
+    track_count = np.bincount(matchup.all_tracks, minlength=n_tracks)
+    of_row, of_column = np.bincount(pairs.row, pairs.similarity), np.bincount(pairs.column, pairs.similarity)
+    share = pairs.similarity / (of_column[pairs.column] + of_row[pairs.row] - pairs.similarity)
+    # Only people and tracks that are alike in some frame have an alignment: a table of all would be far larger.
+    cell, of_pair = np.unique(pairs.person * n_tracks + pairs.track, return_inverse=True)
+    shared = np.bincount(of_pair, share, minlength=len(cell))
+    together = truth_count[cell // max(1, n_tracks)] + track_count[cell % max(1, n_tracks)]
+    gain = (shared / np.maximum(together - shared, _EPS))[of_pair] * pairs.similarity
+    ends = (np.append(0, np.cumsum(counts)) for counts in (matchup.ground_truth_counts, matchup.track_counts))
+    gains = SparseTables(pairs.frame, pairs.row, pairs.column, gain, *ends)
+
+    def solve_frame(number: int, *_: object) -> tuple[Indices, Indices]:
+        return gains.best(number)
+
+    found = matchup.assigned(pairs, solve_frame)
+    # The number of thresholds that each match passes; from that, the matches that pass each threshold.
+    passed = np.searchsorted(ALPHAS - _EPS, found.similarity, "right")
+    levels = len(ALPHAS) + 1
+    tp = _at_least(np.bincount(passed, minlength=levels))
+    located = _at_least(np.bincount(passed, found.similarity, minlength=levels))
+    cells, at = np.unique(found.person * n_tracks + found.track, return_inverse=True)
+    counts = np.bincount(at * levels + passed, minlength=levels * len(cells)).reshape(len(cells), levels)
+    matches = _at_least(counts)  # (M, A)
+    there = (truth_count[cells // n_tracks] + track_count[cells % n_tracks])[:, None] if n_tracks else matches
+    association = matches / (there - matches)  # a match counts twice in ``there``, so that this is 1 at least
+    return {
+        "HOTA_TP": tp,
+        "HOTA_FN": len(matchup.all_ground_truth) - tp,
+        "HOTA_FP": len(matchup.all_tracks) - tp,
+        "AssA": (matches * association).sum(axis=0) / np.maximum(1, tp),
+        "LocA": np.where(tp > 0, np.maximum(located, 1e-10) / np.maximum(tp, 1e-10), 1.0),
+    }
+
+
+def _at_least(by_level: NDArray[np.generic]) -> NDArray[np.float64]:
+    """Counts by number of passed thresholds (..., A + 1) -> counts that pass each threshold (..., A)."""
+    return np.cumsum(by_level[..., ::-1], axis=-1)[..., ::-1][..., 1:].astype(float)
+
+
 class Score(NamedTuple):
     """The scores of a sequence that can be added up: counts, and the parts of HOTA at its 19 thresholds."""
 
     counts: dict[str, float]
     hota: dict[str, NDArray[np.float64]]
+
+
+# Identity scores: one track for each person over the whole sequence.
+
+
+#: Larger tables of people and tracks are not made: most of their pairs never meet.
+_LARGE: Final = 100_000
+
+
+def identity(matchup: Matchup) -> dict[str, float]:
+    """Count identity true and false positives and negatives [1]_ of one sequence.
+
+    The best one-to-one assignment of people to tracks is found for the whole sequence; a pair weighs the number of
+    frames in which it is at least as similar as the threshold. Pairs of weight zero are the same as no pair.
+
+    Parameters
+    ----------
+    matchup : Matchup
+        Ground truth and tracks of the sequence.
+
+    Returns
+    -------
+    dict
+        IDTP: rows matched under the best assignment. IDFN, IDFP: the other rows of the ground truth and of the tracks.
+
+    References
+    ----------
+    .. [1] E. Ristani, F. Solera, R. Zou, R. Cucchiara, C. Tomasi: Performance Measures and a Data Set for Multi-Target,
+       Multi-Camera Tracking. ECCV Workshops 2016.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mcaptrack.evaluation.metrics import Matchup
+    >>> first, second, same = np.array([0]), np.array([1]), np.ones((1, 1))
+    >>> identity(Matchup((first, first), (first, second), (same, same), 0.5, n_ground_truth=1, n_tracks=2))
+    {'IDTP': 1.0, 'IDFN': 1.0, 'IDFP': 1.0}
+    """
+    hits = float(best_tracks(matchup)[1].sum())
+    return {"IDTP": hits, "IDFN": matchup.ground_truth_rows - hits, "IDFP": matchup.track_rows - hits}
+
+
+def best_tracks(matchup: Matchup, large: int = _LARGE) -> tuple[Indices, Floats]:
+    """The people of the best assignment of one track to each, and in how many frames they match, (P,) each.
+
+    No table is made of more than ``large`` cells.
+    """
+    shape = (matchup.n_ground_truth, matchup.n_tracks)
+    pairs = matchup.pairs
+    near = pairs.similarity >= matchup.threshold
+    cell = pairs.person[near] * matchup.n_tracks + pairs.track[near]
+    if shape[0] * shape[1] > large:
+        cells, together = np.unique(cell, return_counts=True)
+        found, frames = assign_pairs_by_gain((cells // shape[1], cells % shape[1]), together.astype(float), shape)
+        return found[0], frames
+    if not shape[0] * shape[1]:
+        return np.empty(0, np.intp), np.empty(0)
+    table = np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape).astype(float)
+    rows, columns = solve(-table)
+    return rows, table[rows, columns]
 
 
 def score(matchup: Matchup, rules: Rules = "trackeval") -> Score:
@@ -141,3 +278,145 @@ def summary(part: Score) -> dict[str, Any]:
         "LocA": float(h["LocA"].mean()),
         **{name: int(c[name]) for name in ("IDSW", "FP", "FN", "Frag", "MT", "PT", "ML", "GT")},
     }
+
+
+# Scores averaged over recalls: AMOTA and AMOTP of nuScenes, sAMOTA and AMOTA of AB3DMOT.
+#
+# A tracker that may drop its less certain tracks trades recall for precision. These scores drop tracks by their
+# score, and average over the recalls that this gives.
+#
+# Letters: P pairs, R recalls, H tracks.
+
+
+#: The number of recalls.
+_RECALLS: Final = 40
+#: The least recall of nuScenes.
+_LEAST: Final = 0.1
+
+
+class ScoredMatchup(NamedTuple):
+    """A matchup, and the scores of its tracks (H,): the mean score of the boxes of each."""
+
+    matchup: Matchup
+    score: Floats
+
+
+class _Counts(NamedTuple):
+    """Counts of all sequences with the tracks from a score on: matches, false positives, switches, similarity."""
+
+    tp: int
+    fp: int
+    switches: int
+    similarity_sum: float
+
+
+def average_over_recalls(
+    parts: Sequence[ScoredMatchup], rules: Rules = "trackeval", worst: float = 0.5
+) -> dict[str, float]:
+    """Average CLEAR scores over the recalls of one class.
+
+    For each of 40 recalls r the least score is found from which on tracks reach it (by interpolation between the scores
+    of all matches), the other tracks are dropped, and the rest is matched again. With P rows of ground truth:
+
+    AMOTA [1]_: mean of MOTAR = max(0, 1 - (IDSW + FP + FN - (1 - r) P) / (r P)) over r from 0.1 to 1; in this formula
+    the r that the tracks reach, as in the benchmark's own evaluator. AMOTP: mean similarity of matches over the same r.
+    sAMOTA [2]_: mean of max(0, min(1, 1 - (IDSW + FP + FN - (1 - r) P) / (r P))) over r = 1/40, 2/40, ..., 1.
+    AMOTA_unscaled: AMOTA of [2]_, the mean of MOTA over the same r as sAMOTA. A recall that is never reached counts as
+    0, and in AMOTP as ``worst``.
+
+    Parameters
+    ----------
+    parts : sequence of ScoredMatchup
+        The matchups of all sequences, with the scores of tracks.
+    rules : {"trackeval", "motmetrics"}
+        Rules of CLEAR, see `clear`.
+    worst : float
+        The similarity of recalls that are not reached, for AMOTP: that at the gate for distances, 0 for overlaps.
+
+    Returns
+    -------
+    dict
+        AMOTA, AMOTP, sAMOTA and AMOTA_unscaled; NaN without ground truth. AMOTP is a similarity.
+
+    References
+    ----------
+    .. [1] H. Caesar, V. Bankiti, A. H. Lang, S. Vora, V. E. Liong, Q. Xu, A. Krishnan, Y. Pan, G. Baldan, O. Beijbom:
+       nuScenes: A Multimodal Dataset for Autonomous Driving. CVPR 2020; the definition is that of the tracking task.
+    .. [2] X. Weng, J. Wang, D. Held, K. Kitani: 3D Multi-Object Tracking: A Baseline and New Evaluation Metrics.
+       IROS 2020.
+
+    Examples
+    --------
+    Two objects in two frames; one is tracked, the other is not, so that recalls above 0.5 are not reached:
+
+    >>> import numpy as np
+    >>> from mcaptrack.evaluation.metrics import Matchup
+    >>> both, one, similarity = np.array([0, 1]), np.array([0]), np.array([[1.0], [0.0]])
+    >>> matchup = Matchup((both, both), (one, one), (similarity, similarity), 0.5, n_ground_truth=2, n_tracks=1)
+    >>> found = average_over_recalls([ScoredMatchup(matchup, np.array([0.9]))])
+    >>> found["AMOTA"], found["AMOTP"], found["sAMOTA"]
+    (0.45, 0.725, 0.5)
+    """
+    total = sum(part.matchup.ground_truth_rows for part in parts)
+    if not total:
+        return dict.fromkeys(("AMOTA", "AMOTP", "sAMOTA", "AMOTA_unscaled"), float("nan"))
+    found = [part.score[matches(part.matchup, rules).track] for part in parts]
+    scores = np.sort(np.concatenate(found))[::-1]
+    known: dict[tuple[bytes, ...], _Counts] = {}
+
+    def at(recalls: Floats) -> list[tuple[float, _Counts]]:
+        """The recalls that are reached, each with its counts."""
+        reached = recalls <= len(scores) / total
+        found_recalls = np.arange(1, len(scores) + 1) / total
+        least = np.interp(recalls[reached], found_recalls, scores) if len(scores) else np.empty(0)
+        out = []
+        for recall, score in zip(recalls[reached].tolist(), least.tolist(), strict=True):
+            kept = [part.score >= score for part in parts]
+            key = tuple(one.tobytes() for one in kept)
+            if key not in known:
+                known[key] = _count(
+                    [_of_tracks(part.matchup, one) for part, one in zip(parts, kept, strict=True)], rules
+                )
+            out.append((recall, known[key]))
+        return out
+
+    nuscenes = [one for _, one in at(np.linspace(_LEAST, 1, _RECALLS).round(12))]
+    motar = [max(0.0, 1 - (one.switches + one.fp) / one.tp) for one in nuscenes if one.tp]
+    motp = [one.similarity_sum / one.tp for one in nuscenes if one.tp]
+    by_target = at(np.arange(1, _RECALLS + 1) / _RECALLS)
+    right = [(recall * total, one.tp - one.fp - one.switches) for recall, one in by_target]
+    return {
+        "AMOTA": sum(motar) / _RECALLS,
+        "AMOTP": (sum(motp) + worst * (_RECALLS - len(motp))) / _RECALLS,
+        "sAMOTA": sum(min(1.0, max(0.0, hits / wanted)) for wanted, hits in right) / _RECALLS,
+        "AMOTA_unscaled": sum(hits / total for _, hits in right) / _RECALLS,
+    }
+
+
+def _count(matchups: Sequence[Matchup], rules: Rules) -> _Counts:
+    found = [matches(matchup, rules) for matchup in matchups]
+    tp = sum(len(one.person) for one in found)
+    return _Counts(
+        tp,
+        sum(matchup.track_rows for matchup in matchups) - tp,
+        sum(int(is_switch(one).sum()) for one in found),
+        float(sum(one.similarity.sum() for one in found)),
+    )
+
+
+def _of_tracks(matchup: Matchup, kept: Bools) -> Matchup:
+    """A matchup with some of its tracks (H,)."""
+    if kept.all():
+        return matchup
+    there = [kept[tracks] for tracks in matchup.tracks]
+    alike = matchup.similarity
+    return Matchup(
+        matchup.ground_truth,
+        tuple(tracks[one] for tracks, one in zip(matchup.tracks, there, strict=True)),
+        alike.of_columns(kept[matchup.all_tracks])
+        if isinstance(alike, SparseTables)
+        else tuple(similarity[:, one] for similarity, one in zip(alike, there, strict=True)),
+        matchup.threshold,
+        matchup.n_ground_truth,
+        matchup.n_tracks,
+    )

@@ -12,9 +12,9 @@ import numpy as np
 
 from mcaptrack.foxglove.views import ground, image, projected
 from mcaptrack.foxglove.views.image import View
+from mcaptrack.foxglove.views.label_places import line_unit, style_of
 from mcaptrack.foxglove.views.people import PeopleInParts
 from mcaptrack.foxglove.views.projected import MovingCamera
-from mcaptrack.foxglove.views.style import line_unit, style_of
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes

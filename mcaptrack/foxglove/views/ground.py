@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mcaptrack.foxglove import SceneMessages, class_colour, colours
 from mcaptrack.foxglove.views import label_places
 from mcaptrack.foxglove.views.image import BATCH, View, fade
+from mcaptrack.foxglove.views.label_places import INTERPOLATED, OBSERVED, RETRACKED, TrackStyle
 from mcaptrack.foxglove.views.people import (
     ForecastPaths,
     PeopleInParts,
@@ -28,7 +29,6 @@ from mcaptrack.foxglove.views.people import (
     shown_at,
     trails,
 )
-from mcaptrack.foxglove.views.style import INTERPOLATED, OBSERVED, RETRACKED, TrackStyle
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane, Planes

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mcaptrack.foxglove import Annotations, colours
 from mcaptrack.foxglove.views import label_places
+from mcaptrack.foxglove.views.label_places import INTERPOLATED, OBSERVED, TrackStyle, line_unit
 from mcaptrack.foxglove.views.people import (
     ForecastPaths,
     People,
@@ -27,7 +28,6 @@ from mcaptrack.foxglove.views.people import (
     shown_at,
     trails,
 )
-from mcaptrack.foxglove.views.style import INTERPOLATED, OBSERVED, TrackStyle, line_unit
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.camera_path import CameraPath

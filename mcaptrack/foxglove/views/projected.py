@@ -14,6 +14,7 @@ from mcaptrack.foxglove import Annotations, Cuboids, colours
 from mcaptrack.foxglove.views import label_places
 from mcaptrack.foxglove.views.ground import class_colours, raised
 from mcaptrack.foxglove.views.image import BATCH, PictureTimes, View, fade
+from mcaptrack.foxglove.views.label_places import INTERPOLATED, OBSERVED, TrackStyle, unit_of_width
 from mcaptrack.foxglove.views.people import (
     People,
     PeopleInParts,
@@ -24,7 +25,6 @@ from mcaptrack.foxglove.views.people import (
     segments,
     shown_at,
 )
-from mcaptrack.foxglove.views.style import INTERPOLATED, OBSERVED, TrackStyle, unit_of_width
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.pinhole import Lens, project
 from mcaptrack.schema import Frame

@@ -20,8 +20,15 @@ from mcaptrack.schema import Frame, Rows
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.foreign.boxes import DETECTIONS_READ, Classes, boxes_decoder
 from mcaptrack.sources.foreign.boxes_3d import BOXES_3D_READ, DRAWINGS, Message3d, boxes_3d_decoder
-from mcaptrack.sources.foreign.decoding import MessageType, decoder_with_errors, plain_name
-from mcaptrack.sources.foreign.values import integer, stamp_of, text, to_bytes
+from mcaptrack.sources.foreign.decoding import (
+    MessageType,
+    decoder_with_errors,
+    integer,
+    plain_name,
+    stamp_of,
+    text,
+    to_bytes,
+)
 from mcaptrack.sources.video import PixelLayout
 
 __all__ = [

@@ -4,25 +4,28 @@ from __future__ import annotations
 
 import re
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_special
+from mcaptrack.schema import DETECTIONS
 from mcaptrack.schema.provenance import CLOCK
+from mcaptrack.sources.calibrations import frame_of
+from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.ingest.bags.opening import open_recording
 from mcaptrack.sources.ingest.boxes_3d_job import Boxes3DJob
 from mcaptrack.sources.ingest.calibration import is_calibration
-from mcaptrack.sources.ingest.calibration_job import CalibrationJob
 from mcaptrack.sources.ingest.job import MOTION, IngestJob, IngestOptions, IngestReport, Progress
 from mcaptrack.sources.ingest.label_job import LabelJob, label_frames
 from mcaptrack.sources.ingest.labels.box_rows import OTHERS
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
+from mcaptrack.sources.ingest.labels.camera import boxes_extent, camera_of, picture_size, timeline_of
 from mcaptrack.sources.ingest.labels.content import Format
-from mcaptrack.sources.ingest.labels.cvat_files import is_cvat
+from mcaptrack.sources.ingest.labels.cvat import is_cvat
 from mcaptrack.sources.ingest.labels.yolo import is_label_folder
-from mcaptrack.sources.ingest.motion_job import MotionJob
 from mcaptrack.sources.ingest.recording_job import RecordingJob
 from mcaptrack.sources.ingest.video_job import VideoJob
 from mcaptrack.sources.video import IMAGE_SUFFIXES
@@ -110,6 +113,78 @@ def ingest(
             job, VideoJob
         )
     return job.report
+
+
+# Ingest the motion of a camera alone, for the pictures or the detections of an existing log.
+
+
+_BOXES: Final = "detections"
+
+
+class MotionJob(IngestJob):
+    """The motion of the camera of a log: a file that is itself the input."""
+
+    def __init__(self, source: Path, options: IngestOptions, into: log.Log | None) -> None:
+        if options.motion is not None:
+            raise McaptrackError(f"{source} and {options.motion} are both the motion of the camera; give one")
+        if into is None:
+            raise McaptrackError(
+                f"{source}: the motion of a camera belongs to a log with its pictures or boxes; name it with `into=`"
+            )
+        if options.calibration:
+            raise McaptrackError(f"{source} is the motion of a camera; its calibration is added in a call of its own")
+        super().__init__(source, replace(options, motion=source), into)
+        self.prefix, self.pictures = camera_of(into, options.camera)
+        boxes = into.channels.get(f"{self.prefix}/{_BOXES}")
+        if self.pictures:
+            self._timeline, self._size = timeline_of(into, self.pictures), picture_size(into, self.pictures)
+        elif boxes is not None and boxes.messages and boxes.schema_name == DETECTIONS.name:
+            self._timeline = timeline_of(into, boxes.topic)
+            self._size = boxes_extent(into, boxes.topic)
+        else:
+            raise McaptrackError(f"{into.path}: {self.prefix} has no pictures or detections that {source} is about")
+
+    def write(self, writer: log.LogWriter, has_clock: bool) -> None:
+        """Write the motion."""
+        self.write_motion(writer, self._timeline, self._size)
+
+
+# Ingest the calibration of a camera alone, for the pictures or the boxes of an existing log.
+
+
+class CalibrationJob(IngestJob):
+    """The calibration of a camera of a log: a file that is itself the input, and those that were given beside it."""
+
+    def __init__(self, source: Path, options: IngestOptions, into: log.Log | None) -> None:
+        if into is None:
+            raise McaptrackError(
+                f"{source}: a calibration belongs to a log with pictures or boxes of the camera; name it with `into=`, "
+                "or give the calibration with `calibration=` while the log is made"
+            )
+        if options.labels or options.motion is not None:
+            raise McaptrackError(
+                f"{source} is a calibration; add labels and motions of the camera in a call of their own"
+            )
+        super().__init__(source, replace(options, calibration=(source, *options.calibration)), into)
+        self.prefix, self.pictures = camera_of(into, options.camera)
+        below = [topic for topic in into.channels if topic.startswith(f"{self.prefix}/")]
+        if not below:
+            names = sorted({topic.strip("/").partition("/")[0] for topic in into.channels})
+            raise McaptrackError(
+                f"{into.path} has no camera {self.prefix[1:]} that {source} could be of (`camera=`); its topics begin "
+                f"with {', '.join(names) or 'nothing'}"
+            )
+        # In the frame of what the camera recorded, as the transforms name it, the calibration replaces a recorded one.
+        recorded = self.pictures or camera_at(into, self.prefix).boxes
+        self.frame_id = frame_of(into, recorded) if recorded else ""
+        size = picture_size(into, self.pictures) if self.pictures else options.size
+        extent = size or boxes_extent(into, f"{self.prefix}/detections")
+        self._plane = self.plane(*extent, is_stated=size is not None)
+        self._t_ns = int(into.times(self.pictures)[0]) if self.pictures else into.start_ns
+
+    def write(self, writer: log.LogWriter, has_clock: bool) -> None:
+        """Write the calibration, and the ground plane that follows from it."""
+        self.write_plane(writer, self._plane, self._t_ns)
 
 
 def _job(source: Path, options: IngestOptions, progress: Progress, into: log.Log | None) -> IngestJob:

@@ -12,7 +12,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, Self
 
-from mcaptrack import log
+from mcaptrack import foxglove, log
 from mcaptrack.choices import ImageFormat, InputRole, LengthUnit, Point, Role
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.plane import GroundPlane
@@ -22,18 +22,18 @@ from mcaptrack.schema.classes import classes_beside_rows, only_class, without_cl
 from mcaptrack.schema.encodings import PROTOBUF, Encoding, encoded, record_of
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance, digest
+from mcaptrack.sources.calibrations import is_rectified_topic
 from mcaptrack.sources.cameras import corrected_plane
 from mcaptrack.sources.corrections import CORRECTED
-from mcaptrack.sources.ingest.calibration import GivenCalibration
-from mcaptrack.sources.ingest.ground import PLANE, GivenGround
+from mcaptrack.sources.ingest.calibration import Calibrated, GivenCalibration
 from mcaptrack.sources.ingest.labels.box_rows import OTHERS, fitted
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
-from mcaptrack.sources.ingest.labels.content import Format, Labels
+from mcaptrack.sources.ingest.labels.content import ONLY_PEOPLE, Format, Labels, WantedClasses, describe_classes
 from mcaptrack.sources.ingest.labels.label_rows import frames_of_labels
 from mcaptrack.sources.ingest.labels.long_files import LabelFile, read_labels_of_any_length
-from mcaptrack.sources.ingest.labels.motions import motion_frames, read_motions
+from mcaptrack.sources.ingest.labels.number_table import motion_frames, read_motions
+from mcaptrack.sources.ingest.labels.reading import read_homography
 from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline
-from mcaptrack.sources.ingest.labels.wanted import ONLY_PEOPLE, WantedClasses, describe_classes
 from mcaptrack.sources.ingest.sidecar import encoding_for
 from mcaptrack.sources.video import VideoOptions
 
@@ -132,6 +132,85 @@ class IngestReport:
     uses_size: bool = False
     uses_camera: bool = False
     holds_boxes_3d: bool = False
+
+
+# The ground plane and the calibration that a user gave for a camera: read, fitted to its pictures, and written.
+
+
+#: The last parts of the topics.
+PLANE, CALIBRATION = "ground_plane", "calibration"
+
+
+class GivenGround:
+    """A homography, or a calibration, or neither. Raises McaptrackError for files that can't be read."""
+
+    def __init__(self, homography: Path | None, calibration: GivenCalibration | None, point: Point) -> None:
+        self._path, self._calibration, self._point = homography, calibration, point
+        self._homography = read_homography(homography) if homography else None
+        self._calibrated: Calibrated | None = None
+        if homography and calibration and calibration.has_pose:
+            raise McaptrackError(
+                f"{homography} and {', '.join(map(str, calibration.paths))} are both a ground plane; give one"
+            )
+
+    @property
+    def is_given(self) -> bool:
+        """Whether there is a homography or a calibration."""
+        return self._homography is not None or self._calibration is not None
+
+    @property
+    def has_plane(self) -> bool:
+        """Whether there is a ground plane."""
+        return self._homography is not None or (self._calibration is not None and self._calibration.has_pose)
+
+    def suffixes(self) -> Iterator[str]:
+        """The last parts of the topics that will be written."""
+        if self._calibration is not None:
+            yield CALIBRATION
+        if self.has_plane:
+            yield PLANE
+
+    def plane(
+        self, size: tuple[int, int], prefix: str, pictures: str, frame_id: str, is_stated: bool, remarks: list[str]
+    ) -> GroundPlane | None:
+        """The ground plane for pictures of this size in this topic; None if none follows from what was given.
+
+        ``is_stated`` is false if the size is no more than the extent of boxes. Lines about it are added to ``remarks``.
+        """
+        if self._calibration is not None:
+            is_rectified = is_rectified_topic(pictures)
+            self._calibrated = self._calibration.calibrated(
+                prefix, pictures, size, is_stated, frame_id, self._point, is_rectified
+            )
+            remarks += self._calibrated.remarks
+            if self._calibrated.plane is not None:
+                return self._calibrated.plane
+        if self._homography is None:
+            return None
+        try:
+            return GroundPlane(self._homography, *size, self._point)
+        except McaptrackError as error:
+            raise McaptrackError(f"{self._path}: {error}") from None
+
+    def parameters(self) -> dict[str, Any]:
+        """The parameters of the ground plane in its provenance."""
+        if self._path is not None:
+            return {"file": self._path.name, "point": self._point}
+        return {**(self._calibrated.parameters if self._calibrated else {}), "point": self._point}
+
+    def write_calibration(
+        self, writer: log.LogWriter, prefix: str, pictures: str, t_ns: int, encoding: Encoding
+    ) -> dict[str, int]:
+        """Write the calibration as viewers read it, from a time on. Returns the number of messages by topic."""
+        if self._calibrated is None:
+            return {}
+        topic, message = f"{prefix}/{CALIBRATION}", (t_ns, 0, self._calibrated.at(t_ns))
+        made = Provenance(INGEST, self._calibrated.parameters, pictures, digest=digest(iter([message])))
+        record = foxglove.record_in(foxglove.CALIBRATION, encoding)
+        channel = writer.add_channel(topic, record, encoding, made.to_metadata())
+        for one in foxglove.messages_in(foxglove.CALIBRATION, [message], encoding):
+            writer.add_message(channel, *one)
+        return {topic: 1}
 
 
 class IngestJob:

@@ -7,16 +7,20 @@ and encoded again, and the reason is reported.
 from __future__ import annotations
 
 import re
+import struct
+from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
+
+import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.arrays import Image
-from mcaptrack.geometry.clocks import LAST_NS
+from mcaptrack.geometry.arrays import Image, Ints
+from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.sources.video.codecs import CODECS
 from mcaptrack.sources.video.container import (
@@ -32,13 +36,9 @@ from mcaptrack.sources.video.container import (
 )
 from mcaptrack.sources.video.decode import EncodedPicture, decode_gray
 from mcaptrack.sources.video.encode import H264Encoder, StillFormat, VideoOptions, encode_image
-from mcaptrack.sources.video.frame_slots import count_slots
-from mcaptrack.sources.video.image_folder import Images, find_images, read_image
+from mcaptrack.sources.video.image_folder import Images, find_images, find_seqinfo, read_image
 from mcaptrack.sources.video.limits import check_h264, check_size
 from mcaptrack.sources.video.passthrough import check_stream, packets
-from mcaptrack.sources.video.picture_times import Clock
-from mcaptrack.sources.video.seqinfo import find_seqinfo
-from mcaptrack.sources.video.upright import Orientation, fit, orientation_of
 
 #: A fixed number of threads, so that damaged streams decode to the same pictures on every machine.
 _THREADS: Final = 4
@@ -63,6 +63,204 @@ class DecodedPicture(NamedTuple):
     index: int  # type: ignore[assignment]  # hides tuple.index, which is not needed here
     seconds: Fraction | None
     picture: Any
+
+
+# Count the slots for pictures in containers that number pictures instead of storing times: AVI and IVF.
+#
+# Slots may be empty, where nothing moved or no picture arrived. The container declares its number of slots; if
+# there are fewer, the file was cut off.
+
+
+_RIFF_HEAD, _CHUNK_HEAD, _IVF_FRAME_HEAD = 12, 8, 12
+_LISTS: Final = (b"movi", b"rec ")
+
+
+class _File(Protocol):
+    """An unbuffered file: only the heads of chunks are read, far apart."""
+
+    def read(self, size: int, /) -> bytes: ...
+
+    def seek(self, at: int, /) -> int: ...
+
+
+def count_slots(path: Path, stream: int) -> int | None:
+    """The number of slots of a stream that the file really holds; None for other containers."""
+    with path.open("rb", buffering=0) as file:
+        head = file.read(_RIFF_HEAD)
+        if head[:4] == b"RIFF" and head[8:12] == b"AVI ":
+            return _avi(file, path.stat().st_size, b"%02d" % stream)
+        if head[:4] == b"DKIF":
+            return _ivf(file, path.stat().st_size, int.from_bytes(head[6:8], "little"))
+    return None
+
+
+def _avi(file: _File, size: int, name: bytes) -> int:
+    """Count the chunks "00dc" and "00db" in all lists of all RIFF parts of the file."""
+    count, at = 0, 0
+    while at + _CHUNK_HEAD <= size:
+        file.seek(at)
+        head = file.read(_RIFF_HEAD)
+        kind, length = head[:4], int.from_bytes(head[4:8], "little")
+        if kind == b"RIFF" or (kind == b"LIST" and head[8:12] in _LISTS):
+            at += _RIFF_HEAD
+            continue
+        at += _CHUNK_HEAD + length + length % 2
+        count += kind[:2] == name and kind[2:] in (b"dc", b"db") and at - length % 2 <= size
+    return count
+
+
+def _ivf(file: _File, size: int, first: int) -> int:
+    count, at = 0, first
+    while at + _IVF_FRAME_HEAD <= size:
+        file.seek(at)
+        at += _IVF_FRAME_HEAD + int.from_bytes(file.read(4), "little")
+        count += at <= size
+    return count
+
+
+# Times of pictures as messages: strictly increasing; and what is odd about those of the container.
+
+
+#: Pictures are regular if this share of their intervals is within a tenth of the median, or within the tick of a clock
+#: of milliseconds. An interval is a gap if at least two pictures would fit between.
+_REGULAR, _ALIKE, _TICK_NS, _GAP = 0.9, 0.1, 1_500_000, 2.5
+_FEWEST: Final = 10
+
+
+class Clock:
+    """Times of pictures in ns: from the container, exact in its time base, or evenly spaced by ``fps``."""
+
+    def __init__(self, where: Path, start_ns: int, fps: Fraction | None) -> None:
+        self.fps = fps
+        self._where, self._start_ns = where, start_ns
+        self._first: Fraction | None = None
+        self._times = array("q")
+        self._moved, self._first_moved = 0, 0
+
+    def time(self, index: int, seconds: Fraction | None) -> int:
+        """The time of picture ``index``, which is ``seconds`` in the container."""
+        if self.fps:
+            seconds = index / self.fps
+        elif seconds is None:
+            raise McaptrackError(
+                f"{self._where}: picture {index} has no time in its container; space them evenly with `fps=`"
+            )
+        else:
+            self._first = seconds if self._first is None else self._first
+            seconds -= self._first
+        t_ns = self._start_ns + round(seconds * NS_PER_S)
+        if not 0 <= t_ns < LAST_NS:
+            raise McaptrackError(
+                f"{self._where}: picture {index} is {float(seconds):g} s after the first; times reach to the year 2262"
+            )
+        if self._times and t_ns <= self._times[-1]:
+            self._first_moved = self._first_moved if self._moved else index
+            self._moved += 1
+            t_ns = self._times[-1] + 1
+        self._times.append(t_ns)
+        return t_ns
+
+    def warn(self) -> None:
+        """Warn about times that had to be moved, and about gaps in regular ones."""
+        if self._moved:
+            warn(
+                f"{self._where}: {self._moved} of {len(self._times)} pictures are not later than the one before, "
+                f"number {self._first_moved} first; they are put 1 ns after it (`fps=` spaces all evenly)",
+                "clock",
+            )
+        if self.fps or len(self._times) < _FEWEST:
+            return
+        times: Ints = np.frombuffer(self._times, np.int64)
+        steps = times[1:] - times[:-1]
+        usual = float(np.median(steps))
+        is_usual = np.abs(steps - usual) <= max(_ALIKE * usual, _TICK_NS)
+        gaps = np.flatnonzero(steps >= _GAP * usual)
+        if len(gaps) and is_usual.mean() >= _REGULAR:
+            missing = int((np.rint(steps[gaps] / usual) - 1).sum())
+            places = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
+            at_s, longest_s = (times[gaps[0]] - times[0]) / NS_PER_S, steps[gaps].max() / NS_PER_S
+            warn(
+                f"{self._where} has {places} between pictures that otherwise come every {usual / 1e6:.4g} ms, the "
+                f"first after {at_s:.2f} s, the longest of {longest_s:.2f} s: about {missing} pictures were not "
+                "recorded, or are lost",
+                "clock",
+            )
+
+
+# Turn and mirror pictures as their video says, and fit them into its size.
+
+
+FULL_RANGE: Final = 2  # AVCOL_RANGE_JPEG
+_LIMITED_RANGE: Final = 1  # AVCOL_RANGE_MPEG
+_MATRIX: Final = struct.Struct("=9i")
+#: Matrices are axis-aligned if the other entries are at most this share of the largest: the tangent of one degree.
+_STRAIGHT: Final = 0.0175
+
+
+class Orientation(NamedTuple):
+    """The orientation of pictures: transposed, then mirrored from left to right, then from top to bottom.
+
+    ``words`` say it, "" for pictures that are shown as they are stored. ``oblique`` is an angle in degrees by which
+    they should be turned and aren't, because it is none of quarter turns.
+    """
+
+    is_transposed: bool = False
+    flips_x: bool = False
+    flips_y: bool = False
+    words: str = ""
+    oblique: float = 0.0
+
+    def of(self, picture: Any) -> Image:
+        """A frame of FFmpeg in BGR, (H, W, 3) uint8, upright; arrays are returned as they are."""
+        if isinstance(picture, np.ndarray):
+            return picture
+        image: Image = picture.to_ndarray(format="bgr24")
+        image = image.transpose(1, 0, 2) if self.is_transposed else image
+        return image[:: -1 if self.flips_y else 1, :: -1 if self.flips_x else 1]
+
+
+def orientation_of(frame: Any) -> Orientation:
+    """Read the display matrix of a frame of FFmpeg: x' = a x + c y, y' = b x + d y (ISO 14496-12, 8.3.2)."""
+    # By name, because iterating gives the data themselves up to PyAV 18, and their types from 19 on.
+    found = bytes(frame.side_data.get("DISPLAYMATRIX") or b"")
+    if len(found) != _MATRIX.size:
+        return Orientation()
+    a, b, _, c, d, *_ = _MATRIX.unpack(found)
+    turned = f"turned by {frame.rotation} degrees"
+    largest = max(map(abs, (a, b, c, d)))
+    if max(abs(b), abs(c)) <= _STRAIGHT * largest and a and d:
+        flips = a < 0, d < 0
+        words = {(True, True): turned, (True, False): "mirrored", (False, True): "mirrored from top to bottom"}
+        return Orientation(False, *flips, words.get(flips, ""))
+    if max(abs(a), abs(d)) <= _STRAIGHT * largest and b and c:
+        flips = c < 0, b < 0
+        return Orientation(True, *flips, "turned and mirrored" if flips[0] == flips[1] else turned)
+    return Orientation(oblique=float(np.degrees(np.arctan2(b, a))))
+
+
+def fit(picture: Any, orientation: Orientation, width: int, height: int) -> tuple[Any, bool]:
+    """A picture in an (even) size, in a format that the encoder takes, and whether it had to be scaled.
+
+    A missing last row or column repeats the one before it.
+    """
+    if (
+        not isinstance(picture, np.ndarray)
+        and not orientation.words
+        and (picture.width, picture.height) == (width, height)
+    ):
+        if picture.format.name == "yuv420p" and picture.color_range != FULL_RANGE:
+            return picture, False
+        if picture.format.name.startswith(("yuv4", "yuvj4")):
+            is_full = picture.format.name.startswith("yuvj") or picture.color_range == FULL_RANGE
+            ranges = {"src_color_range": FULL_RANGE if is_full else _LIMITED_RANGE, "dst_color_range": _LIMITED_RANGE}
+            return picture.reformat(format="yuv420p", **ranges), False
+    image = orientation.of(picture)
+    right, below = width - image.shape[1], height - image.shape[0]
+    if 0 <= right <= 1 and 0 <= below <= 1:
+        return (np.pad(image, ((0, below), (0, right), (0, 0)), mode="edge") if right or below else image), False
+    import cv2
+
+    return cv2.resize(np.ascontiguousarray(image), (width, height), interpolation=cv2.INTER_AREA), True
 
 
 @dataclass

@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import Final, Literal, get_args
 
 from mcaptrack import log
+from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish_stream, refuse_overwrite
 from mcaptrack.location import Location, local_name
+from mcaptrack.schema import DETECTIONS, TRACKS
+from mcaptrack.sources.cameras import cameras
 from mcaptrack.tables.exchange import coco, cvat, text
 from mcaptrack.tables.exchange.boxes import BoxTable, read_boxes
-from mcaptrack.tables.exchange.chosen import boxes_topic
 from mcaptrack.tables.exchange.rerun_file import write_recording
 
 __all__ = ["FORMATS", "ExchangeFormat", "WrittenBoxes", "default_file", "ends_with", "write_boxes"]
@@ -66,6 +68,45 @@ def default_file(path: Location, form: ExchangeFormat) -> Path:
 def ends_with(form: str) -> str:
     """The end of the name of a file of this format; "" for others."""
     return next((end for name, end in _ENDS.items() if name == form), "")
+
+
+# Which channel of boxes is given to other programs.
+
+
+#: Below the name of a camera, the best first: re-tracked boxes of every picture before those of the tracker.
+_PREFERRED: Final = ("retracks/full", "tracks", "retracks", "detections")
+
+
+def boxes_topic(opened: log.Log, topic: str | None = None) -> str:
+    """The channel with this topic, or the best tracks of the only camera, or else its detections.
+
+    Raises McaptrackError, with the channels that there are, if there is none or if there are several cameras.
+    """
+    there = sorted(
+        channel.topic
+        for channel in log.topics_with_schema(opened, [DETECTIONS.name, TRACKS.name])
+        if channel.messages and any(channel.holds(schema) for schema in (DETECTIONS, TRACKS))
+    )
+    if topic is not None:
+        if topic in there:
+            return topic
+        opened.channel(topic)  # says what there is
+        raise McaptrackError(f"{opened.path}: {topic} has no detections and no tracks; {_listed(there)} have")
+    if not there:
+        raise McaptrackError(f"{opened.path} has no detections and no tracks to write; run a stage first")
+    best: list[str] = []
+    for camera in cameras(opened):
+        names = (f"{prefix}/{name}" for name in _PREFERRED for prefix in (camera.prefix, *camera.names))
+        found = next((name for name in names if name in there), None)
+        best += [found] if found else []
+    best = best or there
+    if len(best) > 1:
+        raise McaptrackError(f"{opened.path} has boxes in {_listed(best)}; choose one with `topic=`")
+    return best[0]
+
+
+def _listed(topics: list[str]) -> str:
+    return ", ".join(topics) or "no channels"
 
 
 def write_boxes(

@@ -21,8 +21,7 @@ from mcaptrack.files import sweep
 from mcaptrack.location import Location, local_name
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.tables import TABLES, Format
-from mcaptrack.tables.export.contents import LogTables
-from mcaptrack.tables.export.names import file_name, recording_key, recording_name, topic_folder
+from mcaptrack.tables.export.contents import LogTables, file_name, recording_key, recording_name, topic_folder
 from mcaptrack.tables.export.ownership import claimed, owner_words, refuse_tables_of_another
 
 __all__ = [

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
+import os
+import re
+import unicodedata
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any, Final
 
@@ -12,7 +15,10 @@ import numpy as np
 
 from mcaptrack import __version__, evaluation, log, tables
 from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M
+from mcaptrack.files import place_of
 from mcaptrack.geometry.clocks import LAST_NS
+from mcaptrack.location import Location, shortened
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameColumns, collect
@@ -23,11 +29,108 @@ from mcaptrack.sources.cameras import Camera, cameras, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead, holds_boxes, holds_boxes_3d
 from mcaptrack.sources.foreign.flatten import flattener, message_type_of
 from mcaptrack.tables import TABLES, Pointers, TablePieces, TrackNames
-from mcaptrack.tables.export import catalogue
-from mcaptrack.tables.export.names import file_name, recording_name
 
 #: Tables about the places of messages, or about the whole log.
 _OF_THE_WHOLE: Final = ("frames", "channels", "recordings")
+
+
+# Names of logs and channels as names of folders: they can't leave the folder, and do not collide.
+
+
+#: Longer names are cut, with a digest of the whole name; file systems allow 255 bytes.
+_MAX_BYTES: Final = 200
+
+
+#: Words that readers of partitions do not take for text.
+_NO_TEXT: Final = ("nan", "inf", "infinity", "true", "false", "null", "none")
+
+
+def recording_name(path: Location) -> str:
+    """The name of a log for a path and a partition: without slashes, equals signs and leading dots.
+
+    Names that readers would take for numbers or dates (0001 would become 1) get "log-" before them.
+    """
+    name = shortened(re.sub(r"[^\w.\-]+", "_", path.stem).lstrip(".") or "log", _MAX_BYTES)
+    is_text = re.search(r"[^\W\d_]", name) and not re.fullmatch(r"[-\d._]*e[-\d]+", name, re.IGNORECASE)
+    return name if is_text and name.lower().lstrip("-") not in _NO_TEXT else f"log-{name}"
+
+
+def recording_key(name: str) -> str:
+    """The name of a recording without capitals and composed letters, which some file systems don't tell apart."""
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def file_name(path: Location) -> str:
+    """The name of a file as text; bytes that are not UTF-8 are escaped, because tables hold only text."""
+    return os.fsencode(path.name).decode("utf-8", "backslashreplace")
+
+
+def topic_folder(topic: str) -> str:
+    """The folder of a channel's table: /imu/data -> imu.data; other signs as %XX, so that no two channels share one."""
+    body = topic.removeprefix("/")
+    parts = (
+        "".join(c if c.isascii() and (c.isalnum() or c in "_-") else _escaped(c) for c in p) for p in body.split("/")
+    )
+    name = ".".join(parts)
+    name = name or "%2F" * len(topic)
+    return shortened(name if topic.startswith("/") and name.strip(".") else "~" + name, _MAX_BYTES)
+
+
+def _escaped(character: str) -> str:
+    return "".join(f"%{byte:02X}" for byte in character.encode("utf-8", "surrogatepass"))
+
+
+# The columns of ``recordings`` about a log as a whole, so that one table compares thousands of logs.
+
+
+#: The tracks that stand for a camera, below its name: the first that there are.
+_BEST: Final = ("retracks", "retracks/online", "tracks")
+#: The rules by which they are scored, the first that gave a score.
+_RULES: Final = (("metres", GATE_M), ("iou", 0.5))
+_RULES_3D: Final = (("metres", GATE_3D_M), *_RULES)
+#: The scores that are taken over.
+_SCORES: Final = ("MOTA", "IDF1", "HOTA", "IDSW")
+
+
+def location_of(path: Location) -> str:
+    """Where a log is, as the ledger of many logs names it: its path without links, or its URL."""
+    return os.fsencode(str(place_of(path))).decode("utf-8", "backslashreplace")
+
+
+def best_tracks(camera: Camera, topics: Iterable[str]) -> str | None:
+    """The topic of the tracks that stand for a camera; None if it has none."""
+    there = set(topics)
+    return next((name for below in _BEST if (name := f"{camera.prefix}/{below}") in there), None)
+
+
+def about_channels(opened: log.Log) -> dict[str, Any]:
+    """The warnings that the channels of a log carry, and the versions that made them."""
+    made = [Provenance.from_metadata(channel.metadata) for _, channel in sorted(opened.channels.items())]
+    warnings = list(dict.fromkeys((code, message) for one in made if one for code, message in one.warnings))
+    versions = sorted({one.version for one in made if one})
+    said = [{"code": code, "message": message} for code, message in warnings]
+    return {
+        "warnings": len(warnings),
+        "warning_texts": json.dumps(said, ensure_ascii=False) if said else None,
+        "versions": ", ".join(versions) or None,
+    }
+
+
+def worst_score(topics: Sequence[str], scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The scores of the camera with the lowest IDF1, of the tracks in ``topics``; empty without ground truth."""
+    found = [row for topic in topics if (row := _headline([one for one in scores if one["topic"] == topic]))]
+    if not found:
+        return {}
+    worst = min(found, key=lambda row: row["IDF1"])
+    return {"scored": worst["topic"]} | {name: worst[name] for name in ("similarity", "gate", *_SCORES)}
+
+
+def _headline(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+    """The row of one channel of tracks by which it is compared; None if it has no score."""
+    together = [row for row in rows if row.get("class") is None]
+    rules = _RULES_3D if any(row.get("AMOTA") is not None for row in together) else _RULES
+    by_rule = {(row["similarity"], row["gate"]): row for row in together}
+    return next((by_rule[rule] for rule in rules if rule in by_rule), None)
 
 
 class LogTables:
@@ -94,7 +197,7 @@ class LogTables:
         whole = name in _OF_THE_WHOLE
         of = [self.opened.fingerprint()] if whole else [self.opened.fingerprint(topic) for topic in self.topics(name)]
         files = [file_name(part.path) for part in self.opened.parts]
-        where = [catalogue.location_of(self.opened.path)] if name == "recordings" else []
+        where = [location_of(self.opened.path)] if name == "recordings" else []
         return _digest([name, __version__, self.recording, files, of, *where])
 
     def lineage(self, name: str) -> str:
@@ -282,13 +385,13 @@ class LogTables:
     def _as_a_whole(self) -> dict[str, Any]:
         """The columns that tell a log from thousands of others."""
         there = self.topics("tracks")
-        best = [topic for one in cameras(self.opened) if (topic := catalogue.best_tracks(one, there))]
+        best = [topic for one in cameras(self.opened) if (topic := best_tracks(one, there))]
         return {
-            "location": catalogue.location_of(self.opened.path),
+            "location": location_of(self.opened.path),
             "cameras": len(cameras(self.opened)),
             "tracks": sum(map(self._count_tracks, best)) if best else None,
-            **catalogue.worst_score(best, self._scores),
-            **catalogue.about_channels(self.opened),
+            **worst_score(best, self._scores),
+            **about_channels(self.opened),
         }
 
     def _count_tracks(self, topic: str) -> int:

@@ -21,8 +21,7 @@ from mcaptrack.files import place_of
 from mcaptrack.location import Location, Url, is_remote, local_name, parse
 from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.sources import foreign
-from mcaptrack.tables.export.catalogue import location_of
-from mcaptrack.tables.export.names import file_name, recording_key, recording_name
+from mcaptrack.tables.export.contents import file_name, location_of, recording_key, recording_name
 from mcaptrack.tables.files import FORMATS, Format
 
 #: The table that says which log the tables are of.

@@ -29,7 +29,7 @@ from mcaptrack.schema.provenance import frame_id_of, input_of
 from mcaptrack.sources.cameras import cameras
 from mcaptrack.sources.frames import transforms_of
 from mcaptrack.tables.rosbag2 import messages
-from mcaptrack.tables.rosbag2.definitions import message, typestore
+from mcaptrack.tables.rosbag2.messages import message, typestore
 
 __all__ = ["STORAGES", "Storage", "WrittenBag", "default_folder", "write_bag"]
 

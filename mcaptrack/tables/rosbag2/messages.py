@@ -18,7 +18,6 @@ from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.schema.classes import class_name
-from mcaptrack.tables.rosbag2.definitions import message
 
 _CUBE, _CYLINDER, _LINE_STRIP, _TEXT = 1, 3, 4, 9  # Marker.type
 _ADD, _DELETE_ALL = 0, 3  # Marker.action
@@ -28,6 +27,50 @@ _TEXT_M: Final = 0.5
 _LINE_M: Final = 0.1
 #: Markers have ids of 32 bits.
 _MARKERS: Final = 2**31
+
+
+# The ROS messages of bags: those that rosbags knows, and those of vision_msgs 4 (ROS 2 Humble and since).
+
+
+_VISION: Final = {
+    "Point2D": "float64 x\nfloat64 y",
+    "Pose2D": "vision_msgs/Point2D position\nfloat64 theta",
+    "BoundingBox2D": "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y",
+    "BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
+    "ObjectHypothesis": "string class_id\nfloat64 score",
+    "ObjectHypothesisWithPose": "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose",
+    "Detection2D": (
+        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\nvision_msgs/BoundingBox2D bbox\n"
+        "string id"
+    ),
+    "Detection3D": (
+        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\nvision_msgs/BoundingBox3D bbox\n"
+        "string id"
+    ),
+    "Detection2DArray": "std_msgs/Header header\nvision_msgs/Detection2D[] detections",
+    "Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
+}
+
+
+@cache
+def typestore() -> Any:
+    """The types of ROS 2 Humble with vision_msgs."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in _VISION.items():
+        store.register(get_types_from_msg(text, f"vision_msgs/msg/{name}"))
+    return store
+
+
+def message(name: str, *values: Any) -> Any:
+    """A message, such as "geometry_msgs/Point", with the values of its fields in order."""
+    return _class(name)(*values)
+
+
+@cache
+def _class(name: str) -> Any:
+    return typestore().types[name.replace("/", "/msg/")]
 
 
 def header(t_ns: int, frame_id: str) -> Any:

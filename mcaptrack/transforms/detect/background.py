@@ -22,8 +22,7 @@ from mcaptrack.geometry.affine import IDENTITY, move_boxes
 from mcaptrack.geometry.arrays import Floats, Image, Ints
 from mcaptrack.geometry.clocks import FrameClock
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
-from mcaptrack.transforms.detect.registration import Registration
-from mcaptrack.transforms.detect.steadiness import Steadiness
+from mcaptrack.transforms.detect.registration import Registration, Steadiness
 from mcaptrack.transforms.protocol import Colour, check_options, option
 
 # In units of the height of a person as measured in the picture: one body often gives several regions above each other,

@@ -34,8 +34,7 @@ from mcaptrack.transforms.detect.background import (
 from mcaptrack.transforms.detect.median_background import MIN_THRESHOLD, Background, Sampler
 from mcaptrack.transforms.detect.people import Separator
 from mcaptrack.transforms.detect.person_model import Learner, Person, region_boxes, typical_heights
-from mcaptrack.transforms.detect.registration import Registration
-from mcaptrack.transforms.detect.steadiness import Steadiness
+from mcaptrack.transforms.detect.registration import Registration, Steadiness
 from mcaptrack.transforms.protocol import Colour, check_options, option
 
 #: A shorter view, or one of fewer pictures, has no background of its own: people hardly move in that time.

@@ -2,7 +2,6 @@
 
 from mcaptrack.transforms.fuse.agreement import Offset, Shared, compare
 from mcaptrack.transforms.fuse.fuser import FootFuser
-from mcaptrack.transforms.fuse.joined import Joined
-from mcaptrack.transforms.fuse.view import CameraView
+from mcaptrack.transforms.fuse.view import CameraView, Joined
 
 __all__ = ["CameraView", "FootFuser", "Joined", "Offset", "Shared", "compare"]

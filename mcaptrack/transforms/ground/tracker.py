@@ -9,31 +9,50 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from types import MappingProxyType
-from typing import ClassVar, Final
+from typing import ClassVar, Final, Literal
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats
+from mcaptrack.geometry.arrays import Bools, Floats, Indices
+from mcaptrack.geometry.assignment import max_weight_matching
 from mcaptrack.geometry.clocks import JUMP_S, NS_PER_S
+from mcaptrack.geometry.neighbours import Pairing
+from mcaptrack.geometry.oriented_boxes import bev_iou_of_pairs
 from mcaptrack.notices import warn
 from mcaptrack.schema import COVARIANCE_M2, DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.framing import join_frames
-from mcaptrack.transforms.ground.association import Cost, associate
-from mcaptrack.transforms.ground.fast_starts import fast_starts
-from mcaptrack.transforms.ground.lost_tracks import LostTracks, continuations
 from mcaptrack.transforms.ground.output import Waiting
 from mcaptrack.transforms.ground.state import (
+    AGE_S,
+    BOX,
     CLASS,
     DETECTION_ROWS,
+    FIRST,
+    GATE_M,
+    HEADING,
+    HITS,
     ID,
     IS_CONFIRMED,
+    LAST,
     LAST_FRAME,
+    LAST_SPREAD,
+    LAST_VELOCITY,
+    LENGTH,
+    MAX_SPEED,
     MISSED_S,
+    NOISE,
     SCORE,
     SCORES,
+    SPEED,
+    TURNS,
+    Covariances,
     GroundTracks,
     X,
     Y,
+    measured,
+    no_tracks,
+    own_covariances,
+    variance,
 )
 from mcaptrack.transforms.motion_limits import (
     LIMITS_HELP,
@@ -67,6 +86,124 @@ _COLUMNS: Final = (
     "class_id",
     "source_id",
 )
+
+
+# Which detection belongs to which track: gates, costs and one assignment for all classes of a frame.
+#
+# Pairs of different classes are outside the gate, so that one assignment of all is one for each class. Detections
+# that are left are compared once more, with lost tracks of other classes: detectors confuse classes now and then.
+#
+# Letters: K tracks, N detections, P pairs.
+
+
+Cost = Literal["metres", "iou"]
+
+#: The gate in squared standard deviations, and that between different classes.
+_GATE: Final = 16.0
+_OTHER_GATE: Final = 9.0
+#: How much of the gate in metres counts between different classes.
+_OTHER_SHARE: Final = 0.4
+#: The gain of a pair without any distance.
+_GAIN: Final = 30.0
+#: Scores count as probabilities from this one to 1 minus it.
+_LEAST_SCORE: Final = 0.02
+#: Detections that a track of another class needs before.
+_OTHER_HITS: Final = 2
+
+
+def associate(
+    table: Floats,
+    found: Floats,
+    cost: Cost,
+    min_iou: float,
+    across_classes: bool,
+    covariances: Covariances | None = None,
+) -> tuple[Indices, Indices, Bools]:
+    """Tracks and detections that belong together, (P,) each, and whether they have the same class.
+
+    With the ``covariances`` of the tracks, these and those of the detections count instead of usual ones.
+    """
+    if not table.shape[1] or not found.shape[1]:
+        nothing = np.empty(0, np.intp)
+        return nothing, nothing, np.empty(0, bool)
+    reach = table[GATE_M] * (1 + table[MISSED_S])
+    pairs = Pairing(table[[X, Y]], found[[X, Y]], reach)
+    apart = _Apart(table, found, covariances, pairs)
+    same = pairs.of_first(table[CLASS]) == pairs.of_second(found[CLASS])
+    near = apart.within(_GATE, reach)
+    if across_classes:
+        same = np.ones_like(same)
+    track, row = _assigned(table, found, apart, near & same, cost, min_iou)
+    is_same = np.ones(len(track), bool)
+    if across_classes or len(row) == found.shape[1]:
+        return track, row, is_same
+    lost, free = table[HITS] >= _OTHER_HITS, np.ones(found.shape[1], bool)
+    lost[track], free[row] = False, False
+    if not lost.any() or len({*table[CLASS].tolist(), *found[CLASS].tolist()}) == 1:
+        return track, row, is_same
+    other = near & pairs.of_first(lost) & pairs.of_second(free)
+    if not other.any():
+        return track, row, is_same
+    nearer = apart.within(_OTHER_GATE, np.maximum(_OTHER_SHARE * reach, 3 * table[NOISE]))
+    more = _assigned(table, found, apart, other & nearer, cost, min_iou)
+    is_same = np.concatenate([is_same, np.zeros(len(more[0]), bool)])
+    return np.concatenate([track, more[0]]), np.concatenate([row, more[1]]), is_same
+
+
+class _Apart:
+    """Distances of detections (rows, N) from the predicted positions of tracks (rows, K), for each of their pairs."""
+
+    def __init__(self, table: Floats, found: Floats, covariances: Covariances | None, pairs: Pairing) -> None:
+        self.pairs = pairs
+        x = pairs.of_second(found[X]) - pairs.of_first(table[X])
+        y = pairs.of_second(found[Y]) - pairs.of_first(table[Y])
+        self._squared = x * x + y * y
+        self._spread = variance(table)
+        self._deviations: Floats | None = None
+        if covariances is not None:
+            place = pairs.of_first(covariances.places())
+            noise = pairs.of_first(measured(table[NOISE], found[:0]).T) + pairs.of_second(own_covariances(found).T)
+            xx, xy, yy = place + noise
+            #: Twice the log-odds that detections are true; their scores are probabilities.
+            share = np.clip(np.where(np.isnan(found[SCORE]), 0.5, found[SCORE]), _LEAST_SCORE, 1 - _LEAST_SCORE)
+            self._odds = 2 * np.log(share / (1 - share))
+            self._area = xx * yy - xy * xy
+            self._deviations = (yy * x * x - 2 * xy * x * y + xx * y * y) / self._area
+
+    def within(self, gate: float, reach_m: Floats) -> Bools:
+        """Whether pairs are within ``gate`` squared standard deviations, and ``reach_m`` of their track (K,)."""
+        if self._deviations is None:
+            return np.asarray(self._squared <= self.pairs.of_first(np.minimum(gate * self._spread, reach_m * reach_m)))
+        return np.asarray((self._deviations <= gate) & (self._squared <= self.pairs.of_first(reach_m * reach_m)))
+
+    def gain(self, which: Bools, track: Indices, row: Indices) -> Floats:
+        """The gain of the chosen pairs (P,): twice the logarithm of their likelihood, but for a constant.
+
+        Where detections have covariances it is twice that of a ratio: to the detection being false.
+        """
+        if self._deviations is None:
+            s = self._spread[track]
+            return np.asarray(_GAIN - self._squared[which] / s - 2 * np.log(s))
+        return np.asarray(_GAIN - self._deviations[which] - np.log(self._area[which]) + self._odds[row])
+
+
+def _assigned(
+    table: Floats, found: Floats, apart: _Apart, allowed: Bools, cost: Cost, min_iou: float
+) -> tuple[Indices, Indices]:
+    """The best assignment of the allowed pairs."""
+    track, row = apart.pairs.chosen(allowed)
+    if not len(track):
+        return track, row
+    if cost == "iou":
+        gain = bev_iou_of_pairs(table[BOX, track].T, found[BOX, row].T)
+        good = gain >= max(min_iou, 1e-6)
+        track, row, gain = track[good], row[good], gain[good]
+    else:
+        gain = apart.gain(allowed, track, row)
+    if not len(track):
+        return track, row
+    (track, row), _ = max_weight_matching((track, row), np.round(gain, 6), apart.pairs.shape)
+    return track, row
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,6 +336,152 @@ class GroundTracker:
         """Why there are no tracks, for a warning."""
         count = sum(len(frame.rows) for frame in given)
         return f"no track of {count} detections is confirmed (confirm_score)"
+
+
+# New tracks of fast objects: second detections that are beyond the gate, because no velocity is known yet.
+#
+# After one detection an object may be anywhere that it can reach at the highest speed of its class. That is too far
+# for the gate of tracks: on a motorway, or at few frames a second, the next detection is several metres away. So
+# what is left after the association is looked at once more. A vehicle moves along its length, and its detections
+# have one heading and size; of other objects, pairs count that could be no others.
+#
+# Letters: K tracks, N detections, P pairs.
+
+
+#: How far a vehicle moves across its heading, as a share of the way, and beyond this many standard deviations of noise.
+_ACROSS: Final = 0.15
+_NOISE: Final = 4.0
+#: How much two headings of an object differ at most, in rad, up to half a turn; and two lengths, as a ratio.
+_TURNED_RAD: Final = 0.35
+_LENGTHS: Final = 1.6
+#: How much longer a way backwards counts than one ahead.
+_BACKWARDS: Final = 2.0
+
+
+def fast_starts(
+    table: Floats, found: Floats, taken: tuple[Indices, Indices], across_classes: bool
+) -> tuple[Indices, Indices]:
+    """Tracks with one detection (rows, K), and detections (rows, N) of the same objects: numbers of both, (P,) each.
+
+    Those of ``taken``, which are associated already, are no others.
+    """
+    nothing = np.empty(0, np.intp)
+    if len(taken[1]) == found.shape[1]:
+        return nothing, nothing
+    is_free, is_left = table[HITS] == 1, np.ones(found.shape[1], bool)
+    is_free[taken[0]] = is_left[taken[1]] = False
+    if not is_free.any():
+        return nothing, nothing
+    first, left = is_free.nonzero()[0], is_left.nonzero()[0]
+    old, new = table[:, first], found[:, left]
+    reach = old[MAX_SPEED] * old[MISSED_S] + _NOISE * old[NOISE]
+    pairs = Pairing(old[FIRST], new[[X, Y]], reach)
+    x = pairs.of_second(new[X]) - pairs.of_first(old[FIRST][0])
+    y = pairs.of_second(new[Y]) - pairs.of_first(old[FIRST][1])
+    far, noise = np.hypot(x, y), _NOISE * pairs.of_first(old[NOISE])
+    can_be = far <= pairs.of_first(old[MAX_SPEED] * old[MISSED_S]) + noise
+    if not across_classes:
+        can_be &= pairs.of_first(old[CLASS]) == pairs.of_second(new[CLASS])
+    if not can_be.any():
+        return nothing, nothing
+    heading, other_heading = pairs.of_first(old[HEADING]), pairs.of_second(new[HEADING])
+    along, across = x * np.cos(heading) + y * np.sin(heading), np.abs(y * np.cos(heading) - x * np.sin(heading))
+    cost = np.where(along < 0, _BACKWARDS * far, far)
+    has_heading = np.isfinite(heading) & np.isfinite(other_heading) & pairs.of_first(old[TURNS] == 1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        turned = np.abs(np.sin(heading - other_heading))
+        longer = np.abs(np.log(pairs.of_first(old[LENGTH]) / pairs.of_second(new[LENGTH])))
+        is_along = (across <= noise + _ACROSS * far) & (turned <= np.sin(_TURNED_RAD)) & ~(longer > np.log(_LENGTHS))
+    can_be &= np.where(has_heading, is_along, _is_only(can_be, pairs))
+    i, j = pairs.chosen(can_be)
+    if not len(i):
+        return nothing, nothing
+    gain = cost[can_be].max() + 1 - cost[can_be]
+    (i, j), _ = max_weight_matching((i, j), np.round(gain, 6), pairs.shape)
+    return first[i], left[j]
+
+
+def _is_only(can_be: Bools, pairs: Pairing) -> Bools:
+    """Pairs of a track and a detection that have no other."""
+    track, row = pairs.chosen(can_be)
+    out = can_be.copy()
+    out[can_be] = (np.bincount(track)[track] == 1) & (np.bincount(row)[row] == 1)
+    return out
+
+
+# Lost tracks: which of them a new track continues, after an occlusion that lasted longer than tracks coast.
+#
+# A lost track either stood still and is where it was, or has gone on at its last velocity, less certainly the
+# longer and the faster. A new track continues the lost track that makes its first position likely, unless another
+# object is more likely to be there. Everything is computed from the past alone.
+#
+# Letters: K lost tracks, N new tracks.
+
+
+#: How much velocities change within a second during an occlusion: at rest, as a share of the usual speed, and with
+#: speed, as a share of it.
+_DRIFT_AT_REST: Final = 0.07
+_DRIFT_WITH_SPEED: Final = 0.1
+#: A track stood still if it was slower than this share of the usual speed; then it stays with this probability.
+_REST: Final = 0.12
+_STAYS: Final = 0.8
+#: How far an object at rest seems to move, in metres per square root of a second.
+_CREEP_M: Final = 0.15
+#: The density of new objects: their number in a square with the distance of one second at the usual speed as side.
+_NEW: Final = 0.06
+
+
+class LostTracks:
+    """Confirmed tracks that ended at most ``link_s`` seconds after their last detection."""
+
+    def __init__(self, link_s: float) -> None:
+        self._link_s = link_s
+        self.table: Floats = no_tracks()
+
+    def add(self, table: Floats) -> None:
+        """Remember tracks that end, (rows, K)."""
+        self.table = np.concatenate([self.table, table], axis=1)
+
+    def wait(self, dt: float) -> None:
+        """Let ``dt`` seconds pass."""
+        if self.table.shape[1]:
+            self.table[MISSED_S] += dt
+            self.keep(self.table[MISSED_S] <= self._link_s)
+
+    def keep(self, which: Bools) -> None:
+        """Keep some of the tracks."""
+        self.table = self.table.compress(which, axis=1)
+
+
+def continuations(lost: Floats, new: Floats) -> tuple[Indices, Indices]:
+    """Lost tracks (rows, K) and new ones (rows, N) that continue them: numbers of both, (P,) each."""
+    if not lost.shape[1] or not new.shape[1]:
+        nothing = np.empty(0, np.intp)
+        return nothing, nothing
+    # Farther than twice the way of a second, from where a track was or would be, none of the two densities below is
+    # above that of new objects, however long the gap is.
+    longest = np.maximum(lost[MISSED_S] - new[AGE_S].min(), 1e-3)
+    pairs = Pairing(lost[LAST][:2], new[FIRST], 2 * lost[SPEED] + np.hypot(*lost[LAST_VELOCITY]) * longest)
+    gap = pairs.of_first(lost[MISSED_S]) - pairs.of_second(new[AGE_S])
+    seconds = np.maximum(gap, 1e-3)
+    way = pairs.of_second(new[FIRST]) - pairs.of_first(lost[LAST][:2])
+    velocity, usual = pairs.of_first(lost[LAST_VELOCITY]), pairs.of_first(lost[SPEED])
+    speed = np.hypot(*velocity)
+    noise = 2 * pairs.of_first(lost[NOISE]) ** 2
+    drift = _DRIFT_AT_REST * usual + _DRIFT_WITH_SPEED * speed
+    goes = noise + pairs.of_first(lost[LAST_SPREAD]) * seconds**2 + drift**2 * seconds**3 / 3
+    stays = noise + _CREEP_M**2 * seconds
+    off = way - velocity * seconds
+    share = np.where(speed < _REST * usual, _STAYS, 0.0)
+    density = (1 - share) * np.exp(-(off * off).sum(0) / goes / 2) / goes
+    density += share * np.exp(-(way * way).sum(0) / stays / 2) / stays
+    gain = np.log(np.maximum(density / (2 * np.pi) * usual**2 / _NEW, 1e-12))
+    fits = (gain > 0) & (gap > 0) & (pairs.of_first(lost[CLASS]) == pairs.of_second(new[CLASS]))
+    i, j = pairs.chosen(fits)
+    if not len(i):
+        return i, j
+    (i, j), _ = max_weight_matching((i, j), np.round(gain[fits], 6), pairs.shape)
+    return i, j
 
 
 class _Run:

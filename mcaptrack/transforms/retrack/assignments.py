@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Ints
+from mcaptrack.geometry.ragged import group_index
+from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema.classes import first_classes
+from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
+from mcaptrack.schema.framing import frame_numbers, has_any, joined_parts, row_ends, spans_of, split_rows, unique_values
+from mcaptrack.transforms.motion_limits import ClassNames, limits_by_class, units_m
 from mcaptrack.transforms.retrack.samples import LogSamples
 
 
@@ -68,3 +75,115 @@ def _find(ids: Ints, steps: Ints, wanted_ids: Ints, wanted_steps: Ints) -> Ints:
     found = order[at]
     is_there = np.isin(wanted_ids, names) & (have[found] == want)
     return np.where(is_there, found, -1)
+
+
+# Re-tracking of each class by itself: links, swaps and gaps never join tracks of different classes.
+#
+# Letters: C classes, F frames.
+
+
+class Movers(NamedTuple):
+    """The unit and the kind of the tracks of one class.
+
+    All of re-tracking is made for people. Other classes are re-tracked in a unit of length in which they move as people
+    do: ``unit_m`` metres. ``on_ground`` says that a tracker made their tracks in metres, with velocities, and not
+    from boxes in pictures: detections don't merge where objects occlude one another, and the tracker has confirmed each
+    track by the scores of its detections. It knows more than samples say, unless people were detected at no higher rate
+    than that of the samples; those are re-tracked like others. ``usual_score`` is the median score of the log,
+    ``drift_m_per_s`` how much velocities change within a second, None for what the options say.
+    """
+
+    unit_m: float = 1.0
+    on_ground: bool = False
+    usual_score: float = 1.0
+    drift_m_per_s: float | None = None
+
+
+#: People in pictures.
+PEOPLE: Final[Movers] = Movers()
+
+
+def usual_score(frames: Sequence[Frame]) -> float:
+    """The median score of the observed rows of a log; 1 where there are none."""
+    parts = [part.rows["score"][part.rows["observed"]] for _, _, part in joined_parts(TRACKS, frames)]
+    scores = np.concatenate([np.empty(0, np.float32), *parts])
+    scores = scores[np.isfinite(scores)]
+    return max(float(np.median(scores)), 1e-6) if len(scores) else 1.0
+
+
+def movers_of(frames: Sequence[Frame], class_names: ClassNames, usual_score: float, class_limits: str = "") -> Movers:
+    """The unit and the kind of the tracks in frames of one class."""
+    first = next((frame for frame in frames if len(frame.rows)), None)
+    if first is None:
+        return PEOPLE
+    number = int(first.rows["class_id"][0])
+    limits = limits_by_class([number], class_names, class_limits)[number]
+    has_velocities = not has_any(TRACKS, frames, lambda rows: ~np.isfinite(rows["vx_m_per_s"]))
+    on_ground = has_velocities and not (limits.name == "person" and _is_slow(frames))
+    drift_m_per_s = limits.drift_m_per_s if on_ground else None
+    (unit_m,) = units_m([number], class_names, class_limits)
+    return Movers(unit_m, on_ground, usual_score, drift_m_per_s)
+
+
+def _is_slow(frames: Sequence[Frame]) -> bool:
+    """Whether tracks are at no higher rate than their samples: pictures are counted by the frames' ``index``."""
+    passed = np.diff(frame_numbers(frames))
+    return bool(len(passed)) and float(np.median(passed)) <= 1
+
+
+def split_classes(frames: FrameColumns) -> list[FrameColumns]:
+    """The frames of each class (C,), all F of them, in the order in which classes appear.
+
+    The class of a track is that of its first row.
+    """
+    if len(unique_values(TRACKS, frames, "class_id")) < 2:
+        return [frames]
+    columns = [
+        (part.rows["track_id"].copy(), part.rows["class_id"].copy()) for _, _, part in joined_parts(TRACKS, frames)
+    ]
+    track_id, class_of_row = (np.concatenate(parts) for parts in zip(*columns, strict=True))
+    ends = row_ends(frames)
+    frame_of = group_index(np.diff(ends))
+    ids, track = np.unique(track_id, return_inverse=True)
+    class_id = first_classes(track, class_of_row, len(ids))[track]
+    classes, first = np.unique(class_id, return_index=True)
+    # Ids of tracks tell classes apart that appear in one frame: the order of rows has no influence.
+    begins = zip(classes.tolist(), frame_of[first].tolist(), strict=True)
+    lowest = [track_id[(frame_of == frame) & (class_id == one)].min() for one, frame in begins]
+    order = np.lexsort((np.array(lowest), frame_of[first]))
+    numbers = frame_numbers(frames)
+    out = [FrameCollector(TRACKS) for _ in classes]
+    for low, high, part in joined_parts(TRACKS, frames):
+        here = class_id[ends[low] : ends[high]]
+        for one, collector in zip(classes[order].tolist(), out, strict=True):
+            mine = here == one
+            collector.extend(part.t_ns, numbers[low:high], np.append(0, mine.cumsum())[part.ends], part.rows[mine])
+    return [collector.done() for collector in out]
+
+
+def join_classes(classes: Sequence[Sequence[FrameColumns]]) -> Iterator[tuple[Frame, ...]]:
+    """The outputs of several classes (C,) as one: ids follow on those of the class before. A tuple for each frame.
+
+    All outputs of a class have tracks with the same ids: offline and online tracks, predictions and decisions.
+    """
+    above = np.cumsum([0, *(max(map(_highest_id, outputs)) for outputs in classes)])
+    return zip(*(_joined(frames, above) for frames in zip(*classes, strict=True)), strict=True)
+
+
+def _highest_id(frames: FrameColumns) -> int:
+    """The highest id of a track; 0 if there is none."""
+    parts = joined_parts(frames.schema, frames)
+    return max((int(part.rows["track_id"].max(initial=0)) for _, _, part in parts), default=0)
+
+
+def _joined(frames: Sequence[FrameColumns], above: Ints) -> Iterator[Frame]:
+    """One output of all classes (C,) as one; ids of each are raised ``above`` those of the classes before."""
+    schema = frames[0].schema
+    for low, high in spans_of(np.sum([one.ends for one in frames], axis=0)):
+        counts = [np.diff(one.ends[low : high + 1]) for one in frames]
+        rows = schema.joined([one.rows(low, high) for one in frames])
+        raised = rows["track_id"] + np.repeat(above[: len(frames)], [int(count.sum()) for count in counts])
+        rows["track_id"] = np.where(rows["track_id"] < 0, rows["track_id"], raised)
+        order = np.argsort(np.concatenate([group_index(count) for count in counts]), kind="stable")
+        ends = np.cumsum(np.sum(counts, axis=0))
+        yield from split_rows(frames[0].t_ns[low:high], frames[0].numbers[low:high], rows.take(order), ends)

@@ -10,22 +10,21 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import steps_passed
 from mcaptrack.geometry.ragged import group_index
-from mcaptrack.predictors import Predictor, make
-from mcaptrack.schema import TRACKS, Frame, Rows
-from mcaptrack.schema.frame_columns import FrameCollector
-from mcaptrack.transforms.retrack.assignments import Assignments
-from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers
-from mcaptrack.transforms.retrack.input_noise import InputNoise
+from mcaptrack.predictors import Forecast, PeopleSeen, Predictor, make, predict_among, uses_people
+from mcaptrack.predictors.position_noise import PAST, PositionNoise
+from mcaptrack.predictors.tail_calibration import TailCalibration
+from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
+from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
+from mcaptrack.schema.predictions import forecast_to_rows
+from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, Movers
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M, MotionModel, State, StateRows
 from mcaptrack.transforms.retrack.offline_rows import move_rows
-from mcaptrack.transforms.retrack.online_forecasts import OnlineForecasts, Unpredicted
 from mcaptrack.transforms.retrack.online_links import OnlineLinks
 from mcaptrack.transforms.retrack.online_tracker import HITS, IDS, Association, OnlineTracker
 from mcaptrack.transforms.retrack.options import LikelihoodOptions, RetrackOptions
-from mcaptrack.transforms.retrack.recent_positions import RecentPositions
 from mcaptrack.transforms.retrack.samples import LogSamples
 from mcaptrack.transforms.retrack.shown_tracks import ShownTracks
 
@@ -33,6 +32,188 @@ from mcaptrack.transforms.retrack.shown_tracks import ShownTracks
 _STEPS, _SAMPLES = 256, 2**14
 #: The least noise (m) and speed (m/s): a covariance of 0 can't be inverted.
 _MIN_SPREAD: Final = 1e-3
+
+
+# The most that the noise of positions can be, as far as the tracks of the input show it.
+#
+# Online tracking estimates noise from how far observations are from where tracks expect them. Where many are given
+# to the wrong track, as in crowds in which people are merged into one detection now and then, these distances say
+# little about noise; a larger estimate lets more of them be wrong, and it would grow without end. Tracks of the
+# input don't depend on what is decided here: noise bends them, and so does the motion of people, so that there is
+# hardly more noise than bends.
+#
+# Letters: R steps, N observations of all of them, L past positions.
+
+
+#: How many times as large noise may be as bends of the input say: trackers smooth their tracks.
+_FACTOR: Final = 1.5
+#: Noise may be so large in any case: smooth tracks may be off for long. In metres.
+_LEAST_M: Final = 0.3
+
+
+# The recent positions of tracks, looked up for many tracks and steps at once. Letters: N positions, L past ones.
+
+
+class RecentPositions:
+    """Positions by track and step, of which the last ``length`` steps are looked up."""
+
+    def __init__(self, length: int) -> None:
+        self._length = length
+        self._track, self._step = np.empty((2, 0), np.int64)
+        self._xy = np.empty((0, 2))
+
+    def add(self, first: int, track: Ints, step: Ints, xy: Floats) -> None:
+        """Add positions (N, 2) of tracks (N,) at ``step`` (N,), from step ``first`` on; what is too old is dropped."""
+        kept = self._step > first - 1 - self._length
+        self._track = np.concatenate([self._track[kept], track])
+        self._step = np.concatenate([self._step[kept], step])
+        self._xy = np.concatenate([self._xy[kept], xy])
+
+    def before(self, track: Ints, step: Ints, now: Floats) -> tuple[Floats, Bools]:
+        """The last positions of tracks (N,) as known at ``step`` (N,), (N, L, 2), and which are known, (N, L).
+
+        ``now`` (N, 2) are those at ``step``; NaN where a track has none.
+        """
+        width = max(self._step.max(initial=0), step.max(initial=0)) + 1
+        # ids of the input may be as large as they like
+        _, number = np.unique(np.concatenate([self._track, track]), return_inverse=True)
+        had, track = number[: len(self._track)], number[len(self._track) :]
+        have = had * width + self._step
+        order = np.argsort(have)
+        have, xy = have[order], self._xy[order]
+        past = np.full((len(track), self._length, 2), np.nan)
+        for back in range(1, self._length if len(have) else 0):
+            want = track * width + step - back
+            place = np.minimum(np.searchsorted(have, want), len(have) - 1)
+            found = (have[place] == want) & (step >= back)
+            past[found, self._length - 1 - back] = xy[place[found]]
+        past[:, -1] = now
+        return past, np.isfinite(past[..., 0])
+
+
+class InputNoise:
+    """Limits the noise of positions, step by step, from the input up to each; steps have ``step_s`` seconds."""
+
+    def __init__(self, step_s: float) -> None:
+        self._noise = PositionNoise(step_s)
+        self._recent = RecentPositions(PAST)
+
+    def most_m(self, passed: Ints, steps: Ints, place: Ints, source: Ints, xy: Floats) -> list[float]:
+        """The largest noise that there may be at each of ``steps`` (R,), infinite as long as little is known.
+
+        ``passed`` (R,) are the steps since the one before. ``source`` (N,) are the input ids of observations at ``xy``
+        (N, 2), and ``place`` (N,) says of which step they are.
+        """
+        step = steps[place]
+        self._recent.add(int(steps[0]), source, step, xy)
+        past, _ = self._recent.before(source, step, xy)
+        bends_m2 = self._noise.bends_m2(passed, place, past)
+        most = np.maximum(_FACTOR * np.sqrt(np.fmax.reduce(bends_m2, axis=1)), _LEAST_M)
+        out: list[float] = np.where(np.isnan(most), np.inf, most).tolist()
+        return out
+
+
+# Predictions of online tracks, made for many tracks at once and calibrated step by step.
+#
+# Letters: R rows of online tracks, L past positions.
+
+
+#: Predictions that are made at once: more take memory, fewer take time.
+_BATCH: Final = 4096
+
+
+class Unpredicted(NamedTuple):
+    """Tracks without predictions yet: ids, past positions (R, L, 2), which are known, whether tracks coast, steps."""
+
+    ids: Ints
+    past: Floats
+    known: Bools
+    coasts: Bools
+    step: Ints
+
+    def part(self, which: slice | Ints) -> Unpredicted:
+        ids, past, known, coasts, step = self
+        return Unpredicted(ids[which], past[which], known[which], coasts[which], step[which])
+
+
+class _Made(NamedTuple):
+    """Predictions as the predictor made them: ids, past positions, whether tracks coast, means and covariances."""
+
+    ids: Ints
+    past: Floats
+    coasts: Bools
+    mean: Floats
+    cov: Floats
+
+    def part(self, which: slice) -> _Made:
+        return _Made(self.ids[which], self.past[which], self.coasts[which], self.mean[which], self.cov[which])
+
+    def copied(self) -> _Made:
+        return _Made(self.ids.copy(), self.past.copy(), self.coasts.copy(), self.mean.copy(), self.cov.copy())
+
+
+class OnlineForecasts:
+    """Predictions of tracks, frame by frame, made for ``_BATCH`` tracks at once."""
+
+    def __init__(self, name: str, predictor: Predictor, unit_m: float, adapt: bool) -> None:
+        self._name, self._predictor, self._unit_m = name, predictor, unit_m
+        self._calibration = TailCalibration.of(name, predictor, adapt)
+        self._out = FrameCollector(PREDICTIONS)
+        self._waiting: list[Unpredicted] = []
+        nothing = np.empty((0, predictor.steps, 2, 2))
+        ids, past, coasts = np.empty(0, np.int64), np.empty((0, predictor.past, 2)), np.empty(0, bool)
+        self._left = _Made(ids, past, coasts, nothing[..., 0], nothing)  # of a frame that is not complete
+        self._frames: list[tuple[int, int, int, int]] = []  # time, number, step and tracks of frames in neither
+
+    def add(self, t_ns: Ints, numbers: Ints, steps: Ints, ends: Ints, tracks: Unpredicted) -> None:
+        """Add the tracks of frames, ``ends[f]`` to ``ends[f + 1]`` of frame f, with their past positions."""
+        self._frames += zip(t_ns.tolist(), numbers.tolist(), steps.tolist(), np.diff(ends).tolist(), strict=True)
+        self._waiting.append(tracks)
+        self._predict(_BATCH)
+
+    def done(self) -> FrameColumns:
+        """The predictions; nothing can be added any more."""
+        self._predict(1)
+        if self._calibration is not None:
+            self._calibration.warn(self._name)
+        return self._out.done()
+
+    def _predict(self, least: int) -> None:
+        """Predict in batches, as long as at least so many tracks wait, and write the frames that are complete."""
+        waiting = Unpredicted(*(np.concatenate(parts) for parts in zip(*self._waiting, strict=True)))
+        done = 0
+        while len(waiting.ids) - done >= least:
+            end = done + _BATCH
+            if uses_people(self._predictor):  # whole steps, because their tracks are predicted together
+                end = int(np.searchsorted(waiting.step, waiting.step[min(end, len(waiting.ids)) - 1], "right"))
+            ids, past, known, coasts, steps = waiting.part(slice(done, end))
+            units = past / self._unit_m
+            people = PeopleSeen(units, known, steps, np.arange(len(ids)))
+            mean, cov = predict_among(self._predictor, units, known, people)
+            self._write(_Made(ids, past, coasts, mean * self._unit_m, cov * self._unit_m**2))
+            done += len(ids)
+        self._waiting = [waiting.part(slice(done, None))]
+        self._write(self._left.part(slice(0)))  # frames without tracks
+
+    def _write(self, new: _Made) -> None:
+        """Write the frames that are complete with these predictions."""
+        made = (
+            new if new is self._left else _Made(*(np.concatenate(both) for both in zip(self._left, new, strict=True)))
+        )
+        ends = np.cumsum([0, *(count for *_, count in self._frames)])
+        count = int(np.searchsorted(ends, len(made.ids), "right")) - 1
+        self._left = made.part(slice(ends[count], None)).copied()  # so that the larger arrays are not held
+        if not count:
+            return
+        ids, past, coasts, mean, cov = made.part(slice(ends[count]))
+        tails = None
+        if self._calibration is not None:  # by the predictions of the steps before
+            step = np.repeat([step for _, _, step, _ in self._frames[:count]], np.diff(ends[: count + 1]))
+            (_, cov), tails = self._calibration(step, ids, Forecast(mean, cov), past, coasts)
+        rows = forecast_to_rows(ids, Forecast(mean, cov), self._predictor.step_s, tails)
+        t_ns, numbers, *_ = zip(*self._frames[:count], strict=True)
+        self._out.extend(t_ns, numbers, ends[: count + 1] * self._predictor.steps, rows)
+        self._frames = self._frames[count:]
 
 
 class LikelihoodPass:

@@ -5,31 +5,30 @@ Letters: C assignments (a track has a sample at a step), R rows, K tracks, N row
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from itertools import repeat
+from collections.abc import Collection, Iterator, Sequence
+from itertools import pairwise, repeat
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Floats, Ints
-from mcaptrack.geometry.ragged import group_index
-from mcaptrack.schema import APPEARANCE, DECISIONS, Rows
-from mcaptrack.transforms.retrack.appearance import Appearance
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.colour_histograms import BINS, mean_shares
+from mcaptrack.geometry.ragged import group_index, run_ends, run_starts
+from mcaptrack.schema import APPEARANCE, DECISIONS, BodyPart, DecisionKind, Rows
+from mcaptrack.transforms.retrack.appearance import Appearance, Descriptors
 from mcaptrack.transforms.retrack.appearance_calibration import AppearanceCalibration
-from mcaptrack.transforms.retrack.appearance_rows import appearance_rows
-from mcaptrack.transforms.retrack.assignments import Assignments
-from mcaptrack.transforms.retrack.by_class import PEOPLE, Movers
+from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, Movers
 from mcaptrack.transforms.retrack.cut_links import CutTracks, link_pieces
-from mcaptrack.transforms.retrack.decisions import Decided, decision_rows
 from mcaptrack.transforms.retrack.false_tracks import log_odds_in_log, probability, scored_log_odds
-from mcaptrack.transforms.retrack.fixed_tracks import fix_tracks
 from mcaptrack.transforms.retrack.identity_swaps import resolve_swaps
-from mcaptrack.transforms.retrack.joins import Tracked, cut_joins
+from mcaptrack.transforms.retrack.joins import FEATURES, Joins, Tracked, cut_joins, find_joins, with_appearance
 from mcaptrack.transforms.retrack.linking import link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, filtered, smooth, to_trajectories
 from mcaptrack.transforms.retrack.offline_rows import Moved, TrackRows, moved_to, rows_by_step
 from mcaptrack.transforms.retrack.options import RetrackOptions
 from mcaptrack.transforms.retrack.samples import LogSamples
+from mcaptrack.transforms.retrack.weights import weights_of
 
 #: Links of tracks in metres miss by at most so much, and so much more for each second of the gap.
 MAX_MISFIT: Final = (0.6, 0.2)
@@ -48,6 +47,215 @@ class Offline(NamedTuple):
     decisions: Iterator[Rows]
     looks: Iterator[Rows]
     calibration: AppearanceCalibration | None
+
+
+# Tracks that people have corrected: re-tracking neither cuts nor joins them, and leaves none of their samples out.
+#
+# Letters: C assignments (a track has a sample at a step), N samples.
+
+
+def fix_tracks(step: Ints, track: Ints, source: Ints, fixed: Collection[int]) -> Ints:
+    """The track of each assignment (C,) after all samples of a fixed input id have one track, and no other fixed one.
+
+    Parameters
+    ----------
+    step, track, source : (C,) of int
+        The step of each assignment, the track that it has now, and the input id of its sample.
+    fixed : collection of int
+        Input ids of corrected tracks.
+
+    Returns
+    -------
+    (C,) of int
+        What a track has before the first sample of a fixed id, or after its last one, stays with it: a person who was
+        followed into the corrected part keeps the id. All else keeps its track, or gets a new one where a fixed id has
+        taken it.
+    """
+    is_fixed = np.isin(source, np.array(sorted(fixed), np.int64))
+    if not is_fixed.any():
+        return track
+    out = np.full(len(track), -1, np.int64)
+    following = int(track.max()) + 1
+    ends: dict[int, tuple[int, int]] = {}
+    for one in np.unique(source[is_fixed]).tolist():
+        own = np.flatnonzero(source == one)
+        ends[one] = int(own[step[own].argmin()]), int(own[step[own].argmax()])
+    taken: set[int] = set()
+    node: dict[int, int] = {}
+    for one in sorted(ends, key=lambda key: -int((source == key).sum())):
+        names, counts = np.unique(track[source == one], return_counts=True)
+        free = [int(name) for name in names[np.argsort(-counts, kind="stable")] if int(name) not in taken]
+        node[one] = free[0] if free else following
+        following += not free
+        taken.add(node[one])
+        out[source == one] = node[one]
+    for one in np.unique(track[is_fixed]).tolist():
+        own = np.flatnonzero(track == one)
+        own = own[np.argsort(step[own], kind="stable")]
+        rest = following  # of this track, what belongs to no fixed id, if one has taken its name
+        for low, high in _runs(is_fixed[own]):
+            run = own[low:high]
+            before = int(source[own[low - 1]]) if low else None
+            after = int(source[own[high]]) if high < len(own) else None
+            if before is not None and ends[before][1] == own[low - 1]:
+                out[run] = node[before]
+            elif after is not None and ends[after][0] == own[high]:
+                out[run] = node[after]
+            else:
+                out[run] = rest if one in taken else one
+                following = rest + 1
+    untouched = out < 0
+    out[untouched] = track[untouched]
+    return out
+
+
+def _runs(is_fixed: Bools) -> list[tuple[int, int]]:
+    """The runs of assignments that are not of fixed ids, as begin and end."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], is_fixed, [True]]).astype(int)))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+# The decisions of offline re-tracking as rows: how likely each is right, and what would be the case otherwise.
+#
+# Joins are judged once all tracks are decided, whatever step made them: association, a link over a gap, or a swap
+# that was resolved. Tracks are people or false with the odds of the test of false tracks. Probabilities are
+# logistic regressions, fitted on synthetic scenes (see ``weights``), where of the decisions with a probability of
+# 0.9 about 90 % are right.
+#
+# Letters: C assignments, K tracks, J joins, D decisions.
+
+
+_JOINS_WEIGHTS, _JOINS_FITTED = weights_of("joins", FEATURES)
+_JOINS_BIAS: Final = float(_JOINS_FITTED["bias"])
+#: The log odds that a track is a person, from those of the test of false tracks: that one weighs rows, not tracks.
+_PERSON_WEIGHTS, _PERSON_FITTED = weights_of("decided", ("log odds",))
+_PERSON_BIAS: Final = float(_PERSON_FITTED["bias"])
+_NO_ID: Final = -1
+
+
+class Decided(NamedTuple):
+    """All tracks of a log as they were decided, those that were left out included.
+
+    ``sample`` (C,) is the sample of each assignment. ``log_odds`` (K,) that tracks are people, of the test of false
+    tracks, and which were ``kept`` (K,), are ordered by id. ``appearance`` is that of the assignments, None where it
+    isn't used.
+    """
+
+    tracked: Tracked
+    sample: Ints
+    log_odds: Floats
+    kept: Bools
+    appearance: Appearance | None = None
+
+
+def decision_rows(
+    decided: Decided, model: MotionModel, samples: LogSamples, steps: Sequence[int], step_s: float
+) -> Iterator[Rows]:
+    """The decisions at each of ``steps``: rows of Decisions, ordered by kind and track."""
+    parts = _joined(decided, find_kept_joins(decided, model, step_s), step_s), _persons(decided, step_s)
+    at, rows = np.concatenate([one for one, _ in parts]), DECISIONS.joined([rows for _, rows in parts])
+    places = samples.take(decided.sample[at])
+    rows["x_m"], rows["y_m"] = places["x_m"], places["y_m"]
+    rows["x_px"], rows["y_px"] = places["x_px"] + places["w_px"] / 2, places["y_px"] + places["h_px"] / 2
+    step = decided.tracked.step[at]
+    order = np.lexsort((rows["source_id"], rows["track_id"], rows["kind"], step))
+    ends = np.append(0, np.searchsorted(step[order], steps, "right")).tolist()
+    rows = DECISIONS.check(rows.take(order))
+    yield from (rows[low:high] for low, high in pairwise(ends))
+
+
+def find_kept_joins(decided: Decided, model: MotionModel, step_s: float) -> Joins:
+    """The joins of the tracks that were kept."""
+    joins = find_joins(decided.tracked, model, step_s)
+    number = np.cumsum(run_starts(decided.tracked.track)) - 1
+    kept = decided.kept[number[joins.after]]
+    return Joins(*(values[kept] for values in joins))
+
+
+def join_probability(features: Floats) -> Floats:
+    """The probability (J,) that joins with these features (J, F) are right."""
+    return probability(features @ _JOINS_WEIGHTS + _JOINS_BIAS)
+
+
+def person_probability(log_odds: Floats) -> Floats:
+    """The probability (K,) that tracks with these log odds, of the test of false tracks, are people."""
+    return probability(log_odds * _PERSON_WEIGHTS[0] + _PERSON_BIAS)
+
+
+def _joined(decided: Decided, joins: Joins, step_s: float) -> tuple[Ints, Rows]:
+    """The assignment of each join (J,), and its row."""
+    step, track, source = decided.tracked[:3]
+    rows = DECISIONS.empty(len(joins.after))
+    rows["kind"], rows["track_id"] = DecisionKind.JOINED, track[joins.after]
+    rows["previous_id"], rows["source_id"] = source[joins.before], source[joins.after]
+    by_motion = join_probability(joins.features)
+    rows["probability"] = with_appearance(by_motion, joins, decided.tracked, decided.appearance, step_s)
+    rows["alternative_id"] = np.where(joins.alternative >= 0, source[joins.alternative], _NO_ID)
+    rows["duration_s"] = (step[joins.after] - step[joins.before]) * step_s
+    return joins.after, rows
+
+
+def _persons(decided: Decided, step_s: float) -> tuple[Ints, Rows]:
+    """The first assignment of each track (K,), and the row that says whether it is a person."""
+    step, track, source = decided.tracked[:3]
+    starts = run_starts(track)
+    first, last = np.flatnonzero(starts), np.flatnonzero(run_ends(starts))
+    rows = DECISIONS.empty(len(first))
+    rows["kind"] = np.where(decided.kept, DecisionKind.KEPT, DecisionKind.LEFT_OUT)
+    rows["track_id"] = np.where(decided.kept, track[first], _NO_ID)
+    rows["previous_id"] = rows["alternative_id"] = _NO_ID
+    rows["source_id"] = _usual(track, source)
+    is_person = person_probability(decided.log_odds)
+    rows["probability"] = np.where(decided.kept, is_person, 1 - is_person)
+    rows["duration_s"] = (step[last] - step[first]) * step_s
+    rows["frames"] = last - first + 1
+    return first, rows
+
+
+def _usual(track: Ints, source: Ints) -> Ints:
+    """The input id of most samples of each track (K,), of several the lowest. Assignments (C,) are by track."""
+    order = np.lexsort((source, track))
+    starts = np.flatnonzero(run_starts(track[order], source[order]))
+    count = np.diff(np.append(starts, len(order)))
+    of, ids = track[order][starts], source[order][starts]
+    best = np.lexsort((ids, -count, of))
+    return np.asarray(ids[best[run_starts(of[best])]])
+
+
+# The appearance of tracks as rows: the mean histograms of the pictures in which they are seen clearly.
+#
+# Letters: S descriptors, T frames, K tracks.
+
+
+def appearance_rows(descriptors: Descriptors, track: Ints, times_ns: Ints) -> Iterator[Rows]:
+    """The rows of Appearance at each of ``times_ns`` (T,), ordered by track and part of the body.
+
+    ``track`` (S,) is the track that each descriptor is of, or -1. The rows of a track stand at the last of its
+    descriptors that count, which is at one of the times; a track without any has none.
+    """
+    used = np.flatnonzero(descriptors.is_clear & (track >= 0))
+    ids, group = np.unique(track[used], return_inverse=True)
+    t_ns = descriptors.t_ns[used]
+    first, last = np.full(len(ids), np.iinfo(np.int64).max), np.zeros(len(ids), np.int64)
+    np.minimum.at(first, group, t_ns)
+    np.maximum.at(last, group, t_ns)
+    rows = APPEARANCE.empty(len(ids) * len(BodyPart))
+    of_parts = {
+        "track_id": ids,
+        "pictures": np.bincount(group, minlength=len(ids)),
+        "duration_s": (last - first) / NS_PER_S,
+    }
+    for name, values in of_parts.items():
+        rows[name] = np.repeat(values, len(BodyPart))
+    rows["body_part"] = np.tile(list(BodyPart), len(ids))
+    shares = mean_shares(descriptors.values[used], group, len(ids)).reshape(len(rows), len(BINS))
+    for name, column in zip(BINS, shares.T, strict=True):
+        rows[name] = column
+    at = np.repeat(last, len(BodyPart))
+    order = np.argsort(at, kind="stable")
+    ends = np.append(0, np.searchsorted(at[order], times_ns, "right")).tolist()
+    rows = APPEARANCE.check(rows.take(order))
+    yield from (rows[low:high] for low, high in pairwise(ends))
 
 
 def offline_tracks(

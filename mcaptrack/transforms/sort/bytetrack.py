@@ -8,8 +8,7 @@ import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Indices
 from mcaptrack.transforms.protocol import option
-from mcaptrack.transforms.sort.association import associate
-from mcaptrack.transforms.sort.state import SINCE_UPDATE, Measurements
+from mcaptrack.transforms.sort.state import SINCE_UPDATE, Measurements, associate
 from mcaptrack.transforms.sort.tracker import AssociationInput, Sort
 
 

@@ -19,8 +19,7 @@ from mcaptrack.geometry import kalman
 from mcaptrack.geometry.affine import move_boxes, move_points
 from mcaptrack.geometry.arrays import Floats, Indices
 from mcaptrack.transforms.protocol import option
-from mcaptrack.transforms.sort.association import CandidatePairs, associate, iou_pairs
-from mcaptrack.transforms.sort.state import SHARED_ROWS, Measurements, Tracks
+from mcaptrack.transforms.sort.state import SHARED_ROWS, CandidatePairs, Measurements, Tracks, associate, iou_pairs
 from mcaptrack.transforms.sort.tracker import AssociationInput, Sort
 
 # Rows of the table below the shared ones: corners of the last detection; state of the filter after it; frames since

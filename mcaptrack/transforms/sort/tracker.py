@@ -26,15 +26,19 @@ from mcaptrack.geometry.plane import GroundPlane, Planes, moved_planes, plane_at
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.protocol import check_options, context, option
-from mcaptrack.transforms.sort.association import CandidatePairs, Cost, associate, distance_pairs, iou_pairs
 from mcaptrack.transforms.sort.state import (
     CLASS,
     HIT_STREAK,
     SHARED_ROWS,
     SINCE_UPDATE,
+    CandidatePairs,
+    Cost,
     Measurements,
     Tracks,
+    associate,
+    distance_pairs,
     frames_to_measurements,
+    iou_pairs,
     tracks_to_frames,
 )
 

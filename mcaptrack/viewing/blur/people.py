@@ -7,23 +7,31 @@ Letters: N boxes, M pictures.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Final
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mcaptrack import log
-from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.errors import DamagedError, McaptrackError
+from mcaptrack.foxglove import Cuboids
+from mcaptrack.foxglove.views import MovingCamera
+from mcaptrack.foxglove.views.projected import corners
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
-from mcaptrack.geometry.clocks import seconds_to_ns
+from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.geometry.pinhole import project
+from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
-from mcaptrack.schema.classes import class_names
+from mcaptrack.schema.classes import PEOPLE, UNKNOWN, class_name, class_names
 from mcaptrack.schema.framing import frame_times, joined_parts
+from mcaptrack.schema.provenance import frame_id_of
 from mcaptrack.sources import foreign
+from mcaptrack.sources.calibrations import moving_camera
 from mcaptrack.sources.cameras import Camera
-from mcaptrack.viewing.blur.classes import people_among
-from mcaptrack.viewing.blur.in_space import people_in_space
-from mcaptrack.viewing.blur.pieces import MAX_GAP_S, Pieces, around, joined, linked
+from mcaptrack.sources.fixed_frame import holds_boxes_3d, named_detections
 
 #: Detections count for this many pictures before and after their own.
 _NEAR_PICTURES: Final = 2.5
@@ -37,6 +45,276 @@ _GROWTH_PER_S: Final = 0.5
 _LOOKED_S: Final = 1.0
 #: Boxes are computed for this many pictures at once.
 _BLOCK: Final = 512
+
+
+# People in 3D boxes, as they are seen in the pictures of a calibrated camera that may move.
+#
+# Letters: N boxes, M pictures, P points of a box.
+
+
+#: The state of a 3D box.
+_STATE: Final = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "heading_rad")
+#: Boxes are cut off so far before the camera, and each edge is so many points.
+_NEAR_M: Final = 0.1
+_POINTS: Final = 6
+#: Points beyond the edge of the lens are at most so far outside.
+_FAR_PX: Final = 1e6
+#: Detections in space count for this time before and after their own.
+_NEAR_NS: Final = 250_000_000
+
+
+# Pieces of tracks between two times: where a person is, or must be, at any time in between.
+#
+# A person who is missed for a moment is still there. So tracks are interpolated over their gaps, and continued
+# before their first and after their last row, along their motion.
+#
+# Letters: N rows, S pieces, D numbers of a state (a box in a picture, or in space), M times.
+
+
+#: Tracks are interpolated over gaps of this length, and continued for this long at either end.
+MAX_GAP_S: Final = 5.0
+_AHEAD_S: Final = 1.0
+#: The motion at an end of a track is that of this time.
+_MOTION_S: Final = 0.5
+
+
+class Pieces(NamedTuple):
+    """Pieces of tracks between two times (S,), with the states (S, D) at both, and whether there was a row at each."""
+
+    first_ns: Ints
+    last_ns: Ints
+    first: Floats
+    last: Floats
+    is_row: tuple[Bools, Bools]
+
+    def at(self, at_ns: Ints) -> tuple[Ints, Floats, Floats]:
+        """The states at rising times (M,): the index of the time of each, (N, D), and for how long nothing was seen, s.
+
+        They are in the order of the pieces.
+        """
+        if not len(at_ns):
+            return np.empty(0, np.int64), self.first[:0], np.empty(0)
+        near = (self.first_ns <= at_ns[-1]) & (self.last_ns >= at_ns[0])
+        begin, end, start, stop = self.first_ns[near], self.last_ns[near], self.first[near], self.last[near]
+        low, high = np.searchsorted(at_ns, begin, "left"), np.searchsorted(at_ns, end, "right")
+        of, place = group_index(high - low), ragged_range(low, high - low)
+        t_ns = at_ns[place]
+        share = (t_ns - begin[of]) / np.maximum(end - begin, 1)[of]
+        states = start[of] + share[:, None] * (stop - start)[of]
+        since = np.where(self.is_row[0][near][of], t_ns - begin[of], np.inf)
+        until = np.where(self.is_row[1][near][of], end[of] - t_ns, np.inf)
+        return place, states, np.minimum(since, until) / NS_PER_S
+
+
+def joined(parts: Sequence[Pieces], width: int) -> Pieces:
+    """All pieces of these, of states of so many numbers."""
+    if not parts:
+        none, no = np.empty(0, np.int64), np.empty(0, np.bool_)
+        return Pieces(none, none, np.empty((0, width)), np.empty((0, width)), (no, no))
+    rows = tuple(np.concatenate([part.is_row[n] for part in parts]) for n in range(2))
+    first, last, start, stop = (np.concatenate([part[n] for part in parts]) for n in range(4))
+    return Pieces(first, last, start, stop, (rows[0], rows[1]))
+
+
+def around(t_ns: Ints, states: Floats, near_ns: int) -> Pieces:
+    """Detections as pieces around their times."""
+    halves = [(t_ns - near_ns, t_ns, False, True), (t_ns, t_ns + near_ns, True, False)]
+    parts = [
+        Pieces(first, last, states, states, (np.full(len(t_ns), one), np.full(len(t_ns), other)))
+        for first, last, one, other in halves
+    ]
+    return joined(parts, states.shape[1])
+
+
+def linked(t_ns: Ints, track_id: Ints, states: Floats, places: Floats) -> Pieces:
+    """Tracks as pieces between consecutive rows, with one before the first row of each and one after the last.
+
+    ``places`` (N, P) are what moves beyond the ends, the first numbers of the states; the others stay as they are.
+    """
+    order = np.lexsort((t_ns, track_id))
+    t_ns, track_id, states, places = t_ns[order], track_id[order], states[order], places[order]
+    starts = run_starts(track_id, times=t_ns, max_gap=seconds_to_ns(MAX_GAP_S))
+    first, last = np.flatnonzero(starts), np.flatnonzero(run_ends(starts))
+    inner = np.flatnonzero(~run_ends(starts))
+    yes = np.ones(len(inner), np.bool_)
+    between = Pieces(t_ns[inner], t_ns[inner + 1], states[inner], states[inner + 1], (yes, yes))
+    run = np.cumsum(starts) - 1
+    motion_ns, ahead_ns = seconds_to_ns(_MOTION_S), seconds_to_ns(_AHEAD_S)
+    # The row that is half a second after the first one of its track, and the one that is half a second before the last.
+    later = np.minimum(_first_at(run, t_ns, first, t_ns[first] + motion_ns), last)
+    earlier = np.maximum(_first_at(run, t_ns, last, t_ns[last] - motion_ns), first)
+    before, after = states[first].copy(), states[last].copy()
+    before[:, : places.shape[1]] -= _motion(t_ns, places, first, later) * _AHEAD_S
+    after[:, : places.shape[1]] += _motion(t_ns, places, earlier, last) * _AHEAD_S
+    no, yes = np.zeros(len(first), np.bool_), np.ones(len(first), np.bool_)
+    ends = [
+        Pieces(t_ns[first] - ahead_ns, t_ns[first], before, states[first], (no, yes)),
+        Pieces(t_ns[last], t_ns[last] + ahead_ns, states[last], after, (yes, no)),
+    ]
+    return joined([between, *ends], states.shape[1])
+
+
+def _first_at(run: Ints, t_ns: Ints, rows: Ints, wanted_ns: Ints) -> Ints:
+    """For some rows, the index of the first row of the same run at a time or later; the one after the run if none."""
+    if not len(rows):
+        return rows
+    base = int(t_ns.min())
+    length = int(t_ns.max()) - base + seconds_to_ns(MAX_GAP_S)
+    keys = run.astype(np.float64) * length + (t_ns - base)
+    found = np.searchsorted(keys, run[rows].astype(np.float64) * length + (wanted_ns - base))
+    return found.astype(np.int64)
+
+
+def _motion(t_ns: Ints, places: Floats, one: Ints, other: Ints) -> Floats:
+    """The motion of places (N, P) between two rows, by second."""
+    passed = np.maximum(t_ns[other] - t_ns[one], 1)[:, None] / NS_PER_S
+    out: Floats = (places[other] - places[one]) / passed
+    out[other == one] = 0
+    return out
+
+
+# Which classes of objects show people: they are hidden with the object.
+#
+# Letters: N rows.
+
+
+#: Words for people in names of classes of data sets, as in "human.pedestrian.police_officer" or "Person_sitting".
+_WORDS: Final = frozenset(
+    {*PEOPLE, "persons", "pedestrians", "rider", "riders", "cyclist", "bicyclist", "motorcyclist", "adult", "child"}
+    | {"man", "woman", "face", "head", "worker", "officer", "wheelchair", "stroller", "passenger", "driver"}
+)
+_LETTERS: Final = re.compile(r"[a-z]+")
+
+
+def shows_people(name: str) -> bool:
+    """Return whether objects of a class of this name are people, or carry them in view.
+
+    Examples
+    --------
+    >>> [shows_people(name) for name in ("person", "human.pedestrian.adult", "BICYCLIST", "bicycle", "carriage")]
+    [True, True, True, False, False]
+    """
+    return not _WORDS.isdisjoint(_LETTERS.findall(name.casefold()))
+
+
+def people_among(class_id: NDArray[Any], names: Mapping[int, str]) -> Bools:
+    """Which rows (N,) are people, or of unknown class."""
+    numbers = class_id.astype(np.int64)
+    wanted = [one for one in np.unique(numbers).tolist() if one == UNKNOWN or shows_people(class_name(one, names))]
+    return np.asarray(np.isin(numbers, wanted), np.bool_)
+
+
+class SeenInSpace(NamedTuple):
+    """People in 3D boxes that a camera sees: their pieces, the times of the boxes, and the camera."""
+
+    topic: str
+    pieces: Pieces
+    frame_ns: Ints
+    camera: MovingCamera
+
+    def between(self, first: int, last: int) -> tuple[Ints, Floats, Floats]:
+        """The boxes in the pictures ``first`` to before ``last``: their pictures (N,) from 0, the boxes (N, 4), and for
+        how long a person was not seen (N,), in s.
+        """
+        picture, states, unseen_s = self.pieces.at(self.camera.at_ns[first:last])
+        boxes = outlines(states, picture + first, self.camera)
+        seen = np.isfinite(boxes).all(axis=1)
+        return picture[seen], boxes[seen], unseen_s[seen]
+
+    def unknown(self) -> Bools:
+        """Which pictures (M,) can't have boxes, because it is not known where the camera was."""
+        return np.asarray(~np.isfinite(self.camera.rotation).all(axis=(1, 2)), np.bool_)
+
+
+def people_in_space(opened: log.Log, pictures: str, problems: list[str]) -> list[SeenInSpace]:
+    """The people in all 3D boxes of a log, in the pictures of a channel; ``problems`` gets what is in the way."""
+    out: list[SeenInSpace] = []
+    cameras: dict[str, MovingCamera | None] = {}
+    for topic in sorted(opened.channels):
+        try:
+            found = _read(opened, topic)
+        except DamagedError:
+            raise
+        except McaptrackError as error:
+            problems.append(f"{topic}: {error}")
+            continue
+        if found is None:
+            continue
+        pieces, frame_ns, frame_id = found
+        if frame_id not in cameras:
+            try:
+                cameras[frame_id] = moving_camera(opened, pictures, frame_id)
+            except McaptrackError as error:
+                cameras[frame_id] = None
+                problems.append(f"{topic} can't be placed in {pictures}: {error}")
+        camera = cameras[frame_id]
+        if camera is not None:
+            out.append(SeenInSpace(topic, pieces, frame_ns, camera))
+    return out
+
+
+def _read(opened: log.Log, topic: str) -> tuple[Pieces, Ints, str] | None:
+    """The people in a channel of 3D boxes, the times of its frames and its frame of reference; None for others."""
+    channel = opened.channels[topic]
+    schema: Schema | None = next((one for one in (TRACKS, DETECTIONS) if channel.holds(one)), None)
+    frames: Sequence[Frame]
+    if schema is not None:
+        frame_id = frame_id_of(channel.metadata)
+        if not frame_id:
+            return None
+        frames, names = opened.frame_columns(topic, schema), class_names(channel.metadata)
+    elif holds_boxes_3d(opened, topic):
+        found = named_detections(opened, topic)
+        schema, frames, frame_id, names = DETECTIONS, found.frames, found.frame_id, found.classes
+    else:
+        return None
+    parts: list[tuple[Ints, Ints, Floats]] = []
+    for _, _, part in joined_parts(schema, frames):
+        state = np.stack([part.rows[name].astype(np.float64) for name in _STATE], axis=-1)
+        # Boxes without a heading may stand in any direction.
+        turned = np.isfinite(state[:, 6])
+        state[~turned, 3:5] = state[~turned, 3:5].max(axis=1, keepdims=True, initial=0)
+        state[~turned, 6] = 0
+        known = np.isfinite(state).all(axis=1) & people_among(part.rows["class_id"], names)
+        number = part.rows["track_id"] if schema is TRACKS else np.zeros(len(state), np.int64)
+        parts.append((part.row_ns[known], number[known].astype(np.int64), state[known]))
+    if not sum(len(part[0]) for part in parts):
+        return None
+    t_ns, number, state = (np.concatenate([part[n] for part in parts]) for n in range(3))
+    pieces = linked(t_ns, number, state, state[:, :3]) if schema is TRACKS else around(t_ns, state, _NEAR_NS)
+    return pieces, frame_times(frames), frame_id
+
+
+def outlines(states: Floats, picture: Ints, camera: MovingCamera) -> Floats:
+    """The boxes (N, 4) in pictures around 3D boxes (N, 7), each in one of the pictures (N,); NaN where none is seen."""
+    box = corners(Cuboids(states[:, :3], states[:, 3:6], states[:, 6]))
+    at = np.einsum("nij,npj->npi", camera.rotation[picture], box) + camera.translation[picture][:, None]
+    # Points along the lines between all corners: those behind the camera would be mirrored, and lenses bend lines.
+    pairs = np.array(np.triu_indices(box.shape[1], 1)).T
+    share = np.linspace(0, 1, _POINTS)[:, None]
+    ends = at[:, pairs]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        depth = ends[..., 2]
+        cut = np.clip((_NEAR_M - depth) / (depth[..., ::-1] - depth), 0, 1)
+        ends = np.where((depth < _NEAR_M)[..., None], ends + cut[..., None] * (ends[..., ::-1, :] - ends), ends)
+        points = (ends[:, :, None, 0] * (1 - share) + ends[:, :, None, 1] * share).reshape(len(states), -1, 3)
+        is_ahead = points[..., 2] > _NEAR_M * (1 - 1e-9)
+    px = np.full((*points.shape[:2], 2), np.nan)
+    for number in np.unique(camera.lens[picture]).tolist():
+        lens, mine = camera.lenses[number], camera.lens[picture] == number
+        flat = points[mine].reshape(-1, 3)
+        found = project(flat, lens, np.eye(3), np.zeros(3))[0]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            straight = flat[:, :2] / flat[:, 2:] * lens.focal_px + lens.centre_px
+        beyond = np.isnan(found).any(axis=1)
+        found[beyond] = straight[beyond].clip(-_FAR_PX, _FAR_PX)
+        px[mine] = found.reshape(px[mine].shape)
+    px[~is_ahead] = np.nan
+    low, high = np.fmin.reduce(px, axis=1), np.fmax.reduce(px, axis=1)
+    size = np.array([camera.width_px, camera.height_px], np.float64)
+    with np.errstate(invalid="ignore"):
+        is_inside = ((high > 0) & (low < size)).all(axis=1)
+    return np.where(is_inside[:, None], np.concatenate([low, high - low], axis=1), np.nan)
 
 
 class HiddenPeople:

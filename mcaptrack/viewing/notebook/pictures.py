@@ -8,22 +8,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from math import ceil
-from typing import Any, Final
+from itertools import pairwise
+from math import ceil, isfinite
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack import log, notices, pipeline
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, list_names
+from mcaptrack.foxglove import ANNOTATIONS, SCENE, views
+from mcaptrack.foxglove.messages import message_class
 from mcaptrack.foxglove.views import SCENE_SUFFIX
 from mcaptrack.geometry.arrays import Image, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.notices import warn
+from mcaptrack.schema import PREDICTIONS, Schema
+from mcaptrack.schema.classes import class_names
+from mcaptrack.schema.framing import has_any
+from mcaptrack.sources.camera_motion import path_of, tracks_topic
+from mcaptrack.sources.foreign import holds_pictures
+from mcaptrack.sources.foreign.flatten import message_decoder
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import encode_image
+from mcaptrack.transforms import FULL
 from mcaptrack.viewing import from_above
 from mcaptrack.viewing.from_above import Sight
-from mcaptrack.viewing.notebook.drawings import find_drawings
-from mcaptrack.viewing.notebook.strokes import Strokes
 from mcaptrack.viewing.rendering import draw, scaled, sights
 
 #: The largest width of a player and of a still in pixels, unless it is given.
@@ -40,6 +49,88 @@ _DRAWN_BYTES: Final = 500
 _AS_TEXT: Final = 4 / 3
 
 Progress = Callable[[str, int, int], None]
+
+
+# Annotation messages as lines and texts in JSON, for a page that draws them over pictures.
+#
+# A line is [kind, thickness, colour, fill, [x, y, x, y, ...]]. Its kind is closed, open or pairs of points; colour
+# and fill are numbers in the list of colours, the fill of a line that has none is -1. A text is [x, y, size,
+# colour, background, text], at its lower left corner. All is in pixels of the picture.
+
+
+CLOSED, OPEN, PAIRS = 0, 1, 2
+_LINE_LOOP, _LINE_STRIP, _LINE_LIST = 2, 3, 4
+#: The decimal places of coordinates.
+_DIGITS: Final = 2
+
+Line = list[Any]
+Text = list[Any]
+
+
+class Strokes:
+    """Converts annotations to lines and texts; ``colours`` are those that occurred so far, as CSS writes them."""
+
+    def __init__(self) -> None:
+        self._number: dict[str, int] = {}
+
+    @property
+    def colours(self) -> list[str]:
+        """The colours, by number."""
+        return list(self._number)
+
+    def of(self, annotations: Any) -> list[list[Any]]:
+        """Return the lines and the texts of an ImageAnnotations message; what can't be seen is left out."""
+        lines: list[Line] = []
+        for part in annotations.points:
+            points = [(round(point.x, _DIGITS), round(point.y, _DIGITS)) for point in part.points]
+            if not all(isfinite(x) and isfinite(y) for x, y in points):
+                continue
+            shades = part.outline_colors
+            if part.type == _LINE_LOOP:
+                fill = self._colour(part.fill_color)
+                self._add(lines, CLOSED, part.thickness, self._colour(part.outline_color), points, fill)
+            elif part.type == _LINE_LIST and 2 * len(shades) == len(points):
+                self._pairs(lines, part.thickness, shades, zip(points[::2], points[1::2], strict=True))
+            elif part.type == _LINE_STRIP and points and len(shades) == len(points):
+                self._pairs(lines, part.thickness, shades[1:], pairwise(points))
+            elif part.type in (_LINE_STRIP, _LINE_LIST):
+                kind = OPEN if part.type == _LINE_STRIP else PAIRS
+                self._add(lines, kind, part.thickness, self._colour(part.outline_color), points)
+        texts: list[Text] = [
+            [
+                round(text.position.x, _DIGITS),
+                round(text.position.y, _DIGITS),
+                round(text.font_size, _DIGITS),
+                self._colour(text.text_color),
+                self._colour(text.background_color),
+                text.text,
+            ]
+            for text in annotations.texts
+            if isfinite(text.position.x) and isfinite(text.position.y)
+        ]
+        return [lines, texts]
+
+    def _pairs(self, lines: list[Line], thickness: float, shades: Any, pairs: Any) -> None:
+        """Add pairs of points that have colours of their own: one line for each colour."""
+        by_colour: dict[int, list[tuple[float, float]]] = {}
+        for shade, pair in zip(shades, pairs, strict=True):
+            by_colour.setdefault(self._colour(shade), []).extend(pair)
+        for colour, points in by_colour.items():
+            self._add(lines, PAIRS, thickness, colour, points)
+
+    @staticmethod
+    def _add(
+        lines: list[Line], kind: int, thickness: float, colour: int, points: list[tuple[float, float]], fill: int = -1
+    ) -> None:
+        if points and max(colour, fill) >= 0:
+            lines.append([kind, round(thickness, 2), colour, fill, [value for point in points for value in point]])
+
+    def _colour(self, rgba: Any) -> int:
+        """Return the number of a colour; -1 if it can't be seen."""
+        parts = [round(255 * min(1.0, max(0.0, part))) for part in (rgba.r, rgba.g, rgba.b, rgba.a)]
+        if not parts[3]:
+            return -1
+        return self._number.setdefault("#" + bytes(parts).hex(), len(self._number))
 
 
 @dataclass
@@ -63,6 +154,150 @@ class Clip:
         """Every second picture."""
         parts = self.t_ns[::2], self.numbers[::2], self.sizes[::2], self.jpegs[::2], self.drawn[::2]
         return Clip(self.layers, *parts, self.strokes)
+
+
+# The views that a notebook shows: those in the log, or else drawings of rows that have no view yet.
+#
+# Only runs write views. A channel that was only ingested, such as a ground truth, is drawn while it is shown.
+
+
+#: The channels that are drawn if there are no views, below the name of a camera: the first that there is.
+_BEST: Final = (f"retracks{FULL}", "retracks", "tracks", "detections", "truth")
+#: The time before the first picture from which pictures are drawn, for trails.
+_TRAIL_NS: Final = 3 * NS_PER_S
+
+
+class ShownView(NamedTuple):
+    """A view: its topic, or that of the rows which are drawn; and how its messages are read.
+
+    ``messages`` gives time in ns and payload of each message in a span of times, for rising times of pictures.
+    """
+
+    topic: str
+    messages: Callable[[Ints, tuple[int, int]], Iterator[tuple[int, bytes]]]
+    read: Callable[[bytes], Any]
+
+    def payloads(self, t_ns: Ints, span: tuple[int, int]) -> Iterator[bytes]:
+        """Yield the payloads of all messages in a span of times."""
+        return (payload for _, payload in self.messages(t_ns, span))
+
+    def payload_at(self, t_ns: Ints, span: tuple[int, int]) -> Callable[[int], bytes | None]:
+        """Return a function that gives the payload at exactly a time, for rising times; None if there is none."""
+        coming = self.messages(t_ns, span)
+        waiting = next(coming, None)
+
+        def at(time_ns: int) -> bytes | None:
+            nonlocal waiting
+            while waiting is not None and waiting[0] < time_ns:
+                waiting = next(coming, None)
+            return waiting[1] if waiting is not None and waiting[0] == time_ns else None
+
+        return at
+
+
+class ToShow(NamedTuple):
+    """The views that are shown, and the topic of the pictures that they are on; "" for the ground, from above.
+
+    ``t_ns`` are the times of the pictures or scenes.
+    """
+
+    views: list[ShownView]
+    pictures: str
+    t_ns: Ints
+
+
+def find_drawings(opened: log.Log, prefix: str, topics: Sequence[str]) -> ToShow:
+    """Return what is shown of a camera: given channels, or those that layouts show by default.
+
+    A given channel of pictures is shown with nothing on it. Pictures without anything to draw on them are shown, too,
+    with a warning. Raises McaptrackError if there is nothing to see, if a given channel can't be drawn, or if the views
+    of given ones don't fit together.
+    """
+    given = [_full(opened, prefix, topic) for topic in topics]
+    if len(given) == 1 and given[0] in opened.channels and holds_pictures(opened.channels[given[0]]):
+        return ToShow([], given[0], opened.times(given[0]))
+    without = [topic for topic in given if not _has_view(opened, topic)]
+    if without:
+        for topic in given:
+            _schema_of(opened, topic)
+        return _drawn_now(opened, prefix, given)
+    try:
+        shown = pipeline.find_views(opened, prefix, given)
+    except McaptrackError as error:
+        found = [topic for topic in _candidates(opened, prefix) if not given][:1]
+        if not found and (given or pipeline.camera_at(opened, prefix).pictures is None):
+            raise
+        if not found:
+            warn(f"nothing is drawn on the pictures: {error}", "nothing-found")
+        return _drawn_now(opened, prefix, found)
+    t_ns = opened.times(shown.pictures or shown.views[0])
+    return ToShow([_recorded(opened, topic) for topic in shown.views], shown.pictures, t_ns)
+
+
+def _full(opened: log.Log, prefix: str, topic: str) -> str:
+    """Return the topic of a channel that is given by its topic, or by its name below the camera."""
+    below = f"{prefix}/{topic.strip('/')}"
+    return below if topic not in opened.channels and below in opened.channels else topic
+
+
+def _has_view(opened: log.Log, topic: str) -> bool:
+    begin = tuple(one + suffix for one in (topic, topic + FULL) for suffix in views.SUFFIXES)
+    is_view = any(suffix in topic for suffix in views.SUFFIXES)
+    return is_view or any(one.startswith(begin) for one in opened.channels)
+
+
+def _candidates(opened: log.Log, prefix: str) -> list[str]:
+    """Return the channels of a camera that can be drawn, the best ones first."""
+    best = [f"{prefix}/{name}" for name in _BEST]
+    there = [*best, *sorted(pipeline.camera_at(opened, prefix).topics)]
+    return [one for one in dict.fromkeys(there) if one in opened.channels and _kind(opened.channels[one])]
+
+
+def _kind(channel: log.Channel) -> Schema | None:
+    return next((schema for schema in views.DRAWN if channel.holds(schema)), None)
+
+
+def _schema_of(opened: log.Log, topic: str) -> Schema:
+    """Return the schema of a channel to draw. Raises McaptrackError if it can't be drawn."""
+    schema = _kind(opened.channel(topic))
+    if schema is None:
+        there = list_names(sorted(one.topic for one in opened.channels.values() if _kind(one)))
+        raise McaptrackError(f"{opened.path}: {topic} has no boxes, tracks or predictions to draw; there are {there}")
+    return schema
+
+
+def _recorded(opened: log.Log, topic: str) -> ShownView:
+    def messages(_: Ints, span: tuple[int, int]) -> Iterator[tuple[int, bytes]]:
+        return ((message.t_ns, message.payload) for message in opened.messages(topic, *span))
+
+    return ShownView(topic, messages, message_decoder(opened, topic))
+
+
+def _drawn_now(opened: log.Log, prefix: str, topics: Sequence[str]) -> ToShow:
+    """Return drawings of channels: on the pictures of the camera, or on the ground."""
+    pictures = pipeline.camera_at(opened, prefix).pictures
+    t_ns = opened.times(pictures or topics[0])
+    return ToShow([_drawing(opened, prefix, topic, pictures is None) for topic in topics], pictures or "", t_ns)
+
+
+def _drawing(opened: log.Log, prefix: str, topic: str, is_above: bool) -> ShownView:
+    schema = _schema_of(opened, topic)
+    frames = opened.frame_columns(topic, schema)
+    if is_above and schema is not PREDICTIONS and not has_any(schema, frames, lambda rows: np.isfinite(rows["x_m"])):
+        raise McaptrackError(
+            f"{opened.path} has no pictures of {prefix}, and {topic} no positions in metres to show from above; "
+            "with a ground plane, it has"
+        )
+    names = class_names(opened.channel(topic).metadata)
+    path, _ = path_of(opened, prefix, tracks_topic(prefix))
+    drawing = views.Drawing(topic, schema, frames, pipeline.read_planes(opened, prefix) or (), classes=names, path=path)
+
+    def messages(t_ns: Ints, span: tuple[int, int]) -> Iterator[tuple[int, bytes]]:
+        times = np.unique(t_ns[(t_ns >= span[0] - _TRAIL_NS) & (t_ns < span[1])])
+        drawn = drawing.on_ground(times, "") if is_above else drawing.on_pictures(times, times)
+        return ((at_ns, payload) for at_ns, _, payload in drawn if span[0] <= at_ns < span[1])
+
+    return ShownView(topic, messages, message_class(SCENE if is_above else ANNOTATIONS).FromString)
 
 
 class PictureSource:

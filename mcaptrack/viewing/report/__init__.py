@@ -12,6 +12,7 @@ log got past the escaping.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -21,13 +22,13 @@ from mcaptrack import SCHEMA_VERSION, __version__, foxglove
 from mcaptrack.evaluation import EvaluationRow, metrics
 from mcaptrack.evaluation.people import Intervals
 from mcaptrack.foxglove.palette import COUNT as COLOURS
-from mcaptrack.viewing.report import figures, lineage, sections
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.viewing.report import figures, sections
 from mcaptrack.viewing.report.charts import Axis, pairs_chart, ranges_chart, round_most
 from mcaptrack.viewing.report.contents import LogReport, gather
 from mcaptrack.viewing.report.fleet_page import fleet_data, fleet_page
-from mcaptrack.viewing.report.formatting import NONE, counted, number, percent
+from mcaptrack.viewing.report.formatting import NONE, counted, number, percent, render
 from mcaptrack.viewing.report.headline import BeforeAfter
-from mcaptrack.viewing.report.html import render
 from mcaptrack.viewing.report.identity_timeline import identity_timeline, people_over_time
 from mcaptrack.viewing.report.summary import (
     before_after,
@@ -64,6 +65,61 @@ def _without_curve(result: EvaluationRow) -> dict[str, Any]:
     return values
 
 
+# The file itself, and the provenance of its channels.
+
+
+_GROUND: Final = {
+    "given": "measured",
+    "estimated": "estimated from boxes of people",
+    "assumed": "guessed from the size of people",
+    None: "none",
+}
+_MAX_DEPTH: Final = 6
+
+
+def provenance(report: LogReport) -> dict[str, Any]:
+    """The values of the section: the file, and its channels in the order in which they were made, without views."""
+    data = report.data
+    span = "no messages"
+    if data["start_ns"] is not None:
+        span = f"{data['start_ns'] / NS_PER_S:.3f} to {data['end_ns'] / NS_PER_S:.3f} s"
+    channels = _by_lineage([channel for channel in data["channels"] if channel["transform"] != "view"])
+    return {
+        "log": data,
+        "span": span,
+        "ground_plane": _GROUND[data["ground_plane"]],
+        "channels": [channel | {"parameters": _parameters(channel)} for channel in channels],
+    }
+
+
+def _by_lineage(channels: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Channels, each after the one that it was made from, with their depth."""
+    topics = {channel["topic"] for channel in channels}
+    made_from: dict[str | None, list[dict[str, Any]]] = {}
+    for channel in channels:
+        made_from.setdefault(channel["input"], []).append(channel)
+    out: dict[str, dict[str, Any]] = {}
+    roots = [channel for channel in channels if channel["input"] not in topics]
+    for root in (*roots, *channels):  # channels in a cycle have no root
+        waiting = [(root, 0)]
+        while waiting:
+            channel, depth = waiting.pop()
+            if channel["topic"] not in out:
+                out[channel["topic"]] = channel | {"depth": min(depth, _MAX_DEPTH)}
+                waiting += [(other, depth + 1) for other in reversed(made_from.get(channel["topic"], []))]
+    return list(out.values())
+
+
+def _parameters(channel: dict[str, Any]) -> list[str]:
+    """The parameters of a channel as text."""
+    values = channel["parameters"] or {}
+    return [
+        f"{key} {value if isinstance(value, str) else json.dumps(value)}"
+        for key, value in sorted(values.items())
+        if key != "ground_planes"
+    ]
+
+
 def draw(report: LogReport, at: int, total: int) -> None:
     """Render the part of the page on one log, number ``at`` of ``total``, and release its tracks and pictures."""
     report.html = render(
@@ -79,7 +135,7 @@ def draw(report: LogReport, at: int, total: int) -> None:
         forecasts=sections.forecasts(report),
         motion=sections.motion(report),
         zones=report.zones,
-        lineage=lineage.provenance(report),
+        lineage=provenance(report),
         notes=report.notes,
         people=report.has_only_people,
     )

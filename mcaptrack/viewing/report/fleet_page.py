@@ -13,8 +13,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.viewing.report import fleet
 from mcaptrack.viewing.report.charts import Axis, Line, line_chart, round_most
 from mcaptrack.viewing.report.fleet import Row
-from mcaptrack.viewing.report.formatting import NONE, counted, number, percent, plain
-from mcaptrack.viewing.report.html import render
+from mcaptrack.viewing.report.formatting import NONE, counted, number, percent, plain, render
 
 #: The columns of a log in the data of the page.
 _KEPT: Final = (

@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+import base64
 import math
 from collections.abc import Mapping
+from functools import cache
 from typing import Any, Final
+from urllib.parse import quote
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from mcaptrack.evaluation.metrics.displacement import TAU_M2, Displacement
+from mcaptrack.viewing.report.charts import WIDTH, Axis, Line, line_chart, round_most, thinned
 
 #: Printed in place of a number that is missing.
 NONE: Final = "\N{EN DASH}"
@@ -58,3 +68,91 @@ def plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(key): plain(part) for key, part in value.items()}
     return [plain(part) for part in value] if isinstance(value, list | tuple) else value
+
+
+# The templates of the page. They escape every value that they print.
+#
+# Names in logs may hold anything. Templates print them in text and in quoted attributes only: never in a style or
+# as the name of an element, and in a link only quoted and after "./", as the path of a file. Ids in the page are
+# made of numbers. Control characters and marks that change the direction of writing are replaced.
+
+
+_BLANKS: Final = "\n\N{NO-BREAK SPACE}\N{NARROW NO-BREAK SPACE}"
+
+
+@cache
+def environment() -> Environment:
+    """The environment of the templates in ``templates/``: escaping is on, and a missing value is an error."""
+    out = Environment(
+        loader=PackageLoader(__package__ or ""),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=_printable,
+    )
+    out.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
+    out.filters |= {"number": number, "percent": percent, "counted": counted, "base64": _base64, "address": quote}
+    return out
+
+
+def render(template: str, **values: Any) -> Markup:
+    """A template filled with values."""
+    return Markup(environment().get_template(template).render(values))  # noqa: S704 - templates escape
+
+
+def _printable(value: Any) -> Any:
+    if value is None:
+        raise ValueError("a template prints a value that is None")
+    if isinstance(value, str) and not isinstance(value, Markup):
+        return "".join(c if c.isprintable() or c in _BLANKS else "\N{REPLACEMENT CHARACTER}" for c in value)
+    return value
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode()
+
+
+# Curves of displacement error over recall, as an SVG that stands alone: the figures of the paper.
+
+
+#: Roles of the lines: their colours are in the template.
+COLOURS: Final = 8
+#: Up to this recall the mean is one of a few forecasts, and not drawn.
+_LEAST_RECALL: Final = 0.02
+
+
+def curves_svg(forecasts: Mapping[str, Displacement]) -> str:
+    """The ADE over recall of several sets of forecasts, by name: in metres, and squared as the paper has it.
+
+    A dot is where the pasts of tracks and people differ by 2 m², the threshold of the scores.
+
+    Parameters
+    ----------
+    forecasts : mapping of str to Displacement
+
+    Returns
+    -------
+    str
+        An SVG document.
+    """
+    charts = [
+        _chart(forecasts, squared=False, title="ADE over recall"),
+        _chart(forecasts, squared=True, title="Squared ADE over recall (the paper's)"),
+    ]
+    return str(render("curves.svg", charts=charts, width=WIDTH + 100))
+
+
+def _chart(forecasts: Mapping[str, Displacement], squared: bool, title: str) -> dict[str, object]:
+    lines = []
+    for number, (name, one) in enumerate(forecasts.items()):
+        recall, error = one.curve(squared)
+        shown = recall > _LEAST_RECALL
+        x, y = thinned(recall[shown], error[shown])
+        count = int((one.d_obs_m2 < TAU_M2).sum())
+        dot = (float(recall[count - 1]), float(error[count - 1])) if count else None
+        lines.append(Line(name, f"c{number % COLOURS}", x, y, dot=dot))
+    # The wrong pairs at the end of a curve have errors without bound: the axis ends where all lines can be told apart.
+    most = round_most(np.quantile(line.y, [0.9]) if len(line.y) else line.y for line in lines)
+    unit = "m²" if squared else "m"
+    return line_chart(title, lines, Axis("recall: share of people with a forecast", 1.0), Axis(f"ADE, {unit}", most))

@@ -10,7 +10,6 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.evaluation.occupancy import occupancy
 from mcaptrack.foxglove.palette import COUNT as COLOURS
 from mcaptrack.geometry.arrays import Floats, Image, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
@@ -20,6 +19,7 @@ from mcaptrack.geometry.ragged import run_ends, run_starts
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import encode_image
+from mcaptrack.viewing.heat_map import occupancy
 from mcaptrack.viewing.report.charts import round_step
 from mcaptrack.viewing.report.formatting import number
 from mcaptrack.viewing.report.statistics import rows_by_track

@@ -11,7 +11,7 @@ import numpy as np
 from mcaptrack.errors import command
 from mcaptrack.evaluation import EvaluationRow
 from mcaptrack.evaluation.metrics import summary
-from mcaptrack.evaluation.metrics.calibration import LEVELS
+from mcaptrack.evaluation.metrics.displacement import LEVELS
 from mcaptrack.viewing.report.charts import Axis, Bars, Line, histogram_chart, line_chart, round_most
 from mcaptrack.viewing.report.contents import LogReport
 from mcaptrack.viewing.report.formatting import counted, number, percent, short

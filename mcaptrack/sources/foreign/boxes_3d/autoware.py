@@ -21,7 +21,7 @@ from mcaptrack.sources.foreign.boxes_3d.box import (
     rotated,
     vector,
 )
-from mcaptrack.sources.foreign.values import integer, to_bytes
+from mcaptrack.sources.foreign.decoding import integer, to_bytes
 
 #: The labels of ObjectClassification, for messages without their definition (JSON). Earlier ones had no bus.
 _CLASSES: Final = {

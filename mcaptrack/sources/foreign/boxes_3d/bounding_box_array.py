@@ -6,7 +6,7 @@ from math import nan
 from typing import Any
 
 from mcaptrack.sources.foreign.boxes_3d.box import Box3d, Message3d, head_of, number, own_head, part, quaternion, vector
-from mcaptrack.sources.foreign.values import integer
+from mcaptrack.sources.foreign.decoding import integer
 
 
 def boxes_of(message: Any) -> Message3d:

@@ -10,7 +10,7 @@ from functools import lru_cache
 from math import isfinite, nan
 from typing import Any, Final, NamedTuple
 
-from mcaptrack.sources.foreign.values import integer, stamp_of, text
+from mcaptrack.sources.foreign.decoding import integer, stamp_of, text
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

@@ -20,7 +20,7 @@ from mcaptrack.sources.foreign.boxes_3d.box import (
     vector,
     words_of,
 )
-from mcaptrack.sources.foreign.values import integer, text
+from mcaptrack.sources.foreign.decoding import integer, text
 
 _CUBE, _CUBE_LIST, _TEXT, _ADD = 1, 6, 9, 0
 #: Namespaces that say nothing about the class of their markers.

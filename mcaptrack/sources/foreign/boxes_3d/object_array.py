@@ -21,7 +21,7 @@ from mcaptrack.sources.foreign.boxes_3d.box import (
     rotated,
     vector,
 )
-from mcaptrack.sources.foreign.values import integer
+from mcaptrack.sources.foreign.decoding import integer
 
 #: The classes of derived_object_msgs/Object, for messages without their definition (JSON).
 _CLASSES: Final = {

@@ -10,7 +10,7 @@ from math import nan
 from typing import Any, Final
 
 from mcaptrack.sources.foreign.boxes_3d.box import Box3d, Message3d, number, part, quaternion, vector, words_of
-from mcaptrack.sources.foreign.values import stamp_of, text
+from mcaptrack.sources.foreign.decoding import stamp_of, text
 
 #: Keys of metadata, in lower case and without separators, the first that there is.
 _CLASS: Final = ("class", "classname", "label", "category", "type", "objectclass", "classification", "objecttype")

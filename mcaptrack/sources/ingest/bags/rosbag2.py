@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,7 +22,6 @@ from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.ingest.bags import decompression
 from mcaptrack.sources.ingest.bags.metadata_yaml import METADATA, Bag, holds_metadata, read_metadata
 from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
-from mcaptrack.sources.ingest.bags.ros_definitions import known_definition
 from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables
 
 _MCAP_MAGIC, _SQLITE_MAGIC, _ZSTD_MAGIC = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
@@ -189,6 +189,30 @@ class _Files:
                 self.findings.lost.append(
                     f"{self.whole}: {METADATA} counts {messages} messages of {topic}, and {holds[topic]} are there"
                 )
+
+
+# Definitions of standard ROS messages, from rosbags, for recordings that don't contain them.
+
+
+@cache
+def known_definition(kind: str, distro: str, digest: str) -> tuple[str, str]:
+    """The definition of a message type, and the ROS distribution that it is from.
+
+    That is the given distribution, or else the newest one with the same type hash; ("", "") if there is none.
+    """
+    from rosbags.typesys import Stores, get_typestore
+
+    all_stores = {store.value.removeprefix("ros2_"): store for store in Stores if store.value.startswith("ros2_")}
+    named = {distro: all_stores[distro]} if distro in all_stores else {}
+    for name, store in (named or dict(reversed(all_stores.items()))).items():
+        types = get_typestore(store)
+        try:
+            if digest.startswith("RIHS01_") and types.hash_rihs01(kind) != digest:
+                continue
+            return types.generate_msgdef(kind, ros_version=2)[0], f"ROS 2 {name.capitalize()}"
+        except Exception:  # noqa: BLE001, PERF203, S112, RUF100  # it raises various exceptions for unknown types
+            continue
+    return "", ""
 
 
 class Databases(_Files):

@@ -19,10 +19,9 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.notices import Code
 from mcaptrack.schema.classes import PERSON, UNKNOWN, is_person
-from mcaptrack.sources.ingest.labels.content import NO_ID, ClassIds, Format, IgnoredBoxes, Labels
+from mcaptrack.sources.ingest.labels.content import NO_ID, ClassIds, Format, IgnoredBoxes, Labels, WantedClasses
 from mcaptrack.sources.ingest.labels.formats import MAX_FRAME, MAX_PLACE, MAX_SCORE
 from mcaptrack.sources.ingest.labels.number_table import EXACT
-from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
 #: Formats of other detectors and annotation tools.
 OTHERS: Final[tuple[Format, ...]] = ("coco", "cvat", "yolo", "supervision", "csv")

@@ -21,10 +21,9 @@ from mcaptrack.geometry.arrays import Floats
 from mcaptrack.schema.classes import PERSON, is_person
 from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows, FrameNames, TrackIds
 from mcaptrack.sources.ingest.labels.columns import choose_columns
-from mcaptrack.sources.ingest.labels.content import NO_ID, Format, Labels
+from mcaptrack.sources.ingest.labels.content import NO_ID, Format, Labels, WantedClasses
 from mcaptrack.sources.ingest.labels.formats import ClassNames
 from mcaptrack.sources.ingest.labels.number_table import Lines, NumberTable, lines_of
-from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
 #: Columns that supervision writes before those of the user.
 SUPERVISION: Final = ("x_min", "y_min", "x_max", "y_max", "class_id", "confidence", "tracker_id")

@@ -28,9 +28,8 @@ from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.schema.classes import PERSON
-from mcaptrack.sources.ingest.labels.content import NO_ID, ClassIds, Format, IgnoredBoxes, Labels
+from mcaptrack.sources.ingest.labels.content import NO_ID, ClassIds, Format, IgnoredBoxes, Labels, WantedClasses
 from mcaptrack.sources.ingest.labels.number_table import Lines, NumberTable
-from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
 #: Coordinates, in pixels or metres, and scores can't be larger.
 MAX_PLACE: Final = 1e8

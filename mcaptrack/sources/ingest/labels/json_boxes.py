@@ -26,9 +26,8 @@ from mcaptrack.sources.ingest.labels.box_rows import (
     TrackIds,
     numbers_of_names,
 )
-from mcaptrack.sources.ingest.labels.content import NO_ID, Format, Labels
+from mcaptrack.sources.ingest.labels.content import NO_ID, Format, Labels, WantedClasses
 from mcaptrack.sources.ingest.labels.delimited import read_rows
-from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
 _MAX_BYTES: Final = 512 * 2**20
 _MAX_ROWS: Final = 10_000_000

@@ -22,13 +22,12 @@ from mcaptrack.choices import Role
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.notices import Code
 from mcaptrack.schema.spill import SpillFile, Stored
-from mcaptrack.sources.ingest.labels.content import ClassIds, Format, Labels, step_of
-from mcaptrack.sources.ingest.labels.cvat_files import is_cvat
+from mcaptrack.sources.ingest.labels.content import ONLY_PEOPLE, ClassIds, Format, Labels, WantedClasses, step_of
+from mcaptrack.sources.ingest.labels.cvat import is_cvat
 from mcaptrack.sources.ingest.labels.formats import READERS
 from mcaptrack.sources.ingest.labels.json_boxes import is_json
 from mcaptrack.sources.ingest.labels.number_table import lines_of
 from mcaptrack.sources.ingest.labels.reading import in_order, read_labels, refuse_repeated_ids, text_format
-from mcaptrack.sources.ingest.labels.wanted import ONLY_PEOPLE, WantedClasses
 
 _Values = TypeVar("_Values", Ints, ClassIds)
 

@@ -13,14 +13,12 @@ from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
 from mcaptrack.sources.ingest.labels.columns import choose_columns
-from mcaptrack.sources.ingest.labels.content import FORMATS_3D, Format, Labels
-from mcaptrack.sources.ingest.labels.cvat import read_cvat
-from mcaptrack.sources.ingest.labels.cvat_files import is_cvat
+from mcaptrack.sources.ingest.labels.content import FORMATS_3D, ONLY_PEOPLE, Format, Labels, WantedClasses
+from mcaptrack.sources.ingest.labels.cvat import is_cvat, read_cvat
 from mcaptrack.sources.ingest.labels.delimited import MAX_LINE, SUPERVISION, comment_header, header_of, read_csv
 from mcaptrack.sources.ingest.labels.formats import READERS
 from mcaptrack.sources.ingest.labels.json_boxes import is_json, read_json
 from mcaptrack.sources.ingest.labels.number_table import lines_of, split
-from mcaptrack.sources.ingest.labels.wanted import ONLY_PEOPLE, WantedClasses
 from mcaptrack.sources.ingest.labels.yolo import read_yolo
 
 _MOT_COLUMNS: Final = {"frame": 0, "id": 1, "x": 2, "y": 3, "w": 4, "h": 5}

@@ -18,9 +18,8 @@ from mcaptrack.geometry.arrays import Floats
 from mcaptrack.notices import Code
 from mcaptrack.sources.ingest.bags import plain_yaml
 from mcaptrack.sources.ingest.labels.box_rows import BoxRows, numbers_of_names
-from mcaptrack.sources.ingest.labels.content import NO_ID, Labels
+from mcaptrack.sources.ingest.labels.content import NO_ID, Labels, WantedClasses
 from mcaptrack.sources.ingest.labels.number_table import NumberTable, lines_of
-from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 from mcaptrack.sources.video.image_folder import IMAGE_SUFFIXES, natural_order
 
 _NAMES: Final = ("classes.txt", "obj.names", "_classes.txt", "labels.txt")

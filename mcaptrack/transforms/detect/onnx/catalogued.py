@@ -8,8 +8,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import ClassVar
 
-from mcaptrack.transforms.detect.onnx.catalogue import check, find, stored
 from mcaptrack.transforms.detect.onnx.detector import NETWORK, LayoutChoice, OnnxDetector
+from mcaptrack.transforms.detect.onnx.session import check, find, stored
 from mcaptrack.transforms.protocol import Suited, option
 
 

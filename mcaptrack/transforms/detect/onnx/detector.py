@@ -7,6 +7,7 @@ Letters: N boxes.
 
 from __future__ import annotations
 
+import difflib
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -27,12 +28,17 @@ from mcaptrack.geometry.boxes import parse_size
 from mcaptrack.networks import Device, NetworkFile, NetworkLimits, digest_of, read_file
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
-from mcaptrack.transforms.detect.onnx import classes as known_classes
-from mcaptrack.transforms.detect.onnx.convention import Contest, Found, choose, refuse_if_misread
-from mcaptrack.transforms.detect.onnx.layouts import Layout, class_count, possible, recognised
-from mcaptrack.transforms.detect.onnx.nms import Boxes, join_tiles, suppress
-from mcaptrack.transforms.detect.onnx.outputs import MisreadError
-from mcaptrack.transforms.detect.onnx.placing import Size, Tile, place, tiles_of
+from mcaptrack.schema.classes import PEOPLE, PERSON
+from mcaptrack.transforms.detect.onnx.layouts import (
+    LAYOUTS,
+    Layout,
+    NetworkSignature,
+    class_count,
+    possible,
+    recognised,
+)
+from mcaptrack.transforms.detect.onnx.nms import Boxes, Size, Tile, join_tiles, place, suppress, tiles_of
+from mcaptrack.transforms.detect.onnx.outputs import SURE, MisreadError
 from mcaptrack.transforms.detect.onnx.session import DetectorNetwork, workers
 from mcaptrack.transforms.protocol import Colour, ModelCard, Suited, check_options, option
 
@@ -50,6 +56,102 @@ _MOST_TILES: Final = 64
 _KEPT: Final = 4
 #: So many classes without a name are listed.
 _SHOWN: Final = 8
+
+
+# The classes of a detector: their names, the ones that are wanted, and their numbers in rows.
+
+
+#: The classes of COCO in the order of networks that count 80.
+COCO: Final = tuple(
+    """
+    person, bicycle, car, motorcycle, airplane, bus, train, truck, boat, traffic light, fire hydrant, stop sign,
+    parking meter, bench, bird, cat, dog, horse, sheep, cow, elephant, bear, zebra, giraffe, backpack, umbrella,
+    handbag, tie, suitcase, frisbee, skis, snowboard, sports ball, kite, baseball bat, baseball glove, skateboard,
+    surfboard, tennis racket, bottle, wine glass, cup, fork, knife, spoon, bowl, banana, apple, sandwich, orange,
+    broccoli, carrot, hot dog, pizza, donut, cake, chair, couch, potted plant, bed, dining table, toilet, tv, laptop,
+    mouse, remote, keyboard, cell phone, microwave, oven, toaster, sink, refrigerator, book, clock, vase, scissors,
+    teddy bear, hair drier, toothbrush
+    """.replace("\n    ", " ")
+    .strip()
+    .split(", ")
+)
+#: The numbers up to 90 that COCO's own numbers of categories leave out.
+_LEFT_OUT: Final = frozenset({0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83})
+
+
+def names_of(declared: Mapping[int, str], count: int | None) -> dict[int, str]:
+    """The names of classes by index: as the file declares them, or COCO's for 80, 91 or an unknown number of classes.
+
+    The only class of a network is a person. Others without names are called by their index.
+    """
+    if declared:
+        return dict(declared)
+    if count in (80, None):
+        return dict(enumerate(COCO))
+    if count in (90, 91):
+        numbers = [number for number in range(91) if number not in _LEFT_OUT]
+        return dict(zip(numbers, COCO, strict=True))
+    return {0: PEOPLE[0]} if count == 1 else {index: str(index) for index in range(count)}
+
+
+def numbers_of(names: Mapping[int, str]) -> dict[int, int]:
+    """The number of each class in rows: 1 is a person and nothing else, 0 stays free for what is unknown.
+
+    Others keep their index, plus one where the network counts from 0; the one that would be 1 takes the number of
+    people, or the next one after all if there are none.
+    """
+    first = 0 if 0 not in names else 1
+    people = _people(names)
+    numbers = {index: index + first for index in names}
+    free = max(numbers.values(), default=0) + 1 if people is None else numbers[people]
+    for index, number in numbers.items():
+        if people is not None and names[index].casefold() == names[people].casefold():
+            numbers[index] = PERSON
+        elif number == PERSON:
+            numbers[index] = free
+    return numbers
+
+
+def wanted(names: Mapping[int, str], classes: str, where: str) -> list[int]:
+    """The indices of classes that are wanted: names or indices with commas between them, or ``all``.
+
+    Raises McaptrackError, which begins with ``where``, for one that there is not.
+    """
+    if are_all(classes):
+        return sorted(names)
+    by_name: dict[str, list[int]] = {}
+    for index, name in names.items():  # two classes may have one name
+        by_name.setdefault(name.casefold(), []).append(index)
+    out: set[int] = set()
+    for word in filter(None, (word.strip().casefold() for word in classes.split(","))):
+        people = _people(names) if word == PEOPLE[0] else None
+        found = by_name.get(word) or ([] if people is None else by_name[names[people].casefold()])
+        if not found and word.isdecimal() and int(word) in names:
+            found = [int(word)]
+        if not found:
+            close = difflib.get_close_matches(word, by_name, 1)
+            meant = f"did you mean {close[0]}? " if close else ""
+            raise McaptrackError(f"{where} has no class {word!r}; {meant}`classes=` takes {_known(names)}")
+        out.update(found)
+    if not out:
+        raise McaptrackError(f"`classes=` names none; {where} has {_known(names)}")
+    return sorted(out)
+
+
+def are_all(classes: str) -> bool:
+    """Whether every class is wanted."""
+    return classes.strip().casefold() == "all"
+
+
+def _known(names: Mapping[int, str]) -> str:
+    some = ", ".join(list(names.values())[:10])
+    return f"{some} and {len(names) - 10} more, or all" if len(names) > 10 else f"{some}, or all"
+
+
+def _people(names: Mapping[int, str]) -> int | None:
+    """The first index of the class of people."""
+    by_name = {name.casefold(): index for index, name in reversed(list(names.items()))}
+    return next((by_name[name] for name in PEOPLE if name in by_name), None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,8 +267,139 @@ class OnnxDetector:
 
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
         """Why there are no detections, for a warning."""
-        what = "nothing" if known_classes.are_all(self.classes) else f"no {self.classes}"
+        what = "nothing" if are_all(self.classes) else f"no {self.classes}"
         return f"the network finds {what} with a score of at least {self.min_score:g}"
+
+
+# Which layout a network has: by its inputs and outputs, or where several fit, by what each finds in pictures.
+
+
+#: What a layout finds in a picture, or why the outputs can't be read by it.
+Found = Boxes | MisreadError
+#: A layout is taken if its evidence is so many times that of each other one.
+_CLEAR: Final = 2.0
+#: After so many pictures with evidence for several layouts it can't be told.
+_PATIENCE: Final = 25
+
+
+def evidence(boxes: Boxes) -> float:
+    """The amount of certain evidence: the sum of high scores."""
+    return float(boxes.score[boxes.score >= SURE].sum())
+
+
+def choose(path: Path, name: str, seen: NetworkSignature) -> list[Layout]:
+    """The layouts that a network may have: the one of this name, or for "auto" all that fit.
+
+    Raises McaptrackError if the outputs fit none, or not this one.
+    """
+    fitting = possible(seen)
+    if name == "auto":
+        if found := recognised(seen):
+            return found
+        if fitting:
+            names = ", ".join(layout.name for layout in fitting)
+            raise McaptrackError(f"{path} {_outputs(seen)}; its layout may be one of {names}: choose with `layout=`")
+        raise McaptrackError(f"{path} {_outputs(seen)}, as no detector of a known layout does ({_all()})")
+    if not LAYOUTS[name].fits(seen):
+        others = ", ".join(layout.name for layout in fitting)
+        fits = f"that fits {others}" if others else f"that fits no layout ({_all()})"
+        raise McaptrackError(f"{path} {_outputs(seen)}, which a detector of layout {name} does not; {fits}")
+    return [LAYOUTS[name]]
+
+
+class Contest:
+    """Which of several layouts a network has, by what each finds in pictures that are seen in order.
+
+    ``layouts`` are those that are still possible, one once it is settled.
+    """
+
+    def __init__(self, path: Path, layouts: Sequence[Layout]) -> None:
+        self._path = path
+        self.layouts = list(layouts)
+        self._sums = {layout.name: 0.0 for layout in layouts}
+        self._pictures = 0
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether one layout is left."""
+        return len(self.layouts) == 1
+
+    def see(self, found: Mapping[str, Found]) -> None:
+        """Judge by what each layout finds in a picture.
+
+        Raises McaptrackError if none is left, or if it can't be told.
+        """
+        if self.is_settled:
+            return
+        boxes = {name: one for name, one in found.items() if isinstance(one, Boxes)}
+        if not any(layout.name in boxes for layout in self.layouts):
+            why = "; ".join(f"read as {layout.name}, {found[layout.name]}" for layout in self.layouts)
+            raise McaptrackError(f"{self._path} fits no layout: {why}")
+        self._keep([layout for layout in self.layouts if layout.name in boxes])
+        for layout in self.layouts:
+            self._sums[layout.name] += evidence(boxes[layout.name])
+        ordered = sorted(self.layouts, key=lambda layout: -self._sums[layout.name])
+        best, second = (self._sums[layout.name] for layout in (ordered * 2)[:2])
+        self._pictures += best > 0
+        if len(ordered) == 1 or (best > 0 and best >= _CLEAR * second):
+            self._keep(ordered[:1])
+        elif self._pictures >= _PATIENCE:
+            raise McaptrackError(self._unclear())
+
+    def end(self) -> None:
+        """Settle on what is left, after the last picture. Raises McaptrackError if it can't be told."""
+        if not self.is_settled and self._pictures:
+            raise McaptrackError(self._unclear())
+        self._keep(self.layouts[:1])
+
+    def _keep(self, layouts: list[Layout]) -> None:
+        self.layouts = layouts
+
+    def _unclear(self) -> str:
+        names = " and ".join(layout.name for layout in self.layouts)
+        return f"{self._path} finds much the same read as {names}; choose with `layout=`"
+
+
+def refuse_if_misread(
+    path: Path, layout: Layout, pictures: int, found: Mapping[str, Sequence[Found]], is_chosen: bool
+) -> None:
+    """Refuse a network that found nothing in any picture though another layout finds boxes in some of them.
+
+    Parameters
+    ----------
+    path : Path
+        Of the network.
+    layout : Layout
+        The layout by which it found nothing.
+    pictures : int
+        How many pictures there were.
+    found : mapping of str to sequence of Boxes or MisreadError
+        What each other layout that fits finds in some of the pictures.
+    is_chosen : bool
+        Whether the layout was named.
+
+    """
+    for name, boxes in found.items():
+        with_boxes = [one for one in boxes if isinstance(one, Boxes) and evidence(one) > 0]
+        if with_boxes:
+            count = sum(int((one.score >= SURE).sum()) for one in with_boxes)
+            instead = f"choose `layout={name!r}`" if is_chosen else "choose with `layout=`"
+            raise McaptrackError(
+                f"{path}, read as {layout.name}, finds nothing in {pictures} pictures, and read as {name} finds "
+                f"{count} boxes in {len(with_boxes)} of {len(boxes)}; {instead}"
+            )
+
+
+def _outputs(seen: NetworkSignature) -> str:
+    some = [f"{name} {' x '.join(map(str, array.shape)) or 'a number'}" for name, array in seen.outputs.items()]
+    more = f" and {len(some) - 6} more" if len(some) > 6 else ""
+    names = f", with {seen.names} names of classes" if seen.names else ""
+    size = f"{seen.size[0]}x{seen.size[1]}"
+    return f"takes {', '.join(seen.inputs)} and gives {', '.join(some[:6])}{more} at {size}{names}"
+
+
+def _all() -> str:
+    return ", ".join(LAYOUTS)
 
 
 class _Seen(NamedTuple):
@@ -188,10 +421,10 @@ class _Run:
         seen = network.signature
         layouts = choose(file.path, options.layout, seen)
         count = class_count(layouts[0], seen)
-        self._names, self._is_named = known_classes.names_of(network.names, count), bool(network.names)
+        self._names, self._is_named = names_of(network.names, count), bool(network.names)
         self._unknown: Counter[int] = Counter()
-        self._wanted = np.array(known_classes.wanted(self._names, options.classes, str(file.path)), np.int64)
-        self._numbers = known_classes.numbers_of(self._names)
+        self._wanted = np.array(wanted(self._names, options.classes, str(file.path)), np.int64)
+        self._numbers = numbers_of(self._names)
         self._contest = Contest(file.path, layouts)
 
     def detect(self, frames: Iterator[Frame]) -> Iterator[tuple[_Seen, Boxes]]:

@@ -29,9 +29,8 @@ from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.transforms.detect.onnx import outputs as read
-from mcaptrack.transforms.detect.onnx.nms import Boxes
+from mcaptrack.transforms.detect.onnx.nms import Boxes, Fit, Size
 from mcaptrack.transforms.detect.onnx.outputs import Outputs
-from mcaptrack.transforms.detect.onnx.placing import Fit, Size
 
 LayoutName = Literal["yolox", "yolox-legacy", "nanodet", "rtdetr", "dfine", "rfdetr", "ultralytics"]
 

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.transforms.detect.onnx.nms import Boxes
-from mcaptrack.transforms.detect.onnx.placing import Size
+from mcaptrack.transforms.detect.onnx.nms import Boxes, Size
 
 Outputs = Mapping[str, NDArray[Any]]
 

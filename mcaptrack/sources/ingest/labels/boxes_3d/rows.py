@@ -22,9 +22,8 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import Code
 from mcaptrack.schema.classes import PEOPLE, PERSON, UNKNOWN
-from mcaptrack.sources.ingest.labels.content import ClassIds, Format
+from mcaptrack.sources.ingest.labels.content import ClassIds, Format, WantedClasses
 from mcaptrack.sources.ingest.labels.formats import MAX_FRAME, MAX_PLACE, MAX_SCORE
-from mcaptrack.sources.ingest.labels.wanted import WantedClasses
 
 #: The track id of rows without one.
 NO_ID: Final = -1
