@@ -126,13 +126,14 @@ def predictors() -> str:
 def metrics() -> str:
     """The metrics, and what they are computed from."""
     from importlib import import_module
+    from pkgutil import iter_modules
 
     from mcaptrack.evaluation import metrics
 
     parts = [_references(metrics, metrics.__all__)]
-    for name in ("clear", "identity", "hota", "displacement", "calibration"):
-        module = import_module(f"{metrics.__name__}.{name}")
-        own = [each for each, found in vars(module).items() if getattr(found, "__module__", "") == module.__name__]
+    for found in iter_modules(metrics.__path__, f"{metrics.__name__}."):
+        module = import_module(found.name)
+        own = [each for each, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__]
         parts.append(_references(module, [each for each in own if not each.startswith("_")], set(metrics.__all__)))
     return "\n\n".join(parts)
 
