@@ -57,7 +57,8 @@ def stage_options() -> str:
 
 def _parameter(transform: Any, field: Any) -> str:
     """The row of a parameter of a transform."""
-    from mcaptrack.transforms.protocol import bare_type, choices, limits
+    from mcaptrack.ranges import limits
+    from mcaptrack.transforms.protocol import bare_type, choices
 
     kind = bare_type(get_type_hints(type(transform))[field.name])
     value = getattr(transform, field.name)
@@ -77,8 +78,8 @@ def other_numbers() -> str:
 
     from mcaptrack.cli import app
     from mcaptrack.cli.many import NAMES
+    from mcaptrack.ranges import limits
     from mcaptrack.transforms import STAGES
-    from mcaptrack.transforms.protocol import limits
 
     sections = []
     for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]
@@ -101,8 +102,6 @@ def other_numbers() -> str:
 
 def tables() -> str:
     """All tables with their columns, as Markdown."""
-    import pyarrow as pa
-
     from mcaptrack.tables import TABLES
 
     sections = []
@@ -112,8 +111,8 @@ def tables() -> str:
         rows = []
         for field in table.arrow:
             about = {name.decode(): value.decode() for name, value in field.metadata.items()}
-            is_text = pa.types.is_dictionary(field.type) or pa.types.is_string(field.type)
-            kind = f"{'text' if is_text else field.type}{', may be null' if field.nullable else ''}"
+            kind = re.sub(r"^(string|dictionary<.*)$", "text", str(field.type))
+            kind += ", may be null" if field.nullable else ""
             rows.append(f"| `{field.name}` | {kind} | {about['unit']} | {about['description']} |")
         head = ["| column | type | unit | meaning |", "|---|---|---|---|"]
         sections.append("\n".join([f"### {table.name}", "", table.doc, "", f"Key: {key}.{order}", "", *head, *rows]))
