@@ -1,16 +1,15 @@
-"""The help and docs/options.md list all options, in order, with correct names, defaults and ranges."""
+"""The help and the page `mcaptrack docs options` list all options, in order, with correct names, defaults and ranges."""
 
 from __future__ import annotations
 
-import importlib.util
 import inspect
 import math
 import re
 import shlex
 from collections import Counter, defaultdict
+from dataclasses import fields
 from itertools import product
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import pytest
@@ -25,7 +24,8 @@ from tests.commands import GROUP, call
 from tests.tiers import one_in
 
 ROOT = Path(__file__).parent.parent
-PAGE = (ROOT / "docs" / "options.md").read_text()
+#: Options by declaration, as the page is printed.
+PAGE = call("docs", "options").out
 COMMANDS = GROUP.commands
 UNITS = {"s": "second", "m": "metre", "px": "pixel", "hz": "per second", "fps": "per second"}
 EVERY_COMMAND = pytest.mark.parametrize("command", sorted(COMMANDS))
@@ -218,7 +218,7 @@ class TestWrongUsage:
 
 
 class Bounded(NamedTuple):
-    """An option with a range, as docs/options.md lists it."""
+    """An option with a range, as the page of options lists it."""
 
     command: str
     chosen: tuple[str, ...]
@@ -229,7 +229,7 @@ class Bounded(NamedTuple):
 
 
 def documented() -> list[Bounded]:
-    """Return the options for which docs/options.md has a range."""
+    """Return the options for which the page has a range."""
     out, chosen = [], ("", ())
     for line in PAGE.splitlines():
         if head := re.fullmatch(r"### (\w+)(?:, with `--(\w+) (\w+)` alone)?", line):
@@ -249,19 +249,25 @@ WORDS = dict.fromkeys(COMMANDS, ("none.mcap",)) | {
 }
 
 
-@pytest.fixture(scope="module")
-def tool() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("options_doc", ROOT / "tools" / "options_doc.py")
-    assert spec is not None
-    assert spec.loader is not None
-    tool = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(tool)
-    return tool
-
-
 class TestPage:
-    def test_the_page_lists_all_parameters_of_stages_and_all_numbers(self, tool):
-        assert tool.with_options(PAGE) == PAGE, "run tools/options_doc.py"
+    @pytest.mark.parametrize("command", STAGES)
+    def test_the_page_lists_every_parameter_of_a_stage_as_the_command_takes_it(self, command):
+        sections = re.findall(rf"^### {command}\b.*?\n(.*?)(?=^##|\Z)", PAGE, re.MULTILINE | re.DOTALL)
+        listed = dict(re.findall(r"^\| `(--set \w+|--[\w-]+)=?` \| .+? \| (.*?) \|", "".join(sections), re.MULTILINE))
+        declared = {
+            field.name: getattr(kind(), field.name)
+            for kind in reversed(STAGES[command].built_in().values())
+            for field in fields(kind)
+            if not field.metadata.get("context")
+        }
+        names = {name: name.removeprefix("--set ").removeprefix("--").replace("-", "_") for name in listed}
+        assert set(names.values()) - {STAGES[command].kind} == declared.keys() - {STAGES[command].kind}
+        options = {name for one in COMMANDS[command].params for name in one.opts}
+        for name, parameter in names.items():
+            assert name.startswith("--set ") or name in options, name
+            assert name.removeprefix("--set ") == name or f"--{parameter.replace('_', '-')}" not in options, name
+            if isinstance(value := declared.get(parameter), float):
+                assert float(listed[name]) == value
 
     def test_the_page_lists_environment_variables_that_are_not_options(self):
         listed = re.findall(r"^\| `(MCAPTRACK_\w+)` \| (.+) \|$", PAGE, re.MULTILINE)

@@ -180,6 +180,12 @@ def test_the_pages_are_listed_and_printed_as_they_were_written(tmp_path):
     assert (tmp_path / "page.md").read_text() == text
 
 
+def test_pages_are_printed_with_their_generated_parts():
+    """Those of the site alone stand in docs/reference."""
+    for page in json.loads(call("docs", "--json").out)["pages"]:
+        assert "<!-- generated" not in call("docs", page["name"]).out
+
+
 def test_a_page_that_is_not_there_is_said_with_those_that_are():
     code, _, err = call("docs", "tabels")
     assert code == 1

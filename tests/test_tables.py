@@ -6,7 +6,6 @@ import csv
 import datetime as dt
 import errno
 import gc
-import importlib.util
 import io
 import json
 import os
@@ -32,6 +31,7 @@ from mcaptrack.schema import EVENTS, PREDICTIONS, SCHEMAS, TRACKS, Frame
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.tables import TABLES, Pointers
 from mcaptrack.tables import files as tables_files
+from tests.commands import call
 from tests.strategies import columns
 from tests.tiers import one_in
 from tests.worlds import ns, tracks_at
@@ -218,12 +218,15 @@ def test_every_column_says_its_unit_and_meaning(table):
     assert set(table.order) <= set(table.arrow.names)
 
 
-def test_the_document_of_the_tables_is_what_the_schemas_say():
-    spec = importlib.util.spec_from_file_location("tables_doc", ROOT / "tools" / "tables_doc.py")
-    tool = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(tool)
-    text = (ROOT / "docs" / "tables.md").read_text()
-    assert tool.with_tables(text) == text, "run tools/tables_doc.py"
+def test_the_page_of_the_tables_has_every_column_with_unit_and_meaning():
+    page = call("docs", "tables").out
+    for table in TABLES.values():
+        section = page.partition(f"\n### {table.name}\n")[2].partition("\n### ")[0]
+        rows = [[cell.strip() for cell in line.split("|")[1:5]] for line in section.splitlines() if line[:3] == "| `"]
+        assert [row[0].strip("`") for row in rows] == table.arrow.names
+        for (_, kind, unit, meaning), field in zip(rows, table.arrow, strict=True):
+            assert ("may be null" in kind) is field.nullable
+            assert (unit, meaning) == tuple(field.metadata[key].decode() for key in (b"unit", b"description"))
 
 
 def test_tables_without_rows_keep_their_columns(tmp_path):

@@ -1,7 +1,8 @@
-"""What the pages of the site leave to be generated: commands, messages, topics, the changelog.
+"""The generated parts of the site: commands, messages, library, the changelog.
 
 MkDocs calls ``on_page_markdown`` for each page (``hooks`` in mkdocs.yml). A page has the text
-``<!-- generated: NAME -->`` where something of ``GENERATED`` belongs.
+``<!-- generated: NAME -->`` where a part belongs: one of ``GENERATED``, or of those that `mcaptrack docs` prints, too
+(``mcaptrack.cli.generated.PARTS``).
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     """The page, without the marks of its blocks, with what is generated."""
     sys.path[:0] = [path for path in (str(ROOT),) if path not in sys.path]
     text = re.sub(r"^ *<!-- (?:not run|file|exit): .+? -->\n", "", markdown, flags=re.M)
-    return re.sub(r"<!-- generated: (\w+) -->", lambda found: GENERATED[found[1]](), text)
+    from mcaptrack.cli.generated import PARTS, with_parts
+
+    return with_parts(text, PARTS | GENERATED)
 
 
 def commands() -> str:

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from mcaptrack.cli import common
+from mcaptrack.cli.generated import PARTS, with_parts
 from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError
 
@@ -50,7 +51,7 @@ def docs(
         raise McaptrackError(
             f"there is no page {page}; {f'did you mean {near[0]}? ' if near else ''}There are {', '.join(pages)}"
         )
-    text = pages[name].read_text(encoding="utf-8")
+    text = with_parts(pages[name].read_text(encoding="utf-8"), PARTS)
     with common.printed_to(output, force):
         if json:
             common.print_json({"name": name, "title": _title(pages[name]), "text": text})
