@@ -228,6 +228,41 @@ def test_what_takes_too_much_is_ended(use, how, monkeypatch):
     assert not strange_processes(os.getpid())
 
 
+SAME = node("Identity", ["x"], ["y"])
+LONG = "y" * 100_000
+#: Networks that declare too much, by use: and words of the refusal.
+DECLARING = {
+    "a name": (
+        ("detector", "predictor"),
+        lambda shape: model([node("Identity", ["x"], [LONG])], [value("x", shape)], [value(LONG, None)]),
+        "has a name of 100,000 characters",
+    ),
+    "no size": (
+        ("detector",),
+        lambda shape: model([SAME], [value("x", [1, 3, -128, -160])], [value("y", None)]),
+        "takes pictures of any size",
+    ),
+    "a past": (
+        ("predictor",),
+        lambda shape: model([SAME], [value("x", ["B", 2**40, 2])], [value("y", None)]),
+        "takes 1,099,511,627,776 past positions",
+    ),
+    "a future": (
+        ("predictor",),
+        made(node("Tile", ["x", "by"], ["y"]), constants={"by": tensor([1, 9999, 1], "by", INT64)}),
+        "returns 39,996 steps",
+    ),
+}
+
+
+@pytest.mark.parametrize(("how", "use"), [(how, use) for how, (uses, *_) in DECLARING.items() for use in uses])
+def test_what_declares_too_much_is_refused_in_a_short_line(how, use):
+    _, build, words = DECLARING[how]
+    message = refused(use, build(USES[use][1]))
+    assert words in message
+    assert len(message) < 300
+
+
 @pytest.mark.parametrize("use", USES)
 def test_a_network_that_breaks_its_process_is_named(use):
     def kill() -> None:
