@@ -27,7 +27,8 @@ def publish(path: Path) -> Iterator[Path]:
     """A temporary path beside ``path`` to write to; when the block succeeds, that file replaces ``path``.
 
     The bytes are synced to disk before the file is renamed, so that an interruption at any time leaves the old file or
-    the new one. If the block fails, the temporary file is removed.
+    the new one. If the block fails, the temporary file is removed. Raises McaptrackError if it can't be written, as far
+    as errors name it; libraries of video do.
     """
     sweep(path.parent, path.name)
     part = _part_of(path)
@@ -39,6 +40,10 @@ def publish(path: Path) -> Iterator[Path]:
         os.replace(part, path)
         if lost:
             notices.warn(f"{path} is a new file now, without the {' and '.join(lost)} of the old one")
+    except OSError as error:
+        if error.errno is None or part.name not in str(error.filename):
+            raise
+        raise McaptrackError(f"{path} can't be written: {error.strerror}") from error
     finally:
         with suppress(FileNotFoundError):
             part.unlink()

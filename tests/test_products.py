@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -312,3 +313,28 @@ def test_scores_of_two_logs_of_one_name_are_not_mixed(finished, tmp_path):
         shutil.copyfile(finished, log)
     names = {row.sequence for row in mcaptrack.evaluate(logs).results}
     assert names == {"x/l", "y/l", "COMBINED"}
+
+
+#: What writes a file or folder beside a log, as functions of the log and of what to write.
+WRITTEN: dict[str, Callable[[Path, Path], object]] = {
+    "a.mp4": mcaptrack.render,
+    "a.gif": mcaptrack.render,
+    "a.html": mcaptrack.report,
+    "bag": lambda path, output: mcaptrack.export(path, output, form="rosbag2"),
+    "old bag": lambda path, output: mcaptrack.export(path, output, form="rosbag2-sqlite3"),
+    "a.coco.json": lambda path, output: mcaptrack.export(path, output, form="coco"),
+    "a.mcap": lambda path, output: mcaptrack.drop(path, ["/camera/truth"], output=output),
+    "a.trials.jsonl": lambda path, output: mcaptrack.tune(path, study=output, trials=3),
+}
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_what_has_no_room_is_named_and_leaves_nothing(name, finished, tmp_path):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        with pytest.raises(McaptrackError, match=f"{name} can't be written: (File too large|disk I/O)"):
+            WRITTEN[name](finished, tmp_path / name)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [path.name for path in tmp_path.iterdir()] == [name] * name.endswith(".jsonl")  # the trials so far

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import errno
+import gc
 import os
+import resource
 import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from threading import Thread
 from time import sleep
@@ -226,6 +229,79 @@ def test_what_takes_too_much_is_ended(use, how, monkeypatch):
     monkeypatch.setenv("MCAPTRACK_MAX_NETWORK_S", "2" if how == "time" else "1000")
     assert words in refused(use, build(USES[use][1]))
     assert not strange_processes(os.getpid())
+
+
+SAME = node("Identity", ["x"], ["y"])
+LONG = "y" * 100_000
+#: Networks that declare too much, by use: and words of the refusal.
+DECLARING = {
+    "a name": (
+        ("detector", "predictor"),
+        lambda shape: model([node("Identity", ["x"], [LONG])], [value("x", shape)], [value(LONG, None)]),
+        "has a name of 100,000 characters",
+    ),
+    "no size": (
+        ("detector",),
+        lambda shape: model([SAME], [value("x", [1, 3, -128, -160])], [value("y", None)]),
+        "takes pictures of any size",
+    ),
+    "a past": (
+        ("predictor",),
+        lambda shape: model([SAME], [value("x", ["B", 2**40, 2])], [value("y", None)]),
+        "takes 1,099,511,627,776 past positions",
+    ),
+    "a future": (
+        ("predictor",),
+        made(node("Tile", ["x", "by"], ["y"]), constants={"by": tensor([1, 9999, 1], "by", INT64)}),
+        "returns 39,996 steps",
+    ),
+}
+
+
+@pytest.mark.parametrize(("how", "use"), [(how, use) for how, (uses, *_) in DECLARING.items() for use in uses])
+def test_what_declares_too_much_is_refused_in_a_short_line(how, use):
+    _, build, words = DECLARING[how]
+    message = refused(use, build(USES[use][1]))
+    assert words in message
+    assert len(message) < 300
+
+
+@pytest.mark.parametrize("free", [0, 3, 6])
+def test_without_room_for_open_files_no_process_is_started(free):
+    with limited(resource.RLIMIT_NOFILE, 200), ExitStack() as held:
+        taken = []
+        with suppress(OSError):
+            while True:
+                taken.append(os.open("/dev/null", os.O_RDONLY))
+        for handle in taken[free:]:
+            held.callback(os.close, handle)
+        for handle in taken[:free]:
+            os.close(handle)
+        refuses_to_start()
+        again = [os.open("/dev/null", os.O_RDONLY) for _ in range(free)]  # nothing stayed open
+        for handle in again:
+            os.close(handle)
+
+
+def test_where_files_have_to_be_small_no_process_is_started():
+    with limited(resource.RLIMIT_FSIZE, 1_000_000):
+        refuses_to_start()
+
+
+@contextmanager
+def limited(kind: int, most: int) -> Iterator[None]:
+    before = resource.getrlimit(kind)
+    resource.setrlimit(kind, (most, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(kind, before)
+
+
+def refuses_to_start() -> None:
+    with pytest.raises(McaptrackError, match="can't be run: no process can be started for it"):
+        networks.Network(networks.NetworkFile(Path("net.onnx"), b"", ""), networks.Limits.of_environment())
+    gc.collect()
 
 
 @pytest.mark.parametrize("use", USES)

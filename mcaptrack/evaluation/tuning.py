@@ -218,8 +218,11 @@ class _Study:
         self.trials.append(trial)
         if self._path is not None:
             line = {"number": trial.number, "parameters": trial.parameters, "scores": trial.scores}
-            with self._path.open("a", encoding="utf-8") as stream:
-                stream.write(json.dumps(line) + "\n")
+            try:
+                with self._path.open("a", encoding="utf-8") as stream:
+                    stream.write(json.dumps(line) + "\n")
+            except OSError as error:
+                raise McaptrackError(f"{self._path} can't be written: {error.strerror}") from None
 
 
 class _Proposer(Protocol):

@@ -10,7 +10,7 @@ import sys
 import tempfile
 import weakref
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from multiprocessing import Pipe
 from queue import SimpleQueue
 from time import monotonic
@@ -56,31 +56,32 @@ class NetworkProcess:
         #: Why the process ended, in words that follow the name of the network; "" while it runs.
         self.failure: SessionError | None = None
         size = min(memory_bytes, _LANE_BYTES)
-        life, its_life = Pipe()
-        pairs = [Pipe() for _ in range(lanes)]
-        memories = [_shared_memory(size) for _ in range(lanes)]
-        handles = [(its.fileno(), memory) for (_, its), memory in zip(pairs, memories, strict=True)]
         path = [os.path.abspath(folder) for folder in sys.path]
         try:
-            own = [Lane(connection, memory, size) for (connection, _), memory in zip(pairs, memories, strict=True)]
-            self._process = subprocess.Popen(
-                [sys.executable, "-I", "-c", _CODE, json.dumps([path, its_life.fileno(), handles, size, device])],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                cwd="/",  # relative names lead nowhere
-                env=without("ORT_LOAD_CONFIG_FROM_MODEL"),  # a network must not set options of ONNX Runtime
-                pass_fds=[its_life.fileno(), *(handle for pair in handles for handle in pair)],
-                process_group=0,  # Ctrl-C at the terminal is for this process, which ends the other
-            )
+            with ExitStack() as its_ends:
+                life, its_life = Pipe()
+                its_ends.enter_context(its_life)
+                own: list[Lane] = []
+                handles: list[tuple[int, int]] = []
+                for _ in range(lanes):
+                    connection, its_connection = Pipe()
+                    its_ends.enter_context(its_connection)
+                    memory = _shared_memory(size)
+                    its_ends.callback(os.close, memory)
+                    own.append(Lane(connection, memory, size))
+                    handles.append((its_connection.fileno(), memory))
+                self._process = subprocess.Popen(
+                    [sys.executable, "-I", "-c", _CODE, json.dumps([path, its_life.fileno(), handles, size, device])],
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                    cwd="/",  # relative names lead nowhere
+                    env=without("ORT_LOAD_CONFIG_FROM_MODEL"),  # a network must not set options of ONNX Runtime
+                    pass_fds=[its_life.fileno(), *(handle for pair in handles for handle in pair)],
+                    process_group=0,  # Ctrl-C at the terminal is for this process, which ends the other
+                )
         except OSError as error:
             raise SessionError(f"can't be run: no process can be started for it ({error.strerror or error})") from None
-        finally:
-            its_life.close()
-            for _, its in pairs:
-                its.close()
-            for memory in memories:
-                os.close(memory)
         self._life = life  # the other process ends when this is closed
         self._finalizer = weakref.finalize(self, _end, self._process)
         self._free: SimpleQueue[Lane] = SimpleQueue()
@@ -167,7 +168,11 @@ def _shared_memory(size: int) -> int:
     else:
         with tempfile.TemporaryFile() as file:
             handle = os.dup(file.fileno())
-    os.ftruncate(handle, size)
+    try:
+        os.ftruncate(handle, size)
+    except OSError:  # larger than a file may be here
+        os.close(handle)
+        raise
     return handle
 
 

@@ -122,7 +122,7 @@ def input_size(model: Any, name: str) -> tuple[int | None, int | None]:
     for value in model.graph.input:
         if value.name == name:
             dims = value.type.tensor_type.shape.dim
-            height, width = ((dim.dim_value or None) for dim in dims[2:4])
+            height, width = ((dim.dim_value if dim.dim_value > 0 else None) for dim in dims[2:4])
             return width, height
     return None, None
 

@@ -19,7 +19,7 @@ Value = tuple[str, list[int | str | None], str]
 
 _CPU: Final = "CPUExecutionProvider"
 _CUDA: Final = "CUDAExecutionProvider"
-#: Longer texts of the metadata are not passed on.
+#: Longer texts of the metadata are not passed on; networks with longer names are refused, since messages have them.
 _LONGEST: Final = 1000
 
 
@@ -87,6 +87,9 @@ class Session:
         is_on_gpu = _CUDA in self._session.get_providers()
         if device == "cuda" and not is_on_gpu:
             raise SessionError("can't be run on CUDA here; see what ONNX Runtime's CUDA needs")
+        names = [text for one in self._values() for text in (one.name, *(one.shape or [])) if isinstance(text, str)]
+        if len(longest := max(names, key=len, default="")) > _LONGEST:
+            raise SessionError(f"has a name of {len(longest):,} characters, {longest[:20]}...; give it a shorter one")
         self._alone = Lock()
         metadata = self._session.get_modelmeta().custom_metadata_map
         inputs = [(one.name, list(one.shape or []), one.type) for one in self._session.get_inputs()]
@@ -99,6 +102,10 @@ class Session:
             "is_on_gpu": is_on_gpu,
             "is_without_gpu": providers[0] == _CUDA and not is_on_gpu,
         }
+
+    def _values(self) -> list[Any]:
+        """Inputs and outputs, as ONNX Runtime has them."""
+        return [*self._session.get_inputs(), *self._session.get_outputs()]
 
     def run(self, inputs: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
         """The outputs, in order; one that holds no numbers is empty, of type object. Raises SessionError."""

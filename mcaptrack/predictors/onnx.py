@@ -22,6 +22,8 @@ from mcaptrack.predictors.forecast import Forecast
 from mcaptrack.predictors.linear import LinearPredictor
 
 _STEP_S: Final = 0.4
+#: The most positions that a network may take or give for a track: more than an hour of them, and little memory.
+_MAX_STEPS: Final = 10_000
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,8 @@ class Onnx:
         shape = next((shape for _, shape, _ in network.facts["inputs"]), [])
         if len(shape) != 3 or not isinstance(shape[1], int) or shape[2] != 2:
             raise McaptrackError(f"{path}: its first input has to be B x L x 2 with a fixed L, not {shape}")
+        if shape[1] > _MAX_STEPS:
+            raise McaptrackError(f"{path} takes {shape[1]:,} past positions; at most {_MAX_STEPS:,} are supported")
         text = network.facts["metadata"].get("step_s", "")
         try:
             step_s = float(text or _STEP_S)
@@ -91,6 +95,8 @@ class Onnx:
             Onnx._of.cache_clear()
             raise
         mean = outputs[0] if outputs else np.empty(0)
+        if mean.ndim == 3 and mean.shape[1] > _MAX_STEPS:
+            raise McaptrackError(f"{self.path} returns {mean.shape[1]:,} steps; at most {_MAX_STEPS:,} are supported")
         fits = mean.ndim == 3 and len(mean) == len(xy_m) and mean.shape[1] > 0 and mean.shape[2] == 2
         if fits and len(outputs) > 1:
             fits = outputs[1].shape == (*mean.shape, 2)

@@ -46,7 +46,8 @@ def resample(frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int, usual_ns: fl
     Returns
     -------
     rows : (S,) structured array
-        Rows of tracks, sorted by time and id. Rows at one of the times are unchanged; ``observed`` is false in gaps.
+        Rows of tracks, sorted by time and id, one for each of these. Rows at one of the times are unchanged (of several
+        of one id the last); ``observed`` is false in gaps.
     at : (S,) of int64
         Index of the time of each row in ``at_ns``.
     """
@@ -60,11 +61,12 @@ def resample(frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int, usual_ns: fl
     rows, row_ns = joined.rows.take(order), joined.row_ns[order]
     has_next = ~run_ends(run_starts(rows["track_id"]))
     step_ns = np.append(np.diff(row_ns), 0)[: len(rows)]
+    is_replaced = has_next & (step_ns == 0)  # the last row of an id at a time counts
     is_linked = has_next & (step_ns > 0) & (step_ns <= max_gap_ns)
     low = np.searchsorted(at_ns, row_ns, "left")
     until = np.searchsorted(at_ns, np.where(is_linked, row_ns + step_ns, row_ns), "left")
     high = np.where(is_linked, until, np.searchsorted(at_ns, row_ns, "right"))
-    count = high - low
+    count = np.where(is_replaced, 0, high - low)
 
     before, at = group_index(count), ragged_range(low, count)
     after = before + is_linked[before]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import heapq
 import shutil
+import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -96,7 +97,8 @@ def write_bag(
     Raises
     ------
     McaptrackError
-        If the log has nothing to write, if the folder exists, and if a time is later than ROS can express.
+        If the log has nothing to write, if the folder exists or can't be written, and if a time is later than ROS can
+        express.
     """
     _refuse_folder(folder, force)
     done = WrittenBag()
@@ -114,6 +116,8 @@ def write_bag(
         if folder.exists():
             folder.rename(part / "before")  # removed in one step: half of a bag would be taken for no bag
         (part / folder.name).rename(folder)
+    except (OSError, sqlite3.Error) as error:
+        raise McaptrackError(f"{folder} can't be written: {getattr(error, 'strerror', None) or error}") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
     return done
