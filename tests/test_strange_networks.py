@@ -300,7 +300,7 @@ def limited(kind: int, most: int) -> Iterator[None]:
 
 def refuses_to_start() -> None:
     with pytest.raises(McaptrackError, match="can't be run: no process can be started for it"):
-        networks.Network(networks.NetworkFile(Path("net.onnx"), b"", ""), networks.Limits.of_environment())
+        networks.OnnxNetwork(networks.NetworkFile(Path("net.onnx"), b"", ""), networks.NetworkLimits.of_environment())
     gc.collect()
 
 
