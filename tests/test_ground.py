@@ -133,6 +133,8 @@ def test_with_covariances_the_filter_is_that_of_matrices():
         assert tracks.table[[X, VX, Y, VY], 0] == pytest.approx(mean[[0, 1, 3, 4]])
         assert tracks.covariances is not None
         assert tracks.covariances.values[0] == pytest.approx(cov)
+        assert tracks.covariances.places()[:, 0] == pytest.approx(cov[[0, 0, 3], [0, 3, 3]])
+        assert tracks.covariances.means()[:, 0] == pytest.approx(((cov[:3, :3] + cov[3:, 3:]) / 2)[np.triu_indices(3)])
 
 
 def seen(places: list[tuple[float, float, float]], cov: tuple[float, float, float] | None) -> Frame:

@@ -479,30 +479,12 @@ def test_yaml_is_read_as_text_lists_and_maps(text, value):
     assert plain_yaml.load(plain_yaml.dump(loaded).encode()) == value
 
 
-NOT_LOADED = {
-    "": "it holds 0 documents, not one",
-    "a\n---\nb": "it holds 2 documents, not one",
-    "a\n---\n%b": "it has a line that begins with %; directives are not read",
-    "x: 1\na: &b c": "line 2: anchors and aliases are not read",
-    "\na: !!int 3": "line 2: tags are not read",
-    "a: 1\nb: 2\na: 3": "line 3: 'a' is there twice",
-    "[a]: 1": "line 1: a list or a map is a key",
-    "[" * 31 + "]" * 31: None,
-    "[" * 32 + "]" * 32: "line 1: it is nested more than 32 deep",
-}
-
-
-@pytest.mark.parametrize(("text", "words"), NOT_LOADED.items())
-def test_other_yaml_is_refused_with_its_line(text, words):
-    if words is None:
-        plain_yaml.load(text.encode())
-        return
-    with pytest.raises(UnsupportedYamlError) as error:
-        plain_yaml.load(text.encode())
-    assert str(error.value) == words
-
-
 def test_yaml_has_limits(monkeypatch):
+    plain_yaml.load(b"[" * 31 + b"]" * 31)
+    with pytest.raises(UnsupportedYamlError, match="line 2: it is nested more than 32 deep"):
+        plain_yaml.load(b"\n" + b"[" * 32 + b"]" * 32)
+    with pytest.raises(UnsupportedYamlError, match="it holds 0 documents, not one"):
+        plain_yaml.load(b"")
     monkeypatch.setattr(plain_yaml, "MAX_BYTES", 4)
     assert plain_yaml.load(b"abcd") == "abcd"
     with pytest.raises(UnsupportedYamlError, match="it has 5 bytes; at most 4 are read"):
@@ -611,12 +593,3 @@ def test_labels_take_the_plane_of_their_camera_if_it_was_measured_and_stays(tmp_
             rows = opened.rows("/camera/tracks", TRACKS).rows
         wanted = [(6.0, 14.0)] * 2 if is_taken else [(np.nan, np.nan)] * 2  # the foot of the box, halved
         assert np.array_equal(np.stack([rows["x_m"], rows["y_m"]], axis=1), wanted, equal_nan=True)
-
-
-def test_first_frames_that_differ_are_a_warning_about_the_clock(tmp_path):
-    first, other = write(tmp_path / "a.txt", "1,1,1,1,2,2\n"), write(tmp_path / "b.txt", "0,1,1,1,2,2\n")
-    report, _ = made(first, role="tracks", labels={"truth": other}, fps=Fraction(10))
-    words = (
-        f"frame 1 of {first} and frame 0 of {other} are assumed to be the same picture; `first_frame=` sets the number"
-    )
-    assert said(report) == [(words, "clock")]
