@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 import shutil
@@ -14,13 +15,14 @@ import pytest
 
 from mcaptrack import log, notices, pipeline
 from mcaptrack.errors import McaptrackError
-from mcaptrack.pipeline import run
 from mcaptrack.pipeline.planes import make_plane
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import TRANSFORMS, KnnDetector
 from tests.commands import call, done
 from tests.worlds import assert_same_rows, ns, tracks_at, walk
+
+run = importlib.import_module("mcaptrack.pipeline.run")  # the package has a function of that name
 
 
 @pytest.fixture
