@@ -38,17 +38,6 @@ def job(*, source: str = "a.mp4", **options) -> IngestJob:
     return IngestJob(Path(source), IngestOptions(labels=labels, **options))
 
 
-def test_topics_are_below_the_name_of_the_camera(place):
-    made = job(labels={"truth": "gt.txt", "tracks": "zero.txt"}, camera="/left/", motion=Path("motion.txt"))
-    assert list(made.topics()) == ["/left/truth", "/left/tracks", "/left/motion"]
-    assert (made.has_labels, set(made.roles)) == (True, {"truth", "tracks"})
-    assert made.hint_other_topic(["/left/truth"]) == "`camera='left/labels'` puts these beside them"
-    taken = ["/left/labels/tracks", "/left/labels2/motion", "/left/labels3/other"]
-    assert made.hint_other_topic(taken) == "`camera='left/labels3'` puts these beside them"
-    bare = job()
-    assert (list(bare.topics()), bare.has_labels) == ([], False)
-
-
 def test_what_is_assumed_and_left_out_is_said(place):
     made = job(labels={"truth": "gt.txt", "tracks": "zero.txt"})
     with collected() as warnings:
