@@ -14,7 +14,7 @@ from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
 from mcaptrack.schema.provenance import CLOCK, Provenance
 from mcaptrack.sources.demo import demo_scene
-from mcaptrack.sources.ingest import IngestOptions, ingest, label_frames
+from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 from tests.worlds import ids, ns, write_clip
 
@@ -131,17 +131,6 @@ class TestIngest:
         assert report.messages["/camera/truth"] == 2  # frames 0 and 12 of 20
         assert report.remarks == [f"{truth} has labels every 12 frames, from 0 on; the frames in between are left out"]
 
-    def test_labels_alone_keep_their_own_clock(self, tmp_path):
-        out = tmp_path / "a.mcap"
-        ingest(write(tmp_path / "world.txt", TRAJNET), out, options())
-        with log.read(out) as opened:
-            frames = opened.frames("/camera/tracks", TRACKS)
-            assert [(f.t_ns, f.index, ids(f)) for f in frames] == [
-                (0, 0, [7]),
-                (ns(0.4), 12, [7, 9]),
-                (ns(0.8), 24, [7]),
-            ]
-
     def test_label_files_of_one_log_share_a_clock(self, tmp_path):
         """Boxes at every frame that begin at frame 8, truth at every twelfth: frame 1 of these is frame 0 of those."""
         found = write(tmp_path / "det.txt", "".join(f"{n},-1,10,20,4,8,1,-1,-1,-1\n" for n in range(8, 30)))
@@ -249,16 +238,6 @@ class TestIngest:
             ingest(clip, tmp_path / "a.mcap", options(**named))
         assert sorted(tmp_path.iterdir()) == before
 
-    def test_labels_alone_need_a_clock(self, tmp_path):
-        with pytest.raises(McaptrackError, match="has no clock of its own; give the frames per second with `fps=`"):
-            ingest(write(tmp_path / "a.txt", MOT15), tmp_path / "a.mcap", options())
-
     def test_input_and_output_are_not_one(self, clip):
         with pytest.raises(McaptrackError, match="is both input and output"):
             ingest(clip, clip, options())
-
-    def test_label_files_can_be_compared_without_a_log(self, tmp_path):
-        both = label_frames(
-            {"tracks": write(tmp_path / "t.txt", MOT15), "truth": write(tmp_path / "g.txt", MOT15)}, None, None, "foot"
-        )
-        assert [ids(f) for f in both["truth"]] == [ids(f) for f in both["tracks"]] == [[3, 5], [3]]

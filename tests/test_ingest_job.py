@@ -55,16 +55,6 @@ def test_what_is_assumed_and_left_out_is_said(place):
     assert any("gt.txt has several classes; class_id is" in one for one in every.report.remarks)
 
 
-def test_roles_that_labels_do_not_suit(place):
-    Path("none.txt").write_text(MOT.replace(",1,10,", ",-1,10,").replace(",2,20,", ",-1,20,"))
-    with pytest.raises(McaptrackError, match=r"none.txt has no ids \(all are -1\); truth need ids"):
-        job(labels={"truth": "none.txt"})
-    assert job(labels={"detections": "none.txt"}).has_labels
-    Path("places.txt").write_text("0\t1\t1.5\t2.5\n12\t1\t1.6\t2.5\n24\t1\t1.7\t2.5\n")
-    with pytest.raises(McaptrackError, match=r"places.txt holds positions, not boxes; detections are boxes"):
-        job(labels={"detections": "places.txt"})
-
-
 def test_parameters_of_labels(place):
     one = job(labels={"truth": "gt.txt"})
     labels = one.labels["truth"][1]
