@@ -29,7 +29,7 @@ from mcaptrack.pipeline.planes import (
 )
 from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, TRACKS, Frame
-from mcaptrack.schema.provenance import Provenance
+from mcaptrack.schema.provenance import Plugin, Provenance
 from mcaptrack.transforms import Sort
 from mcaptrack.transforms.motion import EstimateMotion
 from tests.commands import done
@@ -205,6 +205,12 @@ LEARNED = Provenance("detect", {"detector": "onnx"}, "/camera/video")
         (Provenance("ingest", {}), "estimate-ground-plane"),
         (Provenance("detect", {"detector": "knn"}, "/camera/video"), "assume-ground-plane"),
         (Provenance("detect", {"detector": "median"}, "/camera/video"), "assume-ground-plane"),
+        (Provenance("detect", {}, "/camera/video"), "assume-ground-plane"),  # the usual one
+        (Provenance("detect", {"detector": "of another package"}, "/camera/video"), "assume-ground-plane"),
+        (
+            Provenance("detect", {"detector": "knn"}, plugins={"transform": Plugin("a", "b:C", "", "")}),
+            "estimate-ground-plane",
+        ),
     ],
 )
 def test_boxes_of_motion_detectors_are_not_used(tmp_path, provenance, transform):
