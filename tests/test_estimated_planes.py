@@ -16,11 +16,10 @@ from mcaptrack import log, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
-from mcaptrack.pipeline.motion import detects_motion, side_inputs
+from mcaptrack.pipeline.motion import side_inputs
 from mcaptrack.pipeline.planes import (
     AS_BEFORE,
     PlaneChoice,
-    _boxes,
     fit_in_words,
     fit_of,
     is_poor,
@@ -30,11 +29,11 @@ from mcaptrack.pipeline.planes import (
 )
 from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, TRACKS, Frame
-from mcaptrack.schema.provenance import Provenance
+from mcaptrack.schema.provenance import Plugin, Provenance
 from mcaptrack.transforms import Sort
 from mcaptrack.transforms.motion import EstimateMotion
 from tests.commands import done
-from tests.worlds import assert_same_rows, ns
+from tests.worlds import ns
 
 HIGH_M, PITCH, FOCAL, WIDTH, HEIGHT = 5.0, np.deg2rad(18.0), 640.0, 640, 480
 
@@ -170,15 +169,6 @@ def test_metres_are_proportional_to_the_height_of_people(path):
         mcaptrack.run(path, person_height_m=-1.0)
 
 
-def test_tracks_of_a_camera_that_looks_along_the_ground_are_passed_on(tmp_path):
-    path = written(tmp_path / "a.mcap", Provenance("ingest", {}), detections(people(high=1.6, pitch=0.0)))
-    result = mcaptrack.run(path, tables=False)
-    assert [one.code for one in result.warnings] == ["estimated-ground-plane", "held-back"]
-    with log.read(path) as opened:
-        samples, retracks = (opened.rows(f"/camera/{name}", TRACKS).rows for name in ("samples", "retracks"))
-    assert_same_rows(retracks, samples)
-
-
 def test_a_given_plane_wins(template, tmp_path):
     (tmp_path / "plane.txt").write_text("0.05,0,0\n0,0.05,0\n0,0,1\n")
     result = mcaptrack.ingest(
@@ -215,6 +205,12 @@ LEARNED = Provenance("detect", {"detector": "onnx"}, "/camera/video")
         (Provenance("ingest", {}), "estimate-ground-plane"),
         (Provenance("detect", {"detector": "knn"}, "/camera/video"), "assume-ground-plane"),
         (Provenance("detect", {"detector": "median"}, "/camera/video"), "assume-ground-plane"),
+        (Provenance("detect", {}, "/camera/video"), "assume-ground-plane"),  # the usual one
+        (Provenance("detect", {"detector": "of another package"}, "/camera/video"), "assume-ground-plane"),
+        (
+            Provenance("detect", {"detector": "knn"}, plugins={"transform": Plugin("a", "b:C", "", "")}),
+            "estimate-ground-plane",
+        ),
     ],
 )
 def test_boxes_of_motion_detectors_are_not_used(tmp_path, provenance, transform):
@@ -414,27 +410,6 @@ def test_a_scale_is_poor_where_the_ground_has_less_than_two_heights(deep_px, poo
     assert is_poor([Frame(0, 0, rows[:20]), Frame(1, 1, rows[20:])]) == poor
 
 
-@pytest.mark.parametrize(
-    ("classes", "names", "which"),
-    [
-        ([1, 2, 0], {}, [0]),
-        ([2, 0, 0], {}, [1, 2]),  # unknown ones, where none is a person
-        ([2, 3, 7], {}, []),
-        ([1, 2, 7], {"2": "Pedestrian", "7": "person", "1": "car"}, [1, 2]),
-        ([1, 2, 7], {"x": "person"}, [0]),
-    ],
-)
-def test_which_boxes_are_of_people(classes, names, which):
-    rows = DETECTIONS.rows(
-        x_px=[1.0, 2, 3, np.nan], y_px=[5.0, 5, 5, np.nan], w_px=[6.0, 6, 6, np.nan], h_px=[7.0, 8, 9, np.nan],
-        x_m=[0.0] * 4, y_m=[0.0] * 4, score=[0.5] * 4, class_id=[*classes, 1],
-    )  # fmt: skip
-    boxes, number, score, are_people = _boxes([Frame(0, 0, rows[:1]), Frame(1, 1, rows[1:])], names)
-    assert boxes.tolist() == [[1, 5, 6, 7], [2, 5, 6, 8], [3, 5, 6, 9]]  # the last one is none
-    assert (number.tolist(), score.tolist()) == ([0, 1, 1], [0.5] * 3)
-    assert np.flatnonzero(are_people).tolist() == which
-
-
 class TestBesideThePictures:
     """The boxes of people that the estimate of the camera's motion leaves out."""
 
@@ -478,18 +453,3 @@ class TestBesideThePictures:
             assert len(notices) == said
             if said:
                 assert notices[0].message.startswith("the motion of the camera is not known: /camera/motion needs")
-
-    @pytest.mark.parametrize(
-        ("made", "is_of_motion"),
-        [
-            (None, False),
-            (Provenance("ingest", {}), False),
-            (Provenance("track", {"detector": "knn"}), False),
-            (LEARNED, False),
-            (Provenance("detect", {}), True),  # the usual one
-            (Provenance("detect", {"detector": "of another package"}), True),
-            (Provenance("detect", {"detector": "knn"}, plugins={"transform": None}), False),  # type: ignore[dict-item]
-        ],
-    )
-    def test_which_boxes_come_from_motion(self, made, is_of_motion):
-        assert detects_motion(made) is is_of_motion

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from mcaptrack import log, notices, pipeline
@@ -16,7 +15,7 @@ from mcaptrack.pipeline.checks import describe_origin
 from mcaptrack.pipeline.write import Made, _floor_m
 from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind, Frame
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance
-from tests.worlds import ns, walk
+from tests.worlds import walk
 
 WALK = walk(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 4.0)}, 10, 10)
 
@@ -38,16 +37,7 @@ def watched(path: Path, **options: Any) -> pipeline.Report:
         return pipeline.run(opened, "/camera", [], watch=pipeline.Watch(**options))
 
 
-TRUE = ("/camera/truth", Provenance(INGEST, {}, digest="x"), WALK)
 TRACKED = ("/camera/tracks", Provenance(INGEST, {}, digest="y"), WALK)
-
-
-def test_what_cannot_be_compared_is_a_warning_of_that_kind(tmp_path):
-    late = [Frame(frame.t_ns + ns(900), frame.index, frame.rows) for frame in WALK]
-    path = written(tmp_path / "a.mcap", TRACKED, (*TRUE[:2], late))
-    (warning,) = watched(path).warnings
-    assert warning.code == "not-compared"
-    assert "never overlap in time" in warning.message
 
 
 @pytest.mark.parametrize("end", ["events", "events/view/log", "counts"])
@@ -80,14 +70,6 @@ def test_of_two_channels_of_a_topic_the_recorded_one_is_named(tmp_path):
         with log.read(path) as opened:
             assert describe_origin(opened, "/camera/retracks") == "was recorded by others (mcaptrack.Tracks)"
             assert describe_origin(opened, "/camera/tracks") == "was ingested"
-
-
-def test_a_camera_without_tracks_has_no_events(tmp_path):
-    path = written(tmp_path / "a.mcap", TRUE)
-    assert watched(path).stages == []
-    with pytest.raises(McaptrackError) as error:
-        watched(path, again=True)
-    assert str(error.value) == f"{path} has no tracks of /camera; `mcaptrack.run('{path}')` makes them"
 
 
 def test_the_usual_tracks_and_those_with_events_are_watched(tmp_path):
@@ -152,29 +134,3 @@ def test_events_are_tallied_by_kind_for_each_channel():
     )
     counted = {"birth": 2, "miss": 1, "parted": 1}
     assert found == {"/a": dict.fromkeys(EVENT_KINDS.values(), 0) | counted}
-
-
-def test_events_follow_their_tracks_their_truth_and_their_options(tmp_path):
-    path = written(tmp_path / "a.mcap", TRACKED, TRUE)
-    assert watched(path).stages == ["events"]
-    with log.read(path) as opened:
-        made = Provenance.from_metadata(opened.channel("/camera/tracks/events").metadata)
-        view = Provenance.from_metadata(opened.channel("/camera/tracks/events/view/log").metadata)
-        counts = Provenance.from_metadata(opened.channel("/camera/tracks/counts").metadata)
-    assert made is not None
-    assert view is not None
-    assert counts is not None
-    assert made.made_from() == counts.made_from() == {"/camera/tracks": "y", "/camera/truth": "x"}
-    assert (view.transform, view.input, view.input_digest) == (VIEW, "/camera/tracks/events", made.digest)
-    assert watched(path).stages == []
-    assert watched(path, force=True).frames == {
-        "/camera/tracks/events": 10,
-        "/camera/tracks/events/view/log": 2,
-        "/camera/tracks/counts": 10,
-    }
-    assert watched(path, options=EventOptions("metres", 0.5)).stages == ["events"]
-    assert watched(path, force=True).stages == ["events"]
-    with log.read(path) as opened:
-        kept = events._options_for(opened, "/camera/tracks", EventOptions())
-        assert int(np.sum([len(frame.rows) for frame in opened.frames("/camera/tracks/events", EVENTS)])) == 2
-    assert kept == EventOptions("metres", 0.5)

@@ -207,22 +207,6 @@ class TestCvat:
         assert labels.id.tolist() == [3] * 7
         assert any("4 boxes are interpolated" in words for words in labels.remarks)
 
-    def test_ids_are_those_of_the_attribute_and_a_track_that_was_split_gets_a_new_one(self, tmp_path):
-        def own(n):
-            return f'<attribute name="track_id">{n}</attribute>'
-
-        tracks = [
-            track(0, box(0, 1, inner=own(40))),
-            track(1, *(box(frame, 1, inner=own(40)) for frame in (1, 2))),
-            track(2, box(0, 50, inner=own(7))),
-            track(3, box(1, 90)),
-        ]
-        labels = read(tmp_path, f"<annotations>{''.join(tracks)}</annotations>")
-        rows = list(zip(labels.frame.tolist(), labels.id.tolist(), strict=True))
-        assert rows == [(0, 7), (0, 41), (1, 40), (1, 42), (2, 40)]
-        assert any("several tracks state one track_id (40)" in words for words in labels.remarks)
-        assert any("1 tracks state no track_id" in words for words in labels.remarks)
-
     def test_a_zip_file_of_cvat(self, tmp_path):
         with zipfile.ZipFile(tmp_path / "task.zip", "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("images/frame_000000.png", b"\0")
@@ -240,41 +224,6 @@ class TestCvat:
         assert (labels.frame.tolist(), labels.boxes_px.tolist(), labels.has_ids) == ([2], [[1, 2, 3, 6]], False)
         assert labels.labelled.tolist() == [0, 2]
         assert [code for _, code in labels.doubts if "1 of <polygon>, 1 of <tag>" in _] == ["left-out"]
-
-    def test_ids_of_images_are_those_of_the_attribute(self, tmp_path):
-        """CVAT writes tracks as boxes of images, with the attributes of their tracks."""
-        inner = '<box label="person" xtl="1" ytl="2" xbr="4" ybr="8"><attribute name="track_id">{}</attribute></box>'
-        images = "".join(f'<image id="{k}" name="{k}.jpg">{inner.format(7 + k)}</image>' for k in range(2))
-        labels = read(tmp_path, f"<annotations>{images}</annotations>")
-        assert (labels.frame.tolist(), labels.id.tolist()) == ([0, 1], [7, 8])
-
-    def test_a_task_of_every_fifth_picture_has_no_boxes_in_between(self, tmp_path):
-        meta = "<meta><task><size>5</size><start_frame>3</start_frame><stop_frame>23</stop_frame>"
-        meta += "<frame_filter>step=5</frame_filter></task></meta>"
-        boxes = [box(3, 100), box(13, 120), box(18, 150, outside=1)]
-        labels = read(tmp_path, f"<annotations>{meta}{track(0, *boxes)}</annotations>")
-        assert (labels.frame.tolist(), labels.boxes_px[:, 0].tolist()) == ([3, 8, 13], [100, 110, 120])
-        assert labels.labelled.tolist() == [3, 8, 13, 18, 23]
-
-    @pytest.mark.parametrize(
-        ("meta", "inner", "words"),
-        [
-            ("<start_frame>9</start_frame><stop_frame>12</stop_frame>", "", "2 boxes are in frames that its task"),
-            ("", '<attribute name="track_id">seven</attribute>', "not a whole number ('seven')"),
-        ],
-    )
-    def test_what_is_odd_is_said(self, meta, inner, words, tmp_path):
-        text = (
-            f"<annotations><meta><task>{meta}</task></meta>{track(0, box(0, 1, inner=inner), box(1, 1))}</annotations>"
-        )
-        labels = read(tmp_path, text)
-        assert labels.frame.tolist() == [0, 1]
-        assert [words in said for said, _ in labels.doubts] == [True]
-
-    def test_a_rotated_box_is_said(self, tmp_path):
-        turned = box(0, 1, more='rotation="30.5"')
-        labels = read(tmp_path, f"<annotations>{track(0, turned)}</annotations>")
-        assert any("1 boxes are rotated" in words for words, _ in labels.doubts)
 
     BOMB = '<!DOCTYPE a [<!ENTITY b "bbbb"><!ENTITY c "&b;&b;">]><annotations>&c;</annotations>'
     OUTER = '<!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/passwd">]><annotations>&x;</annotations>'

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
-from importlib import import_module
+from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
-from types import MappingProxyType
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -18,15 +16,13 @@ import pytest
 from mcaptrack import log, notices, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.pipeline.planes import make_plane
-from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
+from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import TRANSFORMS, KnnDetector
-from mcaptrack.transforms.protocol import option
 from tests.commands import call, done
-from tests.tiers import one_in
-from tests.worlds import assert_same_rows, boxes_at, ns, tracks_at, walk
+from tests.worlds import assert_same_rows, ns, tracks_at, walk
 
-runner = import_module("mcaptrack.pipeline.run")  # the package has a function of its name
+run = importlib.import_module("mcaptrack.pipeline.run")  # the package has a function of that name
 
 
 @pytest.fixture
@@ -161,7 +157,7 @@ def test_a_missing_channel_is_reported_once(path):
 
 
 def test_run_warns_of_too_little_memory(path, monkeypatch):
-    monkeypatch.setattr(runner, "free_memory", lambda: 1_000_000)
+    monkeypatch.setattr(run, "free_memory", lambda: 1_000_000)
     said = json.loads(done("track", path, "--json", "-q").out)["warnings"]
     assert [one["code"] for one in said] == ["memory"]
 
@@ -171,9 +167,9 @@ def test_the_memory_warning_begins_at_the_estimated_need(monkeypatch):
     frames = [Frame(n * 100_000_000, n, DETECTIONS.empty(20)) for n in range(1_000)]
     needed = 400_000_000 + 2_000 * 3_000
     for free, is_little in ((needed, False), (needed - 1, True), (None, False)):
-        monkeypatch.setattr(runner, "free_memory", lambda free=free: free)
+        monkeypatch.setattr(run, "free_memory", lambda free=free: free)
         with notices.listening(lambda _: None), notices.collected() as said:
-            runner.warn_memory(frames)
+            run.warn_memory(frames)
         assert [one.code for one in said] == ["memory"] * is_little
 
 
@@ -184,10 +180,10 @@ def test_empty_results_are_explained_by_the_input_or_the_transform():
         ([none, some], "no samples of /camera/tracks: "),
     ):
         with notices.listening(lambda _: None), notices.collected() as said:
-            runner.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), given, [none])
+            run.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), given, [none])
         assert [one.message.startswith(words) for one in said] == [True]
     with notices.listening(lambda _: None), notices.collected() as said:
-        runner.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), [none, some], [none, some])
+        run.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), [none, some], [none, some])
     assert said == []
 
 
@@ -323,89 +319,3 @@ def test_later_stages_repeat_the_warning_of_camera_motion(tmp_path):
         outcome = done(command, path, "--json", "-q")
         assert "camera-moves" in [one["code"] for one in json.loads(outcome.out)["warnings"]]
         assert f"warning: {path}: the camera moves in" in outcome.err
-
-
-# Transforms of other packages
-
-
-@dataclass(frozen=True, kw_only=True)
-class Fixed:
-    """A detector of another package: one box in every picture."""
-
-    size_px: float = option(8.0, "how large the box is")
-
-    reads: ClassVar[Schema] = VIDEO
-    writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": DETECTIONS})
-    latency_s: ClassVar[float] = 0.0
-
-    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        for frame in frames:
-            yield (frame._replace(rows=boxes_at([(20.0, 20.0)], (self.size_px, self.size_px))),)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Single:
-    """A tracker of another package: it assigns all boxes to one track."""
-
-    reads: ClassVar[Schema] = DETECTIONS
-    writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": TRACKS})
-    latency_s: ClassVar[float] = 0.0
-
-    def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        for frame in frames:
-            yield (frame._replace(rows=tracks_at({7: (1.0, frame.index / 10)})),)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sized(Fixed):
-    """A detector with a parameter that a log can't hold."""
-
-    sizes_px: dict[str, float] = field(default_factory=dict)
-
-
-def run_stage(path: Path, stage: str, transform: object) -> None:
-    with log.read(path) as opened:
-        pipeline.run(opened, "/camera", pipeline.plan_stage(opened, "/camera", stage, transform))
-
-
-@pytest.mark.parametrize(
-    ("stage", "transform", "kind"),
-    one_in(2, [("detect", Fixed(size_px=9.0), "detector"), ("track", Single(), "tracker")]),
-)
-def test_a_class_that_only_the_log_names_is_not_imported(path, stage, transform, kind):
-    """``run`` names the class and the option that allows it, and leaves the log unchanged."""
-    topic = {"detect": "/camera/detections", "track": "/camera/tracks"}[stage]
-    run_stage(path, stage, transform)
-    first, name = made_by(path, topic), f"{__name__}:{type(transform).__name__}"
-    assert first.plugins["transform"].implementation == first.parameters[kind] == name
-    done("run", path, "--no-tables", "-q")  # what was made from it follows
-    before = path.read_bytes()
-    refused = call("run", path, "--no-tables", "--force")
-    assert refused.code == 1
-    assert f"{kind} {name}" in refused.err.splitlines()[-1]
-    assert f"imported only if you name it, as in `mcaptrack run {path} --force --{kind} {name}`" in refused.err
-    assert path.read_bytes() == before
-    with log.read(path) as opened:
-        jobs = pipeline.plan_all(opened, "/camera", defaults={stage: type(transform)()}, force=True)
-        assert [type(job.transform) for job in jobs if job.stage == stage] == [type(transform)]
-        pipeline.run(opened, "/camera", jobs)
-    assert made_by(path, topic).plugins == first.plugins
-    done("drop", path, topic, "-o", "left.mcap", "-q")
-    assert "running " + stage in done("run", "left.mcap", "--no-tables").err
-
-
-def test_outdated_results_of_an_unnamed_class_can_be_replaced(path):
-    run_stage(path, "track", Single())
-    done("detect", path, "--detector", "knn", "-q")
-    said = call("run", path, "--no-tables", "-q").err  # these tests are part of mcaptrack, if it is installed from here
-    assert re.search(r"tracker tests\.test_findings:Single (\(mcaptrack \S+\) )?made it", said)
-    done("run", path, "--no-tables", "--tracker", "ocsort", "-q")
-    assert made_by(path, "/camera/tracks").parameters["tracker"] == "ocsort"
-    assert made_by(path, "/camera/tracks").plugins == {}
-
-
-def test_parameters_that_a_log_can_not_hold_are_refused(path):
-    before = path.read_bytes()
-    with pytest.raises(McaptrackError, match=r"Sized\.sizes_px is a dict\[str, float\]; a parameter is a float"):
-        run_stage(path, "detect", Sized())
-    assert path.read_bytes() == before

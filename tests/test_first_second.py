@@ -19,7 +19,7 @@ from scipy.stats import chi2
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.forecasts import by_frame, radii_m
+from mcaptrack.evaluation.forecasts import radii_m
 from mcaptrack.foxglove.views.layouts import limit_of
 from mcaptrack.geometry.mixtures import normal_tails
 from mcaptrack.viewing.links import utc_text
@@ -214,20 +214,6 @@ def test_the_spread_of_forecasts_in_the_log_is_that_of_their_ellipses(finished):
             assert one["spread_mean_m"] == pytest.approx(mine.mean())
             assert one["spread_90_m"] == pytest.approx(np.percentile(mine, 90))
     assert seen > 5
-
-
-@given(st.lists(st.tuples(st.integers(0, 4), st.floats(0, 100) | st.just(math.nan)), max_size=25))
-def test_means_and_percentiles_are_those_of_numpy(pairs):
-    frame = np.array([one for one, _ in pairs], np.int64)
-    values = np.array([one for _, one in pairs], np.float64)
-    mean, most = by_frame(values, frame, 5)
-    for one in range(5):
-        mine = values[(frame == one) & np.isfinite(values)]
-        if len(mine):
-            assert mean[one] == pytest.approx(mine.mean())
-            assert most[one] == pytest.approx(np.percentile(mine, 90))
-        else:
-            assert np.isnan([mean[one], most[one]]).all()
 
 
 @given(st.floats(0.01, 10), st.floats(0.01, 10), st.floats(0, 7))

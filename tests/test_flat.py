@@ -222,7 +222,6 @@ JSON = st.deferred(
 
 
 @given(st.lists(JSON, max_size=5))
-@settings(max_examples=50)
 def test_whatever_json_holds_becomes_a_table(tmp_path_factory, values):
     path = tmp_path_factory.mktemp("j") / "a.mcap"
     table = one_channel(path, "", "", b"", "json", [json.dumps(value).encode() for value in values])

@@ -336,20 +336,6 @@ def test_rows_of_one_time_are_the_same_person_near_each_other(mine, theirs, pair
     assert following._pairs(rows_at(mine), rows_at(theirs)) == pairs
 
 
-@pytest.mark.parametrize(("x", "count"), [(100.5, 1), (100.51, 0)])
-def test_rows_without_boxes_are_compared_in_metres(x, count):
-    one, other = rows_at({1: (100, 40)}, metres=(1.0, 1.0)), rows_at({7: (x, 40)}, metres=(1.0, 1.0))
-    assert following._pairs(one, other) == [(1, 7)] * count
-    assert following._pairs(rows_at({1: (100, 40)}), other) == []  # 91 m away
-    assert following._distances(one, other)[0, 0] == pytest.approx(2 * (x - 100))
-
-
-def test_ids_that_go_on_keep_their_names_and_others_follow_the_last():
-    ids = np.array([3, 1, 2, 3])
-    assert following._renumbered(ids, {3: 1, 2: 40}, 50).tolist() == [1, 51, 40, 1]
-    assert ids.tolist() == [3, 1, 2, 3]
-
-
 def test_a_lead_is_brought_to_other_planes():
     one, two = (GroundPlane((scale, 0, 0, 0, scale, 0, 0, 0, 1), 640, 480) for scale in (0.1, 0.2))
     assert following._differ([(0, one)], [(5, two)])

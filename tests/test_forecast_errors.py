@@ -120,31 +120,6 @@ def test_ground_truth_of_another_time_is_ignored():
     assert np.isnan(score["false_forecasts"])
 
 
-def test_an_unknown_future_has_a_person_and_no_error():
-    truth = walk(straight_on, 8)
-    made = predictions(lambda n: {1: [(0.5 * (n + k), 0.0) for k in (1, 2, 3)]} if n == 6 else {}, 8)
-    row, score = only(find_forecast_errors(made, truth, truth, truth))
-    assert (row["truth_id"], row["later_id"]) == (1, 1)
-    assert np.isnan([row["ade_m"], row["later_ade_m"], row["error_1s_m"]]).all()
-    assert (score["scored"], score["false_forecasts"], score["later_scored"]) == (0, 0, 0)
-
-
-def test_a_forecast_of_a_false_track_has_no_person():
-    truth = walk(straight_on, 12)
-    tracks = walk(lambda n: {1: straight_on(n)[1], 9: (0.5 * n, 40.0)}, 12)
-    kept = walk(straight_on, 12)  # what re-tracking left of it
-    made = predictions(
-        lambda n: {who: [(0.5 * (n + k), y) for k in (1, 2, 3)] for who, y in ((9, 40.0), (1, 0.0))} if n == 5 else {},
-        12,
-    )
-    found = find_forecast_errors(made, tracks, truth, kept)
-    rows, score = rows_of(found.errors), found.scores[5].rows[0]
-    assert rows["track_id"].tolist() == [1, 9]
-    assert rows["truth_id"].tolist() == rows["later_id"].tolist() == [1, -1]
-    assert (score["forecasts"], score["scored"], score["false_forecasts"], score["later_scored"]) == (2, 1, 1, 1)
-    assert score["ade_m"] == 0.0
-
-
 @pytest.mark.parametrize(
     ("step_s", "steps", "wanted"), [(0.5, 3, 2.0), (1.0, 2, 1.0), (1.0, 1, 1.0), (0.25, 3, None), (2.0, 3, None)]
 )

@@ -38,15 +38,6 @@ def source(
     return gathering.Source(f"/{name}", frames, t_ns, CameraView(name=name, planes=((0, plane),)))
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_the_nearest_of_times_is_the_earlier_one_of_two(seed: int):
-    rng = np.random.default_rng(seed)
-    times = np.sort(rng.choice(60, int(rng.integers(1, 12)), replace=False)) * 2
-    at = np.arange(-5, 130)
-    wanted = [int(np.abs(times - one).argmin()) for one in at]  # the first one of equals
-    assert gathering._nearest(times, at).tolist() == wanted
-
-
 @pytest.mark.parametrize(
     ("steps_s", "late_s", "within_s"),
     [((0.5, 0.2), 0.0, 0.25), ((0.5, 0.2), 0.13, 0.25), ((4.0, 0.7), 0.3, 0.5), ((1.0, 1.0), 1.6, 0.5)],

@@ -1,9 +1,13 @@
-"""Tracks in metres: the ground tracker, and the stages after it."""
+"""Tracks in metres: the ground tracker, and the stages after it.
+
+That its rows are those of a slow tracker, whatever detectors do, is tested in ``test_ground_reference``.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,8 +19,7 @@ from mcaptrack.transforms import GroundTracker, Predict, Retrack, RetrackByConsi
 from mcaptrack.transforms.ground.state import VX, VY, GroundTracks, X, Y
 from mcaptrack.transforms.motion_limits import LIMITS, limits_of, limits_row, read_limits
 from mcaptrack.transforms.to_video_rate import to_video_rate
-from tests.commands import call
-from tests.references.ground import Axis, transition
+from tests.references.ground import transition
 from tests.tiers import one_in
 from tools.traffic import CLASSES, Faults, draw_traffic
 
@@ -77,36 +80,6 @@ def test_the_laws_hold_with_covariances_of_some_detections():
     check_transform(GroundTracker(class_names=NAMES), frames)
 
 
-def test_points_without_size_are_tracked_too():
-    points = frames_of(drive(12))
-    (rows,) = (tracked(points)[-1].rows,)
-    assert rows["x_m"] == pytest.approx([11.0], abs=0.2)
-    assert rows["vx_m_per_s"] == pytest.approx([10.0], abs=0.5)
-    assert np.isnan(rows["length_m"]).all()
-    assert np.isnan(rows["heading_rad"]).all()
-
-
-@pytest.mark.parametrize(("row", "class_id"), [("person", PEDESTRIAN), ("car", CAR)])
-def test_the_filter_is_that_of_the_textbook(row: str, class_id: int):
-    """Along a straight line an arc has no part; each axis is a filter of its own."""
-    limits, rng = LIMITS[row], np.random.default_rng(4)
-    tracks, own = GroundTracks(), Axis(1.0, limits.noise_m, limits.speed_m_per_s, limits.drift_m_per_s, limits.turns)
-    found = np.full((12, 1), np.nan)
-    found[[X, Y]], found[9:, 0] = [[1.0], [0.0]], (0.5, class_id, -1)
-    tracks.initiate(1, found, {class_id: limits}, 0)
-    for frame in range(1, 12):
-        seconds = float(rng.uniform(0.05, 0.5))
-        tracks.predict(seconds)
-        own.predict(seconds)
-        assert tracks.table[[X, VX], 0] == pytest.approx(own.mean[:2])
-        if frame % 4:
-            found[X] = 1.0 + frame * 0.3 + rng.normal(0, 0.1)
-            tracks.update(np.array([0]), found, np.array([True]), frame)
-            own.correct(float(found[X, 0]))
-        assert tracks.table[[X, VX, 12], 0] == pytest.approx(own.mean)
-        assert tracks.table[14:20, 0] == pytest.approx(own.cov[np.triu_indices(3)])
-
-
 def test_with_covariances_the_filter_is_that_of_matrices():
     """One filter over both axes, from the textbook, with a noise of its own for each detection."""
     limits, rng = LIMITS["person"], np.random.default_rng(5)
@@ -133,6 +106,8 @@ def test_with_covariances_the_filter_is_that_of_matrices():
         assert tracks.table[[X, VX, Y, VY], 0] == pytest.approx(mean[[0, 1, 3, 4]])
         assert tracks.covariances is not None
         assert tracks.covariances.values[0] == pytest.approx(cov)
+        assert tracks.covariances.places()[:, 0] == pytest.approx(cov[[0, 0, 3], [0, 3, 3]])
+        assert tracks.covariances.means()[:, 0] == pytest.approx(((cov[:3, :3] + cov[3:, 3:]) / 2)[np.triu_indices(3)])
 
 
 def seen(places: list[tuple[float, float, float]], cov: tuple[float, float, float] | None) -> Frame:
@@ -180,99 +155,20 @@ def test_covariances_that_are_none_count_as_missing(cov: tuple[float, float, flo
         assert one.rows.tobytes() == other.rows.tobytes()
 
 
-def turning(count: int, missing: tuple[int, ...] = ()) -> tuple[dict[int, dict[str, float]], np.ndarray]:
-    """A car that goes 8 m/s on a circle of 10 m, with its heading; and its path."""
+def turning(count: int, missing: tuple[int, ...] = ()) -> dict[int, dict[str, float]]:
+    """A car that goes 8 m/s on a circle of 10 m, with its heading."""
     angle = 0.08 * np.arange(count)
     path = 10 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=-1)
-    car = {
+    return {
         t: {"x_m": path[t, 0], "y_m": path[t, 1], "heading_rad": (angle[t] + np.pi) % (2 * np.pi) - np.pi}
         for t in range(count)
         if t not in missing
     }
-    return car, path
-
-
-def test_a_car_that_turns_is_predicted_on_an_arc():
-    """Half a second later a straight line is v^2 / r * t^2 / 2 = 0.8 m beside the circle, if the velocity is right."""
-    car, path = turning(40)
-    run = tracked(frames_of(car), delay_s=0.0)[-1].rows
-    tracks = GroundTracks()
-    found = np.full((12, 1), np.nan)
-    found[9:, 0] = (0.8, CAR, -1)
-    for frame in range(35):
-        found[[X, Y], 0] = path[frame]
-        if frame:
-            tracks.predict(0.1)
-            tracks.update(np.array([0]), found, np.array([True]), frame)
-        else:
-            tracks.initiate(1, found, {CAR: LIMITS["car"]}, 0)
-    velocity = tracks.table[[VX, VY], 0]
-    straight = tracks.table[[X, Y], 0] + 0.5 * velocity
-    tracks.predict(0.5)
-    arc_m, straight_m = (float(np.hypot(*(at - path[39]))) for at in (tracks.table[[X, Y], 0], straight))
-    assert arc_m < 0.6 * straight_m
-    assert (run["x_m"][0], run["y_m"][0]) == pytest.approx(tuple(path[39]), abs=0.2)
 
 
 def test_a_gap_in_a_turn_is_closed_under_the_same_id():
-    car, _ = turning(60, missing=tuple(range(30, 42)))
+    car = turning(60, missing=tuple(range(30, 42)))
     assert {one for frame in ids(tracked(frames_of(car))) for one in frame} == {1}
-
-
-def test_half_turns_of_headings_are_mended():
-    """Every fifth heading is turned around; those of the track never are."""
-    car = {t: box | {"heading_rad": np.pi - 0.01 if t % 5 == 2 else 0.0} for t, box in drive(30).items()}
-    headings = [float(frame.rows["heading_rad"][0]) for frame in tracked(frames_of(car))]
-    assert np.abs(headings).max() < 0.1
-
-
-def test_motion_tells_front_from_back():
-    """A detector that always takes the back of a car for its front is not followed once the car moves."""
-    car = {t: box | {"heading_rad": np.pi} for t, box in drive(20).items()}
-    assert abs(tracked(frames_of(car))[-1].rows["heading_rad"][0]) < 0.1
-    parked = {t: {"x_m": 0.0, "y_m": 0.0, "heading_rad": 2.0} for t in range(20)}
-    assert tracked(frames_of(parked))[-1].rows["heading_rad"] == pytest.approx([2.0])
-
-
-def test_a_wrong_size_changes_little():
-    sizes = {"z_m": 1.0, "length_m": 4.0, "width_m": 2.0, "height_m": 1.5}
-    car = {t: box | sizes | ({"length_m": 12.0} if t == 15 else {}) for t, box in drive(20).items()}
-    assert tracked(frames_of(car))[-1].rows["length_m"] == pytest.approx([4.0], abs=0.1)
-
-
-def test_low_scores_continue_tracks_and_start_none():
-    strong = {t: box | {"score": 0.8 if t < 5 else 0.1} for t, box in drive(15).items()}
-    weak = {t: {"x_m": 50.0, "y_m": 50.0, "score": 0.1} for t in range(15)}
-    assert ids(tracked(frames_of(strong, weak))) == [[1]] * 15
-
-
-def test_false_births_are_taken_back_and_true_ones_begin_at_the_first_detection():
-    once = {5: {"x_m": 80.0, "y_m": 0.0}}
-    frames = frames_of(drive(20), once)
-    assert ids(tracked(frames)) == [[1]] * 20
-    causal = ids(tracked(frames, delay_s=0.0))
-    assert causal == [[], *[[1]] * 19]
-
-
-def test_a_gap_within_the_delay_is_interpolated():
-    frames = tracked(frames_of(drive(20, missing=(9, 10, 11))))
-    rows = np.concatenate([frame.rows for frame in frames])
-    assert rows["x_m"] == pytest.approx(np.arange(20.0), abs=0.25)
-    assert np.flatnonzero(~rows["observed"]).tolist() == [9, 10, 11]
-    assert len(tracked(frames_of(drive(20, missing=(9, 10, 11))), delay_s=0.0)[10].rows) == 0
-
-
-def test_a_track_keeps_its_id_while_its_class_flickers():
-    """Every fourth detection of a truck says car: one track, and most of its scores say truck."""
-    truck = {t: box | {"class_id": CAR if t % 4 == 3 else 4} for t, box in drive(24).items()}
-    frames = tracked(frames_of(truck))
-    assert ids(frames) == [[1]] * 24
-    assert set(frames[-1].rows["class_id"].tolist()) == {4}
-
-
-def test_objects_of_two_classes_at_one_place_are_two_tracks():
-    rider, bicycle = drive(12, 4.0, class_id=PEDESTRIAN), drive(12, 4.0, class_id=2)
-    assert ids(tracked(frames_of(rider, bicycle)))[-1] == [1, 2]
 
 
 def test_a_limit_of_speed_keeps_two_cars_apart():
@@ -382,9 +278,14 @@ def test_detections_without_a_position_are_left_out_aloud():
 
 
 def test_the_documentation_has_the_table_of_limits():
-    rows = [line for line in call("docs", "robots").out.splitlines() if line.count("|") == 9][2:]
-    assert [row.split(" ")[1] for row in rows] == list(LIMITS)
-    assert "| bicycle | 3.5 | 15 | 1.5 | 0.2 | 2 | yes | 1.8, 0.6, 1.7 |" in rows
+    text = (Path(__file__).parent.parent / "docs" / "robots.md").read_text()
+    lines = text.partition("<!-- limits: begin -->")[2].partition("<!-- limits: end -->")[0].split("\n")[3:-1]
+    made = [
+        f"| {row.name} | {row.speed_m_per_s:g} | {row.max_speed_m_per_s:g} | {row.drift_m_per_s:g} | {row.noise_m:g} "
+        f"| {row.gate_m:g} | {'yes' if row.turns else 'no'} | {', '.join(f'{side:g}' for side in row.size_m)} |"
+        for row in LIMITS.values()
+    ]
+    assert lines == made
 
 
 @pytest.mark.parametrize(
@@ -559,22 +460,6 @@ def test_the_faults_of_the_detector_are_what_they_are_set_to():
     truth, frames = scene(2, seconds=3.0, faults=none)
     assert sum(len(frame.rows) for frame in frames) == len(truth["frame"])
     assert sum(len(frame.rows) for frame in scene(2, seconds=3.0)[1]) < 0.9 * len(truth["frame"])
-
-
-def test_tracks_face_as_true_vehicles_do():
-    truth, frames = scene(5, seconds=8.0, density=0.6)
-    off = []
-    for number, frame in enumerate(tracked(frames)):
-        at = np.flatnonzero((truth["frame"] == number) & (truth["class_id"] == CAR))
-        rows = frame.rows[frame.rows["class_id"] == CAR]
-        if len(at) and len(rows):
-            away = np.hypot(truth["x_m"][at][:, None] - rows["x_m"], truth["y_m"][at][:, None] - rows["y_m"])
-            best = away.argmin(axis=1)
-            near = away[np.arange(len(at)), best] < 1.0
-            off.append((rows["heading_rad"][best] - truth["heading_rad"][at])[near])
-    turned = np.abs(np.angle(np.exp(1j * np.concatenate(off))))
-    assert (turned > np.pi / 2).mean() < 0.02
-    assert np.median(turned) < 0.08
 
 
 #: Mean length, width and height in metres of boxes of the public data set nuScenes (its training split).

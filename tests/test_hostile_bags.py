@@ -10,7 +10,7 @@ import socket
 import sqlite3
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -35,6 +35,17 @@ TOPICS = [(1, "/a", STRING1, "cdr", "")]
 def folder(tmp_path) -> Path:
     (tmp_path / "in").mkdir()
     return tmp_path / "in"
+
+
+def changed(path: Path, *statements: str, messages: Sequence[tuple] = ()) -> Path:
+    """A bag that was changed by SQL."""
+    database(path, 3, messages, TOPICS)
+    db = sqlite3.connect(path)
+    for statement in statements:
+        db.execute(statement)
+    db.commit()
+    db.close()
+    return path
 
 
 def refused(commands, source: Path, words: str) -> bounded.Outcome:
@@ -204,6 +215,7 @@ def test_what_is_no_file_is_not_waited_for(commands, folder, kind, place):
 # Databases
 
 
+COUNTED = "WITH RECURSIVE r(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM r LIMIT {})"
 RECURSIVE = "WITH RECURSIVE r(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM r) SELECT"
 SCHEMAS = {
     "a recursive view": f"CREATE VIEW messages AS {RECURSIVE} 1 AS topic_id, n AS timestamp, x'00' AS data FROM r",
@@ -216,27 +228,20 @@ SCHEMAS = {
 
 @pytest.mark.parametrize("name", SCHEMAS)
 def test_only_tables_are_read(commands, folder, name):
-    database(folder / "a.db3", 3, [], TOPICS)
-    with sqlite3.connect(folder / "a.db3") as db:
-        db.execute("DROP TABLE messages")
-        db.execute(SCHEMAS[name])
-    db.close()
-    refused(
-        commands,
-        folder / "a.db3",
-        "is computed" if "zeros" in name and "view" not in name else "is not an ordinary table",
-    )
+    path = changed(folder / "a.db3", "DROP TABLE messages", SCHEMAS[name])
+    why = "is computed" if "zeros" in name and "view" not in name else "is not an ordinary table"
+    refused(commands, path, why)
 
 
 def test_a_view_that_calls_itself_a_table_is_not_read(commands, folder):
-    database(folder / "a.db3", 3, [], TOPICS)
-    with sqlite3.connect(folder / "a.db3") as db:
-        db.execute("DROP TABLE messages")
-        db.execute(SCHEMAS["a recursive view"])
-        db.execute("PRAGMA writable_schema=ON")
-        db.execute("UPDATE sqlite_master SET type = 'table' WHERE name = 'messages'")
-    db.close()
-    refused(commands, folder / "a.db3", "messages")
+    path = changed(
+        folder / "a.db3",
+        "DROP TABLE messages",
+        SCHEMAS["a recursive view"],
+        "PRAGMA writable_schema=ON",
+        "UPDATE sqlite_master SET type = 'table' WHERE name = 'messages'",
+    )
+    refused(commands, path, "messages")
 
 
 def test_a_database_is_read_with_the_guards_of_sqlite(folder, monkeypatch):
@@ -251,43 +256,34 @@ def test_a_database_is_read_with_the_guards_of_sqlite(folder, monkeypatch):
 
 def test_damaged_words_of_a_database_that_are_no_text_are_said_as_such(commands, folder):
     """SQLite quotes them in its message, which Python then can't decode."""
-    database(folder / "a.db3", 3, [], TOPICS)
-    with sqlite3.connect(folder / "a.db3") as db:
-        db.execute("PRAGMA writable_schema=ON")
-        db.execute("UPDATE sqlite_master SET sql = CAST(x'637265617465ff' AS TEXT) WHERE name = 'messages'")
-    db.close()
-    refused(commands, folder / "a.db3", "a.db3 is damaged: it can't be understood")
+    damage = "UPDATE sqlite_master SET sql = CAST(x'637265617465ff' AS TEXT) WHERE name = 'messages'"
+    path = changed(folder / "a.db3", "PRAGMA writable_schema=ON", damage)
+    refused(commands, path, "a.db3 is damaged: it can't be understood")
 
 
 def test_one_of_two_tables_is_no_bag(commands, folder):
     for gone in ("topics", "messages"):
-        database(folder / "a.db3", 3, [], TOPICS)
-        with sqlite3.connect(folder / "a.db3") as db:
-            db.execute(f"DROP TABLE {gone}")
-        db.close()
-        refused(commands, folder / "a.db3", "none of rosbag2: it has no topics and messages")
-        (folder / "a.db3").unlink()
+        path = changed(folder / "a.db3", f"DROP TABLE {gone}")
+        refused(commands, path, "none of rosbag2: it has no topics and messages")
+        path.unlink()
 
 
 @pytest.mark.parametrize(("table", "column"), [("topics", "serialization_format"), ("messages", "data")])
 def test_each_column_is_needed(commands, folder, table, column):
-    database(folder / "a.db3", 3, [], TOPICS)
-    with sqlite3.connect(folder / "a.db3") as db:
-        db.execute(f"ALTER TABLE {table} RENAME COLUMN {column} TO other")
-    db.close()
-    refused(commands, folder / "a.db3", "none of rosbag2")
+    path = changed(folder / "a.db3", f"ALTER TABLE {table} RENAME COLUMN {column} TO other")
+    refused(commands, path, "none of rosbag2")
 
 
 def test_a_table_gives_no_more_than_the_file_holds(commands, folder):
     """Rows that are short on the disk get a long default."""
-    database(folder / "a.db3", 3, [], TOPICS)
-    with sqlite3.connect(folder / "a.db3") as db:
-        db.execute("DROP TABLE messages")
-        db.execute("CREATE TABLE messages(topic_id INTEGER, timestamp INTEGER)")
-        db.executemany("INSERT INTO messages VALUES (1, ?)", [(n,) for n in range(50_000)])
-        db.execute(f"ALTER TABLE messages ADD COLUMN data BLOB DEFAULT x'{'00' * 300_000}'")
-    db.close()
-    refused(commands, folder / "a.db3", "its table messages holds more than the file can")
+    path = changed(
+        folder / "a.db3",
+        "DROP TABLE messages",
+        "CREATE TABLE messages(topic_id INTEGER, timestamp INTEGER)",
+        f"INSERT INTO messages {COUNTED.format(50_000)} SELECT 1, n FROM r",
+        f"ALTER TABLE messages ADD COLUMN data BLOB DEFAULT x'{'00' * 300_000}'",
+    )
+    refused(commands, path, "its table messages holds more than the file can")
 
 
 def test_pages_that_stand_for_each_other_end(commands, folder):
@@ -518,11 +514,8 @@ def test_a_message_of_a_bag_is_not_larger_than_one_of_a_log(commands, folder):
 
 def endless_database(path: Path) -> None:
     """Not quite: more messages than are read within a second."""
-    database(path, 3, [], TOPICS)
-    with sqlite3.connect(path) as db:
-        counted = "WITH RECURSIVE r(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM r LIMIT 600000)"
-        db.execute(f"{counted} INSERT INTO messages(topic_id, timestamp, data) SELECT 1, n, x'00010000' FROM r")
-    db.close()
+    columns = "messages(topic_id, timestamp, data)"
+    changed(path, f"INSERT INTO {columns} {COUNTED.format(600_000)} SELECT 1, n, x'00010000' FROM r")
 
 
 def endless_bag(path: Path) -> None:

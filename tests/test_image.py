@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import os
 import re
@@ -42,21 +41,6 @@ def is_sent(path: str) -> bool:
         if line and not line.startswith("#") and fits:
             kept = keeps
     return kept
-
-
-def test_the_last_stage_is_slim_and_not_root_and_has_a_health_check():
-    pythons = re.findall(r"Programming Language :: Python :: (3\.\d+)", (ROOT / "pyproject.toml").read_text())
-    bases = [words.split()[0] for words in named("FROM")]
-    assert len(set(bases)) == 1
-    assert bases[0] in {f"python:{version}-slim" for version in pythons}
-    last = LINES[max(number for number, (name, _) in enumerate(LINES) if name == "FROM") :]
-    (user,) = [words for name, words in last if name == "USER"]
-    assert f"useradd --uid 10001 --create-home {user}" in TEXT
-    assert [name for name, _ in last].index("USER") < [name for name, _ in last].index("ENTRYPOINT")
-    assert not any("pip" in words for name, words in last if name == "RUN")
-    (check,) = named("HEALTHCHECK")
-    assert ast.literal_eval(check.partition("CMD ")[2]) == ["mcaptrack", "doctor", "--quiet"]
-    assert [ast.literal_eval(words) for words in named("ENTRYPOINT")] == [["mcaptrack"]]
 
 
 def test_what_is_copied_is_there_and_gives_the_wheel_of_the_repository(tmp_path):

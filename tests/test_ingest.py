@@ -14,13 +14,13 @@ from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
 from mcaptrack.schema.provenance import CLOCK, Provenance
 from mcaptrack.sources.demo import demo_scene
-from mcaptrack.sources.ingest import IngestOptions, ingest, label_frames
+from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 from tests.worlds import ids, ns, write_clip
 
 MOT15 = "1,3,10,20,4,8,1,-1,-1,-1\n2,3,11,20,4,8,0.5,-1,-1,-1\n1,5,50,60,4,8,1,-1,-1,-1\n"
-MOT17 = "1,1,10,20,4,8,1,1,1.0\n1,2,10,20,4,8,1,7,1.0\n1,3,10,20,4,8,0,1,1.0\n2,1,11,20,4,8,1,1,0.5\n"
-SDD = '0 10 20 14 28 0 0 0 0 "Pedestrian"\n0 11 20 15 28 1 0 0 1 "Pedestrian"\n4 1 1 9 9 1 0 0 0 "Biker"\n0 12 20 16 28 2 1 0 1 "Pedestrian"\n'
+
+
 TRAJNET = "0 7 1.5 2.5\n12 7 1.6 2.5\n12 9 3.0 4.0\n24 7 1.7 2.5\n"
 OBSMAT = "780 1 8.46 0 3.59 1.67 0 0.17\n786 1 9.13 0 3.66 1.67 0 0.17\n"
 
@@ -31,33 +31,6 @@ def write(path: Path, text: str) -> Path:
 
 
 class TestLabels:
-    def test_mot15_by_hand(self, tmp_path):
-        labels = read_labels(write(tmp_path / "a.txt", MOT15))
-        assert (labels.format, labels.first_frame, labels.step) == ("mot", 1, 1)
-        assert labels.frame.tolist() == [1, 1, 2]
-        assert labels.id.tolist() == [3, 5, 3]
-        assert labels.boxes_px.tolist() == [[10, 20, 4, 8], [50, 60, 4, 8], [11, 20, 4, 8]]
-        assert labels.score.tolist() == [1, 1, 0.5]
-
-    def test_mot17_truth_counts_people_that_count(self, tmp_path):
-        path = write(tmp_path / "gt.txt", MOT17)
-        truth = read_labels(path, role="truth")
-        assert list(zip(truth.frame.tolist(), truth.id.tolist(), strict=True)) == [(1, 1), (2, 1)]
-        assert truth.left_out == "2 boxes that don't count (score 0 or a class but 1)"
-        tracks = read_labels(path, role="tracks")
-        assert len(tracks.frame) == 4
-        assert tracks.left_out == "the classes of 1 boxes that aren't people (column 8)"
-        assert read_labels(write(tmp_path / "a.txt", MOT15), role="tracks").left_out == ""
-
-    def test_a_frame_0_says_that_frames_count_from_0(self, tmp_path):
-        assert read_labels(write(tmp_path / "a.txt", "0,1,1,1,2,2\n5,1,1,1,2,2\n")).first_frame == 0
-
-    def test_sdd_by_hand(self, tmp_path):
-        labels = read_labels(write(tmp_path / "a.txt", SDD))
-        assert (labels.format, labels.first_frame) == ("sdd", 0)
-        assert labels.boxes_px.tolist() == [[10, 20, 4, 8], [11, 20, 4, 8]]
-        assert labels.left_out == "1 Biker and 1 boxes out of sight (lost)"
-
     @pytest.mark.parametrize("text", [TRAJNET, TRAJNET.replace(" ", ","), TRAJNET.replace(" ", "\t")])
     def test_trajnet_by_hand(self, tmp_path, text):
         labels = read_labels(write(tmp_path / "a.txt", text))
@@ -70,25 +43,16 @@ class TestLabels:
         assert (labels.format, labels.step) == ("obsmat", 6)
         assert labels.xy_m.tolist() == [[8.46, 3.59], [9.13, 3.66]]
 
-    def test_blank_lines_and_remarks_are_passed_over(self, tmp_path):
-        assert len(read_labels(write(tmp_path / "a.txt", f"# remark\n\n{MOT15}\n")).frame) == 3
-
     BAD = {
         "letters": ("1,1,1,1,2,2\n2,1,x,1,2,2\n", "auto", r"a\.txt:2: not MOTChallenge .*not all are numbers: 2,1,x"),
-        "columns": ("1,1,1,1,2,2\n2,1,3\n", "auto", r"a\.txt:2: not MOTChallenge .*3 columns"),
         "another format": (MOT15, "trajnet", r"a\.txt:1: not TrajNet \(frame id x y\), 10 columns"),
-        "no format": ("hello world\n", "auto", r"a\.txt:1: a row of 2 columns fits no label format"),
         "half a frame": (
             "1.5,1,1,1,2,2\n",
             "auto",
             r"a\.txt:1: the frame \(a count of pictures, no time\) has to be a whole number from 0 on, not 1\.5",
         ),
-        "negative width": ("1,1,1,1,-2,2\n", "auto", r"a\.txt:1: a box can't be -2 wide"),
         "not a number": ("1,1,nan,1,2,2\n", "auto", r"a\.txt:1: a number is not finite"),
-        "twice in one frame": ("1,4,1,1,2,2\n1,4,5,5,2,2\n", "auto", r"id 4 appears twice in frame 1"),
         "nothing": ("\n\n", "auto", "holds no labels"),
-        "sdd without people": (SDD.replace("Pedestrian", "Cart"), "sdd", "holds no pedestrians, only 3 Cart, 1 Biker"),
-        "words in a score": ("1,1,1,1,2,2,high\n", "auto", "not all are numbers"),
     }
 
     @pytest.mark.parametrize(("text", "label_format", "words"), BAD.values(), ids=BAD)
@@ -106,11 +70,6 @@ class TestLabels:
     @pytest.mark.parametrize("text", ["1,0,0\n0,1,0\n0,0,1\n", "1 0 0\n0 1 0\n0 0 1", "1.0e0\t0\t0\n0,1,0\n0 0 1\n"])
     def test_homographies_by_comma_or_blank(self, tmp_path, text):
         assert read_homography(write(tmp_path / "h.txt", text)) == (1, 0, 0, 0, 1, 0, 0, 0, 1)
-
-    @pytest.mark.parametrize("text", ["", "1 2 3\n4 5\n", "1 2 3\n4 5 6\n7 8 9\n1 2 3\n", "a b c\n1 2 3\n1 2 3\n"])
-    def test_what_is_no_homography_is_refused(self, tmp_path, text):
-        with pytest.raises(McaptrackError, match="is not a homography: it needs 3 rows of 3 numbers"):
-            read_homography(write(tmp_path / "h.txt", text))
 
     def test_planes_come_back_from_their_channel(self):
         plane = demo_scene().ground_plane()
@@ -171,17 +130,6 @@ class TestIngest:
         report = ingest(clip, out, options(labels={"truth": truth}))
         assert report.messages["/camera/truth"] == 2  # frames 0 and 12 of 20
         assert report.remarks == [f"{truth} has labels every 12 frames, from 0 on; the frames in between are left out"]
-
-    def test_labels_alone_keep_their_own_clock(self, tmp_path):
-        out = tmp_path / "a.mcap"
-        ingest(write(tmp_path / "world.txt", TRAJNET), out, options())
-        with log.read(out) as opened:
-            frames = opened.frames("/camera/tracks", TRACKS)
-            assert [(f.t_ns, f.index, ids(f)) for f in frames] == [
-                (0, 0, [7]),
-                (ns(0.4), 12, [7, 9]),
-                (ns(0.8), 24, [7]),
-            ]
 
     def test_label_files_of_one_log_share_a_clock(self, tmp_path):
         """Boxes at every frame that begin at frame 8, truth at every twelfth: frame 1 of these is frame 0 of those."""
@@ -290,27 +238,6 @@ class TestIngest:
             ingest(clip, tmp_path / "a.mcap", options(**named))
         assert sorted(tmp_path.iterdir()) == before
 
-    def test_labels_alone_need_a_clock(self, tmp_path):
-        with pytest.raises(McaptrackError, match="has no clock of its own; give the frames per second with `fps=`"):
-            ingest(write(tmp_path / "a.txt", MOT15), tmp_path / "a.mcap", options())
-
-    def test_labels_that_count_from_elsewhere_are_assumed_to_begin_together_and_that_is_said(self, tmp_path, clip):
-        both = {
-            "truth": write(tmp_path / "gt.txt", "0,1,1,1,2,2\n1,1,1,1,2,2\n"),
-            "detections": write(tmp_path / "found.txt", "1,1,1,1,2,2\n2,1,1,1,2,2\n"),
-        }
-        said = [notice.message for notice in ingest(clip, tmp_path / "a.mcap", options(labels=both)).warnings]
-        first, other = (f"frame {k} of {path}" for k, path in enumerate(both.values()))
-        assert f"{first} and {other} are assumed to be the same picture; `first_frame=` sets the number" in said
-        given = ingest(clip, tmp_path / "b.mcap", options(labels=both, first_frame=0))
-        assert not [notice for notice in given.warnings if "same picture" in notice.message]
-
     def test_input_and_output_are_not_one(self, clip):
         with pytest.raises(McaptrackError, match="is both input and output"):
             ingest(clip, clip, options())
-
-    def test_label_files_can_be_compared_without_a_log(self, tmp_path):
-        both = label_frames(
-            {"tracks": write(tmp_path / "t.txt", MOT15), "truth": write(tmp_path / "g.txt", MOT15)}, None, None, "foot"
-        )
-        assert [ids(f) for f in both["truth"]] == [ids(f) for f in both["tracks"]] == [[3, 5], [3]]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from fractions import Fraction
 from pathlib import Path
 
 import pytest
@@ -15,8 +14,6 @@ from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.sources.ingest.job import IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.camera import boxes_extent
 from mcaptrack.sources.ingest.labels.content import WantedClasses
-from mcaptrack.sources.ingest.labels.number_table import read_motions
-from mcaptrack.sources.ingest.labels.timeline import Timeline
 from mcaptrack.tables.compared import pair_files
 from tests.logs import add_rows, some_log
 from tests.worlds import boxes_at, tracks_at
@@ -41,28 +38,6 @@ def job(*, source: str = "a.mp4", **options) -> IngestJob:
     return IngestJob(Path(source), IngestOptions(labels=labels, **options))
 
 
-def test_topics_are_below_the_name_of_the_camera(place):
-    made = job(labels={"truth": "gt.txt", "tracks": "zero.txt"}, camera="/left/", motion=Path("motion.txt"))
-    assert list(made.topics()) == ["/left/truth", "/left/tracks", "/left/motion"]
-    assert (made.has_labels, set(made.roles)) == (True, {"truth", "tracks"})
-    assert made.hint_other_topic(["/left/truth"]) == "`camera='left/labels'` puts these beside them"
-    taken = ["/left/labels/tracks", "/left/labels2/motion", "/left/labels3/other"]
-    assert made.hint_other_topic(taken) == "`camera='left/labels3'` puts these beside them"
-    bare = job()
-    assert (list(bare.topics()), bare.has_labels) == ([], False)
-
-
-def test_channels_of_a_log_are_replaced_when_told(place):
-    made = job(labels={"truth": "gt.txt"}, camera="camera")
-    path = some_log(place / "a.mcap")
-    assert made.topics_to_replace(None, False) == set()
-    with log.read(path) as opened:
-        assert made.topics_to_replace(opened, True) == {"/camera/truth"}
-        with pytest.raises(McaptrackError, match=r"a.mcap has /camera/truth already; `force=True` replaces them"):
-            made.topics_to_replace(opened, False)
-        assert job(labels={"truth": "gt.txt"}, camera="other").topics_to_replace(opened, False) == set()
-
-
 def test_what_is_assumed_and_left_out_is_said(place):
     made = job(labels={"truth": "gt.txt", "tracks": "zero.txt"})
     with collected() as warnings:
@@ -78,16 +53,6 @@ def test_what_is_assumed_and_left_out_is_said(place):
         every.report_assumptions()
     assert [one.message for one in warnings] == []
     assert any("gt.txt has several classes; class_id is" in one for one in every.report.remarks)
-
-
-def test_roles_that_labels_do_not_suit(place):
-    Path("none.txt").write_text(MOT.replace(",1,10,", ",-1,10,").replace(",2,20,", ",-1,20,"))
-    with pytest.raises(McaptrackError, match=r"none.txt has no ids \(all are -1\); truth need ids"):
-        job(labels={"truth": "none.txt"})
-    assert job(labels={"detections": "none.txt"}).has_labels
-    Path("places.txt").write_text("0\t1\t1.5\t2.5\n12\t1\t1.6\t2.5\n24\t1\t1.7\t2.5\n")
-    with pytest.raises(McaptrackError, match=r"places.txt holds positions, not boxes; detections are boxes"):
-        job(labels={"detections": "places.txt"})
 
 
 def test_parameters_of_labels(place):
@@ -124,32 +89,6 @@ def test_boxes_in_shares_of_the_picture_need_its_size(place):
     job(labels={"truth": "gt.txt"}).fit_to_pictures(lambda: pytest.fail("it asks"))
 
 
-def test_options_of_videos_are_named():
-    assert IngestOptions().for_videos() == ""
-    for name, value in (("image_format", "jpeg"), ("quality", 0), ("keyframe_interval_s", 0.0)):
-        assert IngestOptions(**{name: value}).for_videos() == f"`{name}=`"
-    assert IngestOptions(fps=Fraction(5), quality=3).video_options.quality == 3
-
-
-@pytest.mark.parametrize(
-    ("pictures", "said"), [(3, ""), (2, "the rest is left out"), (5, "it is taken as none in the rest")]
-)
-def test_the_motion_of_a_camera_is_of_its_pictures(place, pictures, said):
-    made = job(motion=Path("motion.txt"))
-    assert len(made.motions) == len(read_motions(Path("motion.txt"))) == 3
-    line, written = Timeline.spaced(pictures, Fraction(10), 0, "the pictures"), []
-    made.write_rows = lambda _, suffix, schema, frames, parameters: written.append((suffix, list(frames()), parameters))
-    with collected() as warnings:
-        made.write_motion(None, line, (640, 480))
-    assert [one.message for one in warnings] == [
-        f"motion.txt has the motion of 3 frames, and the pictures are {pictures}; {said}"
-    ] * bool(said)
-    ((suffix, frames, parameters),) = written
-    assert (suffix, len(frames), parameters) == ("motion", pictures, {"file": "motion.txt"})
-    assert {(int(one.rows["width_px"][0]), int(one.rows["height_px"][0])) for one in frames} == {(640, 480)}
-    job().write_motion(None, line, (640, 480))
-
-
 def test_pictures_are_as_large_as_what_their_boxes_reach(place):
     with log.create(place / "a.mcap") as writer:
         boxes = [boxes_at([(30, 40)], (20.5, 10)), boxes_at([(5, 90), (7, 3)], (2, 4.2))]
@@ -163,16 +102,6 @@ def test_pictures_are_as_large_as_what_their_boxes_reach(place):
             for name in ("a/detections", "b/detections", "c/detections", "d/tracks", "e")
         ]
     assert found == [(41, 93), (1, 1), (0, 0), (0, 0), (0, 0)]
-
-
-def test_frames_of_labels_have_their_rows(place):
-    made = job(labels={"tracks": "gt.txt"})
-    line = Timeline.spaced(14, Fraction(10), 0, "the pictures")
-    placed = line.place(Path("gt.txt"), made.labels["tracks"][1], [])
-    found = list(made.frames("tracks", None, placed)())
-    assert [(frame.index, frame.t_ns, frame.rows["track_id"].tolist()) for frame in found] == [
-        (0, 0, [1, 2]), (6, 600_000_000, [1, 2]), (12, 1_200_000_000, [1, 2]),
-    ]  # fmt: skip
 
 
 # Other places where an input is taken, paired or refused

@@ -14,6 +14,7 @@ from mcaptrack.transforms.retrack.likelihood import InputNoise, LikelihoodPass
 from mcaptrack.transforms.retrack.motion_model import MotionModel
 from mcaptrack.transforms.retrack.online_tracker import Association, OnlineTracker
 from tests.references.online import Bends
+from tests.tiers import thorough
 from tools.corruptions import STEP_S, corrupt
 from tools.crowds import drawn
 from tools.reproduce import on_clock
@@ -60,6 +61,7 @@ def test_without_tracks_noise_has_no_limit():
     assert set(found) == {np.inf}
 
 
+@thorough
 def test_people_merged_into_one_detection_are_not_taken_for_noise():
     """In this synthetic crowd positions are off by 0.17 m; the estimate went to its highest value, 0.8 m."""
     (truth, how) = next(islice(drawn(1, 150), 4, None))

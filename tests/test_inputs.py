@@ -51,11 +51,12 @@ def said_of(name: str, parameter: Any, url: str) -> str:
     return said.removeprefix("mcaptrack: ")
 
 
-@pytest.mark.parametrize(("name", "parameter"), PATHS, ids=[f"{name} {p.name}" for name, p in PATHS])
-def test_a_url_is_refused_as_a_url(tmp_path, monkeypatch, name, parameter):
+def test_a_url_is_refused_as_a_url(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = "is a URL; only files, and logs at s3://, gs:// and az://, are read: copy it here first"
-    assert said_of(name, parameter, "https://me:secret@example.org/a/b?c=d") == f"https://example.org/a/b?... {words}"
+    for name, parameter in PATHS:
+        said = said_of(name, parameter, "https://me:secret@example.org/a/b?c=d")
+        assert said == f"https://example.org/a/b?... {words}", (name, parameter.name)
 
 
 #: Arguments that are logs, which may be in a store.
@@ -69,31 +70,25 @@ LOGS = {
 LOGS |= {("query", "words"), ("evaluate", "inputs")}
 
 
-@pytest.mark.parametrize(("name", "parameter"), PATHS, ids=[f"{name} {p.name}" for name, p in PATHS])
-def test_only_logs_are_read_from_a_store(tmp_path, monkeypatch, name, parameter):
+def test_only_logs_are_read_from_a_store(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "obstore", None)
-    said = said_of(name, parameter, "s3://bucket/a/b.mcap")
-    if (name, parameter.name) in LOGS:
-        assert said.startswith("s3://bucket/a/b.mcap is in Amazon S3, which needs obstore, ")
-    else:
-        assert said.startswith("s3://bucket/a/b.mcap is in a store, ")
+    for name, parameter in PATHS:
+        said = said_of(name, parameter, "s3://bucket/a/b.mcap")
+        where = "Amazon S3, which needs obstore, " if (name, parameter.name) in LOGS else "a store, "
+        assert said.startswith(f"s3://bucket/a/b.mcap is in {where}"), (name, parameter.name)
 
 
 def test_paths_of_all_commands_have_a_test():
     assert {name for name, _ in PATHS} == set(COMMANDS) - {"doctor", "models"}  # one takes none, and one URLs, too
 
 
-@pytest.mark.parametrize("name", ["a.mcap", "C:/a", "12:30.mp4", "a b://c", "://x", "/s3:/x"])
-def test_a_path_is_not_taken_for_a_url(name):
-    refuse_url(name)
-
-
-def test_a_folder_that_looks_like_a_url_is_a_folder(tmp_path, monkeypatch):
+def test_a_path_that_looks_like_a_url_is_a_path(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("s3:").mkdir()
     Path("s3:/a").write_text("x")
-    refuse_url(Path("s3:/a"))
+    for name in (Path("s3:/a"), "a.mcap", "C:/a", "12:30.mp4", "a b://c", "://x", "/s3:/x"):
+        refuse_url(name)
     with pytest.raises(McaptrackError, match="s3://b is in a store"):
         refuse_url(Path("s3:/b"))
 

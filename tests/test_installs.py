@@ -30,13 +30,6 @@ def program(path: Path, said: str, code: int = 0) -> Path:
     return path
 
 
-def test_what_is_run_for_every_change_installs_first_and_ends_with_the_tests_as_the_readme_has_them():
-    lines = (ROOT / ".ci" / "run").read_text().splitlines()
-    assert lines[-1] == "exec make test"
-    assert any("tools/installs.py" in line for line in lines)
-    assert "```sh\nmake test\n```" in (ROOT / "README.md").read_text()
-
-
 def test_every_python_is_found_once_in_its_latest_release(tool, tmp_path, monkeypatch):
     program(tmp_path / "bin" / "python3.97", "3 97 1")
     program(tmp_path / "bin" / "python3.99", "no such version is chosen", 127)

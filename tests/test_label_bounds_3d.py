@@ -428,6 +428,8 @@ def test_a_column_that_is_named_is_read_although_others_say_the_same(tmp_path):
         ("t,id,x,y_m,z", ""),
         ("t,id,x [mm],y_m,z", "no column for x_m; x [mm] is not in metres"),
         ("t,id,x_m,y_px,z", "y_px is not in metres"),
+        ("t,id,x_m,north", "no column for y_m"),
+        ("t,id,x_cm,y_m,z", "no column for x_m; x_cm is not in metres"),
         ("id,x_m,y_m,z", "no column for the time or the frame of boxes; its columns are id, x_m, y_m, z; name it with"),
     ],
 )
@@ -533,20 +535,6 @@ def nuscenes(folder: Path, **changed: object) -> Path:
 
 BOX = {"token": "a0", "sample_token": "s0", "instance_token": "i0", "translation": [0, 2, 3], "size": [2, 4, 1.5],
        "rotation": [1, 0, 0, 0]}  # fmt: skip
-
-
-def test_a_scene_of_nuscenes_by_hand(tmp_path):
-    rows = read_boxes_3d(nuscenes(tmp_path), "truth")
-    assert rows.t_ns.tolist() == [100_000, 101_000, 100_000]
-    assert rows.boxes.tolist() == [[n, 2, 3, 4, 2, 1.5, 0] for n in range(3)]
-    assert rows.labelled.tolist() == [100_000, 101_000, 102_000]
-    assert rows.track_id.tolist() == [1, 1, 2]
-    assert f"{tmp_path}: 3 samples; tracks are numbered from 1 on, a number for each instance" in rows.remarks
-    assert f"{tmp_path}: 1 of 3 boxes have no points of lidar or radar; they stay" in rows.remarks
-    found = timed(rows)
-    assert (found.class_id.tolist(), found.classes, rows.left_out) == ([2, 2], {2: "car"}, "1 animal")
-    rows = read_boxes_3d(tmp_path, "truth")
-    assert timed(rows, classes="animal, car").classes == {2: "car", 3: "animal"}
 
 
 @pytest.mark.parametrize("points", [(0, 1), (1, 0), (None, 0), (1, None)])
@@ -747,24 +735,6 @@ def test_labels_are_at_most_a_minute_from_their_log(first_s, is_taken, tmp_path)
         return
     with pytest.raises(McaptrackError, match=r"from 100\.000 to 110\.000 s; give the time of the first labels with"):
         ingested(labels, tmp_path, tmp_path / "log.mcap", **options)
-
-
-def test_frames_of_a_log_are_those_of_its_boxes(tmp_path):
-    box = usual(id=None, score=None)
-    boxes = [box | {"t_ns": t * S} for t in (3, 5, 9)]
-    ingested(table(tmp_path, *boxes, name="boxes.csv"), tmp_path / "log.mcap", role="detections")
-    path = table(tmp_path, framed(frame=1), framed(frame=3))
-    found, remarks, _ = ingested(path, tmp_path, tmp_path / "log.mcap")
-    assert found == [3 * S, 9 * S]
-    assert f"{path}: frame 1 is the first message of /camera/detections" in remarks
-    found, _, _ = ingested(path, tmp_path, tmp_path / "log.mcap", fps=Fraction(4))
-    assert found == [3 * S, 3 * S + S // 2]
-    path = table(tmp_path, framed(frame=1), framed(frame=4))
-    words = f"{path}: its last frame is 4, and /camera/detections has 3 messages, from frame 1 on; give the number of"
-    with pytest.raises(McaptrackError) as refused:
-        ingested(path, tmp_path, tmp_path / "log.mcap")
-    assert words in str(refused.value)
-    assert ingested(path, tmp_path, tmp_path / "log.mcap", first_frame=1, fps=Fraction(1))[0] == [3 * S, 6 * S]
 
 
 def test_all_classes_are_counted_in_a_remark(tmp_path):

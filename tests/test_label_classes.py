@@ -189,25 +189,14 @@ def test_classes_of_the_motchallenge_that_are_scored_forgiven_or_false(tmp_path)
     assert tracks.left_out == "the classes of 12 boxes that aren't people (column 8)"
 
 
-def test_people_of_kitti_that_are_scored_forgiven_or_false(tmp_path):
-    """Truncated, occluded; the left edge says which."""
-    rows = {
-        10: ("Pedestrian", 0, 2), 20: ("Pedestrian", 0, 3), 30: ("Pedestrian", 1, 0), 40: ("Person_sitting", 0, 0),
-        50: ("Car", 0, 0), 60: ("DontCare", -1, -1), 70: ("Pedestrian", 0, 0), 80: ("Person", 0, 0),
-    }  # fmt: skip
+def test_people_of_kitti_that_are_hidden_or_cut_off_are_ignored_if_all_classes_count(tmp_path):
     (tmp_path / "a.txt").write_text("".join(
-        f"0 {x} {kind} {cut} {hidden} 0 {x} 20 {x + 9} 40 1 1 1 1 1 1 0\n" for x, (kind, cut, hidden) in rows.items()
+        f"0 {x} {kind} {cut} {hidden} 0 {x} 20 {x + 9} 40 1 1 1 1 1 1 0\n"
+        for x, kind, cut, hidden in (
+            (10, "Pedestrian", 0, 2), (20, "Pedestrian", 0, 3), (30, "Pedestrian", 1, 0), (50, "Car", 0, 0),
+            (60, "DontCare", -1, -1),
+        )
     ))  # fmt: skip
-    truth = read_labels(tmp_path / "a.txt", "kitti", "truth", wanted=WantedClasses("person"))
-    assert truth.id.tolist() == [10, 70]
-    assert truth.left_out == "1 Person_sitting, 1 Car, 1 DontCare, 1 Person and 2 Pedestrian, hidden or cut off"
-    ignored = truth.ignored
-    assert ignored.boxes_px[:, 0].tolist() == [20, 30, 40, 60, 80]
-    assert ignored.region.tolist() == [False, False, False, True, False]
-    assert ignored.forgiven.tolist() == [True, True, True, False, True]
-    tracks = read_labels(tmp_path / "a.txt", "kitti", "tracks", wanted=WantedClasses("person"))
-    assert (tracks.id.tolist(), tracks.ignored) == ([10, 20, 30, 70], None)
     every = read_labels(tmp_path / "a.txt", "kitti", "truth", wanted=WantedClasses("all"))
-    assert every.id.tolist() == [10, 40, 50, 70, 80]
-    assert every.left_out == "1 DontCare and 2 boxes, hidden or cut off"
+    assert (every.id.tolist(), every.left_out) == ([10, 50], "1 DontCare and 2 boxes, hidden or cut off")
     assert every.ignored.boxes_px[:, 0].tolist() == [20, 30, 60]
