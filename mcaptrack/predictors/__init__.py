@@ -86,8 +86,8 @@ class OnClock:
         if abs(self.step_s / self.inner.step_s - 1) > 1e-6:
             xy_m, valid = self._past(xy_m, valid)
             if people is not None:
-                past, known = self._past(people.xy_m, people.valid)
-                people = people._replace(xy_m=past, valid=known)
+                past, is_known = self._past(people.xy_m, people.valid)
+                people = people._replace(xy_m=past, valid=is_known)
         return self._future(predict_among(self.inner, xy_m, valid, people), xy_m[:, -1])
 
     def _past(self, xy_m: Floats, valid: Bools) -> tuple[Floats, Bools]:
@@ -100,11 +100,11 @@ class OnClock:
         is_inside = low >= 0
         low, high = np.maximum(low, 0), np.maximum(high, 0)
         share = (at - low)[:, None]
-        known = valid[:, low] & valid[:, high] & is_inside
+        is_known = valid[:, low] & valid[:, high] & is_inside
         past = (1 - share) * xy_m[:, low] + share * xy_m[:, high]
         # A neighbour with share 0 may be NaN.
         past = np.where(share == 0, xy_m[:, low], past)
-        return np.where(known[..., None], past, np.nan), known
+        return np.where(is_known[..., None], past, np.nan), is_known
 
     def _future(self, forecast: Forecast, now: Floats) -> Forecast:
         """The forecast at the wanted times. At 0 its standard deviation is half of that at the first inner step."""
@@ -195,9 +195,9 @@ def entry_of(name: PredictorName) -> tuple[Entry, Path | None]:
         return entry, None
     entry = find("predictor", kind)
     if not file or _file_of(entry) is _NO_FILE:
-        those = [one for one in BUILT_IN["predictor"] if _file_of(find("predictor", one)) is not _NO_FILE]
-        words = ", ".join(f"{one}:FILE" for one in those)
-        raise McaptrackError(f"predictor is one of {', '.join(NAMES)}, or {words}, not {name}")
+        those = [name_ for name_ in BUILT_IN["predictor"] if _file_of(find("predictor", name_)) is not _NO_FILE]
+        text = ", ".join(f"{name_}:FILE" for name_ in those)
+        raise McaptrackError(f"predictor is one of {', '.join(NAMES)}, or {text}, not {name}")
     if not Path(file).is_file():
         raise McaptrackError(f"predictor {name}: there is no file {file}")
     return entry, Path(file)
@@ -225,8 +225,8 @@ def _file_of(entry: Entry) -> Any:
 
 
 def _made(entry: Entry, file: Path | None, steps: int, step_s: float, parameters: Mapping[str, Any]) -> Predictor:
-    given = {"file": file} if file else {}
+    options = {"file": file} if file else {}
     if entry.is_built_in:
-        made: Predictor = entry.cls(steps=steps, step_s=step_s, **given, **parameters)
-        return made
-    return CheckedPredictor.of(entry, {"steps": steps, "step_s": step_s, **given, **parameters})
+        predictor: Predictor = entry.cls(steps=steps, step_s=step_s, **options, **parameters)
+        return predictor
+    return CheckedPredictor.of(entry, {"steps": steps, "step_s": step_s, **options, **parameters})

@@ -69,8 +69,8 @@ def running(before: Floats, kept: Floats, new: NDArray[Any]) -> tuple[Floats, Fl
     [[5.0], [2.5]]
     """
     out = np.empty(new.shape)
-    for number, (left, one) in enumerate(zip(kept, new, strict=True)):
-        before = left * before + one
+    for number, (left, added) in enumerate(zip(kept, new, strict=True)):
+        before = left * before + added
         out[number] = before
     return out, out[-1].copy() if len(out) else before
 

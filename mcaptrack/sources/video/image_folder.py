@@ -54,8 +54,8 @@ def find_images(folder: Path) -> Images:
     if place != sorted(set(place)) or len(place) < _DENSE * (place[-1] + 1):
         return in_order
     gone = sorted(set(range(place[-1] + 1)) - set(place))
-    words = ", ".join(str(numbers[0] + every * at) for at in gone[:_SHOWN]) + (", ..." if len(gone) > _SHOWN else "")
-    return Images(paths, place, every, f"{len(gone)} of {place[-1] + 1} numbered images ({words})" if gone else "")
+    text = ", ".join(str(numbers[0] + every * at) for at in gone[:_SHOWN]) + (", ..." if len(gone) > _SHOWN else "")
+    return Images(paths, place, every, f"{len(gone)} of {place[-1] + 1} numbered images ({text})" if gone else "")
 
 
 def natural_order(path: Path) -> list[tuple[int, str]]:

@@ -157,8 +157,8 @@ def _region_boxes(mask: Image, min_area_px: float) -> Floats:
     import cv2
 
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    found = [cv2.boundingRect(contour) for contour in contours if cv2.contourArea(contour) >= min_area_px]
-    return np.array(found, np.float64).reshape(-1, 4)
+    boxes = [cv2.boundingRect(contour) for contour in contours if cv2.contourArea(contour) >= min_area_px]
+    return np.array(boxes, np.float64).reshape(-1, 4)
 
 
 class _PersonHeight:
@@ -236,5 +236,5 @@ class _BackgroundModel:
         # KNN draws from OpenCV's random number generator; without a seed results would differ from run to run.
         cv2.setRNGSeed(self._count)
         rate = 1 / min(2 * self._count, max(clock.frames(self._history_s), 2))
-        found = self._model.apply(image, learningRate=rate)
-        return np.where(np.asarray(found) == _FOREGROUND, np.uint8(255), np.uint8(0))
+        labels = self._model.apply(image, learningRate=rate)
+        return np.where(np.asarray(labels) == _FOREGROUND, np.uint8(255), np.uint8(0))

@@ -146,18 +146,18 @@ class MedianDetector:
                     views[-1].add(unknown.pop(0), self)
                 continue
             begun = _of_next_view(unknown, image) if is_new else []
-            for one in unknown[: len(unknown) - len(begun)]:
-                views[-1].add(one, self)
+            for seen in unknown[: len(unknown) - len(begun)]:
+                views[-1].add(seen, self)
             if is_new:
                 if views:
                     views[-1].close(self)
                 views.append(_View(image.shape))
-            for one in (*begun, picture):
-                views[-1].add(one, self)
+            for seen in (*begun, picture):
+                views[-1].add(seen, self)
             unknown = []
         if views:
-            for one in unknown:
-                views[-1].add(one, self)
+            for seen in unknown:
+                views[-1].add(seen, self)
             views[-1].close(self)
         steadiness.check()
         return views
@@ -177,14 +177,14 @@ def _of_next_view(unknown: Sequence[_Picture], reference: Image) -> list[_Pictur
 
     A camera that has settled, or a cut without contrast, is noticed only after some pictures.
     """
-    camera, found = Registration(), deque[_Picture]()
+    camera, registered = Registration(), deque[_Picture]()
     _register(camera, reference)
-    for one in reversed(unknown):
-        to_reference, is_new = _register(camera, one.image)
+    for picture in reversed(unknown):
+        to_reference, is_new = _register(camera, picture.image)
         if is_new or camera.view != "steady":
             break
-        found.appendleft(one._replace(to_reference=to_reference, is_lost=False))
-    return [*found]
+        registered.appendleft(picture._replace(to_reference=to_reference, is_lost=False))
+    return [*registered]
 
 
 def _picture(frame: Frame, max_pixels: int) -> tuple[Image, int]:

@@ -64,7 +64,7 @@ def persistence(
     """
     count, sizes = len(certainty), np.bincount(block.frame, minlength=len(block.frames))
     ends = np.cumsum(sizes)
-    times = np.array([one.t_ns for one in block.frames], np.int64)
+    times = np.array([frame_.t_ns for frame_ in block.frames], np.int64)
     last = slice(int(ends[-1] - sizes[-1]), int(ends[-1]))
     after = LastFrame(
         int(times[-1]),
@@ -96,12 +96,12 @@ def persistence(
     now, then, apart = now[fits], then[fits], apart[fits]
     order = np.lexsort((then, now, apart - 2 * np.log(probable[now]) - 2 * np.log(probable[then])))
     stays = np.zeros(extra + count)
-    taken, given = set[int](), set[int]()
-    for one, other in zip(now[order].tolist(), then[order].tolist(), strict=True):
-        if one not in taken and other not in given:
-            taken.add(one)
-            given.add(other)
-            stays[one] = probable[other]
+    taken, continued = set[int](), set[int]()
+    for new, other in zip(now[order].tolist(), then[order].tolist(), strict=True):
+        if new not in taken and other not in continued:
+            taken.add(new)
+            continued.add(other)
+            stays[new] = probable[other]
     stays = stays[extra:]
     odds = np.log(stays * (_STAYS / _PERSISTENCE_CHANCE) + (1 - stays) * ((1 - _STAYS) / (1 - _PERSISTENCE_CHANCE)))
     return np.where(counts[block.frame], odds, 0.0), after
@@ -192,7 +192,7 @@ class FootFuser:
         number[kept] = ragged_range(0, sizes)
         classes = np.zeros(len(seen), np.int64)
         classes[of] = block.rows["class_id"]
-        found = DETECTIONS.rows(
+        rows = DETECTIONS.rows(
             x_m=centre.xy_m[kept, 0],
             y_m=centre.xy_m[kept, 1],
             cov_xx_m2=centre.cov[kept, 0],
@@ -205,9 +205,9 @@ class FootFuser:
         )
         members = block.rows.copy()
         members["detection"] = number[of]
-        when, index = [one.t_ns for one in block.frames], [one.index for one in block.frames]
+        when, index = [frame.t_ns for frame in block.frames], [frame.index for frame in block.frames]
         yield from zip(
-            split_rows(when, index, found, np.cumsum(sizes)),
+            split_rows(when, index, rows, np.cumsum(sizes)),
             split_rows(when, index, members, np.cumsum(block.counts)),
             strict=True,
         )

@@ -54,14 +54,14 @@ class Descriptors(NamedTuple):
         who = np.minimum(np.searchsorted(ids, track_id), len(ids) - 1)
         want = at * len(ids) + who
         row = np.minimum(np.searchsorted(have, want), len(have) - 1)
-        found = (have[row] == want) & (times[at] == t_ns) & (ids[who] == track_id)
-        return np.where(found, row, -1)
+        is_stored = (have[row] == want) & (times[at] == t_ns) & (ids[who] == track_id)
+        return np.where(is_stored, row, -1)
 
     def tracks_of(self, t_ns: Ints, track_id: Ints, track: Ints) -> Ints:
         """The ``track`` of each descriptor (S,), or -1, by those of samples (C,)."""
-        found = self.find(t_ns, track_id)
+        row = self.find(t_ns, track_id)
         out = np.full(len(self.t_ns), -1)
-        out[found[found >= 0]] = track[found >= 0]
+        out[row[row >= 0]] = track[row >= 0]
         return out
 
 
@@ -131,10 +131,10 @@ class Sides:
         before, after = self._place[before], self._place[after]
         return self._compare(self._number[before], before + 1, self._number[after], after)
 
-    def of_swaps(self, one: Ints, other: Ints, since: Ints, until: Ints) -> Floats:
+    def of_swaps(self, track: Ints, other: Ints, since: Ints, until: Ints) -> Floats:
         """The log likelihood ratio (E,) that two tracks were exchanged from step ``since`` to ``until``."""
-        ratio = np.zeros(len(one))
-        for before, after, sign in ((one, other, 1), (other, one, 1), (one, one, -1), (other, other, -1)):
+        ratio = np.zeros(len(track))
+        for before, after, sign in ((track, other, 1), (other, track, 1), (track, track, -1), (other, other, -1)):
             ratio += sign * self._compare(before, self._from(before, since), after, self._from(after, until + 1))
         return ratio
 

@@ -98,10 +98,10 @@ class OcSort(Sort):
         """
         table, detections = step.tracks.table, step.detections
         centres, tracks = table[_CENTRES:].reshape(-1, 2, table.shape[1]), np.arange(table.shape[1])
-        known = np.isfinite(centres[:, 0])
+        is_known = np.isfinite(centres[:, 0])
         # The oldest and the newest known centre: if they are the same or NaN, the direction is unknown.
-        oldest = centres[known.argmax(axis=0), :, tracks].T
-        newest = centres[-1 - known[::-1].argmax(axis=0), :, tracks].T
+        oldest = centres[is_known.argmax(axis=0), :, tracks].T
+        newest = centres[-1 - is_known[::-1].argmax(axis=0), :, tracks].T
         before = (newest - oldest)[:, pairs.track]
         now = detections.measured[:2, pairs.detection] - oldest[:, pairs.track]
         length = np.hypot(before[0], before[1]) * np.hypot(now[0], now[1])
@@ -119,9 +119,9 @@ class OcSort(Sort):
         detections, tracks = np.flatnonzero(detection_left), np.flatnonzero(track_left)
         last = step.tracks.table[_LAST_BOX][:, tracks]
         area = (last[2] - last[0]) * (last[3] - last[1])
-        found = iou_pairs(step.detections.corners[:, detections], last, step.detections.measured[2, detections], area)
+        near = iou_pairs(step.detections.corners[:, detections], last, step.detections.measured[2, detections], area)
         shape = (len(detection_left), len(track_left))
-        pairs = CandidatePairs(detections[found.detection], tracks[found.track], found.similarity, shape)
+        pairs = CandidatePairs(detections[near.detection], tracks[near.track], near.similarity, shape)
         return self._of_same_class(step, pairs)
 
     def _move(self, tracks: Tracks, motion: Floats) -> None:

@@ -200,8 +200,8 @@ class Sort:
             spans = pairwise(ends.tolist())
             parts = [self._step(run, f, Measurements(columns[:, a:b])) for f, (a, b) in zip(block, spans, strict=True)]
             written, written_ends = np.concatenate(parts, axis=1), np.cumsum([0, *(p.shape[1] for p in parts)])
-            made = tracks_to_frames(block, written, written_ends.tolist(), run.planes)
-            yield from ((frame,) for frame in made)
+            tracked = tracks_to_frames(block, written, written_ends.tolist(), run.planes)
+            yield from ((frame,) for frame in tracked)
         report.warn()
 
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
@@ -337,11 +337,11 @@ class _FilterReport:
         if self._kept or not self._count:
             return
         if wanted is not None and wanted not in self._classes:
-            there = ", ".join(map(str, sorted(self._classes)[:_MAX_LISTED]))
-            warn(f"no detection has class {wanted}, so there are no tracks; the classes are {there}", "left-out")
+            listed = ", ".join(map(str, sorted(self._classes)[:_MAX_LISTED]))
+            warn(f"no detection has class {wanted}, so there are no tracks; the classes are {listed}", "left-out")
         elif least is not None and self._highest < least:
-            words = f"the highest is {self._highest:g}"
-            warn(f"no detection has a score of {least:g} or more, so there are no tracks; {words}", "left-out")
+            text = f"the highest is {self._highest:g}"
+            warn(f"no detection has a score of {least:g} or more, so there are no tracks; {text}", "left-out")
 
 
 class _Run:

@@ -101,13 +101,13 @@ def opened_xml(path: Path) -> Iterator[IO[bytes]]:
 
 def _member(path: Path, names: list[str]) -> str:
     """The name of the only member with annotations. Raises McaptrackError if there is none, or if there are several."""
-    found = [name for name in names if name.replace("\\", "/").rsplit("/", 1)[-1] == _MEMBER]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise McaptrackError(f"{path} holds {len(found)} of {_MEMBER}; give each as a file ({_listed(found)})")
-    there = f"it holds {_listed(names)}" if names else "it is empty"
-    raise McaptrackError(f"{path} is a zip file without the {_MEMBER} of CVAT: {there}; unpack other formats")
+    members = [name for name in names if name.replace("\\", "/").rsplit("/", 1)[-1] == _MEMBER]
+    if len(members) == 1:
+        return members[0]
+    if members:
+        raise McaptrackError(f"{path} holds {len(members)} of {_MEMBER}; give each as a file ({_listed(members)})")
+    content = f"it holds {_listed(names)}" if names else "it is empty"
+    raise McaptrackError(f"{path} is a zip file without the {_MEMBER} of CVAT: {content}; unpack other formats")
 
 
 def _listed(names: list[str]) -> str:
@@ -162,13 +162,13 @@ class _Parser:
         except (LookupError, ValueError) as error:  # what expat says of encodings that it doesn't know
             raise McaptrackError(f"{self.path}:{self._reader.CurrentLineNumber}: not read: {error}") from None
 
-    def _fail(self, words: str) -> NoReturn:
-        raise McaptrackError(f"{self.path}:{self._reader.CurrentLineNumber}: {words}")
+    def _fail(self, problem: str) -> NoReturn:
+        raise McaptrackError(f"{self.path}:{self._reader.CurrentLineNumber}: {problem}")
 
     def _refuse_doctype(self, *_: object) -> NoReturn:
         self._fail("a document type, which CVAT doesn't write; it may hold entities, and isn't read")
 
-    def _start(self, name: str, given: dict[str, str]) -> None:
+    def _start(self, name: str, attributes: dict[str, str]) -> None:
         self.names.append(name)
         if len(self.names) > _MAX_DEPTH:
             self._fail("nested deeper than annotations of CVAT are")
@@ -177,24 +177,26 @@ class _Parser:
         if "meta" in self.names[:2]:
             self._text = []
         elif name == _TRACK and len(self.names) == 2:
-            self._check_task(given)
+            self._check_task(attributes)
             line = self._reader.CurrentLineNumber
-            number = len(self.tracks) if "id" not in given else self._whole(given["id"], "the id of a track")
-            self._track = _Track(number, self._label(given), line)
+            number = len(self.tracks) if "id" not in attributes else self._whole(attributes["id"], "the id of a track")
+            self._track = _Track(number, self._label(attributes), line)
         elif name == "image" and len(self.names) == 2:
-            self._check_task(given)
-            self._image = self._whole(given.get("id", ""), "the id of an image")
+            self._check_task(attributes)
+            self._image = self._whole(attributes.get("id", ""), "the id of an image")
             if self._image in self.images:
                 self._fail(f"image {self._image} is there before; give one file for each task")
             self.images[self._image] = None
         elif name == "box" and self._track is not None:
-            self._add_to_track(self._track, given)
+            self._add_to_track(self._track, attributes)
         elif name == "box" and self._image is not None:
-            self._add(self._image, self._corners(given), NO_ID, self._label(given), _is(given, "occluded"))
+            self._add(
+                self._image, self._corners(attributes), NO_ID, self._label(attributes), _is(attributes, "occluded")
+            )
         elif name in _OTHER_SHAPES:
             self.others[name] += 1
         elif name == "attribute":
-            self._attribute, self._text = given.get("name", ""), []
+            self._attribute, self._text = attributes.get("name", ""), []
 
     def _end(self, name: str) -> None:
         text = "".join(self._text or ()).strip()
@@ -218,9 +220,9 @@ class _Parser:
             if len(self._text) > _MAX_TEXT:
                 self._fail("a text is longer than those of CVAT are")
 
-    def _check_task(self, given: dict[str, str]) -> None:
+    def _check_task(self, attributes: dict[str, str]) -> None:
         """Fail at the second task of a file of a whole project: frames of all tasks are counted from 0."""
-        task = given.get("task_id")
+        task = attributes.get("task_id")
         if task is not None and self.task not in (None, task):
             self._fail(f"tasks {self.task} and {task:.20} of a project; export each task, and give one file for each")
         self.task = self.task or task
@@ -237,8 +239,8 @@ class _Parser:
         elif self._image is not None:
             self.values[_ID - _COLUMNS] = int(text)
 
-    def _label(self, given: dict[str, str]) -> int:
-        name = " ".join(given.get("label", "").split())[:256]
+    def _label(self, attributes: dict[str, str]) -> int:
+        name = " ".join(attributes.get("label", "").split())[:256]
         if name not in self.labels and len(self.labels) >= _MAX_CLASSES:
             self._fail(f"more than {_MAX_CLASSES} labels")
         return self.labels.setdefault(name, len(self.labels))
@@ -248,14 +250,14 @@ class _Parser:
             self._fail(f"{what} is a whole number from 0 on, not {text[:40]!r}")
         return int(text)
 
-    def _corners(self, given: dict[str, str]) -> tuple[float, ...]:
+    def _corners(self, attributes: dict[str, str]) -> tuple[float, ...]:
         try:
-            corners = tuple(float(given[name]) for name in ("xtl", "ytl", "xbr", "ybr"))
+            corners = tuple(float(attributes[name]) for name in ("xtl", "ytl", "xbr", "ybr"))
         except KeyError as error:
             self._fail(f"a box without {error}")
         except ValueError:
-            self._fail(f"a box with corners that aren't numbers: {str(given)[:80]}")
-        self.rotated += given.get("rotation", "0.0").strip("0.") != ""
+            self._fail(f"a box with corners that aren't numbers: {str(attributes)[:80]}")
+        self.rotated += attributes.get("rotation", "0.0").strip("0.") != ""
         return corners
 
     def _add(self, frame: int, corners: tuple[float, ...], track: int, label: int, is_occluded: bool) -> None:
@@ -265,9 +267,9 @@ class _Parser:
         if len(self.values) > _MAX_ROWS * _COLUMNS:
             self._fail(f"more than {_MAX_ROWS} boxes, interpolated ones among them; give it in parts")
 
-    def _add_to_track(self, track: _Track, given: dict[str, str]) -> None:
+    def _add_to_track(self, track: _Track, attributes: dict[str, str]) -> None:
         """Add a box, and those between it and the one before."""
-        frame, corners = self._whole(given.get("frame", ""), "the frame of a box"), self._corners(given)
+        frame, corners = self._whole(attributes.get("frame", ""), "the frame of a box"), self._corners(attributes)
         own = len(self.tracks)
         if track.last is not None:
             before, *start = track.last
@@ -281,7 +283,7 @@ class _Parser:
                 self._add(between, box, own, track.label, track.is_occluded)
                 self.interpolated += 1
         track.last = (frame, *corners)
-        track.is_outside, track.is_occluded = _is(given, "outside"), _is(given, "occluded")
+        track.is_outside, track.is_occluded = _is(attributes, "outside"), _is(attributes, "occluded")
         if not track.is_outside:
             self._add(frame, corners, own, track.label, track.is_occluded)
 
@@ -304,8 +306,8 @@ class _Parser:
         return first, last, every
 
 
-def _is(given: dict[str, str], name: str) -> bool:
-    return given.get(name, "").lower() in ("1", "true")
+def _is(attributes: dict[str, str], name: str) -> bool:
+    return attributes.get(name, "").lower() in ("1", "true")
 
 
 def read_cvat(path: Path, role: Role, wanted: WantedClasses) -> Labels:
@@ -336,9 +338,9 @@ def read_cvat(path: Path, role: Role, wanted: WantedClasses) -> Labels:
     rows.doubts += [(f"{path}: {doubt}", "clock")] if doubt else []
     if parser.tracks:
         own = values[:, _ID].astype(int)
-        ids, made, words = _ids(path, parser.tracks, np.bincount(own, minlength=len(parser.tracks)))
-        rows.id, rows.made_ids = ids[own].astype(float), made
-        rows.remarks += words
+        ids, new_ids, remarks = _ids(path, parser.tracks, np.bincount(own, minlength=len(parser.tracks)))
+        rows.id, rows.made_ids = ids[own].astype(float), new_ids
+        rows.remarks += remarks
     if parser.unread:
         shown = ", ".join(repr(text) for text in list(parser.unread)[:3])
         unread = f"{path}: {parser.unread.total()} boxes have a track_id that is not a whole number ({shown})"
@@ -377,11 +379,11 @@ def _frames(parser: _Parser, frame: Floats) -> tuple[Ints, str]:
     others = ~np.isin(frame, frames)
     if not others.any():
         return frames, ""
-    there = f"frames {first} to {last}" + (f" in steps of {every}" if every > 1 else "")
-    words = (
-        f"{int(others.sum())} boxes are in frames that its task doesn't have ({there}), as in {frame[others][0]:.0f}"
+    listed = f"frames {first} to {last}" + (f" in steps of {every}" if every > 1 else "")
+    text = (
+        f"{int(others.sum())} boxes are in frames that its task doesn't have ({listed}), as in {frame[others][0]:.0f}"
     )
-    return np.unique(frame.astype(np.int64)), f"{words}; frames are taken as they are, and only those with boxes count"
+    return np.unique(frame.astype(np.int64)), f"{text}; frames are taken as they are, and only those with boxes count"
 
 
 def _is_count(text: str) -> bool:
@@ -398,7 +400,7 @@ def _ids(path: Path, tracks: list[_Track], counts: Any) -> tuple[Ints, Ints | No
     renamed = sum(track.is_renamed for track in tracks)
     remarks = [f"{path}: {renamed} tracks change their track_id; the first of each is taken"] if renamed else []
     ids = np.full(len(tracks), -1, np.int64)
-    if not any(one is not None for one in stated):
+    if not any(number is not None for number in stated):
         numbers = np.array([track.number for track in tracks], np.int64)
         if len(np.unique(numbers)) == len(numbers):
             return numbers, None, remarks
@@ -407,18 +409,18 @@ def _ids(path: Path, tracks: list[_Track], counts: Any) -> tuple[Ints, Ints | No
     taken: set[int] = set()
     split: Counter[int] = Counter()
     for at in np.argsort(-counts, kind="stable").tolist():
-        one = stated[at]
-        if one is None or one in taken:
-            split.update([one] if one is not None else [])
+        number = stated[at]
+        if number is None or number in taken:
+            split.update([number] if number is not None else [])
             continue
-        taken.add(one)
-        ids[at] = one
+        taken.add(number)
+        ids[at] = number
     new = np.flatnonzero(ids < 0)
     ids[new] = max(taken) + 1 + np.arange(len(new))
     if split:
         shown = ", ".join(map(str, sorted(split)[:8])) + (", ..." if len(split) > 8 else "")
         remarks.append(f"{path}: several tracks state one track_id ({shown}): {split.total()} of them get new ids")
-    drawn = sum(one is None for one in stated)
+    drawn = sum(number is None for number in stated)
     if drawn:
         remarks.append(f"{path}: {drawn} tracks state no track_id and get new ids")
     return ids, ids[new] if len(new) else None, remarks
