@@ -258,7 +258,7 @@ def _similarities(
 
 
 def _reach(places: Floats, similarity: Similarity, gate: float) -> Floats:
-    """The rectangles (N, 4) around boxes or positions that those of all alike ones touch."""
+    """Rectangles (N, 4) around boxes or positions, which touch for any two that are similar."""
     if similarity == "iou":
         return np.concatenate([places[:, :2], places[:, :2] + places[:, 2:]], axis=1)
     around = np.full(len(places), gate) if similarity == "metres" else np.hypot(places[:, 3], places[:, 4]) / 2

@@ -96,7 +96,7 @@ def share_classes(
 
 
 def _same_kind(ground_truth: Collection[str | int], tracks: Collection[str | int]) -> dict[str | int, str | int]:
-    """The class of the ground truth for each class of tracks with another name of one kind of object, by their keys.
+    """Match classes of different names by kind of object: the ground truth's key by each key of the tracks.
 
     Only kinds that each side has one class of count: a van is no taxi where there are cars, too.
     """

@@ -149,13 +149,13 @@ def compare(
 
 
 def _class(number: int, names: Mapping[int, str]) -> str:
-    """The name of a class; formats call people by several."""
+    """The name of a class; "person" for every name of people."""
     name = class_name(number, names)
     return "person" if is_person(name) else name
 
 
 def _pairs(before: Sequence[Frame], after: Sequence[Frame]) -> Iterator[tuple[Rows, Rows]]:
-    """The rows with boxes of each frame that both have, by time."""
+    """The boxes of both sides in each frame that both have, in order of time."""
     rest = iter(after)
     new = next(rest, None)
     for old in before:

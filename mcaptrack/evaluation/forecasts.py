@@ -369,7 +369,7 @@ SMOOTHING: Final = 0.5
 
 @dataclass
 class SmoothedHistories:
-    """The smoothed pasts of all tracks that the frame before had: after a gap a past begins again."""
+    """The smoothed pasts of the tracks in the last frame; a track that returns after a gap begins a new past."""
 
     length: int
 

@@ -52,7 +52,7 @@ _SECOND_MOTION_WINDOW_PX, _SECOND_MOTION_LEVELS = 11, 4
 
 
 class SecondMotion:
-    """Looks for such a part in some of the pictures of a camera.
+    """Looks in some pictures for a part that moves as a whole, otherwise than the scene.
 
     Attributes
     ----------
@@ -210,7 +210,7 @@ class MotionEstimator:
 
     @property
     def stand(self) -> Floats | None:
-        """From pixels of the view where the camera stands to those of the reference: the same object while it does."""
+        """The transform from pixels at the camera's stand to the reference; the same object while it stands there."""
         return self._stance.stand
 
     @property

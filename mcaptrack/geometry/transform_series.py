@@ -270,7 +270,7 @@ def _dynamic(parent: str, child: str, samples: PoseSamples, messages: int) -> tu
 
 
 def _single_outliers(series: TransformSeries) -> Indices:
-    """Return the poses that the frame jumps to, and from them back to where it was."""
+    """Return the single poses that a frame jumps to, and from which it jumps back."""
     jumps = series.jumps
     jumped = jumps[:-1][np.diff(jumps) == 1] + 1
     before, after = series.translation[jumped - 1], series.translation[jumped + 1]
@@ -283,7 +283,7 @@ def _single_outliers(series: TransformSeries) -> Indices:
 
 
 def _one_pass(samples: PoseSamples) -> tuple[PoseSamples, list[str]]:
-    """Return the poses without those of times that another, longer pass of the clock has shown, too."""
+    """Leave out poses recorded again after a clock was set back: the longest pass over a time is kept."""
     stamps = samples.stamp_ns
     starts, newest, back = [0], int(stamps[0]), 0
     for number, stamp in enumerate(stamps.tolist()):

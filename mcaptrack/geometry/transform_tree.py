@@ -119,7 +119,7 @@ class TransformTree:
 
     @cached_property
     def on_log_time(self) -> TransformTree:
-        """The same transforms with the log time in the place of stamps."""
+        """A tree of the same transforms that uses log times instead of stamps."""
         return TransformTree(self._recorded, on_log_time=True)
 
     @cached_property
@@ -225,7 +225,7 @@ class TransformTree:
         return [self.series[frame] for frame in ways[0]], [self.series[frame] for frame in ways[1]]
 
     def _chosen(self, child: str, several: list[TransformSeries]) -> TransformSeries:
-        """Return the one of several transforms of a frame that is taken: the one that moves, with the most messages."""
+        """Choose among several transforms of a frame: a moving one, then the one with the most messages."""
         best = min(several, key=lambda series: (series.is_static, -series.messages, series.parent))
         others = {series.parent: series.messages for series in several if series.parent != best.parent}
         if others:

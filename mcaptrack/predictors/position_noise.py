@@ -59,7 +59,7 @@ class NoiseOfErrors(NamedTuple):
 
 
 def running(before: Floats, kept: Floats, new: NDArray[Any]) -> tuple[Floats, Floats]:
-    """The sums (R, ...) at some times, and the last of them.
+    """Decaying sums (R, ...) at some times, and the last of them.
 
     At each time ``kept`` (R, ...) of the sum before, which has the shape (...), is left, and ``new`` (R, ...) is added.
 

@@ -52,7 +52,7 @@ class _Made(NamedTuple):
     fit: Ints
 
     def copied(self, which: slice) -> _Made:
-        """A part, without the larger arrays that it is of."""
+        """A part in arrays of its own, so that the larger ones can be freed."""
         step, ids, is_seen, past, mean, cov, fit = self
         numbers = step[which].copy(), ids[which].copy(), is_seen[which].copy()
         return _Made(*numbers, past[which].copy(), mean[which].copy(), cov[which].copy(), fit[which].copy())
@@ -212,7 +212,7 @@ class Learned(NamedTuple):
         return np.maximum(_LEAST_MEASURED * self.least, 1e-6)
 
     def measured(self, tails: Tails) -> Tails:
-        """The distributions (T,) of distances from measured positions, of those from true ones."""
+        """Distributions (T,) of distances from measured positions, given those from true positions."""
         least = self.least_measured
         narrow, wide = (np.maximum(part + self.noise, least) for part in (tails.narrow_scale, tails.wide_scale))
         return Tails(tails.wide_weight, narrow, wide)

@@ -104,7 +104,7 @@ def find_calibration(opened: log.Log, source: str, frame_id: str) -> str:
 
 
 def read_calibrations(opened: log.Log, topic: str, is_rectified: bool) -> list[tuple[int, Calibration]]:
-    """Return the calibrations of a channel with the log time from which each holds, in ns; changes only.
+    """Return the calibrations of a channel, each with the log time in ns from which it holds; repeats are left out.
 
     ``is_rectified``: of pictures that are rectified already. Raises McaptrackError for what can't be read.
     """
@@ -123,7 +123,7 @@ def read_calibrations(opened: log.Log, topic: str, is_rectified: bool) -> list[t
 
 
 def see_ground(opened: log.Log, camera: Camera, frame: str = "", ground_frame: str = "") -> GroundSeen | None:
-    """Return the ground planes of a camera, one for each picture in which it stands elsewhere.
+    """Return the ground planes of a camera: one for each picture at which its pose has changed.
 
     ``frame`` is the frame of the metres, by default the root above the camera; the ground is z = 0 of ``ground_frame``,
     by default of ``frame``. None if the log has no calibration of a camera. Raises McaptrackError if none fits the
@@ -157,7 +157,7 @@ def see_ground(opened: log.Log, camera: Camera, frame: str = "", ground_frame: s
 
 
 def moving_camera(opened: log.Log, topic: str, frame: str) -> MovingCamera:
-    """Return where the camera of a channel of pictures was in a frame at each of them, and its lens.
+    """Return the pose of a camera in a frame at each of its pictures, and its lens.
 
     Raises McaptrackError if no calibration fits the pictures, or if no transforms connect the camera with the frame.
     """
@@ -252,7 +252,7 @@ def _ground_frame(tree: TransformTree, frame: str, eye: str, stamps_ns: Ints) ->
 
 
 def _headers(opened: log.Log, topics: Sequence[str]) -> tuple[Ints, Ints, str]:
-    """Return log times and stamps in ns of all messages, (N,) each, by log time; and the frame of the first one."""
+    """Return log times and stamps in ns of all messages, (N,) each, by log time; and the frame of the first message."""
     times: list[tuple[int, int]] = []
     frame_id = ""
     for topic in topics:
@@ -343,7 +343,7 @@ def _cropped(message: Any, calibration: Calibration) -> Calibration:
 
 
 def _fitted(calibration: Calibration, size: tuple[int, int] | None, topic: str) -> Calibration:
-    """Return the calibration for pictures of this width and height, which may have been resized; None: as it is."""
+    """Return the calibration scaled to pictures of this size, which may have been resized; unchanged for None."""
     if size in (None, (calibration.width_px, calibration.height_px), (0, 0)) or size is None:
         return calibration
     if not calibration.width_px or not calibration.height_px:

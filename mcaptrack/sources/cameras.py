@@ -108,7 +108,7 @@ def camera_to_name(opened: log.Log, topic: str) -> str:
 
 
 def _with_pictures_first(opened: log.Log, all_cameras: list[Camera]) -> list[Camera]:
-    """Return the cameras without those that are boxes in space alone, if there are others; or else all."""
+    """Leave out cameras that are only boxes in space, unless all are."""
     return [camera for camera in all_cameras if not camera.in_space or has_own_channels(opened, camera)] or all_cameras
 
 
@@ -196,7 +196,7 @@ def provenance_of(opened: log.Log, topic: str) -> Provenance | None:
 
 
 def repaired_tracks(tracks: Sequence[Frame], origin: Provenance | None) -> Sequence[Frame]:
-    """Return tracks with ``source_id`` only where it names tracks: that of tracks of detections names these."""
+    """Return tracks without ``source_id`` where it names detections instead of tracks."""
     is_from_boxes = (
         origin is not None and origin.transform in STAGES and STAGES[origin.transform].default.reads is DETECTIONS
     )
@@ -343,7 +343,7 @@ class _Channels:
         return next((channel.topic for channel in channels if not is_made_by_stage(channel)), None)
 
     def _corrected(self, plane: str) -> str:
-        """Return the topic of the ground plane that was corrected, if it was this one; or else this one."""
+        """Return the topic of the correction of a ground plane if the log has it, otherwise the plane itself."""
         topic = corrected_plane(plane)
         after, before = self._provenance.get(topic), self._provenance.get(plane)
         if after is None or after.transform != REFINE or after.input != plane or plane not in self._opened.channels:

@@ -133,7 +133,7 @@ class BoxesRead:
         self._found: dict[str, foreign.NamedFrames] = {}
 
     def read(self, opened: log.Log, topic: str, frame_id: str = "") -> foreign.NamedFrames:
-        """Return the boxes of a channel as ``named_detections`` does; those that were read before without decoding."""
+        """Return the boxes of a channel as ``named_detections`` does; each channel is decoded only once."""
         wanted = plain_frame(frame_id) or _frame_before(opened, topic)
         stored = self._found.get(topic)
         if stored is None or stored.frame_id != (wanted or stored.frame_id):

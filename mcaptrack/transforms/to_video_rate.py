@@ -79,7 +79,7 @@ def mended_ends(frames: FrameColumns) -> FrameColumns:
 
 
 def _is_kept(joined: JoinedFrames, until_ns: Mapping[int, int]) -> Bools:
-    """Which rows (N,) are not after the time that is given for their track, if there is one."""
+    """Mask the rows (N,) that are not later than the limit of their track, if it has one."""
     ids, which = np.unique(joined.rows["track_id"], return_inverse=True)
     limits = np.array([until_ns.get(track, LAST_NS) for track in ids.tolist()], np.int64)
     return np.asarray(joined.row_ns <= limits[which])
@@ -108,7 +108,7 @@ def _kept_until(frames: FrameColumns) -> dict[int, int]:
 
 
 def _moved_on(frames: FrameColumns) -> tuple[Rows, Ints]:
-    """Rows (N,) that move tracks on by a frame at both of their ends, and the frame of each."""
+    """Rows (N,) that extend tracks by one frame at both ends, and the frame of each."""
     t_ns = frames.t_ns
     first: dict[int, tuple[int, Rows]] = {}
     soon: dict[int, tuple[int, Rows]] = {}
@@ -148,7 +148,7 @@ def _moved_on(frames: FrameColumns) -> tuple[Rows, Ints]:
 
 
 def _moved(row: Rows, x_m: Floats, y_m: Floats) -> Rows:
-    """A row (1,) that is not observed, so far away."""
+    """A copy of a row (1,) moved by these distances, which is not observed."""
     out = row.copy()
     out["x_m"] += x_m
     out["y_m"] += y_m
@@ -157,7 +157,7 @@ def _moved(row: Rows, x_m: Floats, y_m: Floats) -> Rows:
 
 
 def _with_rows(frames: FrameColumns, rows: Rows, frame_of: Ints) -> FrameColumns:
-    """Frames with more rows (N,), of these frames; those of each frame are ordered by id."""
+    """Frames with rows (N,) added to frames (N,); the rows of each frame are ordered by id."""
     out = FrameCollector(TRACKS)
     for low, high, joined in joined_parts(TRACKS, frames):
         here = (frame_of >= low) & (frame_of < high)

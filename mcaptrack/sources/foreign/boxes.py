@@ -67,7 +67,7 @@ class Classes:
         return people | dict(enumerate(sorted(self._names), start=self._largest + 1))
 
     def nameless(self, used: Collection[int]) -> list[int]:
-        """Those of the final ids ``used`` that messages state as numbers, without a name; 0 is no class."""
+        """The final ids among ``used`` that messages state as numbers, without a name; 0 is no class."""
         named = set(self.numbers().values()) | ({PERSON} if self._people else set()) | {UNKNOWN}
         return sorted(set(used) - named)
 

@@ -137,7 +137,7 @@ def _webp(head: bytes) -> StillHeader | None:
 
 
 def _tiff(data: Buffer, order: str) -> StillHeader | None:
-    """Includes the bytes of a pixel, because a whole strip is decoded in memory."""
+    """The size of a TIFF image, and the bytes of its pixels, because a whole strip is decoded in memory."""
 
     def number(at: int, size: int) -> int:
         return int.from_bytes(bytes(data[at : at + size]), order)  # type: ignore[arg-type]
@@ -158,7 +158,7 @@ def _tiff(data: Buffer, order: str) -> StillHeader | None:
 
 
 def _avif(head: bytes) -> StillHeader | None:
-    """The largest size of its images, which may be composed of tiles."""
+    """The largest size of the images in an AVIF file, which may be composed of tiles."""
     sizes = [
         StillHeader(_big_endian(head[at + 8 : at + 12]), _big_endian(head[at + 12 : at + 16]))
         for at in _places(head, b"ispe")

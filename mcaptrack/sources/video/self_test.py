@@ -58,7 +58,7 @@ def _encoded() -> tuple[bytes, str]:
 
 
 def _decoding_fault(name: str, data: bytes) -> str:
-    """Return why a picture can't be decoded, or is another one than that which was encoded; "" otherwise."""
+    """Return why a picture can't be decoded, or that it differs from the encoded one; "" otherwise."""
     from mcaptrack.sources.video.decode import EncodedPicture, decode_gray
 
     try:

@@ -173,7 +173,7 @@ class _Picture(NamedTuple):
 
 
 def _of_next_view(unknown: Sequence[_Picture], reference: Image) -> list[_Picture]:
-    """The last ones of pictures that no view has yet which show what ``reference`` shows, registered to it.
+    """The latest pictures without a view that show the scene of ``reference``, registered to it.
 
     A camera that has settled, or a cut without contrast, is noticed only after some pictures.
     """
@@ -188,7 +188,7 @@ def _of_next_view(unknown: Sequence[_Picture], reference: Image) -> list[_Pictur
 
 
 def _picture(frame: Frame, max_pixels: int) -> tuple[Image, int]:
-    """The picture (H, W, 3), halved until it is small enough, and how often; grey is three equal colours."""
+    """The picture (H, W, 3), halved until it is small enough, and how often; grey pictures get three equal channels."""
     image, halvings = halve(frame.rows, max_pixels)
     return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2), halvings
 

@@ -145,7 +145,7 @@ class Background:
 
     @cached_property
     def _light(self) -> NDArray[np.float32]:
-        """Its colours on a grid, one brighter than they are."""
+        """The background's colours on a coarse grid, plus 1, so that they can be divided by."""
         return self.median[::_GRID, ::_GRID].astype(np.float32) + 1
 
     @property
@@ -168,7 +168,7 @@ class Background:
         return cls(median, limit, not np.ptp(median, axis=-1).any(), is_blurred)
 
     def swaying(self, samples: Sequence[Image], person_px: float) -> Background:
-        """The same, with a wider range at places that sway in ``samples``.
+        """The background with a wider range at places that sway in ``samples``.
 
         ``person_px`` is how tall people are, in pixels.
         """

@@ -126,7 +126,7 @@ class Separator:
         return out[:, :4], out[:, 4].astype(np.int64)
 
     def _contradicting(self, boxes: Ints, expected: Floats) -> tuple[Ints, Bools]:
-        """Boxes and counts (M, 5) of regions (N, 5) that are no group of people as tall as expected, and the others.
+        """Boxes and counts (M, 5) of regions (N, 5) too tall for people of their height; and a mask of the others.
 
         What lies inside of the box of such a region, such as a shoe or a bag, is a part of it and no person beside it.
         The second array (N,) is false for both.

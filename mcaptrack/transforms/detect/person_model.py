@@ -221,7 +221,7 @@ class Learner:
         return float(np.sqrt(area[fits]).sum())
 
     def _checked(self, person: Person | None) -> Person | None:
-        """The same, with the rows where the heights hold; None if the shape isn't one of people."""
+        """The appearance of people, with the rows where their heights hold; None if the shape isn't one of people."""
         if person is None or person.template.sum() < _LEAST_WIDTH * ROWS**2:
             return None
         foot, area, fits, contradicts = self._judged(person)
@@ -242,7 +242,7 @@ class _Sample:
         self._cuts: list[Image] = []
 
     def copy(self) -> _Sample:
-        """The same regions, to which others are added than here."""
+        """A copy, to which regions can be added independently."""
         other = _Sample()
         other._boxes, other._cuts = [*self._boxes], [*self._cuts]
         return other

@@ -36,7 +36,7 @@ _STRANGERS: Final = 0.25
 
 
 class Shared(NamedTuple):
-    """The number of people that two cameras should see, over all frames, and of those that two do see."""
+    """Over all frames: how many people two cameras should both see, and how many both do see."""
 
     expected: int
     seen: int

@@ -142,7 +142,7 @@ class CameraView:
     width: ClassVar[float] = 0.4
 
     def with_heights_in(self, frames: Iterable[Frame]) -> Self:
-        """The same camera with heights as in the boxes of the first of its frames of detections."""
+        """The camera with heights as in the boxes of the first frames of its detections."""
         boxes = [columns_to_boxes(frame.rows) for frame in islice(frames, _MOST_FRAMES)]
         joined = np.concatenate([np.empty((0, len(BOX_PX))), *boxes])
         return self.with_heights(joined[np.isfinite(joined).all(axis=1)])

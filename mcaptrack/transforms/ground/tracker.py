@@ -406,7 +406,7 @@ def fast_starts(
 
 
 def _is_only(can_be: Bools, pairs: Pairing) -> Bools:
-    """Pairs of a track and a detection that have no other."""
+    """Mask the pairs whose track and detection are in no other pair."""
     track, row = pairs.chosen(can_be)
     out = can_be.copy()
     out[can_be] = (np.bincount(track)[track] == 1) & (np.bincount(row)[row] == 1)

@@ -216,7 +216,7 @@ def _fewer(blocks: _Blocks, step_s: float) -> _Blocks:
 
 
 def _pairs(blocks: _Blocks, step_s: float) -> Iterator[_Pairs]:
-    """Pairs of blocks, one after the other, of one track or of two that are there at one time and within reach."""
+    """Pairs of successive blocks: of one track, or of two tracks that exist at the same time within reach."""
     order = np.argsort(blocks.first, kind="stable")
     begins = blocks.first[order]
     low = np.searchsorted(begins, blocks.last, "right")

@@ -66,7 +66,7 @@ class CutTracks(NamedTuple):
 
     @classmethod
     def of(cls, step: Ints, track: Ints, source: Ints, cuts: Cuts) -> CutTracks:
-        """Those of assignments (C,)."""
+        """The tracks of assignments (C,)."""
         order = np.lexsort((step, track))
         starts = run_starts(track[order])
         first, last = np.flatnonzero(starts), np.flatnonzero(run_ends(starts))
@@ -105,7 +105,7 @@ def find_candidates(
     pieces: CutTracks,
     evidence: Evidence | None = None,
 ) -> CandidateLinks:
-    """The links that may be made: those with a chance as without cuts, and at cuts those of one track or input id.
+    """Candidate links: plausible ones as without cuts, and at cuts those within one track or input id.
 
     ``evidence`` is what else tells whether both sides are one person.
     """

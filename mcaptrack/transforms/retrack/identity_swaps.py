@@ -99,7 +99,7 @@ def compatible(pair: Ints, low: Ints, high: Ints, gain: Floats) -> Ints:
 
 
 def _rivals(pair: Ints, low: Ints, high: Ints) -> list[Ints]:
-    """Groups of encounters that need one track at one time: those of a track that last when another one begins.
+    """Groups of encounters that compete for a track: those of it that are under way when another one begins.
 
     None is a part of another one.
     """
@@ -255,7 +255,7 @@ def _exchanged(trajectories: Trajectories, track: Ints, encounters: list[_Swaps]
 
 
 def _batches(length: Ints) -> Iterator[Ints]:
-    """Encounters of similar length together, each once, as many as are computed with at once."""
+    """Batches of encounters of similar length; each encounter is in one."""
     order = np.argsort(length, kind="stable")
     first = 0
     while first < len(order):

@@ -132,7 +132,7 @@ Retracking: TypeAlias = Retrack | RetrackByConsistency
 
 
 class KeptIds:
-    """Tracks as their input has them.
+    """Online re-tracking that keeps the ids of the input.
 
     Parameters
     ----------

@@ -134,7 +134,7 @@ _NO_ID: Final = -1
 
 
 class Decided(NamedTuple):
-    """All tracks of a log as they were decided, those that were left out included.
+    """The tracks of a log as they were decided, including those that are left out as false.
 
     ``sample`` (C,) is the sample of each assignment. ``log_odds`` (K,) that tracks are people, of the test of false
     tracks, and which were ``kept`` (K,), are ordered by id. ``appearance`` is that of the assignments, None where it
@@ -349,7 +349,7 @@ def _without_swaps(
     step_s: float,
     appearance: Appearance | None = None,
 ) -> Ints:
-    """The track of each assignment (C,) after deciding again which track is which where two of them met."""
+    """The track of each assignment (C,) after undoing swaps of tracks that met."""
     examined: Ints | None = None  # tracks that were changed: the encounters of all others stay as they are
     for _ in range(_ROUNDS):
         ids, row, trajectories = to_trajectories(step, track, xy, model.noise_m)

@@ -75,7 +75,7 @@ class Moved(NamedTuple):
     shift_px: Floats | None
 
     def take(self, which: Ints) -> Moved:
-        """Those of some of the rows."""
+        """The movements of some of the rows."""
         return Moved(self.xy_m[which], None if self.shift_px is None else self.shift_px[which])
 
 

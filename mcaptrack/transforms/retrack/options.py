@@ -201,12 +201,12 @@ class RetrackOptions:
 
     @property
     def looks(self) -> Descriptors | None:
-        """The descriptors of the samples, where these are compared."""
+        """The descriptors of samples; None if appearance is not compared."""
         return None
 
     @property
     def stored_looks(self) -> Descriptors | None:
-        """The descriptors of the samples, where what tracks look like is written."""
+        """The descriptors of samples; None if appearance is not stored."""
         return None
 
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
@@ -222,7 +222,7 @@ Value = TypeVar("Value")
 
 
 class _OfOutputs(Generic[Value]):
-    """A value for each output: of the class those of all outputs, of an object those of the outputs that it writes."""
+    """A value for each output: on the class for all outputs, on an object for those that it writes."""
 
     def __init__(self, of_all: Mapping[str, Value]) -> None:
         self._of_all = MappingProxyType(of_all)

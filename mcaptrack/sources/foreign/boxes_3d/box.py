@@ -48,7 +48,7 @@ class Box3d(NamedTuple):
 
 @dataclass
 class Message3d:
-    """The boxes of a message, and what of it is no box, in words with its count.
+    """The boxes of a message, and a count of its other parts for each description of them.
 
     ``is_measured`` is false for a message that only takes boxes away from a viewer: nothing was measured then.
     """

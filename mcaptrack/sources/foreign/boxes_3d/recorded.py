@@ -67,7 +67,7 @@ def find_sweeps(t_ns: Ints, log_ns: Ints, place: Ints, centre_m: Floats, class_i
 
 
 def are_mixed(t_ns: Ints, place: Ints, centre_m: Floats) -> bool:
-    """Whether most of T rising times have one box, and it is of another object than the one before."""
+    """Whether most of T rising times have a single box, of another object than the box before it."""
     counts = np.bincount(place, minlength=len(t_ns))
     if len(t_ns) < 4 * _MIN_SWEEPS or not len(place) or (counts[counts > 0] == 1).mean() < 0.9:
         return False
@@ -129,7 +129,7 @@ def _share_repeated(sweep: Ints, centre_m: Floats, class_id: Ints) -> float:
 
 
 def _nearest(some: Ints, others: Ints, centre_m: Floats, class_id: Ints) -> Floats:
-    """The distance of boxes (S,) to the nearest of others of their class; those at the same place don't count."""
+    """The distance (S,) of boxes to the nearest other box of their class, except boxes at the same place."""
     places = np.nan_to_num(centre_m)
     away = np.linalg.norm(places[some][:, None] - places[others], axis=2)
     is_other = (class_id[some][:, None] == class_id[others]) & (away > 0)
@@ -194,7 +194,7 @@ class Recorded3d:
         return np.where(is_off, self.log_ns, self.stamp_ns), int(is_off.sum())
 
     def in_usual_frame(self) -> tuple[Recorded3d, int]:
-        """The same boxes, those that name no frame in the frame that most others name, and their number."""
+        """Put boxes without a frame into the frame that most boxes name; also returns their number."""
         counts = np.bincount(self.frame, minlength=len(self.names))
         unnamed = [number for number, name in enumerate(self.names) if not name]
         counts[unnamed] = 0
@@ -204,7 +204,7 @@ class Recorded3d:
         return replace(self, frame=np.where(is_unnamed, counts.argmax(), self.frame)), int(is_unnamed.sum())
 
     def is_repeated(self, frame: Ints) -> Bools:
-        """Whether each box (N,) is an earlier one of its frame (N,) again, as where messages are recorded twice."""
+        """Mark boxes (N,) that repeat an earlier box of their frame (N,), as in messages recorded twice."""
         out = np.zeros(len(frame), bool)
         many = max(len(self.message_ns), 1)
         several = np.bincount(np.unique(frame * many + self.message) // many) > 1  # frames of several messages
@@ -217,7 +217,7 @@ class Recorded3d:
         return out
 
     def of_several_messages(self, frame: Ints) -> int:
-        """The number of frames with boxes of several messages, if most have those of one; boxes are in ``frame`` (N,).
+        """Count frames with boxes of several messages, if most have one; ``frame`` (N,) is by box.
 
         0 where each message has one box: then they are parts of a frame.
         """

@@ -124,7 +124,7 @@ _HASH: Final = 7
 
 
 class _Content(NamedTuple):
-    """All topics of a file, and of those with ROS messages their messages and types, and which hold results.
+    """The topics of a file; for those with ROS messages also counts and types, and which of them hold results.
 
     The times are those of all messages.
     """

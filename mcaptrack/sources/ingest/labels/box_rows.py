@@ -126,7 +126,7 @@ class BoxRows:
             self.remarks.append(f"{self.path}: {text}")
 
     def leave_out_empty(self, is_empty: Bools) -> None:
-        """Take rows (N,) without a box as frames in which there are none."""
+        """Remove rows (N,) without a box; their frames stay labelled, as frames without boxes."""
         if not is_empty.any():
             return
         self.labelled = np.unique(self._whole(self.frame, _FRAME, 0, MAX_FRAME))

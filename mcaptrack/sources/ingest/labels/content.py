@@ -108,7 +108,7 @@ class Labels:
         return corner
 
     def take(self, rows: Ints | slice) -> Labels:
-        """These rows alone, or in this order; what is known of the file stays."""
+        """Select or reorder rows; facts about the file stay."""
         boxes, xy, observed = self.boxes_px, self.xy_m, self.observed
         return replace(
             self,

@@ -189,6 +189,6 @@ def _put(file: SpillFile, part: Labels) -> dict[str, Stored]:
 
 
 def _summed(texts: Sequence[str]) -> str:
-    """Texts that differ in their first number as one with the sum; "" for none."""
+    """Merge texts that differ only in their first number, which is summed; "" if there are none."""
     total = sum(int(number[0]) for text in texts if (number := re.search(r"\d+", text)))
     return re.sub(r"\d+", str(total), texts[0], count=1) if texts else ""

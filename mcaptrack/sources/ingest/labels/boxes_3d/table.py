@@ -228,7 +228,7 @@ def _seconds_and_ns(text: str, unit: float) -> tuple[int, int]:
 
 
 def _leave_out_empty(rows: BoxRows3D) -> None:
-    """Take rows without a box as times at which there is none."""
+    """Remove rows without a box; their times stay, as times without boxes."""
     is_row = ~np.isnan(rows.boxes[:, :6]).all(axis=1)
     rows.labelled = np.unique(rows.number)
     if is_row.all():
