@@ -29,7 +29,7 @@ import math
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields
-from functools import cache
+from functools import cache, partial
 from types import MappingProxyType, UnionType
 from typing import Any, ClassVar, Final, Literal, NamedTuple, Protocol, get_args, get_origin, get_type_hints
 
@@ -219,6 +219,10 @@ def option(
     about = {"help": help, "least": least, "most": most, "search": search, "kind": kind, "theme": theme}
     about |= {"pattern": pattern, "flag": flag}
     return field(default=default, metadata=about)
+
+
+#: Declares a parameter that only ``--set`` sets: the command has no option of its own for it.
+setting: Final = partial(option, flag=False)
 
 
 def context(factory: Callable[[], Any], *, is_recorded: bool = True) -> Any:

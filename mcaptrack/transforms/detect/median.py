@@ -35,7 +35,7 @@ from mcaptrack.transforms.detect.median_background import MIN_THRESHOLD, Backgro
 from mcaptrack.transforms.detect.people import Separator
 from mcaptrack.transforms.detect.person_model import Learner, Person, region_boxes, typical_heights
 from mcaptrack.transforms.detect.registration import Registration, Steadiness
-from mcaptrack.transforms.protocol import Colour, check_options, option
+from mcaptrack.transforms.protocol import Colour, check_options, option, setting
 
 #: A shorter view, or one of fewer pictures, has no background of its own: people hardly move in that time.
 _MIN_SPAN_S: Final = 1.8
@@ -82,29 +82,15 @@ class MedianDetector:
     threshold: float = option(
         MIN_THRESHOLD, "difference of colour (0 to 255) that counts as motion at least", least=0.0
     )
-    history_s: float = option(
-        600.0, "length of the blocks of time that have one background, in seconds", least=0.1, flag=False
+    history_s: float = setting(600.0, "length of the blocks of time that have one background, in seconds", least=0.1)
+    max_pixels: int = setting(
+        1_000_000, "pictures are halved until they have no more pixels than this", least=1_000, most=1_000_000_000
     )
-    max_pixels: int = option(
-        1_000_000,
-        "pictures are halved until they have no more pixels than this",
-        least=1_000,
-        most=1_000_000_000,
-        flag=False,
-    )
-    stabilise: bool = option(True, "compensate the motion of a shaking camera", flag=False)
-    remove_shadows: bool = option(
-        True, "leave out what is darker than the background, but of the same colour", flag=False
-    )
-    separate: bool = option(
-        True, "separate people who are one region, by the height and shape of people in the scene", flag=False
-    )
-    least_visible: float = option(
-        0.5,
-        "share of a person that has to be seen for a box of their own beside others",
-        least=0.05,
-        most=1.0,
-        flag=False,
+    stabilise: bool = setting(True, "compensate the motion of a shaking camera")
+    remove_shadows: bool = setting(True, "leave out what is darker than the background, but of the same colour")
+    separate: bool = setting(True, "separate people who are one region, by the height and shape of people in the scene")
+    least_visible: float = setting(
+        0.5, "share of a person that has to be seen for a box of their own beside others", least=0.05, most=1.0
     )
 
     colour: ClassVar[Colour] = "bgr"

@@ -62,7 +62,7 @@ from mcaptrack.transforms.motion_limits import (
     limits_by_class,
     read_limits,
 )
-from mcaptrack.transforms.protocol import check_options, context, option
+from mcaptrack.transforms.protocol import check_options, context, option, setting
 
 _ASSOCIATION: Final = "Association"
 _DETECTIONS: Final = "Detections"
@@ -249,43 +249,38 @@ class GroundTracker:
     max_age_s: float = option(
         1.6, "a track ends after this many seconds without a detection", least=0.0, search=(0.2, 4.0), theme=_LIFE
     )
-    delay_s: float = option(
+    delay_s: float = setting(
         1.0,
         "rows are written this many seconds late, so that false births are taken back and short gaps are filled; 0 for "
         "results that depend on the past alone",
         least=0.0,
         theme=_LIFE,
-        flag=False,
     )
-    link_s: float = option(
+    link_s: float = setting(
         8.0,
         "a new track continues a lost one that it fits, up to this many seconds after its last detection; 0 for never",
         least=0.0,
         theme=_LIFE,
-        flag=False,
     )
-    confirm_score: float = option(
+    confirm_score: float = setting(
         0.9,
         "a track is confirmed once the scores of its detections add up to this; detections without a score count 0.5",
         least=0.0,
         search=(0.3, 4.0),
         theme=_LIFE,
-        flag=False,
     )
-    birth_score: float = option(
+    birth_score: float = setting(
         0.2,
         "detections with a lower score continue tracks, but start none",
         least=0.0,
         most=1.0,
         search=(0.0, 0.8),
         theme=_LIFE,
-        flag=False,
     )
-    cost: Cost = option(
+    cost: Cost = setting(
         "metres",
         "how detections and tracks are compared: distance of their centres, or overlap of their boxes seen from above",
         theme=_ASSOCIATION,
-        flag=False,
     )
     min_iou: float = option(
         0.05,
@@ -295,13 +290,8 @@ class GroundTracker:
         theme=_ASSOCIATION,
     )
     min_score: float | None = option(None, "ignore detections with a lower score", theme=_DETECTIONS)
-    class_id: int | None = option(
-        None,
-        "ignore detections of other classes",
-        least=0,
-        most=2**31 - 1,
-        theme=_DETECTIONS,
-        flag=False,
+    class_id: int | None = setting(
+        None, "ignore detections of other classes", least=0, most=2**31 - 1, theme=_DETECTIONS
     )
     across_classes: bool = option(
         False,

@@ -18,7 +18,7 @@ import numpy as np
 from mcaptrack.geometry import kalman
 from mcaptrack.geometry.affine import move_boxes, move_points
 from mcaptrack.geometry.arrays import Floats, Indices
-from mcaptrack.transforms.protocol import option
+from mcaptrack.transforms.protocol import setting
 from mcaptrack.transforms.sort.state import SHARED_ROWS, CandidatePairs, Measurements, Tracks, associate, iou_pairs
 from mcaptrack.transforms.sort.tracker import AssociationInput, Sort
 
@@ -54,19 +54,12 @@ class OcSort(Sort):
     J. Cao et al., "Observation-Centric SORT: Rethinking SORT for Robust Multi-Object Tracking", CVPR 2023.
     """
 
-    inertia: float = option(
-        0.2, "weight of the direction of motion, beside overlap", least=0.0, search=(0.0, 0.6), flag=False
+    inertia: float = setting(0.2, "weight of the direction of motion, beside overlap", least=0.0, search=(0.0, 0.6))
+    direction_frames: int = setting(
+        3, "number of frames over which the direction of motion is measured", least=2, most=100, search=(2, 10)
     )
-    direction_frames: int = option(
-        3,
-        "number of frames over which the direction of motion is measured",
-        least=2,
-        most=100,
-        search=(2, 10),
-        flag=False,
-    )
-    recover: bool = option(True, "match lost tracks once more by their last detection", flag=False)
-    reupdate: bool = option(True, "recompute the filter over the gap when a track is found again", flag=False)
+    recover: bool = setting(True, "match lost tracks once more by their last detection")
+    reupdate: bool = setting(True, "recompute the filter over the gap when a track is found again")
 
     def _empty_tracks(self) -> Tracks:
         return Tracks(_CENTRES - SHARED_ROWS + 2 * (self.direction_frames + 1))

@@ -40,7 +40,7 @@ from mcaptrack.transforms.detect.onnx.layouts import (
 from mcaptrack.transforms.detect.onnx.nms import Boxes, Size, Tile, join_tiles, place, suppress, tiles_of
 from mcaptrack.transforms.detect.onnx.outputs import SURE, MisreadError
 from mcaptrack.transforms.detect.onnx.session import DetectorNetwork, workers
-from mcaptrack.transforms.protocol import Colour, ModelCard, Suited, check_options, option
+from mcaptrack.transforms.protocol import Colour, ModelCard, Suited, check_options, option, setting
 
 LayoutChoice = Literal["auto", "yolox", "yolox-legacy", "nanodet", "rtdetr", "dfine", "rfdetr", "ultralytics"]
 
@@ -190,13 +190,8 @@ class OnnxDetector:
     tiles: str = option(
         "1x1", "columns and rows of tiles that each picture is cut into, as in 3x2, for small objects", theme=_BOXES
     )
-    overlap: float = option(
-        0.2,
-        "how much of its width or height a tile shares with the next one",
-        least=0.0,
-        most=0.5,
-        theme=_BOXES,
-        flag=False,
+    overlap: float = setting(
+        0.2, "how much of its width or height a tile shares with the next one", least=0.0, most=0.5, theme=_BOXES
     )
     classes: str = option(
         "person", "classes to detect, by name or index with commas between them; `all` for every one", theme=_BOXES
@@ -204,14 +199,13 @@ class OnnxDetector:
     min_score: float = option(
         0.1, "boxes with a lower score are left out", least=0.0, most=1.0, search=(0.05, 0.6), theme=_BOXES
     )
-    max_iou: float = option(
+    max_iou: float = setting(
         0.45,
         "boxes of one class that overlap more are one object",
         least=0.0,
         most=1.0,
         search=(0.3, 0.8),
         theme=_BOXES,
-        flag=False,
     )
 
     reads: ClassVar[Schema] = VIDEO
