@@ -92,8 +92,8 @@ def changes_in(opened: log.Log, topic: str) -> Changes | None:
     corrected = opened.frame_columns(topic, TRACKS)
     classes = {name: class_names(opened.channel(name).metadata) for name in (*present, topic)}
     compared = [
-        compare(name_, opened.frame_columns(name_, TRACKS), corrected, classes[name_], classes[topic])
-        for name_ in present
+        compare(source, opened.frame_columns(source, TRACKS), corrected, classes[source], classes[topic])
+        for source in present
     ]
     return max(compared, key=lambda result: result[1])[0] if compared else None
 

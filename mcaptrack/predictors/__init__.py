@@ -195,8 +195,8 @@ def entry_of(name: PredictorName) -> tuple[Entry, Path | None]:
         return entry, None
     entry = find("predictor", kind)
     if not file or _file_of(entry) is _NO_FILE:
-        those = [name_ for name_ in BUILT_IN["predictor"] if _file_of(find("predictor", name_)) is not _NO_FILE]
-        text = ", ".join(f"{name_}:FILE" for name_ in those)
+        those = [kind for kind in BUILT_IN["predictor"] if _file_of(find("predictor", kind)) is not _NO_FILE]
+        text = ", ".join(f"{kind}:FILE" for kind in those)
         raise McaptrackError(f"predictor is one of {', '.join(NAMES)}, or {text}, not {name}")
     if not Path(file).is_file():
         raise McaptrackError(f"predictor {name}: there is no file {file}")

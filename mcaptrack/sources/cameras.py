@@ -120,7 +120,7 @@ def _refuse_several(opened: log.Log, topics: list[str]) -> None:
 
 def _refuse_unknown(opened: log.Log, name: str) -> None:
     """Raise McaptrackError if the log has cameras, but none of this name."""
-    names = [name_.strip("/") for camera in cameras(opened) for name_ in camera.names]
+    names = [prefix.strip("/") for camera in cameras(opened) for prefix in camera.names]
     if names and name.strip("/") not in names:
         raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(names))}")
 
@@ -130,7 +130,7 @@ def _prefix_of_topic(opened: log.Log, topic: str) -> str:
     name = name_above(chain_of(opened, topic)[-1])
     camera = camera_at(opened, name)
     has_results = any(
-        is_made_by_stage(opened.channels[topic_]) for topic_ in camera.topics if topic_.startswith(camera.prefix + "/")
+        is_made_by_stage(opened.channels[other]) for other in camera.topics if other.startswith(camera.prefix + "/")
     )
     return camera.prefix if has_results else name
 

@@ -84,19 +84,19 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
     """
     if not foreign.may_hold_boxes_3d(opened.channel(topic)):
         return foreign.named_detections(opened, topic)
-    recorded_, unnamed = recorded(foreign.boxes_3d(opened, topic)).in_usual_frame()
-    for remark, count in recorded_.remarks.items():
+    boxes, unnamed = recorded(foreign.boxes_3d(opened, topic)).in_usual_frame()
+    for remark, count in boxes.remarks.items():
         warn(f"{opened.path}: {topic}: {count:,} {remark}", "left-out")
     if unnamed:
-        usual = recorded_.names[np.bincount(recorded_.frame).argmax()]
+        usual = boxes.names[np.bincount(boxes.frame).argmax()]
         remark = f"boxes name no frame: they count as in {usual}, as most others are"
-        warn(f"{opened.path}: {topic}: {unnamed:,} of {len(recorded_.frame):,} {remark}", "transforms")
-    fixed = _fixed_frame(opened, topic, recorded_, plain_frame(frame_id))
-    is_known, rotation, shift = _poses(opened, topic, recorded_, fixed)
-    start_ns, frame, assumed = recorded_.frames()
+        warn(f"{opened.path}: {topic}: {unnamed:,} of {len(boxes.frame):,} {remark}", "transforms")
+    fixed = _fixed_frame(opened, topic, boxes, plain_frame(frame_id))
+    is_known, rotation, shift = _poses(opened, topic, boxes, fixed)
+    start_ns, frame, assumed = boxes.frames()
     if assumed:
         warn(f"{opened.path}: {topic}: {assumed}", "clock")
-    is_repeated = recorded_.is_repeated(frame)
+    is_repeated = boxes.is_repeated(frame)
     is_left_out = np.zeros(len(start_ns), bool)
     is_left_out[frame[~is_known]] = True  # nothing is known then, unlike in a frame without boxes
     is_left_out[frame[is_known]] = False
@@ -104,18 +104,18 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
         remark = "boxes are recorded again, with the same stamp and numbers: they are left out"
         warn(f"{opened.path}: {topic}: {repeated:,} of {len(frame):,} {remark}", "left-out")
     is_taken = is_known & ~is_repeated
-    recorded_, frame = recorded_.select(is_taken), frame[is_taken]
-    _warn_odd(opened, topic, recorded_)
-    rows = rows_of_boxes(recorded_, rotation[is_taken], shift[is_taken], f"{opened.path}: {topic}")
-    names = foreign.settle_classes(opened, topic, recorded_.classes, [rows])
-    if nameless := recorded_.classes.nameless(np.unique(rows["class_id"]).tolist()):
+    boxes, frame = boxes.select(is_taken), frame[is_taken]
+    _warn_odd(opened, topic, boxes)
+    rows = rows_of_boxes(boxes, rotation[is_taken], shift[is_taken], f"{opened.path}: {topic}")
+    names = foreign.settle_classes(opened, topic, boxes.classes, [rows])
+    if nameless := boxes.classes.nameless(np.unique(rows["class_id"]).tolist()):
         listed = ", ".join(map(str, nameless[:_LISTED])) + (", ..." if len(nameless) > _LISTED else "")
         remark = "1 counts as people, and others move as objects of unknown class do"
         warn(f"{opened.path}: classes of {topic} are numbers without names ({listed}): {remark}", "classes")
     if unclassed := int((rows["class_id"] == UNKNOWN).sum()):
         remark = "boxes have no class, or 0: they move as objects of unknown class do"
         warn(f"{opened.path}: {topic}: {unclassed:,} of {len(rows):,} {remark}", "classes")
-    if not assumed and (several := recorded_.of_several_messages(frame)):
+    if not assumed and (several := boxes.of_several_messages(frame)):
         remark = "times have boxes of several messages, where others have those of one, as if a clock was set back"
         warn(f"{opened.path}: {topic}: {several:,} of {len(start_ns):,} {remark}: they count as one frame", "clock")
     order = np.argsort(frame, kind="stable")

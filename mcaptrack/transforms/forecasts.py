@@ -121,18 +121,19 @@ class Forecaster:
         # An interpolated position depends on later ones: a prediction from it would not be causal.
         ready = is_known[:, -self._min_history :].all(axis=1) & frame.rows["observed"]
         people = self._people(frame.rows, past, is_known, ready) if uses_people(self._predictor) else None
-        made_ = self._made(frame.rows[ready], past[ready], is_known[ready], people)
+        forecasts = self._made(frame.rows[ready], past[ready], is_known[ready], people)
         tails = None
-        if self._calibration is not None and not made_.has_velocity.any():
-            step, is_coasting = np.full(len(made_.has_velocity), self._step), np.zeros(len(made_.has_velocity), bool)
+        if self._calibration is not None and not forecasts.has_velocity.any():
+            count = len(forecasts.has_velocity)
+            step, is_coasting = np.full(count, self._step), np.zeros(count, bool)
             observed_m, since = np.where(frame.rows["observed"][:, None], xy_m, np.nan), self._step - self._observed_at
             (observed, _), self._observed_at = self._observed.push(ids, observed_m, since), self._step
-            inputs = made_.forecast, past[ready], is_coasting, observed[ready]
+            inputs = forecasts.forecast, past[ready], is_coasting, observed[ready]
             forecast, tails = self._calibration(step, ids[ready], *inputs)
-        elif made_.is_vehicle.any():
-            forecast, tails = self._of_vehicles(made_, frame.rows[ready], past[ready])
+        elif forecasts.is_vehicle.any():
+            forecast, tails = self._of_vehicles(forecasts, frame.rows[ready], past[ready])
         else:
-            forecast = made_.forecast
+            forecast = forecasts.forecast
         return forecast_to_rows(ids[ready], forecast, self._predictor.step_s, tails)
 
     def predict_all(self, frames: FrameColumns) -> FrameColumns:

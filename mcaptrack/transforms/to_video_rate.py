@@ -95,15 +95,15 @@ def _kept_until(frames: FrameColumns) -> dict[int, int]:
         order = order[joined.rows["observed"][order]]
         starts = np.flatnonzero(run_starts(of[order]))
         for here in np.split(order, starts[1:]) if len(order) else ():
-            track, frames_ = int(of[here[0]]), joined.frame[here] + low
-            before = np.append(last.get(track, frames_[0]), frames_[:-1])
-            waited = frames.t_ns[frames_] - frames.t_ns[before]
-            is_alone = (waited > _LONG_NS) & (frames_ - before > _LONG_FRAMES)
+            track, seen = int(of[here[0]]), joined.frame[here] + low
+            before = np.append(last.get(track, seen[0]), seen[:-1])
+            waited = frames.t_ns[seen] - frames.t_ns[before]
+            is_alone = (waited > _LONG_NS) & (seen - before > _LONG_FRAMES)
             # A detection soon after another one makes both certain.
             sure = np.flatnonzero(~is_alone)
             if len(sure):
-                out[track] = int(frames_[sure[-1]])
-            last[track] = int(frames_[-1])
+                out[track] = int(seen[sure[-1]])
+            last[track] = int(seen[-1])
     return {track: frame for track, frame in out.items() if frame < last[track]}
 
 

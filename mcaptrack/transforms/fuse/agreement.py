@@ -139,7 +139,7 @@ def compare(
             pace = (moving**2).sum(axis=1)
             fast = pace > _MOVES_M_PER_S**2  # False where it isn't known
             box = mine[which[fast]]
-            times = np.array([frame_.t_ns for frame_ in block.frames])[frame[box]]
+            times = np.array([each.t_ns for each in block.frames])[frame[box]]
             away_s = (block.rows["picture_ns"][box] - offset_ns[number] - times) / NS_PER_S
             late[number].append(away_s - (difference[fast] * moving[fast]).sum(axis=1) / pace[fast])
     compared = tuple(

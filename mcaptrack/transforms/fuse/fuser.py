@@ -64,7 +64,7 @@ def persistence(
     """
     count, sizes = len(certainty), np.bincount(block.frame, minlength=len(block.frames))
     ends = np.cumsum(sizes)
-    times = np.array([frame_.t_ns for frame_ in block.frames], np.int64)
+    times = np.array([frame.t_ns for frame in block.frames], np.int64)
     last = slice(int(ends[-1] - sizes[-1]), int(ends[-1]))
     after = LastFrame(
         int(times[-1]),

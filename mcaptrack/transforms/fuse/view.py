@@ -82,7 +82,7 @@ def joined(frames: Iterable[Frame], views: Views, max_sigma: float, max_distance
         seen = np.zeros((count, max(len(views), int(camera.max(initial=0)) + 1)), bool)
         seen[of, camera] = True
         visible = np.empty((count, len(views)))
-        sizes, times = np.bincount(frame, minlength=len(block)), [frame_.t_ns for frame_ in block]
+        sizes, times = np.bincount(frame, minlength=len(block)), [each.t_ns for each in block]
         for column, view in enumerate(views):
             visible[:, column] = _visible(view, centre.xy_m, sizes, times)
         yield Joined(block, rows, counts, of, frame, centre, seen, visible)

@@ -153,7 +153,7 @@ def decision_rows(
 ) -> Iterator[Rows]:
     """The decisions at each of ``steps``: rows of Decisions, ordered by kind and track."""
     parts = _joined(decided, find_kept_joins(decided, model, step_s), step_s), _persons(decided, step_s)
-    at, rows = np.concatenate([steps_ for steps_, _ in parts]), DECISIONS.joined([rows for _, rows in parts])
+    at, rows = np.concatenate([places for places, _ in parts]), DECISIONS.joined([rows for _, rows in parts])
     places = samples.take(decided.sample[at])
     rows["x_m"], rows["y_m"] = places["x_m"], places["y_m"]
     rows["x_px"], rows["y_px"] = places["x_px"] + places["w_px"] / 2, places["y_px"] + places["h_px"] / 2
@@ -386,6 +386,6 @@ def _linked(
         continued_by = link_pieces(model, trajectories, forward, backward, step_s, *limits, pieces, seen)
     root = np.arange(len(ids))
     order = np.argsort(trajectories.step[trajectories.first[:-1]], kind="stable")  # a continuation begins later
-    for track_ in order[continued_by[order] >= 0].tolist():
-        root[continued_by[track_]] = root[track_]
+    for earlier in order[continued_by[order] >= 0].tolist():
+        root[continued_by[earlier]] = root[earlier]
     return np.asarray(ids[root][np.searchsorted(ids, track)])

@@ -120,9 +120,9 @@ def _share_repeated(sweep: Ints, centre_m: Floats, class_id: Ints) -> float:
     parts = np.split(order, begins[1:])
     judged = np.unique(np.linspace(0, len(numbers) - 2, min(len(numbers) - 1, _JUDGED)).astype(int))
     compared = repeated = 0
-    for sweep_ in judged.tolist():
-        own = _nearest(parts[sweep_], parts[sweep_], centre_m, class_id)
-        later = _nearest(parts[sweep_], parts[sweep_ + 1], centre_m, class_id)
+    for number in judged.tolist():
+        own = _nearest(parts[number], parts[number], centre_m, class_id)
+        later = _nearest(parts[number], parts[number + 1], centre_m, class_id)
         compared += int(np.isfinite(later).sum())
         repeated += int((own < later).sum() - (np.isfinite(own) & np.isinf(later)).sum())
     return repeated / compared if compared else 1.0

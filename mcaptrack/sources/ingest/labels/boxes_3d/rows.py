@@ -251,14 +251,12 @@ class BoxRows3D:
             self.doubts.append((f"{self.path} has no class names; class 1 is taken as people", "classes"))
             ids, classes = [int(name) for name in self.names], {}
         else:
-            named_ = {self.names[number] for number in np.unique(self.kind[stated]).tolist()}
-            unusual = {name.casefold() for name in named_ - (self.usual or named_)}
-            others = sorted(
-                {name.casefold() for name in named_} - set(PEOPLE), key=lambda name: (name in unusual, name)
-            )
+            used = {self.names[number] for number in np.unique(self.kind[stated]).tolist()}
+            unusual = {name.casefold() for name in used - (self.usual or used)}
+            others = sorted({name.casefold() for name in used} - set(PEOPLE), key=lambda name: (name in unusual, name))
             places = {name: place for place, name in enumerate(others, start=PERSON + 1)}
             ids = [places.get(name.casefold(), PERSON) for name in self.names]
-            named = [(number, name) for number, name in zip(ids, self.names, strict=True) if name in named_]
+            named = [(number, name) for number, name in zip(ids, self.names, strict=True) if name in used]
             classes = dict(reversed(named))
         out = np.full(len(self.kind), UNKNOWN, np.uint32)
         out[stated] = np.array(ids, np.uint32)[self.kind[stated]]
