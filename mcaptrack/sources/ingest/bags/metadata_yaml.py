@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import follow_links, publish_bytes
+from mcaptrack.files import follow_links, publish_bytes, read_beginning
 from mcaptrack.notices import warn
 from mcaptrack.schema.encodings import CDR
 from mcaptrack.schema.provenance import Provenance
@@ -35,7 +35,7 @@ class Bag:
 
 def holds_metadata(path: Path) -> bool:
     """Whether a file exists and looks like the metadata of a bag."""
-    return path.is_file() and ROOT.encode() in _start(path)
+    return path.is_file() and ROOT.encode() in read_beginning(path, plain_yaml.MAX_BYTES + 1)
 
 
 def names_file(path: Path, name: str) -> bool:
@@ -59,18 +59,9 @@ def is_packed(path: Path, name: str) -> bool:
     return bag.packed and name in names
 
 
-def _start(path: Path) -> bytes:
-    """The first bytes up to the limit, and one more if there are more."""
-    try:
-        with path.open("rb") as stream:
-            return stream.read(plain_yaml.MAX_BYTES + 1)
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
-
-
 def read_metadata(path: Path) -> tuple[Bag, list[str]]:
     """Read a metadata.yaml; returns it and the files that it names. Raises McaptrackError if it is invalid."""
-    text = _start(path)
+    text = read_beginning(path, plain_yaml.MAX_BYTES + 1)
     try:
         fields = Fields(plain_yaml.load(text), "it").map(ROOT)
         mode, compression = fields.text("compression_mode", ""), fields.text("compression_format", "")

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import follow_links, refuse_special, temporary_folder
+from mcaptrack.files import follow_links, read_beginning, temporary_folder
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.ingest.bags import decompression
@@ -73,7 +73,7 @@ def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> Re
         bag = _own_metadata(paths)
     with ExitStack() as opened:
         parts = [_decompressed_file(path, opened) for path in paths]
-        heads = [_first_bytes(path) for path in parts]
+        heads = [read_beginning(path, 16) for path in parts]
         source: _Files
         if all(head.startswith(_SQLITE_MAGIC) for head in heads):
             source = Databases(parts, whole, bag)
@@ -89,18 +89,9 @@ def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> Re
         return source
 
 
-def _first_bytes(path: Path) -> bytes:
-    refuse_special(path)
-    try:
-        with path.open("rb") as stream:
-            return stream.read(16)
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
-
-
 def _decompressed_file(path: Path, opened: ExitStack) -> Path:
     """The file, or its decompressed copy if it is compressed as a whole."""
-    if not _first_bytes(path).startswith(_ZSTD_MAGIC):
+    if not read_beginning(path, 16).startswith(_ZSTD_MAGIC):
         return path
     out = Path(opened.enter_context(temporary_folder())) / path.name.removesuffix(".zstd")
     decompression.unzstd_file(path, out)

@@ -25,7 +25,7 @@ import numpy as np
 
 from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import read_beginning, refuse_special
+from mcaptrack.files import read_beginning
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.schema.classes import PERSON, is_person
 from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows
@@ -77,7 +77,6 @@ _SHOWN: Final = 5
 
 def is_cvat(path: Path) -> bool:
     """Whether a file is XML, or a zip file: of label files, only those of CVAT are."""
-    refuse_special(path)
     head = read_beginning(path, 4096)
     return head.startswith((_ZIP, _EMPTY_ZIP)) or head.removeprefix(b"\xef\xbb\xbf").lstrip()[:1] == b"<"
 

@@ -17,7 +17,7 @@ import numpy as np
 from mcaptrack import files
 from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import read_beginning, refuse_special
+from mcaptrack.files import read_beginning
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.sources.ingest.labels.box_rows import (
     NO_CLASS,
@@ -44,7 +44,6 @@ _COLUMNS: Final = 10
 
 def is_json(path: Path) -> bool:
     """Whether the first character of a file is that of a JSON list or object."""
-    refuse_special(path)
     return read_beginning(path, 4096).removeprefix(b"\xef\xbb\xbf").lstrip()[:1] in (b"{", b"[")
 
 
