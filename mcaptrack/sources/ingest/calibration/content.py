@@ -11,8 +11,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NoReturn
-from xml.parsers import expat
+from typing import Any, Final
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import read_beginning, refuse_special
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.sources.ingest.bags.plain_yaml import Scalar, UnsupportedYamlError, load
+from mcaptrack.sources.ingest.xml_reader import XmlReader
 
 #: Names of values in files of OpenCV, in small letters and without "_", "-" and blanks.
 _MATRIX: Final = ("cameramatrix", "intrinsicmatrix", "intrinsics", "intrinsic", "mtx", "k", "m1")
@@ -131,46 +131,33 @@ def read_tree(path: Path) -> dict[str, Any]:
     return tree
 
 
-class _Xml:
+class _Xml(XmlReader):
     """Reads OpenCV's XML: elements with elements become maps (or lists, if they are named ``_``), others text."""
 
+    writer = "OpenCV"
+
     def __init__(self, path: Path) -> None:
-        self._path, self._nodes = path, 0
+        super().__init__(path)
+        self._nodes = 0
         self._open: list[tuple[str, list[tuple[str, Any]], list[str]]] = [("", [], [])]
-        self._reader = expat.ParserCreate()
-        self._reader.buffer_text = True
-        self._reader.StartDoctypeDeclHandler = self._refuse_doctype
-        self._reader.StartElementHandler = self._start
-        self._reader.EndElementHandler = self._end
-        self._reader.CharacterDataHandler = self._text
 
     def read(self, data: bytes) -> dict[str, Any]:
-        try:
-            self._reader.Parse(data, True)
-        except expat.ExpatError as error:
-            why = expat.ErrorString(error.code)
-            raise McaptrackError(f"{self._path}:{error.lineno}: not valid XML: {why}") from None
+        self.parse([data])
         ((name, tree),) = self._open[0][1]
         if name != _ROOT:
-            raise McaptrackError(f"{self._path} is XML of <{name:.40}>; calibrations of OpenCV are of <{_ROOT}>")
+            raise McaptrackError(f"{self.path} is XML of <{name:.40}>; calibrations of OpenCV are of <{_ROOT}>")
         return tree if isinstance(tree, dict) else {}
 
-    def _fail(self, problem: str) -> NoReturn:
-        raise McaptrackError(f"{self._path}:{self._reader.CurrentLineNumber}: {problem}")
-
-    def _refuse_doctype(self, *_: object) -> NoReturn:
-        self._fail("a document type, which OpenCV doesn't write; it may hold entities, and isn't read")
-
-    def _start(self, name: str, _: dict[str, str]) -> None:
+    def start(self, name: str, attributes: dict[str, str]) -> None:
         self._nodes += 1
         if self._nodes > _MAX_NODES or len(self._open) > _MAX_DEPTH:
-            self._fail(f"it has more than {_MAX_NODES} elements, or is nested more than {_MAX_DEPTH} deep")
+            self.fail(f"it has more than {_MAX_NODES} elements, or is nested more than {_MAX_DEPTH} deep")
         self._open.append((name, [], []))
 
-    def _text(self, text: str) -> None:
+    def text(self, text: str) -> None:
         self._open[-1][2].append(text)
 
-    def _end(self, name: str) -> None:
+    def end(self, name: str) -> None:
         _, inner, text = self._open.pop()
         value: Any = Scalar.of("".join(text).strip().strip('"'), is_plain=True)
         if inner and all(key == "_" for key, _ in inner):
@@ -179,7 +166,7 @@ class _Xml:
             value = dict(inner)
             if len(value) != len(inner):
                 twice = next(key for number, (key, _) in enumerate(inner) if key in dict(inner[:number]))
-                self._fail(f"<{twice:.40}> is there twice")
+                self.fail(f"<{twice:.40}> is there twice")
         self._open[-1][1].append((name, value))
 
 

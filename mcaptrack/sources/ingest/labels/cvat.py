@@ -18,8 +18,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, Final, NoReturn
-from xml.parsers import expat
+from typing import IO, Any, Final
 
 import numpy as np
 
@@ -30,6 +29,7 @@ from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.schema.classes import PERSON, is_person
 from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows
 from mcaptrack.sources.ingest.labels.content import NO_ID, Labels, WantedClasses
+from mcaptrack.sources.ingest.xml_reader import XmlReader
 
 _MAX_BYTES: Final = 512 * 2**20
 _MAX_ROWS: Final = 10_000_000
@@ -115,8 +115,10 @@ def _listed(names: list[str]) -> str:
 
 
 @dataclass
-class _Parser:
+class _Parser(XmlReader):
     """The content of a file, as far as it was read. ``meta`` are the texts of the description of the task, by name."""
+
+    writer = "CVAT"
 
     path: Path
     values: array[float] = field(default_factory=lambda: array("d"))
@@ -136,55 +138,37 @@ class _Parser:
         self._image: int | None = None
         self._text: list[str] | None = None
         self._attribute = ""
-        self._size = 0
         self._steps: tuple[int, int, int] | None = None
-        self._reader = expat.ParserCreate()
-        self._reader.buffer_text = True
-        self._reader.StartDoctypeDeclHandler = self._refuse_doctype
-        self._reader.StartElementHandler = self._start
-        self._reader.EndElementHandler = self._end
-        self._reader.CharacterDataHandler = self._character
+        super().__init__(self.path)
 
-    def read(self) -> None:
-        """Read the whole file. Raises McaptrackError, with the line, if it isn't what CVAT writes."""
-        try:
-            with opened_xml(self.path) as stream:
-                while block := stream.read(_BLOCK):
-                    self._size += len(block)
-                    if self._size > _MAX_BYTES:
-                        self._fail(f"there are more than {_MAX_BYTES} bytes of XML; give it in parts")
-                    self._reader.Parse(block, False)
-                self._reader.Parse(b"", True)
-        except expat.ExpatError as error:
-            why = expat.ErrorString(error.code)
-            raise McaptrackError(f"{self.path}:{error.lineno}: not valid XML: {why}") from None
-        except (LookupError, ValueError) as error:  # what expat says of encodings that it doesn't know
-            raise McaptrackError(f"{self.path}:{self._reader.CurrentLineNumber}: not read: {error}") from None
+    def pieces(self) -> Iterator[bytes]:
+        """The XML of the file, in blocks. Raises McaptrackError if there is too much."""
+        size = 0
+        with opened_xml(self.path) as stream:
+            while block := stream.read(_BLOCK):
+                size += len(block)
+                if size > _MAX_BYTES:
+                    self.fail(f"there are more than {_MAX_BYTES} bytes of XML; give it in parts")
+                yield block
 
-    def _fail(self, problem: str) -> NoReturn:
-        raise McaptrackError(f"{self.path}:{self._reader.CurrentLineNumber}: {problem}")
-
-    def _refuse_doctype(self, *_: object) -> NoReturn:
-        self._fail("a document type, which CVAT doesn't write; it may hold entities, and isn't read")
-
-    def _start(self, name: str, attributes: dict[str, str]) -> None:
+    def start(self, name: str, attributes: dict[str, str]) -> None:
         self.names.append(name)
         if len(self.names) > _MAX_DEPTH:
-            self._fail("nested deeper than annotations of CVAT are")
+            self.fail("nested deeper than annotations of CVAT are")
         if len(self.names) == 1 and name != "annotations":
-            self._fail(f"XML that begins with <{name[:40]}>; of XML, <annotations> of CVAT are read")
+            self.fail(f"XML that begins with <{name[:40]}>; of XML, <annotations> of CVAT are read")
         if "meta" in self.names[:2]:
             self._text = []
         elif name == _TRACK and len(self.names) == 2:
             self._check_task(attributes)
-            line = self._reader.CurrentLineNumber
+            line = self.line
             number = len(self.tracks) if "id" not in attributes else self._whole(attributes["id"], "the id of a track")
             self._track = _Track(number, self._label(attributes), line)
         elif name == "image" and len(self.names) == 2:
             self._check_task(attributes)
             self._image = self._whole(attributes.get("id", ""), "the id of an image")
             if self._image in self.images:
-                self._fail(f"image {self._image} is there before; give one file for each task")
+                self.fail(f"image {self._image} is there before; give one file for each task")
             self.images[self._image] = None
         elif name == "box" and self._track is not None:
             self._add_to_track(self._track, attributes)
@@ -197,7 +181,7 @@ class _Parser:
         elif name == "attribute":
             self._attribute, self._text = attributes.get("name", ""), []
 
-    def _end(self, name: str) -> None:
+    def end(self, name: str) -> None:
         text = "".join(self._text or ()).strip()
         if "meta" in self.names[:2] and text and len(self.names) <= 4:
             self.meta.setdefault(name, text)
@@ -206,24 +190,24 @@ class _Parser:
         elif name == _TRACK and self._track is not None:
             self.tracks.append(self._track)
             if len(self.tracks) > _MAX_ROWS:
-                self._fail(f"more than {_MAX_ROWS} tracks; give it in parts")
+                self.fail(f"more than {_MAX_ROWS} tracks; give it in parts")
             self._track = None
         elif name == "image":
             self._image = None
         self._text = None
         self.names.pop()
 
-    def _character(self, text: str) -> None:
+    def text(self, text: str) -> None:
         if self._text is not None:
             self._text.append(text[:_MAX_TEXT])
             if len(self._text) > _MAX_TEXT:
-                self._fail("a text is longer than those of CVAT are")
+                self.fail("a text is longer than those of CVAT are")
 
     def _check_task(self, attributes: dict[str, str]) -> None:
         """Fail at the second task of a file of a whole project: frames of all tasks are counted from 0."""
         task = attributes.get("task_id")
         if task is not None and self.task not in (None, task):
-            self._fail(f"tasks {self.task} and {task:.20} of a project; export each task, and give one file for each")
+            self.fail(f"tasks {self.task} and {task:.20} of a project; export each task, and give one file for each")
         self.task = self.task or task
 
     def _take_id(self, text: str) -> None:
@@ -241,30 +225,30 @@ class _Parser:
     def _label(self, attributes: dict[str, str]) -> int:
         name = " ".join(attributes.get("label", "").split())[:256]
         if name not in self.labels and len(self.labels) >= _MAX_CLASSES:
-            self._fail(f"more than {_MAX_CLASSES} labels")
+            self.fail(f"more than {_MAX_CLASSES} labels")
         return self.labels.setdefault(name, len(self.labels))
 
     def _whole(self, text: str, what: str) -> int:
         if not (text.isascii() and text.isdecimal() and len(text) < 16):
-            self._fail(f"{what} is a whole number from 0 on, not {text[:40]!r}")
+            self.fail(f"{what} is a whole number from 0 on, not {text[:40]!r}")
         return int(text)
 
     def _corners(self, attributes: dict[str, str]) -> tuple[float, ...]:
         try:
             corners = tuple(float(attributes[name]) for name in ("xtl", "ytl", "xbr", "ybr"))
         except KeyError as error:
-            self._fail(f"a box without {error}")
+            self.fail(f"a box without {error}")
         except ValueError:
-            self._fail(f"a box with corners that aren't numbers: {str(attributes)[:80]}")
+            self.fail(f"a box with corners that aren't numbers: {str(attributes)[:80]}")
         self.rotated += attributes.get("rotation", "0.0").strip("0.") != ""
         return corners
 
     def _add(self, frame: int, corners: tuple[float, ...], track: int, label: int, is_occluded: bool) -> None:
         left, top, right, bottom = corners
-        line = self._reader.CurrentLineNumber
+        line = self.line
         self.values.extend((frame, left, top, right - left, bottom - top, track, label, is_occluded, line))
         if len(self.values) > _MAX_ROWS * _COLUMNS:
-            self._fail(f"more than {_MAX_ROWS} boxes, interpolated ones among them; give it in parts")
+            self.fail(f"more than {_MAX_ROWS} boxes, interpolated ones among them; give it in parts")
 
     def _add_to_track(self, track: _Track, attributes: dict[str, str]) -> None:
         """Add a box, and those between it and the one before."""
@@ -273,9 +257,9 @@ class _Parser:
         if track.last is not None:
             before, *start = track.last
             if frame <= before:
-                self._fail(f"the frame of a box is {frame}, and that of the box before is {before:.0f}")
+                self.fail(f"the frame of a box is {frame}, and that of the box before is {before:.0f}")
             if not track.is_outside and frame - before > _MAX_FRAMES:
-                self._fail(f"{frame - before - 1:.0f} boxes would be interpolated; at most {_MAX_FRAMES} are")
+                self.fail(f"{frame - before - 1:.0f} boxes would be interpolated; at most {_MAX_FRAMES} are")
             for between in self._between(int(before), frame) if not track.is_outside else ():
                 share = (between - before) / (frame - before)
                 box = tuple(a + share * (b - a) for a, b in zip(start, corners, strict=True))
@@ -312,7 +296,7 @@ def _is(attributes: dict[str, str], name: str) -> bool:
 def read_cvat(path: Path, role: Role, wanted: WantedClasses) -> Labels:
     """Read annotations of CVAT. Raises McaptrackError, with the line, if they are damaged or hold no boxes."""
     parser = _Parser(path)
-    parser.read()
+    parser.parse(parser.pieces())
     if parser.tracks and parser.images:
         raise McaptrackError(f"{path} holds both tracks and images; CVAT writes one of them")
     if not parser.values:
