@@ -19,7 +19,7 @@ from mcaptrack.geometry.arrays import Bools, Floats
 #: Numbers of coefficients of OpenCV's models: none, plumb_bob, rational_polynomial; and of fisheye (equidistant).
 _COEFFICIENTS: Final = (0, 4, 5, 8)
 _FISHEYE_COEFFICIENTS: Final = 4
-#: A point is outside of what a lens maps if there and back again it is off by more.
+#: A point is beyond the edge of the lens if undistorting and distorting it moves it by more than this.
 _LOST_PX: Final = 0.5
 _ITERATIONS: Final = 50
 

@@ -105,7 +105,7 @@ _MIDDLE, _OUTER = 0.5, 0.9
 # compared with where their tracks were observed then, and scale the distributions of the forecasts after them
 # (compare adaptive conformal inference: I. Gibbs and E. Candes, NeurIPS 2021; here the scales are shrunk towards
 # the table, so that few comparisons change little). What ellipses have held in the log so far corrects them
-# (``held_levels``), and the noise of positions is taken out of the comparisons (``position_noise``). Nothing is
+# (``correct``), and the noise of positions is taken out of the comparisons (``position_noise``). Nothing is
 # known that was not known at the time of a forecast.
 #
 # The means of forecasts, and the covariances by which tracks are associated, are those of the predictor.

@@ -39,9 +39,9 @@ _HEIGHTS_M: Final = (0.05, 30.0)
 _GROUND_FRAMES: Final = ("base_footprint", "base_link")
 #: A word of a topic of rectified pictures: /front/image_rect_color/compressed, but not /direct/image.
 _RECTIFIED: Final = re.compile(r"(?<![a-z])(image)?rect(ified)?(?![a-z])", re.IGNORECASE)
-#: Where the frame of a camera is no optical one, its z axis points up: z of a unit vector is more than this.
+#: A camera's frame is no optical one if its z axis points up: z of a unit vector is more than this.
 _LOOKS_UP: Final = 0.7
-#: Pictures of another size than the calibration's have been resized if their shape is the same but for so much.
+#: Pictures were resized, not cropped, if their ratio of width to height differs by less than this share.
 _SHAPE: Final = 0.02
 
 

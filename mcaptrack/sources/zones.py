@@ -28,7 +28,7 @@ _MAX_BYTES: Final = 8 * 2**20
 _MAX_ZONES: Final = 500
 _MAX_POINTS: Final = 2000
 _MAX_NAME: Final = 100
-#: Farther from the origin there are no metres of a map, nor pixels.
+#: Larger coordinates are neither metres of a map nor pixels.
 _FARTHEST: Final = 1e8
 #: A zone of less area in square metres, or of a shorter line in metres, is taken to be in degrees.
 _LEAST_M2, _LEAST_M = 0.01, 0.01

@@ -23,7 +23,7 @@ from mcaptrack.transforms.protocol import Transform, traits_of
 _ONE_FOR_EACH: Final = ("detector", "tracker", "fuser")
 #: Above the largest time in nanoseconds, and above the largest frame number, that a log can hold.
 _END_NS, _END_INDEX = 2**63, 2**32
-#: What a transform that has ended gives.
+#: Marks the end of a transform's output.
 _END: Final = object()
 
 

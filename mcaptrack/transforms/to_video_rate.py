@@ -32,7 +32,7 @@ from mcaptrack.schema.resampling import interval_ns, resample, resample_parts
 
 #: Columns taken from the tracker where it has a box.
 _FROM_TRACKER: Final = ("x_px", "y_px", "w_px", "h_px", "score", "observed")
-#: The same for tracks that a tracker made in metres, with velocities.
+#: Columns of tracks that a tracker made in metres, with velocities.
 _IN_METRES: Final = ("x_m", "y_m", "z_m", "heading_rad", "vx_m_per_s", "vy_m_per_s")
 
 

@@ -28,7 +28,7 @@ TAU_M2: Final = 2.0
 
 #: The probabilities of the ellipses for which reliability is reported.
 RELIABILITY_LEVELS: Final = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
-#: Those of them that tables have columns for.
+#: The levels that tables have columns for.
 LEVELS: Final = (0.5, 0.9, 0.95)
 
 

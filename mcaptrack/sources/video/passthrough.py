@@ -89,7 +89,7 @@ def packets(opened: Any, image_format: str) -> Iterator[StreamPacket]:
 # Other damage shows only when pictures are decoded.
 
 
-#: As many zero bytes are no padding between NAL units but a hole in the file.
+#: This many zero bytes are a hole in the file, not padding between NAL units.
 _HOLE: Final = bytes(64)
 _START: Final = b"\x01"
 #: Encoders that pad pictures with zeros do so in more than this share of them; those that don't count pictures as the

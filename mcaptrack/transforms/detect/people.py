@@ -53,7 +53,7 @@ _LEAST_WORK: Final = 200_000
 _PASSES: Final = 2
 #: What a region costs in addition to its filtered pixels, in pixels.
 _REGION_WORK: Final = 5_000
-#: A region that more people would have to fill is no group of people that its outline could tell apart.
+#: A region that more people would have to fill is not separated: its outline couldn't tell them apart.
 _MOST_PEOPLE: Final = 32
 #: More regions in a picture than this are noise, such as rain: they are not compared with each other.
 _MOST_PARTS: Final = 500

@@ -28,7 +28,7 @@ from mcaptrack.transforms.protocol import Suited, check_options, context, option
 _STAYS, _PERSISTENCE_CHANCE = 0.85, 0.3
 #: How far people walk, in metres per second; and how far at most they seem to be from where they were.
 _PACE_M_PER_S, _FARTHEST_M = 1.0, 2.5
-#: A frame that is longer ago says nothing.
+#: A frame longer ago than this is ignored.
 _MOST_S: Final = 1.0
 #: Groups that are less probable than this are no people of the frame before.
 _PERSISTENCE_LEAST: Final = 0.02

@@ -37,7 +37,7 @@ FEATURES: Final = (
     "log rate",
     "log elsewhere",
 )
-#: Margins beyond this say no more; what is that much less likely is no alternative.
+#: The limit of margins: an assignment that is less likely by this much is no alternative.
 _MARGIN: Final = 12.0
 #: Samples of another input track that last less, within one of the same input track, are no joins. Seconds.
 _BRIEF_S: Final = 1.0

@@ -45,7 +45,7 @@ _MIN_SPREAD: Final = 1e-3
 # Letters: R steps, N observations of all of them, L past positions.
 
 
-#: How many times as large noise may be as bends of the input say: trackers smooth their tracks.
+#: The limit of noise, as a multiple of what bends of the input show: trackers smooth their tracks.
 _FACTOR: Final = 1.5
 #: Noise may be so large in any case: smooth tracks may be off for long. In metres.
 _LEAST_M: Final = 0.3

@@ -45,7 +45,7 @@ _READ: Final = "plumb_bob (radtan), rational_polynomial and equidistant (kannala
 #: Numbers of coefficients that the models have in messages.
 _COUNTS: Final = {POLYNOMIAL: 5, RATIONAL: 8, EQUIDISTANT: 4}
 _MOST_PX: Final = 1e5
-#: A rotation is one if R R^T is the identity but for so much.
+#: R is a rotation if R R^T differs from the identity by less than this.
 _ORTHONORMAL: Final = 1e-3
 _NAMED: Final = 12
 
@@ -86,7 +86,7 @@ _ROOT: Final = "opencv_storage"
 _MAX_BYTES: Final = 2**20
 _MAX_DEPTH: Final = 16
 _MAX_NODES: Final = 20_000
-#: OpenCV's tags; what they hold says what it is, too.
+#: OpenCV's tags, which are ignored: their content says as much.
 _TAGS: Final = tuple(f"tag:yaml.org,2002:opencv-{kind}" for kind in ("matrix", "nd-matrix"))
 #: The first line of OpenCV's YAML, which YAML itself doesn't allow, and the line that ends a document.
 _HEAD: Final = re.compile(rb"\A(\xef\xbb\xbf)?%YAML[: ]1\.[0-9][^\n]*\n")

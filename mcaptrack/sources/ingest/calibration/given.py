@@ -22,7 +22,7 @@ from mcaptrack.sources.ingest.calibration.content import CameraFile, read_camera
 _METRES: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 #: Heights of a camera, as numbers, that are taken for metres (up to), centimetres and millimetres (between).
 _IN_M, _IN_CM, _IN_MM = 30.0, (30.0, 1500.0), (3000.0, 30_000.0)
-#: Pictures of another size have been resized if their shape is the same but for so much.
+#: Pictures were resized, not cropped, if their ratio of width to height differs by less than this share.
 _SHAPE: Final = 0.02
 #: A centre that is farther from the middle than this share of the picture's size is named.
 _OFF_CENTRE: Final = 0.2

@@ -54,7 +54,7 @@ _LEAST_PIXELS, _MOST_PIXELS = 700_000, 1_000_000
 _MOST_TILES: Final = 64
 #: So many pictures in which nothing was found are kept, to try other layouts on.
 _KEPT: Final = 4
-#: So many classes without a name are listed.
+#: The most classes without a name that are listed.
 _SHOWN: Final = 8
 
 

@@ -212,7 +212,7 @@ class DetectorNetwork:
             if is_other and not isinstance(error, NetworkLimitError):
                 raise self._refused_size(_known(own)) from error
             raise
-        #: What it takes and gives.
+        #: The inputs and outputs of the network.
         self.signature = NetworkSignature(tuple(name for name, _, _ in inputs), outputs, wanted, len(self.names))
 
     def run(self, blob: NDArray[np.float32]) -> Outputs:
