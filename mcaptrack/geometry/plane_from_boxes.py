@@ -148,12 +148,7 @@ class PlaneFit:
 
 
 def plane_from_boxes(
-    boxes: Floats,
-    frame: Ints,
-    score: Floats,
-    width_px: int,
-    height_px: int,
-    person_m: float = PERSON_HEIGHT_M,
+    boxes: Floats, frame: Ints, score: Floats, width_px: int, height_px: int, person_m: float = PERSON_HEIGHT_M
 ) -> PlaneFit:
     """Estimate the ground plane of a still camera from boxes of people.
 

@@ -36,7 +36,7 @@ _MEMORY_S, _LEAST_POSITIONS = 60.0, 30
 _LOWEST, _HIGHEST, _BINS = -8, 6, 16
 #: Positions of a past, the current one included, that show bends.
 PAST: Final = 1 + 2 * _LAGS[-1]
-#: The choices of one or more of the three parts.
+#: All choices of the three parts, the empty one first.
 _CHOICES: Final = np.array([[bool(number & 1 << part) for part in range(3)] for number in range(8)])
 #: What is added to the equations of each choice: those of other columns are 0, and some columns are almost alike.
 _ALONE: Final = np.stack([np.diag(np.where(choice, 1e-12, 1.0)) for choice in _CHOICES])

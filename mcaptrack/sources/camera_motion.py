@@ -118,10 +118,7 @@ def planes_in(opened: log.Log, topic: str) -> list[tuple[int, GroundPlane]]:
 
 
 def read_ground_truth(
-    opened: log.Log,
-    prefix: str,
-    provenances: Mapping[str, Provenance] = {},
-    frames: Mapping[str, Sequence[Frame]] = {},
+    opened: log.Log, prefix: str, provenances: Mapping[str, Provenance] = {}, frames: Mapping[str, Sequence[Frame]] = {}
 ) -> list[Frame]:
     """Return the ground truth of a camera, with positions in metres where its pictures show them.
 

@@ -56,9 +56,7 @@ class Footage:
 
 
 def draw_place(
-    cameras: Mapping[str, SyntheticScene],
-    folder: Path,
-    progress: Callable[[str, int, int], None] = lambda *_: None,
+    cameras: Mapping[str, SyntheticScene], folder: Path, progress: Callable[[str, int, int], None] = lambda *_: None
 ) -> tuple[dict[str, Footage], Path]:
     """Write a scene that several cameras see to a folder: the footage of each camera, and where people truly are.
 

@@ -76,13 +76,7 @@ def warn_of_remarks(opened: log.Log, tree: TransformTree | None, target: str, so
 
 
 def poses_at(
-    opened: log.Log,
-    topic: str,
-    target: str,
-    source: str,
-    stamps_ns: Ints,
-    log_ns: Ints,
-    what: str = "messages",
+    opened: log.Log, topic: str, target: str, source: str, stamps_ns: Ints, log_ns: Ints, what: str = "messages"
 ) -> Poses:
     """Return the poses of a frame in another for messages (N,) of a topic, by their stamps, and warn of gaps.
 
@@ -121,9 +115,8 @@ def _read(opened: log.Log) -> FramesRead:
             for message in opened.timed(topic):
                 try:
                     for transform in decode(message.payload):
-                        by_edge.setdefault((transform.parent, transform.child, is_latched), []).append(
-                            (transform, message.t_ns)
-                        )
+                        edge = (transform.parent, transform.child, is_latched)
+                        by_edge.setdefault(edge, []).append((transform, message.t_ns))
                 except McaptrackError as error:
                     bad, why = bad + 1, why or str(error)
         except McaptrackError as error:

@@ -110,10 +110,8 @@ def _from_log(path: Path, options: SourceOptions, step_s: float) -> list[Scene]:
         filled = [topic for topic in topics if topic in opened.channels and opened.channels[topic].messages]
         if not filled:
             raise McaptrackError(f"{path} has none of {', '.join(topics)}; {call('run', path)} makes tracks")
-        if opened.channels[filled[0]].schema_name != TRACKS.name:
-            raise McaptrackError(
-                f"{path}: {filled[0]} holds {opened.channels[filled[0]].schema_name}, not {TRACKS.name}"
-            )
+        if (schema_name := opened.channels[filled[0]].schema_name) != TRACKS.name:
+            raise McaptrackError(f"{path}: {filled[0]} holds {schema_name}, not {TRACKS.name}")
         planes = pipeline.read_planes(opened, prefix) or ()
         return [_scene(f"{path.stem}{filled[0]}", opened.frames(filled[0], TRACKS), step_s, planes)]
 

@@ -299,11 +299,7 @@ _STAGES: Final = (
         at_video_rate=True,
         profiles=PROFILES,
         modes=MappingProxyType(
-            {
-                "both": (),
-                "offline": ("", "decisions", "appearance"),
-                "online": ("online", "predictions"),
-            }
+            {"both": (), "offline": ("", "decisions", "appearance"), "online": ("online", "predictions")}
         ),
         beside=("decisions", "appearance"),
         implied=MappingProxyType({"distance": "consistency"}),

@@ -62,13 +62,7 @@ class SparseTables(Sequence[Floats]):
     """
 
     def __init__(
-        self,
-        frame: Indices,
-        row: Indices,
-        column: Indices,
-        similarity: Floats,
-        row_ends: Indices,
-        column_ends: Indices,
+        self, frame: Indices, row: Indices, column: Indices, similarity: Floats, row_ends: Indices, column_ends: Indices
     ) -> None:
         self.frame, self.row, self.column, self.similarity = frame, row, column, similarity
         self._row_ends, self._column_ends = row_ends, column_ends

@@ -67,10 +67,7 @@ def persistence(
     times = np.array([frame.t_ns for frame in block.frames], np.int64)
     last = slice(int(ends[-1] - sizes[-1]), int(ends[-1]))
     after = LastFrame(
-        int(times[-1]),
-        Places(block.centre.xy_m[last], block.centre.cov[last]),
-        certainty[last],
-        bool(block.counts[-1]),
+        int(times[-1]), Places(block.centre.xy_m[last], block.centre.cov[last]), certainty[last], bool(block.counts[-1])
     )
     begun = before or LastFrame(int(times[0]), Places(np.empty((0, 2)), np.empty((0, 3))), np.empty(0), is_known=False)
     # Groups of the frame before the block come first; frames are numbered from it.

@@ -249,7 +249,7 @@ class GroundTracks:
         weight = is_same_class.astype(float)
         _follow_box(t, detections, weight)
         t[SCORE], t[SOURCE] = detections[SCORE], detections[SOURCE]
-        score = np.where(np.isnan(detections[SCORE]), 0.5, detections[SCORE])
+        score = certainty(detections)
         t[SCORES] += score
         t[HITS] += 1
         t[MISSED_S] = 0
@@ -282,7 +282,7 @@ class GroundTracks:
         t[_FACING] = np.where(has_heading, 1.0, 0.0)
         t[_SIZED] = np.isfinite(detections[LENGTH])
         t[ID] = np.arange(first_id, first_id + count)
-        t[SCORES] = np.where(np.isnan(detections[SCORE]), 0.5, detections[SCORE])
+        t[SCORES] = certainty(detections)
         t[HITS] = 1
         t[LAST_FRAME] = frame
         t[LAST], t[LAST_VELOCITY], t[LAST_SPREAD], t[FIRST] = t[BOX], t[_VELOCITY], t[_VV], t[PLACE]
@@ -305,7 +305,7 @@ class GroundTracks:
             self._classes[number] = len(self._classes)
             self.votes = np.concatenate([self.votes, np.zeros((1, self.votes.shape[1]))])
         which = [self._classes[number] for number in classes]
-        self.votes[which, track] += np.where(np.isnan(detections[SCORE]), 0.5, detections[SCORE])
+        self.votes[which, track] += certainty(detections)
 
     def _winners(self, track: Indices, before: Floats) -> Floats:
         """The class with the highest sum of scores, of each of some tracks (N,) with these classes (N,) before."""
@@ -322,6 +322,11 @@ def measured(noise_m: Floats, detections: Floats) -> Floats:
     """
     out = np.stack([noise_m**2, np.zeros_like(noise_m), noise_m**2], axis=-1)
     return out + own_covariances(detections) if detections.shape[0] > DETECTION_ROWS else out
+
+
+def certainty(detections: Floats) -> Floats:
+    """The scores (N,) of detections (rows, N); 0.5 for those without a score."""
+    return np.where(np.isnan(detections[SCORE]), 0.5, detections[SCORE])
 
 
 def own_covariances(detections: Floats) -> Floats:

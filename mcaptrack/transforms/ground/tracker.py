@@ -49,6 +49,7 @@ from mcaptrack.transforms.ground.state import (
     GroundTracks,
     X,
     Y,
+    certainty,
     measured,
     no_tracks,
     own_covariances,
@@ -167,9 +168,7 @@ class _Apart:
             )
             xx, xy, yy = place + noise
             #: Twice the log-odds that detections are true; their scores are probabilities.
-            share = np.clip(
-                np.where(np.isnan(detections[SCORE]), 0.5, detections[SCORE]), _LEAST_SCORE, 1 - _LEAST_SCORE
-            )
+            share = np.clip(certainty(detections), _LEAST_SCORE, 1 - _LEAST_SCORE)
             self._odds = 2 * np.log(share / (1 - share))
             self._area = xx * yy - xy * xy
             self._deviations = (yy * x * x - 2 * xy * x * y + xx * y * y) / self._area

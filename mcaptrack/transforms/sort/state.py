@@ -219,9 +219,8 @@ def associate(pairs: CandidatePairs, min_similarity: float) -> tuple[Indices, In
         by_class = [
             associate(alone.select(pairs.class_id == kind), min_similarity) for kind in np.unique(pairs.class_id)
         ]
-        return np.concatenate([detections for detections, _ in by_class]), np.concatenate(
-            [tracks for _, tracks in by_class]
-        )
+        detections, tracks = zip(*by_class, strict=True)
+        return np.concatenate(detections), np.concatenate(tracks)
     above = pairs.similarity > min_similarity
     count = np.count_nonzero(above)
     if count:

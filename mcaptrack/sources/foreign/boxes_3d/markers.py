@@ -10,16 +10,7 @@ from collections import Counter
 from math import isnan
 from typing import Any, Final
 
-from mcaptrack.sources.foreign.boxes_3d.box import (
-    Box3d,
-    Message3d,
-    head_of,
-    moved,
-    part,
-    quaternion,
-    vector,
-    words_of,
-)
+from mcaptrack.sources.foreign.boxes_3d.box import Box3d, Message3d, head_of, moved, part, quaternion, vector, words_of
 from mcaptrack.sources.foreign.decoding import integer, text
 
 _CUBE, _CUBE_LIST, _TEXT, _ADD = 1, 6, 9, 0

@@ -67,11 +67,8 @@ def _size(shape: Any) -> Vector:
 
 def _box(seen: Any, head: tuple[int, str]) -> Box3d:
     certainty = integer(seen.classification_certainty)
-    centre, orientation, size = (
-        vector(seen.pose.position),
-        quaternion(part(seen.pose, "orientation")),
-        _size(seen.shape),
-    )
+    centre, size = vector(seen.pose.position), _size(seen.shape)
+    orientation = quaternion(part(seen.pose, "orientation"))
     if isnan(size[0]) and (points := [vector(point) for point in part(part(seen, "polygon"), "points") or ()]):
         x, y, z, w = orientation
         along = [rotated((-x, -y, -z, w), point) for point in points]  # the polygon is in the frame of the message

@@ -19,13 +19,7 @@ from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import read_beginning
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.sources.ingest.labels.box_rows import (
-    NO_CLASS,
-    BoxRows,
-    FrameNames,
-    TrackIds,
-    numbers_of_names,
-)
+from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows, FrameNames, TrackIds, numbers_of_names
 from mcaptrack.sources.ingest.labels.content import NO_ID, Format, Labels, WantedClasses
 from mcaptrack.sources.ingest.labels.delimited import read_rows
 

@@ -135,11 +135,7 @@ def _ultralytics_count(kind: read.Kind, shape: tuple[int, ...]) -> int | None:
 
 
 #: ImageNet's mean and standard deviation, of red, green and blue from 0 to 1.
-_IMAGENET: Final[dict[str, Any]] = {
-    "divide": 255.0,
-    "mean": (0.485, 0.456, 0.406),
-    "deviation": (0.229, 0.224, 0.225),
-}
+_IMAGENET: Final[dict[str, Any]] = {"divide": 255.0, "mean": (0.485, 0.456, 0.406), "deviation": (0.229, 0.224, 0.225)}
 _DETR: Final[dict[str, Any]] = {
     "divide": 255.0,
     "suppresses": True,

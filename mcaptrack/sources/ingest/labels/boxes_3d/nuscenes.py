@@ -167,9 +167,7 @@ def _number(folder: Path, table: str, row: Mapping[str, Any], key: str) -> int:
 def _numbers(folder: Path, row: Mapping[str, Any], key: str, count: int) -> list[float]:
     value = row.get(key)
     numbers = value if isinstance(value, list) else []
-    if len(numbers) != count or not all(
-        isinstance(number, int | float) and not isinstance(number, bool) for number in numbers
-    ):
+    if len(numbers) != count or not all(type(number) in (int, float) for number in numbers):
         raise McaptrackError(
             f"{folder / 'sample_annotation'}.json: {key} has to be {count} numbers, not {str(value)[:60]}"
         )
