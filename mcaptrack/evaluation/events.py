@@ -88,7 +88,7 @@ class _Comparison(NamedTuple):
     """Tracks compared with the ground truth: matches by person and frame, and the times of the frames."""
 
     compared: RowComparison
-    found: RowPairs
+    matches: RowPairs
     t_ns: Ints
 
 
@@ -341,8 +341,8 @@ def _in_order(parts: Sequence[tuple[Ints, Rows]]) -> tuple[Rows, Ints]:
 
 def _switches(comparison: _Comparison) -> tuple[Ints, Rows]:
     """One event for each switch that CLEAR counts."""
-    at = np.flatnonzero(is_switch(comparison.found))
-    pairs, (_, ground_truth, tracks) = comparison.found, comparison.compared
+    at = np.flatnonzero(is_switch(comparison.matches))
+    pairs, (_, ground_truth, tracks) = comparison.matches, comparison.compared
     now_ns, before_ns = comparison.t_ns[pairs.frame[at]], comparison.t_ns[pairs.frame[at - 1]]
     return now_ns, event_rows(
         EventKind.SWITCH,
@@ -356,7 +356,7 @@ def _switches(comparison: _Comparison) -> tuple[Ints, Rows]:
 
 def _misses(comparison: _Comparison) -> tuple[Ints, Rows]:
     """Periods in which a person has no track; ``previous_id`` is the person's last track."""
-    pairs, (_, ground_truth, tracks) = comparison.found, comparison.compared
+    pairs, (_, ground_truth, tracks) = comparison.matches, comparison.compared
     t_ns, places, periods = _periods(ground_truth, pairs.row, comparison.t_ns)
     previous = _before(pairs.person, pairs.frame, pairs.track, periods.slot, periods.frame, tracks.ids)
     return t_ns, event_rows(
@@ -366,7 +366,7 @@ def _misses(comparison: _Comparison) -> tuple[Ints, Rows]:
 
 def _false_tracks(comparison: _Comparison) -> tuple[Ints, Rows]:
     """Periods in which a track matches no person; ``previous_id`` is the person of its last match."""
-    pairs, (_, ground_truth, tracks) = comparison.found, comparison.compared
+    pairs, (_, ground_truth, tracks) = comparison.matches, comparison.compared
     t_ns, places, periods = _periods(tracks, pairs.column, comparison.t_ns)
     order = np.lexsort((pairs.frame, pairs.track))
     previous = _before(
@@ -443,7 +443,7 @@ def _counts(t_ns: Ints, tracks: Sequence[Frame], events: Rows, events_ns: Ints, 
     if comparison is None:
         return out
     matchup, looked_at = comparison.compared.matchup, np.searchsorted(t_ns, comparison.t_ns)
-    hits = np.bincount(comparison.found.frame, minlength=len(comparison.t_ns))
+    hits = np.bincount(comparison.matches.frame, minlength=len(comparison.t_ns))
     false, people = matchup.track_counts - hits, matchup.ground_truth_counts
     switches = so_far(EventKind.SWITCH)[looked_at]
     of_all = np.cumsum(people)

@@ -9,7 +9,7 @@ Letters: N forecasts, P pairs, T future steps, F frames.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -386,10 +386,10 @@ class SmoothedHistories:
         history = self._begin(xy_m)
         _, now, before = np.intersect1d(ids, self._ids, return_indices=True)
         if steps == 1 and len(now):
-            kept = SmoothedHistory(*(getattr(self._history, field.name)[before] for field in fields(SmoothedHistory)))
+            kept = SmoothedHistory(*(values[before] for values in self._history))
             kept.append(self._holt, xy_m[now], np.ones(len(now), np.int64))
-            for field in fields(SmoothedHistory):
-                getattr(history, field.name)[now] = getattr(kept, field.name)
+            for values, kept_values in zip(history, kept, strict=True):
+                values[now] = kept_values
         self._ids, self._history = ids.astype(np.int64), history
         past, is_known = history.positions()
         return np.where(is_known[..., None], past, np.nan), is_known

@@ -156,7 +156,7 @@ def make(name: PredictorName, steps: int, step_s: float, **parameters: Any) -> P
     [1.2, 1.6]
     """
     entry, file = entry_of(name)
-    inner = _made(entry, file, steps, step_s, parameters)
+    inner = _build(entry, file, steps, step_s, parameters)
     if inner.steps == steps and abs(inner.step_s / step_s - 1) < 1e-6:
         return inner
     ahead_s, own_s = steps * step_s, inner.steps * inner.step_s
@@ -208,7 +208,7 @@ def weights_sha256(name: PredictorName) -> str:
     entry, file = entry_of(name)
     if entry.is_built_in and _file_of(entry) is _NO_FILE:
         return ""
-    return _made(entry, file, 1, 1.0, {}).weights_sha256 or ""
+    return _build(entry, file, 1, 1.0, {}).weights_sha256 or ""
 
 
 #: Result of ``_file_of`` for a predictor without a parameter ``file``.
@@ -224,7 +224,7 @@ def _file_of(entry: Entry) -> Any:
     return parameters["file"].default if "file" in parameters else _NO_FILE
 
 
-def _made(entry: Entry, file: Path | None, steps: int, step_s: float, parameters: Mapping[str, Any]) -> Predictor:
+def _build(entry: Entry, file: Path | None, steps: int, step_s: float, parameters: Mapping[str, Any]) -> Predictor:
     options = {"file": file} if file else {}
     if entry.is_built_in:
         predictor: Predictor = entry.cls(steps=steps, step_s=step_s, **options, **parameters)

@@ -37,7 +37,7 @@ _ITERATIONS: Final = 3
 _LARGER, _ENOUGH = 1.8, 100.0
 
 
-class _Made(NamedTuple):
+class _Issued(NamedTuple):
     """Forecasts, in the order of time: their steps and ids (N,), whether tracks were observed then, and their pasts.
 
     ``cov`` (N, T, 2, 2) is before that of the mixture, ``fit`` (N,) the number of the fit that the mixture is of.
@@ -51,11 +51,11 @@ class _Made(NamedTuple):
     cov: Floats
     fit: Ints
 
-    def copied(self, which: slice) -> _Made:
+    def copied(self, which: slice) -> _Issued:
         """A part in arrays of its own, so that the larger ones can be freed."""
         step, ids, is_seen, past, mean, cov, fit = self
         numbers = step[which].copy(), ids[which].copy(), is_seen[which].copy()
-        return _Made(*numbers, past[which].copy(), mean[which].copy(), cov[which].copy(), fit[which].copy())
+        return _Issued(*numbers, past[which].copy(), mean[which].copy(), cov[which].copy(), fit[which].copy())
 
 
 class _Compared(NamedTuple):
@@ -313,11 +313,11 @@ class TailCalibration:
         self._steps, self._step_s, self._past = predictor.steps, predictor.step_s, predictor.past
         self._independent = _INDEPENDENT_PER_S * self._step_s
         self._table, self._adapts = table.at(self._step_s * np.arange(1.0, self._steps + 1)), adapts
-        self._given = Tails(self._table.wide_weight, self._table.narrow_scale, self._table.wide_scale)
+        self._of_table = Tails(self._table.wide_weight, self._table.narrow_scale, self._table.wide_scale)
         # the mixtures (3, T) of the fits that forecasts have, before and after they are corrected by levels
-        self._fitted, self._tails = (np.array([self._given]) for _ in range(2))
+        self._fitted, self._tails = (np.array([self._of_table]) for _ in range(2))
         self._dropped = 0  # fits before those
-        self._made: list[_Made] = []  # forecasts that are not compared with all times that they are of
+        self._issued: list[_Issued] = []  # forecasts that are not compared with all times that they are of
         self._first: int | None = None
         self._fitted_at = 0
         self._counts, self._levels = np.zeros((self._steps, BINS)), np.zeros((self._steps, LEVELS))
@@ -334,7 +334,7 @@ class TailCalibration:
     @property
     def factor(self) -> float:
         """The size of the 50 % ellipses beside those of the table, as a ratio of lengths."""
-        radii = squared_radius(0.5, Tails(*self._tails[-1])) / squared_radius(0.5, self._given)
+        radii = squared_radius(0.5, Tails(*self._tails[-1])) / squared_radius(0.5, self._of_table)
         return float(np.sqrt(np.median(radii)))
 
     def warn(self, name: str) -> None:
@@ -386,7 +386,7 @@ class TailCalibration:
             refits = self._refits(step[~is_coasting])
             fit += np.searchsorted(refits, step, "right")
             seen = (past if observed is None else observed)[:, -PAST:]
-            self._made.append(_Made(step, ids, ~is_coasting, seen, forecast.mean, cov, fit))
+            self._issued.append(_Issued(step, ids, ~is_coasting, seen, forecast.mean, cov, fit))
             if len(refits):
                 self._learn(refits)
         weight, narrow, wide = self._tails[fit - self._dropped].transpose(1, 0, 2)
@@ -410,7 +410,7 @@ class TailCalibration:
 
     def _learn(self, refits: Ints) -> None:
         """Fit mixtures again at some steps (R,), each by what became known since the fit before."""
-        issued = _Made(*(np.concatenate(parts) for parts in zip(*self._made, strict=True)))
+        issued = _Issued(*(np.concatenate(parts) for parts in zip(*self._issued, strict=True)))
         compared, lost = self._compare(issued, refits)
         passed = np.diff(refits, prepend=self._fitted_at)
         kept = np.exp(-passed * self._step_s / _MEMORY_S)
@@ -428,7 +428,7 @@ class TailCalibration:
         learned = Learned(self._independent * counts, self._independent * lost, *(per_m2 * part for part in noise))
         fits = [self._fitted[-1]]
         for step in map(Learned, *learned):
-            fits.append(np.array(follow(self._given, Tails(*fits[-1]), step, _ITERATIONS)))
+            fits.append(np.array(follow(self._of_table, Tails(*fits[-1]), step, _ITERATIONS)))
         self._fitted = np.concatenate([self._fitted, fits[1:]])
 
         # levels of ellipses that were much smaller or larger say little about those of now
@@ -444,9 +444,9 @@ class TailCalibration:
 
         self._fitted_at = int(refits[-1])
         left = int(np.searchsorted(issued.step, self._fitted_at - self._steps, "right"))
-        self._made = [issued.copied(slice(left, None))]
+        self._issued = [issued.copied(slice(left, None))]
 
-    def _compare(self, issued: _Made, refits: Ints) -> tuple[_Compared, Floats]:
+    def _compare(self, issued: _Issued, refits: Ints) -> tuple[_Compared, Floats]:
         """Compare forecasts with where their tracks are observed after the last fit, up to the last of ``refits``.
 
         Returns also the number (R, T) of forecasts of tracks that are not observed when others are.
@@ -474,7 +474,7 @@ class TailCalibration:
 
     def _drop_fits(self) -> None:
         """Drop the fits that no forecast has any more."""
-        fits = [int(forecasts.fit[0]) for forecasts in self._made if len(forecasts.fit)]
+        fits = [int(forecasts.fit[0]) for forecasts in self._issued if len(forecasts.fit)]
         count = min([*fits, self._dropped + len(self._fitted) - 1]) - self._dropped
         if count:
             self._fitted, self._tails = self._fitted[count:].copy(), self._tails[count:].copy()

@@ -130,19 +130,19 @@ class BoxesRead:
     """Boxes of other software that were read from a log, for later steps: decoding them takes long."""
 
     def __init__(self) -> None:
-        self._found: dict[str, foreign.NamedFrames] = {}
+        self._frames: dict[str, foreign.NamedFrames] = {}
 
     def read(self, opened: log.Log, topic: str, frame_id: str = "") -> foreign.NamedFrames:
         """Return the boxes of a channel as ``named_detections`` does; each channel is decoded only once."""
         wanted = plain_frame(frame_id) or _frame_before(opened, topic)
-        stored = self._found.get(topic)
+        stored = self._frames.get(topic)
         if stored is None or stored.frame_id != (wanted or stored.frame_id):
-            self._found[topic] = stored = named_detections(opened, topic, frame_id)
+            self._frames[topic] = stored = named_detections(opened, topic, frame_id)
         return stored
 
     def in_space(self) -> dict[str, foreign.NamedFrames]:
         """Return the boxes in space that were read, by topic."""
-        return {topic: boxes for topic, boxes in self._found.items() if boxes.frame_id}
+        return {topic: boxes for topic, boxes in self._frames.items() if boxes.frame_id}
 
 
 def _fixed_frame(opened: log.Log, topic: str, boxes: Recorded3d, wanted: str) -> str:

@@ -44,7 +44,7 @@ class PastPositions(Protocol):
         ...
 
 
-class _Made(NamedTuple):
+class _Predicted(NamedTuple):
     """Forecasts of tracks (N,) as the predictor made them; which tracks have a velocity, and what their class says."""
 
     forecast: Forecast
@@ -58,11 +58,11 @@ class _Made(NamedTuple):
         """Which tracks were measured in metres, and are of a class that moves otherwise than people."""
         return np.asarray(self.has_velocity & (self.unit_m != 1))
 
-    def take(self, which: Ints) -> _Made:
+    def take(self, which: Ints) -> _Predicted:
         """Some of them."""
         (mean, cov), has_velocity, unit_m, noise_m, kinds = self
         forecast = Forecast(mean[which], cov[which])
-        return _Made(forecast, has_velocity[which], unit_m[which], noise_m[which], kinds[which])
+        return _Predicted(forecast, has_velocity[which], unit_m[which], noise_m[which], kinds[which])
 
 
 class Forecaster:
@@ -121,7 +121,7 @@ class Forecaster:
         # An interpolated position depends on later ones: a prediction from it would not be causal.
         ready = is_known[:, -self._min_history :].all(axis=1) & frame.rows["observed"]
         people = self._people(frame.rows, past, is_known, ready) if uses_people(self._predictor) else None
-        forecasts = self._made(frame.rows[ready], past[ready], is_known[ready], people)
+        forecasts = self._predicted(frame.rows[ready], past[ready], is_known[ready], people)
         tails = None
         if self._calibration is not None and not forecasts.has_velocity.any():
             count = len(forecasts.has_velocity)
@@ -168,7 +168,7 @@ class Forecaster:
         is_ready = is_known[:, -self._min_history :].all(axis=1) & joined.rows["observed"]
         ready = is_ready.nonzero()[0]
         rows, past = joined.rows.take(ready), past[ready]
-        forecasts = self._made(rows, past, is_known[ready], None)
+        forecasts = self._predicted(rows, past, is_known[ready], None)
         forecast, tails = forecasts.forecast, None
         # As frame by frame: those of frames without a vehicle stay as they are, to the last digit.
         count = len(joined.t_ns)
@@ -191,7 +191,7 @@ class Forecaster:
         last_ns, self._last_ns = self._last_ns, t_ns
         return 1 if last_ns is None else steps_passed(t_ns - last_ns, self._rate_hz)
 
-    def _made(self, rows: Rows, past: Floats, is_known: Bools, people: PeopleSeen | None) -> _Made:
+    def _predicted(self, rows: Rows, past: Floats, is_known: Bools, people: PeopleSeen | None) -> _Predicted:
         """The forecasts of tracks (N,) as the predictor makes them, in metres."""
         classes, of = np.unique(rows["class_id"], return_inverse=True)
         numbers = classes.tolist()
@@ -202,9 +202,9 @@ class Forecaster:
         limits = limits_by_class(numbers, self._class_names, self._class_limits)
         noise_m = np.array([limits[number].noise_m for number in numbers])[of]
         kinds = np.array([limits[number].name for number in numbers])[of]
-        return _Made(Forecast(mean * scale, cov * scale[..., None] ** 2), has_velocity, unit_m, noise_m, kinds)
+        return _Predicted(Forecast(mean * scale, cov * scale[..., None] ** 2), has_velocity, unit_m, noise_m, kinds)
 
-    def _of_vehicles(self, forecasts: _Made, rows: Rows, past: Floats) -> tuple[Forecast, Tails | None]:
+    def _of_vehicles(self, forecasts: _Predicted, rows: Rows, past: Floats) -> tuple[Forecast, Tails | None]:
         """The forecasts of tracks (N,) in metres, of which vehicles may stay where they are, and are mixtures."""
         step_s = self._predictor.step_s
         stay = forecasts.is_vehicle * _standing(past, forecasts.unit_m, step_s)

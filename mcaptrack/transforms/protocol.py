@@ -29,7 +29,7 @@ import math
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields
-from functools import cache, partial
+from functools import cache
 from types import MappingProxyType, UnionType
 from typing import Any, ClassVar, Final, Literal, NamedTuple, Protocol, get_args, get_origin, get_type_hints
 
@@ -221,8 +221,9 @@ def option(
     return field(default=default, metadata=about)
 
 
-#: Declares a parameter that only ``--set`` sets: the command has no option of its own for it.
-setting: Final = partial(option, flag=False)
+def setting(default: Any, help: str, **about: Any) -> Any:  # noqa: A002
+    """Declare a parameter as ``option`` does that only ``--set`` sets: the command has no option of its own for it."""
+    return option(default, help, flag=False, **about)
 
 
 def context(factory: Callable[[], Any], *, is_recorded: bool = True) -> Any:

@@ -200,14 +200,14 @@ _STRAIGHT: Final = 0.0175
 class Orientation(NamedTuple):
     """The orientation of pictures: transposed, then mirrored from left to right, then from top to bottom.
 
-    ``words`` say it, "" for pictures that are shown as they are stored. ``oblique`` is an angle in degrees by which
+    ``description`` says it, "" for pictures shown as they are stored. ``oblique`` is an angle in degrees by which
     they should be turned and aren't, because it is none of quarter turns.
     """
 
     is_transposed: bool = False
     flips_x: bool = False
     flips_y: bool = False
-    words: str = ""
+    description: str = ""
     oblique: float = 0.0
 
     def of(self, picture: Any) -> Image:
@@ -245,7 +245,7 @@ def fit(picture: Any, orientation: Orientation, width: int, height: int) -> tupl
     """
     if (
         not isinstance(picture, np.ndarray)
-        and not orientation.words
+        and not orientation.description
         and (picture.width, picture.height) == (width, height)
     ):
         if picture.format.name == "yuv420p" and picture.color_range != FULL_RANGE:
@@ -360,7 +360,7 @@ def open_video(path: Path, options: VideoOptions = VideoOptions()) -> Video:  # 
             fraction(stream.average_rate),
             stream.frames,
             _creation_ns(opened.metadata.get("creation_time") or stream.metadata.get("creation_time")),
-            f"it is {orientation.words}" if orientation.words else "",
+            f"it is {orientation.description}" if orientation.description else "",
             stream=stream.index,
             has_slots=has_slots(opened),
             length_s=_length_s(opened, stream),

@@ -136,7 +136,7 @@ def calibrate(
     blocks, noise = _blocks(values, which[seen], step[seen], source[seen], xy_m[seen], step_s)
     which, has = blocks.which, blocks.has
     parts = [
-        (part, usual_distance(values, which[part.one], has[part.one], which[part.other], has[part.other]))
+        (part, usual_distance(values, which[part.before], has[part.before], which[part.after], has[part.after]))
         for part in _pairs(blocks, step_s)
     ]
     if not parts:
@@ -144,15 +144,15 @@ def calibrate(
     pairs = _Pairs(*(np.concatenate([getattr(part, name) for part, _ in parts]) for name in _Pairs._fields))
     distance = np.concatenate([distances for _, distances in parts])
     lag = np.searchsorted(_LAGS_S, pairs.gap_s, "right") - 1
-    is_same = blocks.track[pairs.one] == blocks.track[pairs.other]
-    tracks = len(np.unique(blocks.track[pairs.one[is_same]]))
+    is_same = blocks.track[pairs.before] == blocks.track[pairs.after]
+    tracks = len(np.unique(blocks.track[pairs.before[is_same]]))
     if tracks < 2 or is_same.all():  # nothing to compare with
         return None
-    drift = _drift(distance - noise, lag, blocks.track[pairs.one], is_same, noise)
+    drift = _drift(distance - noise, lag, blocks.track[pairs.before], is_same, noise)
     calibration = AppearanceCalibration(noise, drift, 0.0, 0.0, 0.5, 0.5, tracks)
     excess = calibration.excess(distance, pairs.gap_s)
-    low = np.minimum(blocks.track[pairs.one], blocks.track[pairs.other])
-    high = np.maximum(blocks.track[pairs.one], blocks.track[pairs.other])
+    low = np.minimum(blocks.track[pairs.before], blocks.track[pairs.after])
+    high = np.maximum(blocks.track[pairs.before], blocks.track[pairs.after])
     _, who, often = np.unique(low * (high.max() + 1) + high, return_inverse=True, return_counts=True)
     weight = 1 / often[who]
     bias, slope, separation = _fit(excess, is_same, weight)
@@ -164,8 +164,8 @@ def calibrate(
 class _Pairs(NamedTuple):
     """Pairs of blocks (P,) and the seconds between them."""
 
-    one: Ints
-    other: Ints
+    before: Ints
+    after: Ints
     gap_s: Floats
 
 
@@ -224,14 +224,16 @@ def _pairs(blocks: _Blocks, step_s: float) -> Iterator[_Pairs]:
     part = np.cumsum(many) // BATCH
     for number in np.unique(part).tolist():
         own = np.flatnonzero(part == number)
-        mine = own[group_index(many[own])]
-        other = order[ragged_range(low[own], many[own])]
-        gap_s = np.asarray((blocks.first[other] - blocks.last[mine]) * step_s, np.float64)
-        way = blocks.from_m[other] - blocks.to_m[mine]
-        meet = np.minimum(blocks.ends[mine], blocks.ends[other]) > np.maximum(blocks.begins[mine], blocks.begins[other])
+        before = own[group_index(many[own])]
+        after = order[ragged_range(low[own], many[own])]
+        gap_s = np.asarray((blocks.first[after] - blocks.last[before]) * step_s, np.float64)
+        way = blocks.from_m[after] - blocks.to_m[before]
+        meet = np.minimum(blocks.ends[before], blocks.ends[after]) > np.maximum(
+            blocks.begins[before], blocks.begins[after]
+        )
         meet &= np.hypot(way[:, 0], way[:, 1]) <= _REACH_M + _SPEED_M_PER_S * gap_s
-        kept = meet | (blocks.track[mine] == blocks.track[other])
-        yield _Pairs(mine[kept], other[kept], gap_s[kept])
+        kept = meet | (blocks.track[before] == blocks.track[after])
+        yield _Pairs(before[kept], after[kept], gap_s[kept])
 
 
 def _drift(beyond: Floats, lag: Ints, track: Ints, is_same: Bools, noise: float) -> Floats:

@@ -136,7 +136,7 @@ class Unpredicted(NamedTuple):
         return Unpredicted(ids[which], past[which], is_known[which], coasts[which], step[which])
 
 
-class _Made(NamedTuple):
+class _Predicted(NamedTuple):
     """Predictions as the predictor made them: ids, past positions, whether tracks coast, means and covariances."""
 
     ids: Ints
@@ -145,11 +145,11 @@ class _Made(NamedTuple):
     mean: Floats
     cov: Floats
 
-    def part(self, which: slice) -> _Made:
-        return _Made(self.ids[which], self.past[which], self.coasts[which], self.mean[which], self.cov[which])
+    def part(self, which: slice) -> _Predicted:
+        return _Predicted(self.ids[which], self.past[which], self.coasts[which], self.mean[which], self.cov[which])
 
-    def copied(self) -> _Made:
-        return _Made(self.ids.copy(), self.past.copy(), self.coasts.copy(), self.mean.copy(), self.cov.copy())
+    def copied(self) -> _Predicted:
+        return _Predicted(self.ids.copy(), self.past.copy(), self.coasts.copy(), self.mean.copy(), self.cov.copy())
 
 
 class OnlineForecasts:
@@ -162,7 +162,7 @@ class OnlineForecasts:
         self._waiting: list[Unpredicted] = []
         nothing = np.empty((0, predictor.steps, 2, 2))
         ids, past, coasts = np.empty(0, np.int64), np.empty((0, predictor.past, 2)), np.empty(0, bool)
-        self._left = _Made(ids, past, coasts, nothing[..., 0], nothing)  # of a frame that is not complete
+        self._left = _Predicted(ids, past, coasts, nothing[..., 0], nothing)  # of a frame that is not complete
         self._frames: list[tuple[int, int, int, int]] = []  # time, number, step and tracks of frames in neither
 
     def add(self, t_ns: Ints, numbers: Ints, steps: Ints, ends: Ints, tracks: Unpredicted) -> None:
@@ -190,15 +190,17 @@ class OnlineForecasts:
             units = past / self._unit_m
             people = PeopleSeen(units, is_known, steps, np.arange(len(ids)))
             mean, cov = predict_among(self._predictor, units, is_known, people)
-            self._write(_Made(ids, past, coasts, mean * self._unit_m, cov * self._unit_m**2))
+            self._write(_Predicted(ids, past, coasts, mean * self._unit_m, cov * self._unit_m**2))
             done += len(ids)
         self._waiting = [waiting.part(slice(done, None))]
         self._write(self._left.part(slice(0)))  # frames without tracks
 
-    def _write(self, new: _Made) -> None:
+    def _write(self, new: _Predicted) -> None:
         """Write the frames that are complete with these predictions."""
         waiting = (
-            new if new is self._left else _Made(*(np.concatenate(both) for both in zip(self._left, new, strict=True)))
+            new
+            if new is self._left
+            else _Predicted(*(np.concatenate(both) for both in zip(self._left, new, strict=True)))
         )
         ends = np.cumsum([0, *(count for *_, count in self._frames)])
         count = int(np.searchsorted(ends, len(waiting.ids), "right")) - 1

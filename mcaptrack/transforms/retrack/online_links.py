@@ -100,7 +100,7 @@ class OnlineLinks:
         self._names: dict[int, int] = {}  # the ids under which tracks are written, of those that were
         self._alive, self._lost = _NOTHING, _NOTHING  # lost ones are over, were written, and are continued by no other
         self._links: deque[tuple[float, float]] = deque(maxlen=_LINKS)  # log odds and seconds
-        self._made, self._estimated = 0, 0
+        self._link_count, self._estimated = 0, 0
         self._shifts = linking.prior_shifts(np.empty(0), np.empty(0))
 
     def __call__(
@@ -224,7 +224,7 @@ class OnlineLinks:
     def _learn(self, log_odds: Floats, gap_s: Floats) -> None:
         """Learn from the best links so far how many are right after gaps of what length."""
         self._links.extend(zip(log_odds.tolist(), gap_s.tolist(), strict=True))
-        self._made += len(log_odds)
-        if self._made > self._estimated + min(_GROWS * self._estimated, _GROWS * _LINKS):
-            self._estimated = self._made
+        self._link_count += len(log_odds)
+        if self._link_count > self._estimated + min(_GROWS * self._estimated, _GROWS * _LINKS):
+            self._estimated = self._link_count
             self._shifts = linking.prior_shifts(*np.array(self._links).T)

@@ -402,7 +402,7 @@ class _Seen(NamedTuple):
     t_ns: int
     frame: int
     size: Size
-    found: Mapping[str, Found]
+    results: Mapping[str, Found]
 
 
 class _Run:
@@ -427,7 +427,7 @@ class _Run:
         kept: list[Image] = []
         pictures, anything = 0, False
         for image, seen in self._look(frames):
-            self._contest.see(seen.found)
+            self._contest.see(seen.results)
             waiting.append(seen)
             pictures += 1
             if not anything and (pictures & (pictures - 1)) == 0:  # the first, second, fourth, eighth ...
@@ -468,7 +468,7 @@ class _Run:
         """The pictures that wait, with the boxes of the layout that was settled on."""
         layout = self._contest.layouts[0]
         for seen in waiting:
-            boxes = seen.found[layout.name]
+            boxes = seen.results[layout.name]
             if isinstance(boxes, MisreadError):
                 raise McaptrackError(self._misread(seen.frame, layout, boxes))
             yield seen, boxes
