@@ -180,7 +180,7 @@ class _LastTracks:
         return self._decided(number, np.concatenate([kept_rows, rows]), np.concatenate([kept_columns, columns]))
 
     def _largest_motmetrics(self, number: int, people: Indices, tracks: Indices) -> tuple[Indices, Indices]:
-        """As ``pairs_motmetrics``, for a frame whose table of all pairs would be too large."""
+        """As ``pairs_motmetrics``, for a frame with a table of all pairs that would be too large."""
         tables = self._matchup.tables
         rows, columns, similarity = tables.pairs_of(number)
         ok = similarity >= self._matchup.threshold

@@ -11,7 +11,7 @@ from mcaptrack.errors import McaptrackError
 
 
 class XmlReader:
-    """Base of readers of XML: a subclass takes elements and texts. ``writer`` is the program whose files it reads."""
+    """Base of readers of XML: a subclass takes elements and texts. ``writer`` is the program that writes the files."""
 
     writer: ClassVar[str]
 

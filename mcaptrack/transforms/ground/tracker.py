@@ -395,7 +395,7 @@ def fast_starts(
 
 
 def _is_only(can_be: Bools, pairs: Pairing) -> Bools:
-    """Mask the pairs whose track and detection are in no other pair."""
+    """Mask the pairs of a track and a detection that are both in no other pair."""
     track, row = pairs.chosen(can_be)
     out = can_be.copy()
     out[can_be] = (np.bincount(track)[track] == 1) & (np.bincount(row)[row] == 1)
