@@ -206,6 +206,7 @@ def is_same_file(one: Location, other: Location) -> bool:
 
 def read_beginning(path: Path, count: int) -> bytes:
     """Return the first bytes of a file, at most ``count``. Raises McaptrackError if it can't be read."""
+    refuse_special(path)
     try:
         with path.open("rb") as stream:
             return stream.read(count)

@@ -234,6 +234,8 @@ PINHOLE = "cam0: {camera_model: pinhole, intrinsics: [400, 400, 320, 240], "
         ("1 0 0\n0 1 0\n0 0 1\n", "a homography of 3 x 3 numbers is given with `ground_plane=`"),
         (BILLION, "a document type"),
         ("<opencv_storage><k>1</k>", "not valid XML"),
+        ('<?xml version="1.0" encoding="utf-99"?><opencv_storage/>', "1: not read: unknown encoding: utf-99"),
+        ('<?xml version="1.0" encoding="shift_jis"?><opencv_storage/>', "1: not read: multi-byte encodings"),
         ("<opencv_storage><k>1</k><k>2</k></opencv_storage>", "<k> is there twice"),
         ("<annotations><k>1</k></annotations>", "is XML of <annotations>"),
         ("<opencv_storage>" + "<a>" * 40 + "</a>" * 40 + "</opencv_storage>", "nested more than 16 deep"),

@@ -237,7 +237,7 @@ def test_pictures_stand_where_the_matrix_puts_their_pixels(a, b, c, d):
     upright = orientation.of(frame)
     assert len(placed) == upright.shape[0] * upright.shape[1] == 6
     assert all(upright[y - top, x - left].tolist() == pixel for (x, y), pixel in placed.items())
-    assert bool(orientation.words) == ((a, b, c, d) != (1, 0, 0, 1))
+    assert bool(orientation.description) == ((a, b, c, d) != (1, 0, 0, 1))
     assert (orientation.is_transposed, orientation.oblique) == (a == 0, 0)
 
 

@@ -115,10 +115,10 @@ _AMOTP: Final = "AMOTP"
 def scored_matchups(compared: RowComparison) -> tuple[ScoredMatchup, ...]:
     """A comparison with the scores of its tracks; none if no track has any."""
     score = _track_scores(compared.tracks)
-    known = np.isfinite(score)
-    if len(score) and not known.any():
+    has_score = np.isfinite(score)
+    if len(score) and not has_score.any():
         return ()
-    return (ScoredMatchup(compared.matchup, np.where(known, score, score[known].min(initial=0.0))),)
+    return (ScoredMatchup(compared.matchup, np.where(has_score, score, score[has_score].min(initial=0.0))),)
 
 
 def _track_scores(tracks: LocatedRows) -> Floats:
@@ -134,15 +134,15 @@ def _track_scores(tracks: LocatedRows) -> Floats:
 
 def averages(parts: Sequence[ScoredMatchup], similarity: Similarity, gate: float, rules: Rules) -> dict[str, float]:
     """The averages over recalls of one class, in all sequences; AMOTP is a distance (AMOTP_m) or an overlap."""
-    found = average_over_recalls(parts, rules, _WORST.get(similarity, 0.0))
+    means = average_over_recalls(parts, rules, _WORST.get(similarity, 0.0))
     if similarity == "metres":
-        found["AMOTP_m"] = 2 * gate * (1 - found.pop(_AMOTP))
-    return found
+        means["AMOTP_m"] = 2 * gate * (1 - means.pop(_AMOTP))
+    return means
 
 
 def mean_of_classes(of_classes: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """The averages of all classes together: their means over classes, as nuScenes gives them."""
-    return {name: float(np.mean([one[name] for one in of_classes])) for name in (of_classes[0] if of_classes else ())}
+    return {name: float(np.mean([row[name] for row in of_classes])) for name in (of_classes[0] if of_classes else ())}
 
 
 @dataclass
@@ -216,9 +216,9 @@ def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Eval
     forecasts_of = {f"{prefix}/{tracks}": f"{prefix}/{name}" for name, tracks in FORECAST_INPUTS.items()}
     candidates = []
     for topic in chosen:
-        made = Provenance.from_metadata(opened.channel(topic).metadata)
+        provenance = Provenance.from_metadata(opened.channel(topic).metadata)
         mode = None
-        if made and made.transform in STAGES and STAGES[made.transform].repairs_tracks:
+        if provenance and provenance.transform in STAGES and STAGES[provenance.transform].repairs_tracks:
             mode = "online" if topic.endswith("/online") else "offline"
         name = forecasts_of.get(topic, "")
         forecasts = opened.frames(name, PREDICTIONS) if name in opened.channels else None
@@ -268,27 +268,27 @@ def evaluate(
 
 def set_means(results: Sequence[EvaluationRow]) -> None:
     """Set averages over recalls, and ``class_means`` of rows of all classes together, where there are several."""
-    for one in results:
-        if one.scored:
-            one.averages = averages(one.scored, one.similarity, one.gate, one.rules)
+    for row in results:
+        if row.scored:
+            row.averages = averages(row.scored, row.similarity, row.gate, row.rules)
     groups: dict[tuple[Any, ...], list[EvaluationRow]] = {}
-    for one in results:
-        groups.setdefault((one.sequence, one.tracks, one.mode, one.similarity, one.gate, one.rules), []).append(one)
+    for row in results:
+        groups.setdefault((row.sequence, row.tracks, row.mode, row.similarity, row.gate, row.rules), []).append(row)
     for members in groups.values():
-        rates = [metrics.summary(one.score) for one in members if one.of_class is not None]
-        of_classes = [one.averages for one in members if one.of_class is not None and one.averages]
-        for one in members:
-            if one.of_class is None and rates:
-                one.class_means = {name: float(np.mean([rate[name] for rate in rates])) for name in metrics.RATES}
-                one.averages = mean_of_classes(of_classes)
+        rates = [metrics.summary(member.score) for member in members if member.of_class is not None]
+        of_classes = [member.averages for member in members if member.of_class is not None and member.averages]
+        for row in members:
+            if row.of_class is None and rates:
+                row.class_means = {name: float(np.mean([rate[name] for rate in rates])) for name in metrics.RATES}
+                row.averages = mean_of_classes(of_classes)
 
 
 def combined(results: Sequence[EvaluationRow]) -> list[EvaluationRow]:
     """Combine all sequences: a row for each kind of tracks, similarity and gate."""
     groups: dict[tuple[Any, ...], list[EvaluationRow]] = {}
-    for one in results:
-        key = (one.group or one.tracks, one.mode, one.similarity, one.gate, one.rules, one.of_class)
-        groups.setdefault(key, []).append(one)
+    for row in results:
+        key = (row.group or row.tracks, row.mode, row.similarity, row.gate, row.rules, row.of_class)
+        groups.setdefault(key, []).append(row)
     out = []
     for (tracks, mode, similarity, gate, rules, one_class), members in groups.items():
         forecasts = [member.displacement for member in members if member.displacement is not None]
@@ -318,7 +318,7 @@ def _score(
     shared = share_classes(sequence.name, candidate.name, *aligned, sequence.classes, candidate.classes)
     notes += shared.notes
     ground_truth, tracks = shared.ground_truth, shared.tracks
-    parts = {one: (of_class(ground_truth, number), of_class(tracks, number)) for number, one in shared.names.items()}
+    parts = {name: (of_class(ground_truth, number), of_class(tracks, number)) for number, name in shared.names.items()}
     wanted = options.similarities or ("iou", "metres")
     is_3d = are_3d(ground_truth, tracks)
     results = []
@@ -331,12 +331,12 @@ def _score(
         gates = options.gates_m if similarity == "metres" else (options.min_iou,)
         for gate in gates:
             compared: dict[str | None, RowComparison]
-            compared = {one: compare_rows(*part, similarity, gate) for one, part in parts.items()}
+            compared = {name: compare_rows(*part, similarity, gate) for name, part in parts.items()}
             compared = compared or {None: compare_rows(ground_truth, tracks, similarity, gate)}
-            scores = {one: metrics.score(part.matchup, options.rules) for one, part in compared.items()}
+            scores = {name: metrics.score(part.matchup, options.rules) for name, part in compared.items()}
             whole = scores.pop(None, None) or metrics.combine(list(scores.values()))
             is_averaged = is_3d and gate == max(gates)
-            scored = {one: scored_matchups(part) for one, part in compared.items()} if is_averaged else {}
+            scored = {name: scored_matchups(part) for name, part in compared.items()} if is_averaged else {}
             if gate == gates[-1] and whole.hota["HOTA_TP"][0] == 0:
                 notes += explain_no_match(sequence.name, candidate.name, ground_truth, tracks, similarity)
             results += [
@@ -349,13 +349,13 @@ def _score(
                     options.rules,
                     score,
                     group=candidate.group,
-                    of_class=one,
+                    of_class=name,
                     is_3d=is_3d,
-                    scored=scored.get(one, ()),
+                    scored=scored.get(name, ()),
                 )
-                for one, score in ((None, whole), *scores.items())
+                for name, score in ((None, whole), *scores.items())
             ]
-    if is_3d and results and not any(one.averages or one.scored for one in results):
+    if is_3d and results and not any(row.averages or row.scored for row in results):
         notes.append(f"{sequence.name}: {candidate.name} has no scores; there is no AMOTA and no sAMOTA")
     if not results:
         notes.append(
@@ -376,10 +376,10 @@ def _forecast_scores(
     out: dict[str | None, Displacement | None] = {None: score_forecasts(forecasts, tracks, ground_truth, name)}
     # At their own times, unlike the rows that tracks are scored by.
     shared = share_classes(sequence.name, name, ground_truth, tracks, sequence.classes, candidate.classes)
-    for number, one in shared.names.items() if classes else ():
+    for number, class_name in shared.names.items() if classes else ():
         ids = ids_of_class(shared.tracks, number)
         parts = (with_ids(forecasts, ids), with_ids(shared.tracks, ids), of_class(shared.ground_truth, number))
-        out[one] = score_forecasts(*parts, name)
+        out[class_name] = score_forecasts(*parts, name)
     return out
 
 

@@ -182,26 +182,26 @@ def compare_rows(
     ground_truth: Sequence[Frame], tracks: Sequence[Frame], similarity: Similarity, gate: float, by_class: bool = False
 ) -> RowComparison:
     """Like `make_matchup`, with the rows that were compared; ``by_class``: rows of different classes are not alike."""
-    people, found = (_locate(part, similarity) for part in (ground_truth, tracks))
-    a, b = (_places(part.rows, similarity) for part in (people, found))
-    classes = (people.rows["class_id"], found.rows["class_id"]) if by_class else None
+    people, theirs = (_locate(part, similarity) for part in (ground_truth, tracks))
+    a, b = (_places(part.rows, similarity) for part in (people, theirs))
+    classes = (people.rows["class_id"], theirs.rows["class_id"]) if by_class else None
     none = np.empty(0, np.intp)
     parts = [(none, none, none, np.empty(0))]
     step = max(1, round(_PAIRS_AT_ONCE / max(1.0, len(a) * len(b) / max(1, len(ground_truth)) ** 2)))
     for first in range(0, len(ground_truth), step):
-        ends = (people.ends[first : first + step + 1], found.ends[first : first + step + 1])
+        ends = (people.ends[first : first + step + 1], theirs.ends[first : first + step + 1])
         frame, row, column, alike = _similarities(a, b, *ends, similarity, gate, classes)
         parts.append((frame + first, row, column, alike))
     frame, row, column, alike = (np.concatenate(part) for part in zip(*parts, strict=True))
     matched = Matchup(
         tuple(np.split(people.track, people.ends[1:-1])),
-        tuple(np.split(found.track, found.ends[1:-1])),
-        SparseTables(frame, row, column, alike, people.ends, found.ends),
+        tuple(np.split(theirs.track, theirs.ends[1:-1])),
+        SparseTables(frame, row, column, alike, people.ends, theirs.ends),
         0.5 if similarity == "metres" else gate,
         len(people.ids),
-        len(found.ids),
+        len(theirs.ids),
     )
-    return RowComparison(matched, people, found)
+    return RowComparison(matched, people, theirs)
 
 
 def _places(rows: Rows, similarity: Similarity) -> Floats:
@@ -258,7 +258,7 @@ def _similarities(
 
 
 def _reach(places: Floats, similarity: Similarity, gate: float) -> Floats:
-    """The rectangles (N, 4) around boxes or positions that those of all alike ones touch."""
+    """Rectangles (N, 4) around boxes or positions, which touch for any two that are similar."""
     if similarity == "iou":
         return np.concatenate([places[:, :2], places[:, :2] + places[:, 2:]], axis=1)
     around = np.full(len(places), gate) if similarity == "metres" else np.hypot(places[:, 3], places[:, 4]) / 2

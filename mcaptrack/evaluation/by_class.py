@@ -57,35 +57,35 @@ def share_classes(
         Tracks of classes that the ground truth doesn't have are left out. Where one side states no classes at all, rows
         are as they were.
     """
-    there, found = (_numbers(frames) for frames in (ground_truth, tracks))
-    if not any(there) or not any(found):
+    true_numbers, numbers = (_numbers(frames) for frames in (ground_truth, tracks))
+    if not any(true_numbers) or not any(numbers):
         notes = []
-        if there and found and max(len(there), len(found)) > 1:
-            side = tracks_name if any(there) else "the ground truth"
+        if true_numbers and numbers and max(len(true_numbers), len(numbers)) > 1:
+            side = tracks_name if any(true_numbers) else "the ground truth"
             notes.append(f"{name}: {side} states no classes; objects of all classes are compared with one another")
         return SharedClasses(list(ground_truth), list(tracks), {}, tuple(notes))
     first: dict[str | int, int] = {}
-    for number in there:
+    for number in true_numbers:
         first.setdefault(_key(number, ground_truth_names), number)  # two numbers with one name are one class
-    places = {number: first[_key(number, ground_truth_names)] for number in there}
-    keys = {number: _key(number, track_names) for number in found}
+    places = {number: first[_key(number, ground_truth_names)] for number in true_numbers}
+    keys = {number: _key(number, track_names) for number in numbers}
     alike = _same_kind(first.keys(), keys.values())
     places_of_tracks = {number: first.get(alike.get(key, key)) for number, key in keys.items()}
     names = {number: class_name(number, ground_truth_names) for number in first.values()}
     beyond = [number for number, place in places_of_tracks.items() if place is None]
     notes = []
     if alike:
-        words = ", ".join(f"{class_name(first[there], names)} with {here}" for here, there in alike.items())
-        notes.append(f"{name}: classes of one kind of object are compared, whatever their names: {words}")
+        listed = ", ".join(f"{class_name(first[true_class], names)} with {here}" for here, true_class in alike.items())
+        notes.append(f"{name}: classes of one kind of object are compared, whatever their names: {listed}")
     if beyond:
-        words = _counted(tracks, beyond, track_names)
+        listed = _counted(tracks, beyond, track_names)
         notes.append(
-            f"{name}: rows of {tracks_name} of classes that the ground truth doesn't have are not compared: {words}"
+            f"{name}: rows of {tracks_name} of classes that the ground truth doesn't have are not compared: {listed}"
         )
-    if missed := [number for number in there if places[number] not in places_of_tracks.values()]:
-        words = _counted(ground_truth, missed, ground_truth_names)
+    if missed := [number for number in true_numbers if places[number] not in places_of_tracks.values()]:
+        listed = _counted(ground_truth, missed, ground_truth_names)
         notes.append(
-            f"{name}: {tracks_name} has no tracks of classes that the ground truth has; all are misses: {words}"
+            f"{name}: {tracks_name} has no tracks of classes that the ground truth has; all are misses: {listed}"
         )
     return SharedClasses(
         _renumbered(ground_truth, places),
@@ -96,7 +96,7 @@ def share_classes(
 
 
 def _same_kind(ground_truth: Collection[str | int], tracks: Collection[str | int]) -> dict[str | int, str | int]:
-    """The class of the ground truth for each class of tracks with another name of one kind of object, by their keys.
+    """Match classes of different names by kind of object: the ground truth's key by each key of the tracks.
 
     Only kinds that each side has one class of count: a van is no taxi where there are cars, too.
     """
@@ -108,17 +108,17 @@ def _same_kind(ground_truth: Collection[str | int], tracks: Collection[str | int
                 kinds.setdefault(kind, set()).add(key)
         return kinds
 
-    there, here = by_kind(ground_truth), by_kind(tracks)
-    single = [kind for kind in sorted(there.keys() & here.keys()) if len(there[kind]) == len(here[kind]) == 1]
-    pairs = ((next(iter(here[kind])), next(iter(there[kind]))) for kind in single)
+    true_kinds, here = by_kind(ground_truth), by_kind(tracks)
+    single = [kind for kind in sorted(true_kinds.keys() & here.keys()) if len(true_kinds[kind]) == len(here[kind]) == 1]
+    pairs = ((next(iter(here[kind])), next(iter(true_kinds[kind]))) for kind in single)
     return {key: other for key, other in pairs if key != other}
 
 
 def _counted(frames: Sequence[Frame], numbers: Sequence[int], names: Mapping[int, str]) -> str:
     """The rows of some classes in words, the most frequent class first."""
-    counts = {one: sum(int((frame.rows["class_id"] == one).sum()) for frame in frames) for one in numbers}
-    words = [f"{counts[one]} of {class_name(one, names)}" for one in sorted(numbers, key=lambda n: -counts[n])]
-    return ", ".join(words[:_SHOWN]) + (f" and {len(words) - _SHOWN} more classes" if len(words) > _SHOWN else "")
+    counts = {kind: sum(int((frame.rows["class_id"] == kind).sum()) for frame in frames) for kind in numbers}
+    counted = [f"{counts[kind]} of {class_name(kind, names)}" for kind in sorted(numbers, key=lambda n: -counts[n])]
+    return ", ".join(counted[:_SHOWN]) + (f" and {len(counted) - _SHOWN} more classes" if len(counted) > _SHOWN else "")
 
 
 def of_class(frames: Sequence[Frame], number: int) -> list[Frame]:
@@ -140,7 +140,7 @@ def with_ids(frames: Sequence[Frame], ids: Ints) -> list[Frame]:
 
 def _numbers(frames: Sequence[Frame]) -> list[int]:
     parts = [np.unique(frame.rows["class_id"]) for frame in frames if len(frame.rows)]
-    return [int(one) for one in np.unique(np.concatenate([np.empty(0, np.uint32), *parts]))]
+    return [int(number) for number in np.unique(np.concatenate([np.empty(0, np.uint32), *parts]))]
 
 
 def _key(number: int, names: Mapping[int, str]) -> str | int:
@@ -155,7 +155,9 @@ def _renumbered(frames: Sequence[Frame], places: Mapping[int, int | None]) -> li
         return list(frames)
     out = []
     for frame in frames:
-        new = np.array([-1 if (to := places[one]) is None else to for one in frame.rows["class_id"].tolist()], np.int64)
+        new = np.array(
+            [-1 if (to := places[number]) is None else to for number in frame.rows["class_id"].tolist()], np.int64
+        )
         rows = frame.rows[new >= 0].copy()
         rows["class_id"] = new[new >= 0]
         out.append(frame._replace(rows=rows))

@@ -56,13 +56,13 @@ class Changes:
         parts = [f"{self.same} boxes as they were"]
         parts += [f"{n} {what}" for n, what in ((self.moved, "moved"), (self.added, "added")) if n]
         parts += [f"{self.removed} removed"] if self.removed else []
-        parts += [f"tracks {_listed(ids)} joined to {one}" for one, ids in list(self.joined.items())[:_SHOWN]]
-        parts += [f"track {one} split into {_listed(ids)}" for one, ids in list(self.split.items())[:_SHOWN]]
+        parts += [f"tracks {_listed(ids)} joined to {track}" for track, ids in list(self.joined.items())[:_SHOWN]]
+        parts += [f"track {track} split into {_listed(ids)}" for track, ids in list(self.split.items())[:_SHOWN]]
         more = max(len(self.joined) - _SHOWN, 0) + max(len(self.split) - _SHOWN, 0)
         parts += [f"{more} more joined or split"] if more else []
         changed: dict[tuple[str, str], list[int]] = {}
-        for one, classes in self.relabelled.items():
-            changed.setdefault(classes, []).append(one)
+        for track, classes in self.relabelled.items():
+            changed.setdefault(classes, []).append(track)
         shown = list(changed.items())
         parts += [
             f"track{'s' * (len(ids) > 1)} {_listed(ids)} from {was} to {now}" for (was, now), ids in shown[:_SHOWN]
@@ -88,11 +88,14 @@ def changes_in(opened: log.Log, topic: str) -> Changes | None:
     """
     prefix = topic.removesuffix(f"/{CORRECTED}")
     names = [f"{prefix}/{name}" for name in CORRECTED_FROM]
-    there = [name for name in names if name in opened.channels and opened.channels[name].holds(TRACKS)]
+    present = [name for name in names if name in opened.channels and opened.channels[name].holds(TRACKS)]
     corrected = opened.frame_columns(topic, TRACKS)
-    classes = {name: class_names(opened.channel(name).metadata) for name in (*there, topic)}
-    found = [compare(one, opened.frame_columns(one, TRACKS), corrected, classes[one], classes[topic]) for one in there]
-    return max(found, key=lambda one: one[1])[0] if found else None
+    classes = {name: class_names(opened.channel(name).metadata) for name in (*present, topic)}
+    compared = [
+        compare(source, opened.frame_columns(source, TRACKS), corrected, classes[source], classes[topic])
+        for source in present
+    ]
+    return max(compared, key=lambda result: result[1])[0] if compared else None
 
 
 def compare(
@@ -122,36 +125,37 @@ def compare(
         for pair in zip(old["track_id"][i].tolist(), new["track_id"][j].tolist(), strict=True):
             parts[pair] += 1
         kinds = zip(new["track_id"][j].tolist(), old["class_id"][i].tolist(), new["class_id"][j].tolist(), strict=True)
-        for one, was, now in kinds:
-            labels[one][_class(was, classes), _class(now, corrected_classes)] += 1
+        for track, was, now in kinds:
+            labels[track][_class(was, classes), _class(now, corrected_classes)] += 1
         kept += int((old["track_id"][i] == new["track_id"][j]).sum())
         ids[0].update(old["track_id"].tolist())
         ids[1].update(new["track_id"].tolist())
     became: dict[int, list[int]] = defaultdict(list)
     made_of: dict[int, list[int]] = defaultdict(list)
-    for (one, other), count in sorted(parts.items()):
+    for (track, other), count in sorted(parts.items()):
         if count >= _LEAST_BOXES:
-            became[one].append(other)
-            made_of[other].append(one)
+            became[track].append(other)
+            made_of[other].append(track)
     same, moved, added, removed = counts.tolist()
+    usual_labels = ((track, of_track.most_common(1)[0][0]) for track, of_track in sorted(labels.items()))
     changes = Changes(
         of, frames, same, moved, added, removed,
-        {one: parts_of for one, parts_of in sorted(made_of.items()) if len(parts_of) > 1},
-        {one: parts_of for one, parts_of in sorted(became.items()) if len(parts_of) > 1},
-        sorted(ids[1] - {other for _, other in parts}), sorted(ids[0] - {one for one, _ in parts}),
-        {one: usual for one, found in sorted(labels.items()) if len(set(usual := found.most_common(1)[0][0])) > 1},
+        {track: parts_of for track, parts_of in sorted(made_of.items()) if len(parts_of) > 1},
+        {track: parts_of for track, parts_of in sorted(became.items()) if len(parts_of) > 1},
+        sorted(ids[1] - {other for _, other in parts}), sorted(ids[0] - {track for track, _ in parts}),
+        {track: usual for track, usual in usual_labels if len(set(usual)) > 1},
     )  # fmt: skip
     return changes, kept
 
 
 def _class(number: int, names: Mapping[int, str]) -> str:
-    """The name of a class; formats call people by several."""
+    """The name of a class; "person" for every name of people."""
     name = class_name(number, names)
     return "person" if is_person(name) else name
 
 
 def _pairs(before: Sequence[Frame], after: Sequence[Frame]) -> Iterator[tuple[Rows, Rows]]:
-    """The rows with boxes of each frame that both have, by time."""
+    """The boxes of both sides in each frame that both have, in order of time."""
     rest = iter(after)
     new = next(rest, None)
     for old in before:

@@ -52,8 +52,8 @@ def nouns_of(
 ) -> Nouns:
     """The nouns for objects: names of their classes, where any is no person. ``classes`` as in `find_events`."""
     sides = [_class_names(frames, names) for frames, names in zip((ground_truth, tracks), classes, strict=True)]
-    found = {name for side in sides for name in side.values()}
-    if found <= {_PERSON, _OBJECT}:
+    names = {name for side in sides for name in side.values()}
+    if names <= {_PERSON, _OBJECT}:
         return PEOPLE
     return Nouns(sides[0], sides[1], _OBJECT)
 
@@ -63,7 +63,7 @@ def _class_names(frames: Sequence[Frame], names: Mapping[int, str]) -> dict[int,
     joined = join_frames(TRACKS, frames)
     ids, which = np.unique(joined.rows["track_id"], return_inverse=True)
     numbers = majority(which, joined.rows["class_id"], len(ids))
-    nouns = {one: _noun(one, names) for one in np.unique(numbers).tolist()}
+    nouns = {number: _noun(number, names) for number in np.unique(numbers).tolist()}
     return {track: nouns[number] for track, number in zip(ids.tolist(), numbers.tolist(), strict=True)}
 
 
@@ -85,9 +85,9 @@ def log_messages(
     for frame in events:
         for row in frame.rows:
             where = f"at {(frame.t_ns - start_ns) / NS_PER_S:.2f} s{_place(row)}"
-            found = groups.text_of(frame.t_ns, row, where, frame_interval_s)
-            if found is not None:
-                level, text = found
+            message = groups.text_of(frame.t_ns, row, where, frame_interval_s)
+            if message is not None:
+                level, text = message
                 yield frame.t_ns, frame.index, foxglove.pack_log(frame.t_ns, level, tracks_topic, text)
 
 

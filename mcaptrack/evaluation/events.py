@@ -88,7 +88,7 @@ class _Comparison(NamedTuple):
     """Tracks compared with the ground truth: matches by person and frame, and the times of the frames."""
 
     compared: RowComparison
-    found: RowPairs
+    matches: RowPairs
     t_ns: Ints
 
 
@@ -145,17 +145,17 @@ class TrackLifecycle:
 
     def births(self) -> tuple[Ints, Rows]:
         """The first row of each track."""
-        there = self.rows[self._first]
-        return self.row_ns[self._first], event_rows(EventKind.BIRTH, there, track_id=there["track_id"])
+        begins = self.rows[self._first]
+        return self.row_ns[self._first], event_rows(EventKind.BIRTH, begins, track_id=begins["track_id"])
 
     def ends(self) -> tuple[Ints, Rows]:
         """The last row of each track that ends before the last frame, with the track's duration and number of rows."""
         until = self.row_ns[self._last]
         kept = until < (self.frame_ns[-1] if len(self.frame_ns) else 0)
-        there, until, since = self.rows[self._last][kept], until[kept], self.row_ns[self._first][kept]
+        ends, until, since = self.rows[self._last][kept], until[kept], self.row_ns[self._first][kept]
         lasted = (until - since + frame_interval_ns(self.frame_ns)) / NS_PER_S
         size = self._size[kept]
-        return until, event_rows(EventKind.END, there, track_id=there["track_id"], duration_s=lasted, frames=size)
+        return until, event_rows(EventKind.END, ends, track_id=ends["track_id"], duration_s=lasted, frames=size)
 
     def repairs(self) -> tuple[Ints, Rows]:
         """Find repairs: a track that continues with another source (joined), a source that continues as another track
@@ -202,8 +202,8 @@ def lifecycle_of(frames: Sequence[Frame]) -> TrackLifecycle:
     kept, kept_ns = [TRACKS.empty()], [np.empty(0, np.int64)]
     for _, _, joined in joined_parts(TRACKS, frames):
         rows, row_ns = joined.rows, joined.row_ns
-        there, count = np.unique(rows["track_id"], return_counts=True)
-        ids, which = np.unique(np.concatenate([ids, there]), return_inverse=True)
+        present, count = np.unique(rows["track_id"], return_counts=True)
+        ids, which = np.unique(np.concatenate([ids, present]), return_inverse=True)
         size = np.bincount(which, np.concatenate([size, count]), len(ids)).astype(np.int64)
         matters = np.zeros(len(rows), bool)
         for some in (np.arange(len(rows)), np.flatnonzero(rows["source_id"] >= 0)):
@@ -295,12 +295,12 @@ def default_rule(ground_truth: Sequence[Frame], tracks: Sequence[Frame]) -> Matc
 
     None if ground truth and tracks share neither boxes nor positions in metres.
     """
-    shared = [one for one in ("iou", "metres") if not sides_without({"truth": ground_truth, "tracks": tracks}, one)]
+    shared = [kind for kind in ("iou", "metres") if not sides_without({"truth": ground_truth, "tracks": tracks}, kind)]
     at_video_rate = have_same_times(frame_times(ground_truth), frame_times(tracks))
     first: tuple[Similarity, ...] = (
         ("iou", "metres") if at_video_rate and has_positions(ground_truth, "iou") else ("metres", "iou")
     )
-    chosen = next((one for one in first if one in shared), None)
+    chosen = next((kind for kind in first if kind in shared), None)
     return EventOptions().rule(chosen, are_3d(ground_truth, tracks)) if chosen else None
 
 
@@ -325,10 +325,10 @@ def _compared(
     shared = share_classes(*names, *at_same, *classes)
     notes += shared.notes
     compared = compare_rows(shared.ground_truth, shared.tracks, *rule, by_class=bool(shared.names))
-    found = matches(compared.matchup)
-    if len(found.person) == 0:
+    pairs = matches(compared.matchup)
+    if len(pairs.person) == 0:
         notes += explain_no_match(*names, *at_same, rule.similarity)
-    return _Comparison(compared, found, frame_times(at_same[0])), rule
+    return _Comparison(compared, pairs, frame_times(at_same[0])), rule
 
 
 def _in_order(parts: Sequence[tuple[Ints, Rows]]) -> tuple[Rows, Ints]:
@@ -341,24 +341,24 @@ def _in_order(parts: Sequence[tuple[Ints, Rows]]) -> tuple[Rows, Ints]:
 
 def _switches(comparison: _Comparison) -> tuple[Ints, Rows]:
     """One event for each switch that CLEAR counts."""
-    at = np.flatnonzero(is_switch(comparison.found))
-    found, (_, ground_truth, tracks) = comparison.found, comparison.compared
-    now_ns, before_ns = comparison.t_ns[found.frame[at]], comparison.t_ns[found.frame[at - 1]]
+    at = np.flatnonzero(is_switch(comparison.matches))
+    pairs, (_, ground_truth, tracks) = comparison.matches, comparison.compared
+    now_ns, before_ns = comparison.t_ns[pairs.frame[at]], comparison.t_ns[pairs.frame[at - 1]]
     return now_ns, event_rows(
         EventKind.SWITCH,
-        ground_truth.rows[found.row[at]],
-        truth_id=ground_truth.ids[found.person[at]],
-        track_id=tracks.ids[found.track[at]],
-        previous_id=tracks.ids[found.track[at - 1]],
+        ground_truth.rows[pairs.row[at]],
+        truth_id=ground_truth.ids[pairs.person[at]],
+        track_id=tracks.ids[pairs.track[at]],
+        previous_id=tracks.ids[pairs.track[at - 1]],
         duration_s=unobserved_s(comparison.t_ns, before_ns, now_ns),
     )
 
 
 def _misses(comparison: _Comparison) -> tuple[Ints, Rows]:
     """Periods in which a person has no track; ``previous_id`` is the person's last track."""
-    found, (_, ground_truth, tracks) = comparison.found, comparison.compared
-    t_ns, places, periods = _periods(ground_truth, found.row, comparison.t_ns)
-    previous = _before(found.person, found.frame, found.track, periods.slot, periods.frame, tracks.ids)
+    pairs, (_, ground_truth, tracks) = comparison.matches, comparison.compared
+    t_ns, places, periods = _periods(ground_truth, pairs.row, comparison.t_ns)
+    previous = _before(pairs.person, pairs.frame, pairs.track, periods.slot, periods.frame, tracks.ids)
     return t_ns, event_rows(
         EventKind.MISS, places, truth_id=places["track_id"], previous_id=previous, **periods.columns()
     )
@@ -366,11 +366,11 @@ def _misses(comparison: _Comparison) -> tuple[Ints, Rows]:
 
 def _false_tracks(comparison: _Comparison) -> tuple[Ints, Rows]:
     """Periods in which a track matches no person; ``previous_id`` is the person of its last match."""
-    found, (_, ground_truth, tracks) = comparison.found, comparison.compared
-    t_ns, places, periods = _periods(tracks, found.column, comparison.t_ns)
-    order = np.lexsort((found.frame, found.track))
+    pairs, (_, ground_truth, tracks) = comparison.matches, comparison.compared
+    t_ns, places, periods = _periods(tracks, pairs.column, comparison.t_ns)
+    order = np.lexsort((pairs.frame, pairs.track))
     previous = _before(
-        found.track[order], found.frame[order], found.person[order], periods.slot, periods.frame, ground_truth.ids
+        pairs.track[order], pairs.frame[order], pairs.person[order], periods.slot, periods.frame, ground_truth.ids
     )
     return t_ns, event_rows(
         EventKind.FALSE_TRACK, places, track_id=places["track_id"], previous_id=previous, **periods.columns()
@@ -386,8 +386,8 @@ def _before(mine: Ints, frame: Ints, other: Ints, slot: Ints, at: Ints, names: I
     if len(mine):
         width = int(max(frame.max(), at.max(initial=0))) + 1
         place = np.searchsorted(mine * width + frame, slot * width + at) - 1
-        known = (place >= 0) & (mine[place] == slot)
-        out[known] = names[other[place[known]]]
+        has_match = (place >= 0) & (mine[place] == slot)
+        out[has_match] = names[other[place[has_match]]]
     return out
 
 
@@ -443,7 +443,7 @@ def _counts(t_ns: Ints, tracks: Sequence[Frame], events: Rows, events_ns: Ints, 
     if comparison is None:
         return out
     matchup, looked_at = comparison.compared.matchup, np.searchsorted(t_ns, comparison.t_ns)
-    hits = np.bincount(comparison.found.frame, minlength=len(comparison.t_ns))
+    hits = np.bincount(comparison.matches.frame, minlength=len(comparison.t_ns))
     false, people = matchup.track_counts - hits, matchup.ground_truth_counts
     switches = so_far(EventKind.SWITCH)[looked_at]
     of_all = np.cumsum(people)

@@ -9,7 +9,7 @@ Letters: N forecasts, P pairs, T future steps, F frames.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -206,8 +206,8 @@ def radii_m(cov_m2: Floats, tails: Tails) -> Floats:
     xx, xy, yy = cov_m2[:, 0, 0], cov_m2[:, 0, 1], cov_m2[:, 1, 1]
     half = np.hypot((xx - yy) / 2, xy)
     larger, smaller = (xx + yy) / 2 + half, (xx + yy) / 2 - half
-    known = np.isfinite(larger) & (smaller >= -1e-9 * np.abs(larger))
-    squared = np.where(known, larger, np.nan) * squared_radius(LEVEL, tails)
+    is_valid = np.isfinite(larger) & (smaller >= -1e-9 * np.abs(larger))
+    squared = np.where(is_valid, larger, np.nan) * squared_radius(LEVEL, tails)
     return np.asarray(np.sqrt(squared), np.float64)
 
 
@@ -223,8 +223,8 @@ def by_frame(values: Floats, frame: Ints, frames: int) -> tuple[Floats, Floats]:
     >>> mean.tolist(), most.round(2).tolist()
     ([2.0, nan], [2.8, nan])
     """
-    known = np.isfinite(values)
-    values, frame = values[known], frame[known]
+    is_known = np.isfinite(values)
+    values, frame = values[is_known], frame[is_known]
     count = np.bincount(frame, minlength=frames)
     if not len(values):
         return np.full(frames, np.nan), np.full(frames, np.nan)
@@ -312,19 +312,19 @@ def _radii_m(forecasts: Forecasts) -> Floats:
 
 
 def _compare(
-    arrays: _ForecastArrays, found: PairedForecasts, rows: Rows, id_column: str, front: str
+    arrays: _ForecastArrays, pairs: PairedForecasts, rows: Rows, id_column: str, front: str
 ) -> NDArray[np.bool_]:
     """Fill in id and errors of the forecasts that are paired; returns which of the others are false (N,)."""
-    near = found.d_obs_m2 < TAU_M2
-    at = found.forecast[near]
-    rows[id_column][at] = found.person[near]
-    off, cov = found.offset_m[near], arrays.forecasts.cov_m2[at]
+    near = pairs.d_obs_m2 < TAU_M2
+    at = pairs.forecast[near]
+    rows[id_column][at] = pairs.person[near]
+    off, cov = pairs.offset_m[near], arrays.forecasts.cov_m2[at]
     errors = forecast_errors(off, cov, arrays.forecasts.shapes(at))
     soon_m = _at_s(off, arrays.clock.step_s, _AHEAD_S)
     measured = (errors.ade_m, errors.fde_m, soon_m, errors.covered[:, _WITHIN])
     for measure, values in zip(_MEASURES, measured, strict=True):
         rows[front + measure][at] = values
-    return np.asarray(found.is_judged & (rows[id_column] == NO_ID), np.bool_)
+    return np.asarray(pairs.is_judged & (rows[id_column] == NO_ID), np.bool_)
 
 
 def _at_s(off_m: Floats, step_s: float, ahead_s: float) -> Floats:
@@ -340,10 +340,10 @@ def _at_s(off_m: Floats, step_s: float, ahead_s: float) -> Floats:
 
 def _mean(message: Ints, rows: Rows, scores: Rows, front: str) -> Ints:
     """Fill in the means of each frame over the known values; returns the number of these (F,)."""
-    known = np.isfinite(rows[front + "ade_m"])
-    count = np.bincount(message[known], minlength=len(scores))
+    is_known = np.isfinite(rows[front + "ade_m"])
+    count = np.bincount(message[is_known], minlength=len(scores))
     for measure in ("ade_m", "fde_m", "within_95"):
-        total = np.bincount(message[known], rows[front + measure][known], minlength=len(scores))
+        total = np.bincount(message[is_known], rows[front + measure][is_known], minlength=len(scores))
         scores[front + measure] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
     return count
 
@@ -369,7 +369,7 @@ SMOOTHING: Final = 0.5
 
 @dataclass
 class SmoothedHistories:
-    """The smoothed pasts of all tracks that the frame before had: after a gap a past begins again."""
+    """The smoothed pasts of the tracks in the last frame; a track that returns after a gap begins a new past."""
 
     length: int
 
@@ -386,20 +386,20 @@ class SmoothedHistories:
         history = self._begin(xy_m)
         _, now, before = np.intersect1d(ids, self._ids, return_indices=True)
         if steps == 1 and len(now):
-            kept = SmoothedHistory(*(getattr(self._history, one.name)[before] for one in fields(SmoothedHistory)))
+            kept = SmoothedHistory(*(values[before] for values in self._history))
             kept.append(self._holt, xy_m[now], np.ones(len(now), np.int64))
-            for one in fields(SmoothedHistory):
-                getattr(history, one.name)[now] = getattr(kept, one.name)
+            for values, kept_values in zip(history, kept, strict=True):
+                values[now] = kept_values
         self._ids, self._history = ids.astype(np.int64), history
-        past, known = history.positions()
-        return np.where(known[..., None], past, np.nan), known
+        past, is_known = history.positions()
+        return np.where(is_known[..., None], past, np.nan), is_known
 
     def _begin(self, xy_m: Floats) -> SmoothedHistory:
         """Pasts of one position each."""
         count = len(xy_m)
-        known = np.arange(self.length) == self.length - 1
+        is_known = np.arange(self.length) == self.length - 1
         past = np.tile(xy_m[:, None].astype(float), (1, self.length, 1))
-        return SmoothedHistory.of_observations(self._holt, past, np.tile(known, (count, 1)))
+        return SmoothedHistory.of_observations(self._holt, past, np.tile(is_known, (count, 1)))
 
 
 def smoothed_predictions(samples: Sequence[Frame], predict: Predict) -> Iterator[Frame]:

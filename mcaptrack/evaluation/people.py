@@ -98,7 +98,7 @@ def person_scores(
     shared = share_classes(*names, *at_same, *classes)
     if sides_without({"truth": shared.ground_truth, "tracks": shared.tracks}, rule.similarity):
         return None
-    matchup, people, found = compare_rows(shared.ground_truth, shared.tracks, *rule, by_class=bool(shared.names))
+    matchup, people, objects = compare_rows(shared.ground_truth, shared.tracks, *rule, by_class=bool(shared.names))
     pairs = matches(matchup)
     count = len(people.ids)
     tracked, frames = best_tracks(matchup, LARGE_TABLE)
@@ -115,7 +115,7 @@ def person_scores(
         int(matchup.track_rows - matched.sum()),
         frame_ns[pairs.frame],
         people.ids[pairs.person],
-        found.ids[pairs.track],
+        objects.ids[pairs.track],
         frame_ns,
     )
 
@@ -170,7 +170,7 @@ def intervals(before: Sequence[PersonScores], after: Sequence[PersonScores]) -> 
         return None
     if any(not np.array_equal(a.ids, b.ids) for a, b in zip(before, after, strict=True)):
         return None
-    people = sum(len(one.ids) for one in before)
+    people = sum(len(scores.ids) for scores in before)
     if people < LEAST_PEOPLE:
         drawn = np.empty((0, people), np.int64)
     else:
@@ -185,10 +185,10 @@ def intervals(before: Sequence[PersonScores], after: Sequence[PersonScores]) -> 
 def _draws(side: Sequence[PersonScores], drawn: Ints) -> tuple[Floats, Floats]:
     """IDF1 and switches for each person: of all people, and of each draw (1 + draws,)."""
     rows, matched, hits, switches = (
-        np.concatenate([getattr(one, name) for one in side]).astype(np.float64)
+        np.concatenate([getattr(scores, name) for scores in side]).astype(np.float64)
         for name in ("rows", "matched", "hits", "switches")
     )
-    false_rows = float(sum(one.false_rows for one in side))
+    false_rows = float(sum(scores.false_rows for scores in side))
     everyone = np.arange(len(rows))[None]
     out = []
     for which in (everyone, drawn):

@@ -120,23 +120,23 @@ def tune(
     """
     if not ranges:
         raise McaptrackError(f"{type(base).__name__.lower()} declares no ranges to search in")
-    known = _Study(study, _about(base, tasks, ranges, scoring))
-    made = known.trials
-    propose = _proposer(ranges, metric, seed, made)
-    while len(made) < trials:
-        number = len(made)
+    searched = _Study(study, _about(base, tasks, ranges, scoring))
+    done = searched.trials
+    propose = _proposer(ranges, metric, seed, done)
+    while len(done) < trials:
+        number = len(done)
         parameters = {} if number == 0 else propose.ask(number)
         with blamed(entry, f"could not be made with {parameters}") if entry else nullcontext():
             transform = replace(base, **parameters)
         trial = Trial(number, parameters, trial_scores(transform, tasks, scoring, entry))
         propose.tell(trial)
-        known.add(trial)
-        on_trial(trial, _best(made, metric), trials)
-    return made[0], _best(made, metric)
+        searched.add(trial)
+        on_trial(trial, _best(done, metric), trials)
+    return done[0], _best(done, metric)
 
 
-def _best(made: Sequence[Trial], metric: str) -> Trial:
-    return max(made, key=lambda trial: trial.scores[metric])
+def _best(trials: Sequence[Trial], metric: str) -> Trial:
+    return max(trials, key=lambda trial: trial.scores[metric])
 
 
 def trial_scores(
@@ -147,13 +147,13 @@ def trial_scores(
     def sequences() -> Iterator[EvaluationInput]:
         for task in tasks:
             names = {f.name for f in fields(transform)}
-            known = replace(transform, **{name: value for name, value in task.context.items() if name in names})
-            results = guarded(entry, known, task.frames) if entry else known(task.frames)
-            main = list(known.writes).index("")
+            told = replace(transform, **{name: value for name, value in task.context.items() if name in names})
+            results = guarded(entry, told, task.frames) if entry else told(task.frames)
+            main = list(told.writes).index("")
             out = [result[main] for result in results]
             yield EvaluationInput(task.name, task.ground_truth, [Candidate("tracks", None, out)])
 
-    row = [one for one in evaluate(sequences(), scoring).results if one.of_class is None][-1].to_json()
+    row = [result for result in evaluate(sequences(), scoring).results if result.of_class is None][-1].to_json()
     return {name: value for name, value in row.items() if isinstance(value, int | float) and name != "gate"}
 
 
@@ -248,7 +248,7 @@ class _Random:
 class _Optuna:
     """Proposes with Optuna's tree-structured Parzen estimator."""
 
-    def __init__(self, ranges: Mapping[str, Range], metric: str, seed: int, made: Sequence[Trial]) -> None:
+    def __init__(self, ranges: Mapping[str, Range], metric: str, seed: int, done: Sequence[Trial]) -> None:
         import optuna
 
         optuna.logging.set_verbosity(optuna.logging.ERROR)
@@ -260,9 +260,9 @@ class _Optuna:
             else distributions.FloatDistribution(part.low, part.high)
             for name, part in ranges.items()
         }
-        sampler = optuna.samplers.TPESampler(seed=seed + len(made), n_startup_trials=min(10, 2 * len(ranges)))
+        sampler = optuna.samplers.TPESampler(seed=seed + len(done), n_startup_trials=min(10, 2 * len(ranges)))
         self._study = optuna.create_study(direction="maximize", sampler=sampler)
-        for trial in made:
+        for trial in done:
             self.tell(trial)
 
     def ask(self, number: int) -> dict[str, Any]:
@@ -277,9 +277,9 @@ class _Optuna:
             )
 
 
-def _proposer(ranges: Mapping[str, Range], metric: str, seed: int, made: Sequence[Trial]) -> _Proposer:
+def _proposer(ranges: Mapping[str, Range], metric: str, seed: int, done: Sequence[Trial]) -> _Proposer:
     try:
-        return _Optuna(ranges, metric, seed, made)
+        return _Optuna(ranges, metric, seed, done)
     except ImportError:
         return _Random(ranges, seed)
 

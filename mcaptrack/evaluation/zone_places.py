@@ -90,12 +90,12 @@ def _in_pieces(shape: Shape) -> Shape:
 
 
 def _on_ground(ring: Floats, plane: GroundPlane, name: str) -> Floats:
-    found = plane.pixels_to_metres(ring)
-    above = np.flatnonzero(~np.isfinite(found).all(axis=1))
+    xy_m = plane.pixels_to_metres(ring)
+    above = np.flatnonzero(~np.isfinite(xy_m).all(axis=1))
     if len(above):
         x, y = ring[above[0]]
         raise McaptrackError(f"zone {name} reaches above the horizon, at ({x:g}, {y:g}) px: there is no ground")
-    return found
+    return xy_m
 
 
 def positions_of(
@@ -148,35 +148,35 @@ def positions_of(
     )
 
 
-def is_counted(found: TrackPositions, zone: Zone) -> Bools:
+def is_counted(positions: TrackPositions, zone: Zone) -> Bools:
     """Mask the rows (N,) of the classes that a zone counts: by their names, and all people for the name of one."""
     if not zone.classes:
-        return np.ones(len(found.track), bool)
+        return np.ones(len(positions.track), bool)
     wanted = {name.casefold() for name in zone.classes}
     has_people = any(map(is_person, wanted))
-    names = {number: class_name(number, found.classes) for number in np.unique(found.class_id).tolist()}
-    kept = [one for one, name in names.items() if name.casefold() in wanted or (has_people and is_person(name))]
-    return np.isin(found.class_id, np.array(kept, np.int64))
+    names = {number: class_name(number, positions.classes) for number in np.unique(positions.class_id).tolist()}
+    kept = [number for number, name in names.items() if name.casefold() in wanted or (has_people and is_person(name))]
+    return np.isin(positions.class_id, np.array(kept, np.int64))
 
 
-def missing_classes(found: TrackPositions, zone: Zone, tracks: str) -> list[str]:
+def missing_classes(positions: TrackPositions, zone: Zone, tracks: str) -> list[str]:
     """A note about a zone that counts classes of which no track is."""
-    if not zone.classes or not len(found.track) or is_counted(found, zone).any():
+    if not zone.classes or not len(positions.track) or is_counted(positions, zone).any():
         return []
-    there = ", ".join(class_name(number, found.classes) for number in np.unique(found.class_id).tolist())
+    listed = ", ".join(class_name(number, positions.classes) for number in np.unique(positions.class_id).tolist())
     kind = "line" if zone.is_line else "zone"
-    return [f"{kind} {zone.name} counts {', '.join(zone.classes)}; {tracks} has none of these, but {there}"]
+    return [f"{kind} {zone.name} counts {', '.join(zone.classes)}; {tracks} has none of these, but {listed}"]
 
 
-def ground_height_m(found: TrackPositions, shape: Shape) -> float:
+def ground_height_m(positions: TrackPositions, shape: Shape) -> float:
     """The height of the ground at a shape in metres: the median of where objects stand in its extent, or anywhere.
 
     0 if no heights are known, as on the plane of a camera.
     """
-    known = np.isfinite(found.low_m) & np.isfinite(found.at["metres"]).all(axis=1)
-    if not known.any():
+    is_known = np.isfinite(positions.low_m) & np.isfinite(positions.at["metres"]).all(axis=1)
+    if not is_known.any():
         return 0.0
     low, high = shape.box
-    places = found.at["metres"]
-    near = known & (places >= low).all(axis=1) & (places <= high).all(axis=1)
-    return float(np.median(found.low_m[near if near.any() else known]))
+    places = positions.at["metres"]
+    near = is_known & (places >= low).all(axis=1) & (places <= high).all(axis=1)
+    return float(np.median(positions.low_m[near if near.any() else is_known]))

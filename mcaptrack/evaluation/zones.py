@@ -81,7 +81,7 @@ class ZoneEvents(NamedTuple):
 
 
 def find_zone_events(
-    frames: Sequence[Frame], found: TrackPositions, zones: Sequence[PlacedZone], options: ZoneOptions, name: str
+    frames: Sequence[Frame], positions: TrackPositions, zones: Sequence[PlacedZone], options: ZoneOptions, name: str
 ) -> ZoneEvents:
     """Find visits of zones and crossings of lines, and count them.
 
@@ -109,41 +109,41 @@ def find_zone_events(
     stays: list[_Stays] = []
     passes: list[_Passes] = []
     for placed in zones:
-        paths, rows = _paths(found, placed, options, name)
-        margin = placed.shape.margin(_margin(found, placed.units, options))
+        paths, rows = _paths(positions, placed, options, name)
+        margin = placed.shape.margin(_margin(positions, placed.units, options))
         if placed.zone.is_line:
             row, sign = crossings(paths, placed.shape, margin)
             passes.append(_Passes(placed.zone.number, rows[row], sign * placed.forward > 0))
         else:
             depth = placed.shape.depth(paths.points, margin)
             some = visits(paths, depth, margin)
-            stays.append(_Stays.of(placed.zone.number, some, rows, found, paths))
+            stays.append(_Stays.of(placed.zone.number, some, rows, positions, paths))
         notes += _far_away(placed, paths.points, name)
-        notes += missing_classes(found, placed.zone, name)
+        notes += missing_classes(positions, placed.zone, name)
     t_ns, numbers = frame_times(frames), frame_numbers(frames)
     return ZoneEvents(
-        _visit_frames(stays, found, t_ns, numbers),
-        _crossing_frames(passes, found, t_ns, numbers),
-        _counts(zones, stays, passes, found, t_ns, numbers),
+        _visit_frames(stays, positions, t_ns, numbers),
+        _crossing_frames(passes, positions, t_ns, numbers),
+        _counts(zones, stays, passes, positions, t_ns, numbers),
         notes,
     )
 
 
-def _margin(found: TrackPositions, units: Units, options: ZoneOptions) -> float:
+def _margin(positions: TrackPositions, units: Units, options: ZoneOptions) -> float:
     """The margin in the units that a zone is compared in."""
-    return options.margin_m if units == "metres" else options.margin_m / PERSON_HEIGHT_M * found.height_px
+    return options.margin_m if units == "metres" else options.margin_m / PERSON_HEIGHT_M * positions.height_px
 
 
-def _paths(found: TrackPositions, placed: PlacedZone, options: ZoneOptions, name: str) -> tuple[Paths, Ints]:
+def _paths(positions: TrackPositions, placed: PlacedZone, options: ZoneOptions, name: str) -> tuple[Paths, Ints]:
     """The paths of tracks in the units of a zone, and the row of each of their points."""
-    points = found.at[placed.units]
+    points = positions.at[placed.units]
     rows = np.flatnonzero(np.isfinite(points).all(axis=1))
     if len(points) and not len(rows):
         where = "positions in metres" if placed.units == "metres" else "boxes in the picture"
         raise McaptrackError(f"{name} has no {where}, which zone {placed.zone.name} in {placed.zone.units} needs")
-    rows = rows[is_counted(found, placed.zone)[rows]]
+    rows = rows[is_counted(positions, placed.zone)[rows]]
     gap_ns = seconds_to_ns(options.max_gap_s)
-    return Paths.of(points[rows], found.t_ns[rows], found.track[rows], gap_ns), rows
+    return Paths.of(points[rows], positions.t_ns[rows], positions.track[rows], gap_ns), rows
 
 
 def _far_away(placed: PlacedZone, points: Floats, name: str) -> Iterator[str]:
@@ -172,11 +172,11 @@ class _Stays(NamedTuple):
     dwell_s: Floats
 
     @classmethod
-    def of(cls, number: int, some: Visits, rows: Ints, found: TrackPositions, paths: Paths) -> _Stays:
+    def of(cls, number: int, some: Visits, rows: Ints, positions: TrackPositions, paths: Paths) -> _Stays:
         ended = some.left < 0
         until = np.where(ended, some.last, some.left)
         dwell = (paths.t_ns[until] - paths.t_ns[some.first]) / NS_PER_S
-        after = found.frame[rows[until]] + ended
+        after = positions.frame[rows[until]] + ended
         return cls(number, rows[some.first], rows[some.last], after, some.began, ended, dwell)
 
 
@@ -188,33 +188,35 @@ class _Passes(NamedTuple):
     forward: Bools
 
 
-def _places(found: TrackPositions, rows: Ints, front: str = "") -> Iterator[tuple[str, Floats]]:
-    for unit, at in (("m", found.at["metres"]), ("px", found.picture_px)):
+def _places(positions: TrackPositions, rows: Ints, front: str = "") -> Iterator[tuple[str, Floats]]:
+    for unit, at in (("m", positions.at["metres"]), ("px", positions.picture_px)):
         for axis, name in enumerate("xy"):
             yield f"{front}{name}_{unit}", at[rows, axis]
 
 
-def _visit_frames(stays: Sequence[_Stays], found: TrackPositions, t_ns: Ints, numbers: Ints) -> Sequence[Frame]:
+def _visit_frames(stays: Sequence[_Stays], positions: TrackPositions, t_ns: Ints, numbers: Ints) -> Sequence[Frame]:
     first, last = (np.concatenate([np.zeros(0, np.int64), *(getattr(s, n) for s in stays)]) for n in ("first", "last"))
     rows = ZONE_VISITS.empty(len(first))
     rows["zone_id"] = np.repeat([s.number for s in stays], [len(s.first) for s in stays])
-    rows["track_id"] = found.track[first]
+    rows["track_id"] = positions.track[first]
     for column, name in (("dwell_s", "dwell_s"), ("began_inside", "began"), ("ended_inside", "ended")):
         rows[column] = np.concatenate([rows[column][:0], *(getattr(s, name) for s in stays)])
-    for column, values in (*_places(found, first), *_places(found, last, "last_")):
+    for column, values in (*_places(positions, first), *_places(positions, last, "last_")):
         rows[column] = values
-    return _by_frame(rows, found.frame[first], t_ns, numbers)
+    return _by_frame(rows, positions.frame[first], t_ns, numbers)
 
 
-def _crossing_frames(passes: Sequence[_Passes], found: TrackPositions, t_ns: Ints, numbers: Ints) -> Sequence[Frame]:
-    row = np.concatenate([np.zeros(0, np.int64), *(one.row for one in passes)])
+def _crossing_frames(
+    passes: Sequence[_Passes], positions: TrackPositions, t_ns: Ints, numbers: Ints
+) -> Sequence[Frame]:
+    row = np.concatenate([np.zeros(0, np.int64), *(crossed.row for crossed in passes)])
     rows = ZONE_CROSSINGS.empty(len(row))
-    rows["zone_id"] = np.repeat([one.number for one in passes], [len(one.row) for one in passes])
-    rows["track_id"] = found.track[row]
-    rows["forward"] = np.concatenate([rows["forward"][:0], *(one.forward for one in passes)])
-    for column, values in _places(found, row):
+    rows["zone_id"] = np.repeat([crossed.number for crossed in passes], [len(crossed.row) for crossed in passes])
+    rows["track_id"] = positions.track[row]
+    rows["forward"] = np.concatenate([rows["forward"][:0], *(crossed.forward for crossed in passes)])
+    for column, values in _places(positions, row):
         rows[column] = values
-    return _by_frame(rows, found.frame[row], t_ns, numbers)
+    return _by_frame(rows, positions.frame[row], t_ns, numbers)
 
 
 def _by_frame(rows: Rows, frame: Ints, t_ns: Ints, numbers: Ints) -> Sequence[Frame]:
@@ -227,7 +229,7 @@ def _counts(
     zones: Sequence[PlacedZone],
     stays: Sequence[_Stays],
     passes: Sequence[_Passes],
-    found: TrackPositions,
+    positions: TrackPositions,
     t_ns: Ints,
     numbers: Ints,
 ) -> FrameColumns:
@@ -235,14 +237,14 @@ def _counts(
     out = FrameCollector(ZONE_COUNTS)
     steps: dict[int, dict[str, Ints]] = {}
     for stay in stays:
-        begin, end = found.frame[stay.first], stay.after
-        new = begin[_first_of_each(found.track[stay.first], begin)]
+        begin, end = positions.frame[stay.first], stay.after
+        new = begin[_first_of_each(positions.track[stay.first], begin)]
         steps[stay.number] = {"entered": np.sort(begin), "left": np.sort(end), "tracks": np.sort(new)}
-    for one in passes:
-        at = found.frame[one.row]
-        new = at[_first_of_each(found.track[one.row], at)]
-        sides = {"forward": np.sort(at[one.forward]), "backward": np.sort(at[~one.forward])}
-        steps[one.number] = {**sides, "tracks": np.sort(new)}
+    for crossed in passes:
+        at = positions.frame[crossed.row]
+        new = at[_first_of_each(positions.track[crossed.row], at)]
+        sides = {"forward": np.sort(at[crossed.forward]), "backward": np.sort(at[~crossed.forward])}
+        steps[crossed.number] = {**sides, "tracks": np.sort(new)}
     count = len(zones)
     for low in range(0, len(t_ns), _FRAMES_AT_ONCE):
         frame = np.arange(low, min(low + _FRAMES_AT_ONCE, len(t_ns)))
@@ -334,10 +336,10 @@ def zone_messages(
     for frame in crossed:
         for row in frame.rows:
             way = "forward" if row["forward"] else "backward"
-            words = f"track {row['track_id']} crosses {names[int(row['zone_id'])]} {way}{_place(row)}"
-            lines.append((frame.t_ns, 2, words))
-    for number, (t_ns, _, words) in enumerate(sorted(lines)):
-        text = f"{words} at {(t_ns - start_ns) / NS_PER_S:.2f} s"
+            sentence = f"track {row['track_id']} crosses {names[int(row['zone_id'])]} {way}{_place(row)}"
+            lines.append((frame.t_ns, 2, sentence))
+    for number, (t_ns, _, sentence) in enumerate(sorted(lines)):
+        text = f"{sentence} at {(t_ns - start_ns) / NS_PER_S:.2f} s"
         yield t_ns, number, foxglove.pack_log(t_ns, "INFO", tracks_topic, text)
 
 

@@ -138,6 +138,6 @@ def _solved(
 
 def _compact(numbers: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """The unique values of small non-negative integers, rising, and the index of each among them."""
-    there = np.zeros(int(numbers.max()) + 1, np.intp)
-    there[numbers] = 1
-    return there.nonzero()[0], (np.cumsum(there) - 1)[numbers]
+    occurs = np.zeros(int(numbers.max()) + 1, np.intp)
+    occurs[numbers] = 1
+    return occurs.nonzero()[0], (np.cumsum(occurs) - 1)[numbers]

@@ -52,7 +52,7 @@ _SECOND_MOTION_WINDOW_PX, _SECOND_MOTION_LEVELS = 11, 4
 
 
 class SecondMotion:
-    """Looks for such a part in some of the pictures of a camera.
+    """Looks in some pictures for a part that moves as a whole, otherwise than the scene.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ def _is_divided(before: Image, now: Image, motion: Floats, boxes: Floats | None)
     if len(points) < _MIN_FEATURES:
         return False
     # Called without a type: the stubs of OpenCV 4 and 5 differ on what may be None.
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(
         first.image,
         second.image,
         points,
@@ -106,22 +106,22 @@ def _is_divided(before: Image, now: Image, motion: Floats, boxes: Floats | None)
         winSize=(_SECOND_MOTION_WINDOW_PX,) * 2,
         maxLevel=_SECOND_MOTION_LEVELS,
     )
-    known = np.asarray(found).ravel() == 1
-    then, there = points[known, 0], np.asarray(moved, np.float32)[known, 0]
+    is_followed = np.asarray(status).ravel() == 1
+    then, now_at = points[is_followed, 0], np.asarray(moved, np.float32)[is_followed, 0]
     if len(then) < _MIN_FEATURES:
         return False
     small = compose(to_small, compose(motion, invert(to_small)))
-    off = np.hypot(*(move_points(small, then.astype(float)) - there).T)
+    off = np.hypot(*(move_points(small, then.astype(float)) - now_at).T)
     others = off > _OTHERWISE_PX
     if np.count_nonzero(others) < _OTHERS * len(then):
         return False
     _, agree = cv2.estimateAffinePartial2D(
-        then[others], there[others], method=cv2.RANSAC, ransacReprojThreshold=_ALIKE_PX, maxIters=200, refineIters=0
+        then[others], now_at[others], method=cv2.RANSAC, ransacReprojThreshold=_ALIKE_PX, maxIters=200, refineIters=0
     )
     as_one = np.asarray(agree, np.bool_).ravel()
     if np.count_nonzero(as_one) < _AS_ONE * len(then):
         return False
-    return bool(np.ptp(there[others][as_one], axis=0).prod() >= _SECOND_MOTION_MIN_AREA * first.image.size)
+    return bool(np.ptp(now_at[others][as_one], axis=0).prod() >= _SECOND_MOTION_MIN_AREA * first.image.size)
 
 
 _MIN_AREA: Final = 0.06
@@ -210,7 +210,7 @@ class MotionEstimator:
 
     @property
     def stand(self) -> Floats | None:
-        """From pixels of the view where the camera stands to those of the reference: the same object while it does."""
+        """The transform from pixels at the camera's stand to the reference; the same object while it stands there."""
         return self._stance.stand
 
     @property
@@ -267,12 +267,12 @@ class MotionEstimator:
             return self._posed(last.to_reference, 0)  # pictures without features show no motion
         fit = self._fit_sure(picture, hidden)
         key = self._keys[-1]
-        there = compose(invert(last.to_reference), key.to_reference)
+        expected = compose(invert(last.to_reference), key.to_reference)
         for is_sudden in (self._is_sudden, not self._is_sudden) if fit is None else ():
             # Where the key picture's features should be now: as far on as from the picture before the last to the
             # last, or as far as the small copies are shifted.
             motion = self._shift(before, picture) if is_sudden else last.from_previous
-            if (fit := self._fit(key, picture, compose(motion, there), hidden)) is not None:
+            if (fit := self._fit(key, picture, compose(motion, expected), hidden)) is not None:
                 self._is_sudden = is_sudden
                 break
         if fit is None:  # the key picture is too long ago
@@ -311,8 +311,8 @@ class MotionEstimator:
 
         height, width = picture.copy.shape
         window = np.outer(np.hanning(height), np.hanning(width)).astype(np.float32)
-        small = (cv2.resize(one.image, (width, height), interpolation=cv2.INTER_AREA) for one in (before, picture))
-        (x, y), _ = cv2.phaseCorrelate(*((np.asarray(one, np.float32) - _GREY) * window for one in small))
+        small = (cv2.resize(side.image, (width, height), interpolation=cv2.INTER_AREA) for side in (before, picture))
+        (x, y), _ = cv2.phaseCorrelate(*((np.asarray(side, np.float32) - _GREY) * window for side in small))
         return np.array([[1.0, 0.0, x * self._size[0] / width], [0.0, 1.0, y * self._size[1] / height]])
 
     def _posed(self, to_reference: Floats, inliers: int) -> CameraPose:
@@ -362,7 +362,7 @@ class MotionEstimator:
             return None
         near = move_points(compose(self._to_small, compose(guess, self._from_small)), key.points[:, 0].astype(float))
         # Called without a type: the stubs of OpenCV 4 and 5 differ on what may be None.
-        moved, found, _ = cv2.calcOpticalFlowPyrLK(
+        moved, status, _ = cv2.calcOpticalFlowPyrLK(
             key.picture.image,
             _in_light_of(key.picture, picture),
             key.points,
@@ -372,22 +372,22 @@ class MotionEstimator:
             criteria=_ITERATIONS,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )
-        there, then = np.asarray(moved, np.float32)[:, 0], key.points[:, 0]
-        known = (np.asarray(found).ravel() == 1) & _inside(there, picture.image)
+        now_at, then = np.asarray(moved, np.float32)[:, 0], key.points[:, 0]
+        is_followed = (np.asarray(status).ravel() == 1) & _inside(now_at, picture.image)
         if hidden is not None:
-            known &= ~_within(there, hidden)
-        then, there, weight = then[known], there[known], key.weight[known]
+            is_followed &= ~_within(now_at, hidden)
+        then, now_at, weight = then[is_followed], now_at[is_followed], key.weight[is_followed]
         least = max(_MIN_INLIERS, _MIN_SHARE * len(then))
         if len(then) < least:
             return None
         matrix, agree = cv2.estimateAffinePartial2D(
-            then, there, method=cv2.RANSAC, ransacReprojThreshold=_INLIER_PX, maxIters=200, refineIters=0
+            then, now_at, method=cv2.RANSAC, ransacReprojThreshold=_INLIER_PX, maxIters=200, refineIters=0
         )
         inliers = np.asarray(agree, np.bool_).ravel()
-        fitted = IDENTITY if matrix is None else _similarity(then[inliers], there[inliers], weight[inliers])
-        if (at_rest := _at_rest(then, there, fitted)) is not None:
+        fitted = IDENTITY if matrix is None else _similarity(then[inliers], now_at[inliers], weight[inliers])
+        if (at_rest := _at_rest(then, now_at, fitted)) is not None:
             return IDENTITY, at_rest
-        area = np.ptp(there[inliers], axis=0).prod() if inliers.any() else 0.0
+        area = np.ptp(now_at[inliers], axis=0).prod() if inliers.any() else 0.0
         if matrix is None or np.count_nonzero(inliers) < least or area < _MIN_AREA * picture.image.size:
             return None
         return compose(self._from_small, compose(fitted, self._to_small)), int(np.count_nonzero(inliers))
@@ -435,9 +435,9 @@ def features(image: Image, hidden: Floats | None) -> tuple[Points, Floats]:
     return np.stack([x, y], axis=1).astype(np.float32)[:, None], np.minimum(peak[kept], good).astype(float)
 
 
-def _similarity(points: Points, there: Points, weight: Floats) -> Floats:
+def _similarity(points: Points, targets: Points, weight: Floats) -> Floats:
     """The similarity (2, 3) that takes points (N, 2) closest to others (N, 2), by weights (N,)."""
-    first, second = (one.astype(float) @ [1, 1j] for one in (points, there))
+    first, second = (side.astype(float) @ [1, 1j] for side in (points, targets))
     share = weight / weight.sum()
     from_middle, to_middle = first @ share, second @ share
     away = first - from_middle
@@ -446,9 +446,9 @@ def _similarity(points: Points, there: Points, weight: Floats) -> Floats:
     return np.array([[turn.real, -turn.imag, shift.real], [turn.imag, turn.real, shift.imag]])
 
 
-def _at_rest(then: Points, there: Points, fitted: Floats) -> int | None:
+def _at_rest(then: Points, targets: Points, fitted: Floats) -> int | None:
     """The number of features (N, 2) at rest, if the scene is; None if it moves as was fitted (2, 3)."""
-    rest, off = _apart(then, there), _apart(move_points(fitted, then.astype(float)), there)
+    rest, off = _apart(then, targets), _apart(move_points(fitted, then.astype(float)), targets)
     at_rest = int(np.count_nonzero(rest < _AT_REST_PX))
     if at_rest >= _REST_SHARE * len(then) and at_rest >= _REST_RATIO * np.count_nonzero(off < _AT_REST_PX):
         return at_rest
@@ -458,9 +458,9 @@ def _at_rest(then: Points, there: Points, fitted: Floats) -> int | None:
     return at_rest if is_scene else None  # what moves, moves by itself
 
 
-def _apart(points: Floats | Points, there: Points) -> Floats:
+def _apart(points: Floats | Points, targets: Points) -> Floats:
     """The distances of points (N, 2) from their expected positions (N, 2)."""
-    return np.asarray(np.hypot(*(points - there).T), np.float64)
+    return np.asarray(np.hypot(*(points - targets).T), np.float64)
 
 
 def _in_light_of(first: _Picture, second: _Picture) -> Image:
@@ -475,7 +475,7 @@ def _in_light_of(first: _Picture, second: _Picture) -> Image:
 
 def _correlation(first: _Picture, second: _Picture) -> float:
     """The correlation of the small copies of two pictures of one size, from -1 to 1."""
-    a, b = (one.copy - one.copy.mean() for one in (first, second))
+    a, b = (side.copy - side.copy.mean() for side in (first, second))
     scale = float(np.sqrt((a * a).sum() * (b * b).sum()))
     return float((a * b).sum()) / scale if scale > 0 else float(not a.any() and not b.any())
 

@@ -99,7 +99,7 @@ class Stance:
         self._is_away = off > FAR * self._diagonal or (self._is_away and off >= STILL_PX)
         if self._is_away and len(self._recent) == _SETTLED_PICTURES:
             back = invert(to_reference)
-            if all(shift_px(compose(back, one), *self._size) < _SETTLED * self._diagonal for one in self._recent):
+            if all(shift_px(compose(back, pose), *self._size) < _SETTLED * self._diagonal for pose in self._recent):
                 self.stand, self._is_away = to_reference, False
                 return to_reference, Verdict.STILL
         if off < STILL_PX:
@@ -121,8 +121,8 @@ def poses_of(motions: Floats, width_px: float, height_px: float) -> list[CameraP
     """
     poses: list[CameraPose] = []
     stance, to_reference, reference = Stance(width_px, height_px), IDENTITY, 0
-    for number, given in enumerate(motions):
-        motion = IDENTITY if number == 0 or np.array_equal(given, IDENTITY) else given
+    for number, motion_before in enumerate(motions):
+        motion = IDENTITY if number == 0 or np.array_equal(motion_before, IDENTITY) else motion_before
         to_reference = compose(to_reference, invert(motion))
         if is_too_far(to_reference, width_px, height_px):
             stance, to_reference, reference = Stance(width_px, height_px, is_away=True), IDENTITY, number
@@ -138,8 +138,8 @@ def verdict_of(verdicts: NDArray[np.integer], elsewhere: Bools) -> Verdict:
     Cuts and lost pictures don't count.
     """
     least = _LEAST_MOVING * max(len(verdicts), 1)
-    known = verdicts <= Verdict.MOVING
-    moving = np.count_nonzero(known & (elsewhere | (verdicts == Verdict.MOVING)))
+    is_judged = verdicts <= Verdict.MOVING
+    moving = np.count_nonzero(is_judged & (elsewhere | (verdicts == Verdict.MOVING)))
     shaking = np.count_nonzero(verdicts == Verdict.SHAKING)
     if moving >= least:
         return Verdict.MOVING

@@ -218,11 +218,11 @@ class Corrector:
         """Return the map (3, 3) that brings feet to the places where others see these people, from a map near it."""
         state = _State(np.zeros(self.size), np.eye(3))
         begin = moved(start, feet.xy_m)
-        there = np.isfinite(begin).all(axis=1)
-        same = np.tile([1.0, 0.0, 1.0], (int(there.sum()), 1))
+        is_mapped = np.isfinite(begin).all(axis=1)
+        same = np.tile([1.0, 0.0, 1.0], (int(is_mapped.sum()), 1))
         for _ in range(0 if np.array_equal(start, np.eye(3)) else _STARTS):
             before = state.parameters
-            state = self._improved(state, feet.xy_m[there], begin[there], same, np.inf)
+            state = self._improved(state, feet.xy_m[is_mapped], begin[is_mapped], same, np.inf)
             if np.abs(state.parameters - before).max() < _CLOSE:
                 break
         for reach_m in _REACH_M:
@@ -264,11 +264,11 @@ class Corrector:
         if self.model == "pose":
             steps = np.eye(self.size) * _STEP
             maps = [self.matrix(state.parameters + step) for step in steps]
-            return np.stack([(moved(one, xy_m) - at) / _STEP for one in maps], axis=-1)
+            return np.stack([(moved(changed, xy_m) - at) / _STEP for changed in maps], axis=-1)
         u, v = ((at - self.centre) / self.unit_m).T
-        one, none = np.ones(len(u)), np.zeros(len(u))
-        across = [one, none, -v, u, u, v, -u * u, -u * v]
-        along = [none, one, u, v, -v, u, -u * v, -v * v]
+        ones, none = np.ones(len(u)), np.zeros(len(u))
+        across = [ones, none, -v, u, u, v, -u * u, -u * v]
+        along = [none, ones, u, v, -v, u, -u * v, -v * v]
         return self.unit_m * np.stack([np.stack(part[: self.size], axis=-1) for part in (across, along)], axis=1)
 
 
@@ -311,8 +311,8 @@ def vote(feet: Feet, places: Feet, span: int) -> Floats:
     ours, theirs = feet._in_space(), places._in_space()
     if not len(ours) or not len(theirs):
         return np.eye(3)
-    found = cKDTree(ours).sparse_distance_matrix(cKDTree(theirs), _VOTE_M + 2, output_type="ndarray")
-    at, to = found["i"], found["j"]
+    near = cKDTree(ours).sparse_distance_matrix(cKDTree(theirs), _VOTE_M + 2, output_type="ndarray")
+    at, to = near["i"], near["j"]
     if not len(at):
         return np.eye(3)
     cells = np.floor(np.concatenate([feet.xy_m[at], places.xy_m[to]], axis=1) / _ONCE_M).astype(np.int64)

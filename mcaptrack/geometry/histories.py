@@ -39,9 +39,9 @@ class Histories:
         remembered[slot[is_old]] = True
         if not (is_old.all() and remembered.all()):
             new = np.unique(ids[~is_old])
-            known = np.concatenate([self.ids[remembered], new])
-            order = np.argsort(known, kind="stable")
-            self.ids = known[order]
+            kept_ids = np.concatenate([self.ids[remembered], new])
+            order = np.argsort(kept_ids, kind="stable")
+            self.ids = kept_ids[order]
             moved = np.concatenate([moved[remembered], np.full((len(new), self.length, 2), np.nan)])[order]
             slot = np.searchsorted(self.ids, ids)
         self.xy_m = moved
@@ -78,9 +78,9 @@ class Histories:
         passed = int(at[-1]) - step
         is_last = np.append(track[1:] != track[:-1], True)[: len(track)].nonzero()[0]
         moved = np.full((len(is_last), length, 2), np.nan)
-        for one in range(length):
-            row = (passed[is_last] == one).nonzero()[0]
-            moved[row, : length - one] = windows[is_last[row], one:]
+        for passed_steps in range(length):
+            row = (passed[is_last] == passed_steps).nonzero()[0]
+            moved[row, : length - passed_steps] = windows[is_last[row], passed_steps:]
         kept = np.isfinite(moved[:, :, 0]).any(axis=1) | (passed[is_last] == 0)
         self.ids, self.xy_m = track[is_last[kept]], moved[kept]
         return past, np.isfinite(past[:, :, 0])

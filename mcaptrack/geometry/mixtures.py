@@ -101,13 +101,13 @@ def squared_radius(level: float, tails: Tails) -> Floats:
     >>> squared_radius(0.95, normal_tails(1)).round(4).tolist()
     [5.9915]
     """
-    known = tails.of_normals()
-    one = -2 * np.log1p(-level)
-    low = one * np.minimum(known.narrow_scale, known.wide_scale)
-    high = one * np.maximum(known.narrow_scale, known.wide_scale)
+    mixture = tails.of_normals()
+    normal = -2 * np.log1p(-level)
+    low = normal * np.minimum(mixture.narrow_scale, mixture.wide_scale)
+    high = normal * np.maximum(mixture.narrow_scale, mixture.wide_scale)
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        is_short = mass_within(middle, known) < level
+        is_short = mass_within(middle, mixture) < level
         low, high = np.where(is_short, middle, low), np.where(is_short, high, middle)
     return np.asarray((low + high) / 2)
 
@@ -128,10 +128,10 @@ def half_radius(level: Floats, tails: Tails) -> Floats:
     # one part alone has less beyond: no further out than the radius
     half = np.maximum(np.maximum(narrow * (np.log1p(-weight) - wanted), wide * (np.log(weight) - wanted)), 0.0)
     for _ in range(_HALLEY_STEPS):
-        one, two = (1 - weight) * np.exp(-half / narrow), weight * np.exp(-half / wide)
-        beyond = one + two
-        off, slope = np.log(beyond) - wanted, (one / narrow + two / wide) / beyond
-        bend = (one / narrow**2 + two / wide**2) / beyond - slope**2
+        of_narrow, two = (1 - weight) * np.exp(-half / narrow), weight * np.exp(-half / wide)
+        beyond = of_narrow + two
+        off, slope = np.log(beyond) - wanted, (of_narrow / narrow + two / wide) / beyond
+        bend = (of_narrow / narrow**2 + two / wide**2) / beyond - slope**2
         half = half + 2 * off * slope / (2 * slope**2 - off * bend)
     return np.asarray(half)
 

@@ -108,7 +108,7 @@ def touching_pairs(a: Floats, b: Floats, a_group: Ints, b_group: Ints) -> tuple[
     keys = np.intersect1d(a_key, b_key)
     a_low, b_low = a_key.searchsorted(keys), b_key.searchsorted(keys)
     a_count, b_count = a_key.searchsorted(keys, "right") - a_low, b_key.searchsorted(keys, "right") - b_low
-    found = [(np.empty(0, np.int64), np.empty(0, np.int64))]
+    pairs = [(np.empty(0, np.int64), np.empty(0, np.int64))]
     part_of = np.cumsum(a_count * b_count) // _PAIRS_AT_ONCE
     for part in np.split(np.arange(len(keys)), np.flatnonzero(np.diff(part_of)) + 1):
         key, left, right = cross_pairs(a_count[part], b_count[part])
@@ -119,8 +119,8 @@ def touching_pairs(a: Floats, b: Floats, a_group: Ints, b_group: Ints) -> tuple[
         # Each pair once: in the cell that holds the left upper corner of what both share.
         first, second, key = first[meet], second[meet], keys[part][key[meet]]
         own = _key(_cell(corner[meet], low, cell, count), of[first], count) == key
-        found.append((first[own], second[own]))
-    first, second = (np.concatenate(side) for side in zip(*found, strict=True))
+        pairs.append((first[own], second[own]))
+    first, second = (np.concatenate(side) for side in zip(*pairs, strict=True))
     order = np.lexsort((second, first))
     return a_at[first[order]], b_at[second[order]]
 

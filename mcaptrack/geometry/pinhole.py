@@ -19,7 +19,7 @@ from mcaptrack.geometry.arrays import Bools, Floats
 #: Numbers of coefficients of OpenCV's models: none, plumb_bob, rational_polynomial; and of fisheye (equidistant).
 _COEFFICIENTS: Final = (0, 4, 5, 8)
 _FISHEYE_COEFFICIENTS: Final = 4
-#: A point is outside of what a lens maps if there and back again it is off by more.
+#: A point is beyond the edge of the lens if undistorting and distorting it moves it by more than this.
 _LOST_PX: Final = 0.5
 _ITERATIONS: Final = 50
 
@@ -46,8 +46,8 @@ class Lens:
             raise McaptrackError(f"a camera can't have the focal lengths {self.focal_px} and centre {self.centre_px}")
         counts = (_FISHEYE_COEFFICIENTS,) if self.is_fisheye else _COEFFICIENTS
         if len(self.distortion) not in counts:
-            known = " or ".join(map(str, counts))
-            raise McaptrackError(f"a lens has {known} coefficients of distortion, not {len(self.distortion)}")
+            allowed = " or ".join(map(str, counts))
+            raise McaptrackError(f"a lens has {allowed} coefficients of distortion, not {len(self.distortion)}")
 
     @cached_property
     def matrix(self) -> Floats:
@@ -120,8 +120,8 @@ class Lens:
         points = np.ascontiguousarray(xy_px[is_finite], np.float64)[:, None]
         stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _ITERATIONS, 1e-12)
         undistorted = cv2.fisheye.undistortPoints if self.is_fisheye else cv2.undistortPoints
-        given, same = np.array(self.distortion), np.eye(3)
-        straight = undistorted(points, self.matrix, given, R=same, P=self.matrix, criteria=stop)
+        distortion, same = np.array(self.distortion), np.eye(3)
+        straight = undistorted(points, self.matrix, distortion, R=same, P=self.matrix, criteria=stop)
         out[is_finite] = straight[:, 0]
         return out
 

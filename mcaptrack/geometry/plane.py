@@ -126,7 +126,7 @@ def plane_at(planes: Planes, t_ns: int) -> GroundPlane | None:
     """The plane that is valid at ``t_ns``; None if there is no plane."""
     if not planes:
         return None
-    return planes[max(bisect_right(planes, t_ns, key=lambda one: one[0]) - 1, 0)][1]
+    return planes[max(bisect_right(planes, t_ns, key=lambda entry: entry[0]) - 1, 0)][1]
 
 
 def runs_of_planes(planes: Planes, times: Sequence[int]) -> list[tuple[int, int]]:

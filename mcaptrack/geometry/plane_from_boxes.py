@@ -143,17 +143,12 @@ class PlaneFit:
 
     def to_json(self) -> dict[str, Any]:
         """Convert all but the plane to JSON values, rounded to four digits."""
-        values = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "plane"}
+        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "plane"}
         return {name: value if isinstance(value, int) else float(f"{value:.4g}") for name, value in values.items()}
 
 
 def plane_from_boxes(
-    boxes: Floats,
-    frame: Ints,
-    score: Floats,
-    width_px: int,
-    height_px: int,
-    person_m: float = PERSON_HEIGHT_M,
+    boxes: Floats, frame: Ints, score: Floats, width_px: int, height_px: int, person_m: float = PERSON_HEIGHT_M
 ) -> PlaneFit:
     """Estimate the ground plane of a still camera from boxes of people.
 
@@ -253,9 +248,9 @@ def whole_people(boxes: Floats, frame: Ints, score: Floats, width_px: int, heigh
     edge_x, edge_y = np.maximum(_BORDER_PX, _BORDER * size)
     use: Bools = _is_upright(boxes) & (left > edge_x) & (top > edge_y)
     use &= (left + width < size[0] - edge_x) & (top + height < size[1] - edge_y)
-    known = np.isfinite(score)
-    if known.any():
-        use &= ~known | (score >= _LEAST_OF_SCORES * np.quantile(score[known], 0.95))
+    has_score = np.isfinite(score)
+    if has_score.any():
+        use &= ~has_score | (score >= _LEAST_OF_SCORES * np.quantile(score[has_score], 0.95))
     order = np.argsort(frame, kind="stable")
     for at in np.split(order, np.flatnonzero(np.diff(frame[order])) + 1):
         some, bottom = boxes[at], top[at] + height[at]
@@ -317,16 +312,16 @@ def _fit(feet: Floats, heights: Floats, focal_px: float) -> tuple[_Solved, Bools
     some = _evenly(len(feet), _FIRST_BOXES)
     solve = _solver(feet[some], heights[some], focal_px)
     first = [_start(feet, heights, focal_px, float(np.deg2rad(pitch))) for pitch in _STARTS]
-    starts = [one for one in first if one is not None]
+    starts = [start for start in first if start is not None]
     if not starts:
         raise McaptrackError("heights of boxes don't follow from where they stand")
-    found = min((solve(start) for start in starts), key=lambda one: one[1])[0]
-    found, _ = _solver(feet, heights, focal_px)(found.values)
+    solved = min((solve(start) for start in starts), key=lambda result: result[1])[0]
+    solved, _ = _solver(feet, heights, focal_px)(solved.values)
     agrees = np.ones(len(feet), bool)
     for _ in range(_ROUNDS):
-        agrees = _agreeing(_deviations(found.camera, feet, heights))
-        found, _ = _solver(feet[agrees], heights[agrees], focal_px)(found.values)
-    return found, agrees
+        agrees = _agreeing(_deviations(solved.camera, feet, heights))
+        solved, _ = _solver(feet[agrees], heights[agrees], focal_px)(solved.values)
+    return solved, agrees
 
 
 def _start(feet: Floats, heights: Floats, focal_px: float, pitch_rad: float) -> Floats | None:
@@ -354,8 +349,8 @@ def _solver(feet: Floats, heights: Floats, focal_px: float) -> Callable[[Floats]
         return np.concatenate([off * weight, expected])
 
     def solve(start: Floats) -> tuple[_Solved, float]:
-        found = least_squares(residuals, start, max_nfev=_MOST_STEPS)
-        return _Solved(found.x, np.linalg.pinv(found.jac.T @ found.jac)), float(found.cost)
+        result = least_squares(residuals, start, max_nfev=_MOST_STEPS)
+        return _Solved(result.x, np.linalg.pinv(result.jac.T @ result.jac)), float(result.cost)
 
     return solve
 

@@ -146,12 +146,12 @@ class TransformSeries:
         and last pose, and into gaps and jumps from either side, the motion is continued for at most one usual interval
         and ``EXTRAPOLATED_S``. Poses are arbitrary where the reason isn't KNOWN.
         """
-        known = np.zeros(len(t_ns), np.int64)
+        reason = np.zeros(len(t_ns), np.int64)
         last = len(self.t_ns) - 1
         index = np.clip(np.searchsorted(self.t_ns, t_ns, side="right") - 1, 0, max(last - 1, 0))
         if self.is_static:
             index = np.clip(np.searchsorted(self.t_ns, t_ns, side="right") - 1, 0, last)
-            return self.rotation[index], self.translation[index], known
+            return self.rotation[index], self.translation[index], reason
         is_broken = np.zeros(last, bool)
         is_broken[self.gaps] = is_broken[self.jumps] = True
         is_second = 2 * (t_ns - self.t_ns[index]) > self.t_ns[index + 1] - self.t_ns[index]
@@ -160,9 +160,9 @@ class TransformSeries:
         is_before, is_after = t_ns < self.t_ns[0], t_ns > self.t_ns[-1]
         is_outside = is_before | is_after | is_broken[index]
         is_far = is_outside & (beyond_ns > min(self.interval_s, EXTRAPOLATED_S) * NS_PER_S)
-        known[is_far] = Reason.GAP
-        known[is_far & is_before] = Reason.BEFORE
-        known[is_far & is_after] = Reason.AFTER
+        reason[is_far] = Reason.GAP
+        reason[is_far & is_before] = Reason.BEFORE
+        reason[is_far & is_after] = Reason.AFTER
         # Into a break, the step on the other side of the nearest pose is continued, if that is none itself.
         step = np.clip(np.where(is_broken[index], np.where(is_second, index + 1, index - 1), index), 0, last - 1)
         length_ns = self.t_ns[step + 1] - self.t_ns[step]
@@ -173,7 +173,7 @@ class TransformSeries:
 
         turned = Rotation.from_rotvec(share[:, None] * (before.inv() * after).as_rotvec())
         moved = self.translation[step] + share[:, None] * (self.translation[step + 1] - self.translation[step])
-        return before * turned, moved, known
+        return before * turned, moved, reason
 
 
 def _usual_speed(speed: Floats) -> Floats:
@@ -258,8 +258,8 @@ def _dynamic(parent: str, child: str, samples: PoseSamples, messages: int) -> tu
         series = series_of(kept.take(np.delete(np.arange(len(kept.stamp_ns)), single)))
     if len(series.gaps):
         longest = float(np.diff(series.t_ns)[series.gaps].max()) / NS_PER_S
-        words = f"{_count(len(series.gaps), 'gap')}, the longest of {longest:.3g} s"
-        findings.append(f"it has {words}; no pose is known there")
+        text = f"{_count(len(series.gaps), 'gap')}, the longest of {longest:.3g} s"
+        findings.append(f"it has {text}; no pose is known there")
     if len(series.jumps):
         metres, turn = series.step_sizes(series.jumps)
         most = int(metres.argmax() if metres.max() > _JUMP_M else turn.argmax())
@@ -270,20 +270,20 @@ def _dynamic(parent: str, child: str, samples: PoseSamples, messages: int) -> tu
 
 
 def _single_outliers(series: TransformSeries) -> Indices:
-    """Return the poses that the frame jumps to, and from them back to where it was."""
+    """Return the single poses that a frame jumps to, and from which it jumps back."""
     jumps = series.jumps
-    there = jumps[:-1][np.diff(jumps) == 1] + 1
-    before, after = series.translation[there - 1], series.translation[there + 1]
-    moved, turned = series.step_sizes(there)
+    jumped = jumps[:-1][np.diff(jumps) == 1] + 1
+    before, after = series.translation[jumped - 1], series.translation[jumped + 1]
+    moved, turned = series.step_sizes(jumped)
     apart = np.linalg.norm(after - before, axis=1)
-    between = (series.rotation[there - 1].inv() * series.rotation[there + 1]).magnitude() if len(there) else turned
+    between = (series.rotation[jumped - 1].inv() * series.rotation[jumped + 1]).magnitude() if len(jumped) else turned
     is_back = (apart <= moved / 2 + _SAME_M) & (between <= turned / 2 + _JUMP_RAD)
-    back: Indices = there[is_back]
+    back: Indices = jumped[is_back]
     return back[np.diff(back, prepend=-2) > 1]
 
 
 def _one_pass(samples: PoseSamples) -> tuple[PoseSamples, list[str]]:
-    """Return the poses without those of times that another, longer pass of the clock has shown, too."""
+    """Leave out poses recorded again after a clock was set back: the longest pass over a time is kept."""
     stamps = samples.stamp_ns
     starts, newest, back = [0], int(stamps[0]), 0
     for number, stamp in enumerate(stamps.tolist()):
@@ -297,7 +297,7 @@ def _one_pass(samples: PoseSamples) -> tuple[PoseSamples, list[str]]:
     ends = [*starts[1:], len(stamps)]
     is_kept = np.zeros(len(stamps), bool)
     spans: list[tuple[int, int]] = []
-    for start, end in sorted(zip(starts, ends, strict=True), key=lambda one: one[0] - one[1]):
+    for start, end in sorted(zip(starts, ends, strict=True), key=lambda span: span[0] - span[1]):
         part = stamps[start:end]
         is_new = np.ones(len(part), bool)
         for first, last in spans:

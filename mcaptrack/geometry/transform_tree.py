@@ -88,27 +88,27 @@ class TransformTree:
         self._recorded = recorded
         self._remarks: list[Remark] = []
         self.series: dict[str, TransformSeries] = {}
-        self._latched = {(plain_frame(one.parent), plain_frame(one.child)) for one in recorded if one.is_latched}
-        is_off = [not one.is_latched and one.samples.is_off_clock() for one in recorded]
-        is_timed = any(not one.is_latched and not off for one, off in zip(recorded, is_off, strict=True))
-        found: dict[str, list[TransformSeries]] = {}
-        for one, off in zip(recorded, is_off, strict=True):
-            parent, child = plain_frame(one.parent), plain_frame(one.child)
+        self._latched = {(plain_frame(edge.parent), plain_frame(edge.child)) for edge in recorded if edge.is_latched}
+        is_off = [not edge.is_latched and edge.samples.is_off_clock() for edge in recorded]
+        is_timed = any(not edge.is_latched and not off for edge, off in zip(recorded, is_off, strict=True))
+        by_child: dict[str, list[TransformSeries]] = {}
+        for edge, off in zip(recorded, is_off, strict=True):
+            parent, child = plain_frame(edge.parent), plain_frame(edge.child)
             if not parent or not child or parent == child:
                 about = "itself" if parent and child else "a frame without a name"
                 self._remark(
-                    f"{_count(len(one.samples.stamp_ns))} of {child or parent!r} in {about} are left out", child
+                    f"{_count(len(edge.samples.stamp_ns))} of {child or parent!r} in {about} are left out", child
                 )
                 continue
-            is_moved = off and is_timed and bool(one.samples.stamp_ns.any())
-            series, clauses = clean(parent, child, one.samples, one.is_latched, on_log_time or is_moved)
+            is_moved = off and is_timed and bool(edge.samples.stamp_ns.any())
+            series, clauses = clean(parent, child, edge.samples, edge.is_latched, on_log_time or is_moved)
             if is_moved and not on_log_time:
                 clauses.insert(0, "its stamps are of another clock than the others', so that the log time is taken")
             for clause in clauses:
                 self._remark(f"{parent} -> {child}: {clause}", child)
             if series is not None:
-                found.setdefault(child, []).append(series)
-        for child, several in sorted(found.items()):
+                by_child.setdefault(child, []).append(series)
+        for child, several in sorted(by_child.items()):
             self.series[child] = self._chosen(child, several)
         self._break_loops()
 
@@ -119,7 +119,7 @@ class TransformTree:
 
     @cached_property
     def on_log_time(self) -> TransformTree:
-        """The same transforms with the log time in the place of stamps."""
+        """A tree of the same transforms that uses log times instead of stamps."""
         return TransformTree(self._recorded, on_log_time=True)
 
     @cached_property
@@ -128,7 +128,7 @@ class TransformTree:
         moving = [series for series in self.series.values() if not series.is_static]
         if not moving:
             return None
-        return min(int(one.t_ns[0]) for one in moving), max(int(one.t_ns[-1]) for one in moving)
+        return min(int(series.t_ns[0]) for series in moving), max(int(series.t_ns[-1]) for series in moving)
 
     def frames(self) -> list[str]:
         """Return the names of all frames."""
@@ -178,7 +178,7 @@ class TransformTree:
         way = self.between(target, source)
         frames = {*self.chain_of(target), *self.chain_of(source)}
         if way is not None:
-            frames = {one.child for one in way} | ({plain_frame(target)} - self.series.keys())
+            frames = {series.child for series in way} | ({plain_frame(target)} - self.series.keys())
         return [remark for remark in self._remarks if not frames.isdisjoint(remark.frames)]
 
     def lookup(self, target: str, source: str, stamps_ns: Ints) -> Poses:
@@ -189,7 +189,7 @@ class TransformTree:
         from scipy.spatial.transform import Rotation
 
         stamps_ns = np.asarray(stamps_ns, np.int64)
-        number, words = len(stamps_ns), {}
+        number, counts = len(stamps_ns), {}
         reason = np.zeros(number, np.int64)
         parts = self._parts(target, source)
         if parts is None or not number:
@@ -205,7 +205,7 @@ class TransformTree:
                 turn, shift = rotation * turn, rotation.apply(shift) + translation
                 is_new = (reason == Reason.KNOWN) & (why != Reason.KNOWN)
                 for code in np.unique(why[is_new]).tolist():
-                    words[f"{_WHERE[code]} {series}"] = int((why[is_new] == code).sum())
+                    counts[f"{_WHERE[code]} {series}"] = int((why[is_new] == code).sum())
                 reason[is_new] = why[is_new]
             ends.append((turn, shift))
         (turn, shift), (base, origin) = ends
@@ -213,7 +213,7 @@ class TransformTree:
         matrix, moved = (back * turn).as_matrix(), back.apply(shift - origin)
         is_unknown = reason != Reason.KNOWN
         matrix[is_unknown], moved[is_unknown] = np.nan, np.nan
-        return Poses(matrix, moved, reason, words)
+        return Poses(matrix, moved, reason, counts)
 
     def _parts(self, target: str, source: str) -> tuple[list[TransformSeries], list[TransformSeries]] | None:
         """Return the transforms from the source, and from the target, up to the first frame above both."""
@@ -225,9 +225,9 @@ class TransformTree:
         return [self.series[frame] for frame in ways[0]], [self.series[frame] for frame in ways[1]]
 
     def _chosen(self, child: str, several: list[TransformSeries]) -> TransformSeries:
-        """Return the one of several transforms of a frame that is taken: the one that moves, with the most messages."""
-        best = min(several, key=lambda one: (one.is_static, -one.messages, one.parent))
-        others = {one.parent: one.messages for one in several if one.parent != best.parent}
+        """Choose among several transforms of a frame: a moving one, then the one with the most messages."""
+        best = min(several, key=lambda series: (series.is_static, -series.messages, series.parent))
+        others = {series.parent: series.messages for series in several if series.parent != best.parent}
         if others:
             named = " and ".join(f"{parent} ({_count(count)})" for parent, count in sorted(others.items()))
             taken = f"{best.parent} ({_count(best.messages)})"
@@ -251,8 +251,8 @@ class TransformTree:
                 weakest = min(loop, key=self._strength)
                 names = [*reversed([*loop, loop[0]])]
                 hidden = max(len(names) - _SHOWN, 0)
-                words = " -> ".join(names[:_SHOWN]) + (f" (and {hidden:,} more)" if hidden else "")
-                self._remark(f"the frames {words} form a loop: {self.series[weakest]} is left out", *loop)
+                text = " -> ".join(names[:_SHOWN]) + (f" (and {hidden:,} more)" if hidden else "")
+                self._remark(f"the frames {text} form a loop: {self.series[weakest]} is left out", *loop)
                 del self.series[weakest]
 
     def _strength(self, child: str) -> tuple[bool, int, str]:

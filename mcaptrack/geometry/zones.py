@@ -253,8 +253,8 @@ def visits(paths: Paths, depth: Floats, margin: float) -> Visits:
     at, ends = np.arange(count), paths.ends
     is_in = depth >= 0
     side = np.where(depth >= margin, 1, np.where(depth < -margin, -1, 0))
-    known = (side != 0) | paths.begins | ends
-    state = is_in[np.maximum.accumulate(np.where(known, at, 0))]
+    is_decided = (side != 0) | paths.begins | ends
+    state = is_in[np.maximum.accumulate(np.where(is_decided, at, 0))]
     before = np.append(False, state[:-1]) & ~paths.begins
     enters = np.flatnonzero(state & ~before)
     leaves = np.flatnonzero(~state & before)

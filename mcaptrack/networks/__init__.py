@@ -77,7 +77,7 @@ class NetworkLimits:
 
     @classmethod
     def with_memory(cls, memory_mb: int, setting: str, hint: str = "") -> Self:
-        """The limit of time that the environment sets, and one of memory that a caller does, in MB."""
+        """The time limit of the environment, and a memory limit of the caller in MB."""
         return cls(memory_mb * 1_000_000, environment.whole_number(_TIME, _TIME_S), setting, hint)
 
     def in_words(self, error: SessionError) -> str:

@@ -34,7 +34,7 @@ _LOOK_S: Final = 0.02 if sys.platform.startswith("linux") else 0.25
 _START_S: Final = 120.0
 #: The most memory that the arrays of one call may take together, in bytes.
 _LANE_BYTES: Final = 2**32
-#: Longer answers are none: they hold names and shapes.
+#: Longer answers are invalid: answers hold names and shapes.
 _LONGEST: Final = 2**24
 #: Seconds in which a process that has closed its connection has to be gone.
 _GONE_S: Final = 2.0

@@ -56,8 +56,8 @@ def _classes() -> dict[str, Any]:
     file = descriptor_pb2.FileDescriptorProto(name="onnx_subset.proto", package="onnx_subset", syntax="proto2")
     for name, declared in _FIELDS.items():
         message = file.message_type.add(name=name)
-        for words in declared.split(", "):
-            field, number, kind = words.split()
+        for declaration in declared.split(", "):
+            field, number, kind = declaration.split()
             label = kinds.LABEL_REPEATED if kind.endswith("*") else kinds.LABEL_OPTIONAL
             kind = kind.rstrip("*")
             added = message.field.add(name=field, number=int(number), label=label)
@@ -67,8 +67,8 @@ def _classes() -> dict[str, Any]:
                 added.type = getattr(kinds, f"TYPE_{kind.upper()}")
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
-    found = {name: pool.FindMessageTypeByName(f"onnx_subset.{name}") for name in _FIELDS}
-    return {name: message_factory.GetMessageClass(message) for name, message in found.items()}
+    descriptors = {name: pool.FindMessageTypeByName(f"onnx_subset.{name}") for name in _FIELDS}
+    return {name: message_factory.GetMessageClass(message) for name, message in descriptors.items()}
 
 
 def parse(data: bytes) -> Any:
@@ -113,8 +113,8 @@ def class_names(model: Any) -> dict[int, str]:
     except (ValueError, SyntaxError, MemoryError, RecursionError):
         return {}
     pairs = names.items() if isinstance(names, dict) else enumerate(names) if isinstance(names, (list, tuple)) else ()
-    found = {index: name for index, name in pairs if type(index) is int and index >= 0 and isinstance(name, str)}
-    return found if len(found) == len(names) else {}
+    by_index = {index: name for index, name in pairs if type(index) is int and index >= 0 and isinstance(name, str)}
+    return by_index if len(by_index) == len(names) else {}
 
 
 def input_size(model: Any, name: str) -> tuple[int | None, int | None]:

@@ -26,8 +26,8 @@ _LONGEST: Final = 1000
 class SessionError(Exception):
     """A network can't be opened or run: why, in words that follow its name, or the limit that it exceeds."""
 
-    def __init__(self, words: str, limit: Limit = "") -> None:
-        super().__init__(words)
+    def __init__(self, message: str, limit: Limit = "") -> None:
+        super().__init__(message)
         self.limit: Limit = limit
 
 
@@ -63,8 +63,8 @@ class Session:
             model = graph.parse(data)
         except graph.NotOnnxError:
             raise SessionError("is no ONNX file, or is damaged or incomplete") from None
-        if words := graph.reach(model):
-            raise SessionError(words)
+        if fault := graph.reach(model):
+            raise SessionError(fault)
         if resize is not None:
             data = graph.resized(data, *resize)
             model = graph.parse(data)
@@ -92,10 +92,10 @@ class Session:
             raise SessionError(f"has a name of {len(longest):,} characters, {longest[:20]}...; give it a shorter one")
         self._alone = Lock()
         metadata = self._session.get_modelmeta().custom_metadata_map
-        inputs = [(one.name, list(one.shape or []), one.type) for one in self._session.get_inputs()]
+        inputs = [(tensor.name, list(tensor.shape or []), tensor.type) for tensor in self._session.get_inputs()]
         self.facts: Facts = {
             "inputs": inputs,
-            "outputs": [(one.name, list(one.shape or []), one.type) for one in self._session.get_outputs()],
+            "outputs": [(tensor.name, list(tensor.shape or []), tensor.type) for tensor in self._session.get_outputs()],
             "sizes": {name: graph.input_size(model, name) for name, shape, _ in inputs if len(shape) == 4},
             "names": {str(index): name for index, name in graph.class_names(model).items()},
             "metadata": {key: text for key, text in metadata.items() if len(key) + len(text) < _LONGEST},
@@ -167,5 +167,5 @@ def _numbers(output: Any) -> NDArray[Any]:
 
 
 def _short(error: Exception) -> str:
-    words = " ".join(str(error).split()) or type(error).__name__
-    return words if len(words) <= 200 else words[:200] + " ..."
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= 200 else text[:200] + " ..."

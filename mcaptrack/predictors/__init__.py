@@ -86,8 +86,8 @@ class OnClock:
         if abs(self.step_s / self.inner.step_s - 1) > 1e-6:
             xy_m, valid = self._past(xy_m, valid)
             if people is not None:
-                past, known = self._past(people.xy_m, people.valid)
-                people = people._replace(xy_m=past, valid=known)
+                past, is_known = self._past(people.xy_m, people.valid)
+                people = people._replace(xy_m=past, valid=is_known)
         return self._future(predict_among(self.inner, xy_m, valid, people), xy_m[:, -1])
 
     def _past(self, xy_m: Floats, valid: Bools) -> tuple[Floats, Bools]:
@@ -100,11 +100,11 @@ class OnClock:
         is_inside = low >= 0
         low, high = np.maximum(low, 0), np.maximum(high, 0)
         share = (at - low)[:, None]
-        known = valid[:, low] & valid[:, high] & is_inside
+        is_known = valid[:, low] & valid[:, high] & is_inside
         past = (1 - share) * xy_m[:, low] + share * xy_m[:, high]
         # A neighbour with share 0 may be NaN.
         past = np.where(share == 0, xy_m[:, low], past)
-        return np.where(known[..., None], past, np.nan), known
+        return np.where(is_known[..., None], past, np.nan), is_known
 
     def _future(self, forecast: Forecast, now: Floats) -> Forecast:
         """The forecast at the wanted times. At 0 its standard deviation is half of that at the first inner step."""
@@ -156,7 +156,7 @@ def make(name: PredictorName, steps: int, step_s: float, **parameters: Any) -> P
     [1.2, 1.6]
     """
     entry, file = entry_of(name)
-    inner = _made(entry, file, steps, step_s, parameters)
+    inner = _build(entry, file, steps, step_s, parameters)
     if inner.steps == steps and abs(inner.step_s / step_s - 1) < 1e-6:
         return inner
     ahead_s, own_s = steps * step_s, inner.steps * inner.step_s
@@ -195,9 +195,9 @@ def entry_of(name: PredictorName) -> tuple[Entry, Path | None]:
         return entry, None
     entry = find("predictor", kind)
     if not file or _file_of(entry) is _NO_FILE:
-        those = [one for one in BUILT_IN["predictor"] if _file_of(find("predictor", one)) is not _NO_FILE]
-        words = ", ".join(f"{one}:FILE" for one in those)
-        raise McaptrackError(f"predictor is one of {', '.join(NAMES)}, or {words}, not {name}")
+        those = [kind for kind in BUILT_IN["predictor"] if _file_of(find("predictor", kind)) is not _NO_FILE]
+        text = ", ".join(f"{kind}:FILE" for kind in those)
+        raise McaptrackError(f"predictor is one of {', '.join(NAMES)}, or {text}, not {name}")
     if not Path(file).is_file():
         raise McaptrackError(f"predictor {name}: there is no file {file}")
     return entry, Path(file)
@@ -208,7 +208,7 @@ def weights_sha256(name: PredictorName) -> str:
     entry, file = entry_of(name)
     if entry.is_built_in and _file_of(entry) is _NO_FILE:
         return ""
-    return _made(entry, file, 1, 1.0, {}).weights_sha256 or ""
+    return _build(entry, file, 1, 1.0, {}).weights_sha256 or ""
 
 
 #: Result of ``_file_of`` for a predictor without a parameter ``file``.
@@ -224,9 +224,9 @@ def _file_of(entry: Entry) -> Any:
     return parameters["file"].default if "file" in parameters else _NO_FILE
 
 
-def _made(entry: Entry, file: Path | None, steps: int, step_s: float, parameters: Mapping[str, Any]) -> Predictor:
-    given = {"file": file} if file else {}
+def _build(entry: Entry, file: Path | None, steps: int, step_s: float, parameters: Mapping[str, Any]) -> Predictor:
+    options = {"file": file} if file else {}
     if entry.is_built_in:
-        made: Predictor = entry.cls(steps=steps, step_s=step_s, **given, **parameters)
-        return made
-    return CheckedPredictor.of(entry, {"steps": steps, "step_s": step_s, **given, **parameters})
+        predictor: Predictor = entry.cls(steps=steps, step_s=step_s, **options, **parameters)
+        return predictor
+    return CheckedPredictor.of(entry, {"steps": steps, "step_s": step_s, **options, **parameters})

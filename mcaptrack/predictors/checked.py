@@ -63,8 +63,8 @@ class CheckedPredictor:
     @property
     def weights_sha256(self) -> str | None:
         with blamed(self.entry, "could not say its weights_sha256", self.guard):
-            found = getattr(self.inner, "weights_sha256", None)
-            return None if found is None else str(found)
+            digest = getattr(self.inner, "weights_sha256", None)
+            return None if digest is None else str(digest)
 
     @property
     def uses_people(self) -> bool:
@@ -78,12 +78,12 @@ class CheckedPredictor:
             return Forecast(np.empty((0, self.steps, 2)), np.empty((0, self.steps, 2, 2)))
         with blamed(self.entry, f"failed on {batch} {'track' if batch == 1 else 'tracks'}", self.guard):
             among = {} if people is None else {"people": people.copied()}
-            given = self.inner.predict(xy_m.copy(), valid.copy(), **among)
-        if not isinstance(given, tuple | list) or len(given) != 2:
+            forecast = self.inner.predict(xy_m.copy(), valid.copy(), **among)
+        if not isinstance(forecast, tuple | list) or len(forecast) != 2:
             raise McaptrackError(
-                f"{self.entry} gave a {type(given).__name__}; predict has to return mean and covariance"
+                f"{self.entry} gave a {type(forecast).__name__}; predict has to return mean and covariance"
             )
-        mean, cov = (self._numbers(one) for one in given)
+        mean, cov = (self._numbers(part) for part in forecast)
         wanted = (batch, self.steps, 2), (batch, self.steps, 2, 2)
         if (mean.shape, cov.shape) != wanted:
             raise McaptrackError(
@@ -98,9 +98,9 @@ class CheckedPredictor:
             raise McaptrackError(f"{self.entry} gave covariances that are not symmetric with variances above 0")
         return Forecast(mean, cov)
 
-    def _numbers(self, given: Any) -> Floats:
+    def _numbers(self, values: Any) -> Floats:
         with blamed(self.entry, "gave what can't be read as numbers", self.guard):
-            array = np.asarray(given)
+            array = np.asarray(values)
             if array.dtype.kind not in "fiu":
                 raise TypeError(f"an array of {array.dtype}")
             return array.astype(np.float64)

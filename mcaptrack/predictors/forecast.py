@@ -62,7 +62,7 @@ class PeopleSeen(NamedTuple):
         return cls(xy_m, valid, each, each)
 
     def copied(self) -> PeopleSeen:
-        """The same in arrays of their own."""
+        """A copy in arrays of its own."""
         return PeopleSeen(self.xy_m.copy(), self.valid.copy(), self.moment.copy(), self.row.copy())
 
 

@@ -33,10 +33,10 @@ MIN_SCALE, MAX_SCALE = 0.7, 2.0
 TAIL_FACTOR: Final = 1.5
 
 
-def _cv_weights(known: int, times: Floats, ahead: Floats) -> Floats:
+def _cv_weights(count: int, times: Floats, ahead: Floats) -> Floats:
     """Extrapolate the mean velocity of the last three steps."""
-    back = min(3, known - 1)
-    weights = np.zeros((len(ahead), known))
+    back = min(3, count - 1)
+    weights = np.zeros((len(ahead), count))
     weights[:, -1] = 1.0
     if back:
         speed = ahead / (times[-1] - times[-1 - back])
@@ -45,35 +45,35 @@ def _cv_weights(known: int, times: Floats, ahead: Floats) -> Floats:
     return weights
 
 
-def _holt_weights(known: int, times: Floats, ahead: Floats) -> Floats:
+def _holt_weights(count: int, times: Floats, ahead: Floats) -> Floats:
     """Extrapolate the smoothed velocity (alpha = beta = 0.5, as in the paper)."""
-    weights = np.zeros((len(ahead), known))
+    weights = np.zeros((len(ahead), count))
     weights[:, -1] = 1.0
-    if known > 1:
+    if count > 1:
         holt = Holt(0.5, 0.5)
-        displacement = np.diff(np.eye(known), axis=0)  # each as weights on the positions
+        displacement = np.diff(np.eye(count), axis=0)  # each as weights on the positions
         level, trend = holt.start(displacement[0])
-        for one in displacement[1:]:
-            level, trend = holt.step(level, trend, one)
+        for step in displacement[1:]:
+            level, trend = holt.step(level, trend, step)
         weights += np.outer(ahead / (times[1] - times[0]), level)
     return weights
 
 
-def _kalman_weights(known: int, times: Floats, ahead: Floats) -> Floats:
+def _kalman_weights(count: int, times: Floats, ahead: Floats) -> Floats:
     """A Kalman filter with the motion model of ``linear_variance``: the weights with the least error."""
-    return _kalman(known, times, ahead)[0]
+    return _kalman(count, times, ahead)[0]
 
 
-def _kalman(known: int, times: Floats, ahead: Floats) -> tuple[Floats, Floats]:
+def _kalman(count: int, times: Floats, ahead: Floats) -> tuple[Floats, Floats]:
     """Weights (T, n) of the filter's forecasts, and (n - 1, n) of its normalised innovations: each of variance 1."""
-    innovations = np.zeros((known - 1, known))
-    step = float(times[1] - times[0]) if known > 1 else 0.0
+    innovations = np.zeros((count - 1, count))
+    step = float(times[1] - times[0]) if count > 1 else 0.0
     move = np.array([[1.0, step], [0.0, 1.0]])
     noise = DRIFT_M2_PER_S3 * np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
     cov = np.diag([POSITION_NOISE_M**2, SPEED_M_PER_S**2])
-    state = np.zeros((2, known))  # position and velocity, each as weights on the positions
+    state = np.zeros((2, count))  # position and velocity, each as weights on the positions
     state[0, 0] = 1.0
-    for at in range(1, known):
+    for at in range(1, count):
         state, cov = move @ state, move @ cov @ move.T + noise
         gain = cov[:, 0] / (cov[0, 0] + POSITION_NOISE_M**2)
         innovation = -state[0]
@@ -152,20 +152,20 @@ class LinearPredictor:
         ahead: Floats = self.step_s * np.arange(1.0, self.steps + 1)
         weights = np.zeros((self.past + 1, self.steps, self.past))
         variance = np.zeros((self.past + 1, self.steps))
-        for known in range(1, self.past + 1):
-            times: Floats = self.step_s * np.arange(float(known))
-            row_weights = _WEIGHTS[self.name](known, times, ahead)
-            weights[known, :, self.past - known :] = row_weights
-            variance[known] = linear_variance(row_weights, times, ahead)
+        for count in range(1, self.past + 1):
+            times: Floats = self.step_s * np.arange(float(count))
+            row_weights = _WEIGHTS[self.name](count, times, ahead)
+            weights[count, :, self.past - count :] = row_weights
+            variance[count] = linear_variance(row_weights, times, ahead)
         return weights, variance
 
     @cached_property
     def _innovations(self) -> Floats:
         """Weights (8 + 1, 7, 8) of normalised innovations, right-aligned, by the number of known positions."""
         weights = np.zeros((_SCALE_PAST + 1, _SCALE_PAST - 1, _SCALE_PAST))
-        for known in range(2, _SCALE_PAST + 1):
-            times: Floats = self.step_s * np.arange(float(known))
-            weights[known, : known - 1, _SCALE_PAST - known :] = _kalman(known, times, np.empty(0))[1]
+        for count in range(2, _SCALE_PAST + 1):
+            times: Floats = self.step_s * np.arange(float(count))
+            weights[count, : count - 1, _SCALE_PAST - count :] = _kalman(count, times, np.empty(0))[1]
         return weights
 
     def predict(self, xy_m: Floats, valid: NDArray[np.bool_]) -> Forecast:
@@ -174,19 +174,19 @@ class LinearPredictor:
         Gaps are interpolated linearly; L' may be longer or shorter than ``past``. The mean uses ``past`` positions, its
         uncertainty 8.
         """
-        filled, known = fill_gaps(xy_m[:, -_SCALE_PAST:], valid[:, -_SCALE_PAST:])
+        filled, count = fill_gaps(xy_m[:, -_SCALE_PAST:], valid[:, -_SCALE_PAST:])
         now = filled[:, -1:]
         filled = filled - now
-        counted = np.minimum(known, self.past)
+        counted = np.minimum(count, self.past)
         weights, variance = self.table
         recent = filled[:, -self.past :]
         mean = now + weights[counted][:, :, self.past - recent.shape[1] :] @ recent
-        scale = self._scale(filled, known, valid[:, -_SCALE_PAST:])
+        scale = self._scale(filled, count, valid[:, -_SCALE_PAST:])
         return Forecast(mean, (variance[counted] * scale[:, None])[:, :, None, None] * np.eye(2))
 
-    def _scale(self, filled: Floats, known: NDArray[np.int64], valid: NDArray[np.bool_]) -> Floats:
+    def _scale(self, filled: Floats, counts: NDArray[np.int64], valid: NDArray[np.bool_]) -> Floats:
         """The scale of the variance of each track (B,): its mean squared innovation so far, shrunk towards 1."""
-        innovations = self._innovations[known][:, :, _SCALE_PAST - filled.shape[1] :] @ filled
+        innovations = self._innovations[counts][:, :, _SCALE_PAST - filled.shape[1] :] @ filled
         count = 2 * (valid.sum(axis=1) - 1)  # along both axes, of positions that are not interpolated
         scale = (PRIOR_COUNT + (innovations**2).sum(axis=(1, 2))) / (PRIOR_COUNT + count)
-        return np.where(known > 1, TAIL_FACTOR * np.clip(scale, MIN_SCALE, MAX_SCALE), 1.0)
+        return np.where(counts > 1, TAIL_FACTOR * np.clip(scale, MIN_SCALE, MAX_SCALE), 1.0)

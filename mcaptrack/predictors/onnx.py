@@ -87,8 +87,8 @@ class Onnx:
         return LinearPredictor("kalman", self.steps, self.step_s)
 
     def _run(self, xy_m: Floats, valid: Bools) -> list[Floats]:
-        given = (xy_m.astype(np.float32), valid)
-        inputs = {name: values for (name, _, _), values in zip(self.network.facts["inputs"], given, strict=False)}
+        arrays = (xy_m.astype(np.float32), valid)
+        inputs = {name: values for (name, _, _), values in zip(self.network.facts["inputs"], arrays, strict=False)}
         try:
             outputs = self.network.run(inputs)[:2]
         except BaseException:  # it may have ended: the next who wants it opens it again
@@ -118,10 +118,10 @@ class Onnx:
         """Positions (B, L', 2), of which ``valid`` (B, L') are known, the last one always -> forecasts."""
         if len(valid) == 0:
             return Forecast(np.empty((0, self.steps, 2)), np.empty((0, self.steps, 2, 2)))
-        padded, known = last_positions(xy_m, valid, self.past)
-        filled, _ = fill_gaps(padded, known)
+        padded, is_known = last_positions(xy_m, valid, self.past)
+        filled, _ = fill_gaps(padded, is_known)
         now = filled[:, -1:]
-        outputs = self._run(filled - now, known)
+        outputs = self._run(filled - now, is_known)
         cov = outputs[1] if len(outputs) > 1 else self._covariance_model.predict(xy_m, valid).cov
         return Forecast(now + outputs[0], cov)
 

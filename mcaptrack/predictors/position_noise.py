@@ -36,7 +36,7 @@ _MEMORY_S, _LEAST_POSITIONS = 60.0, 30
 _LOWEST, _HIGHEST, _BINS = -8, 6, 16
 #: Positions of a past, the current one included, that show bends.
 PAST: Final = 1 + 2 * _LAGS[-1]
-#: Which of the three parts there may be, but for none.
+#: All choices of the three parts, the empty one first.
 _CHOICES: Final = np.array([[bool(number & 1 << part) for part in range(3)] for number in range(8)])
 #: What is added to the equations of each choice: those of other columns are 0, and some columns are almost alike.
 _ALONE: Final = np.stack([np.diag(np.where(choice, 1e-12, 1.0)) for choice in _CHOICES])
@@ -59,7 +59,7 @@ class NoiseOfErrors(NamedTuple):
 
 
 def running(before: Floats, kept: Floats, new: NDArray[Any]) -> tuple[Floats, Floats]:
-    """The sums (R, ...) at some times, and the last of them.
+    """Decaying sums (R, ...) at some times, and the last of them.
 
     At each time ``kept`` (R, ...) of the sum before, which has the shape (...), is left, and ``new`` (R, ...) is added.
 
@@ -69,8 +69,8 @@ def running(before: Floats, kept: Floats, new: NDArray[Any]) -> tuple[Floats, Fl
     [[5.0], [2.5]]
     """
     out = np.empty(new.shape)
-    for number, (left, one) in enumerate(zip(kept, new, strict=True)):
-        before = left * before + one
+    for number, (left, added) in enumerate(zip(kept, new, strict=True)):
+        before = left * before + added
         out[number] = before
     return out, out[-1].copy() if len(out) else before
 

@@ -60,10 +60,10 @@ def prepare(xy_m: Floats, valid: Bools, base_weights: Floats, base_spread: Float
     """
     xy_m, valid = last_positions(xy_m, valid, PAST)
     batch = len(valid)
-    filled, known = fill_gaps(xy_m, valid)
+    filled, count = fill_gaps(xy_m, valid)
     now = filled[:, -1:]
     relative = filled - now
-    ahead = base_weights[known] @ relative
+    ahead = base_weights[count] @ relative
     east, north = ahead[:, -1, 0] + _TINY_M, ahead[:, -1, 1]  # a forecast of length 0 points east
     far = np.hypot(east, north)
     turn = np.empty((batch, 2, 2))
@@ -80,8 +80,8 @@ def prepare(xy_m: Floats, valid: Bools, base_weights: Floats, base_spread: Float
     inputs = np.empty((batch, pairs, FEATURES))
     inputs[:, :, :-1] = features.reshape(batch, pairs, FEATURES - 1)
     inputs[:, :, -1] = (far / 5)[:, None]
-    started = np.arange(1, pairs + 1) * PAIR > (PAST - known)[:, None]
-    return Inputs(inputs, started, turn, now + ahead, base_spread[known], far / (far + _HALFWAY_M))
+    started = np.arange(1, pairs + 1) * PAIR > (PAST - count)[:, None]
+    return Inputs(inputs, started, turn, now + ahead, base_spread[count], far / (far + _HALFWAY_M))
 
 
 @dataclass(frozen=True)
@@ -124,22 +124,22 @@ class Red(Network):
         """The gated recurrent unit (Cho et al. 2014): (B, K, FEATURES) -> (B, H)."""
         into, bias, inside, bias_inside, *_ = self._layers
         batch, pairs, _ = features.shape
-        given = features.transpose(1, 0, 2).reshape(-1, FEATURES) @ into
-        given += bias
+        inputs = features.transpose(1, 0, 2).reshape(-1, FEATURES) @ into
+        inputs += bias
         hidden = len(bias_inside)
-        given = given.reshape(3, pairs, batch, hidden)
+        inputs = inputs.reshape(3, pairs, batch, hidden)
         state: Floats = np.zeros((batch, hidden))
         all_started: Bools = np.asarray(started.all(axis=0))
         for pair in range(pairs):
             old = state @ inside if pair else np.zeros((3, batch, hidden))
-            gates = given[:2, pair] + old[:2]
+            gates = inputs[:2, pair] + old[:2]
             np.tanh(gates, out=gates)
             gates += 1.0
             gates *= 0.5
             candidate = old[2]
             candidate += bias_inside
             candidate *= gates[0]
-            candidate += given[2, pair]
+            candidate += inputs[2, pair]
             np.tanh(candidate, out=candidate)
             new = state - candidate
             new *= gates[1]

@@ -96,11 +96,11 @@ def own_features(seen: Seen) -> Floats:
     return np.concatenate(out, axis=1)
 
 
-def pair_features(one: Seen, other: Seen, step_s: float) -> Floats:
+def pair_features(viewer: Seen, other: Seen, step_s: float) -> Floats:
     """Features of other people as seen by tracks, (P, PAIR_FEATURES), in the frames of reference of the tracks."""
-    faded = one.turn * one.gate[:, None, None]
-    now = other.xy_m[:, -1] - one.xy_m[:, -1]
-    mine, theirs = one.mean - one.xy_m[:, -1:], other.mean - other.xy_m[:, -1:]
+    faded = viewer.turn * viewer.gate[:, None, None]
+    now = other.xy_m[:, -1] - viewer.xy_m[:, -1]
+    mine, theirs = viewer.mean - viewer.xy_m[:, -1:], other.mean - other.xy_m[:, -1:]
     steps = mine.shape[1]
     distance = np.hypot(now[:, 0], now[:, 1])[:, None]
     side = _rotated(faded, now)
@@ -111,8 +111,8 @@ def pair_features(one: Seen, other: Seen, step_s: float) -> Floats:
         out += [_rotated(faded, faster), _length(faster)]
     out.append(_rotated(faded, theirs[:, -1]) / (step_s * steps))
     for back in _BACK:
-        both = one.valid[:, -1 - back] & other.valid[:, -1 - back]
-        before = np.where(both[:, None], other.xy_m[:, -1 - back] - one.xy_m[:, -1 - back], now)
+        both = viewer.valid[:, -1 - back] & other.valid[:, -1 - back]
+        before = np.where(both[:, None], other.xy_m[:, -1 - back] - viewer.xy_m[:, -1 - back], now)
         change = (now - before) / np.sqrt(step_s * back)
         out += [_rotated(faded, change), _length(change), both[:, None].astype(np.float64)]
     apart = now[:, None] + theirs - mine
@@ -188,10 +188,10 @@ class Social(Network):
         """The results of ``red`` for the pasts (M, L', 2) of people."""
         xy_m, valid = last_positions(xy_m, valid, PAST)
         *_, weights, spread = self._red._layers
-        given = prepare(xy_m, valid, weights, spread)
+        inputs = prepare(xy_m, valid, weights, spread)
         mean, cov = self._red.predict(xy_m, valid)
-        state = self._red._encode(given.features, given.started)
-        return Seen(xy_m, valid, mean, cov, given.turn, given.gate, given.spread, state)
+        state = self._red._encode(inputs.features, inputs.started)
+        return Seen(xy_m, valid, mean, cov, inputs.turn, inputs.gate, inputs.spread, state)
 
     def predict(self, xy_m: Floats, valid: Bools, people: PeopleSeen | None = None) -> Forecast:
         """Predict a batch of tracks among other people.
@@ -216,9 +216,9 @@ class Social(Network):
         everyone = self.see(people.xy_m, people.valid)
         track, other = pairs_of(people, everyone.xy_m[:, -1])
         tracks = everyone.chosen(people.row)
-        one, two = tracks.chosen(track), everyone.chosen(other)
+        viewer, two = tracks.chosen(track), everyone.chosen(other)
         ego = np.tanh(np.concatenate([own_features(tracks), tracks.state], axis=1) @ own + own_bias)
-        seen = np.tanh(pair_features(one, two, self.step_s) @ pair + pair_bias)
+        seen = np.tanh(pair_features(viewer, two, self.step_s) @ pair + pair_bias)
         seen = np.tanh(seen @ both + both_bias + (ego @ of_own)[track])
         score = seen @ attend + attend_bias  # for the pool, and for taking over displacements, early and late
         odds, of_alone = np.exp(score), np.exp(ego @ alone + alone_bias)
@@ -227,7 +227,7 @@ class Social(Network):
         total = _summed(seen / (1 + np.exp(-score[:, :1])), track, len(ego))
         late = np.linspace(0.0, 1.0, self.steps)
         taken = (1 - late) * share[:, 1:2] + late * share[:, 2:3]  # (P, T)
-        differ = (two.mean - two.xy_m[:, -1:]) - (one.mean - one.xy_m[:, -1:])
+        differ = (two.mean - two.xy_m[:, -1:]) - (viewer.mean - viewer.xy_m[:, -1:])
         mean = tracks.mean + _summed(taken[..., None] * differ, track, len(ego))
         hidden = np.tanh(np.concatenate([ego, pool, total], axis=1) @ dense + dense_bias)
         outputs = (hidden @ head + head_bias).reshape(len(ego), self.steps, OUTPUTS)

@@ -11,7 +11,7 @@ Letters: N forecasts, T future steps, L past positions, M comparisons, R fits, B
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -37,7 +37,7 @@ _ITERATIONS: Final = 3
 _LARGER, _ENOUGH = 1.8, 100.0
 
 
-class _Made(NamedTuple):
+class _Issued(NamedTuple):
     """Forecasts, in the order of time: their steps and ids (N,), whether tracks were observed then, and their pasts.
 
     ``cov`` (N, T, 2, 2) is before that of the mixture, ``fit`` (N,) the number of the fit that the mixture is of.
@@ -51,11 +51,11 @@ class _Made(NamedTuple):
     cov: Floats
     fit: Ints
 
-    def copied(self, which: slice) -> _Made:
-        """A part, without the larger arrays that it is of."""
+    def copied(self, which: slice) -> _Issued:
+        """A part in arrays of its own, so that the larger ones can be freed."""
         step, ids, is_seen, past, mean, cov, fit = self
         numbers = step[which].copy(), ids[which].copy(), is_seen[which].copy()
-        return _Made(*numbers, past[which].copy(), mean[which].copy(), cov[which].copy(), fit[which].copy())
+        return _Issued(*numbers, past[which].copy(), mean[which].copy(), cov[which].copy(), fit[which].copy())
 
 
 class _Compared(NamedTuple):
@@ -105,7 +105,7 @@ _MIDDLE, _OUTER = 0.5, 0.9
 # compared with where their tracks were observed then, and scale the distributions of the forecasts after them
 # (compare adaptive conformal inference: I. Gibbs and E. Candes, NeurIPS 2021; here the scales are shrunk towards
 # the table, so that few comparisons change little). What ellipses have held in the log so far corrects them
-# (``held_levels``), and the noise of positions is taken out of the comparisons (``position_noise``). Nothing is
+# (``correct``), and the noise of positions is taken out of the comparisons (``position_noise``). Nothing is
 # known that was not known at the time of a forecast.
 #
 # The means of forecasts, and the covariances by which tracks are associated, are those of the predictor.
@@ -158,14 +158,14 @@ class TailTable(NamedTuple):
 
 @lru_cache(maxsize=1)
 def _tables() -> Mapping[str, Any]:
-    found: Mapping[str, Any] = json.loads(TABLES.read_text(encoding="utf-8"))["predictors"]
-    return found
+    tables: Mapping[str, Any] = json.loads(TABLES.read_text(encoding="utf-8"))["predictors"]
+    return tables
 
 
 def table_of(name: str) -> TailTable | None:
     """The table of a predictor by name; None for those of other packages, and for networks with other weights."""
-    found = _tables().get(name)
-    return None if found is None else TailTable(**{key: np.array(found[key], np.float64) for key in TailTable._fields})
+    table = _tables().get(name)
+    return None if table is None else TailTable(**{key: np.array(table[key], np.float64) for key in TailTable._fields})
 
 
 def fit_mixture(counts: Floats, start: Tails, iterations: int) -> Tails:
@@ -176,9 +176,9 @@ def fit_mixture(counts: Floats, start: Tails, iterations: int) -> Tails:
     weight, narrow, wide = (part[:, None] for part in start)
     total = counts.sum(axis=1, keepdims=True)
     for _ in range(iterations):
-        one = (1 - weight) / narrow * np.exp(-_CENTRES / narrow)
+        of_narrow = (1 - weight) / narrow * np.exp(-_CENTRES / narrow)
         two = weight / wide * np.exp(-_CENTRES / wide)
-        of_wide = counts * two / np.maximum(one + two, 1e-300)
+        of_wide = counts * two / np.maximum(of_narrow + two, 1e-300)
         sums = of_wide.sum(axis=1, keepdims=True)
         wide = (of_wide @ _CENTRES)[:, None] / np.maximum(sums, 1e-9)
         narrow = ((counts - of_wide) @ _CENTRES)[:, None] / np.maximum(total - sums, 1e-9)
@@ -212,7 +212,7 @@ class Learned(NamedTuple):
         return np.maximum(_LEAST_MEASURED * self.least, 1e-6)
 
     def measured(self, tails: Tails) -> Tails:
-        """The distributions (T,) of distances from measured positions, of those from true ones."""
+        """Distributions (T,) of distances from measured positions, given those from true positions."""
         least = self.least_measured
         narrow, wide = (np.maximum(part + self.noise, least) for part in (tails.narrow_scale, tails.wide_scale))
         return Tails(tails.wide_weight, narrow, wide)
@@ -226,7 +226,7 @@ def follow(table: Tails, before: Tails, learned: Learned, iterations: int) -> Ta
     counts.
     """
     share, scale = np.stack([1 - before.wide_weight, before.wide_weight]), np.stack(before[1:])  # (2, T): narrow, wide
-    given, mean = np.stack(table[1:]), float(table.wide_weight.mean())
+    scales, mean = np.stack(table[1:]), float(table.wide_weight.mean())
     odds_of_table = 1 / table.wide_weight - 1
     trust, lost = np.array([[1.0], [_LARGE]]), np.zeros_like(scale)
     lost[1] = _LOST * learned.lost  # those that are lost have the size of the table
@@ -237,11 +237,11 @@ def follow(table: Tails, before: Tails, learned: Learned, iterations: int) -> Ta
         density = np.exp(-_CENTRES / seen[..., None]) * (share / seen)[..., None]
         of_wide = (learned.counts * (density[1] / np.maximum(density[0] + density[1], 1e-300))) @ _SUMS
         sums, total = np.stack([all_sums - of_wide, of_wide], axis=1).transpose(2, 1, 0)
-        change = np.log(np.maximum(total / np.maximum(sums, 1e-9) - learned.noise, least) / given) * (sums > 1e-6)
-        known, said = sums + lost, sums * change
-        shared = said.sum(axis=1, keepdims=True) / (trust * _TAILS_ALL_STEPS + known.sum(axis=1, keepdims=True))
-        scale = given * np.exp((trust * _ONE_STEP * shared + said) / (trust * _ONE_STEP + known))
-        many, few = known
+        change = np.log(np.maximum(total / np.maximum(sums, 1e-9) - learned.noise, least) / scales) * (sums > 1e-6)
+        mass, said = sums + lost, sums * change
+        shared = said.sum(axis=1, keepdims=True) / (trust * _TAILS_ALL_STEPS + mass.sum(axis=1, keepdims=True))
+        scale = scales * np.exp((trust * _ONE_STEP * shared + said) / (trust * _ONE_STEP + mass))
+        many, few = mass
         odds = (_WEIGHT * mean + few.sum()) / (_WEIGHT * (1 - mean) + many.sum()) * ((1 - mean) / mean)
         share[1] = (_WEIGHT / (1 + odds_of_table / odds) + few) / (_WEIGHT + few + many)
         share[1] = np.minimum(np.maximum(share[1], _LEAST_WIDE), _TAILS_MOST_WIDE)
@@ -313,11 +313,11 @@ class TailCalibration:
         self._steps, self._step_s, self._past = predictor.steps, predictor.step_s, predictor.past
         self._independent = _INDEPENDENT_PER_S * self._step_s
         self._table, self._adapts = table.at(self._step_s * np.arange(1.0, self._steps + 1)), adapts
-        self._given = Tails(self._table.wide_weight, self._table.narrow_scale, self._table.wide_scale)
+        self._of_table = Tails(self._table.wide_weight, self._table.narrow_scale, self._table.wide_scale)
         # the mixtures (3, T) of the fits that forecasts have, before and after they are corrected by levels
-        self._fitted, self._tails = (np.array([self._given]) for _ in range(2))
+        self._fitted, self._tails = (np.array([self._of_table]) for _ in range(2))
         self._dropped = 0  # fits before those
-        self._made: list[_Made] = []  # forecasts that are not compared with all times that they are of
+        self._issued: list[_Issued] = []  # forecasts that are not compared with all times that they are of
         self._first: int | None = None
         self._fitted_at = 0
         self._counts, self._levels = np.zeros((self._steps, BINS)), np.zeros((self._steps, LEVELS))
@@ -334,7 +334,7 @@ class TailCalibration:
     @property
     def factor(self) -> float:
         """The size of the 50 % ellipses beside those of the table, as a ratio of lengths."""
-        radii = squared_radius(0.5, Tails(*self._tails[-1])) / squared_radius(0.5, self._given)
+        radii = squared_radius(0.5, Tails(*self._tails[-1])) / squared_radius(0.5, self._of_table)
         return float(np.sqrt(np.median(radii)))
 
     def warn(self, name: str) -> None:
@@ -377,8 +377,8 @@ class TailCalibration:
         Forecast, Tails
             With the covariances of the mixtures, and their shapes (N, T).
         """
-        known = np.isfinite(past[:, -self._past :, 0]).sum(axis=1)
-        factor = np.where((known < self._past)[:, None], self._table.short, 1.0)
+        count = np.isfinite(past[:, -self._past :, 0]).sum(axis=1)
+        factor = np.where((count < self._past)[:, None], self._table.short, 1.0)
         factor = np.where(is_coasting[:, None], self._table.coasting, factor)
         cov = forecast.cov * factor[:, :, None, None]
         fit = np.full(len(ids), self._dropped + len(self._fitted) - 1)
@@ -386,7 +386,7 @@ class TailCalibration:
             refits = self._refits(step[~is_coasting])
             fit += np.searchsorted(refits, step, "right")
             seen = (past if observed is None else observed)[:, -PAST:]
-            self._made.append(_Made(step, ids, ~is_coasting, seen, forecast.mean, cov, fit))
+            self._issued.append(_Issued(step, ids, ~is_coasting, seen, forecast.mean, cov, fit))
             if len(refits):
                 self._learn(refits)
         weight, narrow, wide = self._tails[fit - self._dropped].transpose(1, 0, 2)
@@ -410,32 +410,32 @@ class TailCalibration:
 
     def _learn(self, refits: Ints) -> None:
         """Fit mixtures again at some steps (R,), each by what became known since the fit before."""
-        made = _Made(*_joined(self._made))
-        found, lost = self._compare(made, refits)
+        issued = _Issued(*(np.concatenate(parts) for parts in zip(*self._issued, strict=True)))
+        compared, lost = self._compare(issued, refits)
         passed = np.diff(refits, prepend=self._fitted_at)
         kept = np.exp(-passed * self._step_s / _MEMORY_S)
-        place, shape = np.searchsorted(refits, found.step), (len(refits), self._steps)
-        cell, cells = place * self._steps + found.ahead, len(refits) * self._steps
-        new = counts_of(cell, found.half, cells).reshape(*shape, BINS)
+        place, shape = np.searchsorted(refits, compared.step), (len(refits), self._steps)
+        cell, cells = place * self._steps + compared.ahead, len(refits) * self._steps
+        new = counts_of(cell, compared.half, cells).reshape(*shape, BINS)
         counts, self._counts = running(self._counts, kept, new)
-        inverse_m2 = np.bincount(cell, 1 / found.size_m2, cells).reshape(shape)
+        inverse_m2 = np.bincount(cell, 1 / compared.size_m2, cells).reshape(shape)
         parts, self._sums = running(self._sums, kept, np.stack([lost, new.sum(axis=2), inverse_m2], axis=1))
         lost, seen, inverse_m2 = parts.transpose(1, 0, 2)
 
-        here = made.is_seen & (made.step > self._fitted_at) & (made.step <= refits[-1])
-        noise = self._noise.follow(passed, np.searchsorted(refits, made.step[here]), made.past[here], self._steps)
+        here = issued.is_seen & (issued.step > self._fitted_at) & (issued.step <= refits[-1])
+        noise = self._noise.follow(passed, np.searchsorted(refits, issued.step[here]), issued.past[here], self._steps)
         per_m2 = inverse_m2 / np.maximum(seen, 1e-9)
         learned = Learned(self._independent * counts, self._independent * lost, *(per_m2 * part for part in noise))
         fits = [self._fitted[-1]]
-        for one in map(Learned, *learned):
-            fits.append(np.array(follow(self._given, Tails(*fits[-1]), one, _ITERATIONS)))
+        for step in map(Learned, *learned):
+            fits.append(np.array(follow(self._of_table, Tails(*fits[-1]), step, _ITERATIONS)))
         self._fitted = np.concatenate([self._fitted, fits[1:]])
 
         # levels of ellipses that were much smaller or larger say little about those of now
-        change = np.abs(np.diff(np.log([one[1] for one in fits]), axis=0))
-        at = Learned(*(part[place, found.ahead] for part in learned))
-        of = at.measured(Tails(*self._fitted[found.fit - self._dropped, :, found.ahead].T))
-        levels = level_counts(cell, found.half, of, cells).reshape(*shape, LEVELS)
+        change = np.abs(np.diff(np.log([fit[1] for fit in fits]), axis=0))
+        at = Learned(*(part[place, compared.ahead] for part in learned))
+        of = at.measured(Tails(*self._fitted[compared.fit - self._dropped, :, compared.ahead].T))
+        levels = level_counts(cell, compared.half, of, cells).reshape(*shape, LEVELS)
         forgotten = kept[:, None, None] * np.exp(-change)[..., None]
         levels, self._levels = running(self._levels, forgotten, levels * forgotten)
         weight, narrow, wide = correct(Tails(*np.stack(fits[1:], axis=1)), self._independent * levels)
@@ -443,43 +443,39 @@ class TailCalibration:
         self._tails = np.concatenate([self._tails, np.stack([weight, narrow, np.maximum(wide, narrow)], axis=1)])
 
         self._fitted_at = int(refits[-1])
-        left = int(np.searchsorted(made.step, self._fitted_at - self._steps, "right"))
-        self._made = [made.copied(slice(left, None))]
+        left = int(np.searchsorted(issued.step, self._fitted_at - self._steps, "right"))
+        self._issued = [issued.copied(slice(left, None))]
 
-    def _compare(self, made: _Made, refits: Ints) -> tuple[_Compared, Floats]:
+    def _compare(self, issued: _Issued, refits: Ints) -> tuple[_Compared, Floats]:
         """Compare forecasts with where their tracks are observed after the last fit, up to the last of ``refits``.
 
         Returns also the number (R, T) of forecasts of tracks that are not observed when others are.
         """
-        now = np.flatnonzero(made.is_seen & (made.step > self._fitted_at) & (made.step <= refits[-1]))
-        _, slot = np.unique(made.ids, return_inverse=True)
-        first = int(made.step[0]) - self._steps
-        key = slot * (int(made.step[-1]) - first + 1) + (made.step - first)
+        now = np.flatnonzero(issued.is_seen & (issued.step > self._fitted_at) & (issued.step <= refits[-1]))
+        _, slot = np.unique(issued.ids, return_inverse=True)
+        first = int(issued.step[0]) - self._steps
+        key = slot * (int(issued.step[-1]) - first + 1) + (issued.step - first)
         order = np.argsort(key, kind="stable")
         have, wanted = key[order], key[now, None] - np.arange(1, self._steps + 1)
         at = np.minimum(np.searchsorted(have, wanted), len(have) - 1)
         row, ahead = np.nonzero(have[at] == wanted)
         source, row = order[at[row, ahead]], now[row]
-        times = np.unique(made.step[now])
+        times = np.unique(issued.step[now])
         of = times[:, None] - np.arange(1, self._steps + 1)
-        due = np.searchsorted(made.step, of, "right") - np.searchsorted(made.step, of)
-        seen = np.bincount(np.searchsorted(times, made.step[row]) * self._steps + ahead, minlength=due.size)
+        due = np.searchsorted(issued.step, of, "right") - np.searchsorted(issued.step, of)
+        seen = np.bincount(np.searchsorted(times, issued.step[row]) * self._steps + ahead, minlength=due.size)
         lost = np.zeros((len(refits), self._steps))
         np.add.at(lost, np.searchsorted(refits, times), np.maximum(due - seen.reshape(due.shape), 0))
-        off, cov = made.past[row, -1] - made.mean[source, ahead], made.cov[source, ahead]
+        off, cov = issued.past[row, -1] - issued.mean[source, ahead], issued.cov[source, ahead]
         with np.errstate(invalid="ignore", divide="ignore"):
             half = mahalanobis_squared(off, cov) / 2
             size_m2 = np.sqrt(cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] ** 2)
-        return _Compared(made.step[row], ahead, made.fit[source], half, size_m2).chosen(np.isfinite(half)), lost
+        return _Compared(issued.step[row], ahead, issued.fit[source], half, size_m2).chosen(np.isfinite(half)), lost
 
     def _drop_fits(self) -> None:
         """Drop the fits that no forecast has any more."""
-        fits = [int(one.fit[0]) for one in self._made if len(one.fit)]
+        fits = [int(forecasts.fit[0]) for forecasts in self._issued if len(forecasts.fit)]
         count = min([*fits, self._dropped + len(self._fitted) - 1]) - self._dropped
         if count:
             self._fitted, self._tails = self._fitted[count:].copy(), self._tails[count:].copy()
             self._dropped += count
-
-
-def _joined(made: Sequence[_Made]) -> tuple[Any, ...]:
-    return tuple(np.concatenate(parts) for parts in zip(*made, strict=True))

@@ -87,5 +87,5 @@ def _at(table: Mapping[str, Sequence[float]], ahead_s: Floats) -> tuple[Floats, 
 
 @lru_cache(maxsize=1)
 def _tables() -> Mapping[str, Any]:
-    found: Mapping[str, Any] = json.loads(TABLES.read_text(encoding="utf-8"))["predictors"]
-    return found
+    tables: Mapping[str, Any] = json.loads(TABLES.read_text(encoding="utf-8"))["predictors"]
+    return tables

@@ -31,15 +31,15 @@ class Weights:
 
     def get(self, name: str, *shape: int | None) -> Floats:
         """One array, of the given shape (None for any size). Raises McaptrackError if it is missing or different."""
-        found = self.tensors.get(name)
-        if found is None:
+        array = self.tensors.get(name)
+        if array is None:
             raise McaptrackError(f"{self.path} has no {name}; it has {', '.join(sorted(self.tensors)) or 'nothing'}")
-        fits = len(shape) == found.ndim and all(a in (None, b) for a, b in zip(shape, found.shape, strict=True))
-        if not fits or not np.isfinite(found).all():
+        fits = len(shape) == array.ndim and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
+        if not fits or not np.isfinite(array).all():
             wanted = "x".join("n" if size is None else str(size) for size in shape)
-            has = "x".join(map(str, found.shape)) if not fits else "numbers that are not finite"
+            has = "x".join(map(str, array.shape)) if not fits else "numbers that are not finite"
             raise McaptrackError(f"{self.path}: {name} has to be {wanted}, not {has}")
-        return found
+        return array
 
     def clock(self, network: str) -> tuple[int, float]:
         """Number of steps and their length in seconds. Raises McaptrackError if the weights are of another network."""
@@ -65,9 +65,9 @@ class Network:
     @classmethod
     def of(cls, weights: Weights) -> Self:
         """Make the network. Raises McaptrackError if the weights are not of this network."""
-        made = cls(weights)
-        _ = made.steps, made._layers
-        return made
+        network = cls(weights)
+        _ = network.steps, network._layers
+        return network
 
     @property
     def _layers(self) -> tuple[Floats, ...]:

@@ -126,12 +126,12 @@ class Schema:
         import pyarrow as pa
 
         def field(column: Column) -> pa.Field:
-            words = {"unit": column.unit, "description": column.doc}
+            facts = {"unit": column.unit, "description": column.doc}
             return pa.field(
                 column.name,
                 pa.from_numpy_dtype(self.dtype[column.name]),
                 nullable=column.is_nullable,
-                metadata={key: value for key, value in words.items() if value},
+                metadata={key: value for key, value in facts.items() if value},
             )
 
         return pa.schema([field(column) for column in self.columns])
@@ -170,17 +170,17 @@ class Schema:
         >>> DETECTIONS.rows(x_px=[1], y_px=[2], w_px=[3], h_px=[4], score=[0.5], class_id=[1])["w_px"].tolist()
         [3.0]
         """
-        known = {column.name: column for column in self.columns}
+        by_name = {column.name: column for column in self.columns}
         for name in columns:
-            if name not in known:
-                raise ValueError(f"{self.name} has no column {name}; it has {', '.join(known)}")
+            if name not in by_name:
+                raise ValueError(f"{self.name} has no column {name}; it has {', '.join(by_name)}")
         arrays = {name: np.asarray(values) for name, values in columns.items()}
         lengths = {name: array.shape for name, array in arrays.items()}
         if len(set(lengths.values())) > 1 or any(len(shape) != 1 for shape in lengths.values()):
             raise ValueError(f"{self.name} needs columns of one length, not {lengths}")
         count = len(next(iter(arrays.values()))) if arrays else 0
         out = self.empty(count)
-        for name, column in known.items():
+        for name, column in by_name.items():
             if name in arrays:
                 self._check_column(column, arrays[name])
                 out[name] = arrays[name]

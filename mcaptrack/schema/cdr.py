@@ -76,8 +76,8 @@ def ros_name(name: str) -> str:
 
 def schema_of_ros(name: str) -> str:
     """The name of the row schema that a ROS message would have; "" if its package can't be one of row schemas."""
-    found = _NAME.fullmatch(name)
-    return "{}.{}".format(*found.groups()) if found else ""
+    match = _NAME.fullmatch(name)
+    return "{}.{}".format(*match.groups()) if match else ""
 
 
 def is_ros_topic(topic: str) -> bool:
@@ -115,17 +115,17 @@ def read_definition(text: bytes, definition: Definition) -> list[RosField]:
     if len(outer) != 1 or outer[0].name != "rows" or not outer[0].kind.endswith("[]"):
         raise ValueError("its definition has not one field, rows")
     row = outer[0].kind.removesuffix("[]")
-    found = None
+    fields = None
     for section in others:
         name, _, body = section.strip().partition("\n")
         if name.startswith("MSG:") and _plain(name.removeprefix("MSG:").strip()) == _plain(row):
-            found = _fields_in(body)
-    if not found:
+            fields = _fields_in(body)
+    if not fields:
         raise ValueError(f"its definition does not say what {row} is")
-    kinds = {field.name: field.kind for field in found}
-    if len(kinds) < len(found):
+    kinds = {field.name: field.kind for field in fields}
+    if len(kinds) < len(fields):
         raise ValueError(f"its definition of {row} has two fields of one name")
-    odd = next((field for field in found if field.kind not in _FORMATS), None)
+    odd = next((field for field in fields if field.kind not in _FORMATS), None)
     if odd:
         raise ValueError(f"its definition of {row} has {odd.kind} {odd.name}; rows have numbers only")
     for column in definition.columns:
@@ -134,20 +134,20 @@ def read_definition(text: bytes, definition: Definition) -> list[RosField]:
             raise ValueError(f"its definition of {row} lacks {column.name}")
         if kind not in (None, _TYPES[column.kind]):
             raise ValueError(f"its definition of {row} has {kind} {column.name}, not {_TYPES[column.kind]}")
-    return found
+    return fields
 
 
 def _fields_in(section: str) -> list[RosField]:
     """The fields in a section of a definition, without comments and constants. Raises ValueError for other lines."""
     out = []
     for line in section.splitlines():
-        words = line.partition("#")[0].strip()
-        if not words or _CONSTANT.fullmatch(words):
+        text = line.partition("#")[0].strip()
+        if not text or _CONSTANT.fullmatch(text):
             continue
-        found = _FIELD.fullmatch(words)
-        if not found:
-            raise ValueError(f"its definition has the line {words[:80]!r}")
-        out.append(RosField(found[2], found[1]))
+        match = _FIELD.fullmatch(text)
+        if not match:
+            raise ValueError(f"its definition has the line {text[:80]!r}")
+        out.append(RosField(match[2], match[1]))
     return out
 
 
@@ -206,7 +206,9 @@ class CdrCodec:
         starts = np.append(0, ends[:-1])[: len(ends)]
         decoded = self.decode_at(np.frombuffer(b"".join(payloads), np.uint8), starts, ends)
         if decoded is None:
-            fits = [self.decode_at(np.frombuffer(one, np.uint8), *_whole(one)) is not None for one in payloads]
+            fits = [
+                self.decode_at(np.frombuffer(payload, np.uint8), *_whole(payload)) is not None for payload in payloads
+            ]
             bad = payloads[fits.index(False)]
             raise ValueError(f"{len(bad)} bytes are not a CDR message of its definition")
         return decoded

@@ -35,11 +35,11 @@ def class_names(metadata: Mapping[str, str]) -> dict[int, str]:
 
     Numbers that no row can have, and names that are empty, are left out.
     """
-    found = {PERSON: "person"}
+    names = {PERSON: "person"}
     for number, name in read_texts(metadata.get(_NAMES, "")).items():
         if _is_number(number) and name.strip():
-            found[int(number)] = name.encode("utf-8", "backslashreplace").decode()
-    return found
+            names[int(number)] = name.encode("utf-8", "backslashreplace").decode()
+    return names
 
 
 def class_name(number: int, names: Mapping[int, str]) -> str:

@@ -160,7 +160,7 @@ class RowCodec:
         None if one has another layout than this codec's.
         """
         length = end - start
-        counts, found = np.zeros(len(length), np.int64), []
+        counts, parts = np.zeros(len(length), np.int64), []
         for layout in self._layouts:
             mine = layout.begins(raw, start, length)
             if mine.any():
@@ -168,13 +168,13 @@ class RowCodec:
                 block = layout.rows_at(raw, start[mine], counts[mine])
                 if block is None:
                     return None
-                found.append((mine, self._widened(layout, block)))
+                parts.append((mine, self._widened(layout, block)))
         if ((length > 0) & (counts == 0)).any():
             return None
-        if len(found) == 1:
-            return found[0][1], counts
+        if len(parts) == 1:
+            return parts[0][1], counts
         out, first = np.empty((int(counts.sum()), self.dtype.itemsize), np.uint8), np.cumsum(counts) - counts
-        for mine, rows in found:
+        for mine, rows in parts:
             out[ragged_range(first[mine], counts[mine])] = self._bytes(rows)
         return out.view(self.dtype)[:, 0], counts
 
@@ -222,15 +222,15 @@ class RowCodec:
             message.ParseFromString(payload)
         except DecodeError as error:
             raise ValueError(f"{len(payload)} bytes are not a {self._definition.name} message: {error}") from None
-        found: Iterable[Message] = message.rows  # type: ignore[attr-defined]  # a class made at run time
-        rows = np.zeros(len(list(found)), self.dtype)
+        messages: Iterable[Message] = message.rows  # type: ignore[attr-defined]  # a class made at run time
+        rows = np.zeros(len(list(messages)), self.dtype)
         for column in self._definition.columns:
             if column.optional:
                 rows[column.name] = [
-                    getattr(r, column.name) if r.HasField(column.name) else column.missing for r in found
+                    getattr(r, column.name) if r.HasField(column.name) else column.missing for r in messages
                 ]
             else:
-                rows[column.name] = [getattr(r, column.name) for r in found]
+                rows[column.name] = [getattr(r, column.name) for r in messages]
         rows.flags.writeable = False
         return rows
 

@@ -53,6 +53,6 @@ def _lens_to_columns(lens: Lens) -> dict[str, float]:
 def _columns_to_lens(row: np.void) -> Lens:
     is_fisheye = bool(np.isnan(row["p1"]))
     bent = [float(row[name]) for name in (_FISHEYE if is_fisheye else _POLYNOMIAL)]
-    known = tuple(value for value in bent if np.isfinite(value))
+    coefficients = tuple(value for value in bent if np.isfinite(value))
     focal, centre = ((float(row[f"{name}x_px"]), float(row[f"{name}y_px"])) for name in "fc")
-    return Lens(focal, centre, known if any(known) else (), is_fisheye and any(known))
+    return Lens(focal, centre, coefficients if any(coefficients) else (), is_fisheye and any(coefficients))

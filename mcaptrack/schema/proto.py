@@ -146,8 +146,8 @@ def parse(text: str, origin: str) -> Definition:
             optional, kind, name, tag = field.groups()
             if optional and kind not in _MISSING:
                 raise ValueError(f"{origin}:{number}: only {', '.join(_MISSING)} can be optional, not {kind} {name}")
-            words = comment.group(1).strip() if comment else ""
-            columns.append(Column(name, kind, int(tag), bool(optional), words, since, group))
+            description = comment.group(1).strip() if comment else ""
+            columns.append(Column(name, kind, int(tag), bool(optional), description, since, group))
         else:
             raise ValueError(f"{origin}:{number}: not a row schema (fixed-width fields in message Row): {line}")
     numbers = [column.number for column in columns]

@@ -87,7 +87,7 @@ class Provenance:
             "output": self.output,
             "weights_sha256": self.weights_sha256,
             "references": json.dumps(dict(self.references), sort_keys=True, separators=(",", ":")),
-            "plugins": json.dumps({key: one._asdict() for key, one in self.plugins.items()}, sort_keys=True),
+            "plugins": json.dumps({key: plugin._asdict() for key, plugin in self.plugins.items()}, sort_keys=True),
             "classes": json.dumps(dict(self.classes), ensure_ascii=False),
             "class_id": self.class_id,
             "frame_id": self.frame_id,
@@ -111,11 +111,11 @@ class Provenance:
         names = ("classes", "zones", "model", "continued")
         classes, zones, model, continued = (read_texts(values.pop(key, "")) for key in names)
         plugins = _plugins(values)
-        warnings = [one for one in _read(values.pop("warnings", ""), list) if _is_warning(one)]
-        known: dict[str, Any] = {key: value for key, value in values.items() if key in cls.__dataclass_fields__}
-        known |= {"references": references, "warnings": warnings, "plugins": plugins, "classes": classes}
-        known |= {"zones": zones, "continued": continued}
-        return cls(parameters=parameters, model=model, **known)
+        warnings = [warning for warning in _read(values.pop("warnings", ""), list) if _is_warning(warning)]
+        fields: dict[str, Any] = {key: value for key, value in values.items() if key in cls.__dataclass_fields__}
+        fields |= {"references": references, "warnings": warnings, "plugins": plugins, "classes": classes}
+        fields |= {"zones": zones, "continued": continued}
+        return cls(parameters=parameters, model=model, **fields)
 
 
 def input_of(metadata: Mapping[str, str]) -> str:
@@ -150,11 +150,11 @@ def _is_warning(value: object) -> bool:
 
 def _plugins(values: dict[str, str]) -> dict[str, Plugin]:
     """Take the classes of other packages out of the metadata ``values``."""
-    found = _read(values.pop("plugins", ""), dict)
+    plugins = _read(values.pop("plugins", ""), dict)
     return {
-        key: Plugin(**{name: str(one.get(name, "")) for name in Plugin._fields})
-        for key, one in found.items()
-        if isinstance(one, dict)
+        key: Plugin(**{name: str(facts.get(name, "")) for name in Plugin._fields})
+        for key, facts in plugins.items()
+        if isinstance(facts, dict)
     }
 
 

@@ -46,20 +46,20 @@ class SpillFile:
                 f"{tempfile.gettempdir()} takes no more of what is computed ({error.strerror or error}), which needs "
                 "more room than memory; the variable TMPDIR names another folder"
             ) from error
-        there = Stored(self._end, len(packed), memoryview(data).nbytes)
+        stored = Stored(self._end, len(packed), memoryview(data).nbytes)
         self._end += len(packed)
-        return there
+        return stored
 
-    def get(self, there: Stored) -> bytes:
+    def get(self, place: Stored) -> bytes:
         """Bytes that were put."""
         import lz4.block
 
         assert self._handle is not None
         packed = b""
-        while len(packed) < there.stored:
-            more = os.pread(self._handle, there.stored - len(packed), there.at + len(packed))
+        while len(packed) < place.stored:
+            more = os.pread(self._handle, place.stored - len(packed), place.at + len(packed))
             if not more:
                 raise McaptrackError(f"a temporary file in {tempfile.gettempdir()} was made shorter by another process")
             packed += more
-        data: bytes = lz4.block.decompress(packed, uncompressed_size=there.size)
+        data: bytes = lz4.block.decompress(packed, uncompressed_size=place.size)
         return data

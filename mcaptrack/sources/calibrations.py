@@ -39,9 +39,9 @@ _HEIGHTS_M: Final = (0.05, 30.0)
 _GROUND_FRAMES: Final = ("base_footprint", "base_link")
 #: A word of a topic of rectified pictures: /front/image_rect_color/compressed, but not /direct/image.
 _RECTIFIED: Final = re.compile(r"(?<![a-z])(image)?rect(ified)?(?![a-z])", re.IGNORECASE)
-#: Where the frame of a camera is no optical one, its z axis points up: z of a unit vector is more than this.
+#: A camera's frame is no optical one if its z axis points up: z of a unit vector is more than this.
 _LOOKS_UP: Final = 0.7
-#: Pictures of another size than the calibration's have been resized if their shape is the same but for so much.
+#: Pictures were resized, not cropped, if their ratio of width to height differs by less than this share.
 _SHAPE: Final = 0.02
 
 
@@ -81,17 +81,19 @@ def find_calibration(opened: log.Log, source: str, frame_id: str) -> str:
     It is one in the same frame, or else in the same folder of topics; of several, the one with the most similar name.
     Raises McaptrackError if there is none, or if several are as similar.
     """
-    known = {topic: frame_of(opened, topic) for topic, one in opened.channels.items() if holds_calibrations(one)}
-    same = [topic for topic, named in known.items() if frame_id and named == frame_id]
+    frame_at = {
+        topic: frame_of(opened, topic) for topic, channel in opened.channels.items() if holds_calibrations(channel)
+    }
+    same = [topic for topic, named in frame_at.items() if frame_id and named == frame_id]
     # Compressed pictures are one level lower: /front/image/compressed is beside /front/camera_info.
     folder = source.rpartition("/")[0]
     folders = (folder, folder.rpartition("/")[0]) if folder.count("/") > 1 else (folder,)
-    beside = [topic for topic in known if topic.rpartition("/")[0] in folders]
+    beside = [topic for topic in frame_at if topic.rpartition("/")[0] in folders]
     fitting = same or beside
-    given = [topic for topic in fitting if (made := provenance_of(opened, topic)) and made.transform == INGEST]
-    fitting = given or fitting  # what a user gave replaces what was recorded
+    ingested = [topic for topic in fitting if (origin := provenance_of(opened, topic)) and origin.transform == INGEST]
+    fitting = ingested or fitting  # what a user gave replaces what was recorded
     if not fitting:
-        frames = ", ".join(f"{topic} (frame {named or 'without a name'})" for topic, named in sorted(known.items()))
+        frames = ", ".join(f"{topic} (frame {named or 'without a name'})" for topic, named in sorted(frame_at.items()))
         raise McaptrackError(f"no calibration is of the frame {frame_id!r} of {source}; there is {frames or 'none'}")
     alike = {topic: _shared_parts(topic, source) for topic in fitting}
     nearest = sorted(topic for topic in fitting if alike[topic] == max(alike.values()))
@@ -102,7 +104,7 @@ def find_calibration(opened: log.Log, source: str, frame_id: str) -> str:
 
 
 def read_calibrations(opened: log.Log, topic: str, is_rectified: bool) -> list[tuple[int, Calibration]]:
-    """Return the calibrations of a channel with the log time from which each holds, in ns; changes only.
+    """Return the calibrations of a channel, each with the log time in ns from which it holds; repeats are left out.
 
     ``is_rectified``: of pictures that are rectified already. Raises McaptrackError for what can't be read.
     """
@@ -110,18 +112,18 @@ def read_calibrations(opened: log.Log, topic: str, is_rectified: bool) -> list[t
     out: list[tuple[int, Calibration]] = []
     for message in opened.timed(topic):
         try:
-            one = decode(message.payload)
+            calibration = decode(message.payload)
         except McaptrackError as error:
             raise McaptrackError(f"{topic} at {message.t_ns} ns: {error}") from None
-        if not out or one[:4] != out[-1][1][:4] or not np.array_equal(one.turn, out[-1][1].turn):
-            out.append((message.t_ns, one))
+        if not out or calibration[:4] != out[-1][1][:4] or not np.array_equal(calibration.turn, out[-1][1].turn):
+            out.append((message.t_ns, calibration))
     if not out:
         raise McaptrackError(f"{topic} has no messages")
     return out
 
 
 def see_ground(opened: log.Log, camera: Camera, frame: str = "", ground_frame: str = "") -> GroundSeen | None:
-    """Return the ground planes of a camera, one for each picture in which it stands elsewhere.
+    """Return the ground planes of a camera: one for each picture at which its pose has changed.
 
     ``frame`` is the frame of the metres, by default the root above the camera; the ground is z = 0 of ``ground_frame``,
     by default of ``frame``. None if the log has no calibration of a camera. Raises McaptrackError if none fits the
@@ -133,9 +135,9 @@ def see_ground(opened: log.Log, camera: Camera, frame: str = "", ground_frame: s
     log_ns, stamp_ns, frame_id = _headers(opened, sources)
     topic = find_calibration(opened, sources[0], frame_id)
     size = _picture_size(opened, camera.pictures)
-    found = read_calibrations(opened, topic, is_rectified_topic(sources[0]))
-    known = [(since_ns, _fitted(one, size, topic)) for since_ns, one in found]
-    eye = known[0][1].frame_id or frame_id
+    calibrations = read_calibrations(opened, topic, is_rectified_topic(sources[0]))
+    fitted = [(since_ns, _fitted(calibration, size, topic)) for since_ns, calibration in calibrations]
+    eye = fitted[0][1].frame_id or frame_id
     tree = transforms_of(opened)
     if tree is None:
         raise McaptrackError(f"there are no transforms, which say where the camera of {topic} is")
@@ -148,33 +150,33 @@ def see_ground(opened: log.Log, camera: Camera, frame: str = "", ground_frame: s
     if not poses.is_known.any():
         raise McaptrackError(f"no pose of the frame {eye} in {ground} is known")
     if np.nanmedian(poses.rotation[:, 2, 2]) > _LOOKS_UP:
-        words = f"{eye} looks up: z of a camera's frame points ahead (an optical frame), and that of {eye} doesn't"
-        warn(f"{words}; no boxes are on the ground", "transforms")
-    planes = _planes(log_ns, known, poses, floor)
+        text = f"{eye} looks up: z of a camera's frame points ahead (an optical frame), and that of {eye} doesn't"
+        warn(f"{text}; no boxes are on the ground", "transforms")
+    planes = _planes(log_ns, fitted, poses, floor)
     return GroundSeen(planes, frame, ground, topic)
 
 
 def moving_camera(opened: log.Log, topic: str, frame: str) -> MovingCamera:
-    """Return where the camera of a channel of pictures was in a frame at each of them, and its lens.
+    """Return the pose of a camera in a frame at each of its pictures, and its lens.
 
     Raises McaptrackError if no calibration fits the pictures, or if no transforms connect the camera with the frame.
     """
     log_ns, stamp_ns, frame_id = _headers(opened, [topic])
     source = find_calibration(opened, topic, frame_id)
-    found = read_calibrations(opened, source, is_rectified_topic(topic))
+    calibrations = read_calibrations(opened, source, is_rectified_topic(topic))
     size = _picture_size(opened, topic)
-    known = [(since_ns, _fitted(one, size, source)) for since_ns, one in found]
-    first = known[0][1]
+    fitted = [(since_ns, _fitted(calibration, size, source)) for since_ns, calibration in calibrations]
+    first = fitted[0][1]
     poses = poses_at(opened, topic, first.frame_id or frame_id, frame, stamp_ns, log_ns)
     if not poses.is_known.any():
         raise McaptrackError(f"no pose of the frame {first.frame_id or frame_id} in {frame} is known")
-    which = _holding(known, log_ns)
-    turn = np.array([one.turn for _, one in known])[which]
+    which = _holding(fitted, log_ns)
+    turn = np.array([calibration.turn for _, calibration in fitted])[which]
     is_other_clock = bool(len(log_ns)) and np.median(np.abs(log_ns - stamp_ns)) > OTHER_CLOCK_S * NS_PER_S
     return MovingCamera(
         log_ns, stamp_ns, log_ns if is_other_clock else np.maximum.accumulate(stamp_ns),
         turn @ poses.rotation, (turn @ poses.translation[..., None])[..., 0],
-        [one.lens for _, one in known], which, first.width_px, first.height_px,
+        [calibration.lens for _, calibration in fitted], which, first.width_px, first.height_px,
     )  # fmt: skip
 
 
@@ -183,33 +185,33 @@ def is_rectified_topic(topic: str) -> bool:
     return any(_RECTIFIED.search(part) for part in topic.split("/")[-2:])
 
 
-def _holding(known: Sequence[tuple[int, Calibration]], log_ns: Ints) -> Ints:
+def _holding(calibrations: Sequence[tuple[int, Calibration]], log_ns: Ints) -> Ints:
     """Return which of the calibrations holds at each log time (N,)."""
-    return np.maximum(np.searchsorted([t_ns for t_ns, _ in known], log_ns, side="right") - 1, 0)
+    return np.maximum(np.searchsorted([t_ns for t_ns, _ in calibrations], log_ns, side="right") - 1, 0)
 
 
 def _planes(
-    log_ns: Ints, known: Sequence[tuple[int, Calibration]], poses: Poses, floor: Poses | None
+    log_ns: Ints, calibrations: Sequence[tuple[int, Calibration]], poses: Poses, floor: Poses | None
 ) -> list[tuple[int, GroundPlane]]:
     """Return the planes of pictures at log times (N,), from the poses of the camera on the ground.
 
     ``floor`` are the poses of the ground in the frame of the metres, unless that is the same.
     """
-    which = _holding(known, log_ns)
+    which = _holding(calibrations, log_ns)
     is_known = poses.is_known if floor is None else poses.is_known & floor.is_known
     out: list[tuple[int, GroundPlane]] = []
     below = 0
     for number, t_ns in enumerate(log_ns.tolist()):
-        one = known[which[number]][1]
-        plane = _nowhere(one)
+        calibration = calibrations[which[number]][1]
+        plane = _nowhere(calibration)
         if is_known[number]:
-            back = one.turn @ poses.rotation[number].T
+            back = calibration.turn @ poses.rotation[number].T
             metres = np.eye(3)
             if floor is not None:
                 metres[:2] = np.column_stack([floor.rotation[number][:2, :2], floor.translation[number][:2]])
             try:
-                homography = ground_homography(one.lens, back, -back @ poses.translation[number], metres)
-                plane = GroundPlane(homography, one.width_px, one.height_px, lens=one.lens)
+                homography = ground_homography(calibration.lens, back, -back @ poses.translation[number], metres)
+                plane = GroundPlane(homography, calibration.width_px, calibration.height_px, lens=calibration.lens)
             except McaptrackError:
                 below += 1
         if out and out[-1][0] == t_ns:
@@ -223,10 +225,10 @@ def _planes(
     return out
 
 
-def _nowhere(one: Calibration) -> GroundPlane:
+def _nowhere(calibration: Calibration) -> GroundPlane:
     """Return the plane of a picture in which no point is known to be on the ground."""
     numbers = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0)
-    return GroundPlane(numbers, one.width_px, one.height_px, lens=one.lens)
+    return GroundPlane(numbers, calibration.width_px, calibration.height_px, lens=calibration.lens)
 
 
 def _ground_frame(tree: TransformTree, frame: str, eye: str, stamps_ns: Ints) -> str:
@@ -241,8 +243,8 @@ def _ground_frame(tree: TransformTree, frame: str, eye: str, stamps_ns: Ints) ->
         return frame
     for other in _GROUND_FRAMES:
         if other in tree.frames() and _HEIGHTS_M[0] < height_m(other) < _HEIGHTS_M[1]:
-            words = f"{eye} is {above:.3g} m above z = 0 of {frame}: the ground is taken to be z = 0 of {other}"
-            warn(f"{words}. `ground_frame=` chooses", "transforms")
+            text = f"{eye} is {above:.3g} m above z = 0 of {frame}: the ground is taken to be z = 0 of {other}"
+            warn(f"{text}. `ground_frame=` chooses", "transforms")
             return other
     raise McaptrackError(
         f"{eye} is {above:.3g} m above z = 0 of {frame}; name a frame on the ground by `ground_frame=`"
@@ -250,12 +252,14 @@ def _ground_frame(tree: TransformTree, frame: str, eye: str, stamps_ns: Ints) ->
 
 
 def _headers(opened: log.Log, topics: Sequence[str]) -> tuple[Ints, Ints, str]:
-    """Return log times and stamps in ns of all messages, (N,) each, by log time; and the frame of the first one."""
+    """Return log times and stamps in ns of all messages, (N,) each, by log time; and the frame of the first message."""
     times: list[tuple[int, int]] = []
     frame_id = ""
     for topic in topics:
         try:
-            decode = decoder_with_errors(message_type_of(opened, topic), lambda one: (stamp_of(one), frame_named(one)))
+            decode = decoder_with_errors(
+                message_type_of(opened, topic), lambda message: (stamp_of(message), frame_named(message))
+            )
             for message in opened.timed(topic):
                 stamp_ns, named = decode(message.payload)
                 frame_id = frame_id or named
@@ -327,28 +331,28 @@ def calibration_of(message: Any, is_rectified: bool) -> Calibration:
     return _cropped(message, Calibration(frame_named(message), lens, width, height, np.eye(3)))
 
 
-def _cropped(message: Any, one: Calibration) -> Calibration:
+def _cropped(message: Any, calibration: Calibration) -> Calibration:
     """Return the calibration of pictures that are a part of what the sensor sees, or have fewer pixels."""
     step_x, step_y = (max(int(getattr(message, f"binning_{axis}", 0)), 1) for axis in "xy")
     roi = getattr(message, "roi", None)
     left, top, width, height = (int(getattr(roi, name, 0)) for name in ("x_offset", "y_offset", "width", "height"))
-    cx, cy = one.lens.centre_px
-    lens = replace(one.lens, centre_px=(cx - left, cy - top)).scaled(1 / step_x, 1 / step_y)
-    size = ((width or one.width_px) // step_x, (height or one.height_px) // step_y)
-    return one._replace(lens=lens, width_px=size[0], height_px=size[1])
+    cx, cy = calibration.lens.centre_px
+    lens = replace(calibration.lens, centre_px=(cx - left, cy - top)).scaled(1 / step_x, 1 / step_y)
+    size = ((width or calibration.width_px) // step_x, (height or calibration.height_px) // step_y)
+    return calibration._replace(lens=lens, width_px=size[0], height_px=size[1])
 
 
-def _fitted(one: Calibration, size: tuple[int, int] | None, topic: str) -> Calibration:
-    """Return the calibration for pictures of this width and height, which may have been resized; None: as it is."""
-    if size in (None, (one.width_px, one.height_px), (0, 0)) or size is None:
-        return one
-    if not one.width_px or not one.height_px:
-        return one._replace(width_px=size[0], height_px=size[1])
-    across, down = size[0] / one.width_px, size[1] / one.height_px
+def _fitted(calibration: Calibration, size: tuple[int, int] | None, topic: str) -> Calibration:
+    """Return the calibration scaled to pictures of this size, which may have been resized; unchanged for None."""
+    if size in (None, (calibration.width_px, calibration.height_px), (0, 0)) or size is None:
+        return calibration
+    if not calibration.width_px or not calibration.height_px:
+        return calibration._replace(width_px=size[0], height_px=size[1])
+    across, down = size[0] / calibration.width_px, size[1] / calibration.height_px
     if abs(across / down - 1) > _SHAPE:
-        was = f"{one.width_px} x {one.height_px}"
+        was = f"{calibration.width_px} x {calibration.height_px}"
         raise McaptrackError(f"{topic} is for pictures of {was} pixels, and these are {size[0]} x {size[1]}")
-    return one._replace(lens=one.lens.scaled(across, down), width_px=size[0], height_px=size[1])
+    return calibration._replace(lens=calibration.lens.scaled(across, down), width_px=size[0], height_px=size[1])
 
 
 def _numbers(message: Any, name: str) -> list[float]:

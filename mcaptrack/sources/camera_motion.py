@@ -35,7 +35,7 @@ def motion_topic(prefix: str) -> str:
 
 def tracks_topic(prefix: str) -> str:
     """The usual topic of the tracks of a camera."""
-    return f"{prefix}/{next(one.output_topic for one in STAGES.values() if one.default.reads is DETECTIONS)}"
+    return f"{prefix}/{next(stage.output_topic for stage in STAGES.values() if stage.default.reads is DETECTIONS)}"
 
 
 def path_of(
@@ -51,10 +51,10 @@ def path_of(
     The path is None if the tracks are not compensated, or were made from an earlier motion.
     """
     motion = motion_topic(prefix)
-    for _, made in lineage(opened, topic, provenances):
-        if made and motion in made.references and "camera_motion" in made.parameters:
-            path = used_path(_read_path(opened, motion, frames), made.parameters["camera_motion"])
-            return path, {} if path is None else {motion: made.references[motion]}
+    for _, provenance in lineage(opened, topic, provenances):
+        if provenance and motion in provenance.references and "camera_motion" in provenance.parameters:
+            path = used_path(_read_path(opened, motion, frames), provenance.parameters["camera_motion"])
+            return path, {} if path is None else {motion: provenance.references[motion]}
     return None, {}
 
 
@@ -118,10 +118,7 @@ def planes_in(opened: log.Log, topic: str) -> list[tuple[int, GroundPlane]]:
 
 
 def read_ground_truth(
-    opened: log.Log,
-    prefix: str,
-    provenances: Mapping[str, Provenance] = {},
-    frames: Mapping[str, Sequence[Frame]] = {},
+    opened: log.Log, prefix: str, provenances: Mapping[str, Provenance] = {}, frames: Mapping[str, Sequence[Frame]] = {}
 ) -> list[Frame]:
     """Return the ground truth of a camera, with positions in metres where its pictures show them.
 
@@ -131,8 +128,8 @@ def read_ground_truth(
     """
     camera = camera_at(opened, prefix)
     truth = opened.frames(camera.truth, TRACKS)
-    made = provenances.get(tracks_topic(prefix)) or provenance_of(opened, tracks_topic(prefix))
-    fixed, own = made.frame_id if made else "", frame_id_of(opened.channel(camera.truth).metadata)
+    provenance = provenances.get(tracks_topic(prefix)) or provenance_of(opened, tracks_topic(prefix))
+    fixed, own = provenance.frame_id if provenance else "", frame_id_of(opened.channel(camera.truth).metadata)
     if fixed and own:
         return in_frame(opened, camera.truth, truth, fixed, own)
     path, _ = path_of(opened, prefix, tracks_topic(prefix), provenances, frames)
@@ -149,11 +146,11 @@ def in_metres(frames: Sequence[Frame], planes: Planes, path: CameraPath) -> list
     """
     joined = join_frames(TRACKS, frames)
     rows, boxes = joined.rows.copy(), columns_to_boxes(joined.rows)
-    given = np.stack([rows["x_m"], rows["y_m"]], axis=1)
+    recorded = np.stack([rows["x_m"], rows["y_m"]], axis=1)
     if not planes or not len(rows):
         return list(frames)
     with np.errstate(invalid="ignore"):
-        is_derived = (np.abs(planes[0][1].boxes_to_metres(boxes) - given) <= _SAME_M).all(axis=1)
+        is_derived = (np.abs(planes[0][1].boxes_to_metres(boxes) - recorded) <= _SAME_M).all(axis=1)
     still = scene_planes(planes, path)
     which = np.searchsorted(np.array([since for since, _ in still[1:]], np.int64), joined.row_ns, "right")
     for number, (_, plane) in enumerate(still):

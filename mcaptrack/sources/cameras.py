@@ -82,20 +82,20 @@ def find_camera(opened: log.Log, name: str | None = None, topic: str | None = No
     if name:
         _refuse_unknown(opened, name)
         return camera_at(opened, "/" + name.strip("/")).prefix
-    known = _with_pictures_first(opened, cameras(opened))
+    shown = _with_pictures_first(opened, cameras(opened))
     # Recorded cameras without results count only if no camera has any.
-    chosen = [camera for camera in known if has_own_channels(opened, camera)]
+    chosen = [camera for camera in shown if has_own_channels(opened, camera)]
     if not chosen:
         # With several recorded cameras, the planner asks for one by name and lists them.
-        if known and all(camera.in_space for camera in known):
-            _refuse_several(opened, [topic for camera in known for topic in camera.in_space])
-        return known[0].prefix if len(known) == 1 else f"/{DEFAULT_CAMERA}"
+        if shown and all(camera.in_space for camera in shown):
+            _refuse_several(opened, [topic for camera in shown for topic in camera.in_space])
+        return shown[0].prefix if len(shown) == 1 else f"/{DEFAULT_CAMERA}"
     if len(chosen) == 1:
         return chosen[0].prefix
     names = ", ".join(camera.prefix for camera in chosen)
     scenes = list(scenes_of(opened))
     kind = "sensors" if any(camera.in_space and camera.prefix not in scenes for camera in chosen) else "cameras"
-    usual = scenes if len(scenes) == 1 else [one.prefix for one in chosen if f"/{DEFAULT_CAMERA}" in one.names]
+    usual = scenes if len(scenes) == 1 else [camera.prefix for camera in chosen if f"/{DEFAULT_CAMERA}" in camera.names]
     if not usual:
         raise McaptrackError(f"{opened.path} has several {kind}, {names}; choose one with `camera=`")
     warn(f"several {kind}, {names}: taking {usual[0]}; `camera=` chooses another", "chosen-camera")
@@ -107,9 +107,9 @@ def camera_to_name(opened: log.Log, topic: str) -> str:
     return _prefix_of_topic(opened, topic)[1:] if len(cameras(opened)) > 1 else ""
 
 
-def _with_pictures_first(opened: log.Log, known: list[Camera]) -> list[Camera]:
-    """Return the cameras without those that are boxes in space alone, if there are others; or else all."""
-    return [camera for camera in known if not camera.in_space or has_own_channels(opened, camera)] or known
+def _with_pictures_first(opened: log.Log, all_cameras: list[Camera]) -> list[Camera]:
+    """Leave out cameras that are only boxes in space, unless all are."""
+    return [camera for camera in all_cameras if not camera.in_space or has_own_channels(opened, camera)] or all_cameras
 
 
 def _refuse_several(opened: log.Log, topics: list[str]) -> None:
@@ -120,7 +120,7 @@ def _refuse_several(opened: log.Log, topics: list[str]) -> None:
 
 def _refuse_unknown(opened: log.Log, name: str) -> None:
     """Raise McaptrackError if the log has cameras, but none of this name."""
-    names = [one.strip("/") for camera in cameras(opened) for one in camera.names]
+    names = [prefix.strip("/") for camera in cameras(opened) for prefix in camera.names]
     if names and name.strip("/") not in names:
         raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(names))}")
 
@@ -128,11 +128,11 @@ def _refuse_unknown(opened: log.Log, name: str) -> None:
 def _prefix_of_topic(opened: log.Log, topic: str) -> str:
     """Return the prefix for results of a topic: the name above its source, unless its camera has results elsewhere."""
     name = name_above(chain_of(opened, topic)[-1])
-    found = camera_at(opened, name)
+    camera = camera_at(opened, name)
     has_results = any(
-        is_made_by_stage(opened.channels[one]) for one in found.topics if one.startswith(found.prefix + "/")
+        is_made_by_stage(opened.channels[other]) for other in camera.topics if other.startswith(camera.prefix + "/")
     )
-    return found.prefix if has_results else name
+    return camera.prefix if has_results else name
 
 
 def has_own_channels(opened: log.Log, camera: Camera) -> bool:
@@ -169,14 +169,14 @@ def corrected_plane(topic: str) -> str:
 def scenes_of(opened: log.Log) -> tuple[str, ...]:
     """Return the prefixes of the scenes that several cameras were fused to."""
     target = STAGES["detect"].output_topic
-    made = ((camera.prefix, provenance_of(opened, f"{camera.prefix}/{target}")) for camera in cameras(opened))
-    return tuple(prefix for prefix, how in made if how is not None and how.transform == FUSE)
+    fused = ((camera.prefix, provenance_of(opened, f"{camera.prefix}/{target}")) for camera in cameras(opened))
+    return tuple(prefix for prefix, how in fused if how is not None and how.transform == FUSE)
 
 
 def camera_at(opened: log.Log, prefix: str) -> Camera:
     """Return the camera of this name, even if the log has no channels for it."""
-    found = next((camera for camera in cameras(opened) if prefix in camera.names), None)
-    return found or _Channels(opened).camera([prefix])
+    camera = next((camera for camera in cameras(opened) if prefix in camera.names), None)
+    return camera or _Channels(opened).camera([prefix])
 
 
 def chain_of(opened: log.Log, topic: str) -> list[str]:
@@ -195,9 +195,10 @@ def provenance_of(opened: log.Log, topic: str) -> Provenance | None:
     return Provenance.from_metadata(channel.metadata) if channel else None
 
 
-def repaired_tracks(tracks: Sequence[Frame], made: Provenance | None) -> Sequence[Frame]:
-    """Return tracks with ``source_id`` only where it names tracks: that of tracks of detections names these."""
-    is_from_boxes = made is not None and made.transform in STAGES and STAGES[made.transform].default.reads is DETECTIONS
+def repaired_tracks(tracks: Sequence[Frame], origin: Provenance | None) -> Sequence[Frame]:
+    """Return tracks without ``source_id`` where it names detections instead of tracks."""
+    stage = STAGES.get(origin.transform) if origin else None
+    is_from_boxes = stage is not None and stage.default.reads is DETECTIONS
     if not is_from_boxes or not has_any(TRACKS, tracks, lambda rows: rows["source_id"] >= 0):
         return tracks
 
@@ -219,15 +220,15 @@ def lineage(
     seen: set[str] = set()
     while topic and topic not in seen:
         seen.add(topic)
-        made = provenances.get(topic) or provenance_of(opened, topic)
-        yield topic, made
-        topic = made.input if made else ""
+        provenance = provenances.get(topic) or provenance_of(opened, topic)
+        yield topic, provenance
+        topic = provenance.input if provenance else ""
 
 
 def is_made_by_stage(channel: log.Channel) -> bool:
     """Return whether a stage made a channel, and so can make it again."""
-    made = Provenance.from_metadata(channel.metadata)
-    return made is not None and made.transform in STAGES
+    provenance = Provenance.from_metadata(channel.metadata)
+    return provenance is not None and provenance.transform in STAGES
 
 
 _CACHE: Final[WeakKeyDictionary[log.Log, list[Camera]]] = WeakKeyDictionary()
@@ -254,7 +255,9 @@ class _Channels:
 
     def __init__(self, opened: log.Log) -> None:
         self._opened = opened
-        self._provenance = {topic: Provenance.from_metadata(one.metadata) for topic, one in opened.channels.items()}
+        self._provenance = {
+            topic: Provenance.from_metadata(channel.metadata) for topic, channel in opened.channels.items()
+        }
         self._topics: dict[str, set[str]] = {}
         self._source: dict[str, str] = {}
         for topic, channel in opened.channels.items():
@@ -272,7 +275,9 @@ class _Channels:
 
     def cameras(self) -> list[Camera]:
         """Group names to cameras: names with labels or detections alone join the nearest camera with pictures."""
-        labels = {name for name, topics in self._topics.items() if all(_is_label(self._source[one]) for one in topics)}
+        labels = {
+            name for name, topics in self._topics.items() if all(_is_label(self._source[topic]) for topic in topics)
+        }
         joined = {name: [name] for name in self._topics}
         for name in sorted(set(self._topics) - self._with_pictures - self._in_space):
             others = self._with_pictures or (set(self._topics) - labels)
@@ -309,10 +314,12 @@ class _Channels:
         """Return the topic of the video, or of the pictures that detections were made from; None if there is none."""
         topics = [f"{name}/{VIDEO}" for name in names]
         topics += [
-            made.input for name in names if (made := self._provenance.get(f"{name}/{STAGES['detect'].output_topic}"))
+            origin.input
+            for name in names
+            if (origin := self._provenance.get(f"{name}/{STAGES['detect'].output_topic}"))
         ]
-        there = [self._opened.channels[topic] for topic in topics if topic in self._opened.channels]
-        return next((channel.topic for channel in there if foreign.holds_pictures(channel)), None)
+        channels = [self._opened.channels[topic] for topic in topics if topic in self._opened.channels]
+        return next((channel.topic for channel in channels if foreign.holds_pictures(channel)), None)
 
     def _detection_topics(self, names: list[str]) -> list[str]:
         """Return the topics of detections in pictures that no stage made."""
@@ -326,22 +333,22 @@ class _Channels:
 
     def _result_topics(self, names: list[str]) -> list[str]:
         """Return the topics below these names that stages made; the motion of a camera is part of its pictures."""
-        return [one for name in names for one in self._select([name], _is_result) if one.startswith(name + "/")]
+        return [topic for name in names for topic in self._select([name], _is_result) if topic.startswith(name + "/")]
 
     def _label_topic(self, names: list[str], label: str) -> str | None:
         """Return the first topic below one of the names for a label, unless a stage made it; None if there is none."""
         topics = [f"{name}/{label}" for name in names]
-        there = [self._opened.channels[topic] for topic in topics if topic in self._opened.channels]
-        return next((channel.topic for channel in there if not is_made_by_stage(channel)), None)
+        channels = [self._opened.channels[topic] for topic in topics if topic in self._opened.channels]
+        return next((channel.topic for channel in channels if not is_made_by_stage(channel)), None)
 
-    def _corrected(self, given: str) -> str:
-        """Return the topic of the ground plane that was corrected, if it was this one; or else this one."""
-        topic = corrected_plane(given)
-        made, before = self._provenance.get(topic), self._provenance.get(given)
-        if made is None or made.transform != REFINE or made.input != given or given not in self._opened.channels:
-            return given
-        is_same = before is None or not before.digest or before.digest == made.input_digest
-        return topic if is_same else given
+    def _corrected(self, plane: str) -> str:
+        """Return the topic of the correction of a ground plane if the log has it, otherwise the plane itself."""
+        topic = corrected_plane(plane)
+        after, before = self._provenance.get(topic), self._provenance.get(plane)
+        if after is None or after.transform != REFINE or after.input != plane or plane not in self._opened.channels:
+            return plane
+        is_same = before is None or not before.digest or before.digest == after.input_digest
+        return topic if is_same else plane
 
     def _select(self, names: list[str], wanted: Callable[[log.Channel], bool]) -> list[str]:
         topics = sorted(topic for name in names for topic in self._topics.get(name, ()))
@@ -374,5 +381,5 @@ def _nearest(name: str, others: set[str]) -> str | None:
         return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
     most = max(map(shared, others), default=0)
-    found = [other for other in others if shared(other) == most]
-    return found[0] if len(found) == 1 else None
+    nearest = [other for other in others if shared(other) == most]
+    return nearest[0] if len(nearest) == 1 else None

@@ -106,7 +106,7 @@ def _is_covered(t_ns: Ints, times: Ints) -> Bools:
 
 
 def without_filled(frames: Sequence[Frame], corrected: Sequence[Frame]) -> Sequence[Frame]:
-    """Re-tracked frames at the rate of the pictures with no other boxes than corrected ones, where there are these.
+    """Re-tracked frames at the rate of the pictures; where there are corrections, only with corrected boxes.
 
     A person who was said not to be in a picture is not put back there by interpolation.
     """

@@ -56,9 +56,7 @@ class Footage:
 
 
 def draw_place(
-    cameras: Mapping[str, SyntheticScene],
-    folder: Path,
-    progress: Callable[[str, int, int], None] = lambda *_: None,
+    cameras: Mapping[str, SyntheticScene], folder: Path, progress: Callable[[str, int, int], None] = lambda *_: None
 ) -> tuple[dict[str, Footage], Path]:
     """Write a scene that several cameras see to a folder: the footage of each camera, and where people truly are.
 
@@ -68,8 +66,8 @@ def draw_place(
     rows = ["t,id,class,x_m,y_m"]
     seen = {name: iter(scene.shots(draw=False)) for name, scene in cameras.items()}
     for shots in zip(*seen.values(), strict=True):
-        found = {one: at for shot in shots for one, at in zip(shot.ids, shot.places_m.tolist(), strict=True)}
-        rows += [f"{shots[0].seconds:.6f},{one},person,{x:.4f},{y:.4f}" for one, (x, y) in sorted(found.items())]
+        places = {walker: at for shot in shots for walker, at in zip(shot.ids, shot.places_m.tolist(), strict=True)}
+        rows += [f"{shots[0].seconds:.6f},{walker},person,{x:.4f},{y:.4f}" for walker, (x, y) in sorted(places.items())]
     with writing_to(folder):
         _write_text(folder / POSITIONS, "\n".join(rows) + "\n")
     return footage, folder / POSITIONS

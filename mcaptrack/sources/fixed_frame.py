@@ -50,13 +50,13 @@ def holds_boxes_3d(opened: log.Log, topic: str) -> bool:
         return False
     if not foreign.is_drawing(channel):
         return True
-    known = _CACHE.setdefault(opened, {})
-    if topic not in known:
+    cached = _CACHE.setdefault(opened, {})
+    if topic not in cached:
         try:
-            known[topic] = any(one.boxes for _, one in islice(foreign.boxes_3d(opened, topic), _TRIED))
+            cached[topic] = any(message.boxes for _, message in islice(foreign.boxes_3d(opened, topic), _TRIED))
         except McaptrackError:
-            known[topic] = False
-    return known[topic]
+            cached[topic] = False
+    return cached[topic]
 
 
 def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign.NamedFrames:
@@ -84,40 +84,40 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
     """
     if not foreign.may_hold_boxes_3d(opened.channel(topic)):
         return foreign.named_detections(opened, topic)
-    found, unnamed = recorded(foreign.boxes_3d(opened, topic)).in_usual_frame()
-    for words, count in found.remarks.items():
-        warn(f"{opened.path}: {topic}: {count:,} {words}", "left-out")
+    boxes, unnamed = recorded(foreign.boxes_3d(opened, topic)).in_usual_frame()
+    for remark, count in boxes.remarks.items():
+        warn(f"{opened.path}: {topic}: {count:,} {remark}", "left-out")
     if unnamed:
-        usual = found.names[np.bincount(found.frame).argmax()]
-        words = f"boxes name no frame: they count as in {usual}, as most others are"
-        warn(f"{opened.path}: {topic}: {unnamed:,} of {len(found.frame):,} {words}", "transforms")
-    fixed = _fixed_frame(opened, topic, found, plain_frame(frame_id))
-    is_known, rotation, shift = _poses(opened, topic, found, fixed)
-    start_ns, frame, assumed = found.frames()
+        usual = boxes.names[np.bincount(boxes.frame).argmax()]
+        remark = f"boxes name no frame: they count as in {usual}, as most others are"
+        warn(f"{opened.path}: {topic}: {unnamed:,} of {len(boxes.frame):,} {remark}", "transforms")
+    fixed = _fixed_frame(opened, topic, boxes, plain_frame(frame_id))
+    is_known, rotation, shift = _poses(opened, topic, boxes, fixed)
+    start_ns, frame, assumed = boxes.frames()
     if assumed:
         warn(f"{opened.path}: {topic}: {assumed}", "clock")
-    is_repeated = found.is_repeated(frame)
+    is_repeated = boxes.is_repeated(frame)
     is_left_out = np.zeros(len(start_ns), bool)
     is_left_out[frame[~is_known]] = True  # nothing is known then, unlike in a frame without boxes
     is_left_out[frame[is_known]] = False
     if repeated := int(is_repeated.sum()):
-        words = "boxes are recorded again, with the same stamp and numbers: they are left out"
-        warn(f"{opened.path}: {topic}: {repeated:,} of {len(frame):,} {words}", "left-out")
+        remark = "boxes are recorded again, with the same stamp and numbers: they are left out"
+        warn(f"{opened.path}: {topic}: {repeated:,} of {len(frame):,} {remark}", "left-out")
     is_taken = is_known & ~is_repeated
-    found, frame = found.select(is_taken), frame[is_taken]
-    _warn_odd(opened, topic, found)
-    rows = rows_of_boxes(found, rotation[is_taken], shift[is_taken], f"{opened.path}: {topic}")
-    names = foreign.settle_classes(opened, topic, found.classes, [rows])
-    if nameless := found.classes.nameless(np.unique(rows["class_id"]).tolist()):
+    boxes, frame = boxes.select(is_taken), frame[is_taken]
+    _warn_odd(opened, topic, boxes)
+    rows = rows_of_boxes(boxes, rotation[is_taken], shift[is_taken], f"{opened.path}: {topic}")
+    names = foreign.settle_classes(opened, topic, boxes.classes, [rows])
+    if nameless := boxes.classes.nameless(np.unique(rows["class_id"]).tolist()):
         listed = ", ".join(map(str, nameless[:_LISTED])) + (", ..." if len(nameless) > _LISTED else "")
-        words = "1 counts as people, and others move as objects of unknown class do"
-        warn(f"{opened.path}: classes of {topic} are numbers without names ({listed}): {words}", "classes")
+        remark = "1 counts as people, and others move as objects of unknown class do"
+        warn(f"{opened.path}: classes of {topic} are numbers without names ({listed}): {remark}", "classes")
     if unclassed := int((rows["class_id"] == UNKNOWN).sum()):
-        words = "boxes have no class, or 0: they move as objects of unknown class do"
-        warn(f"{opened.path}: {topic}: {unclassed:,} of {len(rows):,} {words}", "classes")
-    if not assumed and (several := found.of_several_messages(frame)):
-        words = "times have boxes of several messages, where others have those of one, as if a clock was set back"
-        warn(f"{opened.path}: {topic}: {several:,} of {len(start_ns):,} {words}: they count as one frame", "clock")
+        remark = "boxes have no class, or 0: they move as objects of unknown class do"
+        warn(f"{opened.path}: {topic}: {unclassed:,} of {len(rows):,} {remark}", "classes")
+    if not assumed and (several := boxes.of_several_messages(frame)):
+        remark = "times have boxes of several messages, where others have those of one, as if a clock was set back"
+        warn(f"{opened.path}: {topic}: {several:,} of {len(start_ns):,} {remark}: they count as one frame", "clock")
     order = np.argsort(frame, kind="stable")
     parts = np.split(rows[order], np.searchsorted(frame[order], np.arange(1, len(start_ns))))
     kept = np.flatnonzero(~is_left_out).tolist()
@@ -130,57 +130,59 @@ class BoxesRead:
     """Boxes of other software that were read from a log, for later steps: decoding them takes long."""
 
     def __init__(self) -> None:
-        self._found: dict[str, foreign.NamedFrames] = {}
+        self._frames: dict[str, foreign.NamedFrames] = {}
 
     def read(self, opened: log.Log, topic: str, frame_id: str = "") -> foreign.NamedFrames:
-        """Return the boxes of a channel as ``named_detections`` does; those that were read before without decoding."""
+        """Return the boxes of a channel as ``named_detections`` does; each channel is decoded only once."""
         wanted = plain_frame(frame_id) or _frame_before(opened, topic)
-        found = self._found.get(topic)
-        if found is None or found.frame_id != (wanted or found.frame_id):
-            self._found[topic] = found = named_detections(opened, topic, frame_id)
-        return found
+        stored = self._frames.get(topic)
+        if stored is None or stored.frame_id != (wanted or stored.frame_id):
+            self._frames[topic] = stored = named_detections(opened, topic, frame_id)
+        return stored
 
     def in_space(self) -> dict[str, foreign.NamedFrames]:
         """Return the boxes in space that were read, by topic."""
-        return {topic: one for topic, one in self._found.items() if one.frame_id}
+        return {topic: boxes for topic, boxes in self._frames.items() if boxes.frame_id}
 
 
-def _fixed_frame(opened: log.Log, topic: str, found: Recorded3d, wanted: str) -> str:
+def _fixed_frame(opened: log.Log, topic: str, boxes: Recorded3d, wanted: str) -> str:
     """The frame that boxes are brought to. Raises McaptrackError if there is no such frame."""
-    counts = Counter(found.frame.tolist())
-    usual = found.names[counts.most_common(1)[0][0]] if counts else ""
+    counts = Counter(boxes.frame.tolist())
+    usual = boxes.names[counts.most_common(1)[0][0]] if counts else ""
     tree = transforms_of(opened)
-    known = set(tree.frames() if tree else ()) | set(found.names)
+    frames = set(tree.frames() if tree else ()) | set(boxes.names)
     if wanted:
-        if found.names and wanted not in known:
-            there = ", ".join(sorted(known)[:_LISTED]) or "none"
+        if boxes.names and wanted not in frames:
+            listed = ", ".join(sorted(frames)[:_LISTED]) or "none"
             raise McaptrackError(
-                f"{opened.path}: there is no frame {wanted} for the boxes of {topic}; there are {there}"
+                f"{opened.path}: there is no frame {wanted} for the boxes of {topic}; there are {listed}"
             )
-        if tree and (moving := [one for one in tree.between(tree.root_of(wanted), wanted) or () if not one.is_static]):
-            words = f"{wanted} moves ({moving[0]} isn't static), and so do objects that stand"
-            warn(f"{opened.path}: {topic}: {words}; tracks should be in a frame that doesn't move", "transforms")
+        if tree and (
+            moving := [series for series in tree.between(tree.root_of(wanted), wanted) or () if not series.is_static]
+        ):
+            text = f"{wanted} moves ({moving[0]} isn't static), and so do objects that stand"
+            warn(f"{opened.path}: {topic}: {text}; tracks should be in a frame that doesn't move", "transforms")
         return wanted
-    if (before := _frame_before(opened, topic)) and before in known:
+    if (before := _frame_before(opened, topic)) and before in frames:
         return before
     if tree is None or usual not in tree.frames():
         if counts and not usual:
-            words = "boxes name no frame: they stay as they are, in a frame without a name"
-            warn(f"{opened.path}: {topic}: {words}", "transforms")
+            text = "boxes name no frame: they stay as they are, in a frame without a name"
+            warn(f"{opened.path}: {topic}: {text}", "transforms")
         elif counts:
             why = "the log has no transforms" if tree is None else _unknown(tree, usual)
             warn(f"{opened.path}: {topic}: {why}, so that boxes stay in their frame, {usual}", "transforms")
         if "optical" in usual:
-            words = f"z is ahead and y down in {usual}, so that x and y are no positions on the ground"
-            warn(f"{opened.path}: {topic}: {words}; `frame=` names another frame", "transforms")
+            text = f"z is ahead and y down in {usual}, so that x and y are no positions on the ground"
+            warn(f"{opened.path}: {topic}: {text}; `frame=` names another frame", "transforms")
         return usual
     return tree.root_of(usual)
 
 
 def _frame_before(opened: log.Log, topic: str) -> str:
     """The frame of a channel that was made from these boxes; "" if there is none."""
-    made = (channel.metadata for channel in opened.channels.values() if input_of(channel.metadata) == topic)
-    return next(filter(None, map(frame_id_of, made)), "")
+    metadata = (channel.metadata for channel in opened.channels.values() if input_of(channel.metadata) == topic)
+    return next(filter(None, map(frame_id_of, metadata)), "")
 
 
 def _unknown(tree: TransformTree, frame: str) -> str:
@@ -189,32 +191,32 @@ def _unknown(tree: TransformTree, frame: str) -> str:
     return f"no transform has the frame {frame!r} (but {', '.join(listed[:_LISTED])}{more})"
 
 
-def _poses(opened: log.Log, topic: str, found: Recorded3d, fixed: str) -> tuple[Bools, Floats, Floats]:
+def _poses(opened: log.Log, topic: str, boxes: Recorded3d, fixed: str) -> tuple[Bools, Floats, Floats]:
     """Whether the pose of the frame of each box is known (N,), its rotation (N, 3, 3) and translation (N, 3).
 
     Raises McaptrackError if none is.
     """
-    count = len(found.frame)
+    count = len(boxes.frame)
     rotation, shift = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
     is_known = np.ones(count, bool)
-    for number, name in enumerate(found.names):
-        mine = found.frame == number
+    for number, name in enumerate(boxes.names):
+        mine = boxes.frame == number
         if not mine.any():
             continue
         if name == fixed:
             warn_of_remarks(opened, transforms_of(opened), fixed, name)
             continue
         # Boxes of a message have the same pose, mostly.
-        stamps = np.where(found.stamp_ns > 0, found.stamp_ns, found.log_ns)[mine]
-        times, place = np.unique(np.stack([stamps, found.log_ns[mine]]), axis=1, return_inverse=True)
-        what = "messages" if len(found.names) == 1 else f"messages have boxes in {name} that"
+        stamps = np.where(boxes.stamp_ns > 0, boxes.stamp_ns, boxes.log_ns)[mine]
+        times, place = np.unique(np.stack([stamps, boxes.log_ns[mine]]), axis=1, return_inverse=True)
+        what = "messages" if len(boxes.names) == 1 else f"messages have boxes in {name} that"
         poses = poses_at(opened, topic, fixed, name, *_rows_of(times), what)
         place = place.reshape(-1)
         is_known[mine] = poses.is_known[place]
         rotation[mine], shift[mine] = poses.rotation[place], poses.translation[place]
     if count and not is_known.any():
         raise McaptrackError(
-            f"{opened.path}: the pose of no box of {topic} in {fixed} is known; {_connected(opened, found)} "
+            f"{opened.path}: the pose of no box of {topic} in {fixed} is known; {_connected(opened, boxes)} "
             "`frame=` names another frame, such as that of the boxes"
         )
     return is_known, rotation, shift
@@ -224,55 +226,55 @@ def _rows_of(times: Ints) -> tuple[Ints, Ints]:
     return times[0], times[1]
 
 
-def _connected(opened: log.Log, found: Recorded3d) -> str:
-    there = transforms_of(opened)
-    frames = ", ".join((there.frames() if there else [])[:_LISTED]) or "none"
-    return f"boxes are in {', '.join(found.names[:_LISTED])}, and transforms have {frames};"
+def _connected(opened: log.Log, boxes: Recorded3d) -> str:
+    transforms = transforms_of(opened)
+    frames = ", ".join((transforms.frames() if transforms else [])[:_LISTED]) or "none"
+    return f"boxes are in {', '.join(boxes.names[:_LISTED])}, and transforms have {frames};"
 
 
-def _warn_odd(opened: log.Log, topic: str, found: Recorded3d) -> None:
+def _warn_odd(opened: log.Log, topic: str, boxes: Recorded3d) -> None:
     """Warn of boxes that have the log time instead of their stamp, and of scores that are none."""
-    _, count = found.times()
+    _, count = boxes.times()
     if count:
-        words = "have no stamp, or one that is more than 60 s from the log time: their time is the log time"
-        warn(f"{opened.path}: {topic}: {count:,} of {len(found.stamp_ns):,} boxes {words}", "clock")
-    if ((found.score < 0) | (found.score > 1)).any():
-        low, high = np.nanmin(found.score), np.nanmax(found.score)
+        text = "have no stamp, or one that is more than 60 s from the log time: their time is the log time"
+        warn(f"{opened.path}: {topic}: {count:,} of {len(boxes.stamp_ns):,} boxes {text}", "clock")
+    if ((boxes.score < 0) | (boxes.score > 1)).any():
+        low, high = np.nanmin(boxes.score), np.nanmax(boxes.score)
         warn(f"{opened.path}: {topic}: scores are from {low:g} to {high:g}; {SCORES_NEEDED}")
 
 
-def rows_of_boxes(found: Recorded3d, rotation: Floats, shift: Floats, where: str = "") -> Rows:
+def rows_of_boxes(boxes: Recorded3d, rotation: Floats, shift: Floats, where: str = "") -> Rows:
     """Boxes as rows of detections (N,), from the poses of their frames: (N, 3, 3) and (N, 3). Classes are not settled.
 
     ``where`` is named in warnings.
     """
     from scipy.spatial.transform import Rotation
 
-    count = len(found.frame)
-    axes = np.empty((0, 3, 3)) if not count else rotation @ Rotation.from_quat(found.orientation).as_matrix()
-    has_z = np.isfinite(found.centre[:, 2])
-    centre = turned(rotation, np.where(has_z[:, None] | [True, True, False], found.centre, 0.0)) + shift
-    velocity = turned(rotation, found.velocity)
+    count = len(boxes.frame)
+    axes = np.empty((0, 3, 3)) if not count else rotation @ Rotation.from_quat(boxes.orientation).as_matrix()
+    has_z = np.isfinite(boxes.centre[:, 2])
+    centre = turned(rotation, np.where(has_z[:, None] | [True, True, False], boxes.centre, 0.0)) + shift
+    velocity = turned(rotation, boxes.velocity)
     # The axis that is most upright is that of the height; of the others the first is that of the length.
     up = np.abs(axes[:, 2]).argmax(axis=1) if count else np.empty(0, np.intp)
     along, across = np.where(up == 0, 1, 0), np.where(up == 2, 1, 2)
     here = np.arange(count)
     heading = headings(axes[here, :, along])
-    lying = int((up[found.has_heading] != 2).sum())
+    lying = int((up[boxes.has_heading] != 2).sum())
     if lying:
-        words = "boxes stand on another side than that of their z axis: their height is along the axis that is upright"
-        warn(f"{where}: {lying:,} {words}")
+        text = "boxes stand on another side than that of their z axis: their height is along the axis that is upright"
+        warn(f"{where}: {lying:,} {text}")
     return DETECTIONS.rows(
         x_m=centre[:, 0],
         y_m=centre[:, 1],
         z_m=np.where(has_z, centre[:, 2], np.nan),
-        length_m=found.size[here, along],
-        width_m=found.size[here, across],
-        height_m=found.size[here, up],
-        heading_rad=np.where(found.has_heading, heading, np.nan),
+        length_m=boxes.size[here, along],
+        width_m=boxes.size[here, across],
+        height_m=boxes.size[here, up],
+        heading_rad=np.where(boxes.has_heading, heading, np.nan),
         vx_m_per_s=velocity[:, 0],
         vy_m_per_s=velocity[:, 1],
-        score=found.score,
-        class_id=found.class_id,
-        source_id=found.source_id,
+        score=boxes.score,
+        class_id=boxes.class_id,
+        source_id=boxes.source_id,
     )

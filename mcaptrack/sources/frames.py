@@ -76,13 +76,7 @@ def warn_of_remarks(opened: log.Log, tree: TransformTree | None, target: str, so
 
 
 def poses_at(
-    opened: log.Log,
-    topic: str,
-    target: str,
-    source: str,
-    stamps_ns: Ints,
-    log_ns: Ints,
-    what: str = "messages",
+    opened: log.Log, topic: str, target: str, source: str, stamps_ns: Ints, log_ns: Ints, what: str = "messages"
 ) -> Poses:
     """Return the poses of a frame in another for messages (N,) of a topic, by their stamps, and warn of gaps.
 
@@ -91,26 +85,26 @@ def poses_at(
     """
     tree, _, unread = read_frames(opened)
     tree = tree or TransformTree([])
-    for words in unread:
-        warn(f"{opened.path}: {words}", "lost")
+    for text in unread:
+        warn(f"{opened.path}: {text}", "lost")
     poses = tree.lookup(target, source, stamps_ns)
     if len(stamps_ns) and not poses.is_known.any():
         by_log_time = tree.on_log_time.lookup(target, source, log_ns)
         if by_log_time.is_known.any():
             poses, tree = by_log_time, tree.on_log_time
-            words = "no stamp is within those of the transforms: they are looked up by log time"
-            warn(f"{opened.path}: {topic}: {words}", "clock")
+            text = "no stamp is within those of the transforms: they are looked up by log time"
+            warn(f"{opened.path}: {topic}: {text}", "clock")
     warn_of_remarks(opened, tree, target, source)
     if poses.unknown:
         why = "; ".join(f"{count:,} {where}" for where, count in poses.unknown.items())
         count = f"{sum(poses.unknown.values()):,} of {len(stamps_ns):,}"
-        words = f"{count} {what} are left out, since the pose of {source} in {target} isn't known: {why}"
-        warn(f"{opened.path}: {topic}: {words}", "transforms")
+        text = f"{count} {what} are left out, since the pose of {source} in {target} isn't known: {why}"
+        warn(f"{opened.path}: {topic}: {text}", "transforms")
     return poses
 
 
 def _read(opened: log.Log) -> FramesRead:
-    found: dict[tuple[str, str, bool], list[tuple[_Transform, int]]] = {}
+    by_edge: dict[tuple[str, str, bool], list[tuple[_Transform, int]]] = {}
     topics = [topic for topic, channel in sorted(opened.channels.items()) if holds_transforms(channel)]
     unread: list[str] = []
     for topic in topics:
@@ -120,8 +114,9 @@ def _read(opened: log.Log) -> FramesRead:
             decode = decoder_with_errors(message_type_of(opened, topic), lambda message: list(_transforms(message)))
             for message in opened.timed(topic):
                 try:
-                    for one in decode(message.payload):
-                        found.setdefault((one.parent, one.child, is_latched), []).append((one, message.t_ns))
+                    for transform in decode(message.payload):
+                        edge = (transform.parent, transform.child, is_latched)
+                        by_edge.setdefault(edge, []).append((transform, message.t_ns))
                 except McaptrackError as error:
                     bad, why = bad + 1, why or str(error)
         except McaptrackError as error:
@@ -129,25 +124,25 @@ def _read(opened: log.Log) -> FramesRead:
         if bad:
             unread.append(f"{topic}: {bad:,} message{'' if bad == 1 else 's'} can't be read; the first: {why}")
     recorded = [
-        Recorded(parent, child, is_latched, _samples(those)) for (parent, child, is_latched), those in found.items()
+        Recorded(parent, child, is_latched, _samples(those)) for (parent, child, is_latched), those in by_edge.items()
     ]
     return FramesRead(TransformTree(recorded) if recorded else None, tuple(topics), tuple(unread))
 
 
 def _samples(those: list[tuple[_Transform, int]]) -> PoseSamples:
     return PoseSamples(
-        np.array([one.stamp_ns for one, _ in those], np.int64),
+        np.array([transform.stamp_ns for transform, _ in those], np.int64),
         np.array([t_ns for _, t_ns in those], np.int64),
-        np.array([one.translation for one, _ in those], np.float64),
-        np.array([one.quaternion for one, _ in those], np.float64),
+        np.array([transform.translation for transform, _ in those], np.float64),
+        np.array([transform.quaternion for transform, _ in those], np.float64),
     )
 
 
 def _transforms(message: Any) -> Iterator[_Transform]:
     """Yield the transforms of a message of any of the schemas."""
     if hasattr(message, "transforms"):
-        for one in message.transforms:
-            yield from _transforms(one)
+        for transform in message.transforms:
+            yield from _transforms(transform)
         return
     if hasattr(message, "parent_frame_id"):
         parent, inner = message.parent_frame_id, message

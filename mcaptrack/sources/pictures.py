@@ -33,10 +33,12 @@ _BACK: Final = 2
 
 def size_of_pictures(opened: log.Log, topic: str) -> tuple[int, int] | None:
     """Return width and height in pixels of the first picture of a channel that can be decoded; None if none can."""
-    found = foreign.pictures(opened, topic)
+    decoded = foreign.pictures(opened, topic)
     pictures = (
-        EncodedPicture(m.t_ns, number, one.format, one.data, one.layout, f"{opened.path}: {topic} at {m.t_ns} ns")
-        for number, (m, one) in enumerate(found)
+        EncodedPicture(
+            m.t_ns, number, picture.format, picture.data, picture.layout, f"{opened.path}: {topic} at {m.t_ns} ns"
+        )
+        for number, (m, picture) in enumerate(decoded)
     )
     first = next(decode_gray(pictures), None)
     return None if first is None else (first.rows.shape[1], first.rows.shape[0])
@@ -54,13 +56,13 @@ def find_pictures(opened: log.Log, topic: str) -> str:
 
     Raises McaptrackError if there is none, or several.
     """
-    there = [channel.topic for channel in opened.channels.values() if foreign.holds_pictures(channel)]
-    found = [name for name in there if topic in (name, name.removeprefix("/"))]
-    found = found or [name for name in there if name.endswith("/" + topic.strip("/"))]
-    if len(found) != 1:
-        has = f"pictures in {', '.join(sorted(there))}" if there else "no pictures"
-        raise McaptrackError(f"{opened.path} has {len(found) or 'no'} channels {topic} with pictures; it has {has}")
-    return found[0]
+    topics = [channel.topic for channel in opened.channels.values() if foreign.holds_pictures(channel)]
+    matching = [name for name in topics if topic in (name, name.removeprefix("/"))]
+    matching = matching or [name for name in topics if name.endswith("/" + topic.strip("/"))]
+    if len(matching) != 1:
+        has = f"pictures in {', '.join(sorted(topics))}" if topics else "no pictures"
+        raise McaptrackError(f"{opened.path} has {len(matching) or 'no'} channels {topic} with pictures; it has {has}")
+    return matching[0]
 
 
 class Pictures:
@@ -81,8 +83,8 @@ class Pictures:
 
         Times before the first picture give the first one.
         """
-        found = np.searchsorted(self.t_ns, np.fromiter(times_ns, np.int64), "right") - 1
-        return self.frames(np.maximum(found, 0).tolist() if len(self.t_ns) else [], pixels)
+        index = np.searchsorted(self.t_ns, np.fromiter(times_ns, np.int64), "right") - 1
+        return self.frames(np.maximum(index, 0).tolist() if len(self.t_ns) else [], pixels)
 
     def frames(self, numbers: Iterable[int], pixels: Pixels = decode_bgr) -> Iterator[Frame]:
         """Yield the pictures with these numbers, in order, without repeats; ``index`` is the number.

@@ -144,12 +144,12 @@ class SyntheticScene:
             now = number / self.fps
             image = ground.copy() if draw else ground
             people = [(walker, walker.at(now)) for walker in self.people]
-            there = [(walker, place) for walker, place in people if place and self._depth_m(*place) > _NEAREST_M]
-            boxes = {walker.id: self._figure(image, walker, place, now, draw=False) for walker, place in there}
+            near = [(walker, place) for walker, place in people if place and self._depth_m(*place) > _NEAREST_M]
+            boxes = {walker.id: self._figure(image, walker, place, now, draw=False) for walker, place in near}
             # From far to near, so that nearer objects occlude those behind them.
             acts: list[tuple[float, Callable[[], object]]] = [
                 (self._depth_m(*place), partial(self._figure, image, person, place, now, draw=True))
-                for person, place in there
+                for person, place in near
             ]
             acts += [(self._depth_m(block.x_m, block.y_m), partial(self._block, image, block)) for block in self.blocks]
             for _, act in sorted(acts, key=lambda pair: -pair[0]) if draw else ():
@@ -170,13 +170,13 @@ class SyntheticScene:
             if draw:
                 noisy = image + grain[y : y + self.height_px, x : x + self.width_px]
                 image = np.clip(noisy, 0, 255).astype(np.uint8)
-            ids = [walker.id for walker, _ in there]
+            ids = [walker.id for walker, _ in near]
             xywh = np.array([boxes[person] for person in ids]).reshape(-1, 4)
             corners = xywh[:, :2] + xywh[:, 2:] / 2
             xywh[:, :2] = corners @ moved[:, :2].T + moved[:, 2] - xywh[:, 2:] / 2
             inside = (xywh[:, 0] > -0.3 * xywh[:, 2]) & (xywh[:, 0] + 0.7 * xywh[:, 2] < self.width_px)
             inside &= (xywh[:, 1] > -0.3 * xywh[:, 3]) & (xywh[:, 1] + 0.7 * xywh[:, 3] < self.height_px)
-            places = np.array([place for _, place in there]).reshape(-1, 2)
+            places = np.array([place for _, place in near]).reshape(-1, 2)
             yield SyntheticFrame(
                 now, image, [person for person, ok in zip(ids, inside, strict=True) if ok], xywh[inside], places[inside]
             )

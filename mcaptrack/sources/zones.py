@@ -28,7 +28,7 @@ _MAX_BYTES: Final = 8 * 2**20
 _MAX_ZONES: Final = 500
 _MAX_POINTS: Final = 2000
 _MAX_NAME: Final = 100
-#: Farther from the origin there are no metres of a map, nor pixels.
+#: Larger coordinates are neither metres of a map nor pixels.
 _FARTHEST: Final = 1e8
 #: A zone of less area in square metres, or of a shorter line in metres, is taken to be in degrees.
 _LEAST_M2, _LEAST_M = 0.01, 0.01
@@ -59,9 +59,9 @@ def parse_zones(content: Any) -> tuple[Zone, ...]:
     elif kind in (*_KINDS, *_OTHERS):
         features = [{"type": "Feature", "properties": {}, "geometry": top}]
     else:
-        found = f"an object of type {kind!r:.40}" if kind is not None else f"{_words(content)} without a type"
+        content_type = f"an object of type {kind!r:.40}" if kind is not None else f"{_words(content)} without a type"
         raise McaptrackError(
-            f"it holds {found}, not GeoJSON; a FeatureCollection with Polygons and LineStrings is read"
+            f"it holds {content_type}, not GeoJSON; a FeatureCollection with Polygons and LineStrings is read"
         )
     zones: list[Zone] = []
     taken = {str(name).strip() for name in map(_given_name, features) if name is not None}
@@ -107,10 +107,10 @@ def _zone(feature: Any, top: Mapping[str, Any], place: int, number: int, taken: 
         raise McaptrackError(f"feature {place} needs objects as its properties and geometry")
     kind = geometry.get("type")
     is_line = kind == "LineString"
-    given = own.get("name", feature.get("id"))
-    if given is not None and not isinstance(given, str | int | float):
-        raise McaptrackError(f"feature {place} has {_words(given)} as its name; it needs a text")
-    name = _made_name("line" if is_line else "zone", number, taken) if given is None else str(given).strip()
+    stated = own.get("name", feature.get("id"))
+    if stated is not None and not isinstance(stated, str | int | float):
+        raise McaptrackError(f"feature {place} has {_words(stated)} as its name; it needs a text")
+    name = _made_name("line" if is_line else "zone", number, taken) if stated is None else str(stated).strip()
     called = f"zone {name}" if name and own.get("name") is not None else f"feature {place}"
     if not name or len(name) > _MAX_NAME or not name.isprintable():
         raise McaptrackError(f"feature {place} needs a name of 1 to {_MAX_NAME} printable characters, not {name!r:.60}")
@@ -162,10 +162,10 @@ def _camera(own: Mapping[str, Any], top: Mapping[str, Any], called: str) -> str:
 
 def _classes(own: Mapping[str, Any], top: Mapping[str, Any], called: str) -> tuple[str, ...]:
     """Return the names of the classes that a zone counts; none for all."""
-    given: Any = next((holder["classes"] for holder in (own, top) if holder.get("classes") is not None), [])
-    names = given if isinstance(given, list) else [given]
+    stated: Any = next((holder["classes"] for holder in (own, top) if holder.get("classes") is not None), [])
+    names = stated if isinstance(stated, list) else [stated]
     if not all(isinstance(name, str) and 0 < len(name) <= _MAX_NAME and name.isprintable() for name in names):
-        raise McaptrackError(f"{called} has classes that are no list of names: {given!r:.60}")
+        raise McaptrackError(f"{called} has classes that are no list of names: {stated!r:.60}")
     return tuple(dict.fromkeys(name.strip() for name in names))
 
 
@@ -225,9 +225,9 @@ def _check(zone: Zone, called: str) -> None:
 def zones_to_json(zones: Sequence[Zone]) -> list[dict[str, Any]]:
     """Return zones as values of JSON, for the provenance of channels."""
     return [
-        {"name": one.name, "units": one.units, "line": one.is_line, "camera": one.camera, "parts": one.parts}
-        | ({"classes": list(one.classes)} if one.classes else {})
-        for one in zones
+        {"name": zone.name, "units": zone.units, "line": zone.is_line, "camera": zone.camera, "parts": zone.parts}
+        | ({"classes": list(zone.classes)} if zone.classes else {})
+        for zone in zones
     ]
 
 
@@ -239,14 +239,14 @@ def zones_from_json(values: object) -> tuple[Zone, ...]:
         return tuple(
             Zone(
                 number,
-                str(one["name"]),
-                _UNITS[one["units"]],
-                tuple(tuple(tuple((float(x), float(y)) for x, y in ring) for ring in part) for part in one["parts"]),
-                bool(one["line"]),
-                str(one["camera"]),
-                tuple(map(str, one.get("classes", ()))),
+                str(value["name"]),
+                _UNITS[value["units"]],
+                tuple(tuple(tuple((float(x), float(y)) for x, y in ring) for ring in part) for part in value["parts"]),
+                bool(value["line"]),
+                str(value["camera"]),
+                tuple(map(str, value.get("classes", ()))),
             )
-            for number, one in enumerate(values, start=1)
+            for number, value in enumerate(values, start=1)
         )
     except (TypeError, ValueError, KeyError):
         return ()
@@ -255,15 +255,17 @@ def zones_from_json(values: object) -> tuple[Zone, ...]:
 def to_geojson(zones: Sequence[Zone]) -> dict[str, Any]:
     """Return zones as GeoJSON, which ``parse_zones`` reads back."""
     features = []
-    for one in zones:
-        parts = [[_closed(ring, one.is_line) for ring in part] for part in one.parts]
+    for zone in zones:
+        parts = [[_closed(ring, zone.is_line) for ring in part] for part in zone.parts]
         geometry: dict[str, Any] = {"type": "MultiPolygon", "coordinates": parts}
-        if one.is_line:
+        if zone.is_line:
             geometry = {"type": "LineString", "coordinates": parts[0][0]}
         elif len(parts) == 1:
             geometry = {"type": "Polygon", "coordinates": parts[0]}
-        own: dict[str, Any] = {"name": one.name, "units": one.units}
-        own |= ({"camera": one.camera} if one.camera else {}) | ({"classes": list(one.classes)} if one.classes else {})
+        own: dict[str, Any] = {"name": zone.name, "units": zone.units}
+        own |= ({"camera": zone.camera} if zone.camera else {}) | (
+            {"classes": list(zone.classes)} if zone.classes else {}
+        )
         features.append({"type": "Feature", "properties": own, "geometry": geometry})
     return {"type": "FeatureCollection", "features": features}
 
@@ -274,7 +276,7 @@ def _closed(ring: Sequence[tuple[float, float]], is_line: bool) -> list[list[flo
 
 def _words(value: object) -> str:
     """Describe a value of JSON."""
-    for kind, words in ((dict, "an object"), (list, "a list"), (str, "a text"), (bool, "true or false")):
+    for kind, text in ((dict, "an object"), (list, "a list"), (str, "a text"), (bool, "true or false")):
         if isinstance(value, kind):
-            return words
+            return text
     return "nothing" if value is None else "a number"

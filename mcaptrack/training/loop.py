@@ -137,11 +137,11 @@ def train(
     )
 
 
-def compare(predictor: Predictor, windows: Windows, recipe: Recipe) -> dict[str, dict[str, dict[str, float]]]:
+def compare(other: Predictor, windows: Windows, recipe: Recipe) -> dict[str, dict[str, dict[str, float]]]:
     """Scores of a predictor, constant velocity and the Kalman filter on the same windows, with and without noise."""
-    predictors = [predictor, *(make(name, recipe.steps, recipe.step_s) for name in ("cv", "kalman"))]
+    predictors = [other, *(make(name, recipe.steps, recipe.step_s) for name in ("cv", "kalman"))]
     return {
-        name: {one.name: forecast_scores(*one.predict(part.past, part.known), part.future) for one in predictors}
+        name: {other.name: forecast_scores(*other.predict(part.past, part.known), part.future) for other in predictors}
         for name, part in (("clean", windows), ("noisy", _noisy(windows)))
     }
 
@@ -256,8 +256,8 @@ class _Run:
         """The same windows twice, the second time a step later, with the same noise at the same positions."""
         windows, recipe = self._training, self._recipe
         path = np.concatenate([windows.past, windows.future[:, :1]], axis=1)
-        known = np.concatenate([windows.known, np.ones((len(windows), 1), bool)], axis=1)
-        later = recipe.corruption(Windows(path, known, windows.future, windows.scene), rng)
+        is_known = np.concatenate([windows.known, np.ones((len(windows), 1), bool)], axis=1)
+        later = recipe.corruption(Windows(path, is_known, windows.future, windows.scene), rng)
         # The position a step later is the first of the future, which is not corrupted.
         length = windows.past.shape[1]
         now = Windows(later.past[:, :length], later.known[:, :length].copy(), later.future, windows.scene)
@@ -274,7 +274,7 @@ class _Run:
         predictor = self._predictor(tensors)
         parts = (validation, _noisy(validation))
         off = [predictor.predict(part.past, part.known).mean - part.future for part in parts]
-        ade_m = float(np.mean([np.hypot(one[..., 0], one[..., 1]).mean() for one in off]))
+        ade_m = float(np.mean([np.hypot(offsets[..., 0], offsets[..., 1]).mean() for offsets in off]))
         if ade_m < self.state.best_ade_m:
             self.state.best_epoch, self.state.best_ade_m = self.state.epoch, ade_m
         if self._recipe.kept == "last" or self.state.best_epoch == self.state.epoch:

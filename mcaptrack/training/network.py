@@ -43,23 +43,23 @@ class RedNetwork(nn.Module):
         out["future"] = torch.tensor(windows.future)
         return {name: part.float() if part.is_floating_point() else part for name, part in out.items()}
 
-    def forward(self, given: dict[str, Tensor]) -> tuple[Tensor, ...]:
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, ...]:
         """Means (B, T, 2) in m; standard deviations (B, T) along and across the direction; their correlation (B, T)."""
-        features, started = given["features"], given["started"]
+        features, started = batch["features"], batch["started"]
         state = features.new_zeros(len(features), self.hidden)
         for pair in range(features.shape[1]):
             new = self.gru(features[:, pair], state)
             state = torch.where(started[:, pair, None], new, state)
         outputs = self.head(torch.tanh(self.dense(state))).reshape(-1, self.steps, red.OUTPUTS)
-        gate, spread = given["gate"][:, None], given["spread"]
-        mean = given["mean"] + (outputs[..., :2] * (gate * spread)[..., None]) @ given["turn"]
+        gate, spread = batch["gate"][:, None], batch["spread"]
+        mean = batch["mean"] + (outputs[..., :2] * (gate * spread)[..., None]) @ batch["turn"]
         width, longer = spread * torch.exp(outputs[..., 2]), torch.exp(gate * outputs[..., 3])
         return mean, width * longer, width / longer, red.MOST_CORRELATED * torch.tanh(gate * outputs[..., 4])
 
-    def loss(self, given: dict[str, Tensor], distance_weight: float) -> tuple[Tensor, Tensor]:
+    def loss(self, batch: dict[str, Tensor], distance_weight: float) -> tuple[Tensor, Tensor]:
         """The mean loss of a batch, and its forecasts (B, T, 2)."""
-        mean, along, across, correlation = self(given)
-        off = (given["future"] - mean) @ given["turn"].transpose(1, 2)
+        mean, along, across, correlation = self(batch)
+        off = (batch["future"] - mean) @ batch["turn"].transpose(1, 2)
         x, y, free = off[..., 0] / along, off[..., 1] / across, 1 - correlation**2
         nll = (x * x + y * y - 2 * correlation * x * y) / (2 * free) + torch.log(along * across) + torch.log(free) / 2
         distance = torch.sqrt((off**2).sum(-1) + 1e-6)
@@ -117,9 +117,9 @@ class LstmNetwork(nn.Module):
             out.append(move)
         return torch.stack(out, dim=1)
 
-    def loss(self, given: dict[str, Tensor], angle: float | None) -> Tensor:
+    def loss(self, batch: dict[str, Tensor], angle: float | None) -> Tensor:
         """The sum of squared errors of a batch and, if ``angle`` is given, of the batch rotated by it (radians)."""
-        past, future = given["past"], given["future"]
+        past, future = batch["past"], batch["future"]
         if angle is not None:
             cos, sin = math.cos(angle), math.sin(angle)
             turn = past.new_tensor([[cos, sin], [-sin, cos]])

@@ -83,14 +83,14 @@ class Recipe:
         if self.consistency_weight and self.loss == "displacements":
             raise McaptrackError("a consistency weight needs the recipe red; paper compares displacements only")
 
-    def changed(self, given: Mapping[str, object], corrupted: Mapping[str, object]) -> Self:
+    def changed(self, values: Mapping[str, object], corrupted: Mapping[str, object]) -> Self:
         """The recipe with other hyperparameters and augmentation; None keeps a value. Raises McaptrackError."""
         for name, most in (("noise_m", 10.0), ("gaps", 0.9), ("scale", 1.0)):
             value = corrupted.get(name)
             if isinstance(value, float) and not 0 <= value <= most:
                 raise McaptrackError(f"{name.replace('_', '-')} has to be from 0 to {most:g}, not {value:g}")
         corruption = replace(self.corruption, **{k: v for k, v in corrupted.items() if v is not None})  # type: ignore[arg-type]
-        return replace(self, corruption=corruption, **{k: v for k, v in given.items() if v is not None})  # type: ignore[arg-type]
+        return replace(self, corruption=corruption, **{k: v for k, v in values.items() if v is not None})  # type: ignore[arg-type]
 
     def rate_at(self, step: int, per_epoch: int) -> float:
         """The learning rate of the batch number ``step``, with ``per_epoch`` batches in an epoch."""

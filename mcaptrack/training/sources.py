@@ -73,15 +73,15 @@ def _files(path: Path) -> list[Path]:
         log.refuse_non_mcap(path)
         return [path]
     kinds = (".txt", ".parquet", ".mcap")
-    found = sorted(file for file in path.rglob("*") if file.suffix.lower() in kinds and file.is_file())
+    files = sorted(file for file in path.rglob("*") if file.suffix.lower() in kinds and file.is_file())
     # Only tables of tracks, and none that repeat the log beside them.
-    logs = {sibling(file, ".tables") for file in found if file.suffix.lower() == ".mcap"}
-    found = [file for file in found if not logs & set(file.parents)]
-    found = [file for file in found if file.suffix.lower() != ".parquet" or tables.holds_tracks(file)]
-    if not found:
+    logs = {sibling(file, ".tables") for file in files if file.suffix.lower() == ".mcap"}
+    files = [file for file in files if not logs & set(file.parents)]
+    files = [file for file in files if file.suffix.lower() != ".parquet" or tables.holds_tracks(file)]
+    if not files:
         log.refuse_non_mcap(path)
         raise McaptrackError(f"{path} has no {', '.join(kinds)} to train on")
-    return found
+    return files
 
 
 def _from_labels(path: Path, options: SourceOptions, step_s: float) -> list[Scene]:
@@ -107,13 +107,13 @@ def _from_log(path: Path, options: SourceOptions, step_s: float) -> list[Scene]:
     with log.read(path) as opened:
         prefix = pipeline.find_camera(opened, None, options.topic)
         topics = [options.topic] if options.topic else [f"{prefix}/{name}" for name in _BEST]
-        found = [topic for topic in topics if topic in opened.channels and opened.channels[topic].messages]
-        if not found:
+        filled = [topic for topic in topics if topic in opened.channels and opened.channels[topic].messages]
+        if not filled:
             raise McaptrackError(f"{path} has none of {', '.join(topics)}; {call('run', path)} makes tracks")
-        if opened.channels[found[0]].schema_name != TRACKS.name:
-            raise McaptrackError(f"{path}: {found[0]} holds {opened.channels[found[0]].schema_name}, not {TRACKS.name}")
+        if (schema_name := opened.channels[filled[0]].schema_name) != TRACKS.name:
+            raise McaptrackError(f"{path}: {filled[0]} holds {schema_name}, not {TRACKS.name}")
         planes = pipeline.read_planes(opened, prefix) or ()
-        return [_scene(f"{path.stem}{found[0]}", opened.frames(found[0], TRACKS), step_s, planes)]
+        return [_scene(f"{path.stem}{filled[0]}", opened.frames(filled[0], TRACKS), step_s, planes)]
 
 
 def _from_parquet(path: Path, options: SourceOptions, step_s: float) -> list[Scene]:

@@ -172,8 +172,8 @@ def walks(count: int, steps: int, step_s: float, seed: int) -> tuple[Floats, NDA
     rng = np.random.default_rng(seed)
     every = step_s / _FINE_S
     out: list[Floats] = []
-    made = 0
-    while made < count:
+    count_done = 0
+    while count_done < count:
         crowd = _Crowd.start(rng)
         for _ in range(round(_SETTLE_S / _FINE_S)):
             crowd.step()
@@ -188,6 +188,6 @@ def walks(count: int, steps: int, step_s: float, seed: int) -> tuple[Floats, NDA
         share = (at - low)[:, None]
         sampled = (1 - share) * places[:, low] + share * places[:, low + 1]
         out.append(sampled.reshape(-1, steps, 2))
-        made += len(out[-1])
+        count_done += len(out[-1])
     scene = np.arange(len(out) * _SCENES).repeat(_PEOPLE * _WALKS_EACH)
     return np.concatenate(out)[:count], scene[:count]

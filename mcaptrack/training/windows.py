@@ -34,8 +34,10 @@ class Windows:
     @classmethod
     def of(cls, paths: Floats, past: int, scene: Ints | None = None) -> Windows:
         """Complete trajectories (N, L + T, 2)."""
-        known = np.ones((len(paths), past), bool)
-        return cls(paths[:, :past], known, paths[:, past:], np.zeros(len(paths), np.int64) if scene is None else scene)
+        is_known = np.ones((len(paths), past), bool)
+        return cls(
+            paths[:, :past], is_known, paths[:, past:], np.zeros(len(paths), np.int64) if scene is None else scene
+        )
 
     @classmethod
     def cut(cls, xy_m: Floats, past: int, steps: int, least: int, stride: int = 1, scene: int = 0) -> Windows:
@@ -48,12 +50,12 @@ class Windows:
         if tracks == 0 or length < steps + 1:
             return cls.of(np.empty((0, past + steps, 2)), past)
         windows = np.lib.stride_tricks.sliding_window_view(padded, past + steps, axis=1).transpose(0, 1, 3, 2)
-        known = np.isfinite(windows[..., 0])
-        complete = known[:, :, past - 1 :].all(axis=2) & (known[:, :, :past].sum(axis=2) >= least)
+        is_valid = np.isfinite(windows[..., 0])
+        complete = is_valid[:, :, past - 1 :].all(axis=2) & (is_valid[:, :, :past].sum(axis=2) >= least)
         rank = np.cumsum(complete, axis=1) - 1  # among the windows of each track
         track, start = np.nonzero(complete & (rank % stride == 0))
-        found, is_known = windows[track, start], known[track, start, :past]
-        return cls(found[:, :past], is_known, found[:, past:], np.full(len(found), scene))
+        paths, is_known = windows[track, start], is_valid[track, start, :past]
+        return cls(paths[:, :past], is_known, paths[:, past:], np.full(len(paths), scene))
 
     @classmethod
     def join(cls, parts: list[Windows]) -> Windows:
@@ -115,14 +117,14 @@ class Corruption:
         if self.noise_m:
             spread = self.noise_m * rng.random((count, 1, 1)) ** 2 * (rng.random((count, 1, 1)) < self.noisy)
             past = past + spread * ar1(rng, count, length)
-        known = windows.known.copy()
+        is_known = windows.known.copy()
         if self.gaps:
-            known &= rng.random((count, length)) >= self.gaps * (rng.random((count, 1)) < 0.5)
+            is_known &= rng.random((count, length)) >= self.gaps * (rng.random((count, 1)) < 0.5)
         if self.least is not None:
             keep = rng.integers(self.least, length + 1, count)
-            known &= np.arange(length) >= (length - keep)[:, None]
-        known[:, -1] = True
-        return Windows(past, known, future, windows.scene)
+            is_known &= np.arange(length) >= (length - keep)[:, None]
+        is_known[:, -1] = True
+        return Windows(past, is_known, future, windows.scene)
 
 
 def ar1(rng: np.random.Generator, count: int, length: int, memory: float = _NOISE_MEMORY) -> Floats:

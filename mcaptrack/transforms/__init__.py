@@ -10,11 +10,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
 
-from mcaptrack.transforms.detect import (
-    KnnDetector,
-    MedianDetector,
-    OnnxDetector,
-)
+from mcaptrack.transforms.detect import KnnDetector, MedianDetector, OnnxDetector
 from mcaptrack.transforms.ground import GroundTracker
 from mcaptrack.transforms.motion import EstimateMotion
 from mcaptrack.transforms.predict import Predict

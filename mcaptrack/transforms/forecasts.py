@@ -44,7 +44,7 @@ class PastPositions(Protocol):
         ...
 
 
-class _Made(NamedTuple):
+class _Predicted(NamedTuple):
     """Forecasts of tracks (N,) as the predictor made them; which tracks have a velocity, and what their class says."""
 
     forecast: Forecast
@@ -58,11 +58,11 @@ class _Made(NamedTuple):
         """Which tracks were measured in metres, and are of a class that moves otherwise than people."""
         return np.asarray(self.has_velocity & (self.unit_m != 1))
 
-    def take(self, which: Ints) -> _Made:
+    def take(self, which: Ints) -> _Predicted:
         """Some of them."""
         (mean, cov), has_velocity, unit_m, noise_m, kinds = self
         forecast = Forecast(mean[which], cov[which])
-        return _Made(forecast, has_velocity[which], unit_m[which], noise_m[which], kinds[which])
+        return _Predicted(forecast, has_velocity[which], unit_m[which], noise_m[which], kinds[which])
 
 
 class Forecaster:
@@ -117,22 +117,23 @@ class Forecaster:
         self._step += passed
         ids = frame.rows["track_id"]
         xy_m = np.stack([frame.rows["x_m"], frame.rows["y_m"]], axis=-1)
-        past, known = self._histories.push(ids, xy_m, passed)
+        past, is_known = self._histories.push(ids, xy_m, passed)
         # An interpolated position depends on later ones: a prediction from it would not be causal.
-        ready = known[:, -self._min_history :].all(axis=1) & frame.rows["observed"]
-        people = self._people(frame.rows, past, known, ready) if uses_people(self._predictor) else None
-        made = self._made(frame.rows[ready], past[ready], known[ready], people)
+        ready = is_known[:, -self._min_history :].all(axis=1) & frame.rows["observed"]
+        people = self._people(frame.rows, past, is_known, ready) if uses_people(self._predictor) else None
+        forecasts = self._predicted(frame.rows[ready], past[ready], is_known[ready], people)
         tails = None
-        if self._calibration is not None and not made.has_velocity.any():
-            step, is_coasting = np.full(len(made.has_velocity), self._step), np.zeros(len(made.has_velocity), bool)
+        if self._calibration is not None and not forecasts.has_velocity.any():
+            count = len(forecasts.has_velocity)
+            step, is_coasting = np.full(count, self._step), np.zeros(count, bool)
             observed_m, since = np.where(frame.rows["observed"][:, None], xy_m, np.nan), self._step - self._observed_at
             (observed, _), self._observed_at = self._observed.push(ids, observed_m, since), self._step
-            given = made.forecast, past[ready], is_coasting, observed[ready]
-            forecast, tails = self._calibration(step, ids[ready], *given)
-        elif made.is_vehicle.any():
-            forecast, tails = self._of_vehicles(made, frame.rows[ready], past[ready])
+            inputs = forecasts.forecast, past[ready], is_coasting, observed[ready]
+            forecast, tails = self._calibration(step, ids[ready], *inputs)
+        elif forecasts.is_vehicle.any():
+            forecast, tails = self._of_vehicles(forecasts, frame.rows[ready], past[ready])
         else:
-            forecast = made.forecast
+            forecast = forecasts.forecast
         return forecast_to_rows(ids[ready], forecast, self._predictor.step_s, tails)
 
     def predict_all(self, frames: FrameColumns) -> FrameColumns:
@@ -163,20 +164,20 @@ class Forecaster:
         passed = np.array([self._passed(t_ns) for t_ns in joined.t_ns.tolist()], np.int64)
         self._step += int(passed.sum())
         ids, place = joined.rows["track_id"], np.stack([joined.rows["x_m"], joined.rows["y_m"]], axis=-1)
-        past, known = histories.push_all(passed, joined.ends, ids, place)
-        is_ready = known[:, -self._min_history :].all(axis=1) & joined.rows["observed"]
+        past, is_known = histories.push_all(passed, joined.ends, ids, place)
+        is_ready = is_known[:, -self._min_history :].all(axis=1) & joined.rows["observed"]
         ready = is_ready.nonzero()[0]
         rows, past = joined.rows.take(ready), past[ready]
-        made = self._made(rows, past, known[ready], None)
-        forecast, tails = made.forecast, None
+        forecasts = self._predicted(rows, past, is_known[ready], None)
+        forecast, tails = forecasts.forecast, None
         # As frame by frame: those of frames without a vehicle stay as they are, to the last digit.
         count = len(joined.t_ns)
-        has_vehicle = np.bincount(joined.frame[ready], made.is_vehicle, count)[joined.frame[ready]] > 0
+        has_vehicle = np.bincount(joined.frame[ready], forecasts.is_vehicle, count)[joined.frame[ready]] > 0
         if has_vehicle.all():
-            forecast, tails = self._of_vehicles(made, rows, past)
+            forecast, tails = self._of_vehicles(forecasts, rows, past)
         elif has_vehicle.any():
             here = has_vehicle.nonzero()[0]
-            part, shapes = self._of_vehicles(made.take(here), rows.take(here), past[here])
+            part, shapes = self._of_vehicles(forecasts.take(here), rows.take(here), past[here])
             forecast.mean[here], forecast.cov[here] = part
             if shapes is not None:
                 tails = normal_tails(forecast.mean.shape[:2])
@@ -190,38 +191,38 @@ class Forecaster:
         last_ns, self._last_ns = self._last_ns, t_ns
         return 1 if last_ns is None else steps_passed(t_ns - last_ns, self._rate_hz)
 
-    def _made(self, rows: Rows, past: Floats, known: Bools, people: PeopleSeen | None) -> _Made:
+    def _predicted(self, rows: Rows, past: Floats, is_known: Bools, people: PeopleSeen | None) -> _Predicted:
         """The forecasts of tracks (N,) as the predictor makes them, in metres."""
         classes, of = np.unique(rows["class_id"], return_inverse=True)
         numbers = classes.tolist()
         unit_m = np.array(units_m(numbers, self._class_names, self._class_limits))[of]
         scale = unit_m[:, None, None]
-        mean, cov = predict_among(self._predictor, past / scale, known, people)
+        mean, cov = predict_among(self._predictor, past / scale, is_known, people)
         has_velocity = np.isfinite(rows["vx_m_per_s"])
         limits = limits_by_class(numbers, self._class_names, self._class_limits)
-        noise_m = np.array([limits[one].noise_m for one in numbers])[of]
-        kinds = np.array([limits[one].name for one in numbers])[of]
-        return _Made(Forecast(mean * scale, cov * scale[..., None] ** 2), has_velocity, unit_m, noise_m, kinds)
+        noise_m = np.array([limits[number].noise_m for number in numbers])[of]
+        kinds = np.array([limits[number].name for number in numbers])[of]
+        return _Predicted(Forecast(mean * scale, cov * scale[..., None] ** 2), has_velocity, unit_m, noise_m, kinds)
 
-    def _of_vehicles(self, made: _Made, rows: Rows, past: Floats) -> tuple[Forecast, Tails | None]:
+    def _of_vehicles(self, forecasts: _Predicted, rows: Rows, past: Floats) -> tuple[Forecast, Tails | None]:
         """The forecasts of tracks (N,) in metres, of which vehicles may stay where they are, and are mixtures."""
         step_s = self._predictor.step_s
-        stay = made.is_vehicle * _standing(past, made.unit_m, step_s)
-        forecast = _with_rest(made.forecast, past[:, -1], stay, made.noise_m, made.unit_m, step_s)
+        stay = forecasts.is_vehicle * _standing(past, forecasts.unit_m, step_s)
+        forecast = _with_rest(forecasts.forecast, past[:, -1], stay, forecasts.noise_m, forecasts.unit_m, step_s)
         speed = np.hypot(*(rows[name].astype(float) for name in ("vx_m_per_s", "vy_m_per_s")))
-        return calibrated(self._name, forecast, step_s, made.kinds.tolist(), speed)
+        return calibrated(self._name, forecast, step_s, forecasts.kinds.tolist(), speed)
 
-    def _people(self, rows: Rows, past: Floats, known: Bools, ready: Bools) -> PeopleSeen:
+    def _people(self, rows: Rows, past: Floats, is_known: Bools, ready: Bools) -> PeopleSeen:
         """The people who are observed in a frame, for the tracks of it that are ``ready`` (N,).
 
         Positions are in the unit of the class, and only objects with the same unit are seen together.
         """
-        there = np.flatnonzero(rows["observed"] & known[:, -1])  # interpolated positions depend on later ones
-        classes, of = np.unique(rows["class_id"][there], return_inverse=True)
+        seen = np.flatnonzero(rows["observed"] & is_known[:, -1])  # interpolated positions depend on later ones
+        classes, of = np.unique(rows["class_id"][seen], return_inverse=True)
         unit_m = np.array(units_m(classes.tolist(), self._class_names, self._class_limits))[of]
         _, moment = np.unique(unit_m, return_inverse=True)
-        row = np.searchsorted(there, np.flatnonzero(ready))
-        return PeopleSeen(past[there] / unit_m[:, None, None], known[there], moment, row)
+        row = np.searchsorted(seen, np.flatnonzero(ready))
+        return PeopleSeen(past[seen] / unit_m[:, None, None], is_known[seen], moment, row)
 
 
 def _have_velocities(joined: JoinedFrames) -> bool:

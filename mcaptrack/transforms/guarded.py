@@ -23,7 +23,7 @@ from mcaptrack.transforms.protocol import Transform, traits_of
 _ONE_FOR_EACH: Final = ("detector", "tracker", "fuser")
 #: Above the largest time in nanoseconds, and above the largest frame number, that a log can hold.
 _END_NS, _END_INDEX = 2**63, 2**32
-#: What a transform that has ended gives.
+#: Marks the end of a transform's output.
 _END: Final = object()
 
 
@@ -63,7 +63,7 @@ def guarded(
     source = _Source(frames, traits_of(transform).passes, guard)
     try:
         with guard.step():
-            made = iter(transform(source))
+            outputs = iter(transform(source))
     except BaseException as error:  # code of other packages may raise anything
         raise source.error_of(entry, error) from error
     last_ns: int | None = None
@@ -71,7 +71,7 @@ def guarded(
     while True:
         try:
             with guard.step():
-                result = next(made, _END)
+                result = next(outputs, _END)
         except BaseException as error:
             raise source.error_of(entry, error) from error
         if result is _END:
@@ -161,10 +161,10 @@ def _checked(entry: Entry, transform: Transform, result: object, last_ns: int | 
     schemas = list(transform.writes.values())
     # A Frame is a tuple itself; to yield one without a tuple around it is a common mistake.
     frames = result if isinstance(result, tuple) and not isinstance(result, Frame) else None
-    if frames is None or len(frames) != len(schemas) or not all(isinstance(one, Frame) for one in frames):
+    if frames is None or len(frames) != len(schemas) or not all(isinstance(frame, Frame) for frame in frames):
         gave = f"a {type(result).__name__}"
         if frames is not None:
-            gave = f"a tuple of {', '.join(type(one).__name__ for one in frames) or 'nothing'}"
+            gave = f"a tuple of {', '.join(type(value).__name__ for value in frames) or 'nothing'}"
         wanted = f"a tuple with a Frame for each of its outputs ({len(schemas)})"
         raise McaptrackError(f"{entry} gave {gave} {where}; it has to yield {wanted}")
     return tuple(
@@ -188,7 +188,7 @@ def _checked_frame(entry: Entry, frame: Frame, schema: Schema, last_ns: int | No
         rows = schema.rows(**{name: rows[name] for name in schema.dtype.names or ()})
     except ValueError as error:
         raise McaptrackError(f"{entry} gave rows {where} that are wrong: {error}") from None
-    if found := first_impossible(schema, rows):
-        row, problem = found
+    if fault := first_impossible(schema, rows):
+        row, problem = fault
         raise McaptrackError(f"{entry} gave rows {where} that are wrong: in row {row} {problem}")
     return Frame(t_ns, index, rows)

@@ -16,9 +16,9 @@ from mcaptrack.schema import CAMERA_MOTION, VIDEO, Frame, Schema
 from mcaptrack.schema.camera_motion import pose_to_rows
 from mcaptrack.transforms.protocol import check_options, context, option
 
-#: From this share of lost pictures on, it is said.
+#: Warn from this share of lost pictures on.
 _LEAST_LOST: Final = 0.02
-#: So is a part of the picture that moves otherwise, from this share and number of the pictures that were looked at.
+#: Warn of a part that moves otherwise than the scene from this share, and this number, of compared pictures on.
 _LEAST_DIVIDED, _LEAST_EXAMINED = 0.4, 4
 
 

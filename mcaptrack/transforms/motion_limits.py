@@ -103,8 +103,8 @@ def limits_row(name: str) -> str:
     ['person', 'car', 'bicycle', 'car', 'unknown']
     """
     parts = re.split(r"[^a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower())
-    words = {part.removesuffix("s") for part in parts}
-    return next((row for word, row in _WORDS if word.removesuffix("s") in words), UNKNOWN)
+    singular = {part.removesuffix("s") for part in parts}
+    return next((row for word, row in _WORDS if word.removesuffix("s") in singular), UNKNOWN)
 
 
 def limits_of(name: str, own: Mapping[str, MotionLimits] | None = None) -> MotionLimits:
@@ -115,8 +115,8 @@ def limits_of(name: str, own: Mapping[str, MotionLimits] | None = None) -> Motio
 
 def limits_by_class(numbers: Sequence[int], names: ClassNames, class_limits: str = "") -> dict[int, MotionLimits]:
     """The limits of classes by their number; ``names`` name them, and ``class_limits`` replace rows of the table."""
-    own, known = read_limits(class_limits), dict(names) or {1: "person"}
-    return {number: limits_of(known.get(number, UNKNOWN), own) for number in numbers}
+    own, named = read_limits(class_limits), dict(names) or {1: "person"}
+    return {number: limits_of(named.get(number, UNKNOWN), own) for number in numbers}
 
 
 def unknown_limits(class_limits: str, names: ClassNames) -> list[str]:
@@ -127,8 +127,8 @@ def unknown_limits(class_limits: str, names: ClassNames) -> list[str]:
     >>> unknown_limits("caar=4, forklift=6, van=30", ((1, "Forklift"), (3, "car")))
     ['caar']
     """
-    known = {name.strip().lower() for _, name in names}
-    return [name for name in read_limits(class_limits) if limits_row(name) == UNKNOWN and name not in known | {UNKNOWN}]
+    named = {name.strip().lower() for _, name in names}
+    return [name for name in read_limits(class_limits) if limits_row(name) == UNKNOWN and name not in named | {UNKNOWN}]
 
 
 def units_m(numbers: Sequence[int], names: ClassNames, class_limits: str = "") -> list[float]:
@@ -141,9 +141,9 @@ def units_m(numbers: Sequence[int], names: ClassNames, class_limits: str = "") -
     >>> units_m([1, 3, 7], ((1, "pedestrian"), (3, "car")))
     [1.0, 4.0, 1.0]
     """
-    found = limits_by_class(numbers, names, class_limits)
+    by_class = limits_by_class(numbers, names, class_limits)
     person = LIMITS["person"].speed_m_per_s
-    return [1.0 if (row := found[one]).name == UNKNOWN else row.speed_m_per_s / person for one in numbers]
+    return [1.0 if (row := by_class[number]).name == UNKNOWN else row.speed_m_per_s / person for number in numbers]
 
 
 #: What a text of ``read_limits`` can set, in this order.
@@ -164,8 +164,8 @@ def read_limits(text: str) -> dict[str, MotionLimits]:
     0.1
     """
     out: dict[str, MotionLimits] = {}
-    for one in filter(str.strip, text.split(",")):
-        name, equals, values = one.partition("=")
+    for entry in filter(str.strip, text.split(",")):
+        name, equals, values = entry.partition("=")
         name, parts = name.strip().lower(), [part.strip() for part in values.split(":")]
         try:
             numbers: list[float | None] = [float(part) if part else None for part in parts]
@@ -174,14 +174,14 @@ def read_limits(text: str) -> dict[str, MotionLimits]:
         is_good = all(number is None or 0 <= number < 1e6 for number in numbers)
         if not (name and equals and any(parts) and numbers and is_good and len(numbers) <= len(_NUMBERS)):
             raise McaptrackError(
-                f"class_limits has {one.strip()!r}; it is NAME=SPEED:DRIFT:NOISE:GATE in m/s, m/s within a second, m "
+                f"class_limits has {entry.strip()!r}; it is NAME=SPEED:DRIFT:NOISE:GATE in m/s, m/s within a second, m "
                 "and m, as in car=40 or pedestrian=4:0.5:0.1:1.2"
             )
         row = limits_of(name)
         missing: list[float | None] = [None] * (len(_NUMBERS) - len(numbers))
         speed, drift, noise, gate = numbers + missing
         if 0 in (speed, noise, gate):
-            raise McaptrackError(f"class_limits has {one.strip()!r}; SPEED, NOISE and GATE have to be more than 0")
+            raise McaptrackError(f"class_limits has {entry.strip()!r}; SPEED, NOISE and GATE have to be more than 0")
         if name in out:
             raise McaptrackError(f"class_limits names {name} twice; give each class once")
         most = row.max_speed_m_per_s if speed is None else speed

@@ -143,17 +143,21 @@ def predict_with(predictor: PredictorName) -> type[Predict]:
 
 @cache
 def _with_own_options(entry: Entry) -> type[Predict]:
-    own = [one for one in own_options(entry.cls) if is_option_type(one.annotation)]
+    own = [option for option in own_options(entry.cls) if is_option_type(option.annotation)]
     if not own:
         return Predict
-    if taken := {one.name for one in own} & {one.name for one in fields(Predict)}:
+    if taken := {option.name for option in own} & {option.name for option in fields(Predict)}:
         raise McaptrackError(f"{entry} can't have a parameter {', '.join(sorted(taken))}: that is one of predict")
-    made: type[Predict] = make_dataclass(
+    variant: type[Predict] = make_dataclass(
         f"{Predict.__name__} with {entry.name}",
-        [(one.name, one.annotation, field(default=one.default, metadata=one.metadata)) for one in own],
+        [(option.name, option.annotation, field(default=option.default, metadata=option.metadata)) for option in own],
         bases=(Predict,),
-        namespace={"own_options": tuple(one.name for one in own), "variant_of": Predict, "__doc__": Predict.__doc__},
+        namespace={
+            "own_options": tuple(option.name for option in own),
+            "variant_of": Predict,
+            "__doc__": Predict.__doc__,
+        },
         frozen=True,
         kw_only=True,
     )
-    return made
+    return variant

@@ -135,14 +135,14 @@ class Traits:
 
     def suited(self, kind: str) -> Suited | None:
         """The entry of a kind (see ``mcaptrack.registry``) that suits the output; None if it names none."""
-        found = self.suits.get(kind)
-        return Suited(found) if isinstance(found, str) else found
+        suited = self.suits.get(kind)
+        return Suited(suited) if isinstance(suited, str) else suited
 
 
 def traits_of(transform: Any) -> Traits:
     """The traits of a transform, or of its class (without those that depend on parameters)."""
-    given = {trait.name: getattr(transform, trait.name) for trait in fields(Traits) if hasattr(transform, trait.name)}
-    return Traits(**{name: value for name, value in given.items() if not isinstance(value, property)})
+    traits = {trait.name: getattr(transform, trait.name) for trait in fields(Traits) if hasattr(transform, trait.name)}
+    return Traits(**{name: value for name, value in traits.items() if not isinstance(value, property)})
 
 
 def trait_problem(cls: type[Any]) -> str:
@@ -152,7 +152,7 @@ def trait_problem(cls: type[Any]) -> str:
         value, names = getattr(traits, trait.name), get_args(hints[trait.name])
         if trait.name == "suits":
             if not isinstance(value, Mapping) or not all(
-                kind in KINDS and isinstance(one, str | Suited) for kind, one in value.items()
+                kind in KINDS and isinstance(suited, str | Suited) for kind, suited in value.items()
             ):
                 return f"has suits = {value!r}; it maps kinds to names, as in suits = {{'tracker': 'bytetrack'}}"
         elif hints[trait.name] is bool and not isinstance(value, bool):
@@ -221,6 +221,11 @@ def option(
     return field(default=default, metadata=about)
 
 
+def setting(default: Any, help: str, **about: Any) -> Any:  # noqa: A002
+    """Declare a parameter as ``option`` does that only ``--set`` sets: the command has no option of its own for it."""
+    return option(default, help, flag=False, **about)
+
+
 def context(factory: Callable[[], Any], *, is_recorded: bool = True) -> Any:
     """Declare a parameter that the log gives, not the user: the ground planes, or the time of the first frame.
 
@@ -265,7 +270,7 @@ def member_type(annotation: Any) -> tuple[Any, bool]:
 def is_option_type(annotation: Any) -> bool:
     """Whether an option can have this type."""
     kind, _ = member_type(annotation)
-    return kind in _KINDS or (bool(choices(kind)) and all(isinstance(one, str) for one in get_args(kind)))
+    return kind in _KINDS or (bool(choices(kind)) and all(isinstance(choice, str) for choice in get_args(kind)))
 
 
 @cache
@@ -312,8 +317,8 @@ def check_options(transform: WithOptions) -> None:
             continue
         if is_tuple and not isinstance(value, tuple):
             raise McaptrackError(f"{name} needs a tuple, not {value!r}")
-        for one in value if is_tuple else (value,):
-            _check_value(name, one, kind, parameter.metadata)
+        for item in value if is_tuple else (value,):
+            _check_value(name, item, kind, parameter.metadata)
 
 
 def _check_value(name: str, value: Any, kind: Any, about: Mapping[str, Any]) -> None:

@@ -77,8 +77,8 @@ class Sample:
         for first, last, rows, at in resample_parts(in_metres, tick_ns, seconds_to_ns(self.max_gap_s)):
             rows["source_id"] = rows["track_id"]
             ends = np.searchsorted(at, np.arange(first, last), "right")
-            made = split_rows(tick_ns[first:last].tolist(), picture[first:last].tolist(), rows, ends)
-            yield from ((frame,) for frame in made)
+            sampled = split_rows(tick_ns[first:last].tolist(), picture[first:last].tolist(), rows, ends)
+            yield from ((frame,) for frame in sampled)
 
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
         """Why there are no samples, for a warning."""

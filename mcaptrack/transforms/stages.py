@@ -181,19 +181,19 @@ class Stage:
         """
         entry = self.find(chosen) if chosen else self.entry(self.default)
         cls = self.with_part(entry.cls, parameters.get(self.parameter))
-        known, is_own = [f.name for f in fields(cls) if f.init], self.is_built_in(cls)
+        names, is_own = [f.name for f in fields(cls) if f.init], self.is_built_in(cls)
         for name in parameters:
-            if name not in known:
-                close = difflib.get_close_matches(name, known, 1)
+            if name not in names:
+                close = difflib.get_close_matches(name, names, 1)
                 meant = f"did you mean {close[0]}? " if close else ""
                 what = entry if self.kind else self.name
-                raise McaptrackError(f"{what} has no parameter {name}; {meant}there are {', '.join(known) or 'none'}")
+                raise McaptrackError(f"{what} has no parameter {name}; {meant}there are {', '.join(names) or 'none'}")
         if (file := self.split(chosen)[1]) is not None and parameters.setdefault(_FILE, file) != file:
             raise McaptrackError(f"{chosen} and `{_FILE}={parameters[_FILE]}` are two files; give one")
         with nullcontext() if is_own else blamed(entry, "could not be made"):
-            made: Transform = cls(**parameters)
-            check_options(made)
-        return made
+            transform: Transform = cls(**parameters)
+            check_options(transform)
+        return transform
 
     def _check(self, entry: Entry) -> None:
         """Raise McaptrackError if a class of another package can't be a transform of this stage."""
@@ -236,7 +236,7 @@ class Stage:
                 raise McaptrackError(f"{entry} has no output {suffix!r}; a fuser also writes which boxes it joined")
         if "__call__" not in dir(cls):
             raise McaptrackError(f"{entry} can't be called with frames; it needs a method __call__")
-        if any(one.name == self.kind for one in fields(cls)):
+        if any(field.name == self.kind for field in fields(cls)):
             raise McaptrackError(f"{entry}: a parameter can't have the name of the option `{self.kind}=`")
         if problem := trait_problem(cls):
             raise McaptrackError(f"{entry} {problem}")
@@ -299,11 +299,7 @@ _STAGES: Final = (
         at_video_rate=True,
         profiles=PROFILES,
         modes=MappingProxyType(
-            {
-                "both": (),
-                "offline": ("", "decisions", "appearance"),
-                "online": ("online", "predictions"),
-            }
+            {"both": (), "offline": ("", "decisions", "appearance"), "online": ("online", "predictions")}
         ),
         beside=("decisions", "appearance"),
         implied=MappingProxyType({"distance": "consistency"}),

@@ -32,7 +32,7 @@ from mcaptrack.schema.resampling import interval_ns, resample, resample_parts
 
 #: Columns taken from the tracker where it has a box.
 _FROM_TRACKER: Final = ("x_px", "y_px", "w_px", "h_px", "score", "observed")
-#: The same for tracks that a tracker made in metres, with velocities.
+#: Columns of tracks that a tracker made in metres, with velocities.
 _IN_METRES: Final = ("x_m", "y_m", "z_m", "heading_rad", "vx_m_per_s", "vy_m_per_s")
 
 
@@ -72,16 +72,16 @@ def mended_ends(frames: FrameColumns) -> FrameColumns:
     FrameColumns
         As many frames, at the same times.
     """
-    until_ns = {one: int(frames.t_ns[frame]) for one, frame in _kept_until(frames).items()}
+    until_ns = {track: int(frames.t_ns[frame]) for track, frame in _kept_until(frames).items()}
     if until_ns:
         frames = filtered_rows(TRACKS, frames, lambda joined: _is_kept(joined, until_ns))
     return _with_rows(frames, *_moved_on(frames))
 
 
 def _is_kept(joined: JoinedFrames, until_ns: Mapping[int, int]) -> Bools:
-    """Which rows (N,) are not after the time that is given for their track, if there is one."""
+    """Mask the rows (N,) that are not later than the limit of their track, if it has one."""
     ids, which = np.unique(joined.rows["track_id"], return_inverse=True)
-    limits = np.array([until_ns.get(one, LAST_NS) for one in ids.tolist()], np.int64)
+    limits = np.array([until_ns.get(track, LAST_NS) for track in ids.tolist()], np.int64)
     return np.asarray(joined.row_ns <= limits[which])
 
 
@@ -95,20 +95,20 @@ def _kept_until(frames: FrameColumns) -> dict[int, int]:
         order = order[joined.rows["observed"][order]]
         starts = np.flatnonzero(run_starts(of[order]))
         for here in np.split(order, starts[1:]) if len(order) else ():
-            one, found = int(of[here[0]]), joined.frame[here] + low
-            before = np.append(last.get(one, found[0]), found[:-1])
-            waited = frames.t_ns[found] - frames.t_ns[before]
-            is_alone = (waited > _LONG_NS) & (found - before > _LONG_FRAMES)
+            track, seen = int(of[here[0]]), joined.frame[here] + low
+            before = np.append(last.get(track, seen[0]), seen[:-1])
+            waited = frames.t_ns[seen] - frames.t_ns[before]
+            is_alone = (waited > _LONG_NS) & (seen - before > _LONG_FRAMES)
             # A detection soon after another one makes both certain.
             sure = np.flatnonzero(~is_alone)
             if len(sure):
-                out[one] = int(found[sure[-1]])
-            last[one] = int(found[-1])
-    return {one: frame for one, frame in out.items() if frame < last[one]}
+                out[track] = int(seen[sure[-1]])
+            last[track] = int(seen[-1])
+    return {track: frame for track, frame in out.items() if frame < last[track]}
 
 
 def _moved_on(frames: FrameColumns) -> tuple[Rows, Ints]:
-    """Rows (N,) that move tracks on by a frame at both of their ends, and the frame of each."""
+    """Rows (N,) that extend tracks by one frame at both ends, and the frame of each."""
     t_ns = frames.t_ns
     first: dict[int, tuple[int, Rows]] = {}
     soon: dict[int, tuple[int, Rows]] = {}
@@ -122,20 +122,20 @@ def _moved_on(frames: FrameColumns) -> tuple[Rows, Ints]:
         for a, b in bounds:
             here = order[a : b + 1]
             rows, at = joined.rows, joined.frame[here] + low
-            one = int(rows["track_id"][here[0]])
-            count[one] = count.get(one, 0) + len(here)
-            if one not in first:
-                first[one] = int(at[0]), rows[here[:1]].copy()
-            near = int(np.searchsorted(t_ns[at], t_ns[first[one][0]] + _MOTION_NS, "right")) - 1
+            track = int(rows["track_id"][here[0]])
+            count[track] = count.get(track, 0) + len(here)
+            if track not in first:
+                first[track] = int(at[0]), rows[here[:1]].copy()
+            near = int(np.searchsorted(t_ns[at], t_ns[first[track][0]] + _MOTION_NS, "right")) - 1
             if near >= 0:
-                soon[one] = int(at[near]), rows[here[near : near + 1]].copy()
-            last[one] = int(at[-1]), rows[here[-1:]].copy()
+                soon[track] = int(at[near]), rows[here[near : near + 1]].copy()
+            last[track] = int(at[-1]), rows[here[-1:]].copy()
     limit = min(_NEXT_INTERVALS * interval_ns(t_ns), _NEXT_NS)
     out, frame_of = [TRACKS.empty()], []
-    for one, number in count.items():
+    for track, number in count.items():
         if number < _LEAST_ROWS:
             continue
-        (begin, row), (later, then), (end, final) = first[one], soon[one], last[one]
+        (begin, row), (later, then), (end, final) = first[track], soon[track], last[track]
         if later > begin > 0 and (dt_ns := int(t_ns[begin] - t_ns[begin - 1])) <= limit:
             share = dt_ns / int(t_ns[later] - t_ns[begin])
             out.append(_moved(row, *(share * (row[name] - then[name]) for name in ("x_m", "y_m"))))
@@ -148,7 +148,7 @@ def _moved_on(frames: FrameColumns) -> tuple[Rows, Ints]:
 
 
 def _moved(row: Rows, x_m: Floats, y_m: Floats) -> Rows:
-    """A row (1,) that is not observed, so far away."""
+    """A copy of a row (1,) moved by these distances, which is not observed."""
     out = row.copy()
     out["x_m"] += x_m
     out["y_m"] += y_m
@@ -157,7 +157,7 @@ def _moved(row: Rows, x_m: Floats, y_m: Floats) -> Rows:
 
 
 def _with_rows(frames: FrameColumns, rows: Rows, frame_of: Ints) -> FrameColumns:
-    """Frames with more rows (N,), of these frames; those of each frame are ordered by id."""
+    """Frames with rows (N,) added to frames (N,); the rows of each frame are ordered by id."""
     out = FrameCollector(TRACKS)
     for low, high, joined in joined_parts(TRACKS, frames):
         here = (frame_of >= low) & (frame_of < high)
@@ -249,9 +249,9 @@ def _part(
     _to_metres(outside, frame_ns[at[~inside]], planes)
     rows = TRACKS.joined([base, outside])
     rows_at = np.concatenate([base_at, at[~inside]])
-    known, class_id = classes
-    if len(known):  # of the re-tracked track: that of the tracker's box may be another one
-        rows["class_id"] = class_id[np.searchsorted(known, rows["track_id"])]
+    track_ids, class_id = classes
+    if len(track_ids):  # of the re-tracked track: that of the tracker's box may be another one
+        rows["class_id"] = class_id[np.searchsorted(track_ids, rows["track_id"])]
     order = np.lexsort((rows["track_id"], rows_at))
     rows, rows_at = rows.take(order), rows_at[order]
     return rows, np.searchsorted(rows_at, np.arange(len(frame_ns) + 1), "left")
@@ -276,18 +276,18 @@ def linked_tracks(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Pl
         roots |= dict(zip(rows["source_id"].tolist(), rows["track_id"].tolist(), strict=True))
     spans_ns: dict[int, tuple[int, int]] = {}
     for _, _, joined in joined_parts(TRACKS, tracks):
-        for one, t_ns in zip(joined.rows["track_id"].tolist(), joined.row_ns.tolist(), strict=True):
-            spans_ns[one] = spans_ns.get(one, (t_ns, t_ns))[0], t_ns
+        for track, t_ns in zip(joined.rows["track_id"].tolist(), joined.row_ns.tolist(), strict=True):
+            spans_ns[track] = spans_ns.get(track, (t_ns, t_ns))[0], t_ns
 
     def renamed(joined: JoinedFrames) -> Rows:
         rows = joined.rows
         rows["source_id"] = rows["track_id"]
-        rows["track_id"] = [roots.get(one, one) for one in rows["track_id"].tolist()]
+        rows["track_id"] = [roots.get(track, track) for track in rows["track_id"].tolist()]
         _to_metres(rows, joined.row_ns, planes)
         return rows
 
     def is_first(joined: JoinedFrames) -> Bools:
-        began_ns = np.array([spans_ns[one][0] for one in joined.rows["source_id"].tolist()], np.int64)
+        began_ns = np.array([spans_ns[source][0] for source in joined.rows["source_id"].tolist()], np.int64)
         order = np.lexsort((began_ns, joined.rows["track_id"], joined.frame))
         kept = np.empty(len(order), bool)
         kept[order] = run_starts(joined.frame[order], joined.rows["track_id"][order])
@@ -295,8 +295,8 @@ def linked_tracks(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Pl
 
     frames = mapped_rows(TRACKS, tracks, renamed)
     parts: dict[int, list[tuple[int, int]]] = {}
-    for one, span in spans_ns.items():
-        parts.setdefault(roots.get(one, one), []).append(span)
+    for track, span in spans_ns.items():
+        parts.setdefault(roots.get(track, track), []).append(span)
     linked = {root: sorted(spans) for root, spans in parts.items() if len(spans) > 1}
     if not linked:
         return frames
@@ -350,13 +350,13 @@ def _retracked_ids(track: Ints, t_ns: Ints, retracks: Sequence[Frame]) -> tuple[
 
 def _classes_of(retracks: Sequence[Frame]) -> tuple[Ints, Ints]:
     """The ids of re-tracked tracks, rising, and the class of the first row of each."""
-    known, classes = np.empty(0, np.int64), np.empty(0, np.int64)
+    track_ids, classes = np.empty(0, np.int64), np.empty(0, np.int64)
     for _, _, joined in joined_parts(TRACKS, retracks):
-        ids = np.concatenate([known, joined.rows["track_id"]])
+        ids = np.concatenate([track_ids, joined.rows["track_id"]])
         those = np.concatenate([classes, joined.rows["class_id"]])
-        known, first = np.unique(ids, return_index=True)
+        track_ids, first = np.unique(ids, return_index=True)
         classes = those[first]
-    return known, classes
+    return track_ids, classes
 
 
 def _to_metres(rows: Rows, t_ns: Ints, planes: Planes) -> None:

@@ -90,17 +90,17 @@ def hota(matchup: Matchup) -> dict[str, NDArray[np.float64]]:
     def solve_frame(number: int, *_: object) -> tuple[Indices, Indices]:
         return gains.best(number)
 
-    found = matchup.assigned(pairs, solve_frame)
+    matched = matchup.assigned(pairs, solve_frame)
     # The number of thresholds that each match passes; from that, the matches that pass each threshold.
-    passed = np.searchsorted(ALPHAS - _EPS, found.similarity, "right")
+    passed = np.searchsorted(ALPHAS - _EPS, matched.similarity, "right")
     levels = len(ALPHAS) + 1
     tp = _at_least(np.bincount(passed, minlength=levels))
-    located = _at_least(np.bincount(passed, found.similarity, minlength=levels))
-    cells, at = np.unique(found.person * n_tracks + found.track, return_inverse=True)
+    located = _at_least(np.bincount(passed, matched.similarity, minlength=levels))
+    cells, at = np.unique(matched.person * n_tracks + matched.track, return_inverse=True)
     counts = np.bincount(at * levels + passed, minlength=levels * len(cells)).reshape(len(cells), levels)
     matches = _at_least(counts)  # (M, A)
-    there = (truth_count[cells // n_tracks] + track_count[cells % n_tracks])[:, None] if n_tracks else matches
-    association = matches / (there - matches)  # a match counts twice in ``there``, so that this is 1 at least
+    total = (truth_count[cells // n_tracks] + track_count[cells % n_tracks])[:, None] if n_tracks else matches
+    association = matches / (total - matches)  # a match counts twice in ``total``, so that this is 1 at least
     return {
         "HOTA_TP": tp,
         "HOTA_FN": len(matchup.all_ground_truth) - tp,
@@ -173,8 +173,8 @@ def best_tracks(matchup: Matchup, large: int = _LARGE) -> tuple[Indices, Floats]
     cell = pairs.person[near] * matchup.n_tracks + pairs.track[near]
     if shape[0] * shape[1] > large:
         cells, together = np.unique(cell, return_counts=True)
-        found, frames = assign_pairs_by_gain((cells // shape[1], cells % shape[1]), together.astype(float), shape)
-        return found[0], frames
+        pair, frames = assign_pairs_by_gain((cells // shape[1], cells % shape[1]), together.astype(float), shape)
+        return pair[0], frames
     if not shape[0] * shape[1]:
         return np.empty(0, np.intp), np.empty(0)
     table = np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape).astype(float)
@@ -360,9 +360,9 @@ def average_over_recalls(
     total = sum(part.matchup.ground_truth_rows for part in parts)
     if not total:
         return dict.fromkeys(("AMOTA", "AMOTP", "sAMOTA", "AMOTA_unscaled"), float("nan"))
-    found = [part.score[matches(part.matchup, rules).track] for part in parts]
-    scores = np.sort(np.concatenate(found))[::-1]
-    known: dict[tuple[bytes, ...], _Counts] = {}
+    matched_scores = [part.score[matches(part.matchup, rules).track] for part in parts]
+    scores = np.sort(np.concatenate(matched_scores))[::-1]
+    counts_of: dict[tuple[bytes, ...], _Counts] = {}
 
     def at(recalls: Floats) -> list[tuple[float, _Counts]]:
         """The recalls that are reached, each with its counts."""
@@ -372,19 +372,19 @@ def average_over_recalls(
         out = []
         for recall, score in zip(recalls[reached].tolist(), least.tolist(), strict=True):
             kept = [part.score >= score for part in parts]
-            key = tuple(one.tobytes() for one in kept)
-            if key not in known:
-                known[key] = _count(
-                    [_of_tracks(part.matchup, one) for part, one in zip(parts, kept, strict=True)], rules
+            key = tuple(mask.tobytes() for mask in kept)
+            if key not in counts_of:
+                counts_of[key] = _count(
+                    [_of_tracks(part.matchup, mask) for part, mask in zip(parts, kept, strict=True)], rules
                 )
-            out.append((recall, known[key]))
+            out.append((recall, counts_of[key]))
         return out
 
-    nuscenes = [one for _, one in at(np.linspace(_LEAST, 1, _RECALLS).round(12))]
-    motar = [max(0.0, 1 - (one.switches + one.fp) / one.tp) for one in nuscenes if one.tp]
-    motp = [one.similarity_sum / one.tp for one in nuscenes if one.tp]
+    nuscenes = [counts for _, counts in at(np.linspace(_LEAST, 1, _RECALLS).round(12))]
+    motar = [max(0.0, 1 - (at_recall.switches + at_recall.fp) / at_recall.tp) for at_recall in nuscenes if at_recall.tp]
+    motp = [at_recall.similarity_sum / at_recall.tp for at_recall in nuscenes if at_recall.tp]
     by_target = at(np.arange(1, _RECALLS + 1) / _RECALLS)
-    right = [(recall * total, one.tp - one.fp - one.switches) for recall, one in by_target]
+    right = [(recall * total, counts.tp - counts.fp - counts.switches) for recall, counts in by_target]
     return {
         "AMOTA": sum(motar) / _RECALLS,
         "AMOTP": (sum(motp) + worst * (_RECALLS - len(motp))) / _RECALLS,
@@ -394,13 +394,13 @@ def average_over_recalls(
 
 
 def _count(matchups: Sequence[Matchup], rules: Rules) -> _Counts:
-    found = [matches(matchup, rules) for matchup in matchups]
-    tp = sum(len(one.person) for one in found)
+    matched = [matches(matchup, rules) for matchup in matchups]
+    tp = sum(len(pairs.person) for pairs in matched)
     return _Counts(
         tp,
         sum(matchup.track_rows for matchup in matchups) - tp,
-        sum(int(is_switch(one).sum()) for one in found),
-        float(sum(one.similarity.sum() for one in found)),
+        sum(int(is_switch(pairs).sum()) for pairs in matched),
+        float(sum(pairs.similarity.sum() for pairs in matched)),
     )
 
 
@@ -408,14 +408,14 @@ def _of_tracks(matchup: Matchup, kept: Bools) -> Matchup:
     """A matchup with some of its tracks (H,)."""
     if kept.all():
         return matchup
-    there = [kept[tracks] for tracks in matchup.tracks]
+    masks = [kept[tracks] for tracks in matchup.tracks]
     alike = matchup.similarity
     return Matchup(
         matchup.ground_truth,
-        tuple(tracks[one] for tracks, one in zip(matchup.tracks, there, strict=True)),
+        tuple(tracks[mask] for tracks, mask in zip(matchup.tracks, masks, strict=True)),
         alike.of_columns(kept[matchup.all_tracks])
         if isinstance(alike, SparseTables)
-        else tuple(similarity[:, one] for similarity, one in zip(alike, there, strict=True)),
+        else tuple(similarity[:, mask] for similarity, mask in zip(alike, masks, strict=True)),
         matchup.threshold,
         matchup.n_ground_truth,
         matchup.n_tracks,

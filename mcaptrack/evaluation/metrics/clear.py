@@ -62,23 +62,23 @@ def clear(matchup: Matchup, rules: Rules = "trackeval") -> Counts:
     (2, 1, 1)
     """
     by_devkit = rules == "trackeval"
-    found = matches(matchup, rules)
+    pairs = matches(matchup, rules)
     present = np.bincount(matchup.all_ground_truth, minlength=matchup.n_ground_truth)
-    tracked = np.bincount(found.person, minlength=matchup.n_ground_truth)[present > 0]
+    tracked = np.bincount(pairs.person, minlength=matchup.n_ground_truth)[present > 0]
     ratio = tracked / present[present > 0]
     mostly = ratio > 0.8 if by_devkit else ratio >= 0.8
     lost = ratio < 0.2
     return {
-        "TP": len(found.person),
-        "FP": matchup.track_rows - len(found.person),
-        "FN": matchup.ground_truth_rows - len(found.person),
-        "IDSW": int(is_switch(found).sum()),
-        "Frag": _fragments_trackeval(matchup, found) if by_devkit else _fragments_motmetrics(matchup, found),
+        "TP": len(pairs.person),
+        "FP": matchup.track_rows - len(pairs.person),
+        "FN": matchup.ground_truth_rows - len(pairs.person),
+        "IDSW": int(is_switch(pairs).sum()),
+        "Frag": _fragments_trackeval(matchup, pairs) if by_devkit else _fragments_motmetrics(matchup, pairs),
         "MT": int(mostly.sum()),
         "PT": int((~mostly & ~lost).sum()),
         "ML": int(lost.sum()),
         "GT": int((present > 0).sum()),
-        "similarity_sum": float(found.similarity.sum()),
+        "similarity_sum": float(pairs.similarity.sum()),
     }
 
 
@@ -87,31 +87,31 @@ def matches(matchup: Matchup, rules: Rules = "trackeval") -> RowPairs:
     pairs, by_devkit = matchup.pairs, rules == "trackeval"
     near = pairs.similarity >= matchup.threshold - _EPS if by_devkit else pairs.similarity >= matchup.threshold
     memory = _LastTracks(matchup)
-    found = matchup.assigned(pairs.where(near), memory.pairs_trackeval if by_devkit else memory.pairs_motmetrics)
-    return found.where(np.lexsort((found.frame, found.person)))
+    assigned = matchup.assigned(pairs.where(near), memory.pairs_trackeval if by_devkit else memory.pairs_motmetrics)
+    return assigned.where(np.lexsort((assigned.frame, assigned.person)))
 
 
-def is_switch(found: RowPairs) -> NDArray[np.bool_]:
+def is_switch(pairs: RowPairs) -> NDArray[np.bool_]:
     """Mark the matches (P,) with another track than the person's last; matches are ordered by person and frame."""
-    out = np.zeros(len(found.person), bool)
-    out[1:] = (found.person[1:] == found.person[:-1]) & (found.track[1:] != found.track[:-1])
+    out = np.zeros(len(pairs.person), bool)
+    out[1:] = (pairs.person[1:] == pairs.person[:-1]) & (pairs.track[1:] != pairs.track[:-1])
     return out
 
 
-def _fragments_trackeval(matchup: Matchup, found: RowPairs) -> int:
-    """Count how often people are tracked again after a frame without a match; ``found`` is ordered by person.
+def _fragments_trackeval(matchup: Matchup, pairs: RowPairs) -> int:
+    """Count how often people are tracked again after a frame without a match; ``pairs`` is ordered by person.
 
     Frames without people or without tracks are skipped, as in the devkit.
     """
-    looked_at = np.cumsum((matchup.ground_truth_counts > 0) & (matchup.track_counts > 0))[found.frame]
-    again = found.person[1:] == found.person[:-1]
+    looked_at = np.cumsum((matchup.ground_truth_counts > 0) & (matchup.track_counts > 0))[pairs.frame]
+    again = pairs.person[1:] == pairs.person[:-1]
     return int((again & (np.diff(looked_at) > 1)).sum())
 
 
-def _fragments_motmetrics(matchup: Matchup, found: RowPairs) -> int:
+def _fragments_motmetrics(matchup: Matchup, pairs: RowPairs) -> int:
     """Count changes from tracked to missed between the first and the last frame in which a person is tracked."""
     is_tracked = np.zeros(matchup.ground_truth_rows, bool)
-    is_tracked[found.row] = True
+    is_tracked[pairs.row] = True
     order = np.argsort(matchup.all_ground_truth, kind="stable")
     person, flag = matchup.all_ground_truth[order], is_tracked[order]
     begins = flag.copy()
@@ -180,7 +180,7 @@ class _LastTracks:
         return self._decided(number, np.concatenate([kept_rows, rows]), np.concatenate([kept_columns, columns]))
 
     def _largest_motmetrics(self, number: int, people: Indices, tracks: Indices) -> tuple[Indices, Indices]:
-        """The same for a frame without a table of all pairs."""
+        """As ``pairs_motmetrics``, for a frame with a table of all pairs that would be too large."""
         tables = self._matchup.tables
         rows, columns, similarity = tables.pairs_of(number)
         ok = similarity >= self._matchup.threshold

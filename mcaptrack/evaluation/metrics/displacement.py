@@ -28,7 +28,7 @@ TAU_M2: Final = 2.0
 
 #: The probabilities of the ellipses for which reliability is reported.
 RELIABILITY_LEVELS: Final = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
-#: Those of them that tables have columns for.
+#: The levels that tables have columns for.
 LEVELS: Final = (0.5, 0.9, 0.95)
 
 
@@ -319,20 +319,20 @@ def displacement(
     >>> round(found["ADE_m"], 3), round(found["FDE_m"], 3), found["recall"]
     (0.8, 1.2, 1.0)
     """
-    found = pair_forecasts(ground_truth, tracks, forecasts, t_obs)
-    known = np.isfinite(found.offset_m).all(axis=(1, 2))
-    number = found.forecast[known]
-    errors = forecast_errors(found.offset_m[known], forecasts.cov_m2[number], forecasts.shapes(number))
+    pairs = pair_forecasts(ground_truth, tracks, forecasts, t_obs)
+    is_known = np.isfinite(pairs.offset_m).all(axis=(1, 2))
+    number = pairs.forecast[is_known]
+    errors = forecast_errors(pairs.offset_m[is_known], forecasts.cov_m2[number], forecasts.shapes(number))
     return Displacement(
-        d_obs_m2=found.d_obs_m2[known],
+        d_obs_m2=pairs.d_obs_m2[is_known],
         ade_m=errors.ade_m,
         fde_m=errors.fde_m,
         ade_squared_m2=errors.ade_squared_m2,
         covered=errors.covered,
         nll=errors.nll,
-        people=found.people,
-        false_forecasts=int(found.is_judged.sum() - (found.d_obs_m2 < tau_m2).sum()),
-        frames=found.frames,
+        people=pairs.people,
+        false_forecasts=int(pairs.is_judged.sum() - (pairs.d_obs_m2 < tau_m2).sum()),
+        frames=pairs.frames,
         consistency_m=_consistency_m(forecasts),
         error_m=errors.error_m,
     )

@@ -62,13 +62,7 @@ class SparseTables(Sequence[Floats]):
     """
 
     def __init__(
-        self,
-        frame: Indices,
-        row: Indices,
-        column: Indices,
-        similarity: Floats,
-        row_ends: Indices,
-        column_ends: Indices,
+        self, frame: Indices, row: Indices, column: Indices, similarity: Floats, row_ends: Indices, column_ends: Indices
     ) -> None:
         self.frame, self.row, self.column, self.similarity = frame, row, column, similarity
         self._row_ends, self._column_ends = row_ends, column_ends
@@ -87,7 +81,7 @@ class SparseTables(Sequence[Floats]):
 
     def __getitem__(self, number: int | slice, /) -> Floats | list[Floats]:
         if isinstance(number, slice):
-            return [self[one] for one in range(len(self))[number]]
+            return [self[frame] for frame in range(len(self))[number]]
         number = range(len(self))[number]
         if number != self._last:
             (top, bottom), (left, right) = self._row_ends[number : number + 2], self._column_ends[number : number + 2]
@@ -129,9 +123,9 @@ class SparseTables(Sequence[Floats]):
             return self[number][rows, columns]
         width = int(self._column_ends[number + 1] - self._column_ends[number])
         known_rows, known_columns, similarity = self.pairs_of(number)
-        known, wanted = known_rows * width + known_columns, rows * width + columns
-        at = np.minimum(known.searchsorted(wanted), max(len(known) - 1, 0))
-        return np.where(known[at] == wanted, similarity[at], 0.0) if len(known) else np.zeros(len(rows))
+        stored, wanted = known_rows * width + known_columns, rows * width + columns
+        at = np.minimum(stored.searchsorted(wanted), max(len(stored) - 1, 0))
+        return np.where(stored[at] == wanted, similarity[at], 0.0) if len(stored) else np.zeros(len(rows))
 
     def of_columns(self, kept: NDArray[np.bool_]) -> SparseTables:
         """The tables with some of the columns of all frames (C,)."""
@@ -243,16 +237,16 @@ class Matchup:
         hard[candidates.frame[candidates.contested()]] = True
         easy, numbers = candidates.where(~hard[candidates.frame]), hard.nonzero()[0]
         ends = np.searchsorted(easy.frame, numbers)
-        found: list[tuple[Indices, Indices, Floats]] = []
+        by_frame: list[tuple[Indices, Indices, Floats]] = []
         low = 0
         for number, high in zip(numbers.tolist(), ends.tolist(), strict=True):
             rows, columns = solve_frame(number, easy, low, high)
-            found.append((rows, columns, self.tables.at(number, rows, columns)))
+            by_frame.append((rows, columns, self.tables.at(number, rows, columns)))
             low = high
-        if not found:
+        if not by_frame:
             return easy
-        frame = np.repeat(numbers, [len(rows) for rows, *_ in found])
-        rows, columns, similarity = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        frame = np.repeat(numbers, [len(rows) for rows, *_ in by_frame])
+        rows, columns, similarity = (np.concatenate(parts) for parts in zip(*by_frame, strict=True))
         people, tracks = self.ground_truth_counts, self.track_counts
         row = (np.cumsum(people) - people)[frame] + rows
         column = (np.cumsum(tracks) - tracks)[frame] + columns

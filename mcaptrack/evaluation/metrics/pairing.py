@@ -48,8 +48,8 @@ class _SortedPositions(NamedTuple):
         """Whether the same id has all positions from here to ``by`` steps ahead, or back (N,)."""
         out = np.zeros(len(self.slot), bool)
         if abs(by) < len(out):
-            here, there = slice(max(-by, 0), len(out) - max(by, 0)), slice(max(by, 0), len(out) - max(-by, 0))
-            out[here] = (self.slot[there] == self.slot[here]) & (self.step[there] == self.step[here] + by)
+            here, ahead = slice(max(-by, 0), len(out) - max(by, 0)), slice(max(by, 0), len(out) - max(-by, 0))
+            out[here] = (self.slot[ahead] == self.slot[here]) & (self.step[ahead] == self.step[here] + by)
         return out
 
     def find(self, ids: Ints, step: Ints) -> Ints:
@@ -61,8 +61,8 @@ class _SortedPositions(NamedTuple):
         wanted = place * width + (step - first)
         keys = self.slot * width + (self.step - first)
         at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-        known = (self.ids[place] == ids) & (step >= first) & (step < first + width) & (keys[at] == wanted)
-        return np.where(known, at, -1)
+        exists = (self.ids[place] == ids) & (step >= first) & (step < first + width) & (keys[at] == wanted)
+        return np.where(exists, at, -1)
 
     def window(self, at: Ints, first: int, last: int) -> Floats:
         """The positions (M, last - first + 1, 2) from ``first`` to ``last`` steps after the rows ``at`` (M,)."""
@@ -71,9 +71,9 @@ class _SortedPositions(NamedTuple):
 
 def _sorted_positions(path: Positions, fill: bool) -> _SortedPositions:
     """Sort positions; with ``fill`` gaps are interpolated linearly, if they are not longer than any past needs."""
-    known = np.isfinite(path.xy_m).all(axis=1)
-    ids, slot = np.unique(path.id[known], return_inverse=True)
-    step, xy_m = path.step[known], path.xy_m[known]
+    is_known = np.isfinite(path.xy_m).all(axis=1)
+    ids, slot = np.unique(path.id[is_known], return_inverse=True)
+    step, xy_m = path.step[is_known], path.xy_m[is_known]
     order = np.lexsort((step, slot))
     slot, step, xy_m = slot[order], step[order], xy_m[order]
     last = run_ends(run_starts(slot, step))
@@ -160,15 +160,15 @@ def pair_forecasts(ground_truth: Positions, tracks: Positions, forecasts: Foreca
     is_judged = (place >= 0) & paths.is_continuous(1 - t_obs)[place] if len(paths.slot) else np.zeros(len(place), bool)
     subject = np.flatnonzero(has_past & np.isin(people.step, steps))
     subject = subject[np.argsort(people.step[subject], kind="stable")]
-    made = np.flatnonzero(is_judged)
-    made = made[np.lexsort((forecasts.id[made], forecasts.step[made]))]
+    judged = np.flatnonzero(is_judged)
+    judged = judged[np.lexsort((forecasts.id[judged], forecasts.step[judged]))]
     past_true = people.window(subject, 1 - t_obs, 0)
-    past = paths.window(place[made], 1 - t_obs, 0)
-    row, column, d_obs = _assigned(past_true, past, people.step[subject], forecasts.step[made], steps)
-    at, number = subject[row], made[column]
+    past = paths.window(place[judged], 1 - t_obs, 0)
+    row, column, d_obs = _assigned(past_true, past, people.step[subject], forecasts.step[judged], steps)
+    at, number = subject[row], judged[column]
     offset = np.full((len(at), horizon, 2), np.nan)
-    known = has_future[at]
-    offset[known] = forecasts.mean_m[number[known]] - people.window(at[known], 1, horizon)
+    has_truth = has_future[at]
+    offset[has_truth] = forecasts.mean_m[number[has_truth]] - people.window(at[has_truth], 1, horizon)
     counted = int(has_future[subject].sum())
     return PairedForecasts(number, people.ids[people.slot[at]], d_obs, offset, is_judged, counted, len(steps))
 
@@ -202,9 +202,9 @@ def _best(cost: Floats, row: Ints, column: Ints, which: Ints, down: Ints, across
     rest.
     """
     is_by_row = (down <= across)[which]
-    one, other = np.where(is_by_row, row, column), np.where(is_by_row, column, row)
-    order = np.lexsort((cost, one, which))
-    nearest = order[run_starts(one[order], which[order])]
+    mine, other = np.where(is_by_row, row, column), np.where(is_by_row, column, row)
+    order = np.lexsort((cost, mine, which))
+    nearest = order[run_starts(mine[order], which[order])]
     by_other = nearest[np.lexsort((other[nearest], which[nearest]))]
     contested = np.unique(which[by_other][~run_starts(other[by_other], which[by_other])])
     taken = [nearest[~np.isin(which[nearest], contested)]]

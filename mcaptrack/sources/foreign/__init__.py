@@ -151,8 +151,8 @@ def named_detections(opened: log.Log, topic: str) -> NamedFrames:
     Class names are converted to ids (see ``boxes.Classes``), which a warning lists.
     """
     classes = Classes()
-    found = _decoded(opened, topic, lambda kind: boxes_decoder(kind, classes))
-    frames = [Frame(message.t_ns, index, rows) for index, (message, rows) in enumerate(found)]
+    decoded = _decoded(opened, topic, lambda kind: boxes_decoder(kind, classes))
+    frames = [Frame(message.t_ns, index, rows) for index, (message, rows) in enumerate(decoded)]
     return NamedFrames(frames, settle_classes(opened, topic, classes, [frame.rows for frame in frames]))
 
 
@@ -169,7 +169,7 @@ def settle_classes(opened: log.Log, topic: str, classes: Classes, parts: Sequenc
 
 def boxes_3d(opened: log.Log, topic: str) -> Iterator[tuple[int, Message3d]]:
     """The log time in ns of each message of a channel, and its 3D boxes. Raises McaptrackError as ``pictures`` does."""
-    return ((message.t_ns, found) for message, found in _decoded(opened, topic, boxes_3d_decoder))
+    return ((message.t_ns, boxes) for message, boxes in _decoded(opened, topic, boxes_3d_decoder))
 
 
 def _decoded(
@@ -185,9 +185,9 @@ def _reader(
     channel = opened.channel(topic)
     index = opened.part(channel.topic).index
     schema = index.schemas.get(index.channels[channel.id].schema_id)
-    words = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
+    fields = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
     try:
-        decode = make(MessageType(*words, channel.message_encoding))
+        decode = make(MessageType(*fields, channel.message_encoding))
     except McaptrackError as error:
         raise McaptrackError(f"{opened.path}: {topic}: {error}") from None
 
@@ -224,15 +224,15 @@ def _compressed(message: Any) -> Picture:
     return Picture(stamp_of(message), _format(text(message.format)), data)
 
 
-def _format(words: str) -> str:
+def _format(text: str) -> str:
     """The codec in a format: "h264" -> "h264", "rgb8; jpeg compressed bgr8" -> "jpeg"."""
-    found = re.findall(r"[a-z0-9]+", words.lower().replace("h.26", "h26"))
-    for word in found:
+    tokens = re.findall(r"[a-z0-9]+", text.lower().replace("h.26", "h26"))
+    for word in tokens:
         if word in _VIDEO_WORDS:
             return _VIDEO_WORDS[word]
-    if "compresseddepth" in found:
-        raise ValueError(f"depth in the format {words[:40]!r} is not read")
-    return next((word for word in ("jpeg", "jpg", "png", "webp") if word in found), words[:40])
+    if "compresseddepth" in tokens:
+        raise ValueError(f"depth in the format {text[:40]!r} is not read")
+    return next((word for word in ("jpeg", "jpg", "png", "webp") if word in tokens), text[:40])
 
 
 def _raw(message: Any) -> Picture:

@@ -67,7 +67,7 @@ class Classes:
         return people | dict(enumerate(sorted(self._names), start=self._largest + 1))
 
     def nameless(self, used: Collection[int]) -> list[int]:
-        """Those of the final ids ``used`` that messages state as numbers, without a name; 0 is no class."""
+        """The final ids among ``used`` that messages state as numbers, without a name; 0 is no class."""
         named = set(self.numbers().values()) | ({PERSON} if self._people else set()) | {UNKNOWN}
         return sorted(set(used) - named)
 
@@ -115,9 +115,9 @@ def _box(detection: Any, classes: Classes) -> tuple[float, float, float, float, 
         w, h = (abs(w * cos(theta)) + abs(h * sin(theta)), abs(w * sin(theta)) + abs(h * cos(theta)))
     guesses = [getattr(result, "hypothesis", result) for result in detection.results]
     scored = [(float(guess.score), guess) for guess in guesses]
-    known = [(score, guess) for score, guess in scored if isfinite(score)]
-    score, best = max(known or scored, key=lambda pair: pair[0], default=(nan, None))
-    return x - w / 2, y - h / 2, w, h, score if known else nan, _class_id(best, classes)
+    finite = [(score, guess) for score, guess in scored if isfinite(score)]
+    score, best = max(finite or scored, key=lambda pair: pair[0], default=(nan, None))
+    return x - w / 2, y - h / 2, w, h, score if finite else nan, _class_id(best, classes)
 
 
 def _class_id(guess: Any, classes: Classes) -> int:

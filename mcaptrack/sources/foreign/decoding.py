@@ -46,10 +46,10 @@ def plain_name(schema_name: str) -> str:
     """The normalised name of a schema: sensor_msgs/Image for sensor_msgs/msg/Image, and foxglove.RawImage for
     foxglove_msgs/msg/RawImage.
     """
-    found = _ROS_NAME.fullmatch(schema_name)
-    if not found:
+    match = _ROS_NAME.fullmatch(schema_name)
+    if not match:
         return schema_name
-    package, name = found.groups()
+    package, name = match.groups()
     return f"foxglove.{name}" if package == "foxglove_msgs" else f"{package}/{name}"
 
 
@@ -102,16 +102,16 @@ def ros_types(kind: MessageType) -> tuple[Any, str]:
     """The types of a ROS message (a store of rosbags), and its name in it. Raises McaptrackError as ``unpacker``."""
     from rosbags.typesys import Stores
 
-    found = _ROS_NAME.fullmatch(kind.name)
-    if not found:
+    match = _ROS_NAME.fullmatch(kind.name)
+    if not match:
         raise McaptrackError(f"{kind.name!r} is not the name of a ROS message; those are like sensor_msgs/Image")
-    name = "{}/msg/{}".format(*found.groups())
+    name = "{}/msg/{}".format(*match.groups())
     # Each reader sets the longest sequence of its own store; what was compiled for the type is shared.
     return copy(_typestore(name, kind, Stores.ROS1_NOETIC if kind.encoding == "ros1" else Stores.LATEST)), name
 
 
 @lru_cache(maxsize=64)
-def _typestore(name: str, kind: MessageType, known: Any) -> Any:
+def _typestore(name: str, kind: MessageType, standard: Any) -> Any:
     """The types of a channel: from its definition, supplemented by the standard types of ROS if necessary.
 
     Kept, because the code that reads a type is compiled when it is first used, which takes longer than a short log.
@@ -119,7 +119,7 @@ def _typestore(name: str, kind: MessageType, known: Any) -> Any:
     from rosbags.typesys import Stores, get_typestore
 
     why = "the log has no definition of it, and it is not a standard type of ROS"
-    for base in (Stores.EMPTY, known):
+    for base in (Stores.EMPTY, standard):
         store = get_typestore(base)
         try:
             types = _types(name, kind)
@@ -146,10 +146,10 @@ def stamp_of(message: Any) -> int:
     """The stamp of a message in nanoseconds: ``timestamp`` in Foxglove messages, ``header.stamp`` in ROS messages."""
     stamp = message.timestamp if hasattr(message, "timestamp") else message.header.stamp
     if isinstance(stamp, str):
-        found = _RFC3339.fullmatch(stamp)
-        if not found:
+        match = _RFC3339.fullmatch(stamp)
+        if not match:
             raise ValueError(f"{stamp[:40]!r} is no time")
-        day, clock, fraction, zone = found.groups()
+        day, clock, fraction, zone = match.groups()
         passed = datetime.fromisoformat(f"{day}T{clock}{zone.upper()}") - _EPOCH
         t_ns = (passed.days * 86400 + passed.seconds) * NS_PER_S + int((fraction or "").ljust(9, "0"))
     else:

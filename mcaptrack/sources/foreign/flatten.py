@@ -36,8 +36,8 @@ def message_type_of(opened: log.Log, topic: str) -> MessageType:
     channel = opened.channel(topic)
     index = opened.part(topic).index
     schema = index.schemas.get(index.channels[channel.id].schema_id)
-    words = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
-    return MessageType(*words, channel.message_encoding)
+    fields = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
+    return MessageType(*fields, channel.message_encoding)
 
 
 def message_decoder(opened: log.Log, topic: str) -> Callable[[bytes], Any]:
@@ -59,7 +59,7 @@ def flattener(kind: MessageType) -> Callable[[bytes], dict[Path, Value]]:
     def flatten(payload: bytes) -> dict[Path, Value]:
         try:
             message = unpack(payload)
-            found = dict(_walk(message, ()))
+            row = dict(_walk(message, ()))
         except McaptrackError:
             raise
         except Exception as error:  # untrusted bytes in third-party parsers, which raise various exceptions
@@ -67,7 +67,7 @@ def flattener(kind: MessageType) -> Callable[[bytes], dict[Path, Value]]:
             raise McaptrackError(
                 f"{len(payload)} bytes are not a {kind.name or kind.encoding} message ({why})"
             ) from None
-        return found
+        return row
 
     return flatten
 
@@ -92,13 +92,13 @@ def _protobuf(kind: MessageType) -> Callable[[bytes], Any]:
         pool = DescriptorPool()
         for file in FileDescriptorSet.FromString(kind.schema).file:
             pool.Add(file)
-        made: Any = GetMessageClass(pool.FindMessageTypeByName(kind.name))
+        message_class: Any = GetMessageClass(pool.FindMessageTypeByName(kind.name))
     except Exception as error:  # a third-party parser that raises various exceptions
         why = " ".join(str(error).split())[:120] or type(error).__name__
         raise McaptrackError(
             f"{kind.name} can't be read: the log's definition of it can't be understood ({why})"
         ) from None
-    return made.FromString  # type: ignore[no-any-return]
+    return message_class.FromString  # type: ignore[no-any-return]
 
 
 def _walk(value: Any, path: Path) -> Iterator[tuple[Path, Value]]:

@@ -50,7 +50,7 @@ VIDEO_SUFFIXES: Final = (
     ".ivf",
     ".obu",
 )
-#: What such a file holds is text, whatever its first bytes are.
+#: Files with these endings hold text, whatever their first bytes are.
 _TEXT_SUFFIXES: Final = (".csv", ".tsv", ".txt", ".json", ".xml")
 
 

@@ -66,14 +66,14 @@ def boxes_topic(opened: log.Log, camera: str) -> str:
 
 
 def _holds_boxes(opened: log.Log, channel: log.Channel) -> bool:
-    made = Provenance.from_metadata(channel.metadata)
-    if made is None:
+    provenance = Provenance.from_metadata(channel.metadata)
+    if provenance is None:
         return holds_boxes_3d(opened, channel.topic)
     is_truth = channel.topic.endswith(f"/{_TRUTH}")
     return (
-        made.transform == INGEST
+        provenance.transform == INGEST
         and channel.schema_name in (DETECTIONS.name, TRACKS.name)
-        and bool(made.frame_id and not is_truth)
+        and bool(provenance.frame_id and not is_truth)
     )
 
 
@@ -95,12 +95,14 @@ def root_frame(opened: log.Log) -> str:
 def warn_of_frame(opened: log.Log, frame_id: str, labels: Path) -> None:
     """Warn if a log has frames of reference, and not the one of labels."""
     tree = transforms_of(opened)
-    known = set(tree.frames() if tree else ()) | {frame_id_of(one.metadata) for one in opened.channels.values()} - {""}
-    if known and plain_frame(frame_id) not in known:
-        listed = sorted(known)
-        there = ", ".join(listed[:_LISTED]) + (", ..." if len(listed) > _LISTED else "")
-        words = f"there is no frame {frame_id} in {opened.path} (but {there}), so that its tracks can't be compared"
-        warn(f"{labels}: {words} with these boxes", "transforms")
+    frames = set(tree.frames() if tree else ()) | {
+        frame_id_of(channel.metadata) for channel in opened.channels.values()
+    } - {""}
+    if frames and plain_frame(frame_id) not in frames:
+        listed = sorted(frames)
+        some = ", ".join(listed[:_LISTED]) + (", ..." if len(listed) > _LISTED else "")
+        text = f"there is no frame {frame_id} in {opened.path} (but {some}), so that its tracks can't be compared"
+        warn(f"{labels}: {text} with these boxes", "transforms")
 
 
 class Boxes3DJob(IngestJob):
@@ -115,11 +117,11 @@ class Boxes3DJob(IngestJob):
         super().__init__(inputs[0][1], replace(options, labels={}), into)
         self._refuse_options(options)
         self.boxes: dict[Role, BoxRows3D] = {}
-        for given, path in (*inputs, *options.labels.items()):
-            if given == "corrections":
+        for stated, path in (*inputs, *options.labels.items()):
+            if stated == "corrections":
                 raise McaptrackError(f"{path} holds 3D boxes; corrections are boxes in pictures")
-            rows = read_boxes_3d(path, given or "detections", options.label_format, options.columns, options.scene)
-            role = given or ("tracks" if rows.has_ids else "detections")
+            rows = read_boxes_3d(path, stated or "detections", options.label_format, options.columns, options.scene)
+            role = stated or ("tracks" if rows.has_ids else "detections")
             if role != "detections":
                 rows.check(role)
             if role in self.boxes:
@@ -139,7 +141,7 @@ class Boxes3DJob(IngestJob):
         return self.boxes.keys()
 
     def _refuse_options(self, options: IngestOptions) -> None:
-        given = {
+        is_option_given = {
             options.for_videos(): bool(options.for_videos()),
             "`ground_plane=`": options.ground_plane is not None,
             "`calibration=`": bool(options.calibration),
@@ -147,7 +149,7 @@ class Boxes3DJob(IngestJob):
             "`size=`": options.size is not None,
             "`frames=`": options.frames is not None,
         }
-        for name, is_given in given.items():
+        for name, is_given in is_option_given.items():
             if is_given:
                 raise McaptrackError(f"{self.source} holds 3D boxes; {name} is for pictures and boxes in them")
 
@@ -158,14 +160,14 @@ class Boxes3DJob(IngestJob):
                 warn_of_frame(self.into, self.options.frame_id, rows.path)
             return self.options.frame_id
         root = root_frame(self.into) if self.into else ""
-        found = rows.frame_id or root or FRAME
+        frame_id = rows.frame_id or root or FRAME
         reason = "by its format" if rows.frame_id else "the root of the log's transforms" if root else "assumed"
-        words = f"{rows.path}: boxes are taken as those of the frame {found!r} ({reason}); `frame=` names another"
+        text = f"{rows.path}: boxes are taken as those of the frame {frame_id!r} ({reason}); `frame=` names another"
         if reason == "assumed":
-            rows.doubts.append((words, "other"))
+            rows.doubts.append((text, "other"))
         else:
-            rows.remarks.append(words)
-        return found
+            rows.remarks.append(text)
+        return frame_id
 
     def _at_times(self, role: Role, rows: BoxRows3D) -> TimedLabels:
         if rows.labelled is None:
@@ -195,14 +197,14 @@ class Boxes3DJob(IngestJob):
         if int(labelled[0]) < first:
             raise McaptrackError(f"{rows.path}: its first frame is {labelled[0]}, before `first_frame={first}`")
         if options.first_frame is None and labelled[0] > 0 and rows.format == "csv":
-            words = f"{rows.path}: frames begin with {labelled[0]}; frame {first} is assumed to be the first"
-            rows.doubts.append((f"{words}, `first_frame=` sets the number", "clock"))
+            text = f"{rows.path}: frames begin with {labelled[0]}; frame {first} is assumed to be the first"
+            rows.doubts.append((f"{text}, `first_frame=` sets the number", "clock"))
         if rows.format != "csv" and options.first_frame is None:
             first = 0
         if options.fps is not None:
             start = options.start_ns if options.start_ns is not None else self._log_start_ns()
             rows.remarks.append(f"{rows.path}: frame {first} is at {start / NS_PER_S:.3f} s")
-            both = (start + frame_times_ns(one - first, options.fps) for one in (number, labelled))
+            both = (start + frame_times_ns(numbers - first, options.fps) for numbers in (number, labelled))
             return next(both), next(both)
         if self.into is None or not self._topic:
             raise McaptrackError(
@@ -231,15 +233,15 @@ class Boxes3DJob(IngestJob):
         """Report how the boxes were understood, and what of them is left out."""
         for role, rows in self.boxes.items():
             self.report.remarks += rows.remarks
-            for words, code in rows.doubts:
-                warn(words, code)
+            for text, code in rows.doubts:
+                warn(text, code)
             if rows.left_out:
                 warn(f"{rows.path} also holds {rows.left_out}; left out of {role}", "left-out")
             timed = self._timed[role]
             numbers, counts = np.unique(timed.class_id, return_counts=True)
             named = [f"{number} {timed.classes.get(number, '')}".strip() for number in numbers.tolist()]
-            words = ", ".join(f"{name} ({count})" for name, count in zip(named, counts.tolist(), strict=True))
-            self.report.remarks.append(f"{rows.path}: class_id is {words}")
+            text = ", ".join(f"{name} ({count})" for name, count in zip(named, counts.tolist(), strict=True))
+            self.report.remarks.append(f"{rows.path}: class_id is {text}")
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
         """Write the boxes."""
@@ -262,14 +264,14 @@ class Boxes3DJob(IngestJob):
 
     def _parameters(self, role: Role) -> dict[str, Any]:
         options = self.options
-        given: Mapping[str, Any] = {
+        parameters: Mapping[str, Any] = {
             "first_frame": options.first_frame,
             "columns": ",".join(f"{key}={name}" for key, name in (options.columns or {}).items()) or None,
             "classes": options.classes.text if options.classes and role != "detections" else None,
             "scene": options.scene,
             "fps": None if options.fps is None else str(options.fps),
         }
-        return {name: value for name, value in given.items() if value is not None}
+        return {name: value for name, value in parameters.items() if value is not None}
 
     def classes(self, role: Role) -> Mapping[int, str]:
         """The names of the classes of a role by class id."""

@@ -104,12 +104,12 @@ class IngestOptions:
 
     def for_videos(self) -> str:
         """The first given option that applies only to videos; "" if there is none."""
-        given = {
+        is_option_given = {
             "`image_format=`": self.image_format != "auto",
             "`quality=`": self.quality is not None,
             "`keyframe_interval_s=`": self.keyframe_interval_s is not None,
         }
-        return next((name for name, is_given in given.items() if is_given), "")
+        return next((name for name, is_given in is_option_given.items() if is_given), "")
 
 
 @dataclass
@@ -205,11 +205,11 @@ class GivenGround:
         if self._calibrated is None:
             return {}
         topic, message = f"{prefix}/{CALIBRATION}", (t_ns, 0, self._calibrated.at(t_ns))
-        made = Provenance(INGEST, self._calibrated.parameters, pictures, digest=digest(iter([message])))
+        provenance = Provenance(INGEST, self._calibrated.parameters, pictures, digest=digest(iter([message])))
         record = foxglove.record_in(foxglove.CALIBRATION, encoding)
-        channel = writer.add_channel(topic, record, encoding, made.to_metadata())
-        for one in foxglove.messages_in(foxglove.CALIBRATION, [message], encoding):
-            writer.add_message(channel, *one)
+        channel = writer.add_channel(topic, record, encoding, provenance.to_metadata())
+        for packed in foxglove.messages_in(foxglove.CALIBRATION, [message], encoding):
+            writer.add_message(channel, *packed)
         return {topic: 1}
 
 
@@ -231,8 +231,8 @@ class IngestJob:
         self.prefix = "/" + options.camera.strip("/")
         #: The topic of the pictures that labels belong to; "" if there is none.
         self.pictures = ""
-        given = (options.calibration, options.calibration_name, options.calibration_unit)
-        calibration = GivenCalibration.read(*given) if options.calibration else None
+        source_options = (options.calibration, options.calibration_name, options.calibration_unit)
+        calibration = GivenCalibration.read(*source_options) if options.calibration else None
         #: The ground plane and the calibration that were given.
         self.ground_given = GivenGround(options.ground_plane, calibration, options.point)
         self.labels: dict[Role, tuple[Path, LabelFile]] = {
@@ -268,25 +268,26 @@ class IngestJob:
         ``size`` returns width and height of the pictures; None if there are none. Raises McaptrackError if the size is
         not known, or isn't the given one.
         """
-        given = self.options.size
+        stated = self.options.size
         paths = [path for path, labels in self.labels.values() if labels.is_normalised]
         if not any(labels.format in OTHERS for _, labels in self.labels.values()):
             return
-        found = size() if size else given
-        if given and found and found != given:
+        actual = size() if size else stated
+        if stated and actual and actual != stated:
             raise McaptrackError(
-                f"{self.source}: the pictures are {found[0]}x{found[1]}, not {given[0]}x{given[1]}; leave `size=` out"
+                f"{self.source}: the pictures are {actual[0]}x{actual[1]}, not {stated[0]}x{stated[1]}; "
+                "leave `size=` out"
             )
-        if paths and found is None:
+        if paths and actual is None:
             raise McaptrackError(
                 f"{paths[0]} has boxes in shares of the picture's size; give it with `size='WIDTHxHEIGHT'`, or add the "
                 "labels to a log with pictures with `into=`"
             )
-        if found is None:
+        if actual is None:
             return
         for role, (path, labels) in self.labels.items():
             if isinstance(labels, Labels) and labels.format in OTHERS:
-                self.labels[role] = path, fitted(path, labels, found)
+                self.labels[role] = path, fitted(path, labels, actual)
 
     def check_labels(self) -> None:
         """Refuse labels that don't suit their role."""
@@ -306,15 +307,15 @@ class IngestJob:
             )
         for role, (path, labels) in self.labels.items():
             self.report.remarks += labels.remarks
-            for words, code in labels.doubts:
-                warn(words, code)
+            for text, code in labels.doubts:
+                warn(text, code)
             if labels.left_out:
                 warn(f"{path} also holds {labels.left_out}; left out of {role}", "left-out")
             if labels.step > 1:
-                words = f"{path} has labels every {labels.step} frames, from {labels.labelled[0]} on"
-                self.report.remarks.append(f"{words}; the frames in between are left out")
-            if words := describe_classes(*labels.class_counts(), labels.classes):
-                self.report.remarks.append(f"{path} has several classes; class_id is {words}")
+                text = f"{path} has labels every {labels.step} frames, from {labels.labelled[0]} on"
+                self.report.remarks.append(f"{text}; the frames in between are left out")
+            if text := describe_classes(*labels.class_counts(), labels.classes):
+                self.report.remarks.append(f"{path} has several classes; class_id is {text}")
 
     def __enter__(self) -> Self:
         return self
@@ -344,7 +345,7 @@ class IngestJob:
             raise McaptrackError(
                 f"{into.path} has {', '.join(sorted(topics_to_replace))} already; `force=True` replaces them"
             )
-        corrected = {one for one in map(corrected_plane, topics_to_replace) if into and one in into.channels}
+        corrected = {topic for topic in map(corrected_plane, topics_to_replace) if into and topic in into.channels}
         for topic in sorted(corrected):
             warn(f"{topic} is dropped: it corrected the ground plane that is replaced", "left-out")
         return topics_to_replace | corrected
@@ -383,11 +384,11 @@ class IngestJob:
 
     def write_plane(self, writer: log.LogWriter, plane: GroundPlane | None, t_ns: int) -> None:
         """Write the ground plane and the calibration, if they were given, valid from a time on."""
-        given = self.ground_given
-        if plane is not None and given.has_plane:
+        ground = self.ground_given
+        if plane is not None and ground.has_plane:
             frame = Frame(t_ns, 0, plane_to_rows(plane))
-            self.write_rows(writer, PLANE, GROUND_PLANE, lambda: iter([frame]), given.parameters())
-        self.report.messages |= given.write_calibration(writer, self.prefix, self.pictures, t_ns, self.encoding)
+            self.write_rows(writer, PLANE, GROUND_PLANE, lambda: iter([frame]), ground.parameters())
+        self.report.messages |= ground.write_calibration(writer, self.prefix, self.pictures, t_ns, self.encoding)
 
     def write_labels(self, writer: log.LogWriter, plane: GroundPlane | None, timeline: Timeline) -> None:
         """Write the labels, each frame at the time of its picture."""
@@ -407,9 +408,9 @@ class IngestJob:
             return
         path, count = self.options.motion, int(timeline.index[-1]) + 1
         if len(self.motions) != count:
-            words = f"{path} has the motion of {len(self.motions)} frames, and {timeline.of} are {count}"
+            text = f"{path} has the motion of {len(self.motions)} frames, and {timeline.of} are {count}"
             less = "it is taken as none in the rest" if len(self.motions) < count else "the rest is left out"
-            warn(f"{words}; {less}", "left-out")
+            warn(f"{text}; {less}", "left-out")
         frames = motion_frames(self.motions, timeline.index, timeline.t_ns, size)
         self.write_rows(writer, MOTION, CAMERA_MOTION, lambda: iter(frames), {"file": path.name})
 
@@ -451,11 +452,11 @@ class IngestJob:
 
         names, class_id = {str(number): name for number, name in sorted(classes.items())}, str(only) if only else ""
         of_rows = digest(messages(), classes_beside_rows(class_id, names))
-        made = Provenance(
+        provenance = Provenance(
             INGEST, parameters, self.pictures, digest=of_rows, classes=names, class_id=class_id, frame_id=frame_id
         )
         topic, record = f"{self.prefix}/{suffix}", record_of(schema, self.encoding)
-        channel = writer.add_channel(topic, record, self.encoding, made.to_metadata())
+        channel = writer.add_channel(topic, record, self.encoding, provenance.to_metadata())
         count = 0
         for message in messages() if self.encoding == PROTOBUF else encoded(schema, frames(), self.encoding):
             writer.add_message(channel, *message)

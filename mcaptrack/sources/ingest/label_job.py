@@ -72,8 +72,10 @@ def with_new_ids(into: log.Log, prefix: str, labels: Labels) -> Labels:
     Otherwise the half of a track that was split could get the id of a track that was removed.
     """
     topics = [f"{prefix}/{name}" for name in CORRECTED_FROM]
-    there = [topic for topic in topics if topic in into.channels and into.channels[topic].holds(TRACKS)]
-    used = [int(unique_values(TRACKS, into.frame_columns(topic, TRACKS), "track_id").max(initial=0)) for topic in there]
+    written = [topic for topic in topics if topic in into.channels and into.channels[topic].holds(TRACKS)]
+    used = [
+        int(unique_values(TRACKS, into.frame_columns(topic, TRACKS), "track_id").max(initial=0)) for topic in written
+    ]
     if labels.made_ids is None or not used:
         return labels
     first = max(*used, int(labels.id.max())) + 1
@@ -191,8 +193,8 @@ class LabelJob(IngestJob):
                 f"{into.path}: {timeline.of} are {timeline.fps:.6g} a second, not {float(options.fps):g}; labels take "
                 "the times of their pictures, so leave `fps=` out"
             )
-        for given, name in ((options.start_ns, "`start_time=`"), (options.frames, "`frames=`")):
-            if given is not None:
+        for value, name in ((options.start_ns, "`start_time=`"), (options.frames, "`frames=`")):
+            if value is not None:
                 raise McaptrackError(f"{into.path}: labels take the times of {timeline.of}; leave {name} out")
         return timeline
 
@@ -204,8 +206,8 @@ class LabelJob(IngestJob):
             raise McaptrackError(f"{next(iter(timed))} has times; leave `frames=` out")
         if timed:
             return self._of_times(timed)
-        known = [_known(path, labels) for path, labels in self.labels.values()]
-        rates = {one.fps: one.of for one in known if one.fps}
+        counted = [_known(path, labels) for path, labels in self.labels.values()]
+        rates = {clock.fps: clock.of for clock in counted if clock.fps}
         if self.options.fps:
             self._other_rates = [
                 f"{self.source}: {float(rate):g} frames a second by {of}, and {float(self.options.fps):g} by `fps=`, "
@@ -216,8 +218,8 @@ class LabelJob(IngestJob):
             rates = {self.options.fps: "`fps=`"}
         rates = rates or {labels.fps: topic for topic, labels in existing.items() if labels.fps}
         if len(rates) > 1:
-            words = " and ".join(f"{float(fps):g} by {of}" for fps, of in rates.items())
-            raise McaptrackError(f"{self.source}: {words}: give the frames per second with `fps=`")
+            text = " and ".join(f"{float(fps):g} by {of}" for fps, of in rates.items())
+            raise McaptrackError(f"{self.source}: {text}: give the frames per second with `fps=`")
         if not rates and default is None:
             raise McaptrackError(self._no_clock())
         fps, of = next(iter(rates.items()), (default or Fraction(1), _ASSUMED))
@@ -225,9 +227,9 @@ class LabelJob(IngestJob):
         if self.into:
             self._check_existing(self.into, existing, fps)
             if self.options.start_ns is None:
-                found = self.into.metadata(CLOCK) or {}
-                self._start_ns = parse_ns(found.get("start_ns", "")) or 0
-        count, counted_by = self._count(known, existing)
+                metadata = self.into.metadata(CLOCK) or {}
+                self._start_ns = parse_ns(metadata.get("start_ns", "")) or 0
+        count, counted_by = self._count(counted, existing)
         timeline = Timeline.spaced(count, fps, self._start_ns, f"the frames that {counted_by} counts")
         if self.into and any(part.index.counts for part in self.into.parts):
             self._check_overlap(self.into, timeline)
@@ -244,22 +246,22 @@ class LabelJob(IngestJob):
         if self.options.start_ns is not None:
             seconds = seconds - seconds[0] + self.options.start_ns / NS_PER_S
         self._start_ns = round(float(seconds[0]) * NS_PER_S)
-        timeline, words = Timeline.of_times(path, seconds, self.options.fps)
+        timeline, text = Timeline.of_times(path, seconds, self.options.fps)
         if self.into and any(part.index.counts for part in self.into.parts):
             self._check_overlap(self.into, timeline)
-        self._clock = (f"{self.source}: {words}", False)
+        self._clock = (f"{self.source}: {text}", False)
         return timeline
 
     def report_assumptions(self) -> None:
         """Report also the assumed times of labels without pictures."""
         super().report_assumptions()
-        for words in self._other_rates:
-            warn(words, "clock")
-        words, is_assumed = self._clock
+        for text in self._other_rates:
+            warn(text, "clock")
+        text, is_assumed = self._clock
         if is_assumed:
-            warn(f"{words}; `fps=` sets another rate", "clock")
-        elif words:
-            self.report.remarks.append(words)
+            warn(f"{text}; `fps=` sets another rate", "clock")
+        elif text:
+            self.report.remarks.append(text)
 
     def _check_existing(self, into: log.Log, existing: Mapping[str, ExistingLabels], fps: Fraction) -> None:
         """Check that the labels of one camera have one frame rate."""
@@ -270,13 +272,13 @@ class LabelJob(IngestJob):
                     "labels of one camera are of the same pictures; give the same `fps=`, or another `camera=`"
                 )
 
-    def _count(self, known: Sequence[_Known], existing: Mapping[str, ExistingLabels]) -> tuple[int, str]:
+    def _count(self, counted: Sequence[_Known], existing: Mapping[str, ExistingLabels]) -> tuple[int, str]:
         """The number of frames, and the source of this number."""
         if self.options.frames is not None:
             return self.options.frames, "`frames=`"
-        found = {one.frames: one.of for one in known if one.frames}
-        if found:
-            return max(found), found[max(found)]
+        frame_counts = {entry.frames: entry.of for entry in counted if entry.frames}
+        if frame_counts:
+            return max(frame_counts), frame_counts[max(frame_counts)]
         counts = [count_frames(path, labels) for path, labels in self.labels.values()]
         return max(*counts, *(label.frames for label in existing.values()), 1), "the last label"
 
@@ -291,12 +293,12 @@ class LabelJob(IngestJob):
             )
 
     def _no_clock(self) -> str:
-        words = f"{self.source} has no clock of its own; give the frames per second with `fps=`"
+        text = f"{self.source} has no clock of its own; give the frames per second with `fps=`"
         pictures = sorted(c.topic for c in self.into.channels.values() if holds_pictures(c)) if self.into else []
         if pictures and self.into:
             camera = pictures[0].strip("/")
-            words += f", or choose the pictures of {', '.join(pictures)} in {self.into.path} with `camera={camera!r}`"
-        return words
+            text += f", or choose the pictures of {', '.join(pictures)} in {self.into.path} with `camera={camera!r}`"
+        return text
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
         """Write the ground plane and the labels."""

@@ -45,14 +45,14 @@ class RecordingJob(IngestJob):
     ) -> None:
         self._recorded, self._progress = recorded, progress
         try:
-            for given, name in (
+            for is_option_given, name in (
                 (options.fps, "`fps=`"),
                 (options.start_ns is not None, "`start_time=`"),
                 (options.for_videos(), options.for_videos()),
                 (options.role, "`role=`"),
                 (options.frames is not None, "`frames=`"),
             ):
-                if given:
+                if is_option_given:
                     raise McaptrackError(
                         f"{source} is a log: its messages stay as they are, and so do their times; leave {name} out"
                     )
@@ -117,8 +117,8 @@ class RecordingJob(IngestJob):
         """Warn if a recording of ROS 2 gets messages that ROS 2 can't read."""
         odd = sorted({connection.encoding or "none" for connection in self._recorded.connections} - {CDR})
         if self.encoding == CDR and odd:
-            words = f"{into.path} gets messages that are not of ROS 2 (encoding: {', '.join(odd)})"
-            warn(f"{words}; ROS tools may stumble over them", "other")
+            text = f"{into.path} gets messages that are not of ROS 2 (encoding: {', '.join(odd)})"
+            warn(f"{text}; ROS tools may stumble over them", "other")
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
         """Write everything in the recording, then the labels."""
@@ -179,16 +179,19 @@ class RecordingJob(IngestJob):
 
     def _holds_picture(self) -> Callable[[Connection, bytes], bool]:
         """A predicate: whether a message is one of the pictures that labels belong to."""
-        kinds = {one: picture_predicate(foreign.MessageType(*one.schema, one.encoding)) for one in self._connections}
+        kinds = {
+            connection: picture_predicate(foreign.MessageType(*connection.schema, connection.encoding))
+            for connection in self._connections
+        }
         return lambda connection, payload: connection in kinds and kinds[connection](payload)
 
     def _write_messages(self, writer: log.LogWriter) -> Timeline:
         """Write all channels and messages; returns the pictures that labels belong to."""
-        found, done, times, holds_picture = ReadingNotes(), 0, array("Q"), self._holds_picture()
+        reading_notes, done, times, holds_picture = ReadingNotes(), 0, array("Q"), self._holds_picture()
         for connection in self._recorded.connections:
             self._channel(writer, connection)
         total = sum((self._recorded.declared_counts or {}).values())
-        for connection, message in self._recorded.messages(found):
+        for connection, message in self._recorded.messages(reading_notes):
             number = self._channels[connection]
             if len(message.payload) > _MAX_MESSAGE_BYTES:
                 raise McaptrackError(
@@ -203,8 +206,8 @@ class RecordingJob(IngestJob):
             if done % _PROGRESS_EVERY == 0:
                 self._progress("ingest", done, max(total, done))
         self._progress("ingest", done, max(total, done))
-        self.report.notes += found.notes
-        self.report.lost += found.lost
+        self.report.notes += reading_notes.notes
+        self.report.lost += reading_notes.lost
         self._compare()
         self._report({number: connection.topic for connection, number in self._channels.items()})
         return self._timeline(times)

@@ -82,8 +82,12 @@ class VideoJob(IngestJob):
         times, numbers = array("q"), array("q")
         frame_id = self.prefix.lstrip("/")
         packed = (
-            (one.t_ns, one.index, foxglove.pack_picture(schema_name, one.t_ns, frame_id, video.format, one.data))
-            for one in video.pictures(start_ns)
+            (
+                picture.t_ns,
+                picture.index,
+                foxglove.pack_picture(schema_name, picture.t_ns, frame_id, video.format, picture.data),
+            )
+            for picture in video.pictures(start_ns)
         )
         for t_ns, index, data in foxglove.messages_in(schema_name, packed, self.encoding):
             writer.add_message(channel, t_ns, index, data)
@@ -106,8 +110,8 @@ class VideoJob(IngestJob):
         """Warn if the given frame rate differs from that of the video."""
         own = self.video.fps
         if own and abs(fps - own) > _SAME_FPS * own:
-            words = f"{self.video.path} has {float(own):g} frames a second; its pictures are written at {float(fps):g}"
-            warn(f"{words} by `fps=`", "clock")
+            text = f"{self.video.path} has {float(own):g} frames a second; its pictures are written at {float(fps):g}"
+            warn(f"{text} by `fps=`", "clock")
 
     def _check_existing(self, timeline: Timeline) -> None:
         """Check that existing labels in the log have the times of these pictures."""

@@ -32,13 +32,13 @@ def inspect(data: bytes) -> AccessUnit:
 
 def read_head(data: bytes) -> PictureHead:
     """Parse the first bytes of a message, up to the header of its first slice."""
-    found: set[int] = set()
+    kinds: set[int] = set()
     for start in nal_starts(data):
         kind = data[start] & 0x1F if start < len(data) else 0
         if kind in _PICTURES:
-            return PictureHead(True, kind == _IDR, found >= _SETS)
-        found.add(kind)
-    return PictureHead(False, False, found >= _SETS)
+            return PictureHead(True, kind == _IDR, kinds >= _SETS)
+        kinds.add(kind)
+    return PictureHead(False, False, kinds >= _SETS)
 
 
 def with_parameter_sets(data: bytes, sets: tuple[bytes, ...]) -> bytes:
@@ -57,8 +57,8 @@ def is_interlaced(sets: tuple[bytes, ...]) -> bool:
 
 def largest_size(data: bytes) -> tuple[int, int]:
     """The largest picture size in the sequence parameter sets: width and height, rounded up to macroblocks."""
-    found = [_parse_sps(nal) for kind, nal in nal_units(data, _SETS, 0, 0x1F) if kind == _SPS]
-    sizes = [(one.width_px, one.height_px) for one in found]
+    parsed = [_parse_sps(nal) for kind, nal in nal_units(data, _SETS, 0, 0x1F) if kind == _SPS]
+    sizes = [(sps.width_px, sps.height_px) for sps in parsed]
     return max(sizes, key=lambda size: size[0] * size[1], default=(0, 0))
 
 

@@ -37,13 +37,13 @@ def inspect(data: bytes) -> AccessUnit:
 
 def read_head(data: bytes) -> PictureHead:
     """Parse the first bytes of a message, up to the header of its first slice."""
-    found: set[int] = set()
+    kinds: set[int] = set()
     for start in nal_starts(data):
         kind = _kind(data, start)
         if kind <= _LAST_PICTURE:
-            return PictureHead(True, kind in _RANDOM_ACCESS, found >= _SETS)
-        found.add(kind)
-    return PictureHead(False, False, found >= _SETS)
+            return PictureHead(True, kind in _RANDOM_ACCESS, kinds >= _SETS)
+        kinds.add(kind)
+    return PictureHead(False, False, kinds >= _SETS)
 
 
 def with_parameter_sets(data: bytes, sets: tuple[bytes, ...]) -> bytes:

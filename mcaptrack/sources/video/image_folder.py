@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import refuse_special
+from mcaptrack.files import read_beginning, refuse_special
 from mcaptrack.geometry.clocks import parse_fps
 from mcaptrack.sources.video.limits import check_still, still_size
 
@@ -54,8 +54,8 @@ def find_images(folder: Path) -> Images:
     if place != sorted(set(place)) or len(place) < _DENSE * (place[-1] + 1):
         return in_order
     gone = sorted(set(range(place[-1] + 1)) - set(place))
-    words = ", ".join(str(numbers[0] + every * at) for at in gone[:_SHOWN]) + (", ..." if len(gone) > _SHOWN else "")
-    return Images(paths, place, every, f"{len(gone)} of {place[-1] + 1} numbered images ({words})" if gone else "")
+    text = ", ".join(str(numbers[0] + every * at) for at in gone[:_SHOWN]) + (", ..." if len(gone) > _SHOWN else "")
+    return Images(paths, place, every, f"{len(gone)} of {place[-1] + 1} numbered images ({text})" if gone else "")
 
 
 def natural_order(path: Path) -> list[tuple[int, str]]:
@@ -108,11 +108,7 @@ def find_seqinfo(folder: Path) -> SeqInfo | None:
 
 
 def _read(path: Path) -> SeqInfo:
-    try:
-        with path.open("rb") as stream:
-            text = stream.read(_MAX_BYTES).decode("utf-8", "replace")
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+    text = read_beginning(path, _MAX_BYTES).decode("utf-8", "replace")
     fps, frames = _FPS.search(text), _FRAMES.search(text)
     try:
         return SeqInfo(path, parse_fps(fps[1]) if fps else None, int(frames[1]) if frames else None)

@@ -137,33 +137,33 @@ def _webp(head: bytes) -> StillHeader | None:
 
 
 def _tiff(data: Buffer, order: str) -> StillHeader | None:
-    """Includes the bytes of a pixel, because a whole strip is decoded in memory."""
+    """The size of a TIFF image, and the bytes of its pixels, because a whole strip is decoded in memory."""
 
     def number(at: int, size: int) -> int:
         return int.from_bytes(bytes(data[at : at + size]), order)  # type: ignore[arg-type]
 
     first = number(4, 4)
-    found = {_TIFF_BITS: 1, _TIFF_SAMPLES: 1}
+    tags = {_TIFF_BITS: 1, _TIFF_SAMPLES: 1}
     for entry in range(number(first, 2)):
         at = first + 2 + 12 * entry
         tag, size = number(at, 2), 2 if number(at + 2, 2) == _TIFF_SHORT else 4
         if tag in (_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES):
             is_elsewhere = size * number(at + 4, 4) > 4
             value = number(number(at + 8, 4) if is_elsewhere else at + 8, size)
-            found[tag] = max(found.get(tag, 0), value)
-    if _TIFF_WIDTH not in found or _TIFF_HEIGHT not in found:
+            tags[tag] = max(tags.get(tag, 0), value)
+    if _TIFF_WIDTH not in tags or _TIFF_HEIGHT not in tags:
         return None
-    size = -(-found[_TIFF_BITS] * found[_TIFF_SAMPLES] // 8)
-    return StillHeader(found[_TIFF_WIDTH], found[_TIFF_HEIGHT], max(_BYTES, size))
+    size = -(-tags[_TIFF_BITS] * tags[_TIFF_SAMPLES] // 8)
+    return StillHeader(tags[_TIFF_WIDTH], tags[_TIFF_HEIGHT], max(_BYTES, size))
 
 
 def _avif(head: bytes) -> StillHeader | None:
-    """The largest size of its images, which may be composed of tiles."""
-    found = [
+    """The largest size of the images in an AVIF file, which may be composed of tiles."""
+    sizes = [
         StillHeader(_big_endian(head[at + 8 : at + 12]), _big_endian(head[at + 12 : at + 16]))
         for at in _places(head, b"ispe")
     ]
-    return max(found, key=lambda size: size.width_px * size.height_px, default=None)
+    return max(sizes, key=lambda size: size.width_px * size.height_px, default=None)
 
 
 def _places(head: bytes, name: bytes) -> Iterator[int]:

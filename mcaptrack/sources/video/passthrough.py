@@ -62,10 +62,10 @@ def packets(opened: Any, image_format: str) -> Iterator[StreamPacket]:
     name = CODECS[image_format].annex_b
     to_annex_b = BitStreamFilterContext(name, stream) if name else None
     base = fraction(stream.time_base) or Fraction(1)
-    slots, found = has_slots(opened), opened.demux(stream)
+    slots, demuxed = has_slots(opened), opened.demux(stream)
     while True:
         try:
-            packet = next(found, None)
+            packet = next(demuxed, None)
         except av.error.FFmpegError:  # FFmpeg can't read on
             yield StreamPacket(None, b"", False, False, True, False)
             return
@@ -89,7 +89,7 @@ def packets(opened: Any, image_format: str) -> Iterator[StreamPacket]:
 # Other damage shows only when pictures are decoded.
 
 
-#: As many zero bytes are no padding between NAL units but a hole in the file.
+#: This many zero bytes are a hole in the file, not padding between NAL units.
 _HOLE: Final = bytes(64)
 _START: Final = b"\x01"
 #: Encoders that pad pictures with zeros do so in more than this share of them; those that don't count pictures as the
@@ -201,10 +201,10 @@ def _transport_packets(path: Path) -> Iterator[tuple[np.ndarray, bool]]:
                 is_after_gap = False
             at += good * size
             if good < count:
-                found = _in_step(data[at:], size)
+                step = _in_step(data[at:], size)
                 is_after_gap = True
-                if found is not None:
-                    at += found
+                if step is not None:
+                    at += step
                     continue
                 at = max(at, len(data) - _SURE * size)
             more = np.frombuffer(file.read(_BLOCK), np.uint8)
@@ -231,15 +231,15 @@ def check_stream(path: Path, options: VideoOptions) -> StreamCheck:
         why_not = _rejected_by_codec(image_format, name, options, context)
         if why_not:
             return StreamCheck(image_format, why_not)
-        found = StreamCheck(image_format, "", _container_sets(image_format, context))
-        found.why_not = _check_packets(
-            packets(opened, image_format), found, options.fps, Fraction(options.key_within_s)
+        stream_check = StreamCheck(image_format, "", _container_sets(image_format, context))
+        stream_check.why_not = _check_packets(
+            packets(opened, image_format), stream_check, options.fps, Fraction(options.key_within_s)
         )
-        if not found.why_not and is_transport(opened) and transport_faults(path, stream.id):
-            found.why_not = _DAMAGED
-        if image_format == "h265" and options.image_format != "h265" and not found.why_not:
-            found.why_not = _ONLY_SOME
-        return found
+        if not stream_check.why_not and is_transport(opened) and transport_faults(path, stream.id):
+            stream_check.why_not = _DAMAGED
+        if image_format == "h265" and options.image_format != "h265" and not stream_check.why_not:
+            stream_check.why_not = _ONLY_SOME
+        return stream_check
 
 
 def _rejected_by_codec(image_format: str, name: str, options: VideoOptions, context: Any) -> str:
@@ -260,16 +260,18 @@ def _container_sets(image_format: str, context: Any) -> tuple[bytes, ...]:
     return av1.sequence_headers(bytes(context.extradata or b"")) if image_format == "av1" else ()
 
 
-def _check_packets(found: Iterator[StreamPacket], stream: StreamCheck, fps: Fraction | None, within_s: Fraction) -> str:
+def _check_packets(
+    coming: Iterator[StreamPacket], stream: StreamCheck, fps: Fraction | None, within_s: Fraction
+) -> str:
     """Why these packets can't be passed through, "" if they can; records the parameter sets to insert."""
     inspect = CODECS[stream.format].inspect
-    known: tuple[bytes, ...] = stream.sets
+    sets: tuple[bytes, ...] = stream.sets
     size: tuple[int, int] | None = None
     last: Fraction | None = None
     key_at = Fraction(0)
     all_have_sets, cut_off = True, False
     holes, numbers = Holes(), MissingPictures()
-    for count, packet in enumerate(found):
+    for count, packet in enumerate(coming):
         if cut_off:
             return _DAMAGED
         if packet.is_damaged:
@@ -294,7 +296,7 @@ def _check_packets(found: Iterator[StreamPacket], stream: StreamCheck, fps: Frac
             return "it has B-frames"
         if unit.pictures != 1:
             return "its packets are not one picture each"
-        if count == 0 and not (unit.is_key and (unit.has_parameter_sets or known)):
+        if count == 0 and not (unit.is_key and (unit.has_parameter_sets or sets)):
             return "it does not begin with a key frame"
         if packet.is_key and not unit.is_key:
             return "not every key frame can be decoded on its own (open groups of pictures)"
@@ -304,13 +306,13 @@ def _check_packets(found: Iterator[StreamPacket], stream: StreamCheck, fps: Frac
         elif seconds - key_at > within_s:
             return f"its key frames are more than {float(within_s):g} s apart"
         if count == 0:  # the stream itself decides; the container may say something else
-            known = unit.sets or known
-        if not set(unit.sets) <= set(known) or (size and unit.size and size != unit.size):
+            sets = unit.sets or sets
+        if not set(unit.sets) <= set(sets) or (size and unit.size and size != unit.size):
             return "it changes its size or its parameters on the way"
         size = size or unit.size
-        if count == 0 and stream.format == "h264" and h264.is_interlaced(known):
+        if count == 0 and stream.format == "h264" and h264.is_interlaced(sets):
             return "it is interlaced"
     if holes.count:
         return _DAMAGED
-    stream.sets, stream.missing = () if all_have_sets else known, tuple(numbers.places)
+    stream.sets, stream.missing = () if all_have_sets else sets, tuple(numbers.places)
     return ""

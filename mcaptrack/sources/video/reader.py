@@ -200,14 +200,14 @@ _STRAIGHT: Final = 0.0175
 class Orientation(NamedTuple):
     """The orientation of pictures: transposed, then mirrored from left to right, then from top to bottom.
 
-    ``words`` say it, "" for pictures that are shown as they are stored. ``oblique`` is an angle in degrees by which
+    ``description`` says it, "" for pictures shown as they are stored. ``oblique`` is an angle in degrees by which
     they should be turned and aren't, because it is none of quarter turns.
     """
 
     is_transposed: bool = False
     flips_x: bool = False
     flips_y: bool = False
-    words: str = ""
+    description: str = ""
     oblique: float = 0.0
 
     def of(self, picture: Any) -> Image:
@@ -222,16 +222,16 @@ class Orientation(NamedTuple):
 def orientation_of(frame: Any) -> Orientation:
     """Read the display matrix of a frame of FFmpeg: x' = a x + c y, y' = b x + d y (ISO 14496-12, 8.3.2)."""
     # By name, because iterating gives the data themselves up to PyAV 18, and their types from 19 on.
-    found = bytes(frame.side_data.get("DISPLAYMATRIX") or b"")
-    if len(found) != _MATRIX.size:
+    matrix = bytes(frame.side_data.get("DISPLAYMATRIX") or b"")
+    if len(matrix) != _MATRIX.size:
         return Orientation()
-    a, b, _, c, d, *_ = _MATRIX.unpack(found)
+    a, b, _, c, d, *_ = _MATRIX.unpack(matrix)
     turned = f"turned by {frame.rotation} degrees"
     largest = max(map(abs, (a, b, c, d)))
     if max(abs(b), abs(c)) <= _STRAIGHT * largest and a and d:
         flips = a < 0, d < 0
-        words = {(True, True): turned, (True, False): "mirrored", (False, True): "mirrored from top to bottom"}
-        return Orientation(False, *flips, words.get(flips, ""))
+        names = {(True, True): turned, (True, False): "mirrored", (False, True): "mirrored from top to bottom"}
+        return Orientation(False, *flips, names.get(flips, ""))
     if max(abs(a), abs(d)) <= _STRAIGHT * largest and b and c:
         flips = c < 0, b < 0
         return Orientation(True, *flips, "turned and mirrored" if flips[0] == flips[1] else turned)
@@ -245,7 +245,7 @@ def fit(picture: Any, orientation: Orientation, width: int, height: int) -> tupl
     """
     if (
         not isinstance(picture, np.ndarray)
-        and not orientation.words
+        and not orientation.description
         and (picture.width, picture.height) == (width, height)
     ):
         if picture.format.name == "yuv420p" and picture.color_range != FULL_RANGE:
@@ -334,11 +334,11 @@ def open_video(path: Path, options: VideoOptions = VideoOptions()) -> Video:  # 
     if path.is_dir():
         return _open_folder(path, options)
     with reading(path) as opened:
-        there = videos(opened)
-        if not there:
+        streams = videos(opened)
+        if not streams:
             kinds = ", ".join(sorted({stream.type for stream in opened.streams if stream.type != "video"}))
             raise McaptrackError(f"{path} holds no video, {f'only {kinds}' if kinds else 'and nothing else'}")
-        stream = there[0]
+        stream = streams[0]
         context = stream.codec_context
         if context is None:
             raise McaptrackError(f"{path} holds video in an unknown codec; convert it to H.264 first")
@@ -360,29 +360,29 @@ def open_video(path: Path, options: VideoOptions = VideoOptions()) -> Video:  # 
             fraction(stream.average_rate),
             stream.frames,
             _creation_ns(opened.metadata.get("creation_time") or stream.metadata.get("creation_time")),
-            f"it is {orientation.words}" if orientation.words else "",
+            f"it is {orientation.description}" if orientation.description else "",
             stream=stream.index,
             has_slots=has_slots(opened),
             length_s=_length_s(opened, stream),
             orientation=orientation,
         )
-        if len(there) > 1:
-            video.notes.append(f"{path} holds {len(there)} videos; the first is taken")
+        if len(streams) > 1:
+            video.notes.append(f"{path} holds {len(streams)} videos; the first is taken")
         video.notes += _remarks(path, stream, first, orientation)
         if first.interlaced_frame:
             video.why_transcode = video.why_transcode or "it is interlaced"
     if options.is_still:
         video.why_transcode = ""
     elif not video.why_transcode:
-        found = check_stream(path, options)
-        video.why_transcode, video.sets = found.why_not, found.sets
-        if found.missing:
-            places = "1 place" if len(found.missing) == 1 else f"{len(found.missing)} places"
+        check = check_stream(path, options)
+        video.why_transcode, video.sets = check.why_not, check.sets
+        if check.missing:
+            places = "1 place" if len(check.missing) == 1 else f"{len(check.missing)} places"
             video.lost.append(
-                f"{path}: pictures are missing at {places}, before picture {found.missing[0]} first; those up "
+                f"{path}: pictures are missing at {places}, before picture {check.missing[0]} first; those up "
                 "to the next key picture may be damaged"
             )
-        video.format = "h264" if found.why_not else found.format
+        video.format = "h264" if check.why_not else check.format
     _make_even(video)
     return video
 
@@ -498,11 +498,11 @@ def _transcode(video: Video, clock: Clock) -> Iterator[PictureMessage]:
 
 def _fitted(video: Video, picture: Any) -> Any:
     fitted, is_scaled = fit(picture, video.orientation, video.width_px, video.height_px)
-    words = (
+    text = (
         f"{video.path}: pictures change their size on the way; all are scaled to {video.width_px} x {video.height_px}"
     )
-    if is_scaled and words not in video.notes:
-        video.notes.append(words)
+    if is_scaled and text not in video.notes:
+        video.notes.append(text)
     return fitted
 
 
@@ -537,7 +537,7 @@ def _decoded_pictures(video: Video) -> Iterator[DecodedPicture]:
 def _decoded(video: Video) -> Iterator[DecodedPicture]:
     import av
 
-    given, read, failed, damaged, hidden, cut_off, seconds = 0, 0, 0, 0, 0, 0, None
+    packets_given, read, failed, damaged, hidden, cut_off, seconds = 0, 0, 0, 0, 0, 0, None
     why, has_fields = "", False
     slots: list[int] = []
     with reading(video.path) as opened:
@@ -553,7 +553,7 @@ def _decoded(video: Video) -> Iterator[DecodedPicture]:
                     break
                 hidden += packet.is_discard
                 cut_off += packet.is_corrupt
-                given += packet.size > 0 and not packet.is_discard
+                packets_given += packet.size > 0 and not packet.is_discard
                 if video.has_slots and packet.size:
                     slots.append(len(slots) if packet.dts is None else packet.dts)
                 frames = packet.decode()
@@ -571,9 +571,9 @@ def _decoded(video: Video) -> Iterator[DecodedPicture]:
         video.frames = video.frames or count_indexed(opened)
         hidden += count_empty(opened)
         if stream.codec_context.name in _ONE_EACH and not has_fields:
-            failed = max(failed, given - read)  # FFmpeg passes over some without an error
+            failed = max(failed, packets_given - read)  # FFmpeg passes over some without an error
     if failed:
-        video.lost.append(f"{video.path}: {failed} of {given} packets can't be decoded{why}")
+        video.lost.append(f"{video.path}: {failed} of {packets_given} packets can't be decoded{why}")
     if cut_off:
         video.lost.append(f"{video.path}: {cut_off} packets are cut off or damaged")
     if damaged:

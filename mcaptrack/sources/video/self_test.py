@@ -32,12 +32,12 @@ def codec_faults() -> dict[str, str]:
 
     The keys are those of ``CODECS`` and "h264 encoder".
     """
-    found = {}
-    data, found["h264 encoder"] = _encoded()
+    faults = {}
+    data, faults["h264 encoder"] = _encoded()
     for name in CODECS:
         data_of = data if name == "h264" else b64decode(_ENCODED[name])
-        found[name] = _decoding_fault(name, data_of) if data_of else "there is no picture to decode"
-    return found
+        faults[name] = _decoding_fault(name, data_of) if data_of else "there is no picture to decode"
+    return faults
 
 
 def _picture() -> Image:
@@ -58,7 +58,7 @@ def _encoded() -> tuple[bytes, str]:
 
 
 def _decoding_fault(name: str, data: bytes) -> str:
-    """Return why a picture can't be decoded, or is another one than that which was encoded; "" otherwise."""
+    """Return why a picture can't be decoded, or that it differs from the encoded one; "" otherwise."""
     from mcaptrack.sources.video.decode import EncodedPicture, decode_gray
 
     try:

@@ -23,7 +23,7 @@ from mcaptrack.geometry.arrays import Floats, Image, Ints
 from mcaptrack.geometry.clocks import FrameClock
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.transforms.detect.registration import Registration, Steadiness
-from mcaptrack.transforms.protocol import Colour, check_options, option
+from mcaptrack.transforms.protocol import Colour, check_options, option, setting
 
 # In units of the height of a person as measured in the picture: one body often gives several regions above each other,
 # which are joined over this distance; regions with a smaller area than this (times the height squared) are left out.
@@ -70,15 +70,11 @@ class KnnDetector:
     threshold: float | None = option(
         None, "difference from the background that counts as motion; each detector has its own default", least=0.0
     )
-    history_s: float = option(60.0, "memory of the background model, in seconds", least=0.1, flag=False)
-    max_pixels: int = option(
-        1_000_000,
-        "pictures are halved until they have no more pixels than this",
-        least=1_000,
-        most=1_000_000_000,
-        flag=False,
+    history_s: float = setting(60.0, "memory of the background model, in seconds", least=0.1)
+    max_pixels: int = setting(
+        1_000_000, "pictures are halved until they have no more pixels than this", least=1_000, most=1_000_000_000
     )
-    stabilise: bool = option(True, "compensate the motion of a shaking camera", flag=False)
+    stabilise: bool = setting(True, "compensate the motion of a shaking camera")
 
     colour: ClassVar[Colour] = "grey"
     needs_still_camera: ClassVar[bool] = True
@@ -157,8 +153,8 @@ def _region_boxes(mask: Image, min_area_px: float) -> Floats:
     import cv2
 
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    found = [cv2.boundingRect(contour) for contour in contours if cv2.contourArea(contour) >= min_area_px]
-    return np.array(found, np.float64).reshape(-1, 4)
+    boxes = [cv2.boundingRect(contour) for contour in contours if cv2.contourArea(contour) >= min_area_px]
+    return np.array(boxes, np.float64).reshape(-1, 4)
 
 
 class _PersonHeight:
@@ -236,5 +232,5 @@ class _BackgroundModel:
         # KNN draws from OpenCV's random number generator; without a seed results would differ from run to run.
         cv2.setRNGSeed(self._count)
         rate = 1 / min(2 * self._count, max(clock.frames(self._history_s), 2))
-        found = self._model.apply(image, learningRate=rate)
-        return np.where(np.asarray(found) == _FOREGROUND, np.uint8(255), np.uint8(0))
+        labels = self._model.apply(image, learningRate=rate)
+        return np.where(np.asarray(labels) == _FOREGROUND, np.uint8(255), np.uint8(0))

@@ -35,7 +35,7 @@ from mcaptrack.transforms.detect.median_background import MIN_THRESHOLD, Backgro
 from mcaptrack.transforms.detect.people import Separator
 from mcaptrack.transforms.detect.person_model import Learner, Person, region_boxes, typical_heights
 from mcaptrack.transforms.detect.registration import Registration, Steadiness
-from mcaptrack.transforms.protocol import Colour, check_options, option
+from mcaptrack.transforms.protocol import Colour, check_options, option, setting
 
 #: A shorter view, or one of fewer pictures, has no background of its own: people hardly move in that time.
 _MIN_SPAN_S: Final = 1.8
@@ -82,29 +82,15 @@ class MedianDetector:
     threshold: float = option(
         MIN_THRESHOLD, "difference of colour (0 to 255) that counts as motion at least", least=0.0
     )
-    history_s: float = option(
-        600.0, "length of the blocks of time that have one background, in seconds", least=0.1, flag=False
+    history_s: float = setting(600.0, "length of the blocks of time that have one background, in seconds", least=0.1)
+    max_pixels: int = setting(
+        1_000_000, "pictures are halved until they have no more pixels than this", least=1_000, most=1_000_000_000
     )
-    max_pixels: int = option(
-        1_000_000,
-        "pictures are halved until they have no more pixels than this",
-        least=1_000,
-        most=1_000_000_000,
-        flag=False,
-    )
-    stabilise: bool = option(True, "compensate the motion of a shaking camera", flag=False)
-    remove_shadows: bool = option(
-        True, "leave out what is darker than the background, but of the same colour", flag=False
-    )
-    separate: bool = option(
-        True, "separate people who are one region, by the height and shape of people in the scene", flag=False
-    )
-    least_visible: float = option(
-        0.5,
-        "share of a person that has to be seen for a box of their own beside others",
-        least=0.05,
-        most=1.0,
-        flag=False,
+    stabilise: bool = setting(True, "compensate the motion of a shaking camera")
+    remove_shadows: bool = setting(True, "leave out what is darker than the background, but of the same colour")
+    separate: bool = setting(True, "separate people who are one region, by the height and shape of people in the scene")
+    least_visible: float = setting(
+        0.5, "share of a person that has to be seen for a box of their own beside others", least=0.05, most=1.0
     )
 
     colour: ClassVar[Colour] = "bgr"
@@ -146,18 +132,18 @@ class MedianDetector:
                     views[-1].add(unknown.pop(0), self)
                 continue
             begun = _of_next_view(unknown, image) if is_new else []
-            for one in unknown[: len(unknown) - len(begun)]:
-                views[-1].add(one, self)
+            for seen in unknown[: len(unknown) - len(begun)]:
+                views[-1].add(seen, self)
             if is_new:
                 if views:
                     views[-1].close(self)
                 views.append(_View(image.shape))
-            for one in (*begun, picture):
-                views[-1].add(one, self)
+            for seen in (*begun, picture):
+                views[-1].add(seen, self)
             unknown = []
         if views:
-            for one in unknown:
-                views[-1].add(one, self)
+            for seen in unknown:
+                views[-1].add(seen, self)
             views[-1].close(self)
         steadiness.check()
         return views
@@ -173,22 +159,22 @@ class _Picture(NamedTuple):
 
 
 def _of_next_view(unknown: Sequence[_Picture], reference: Image) -> list[_Picture]:
-    """The last ones of pictures that no view has yet which show what ``reference`` shows, registered to it.
+    """The latest pictures without a view that show the scene of ``reference``, registered to it.
 
     A camera that has settled, or a cut without contrast, is noticed only after some pictures.
     """
-    camera, found = Registration(), deque[_Picture]()
+    camera, registered = Registration(), deque[_Picture]()
     _register(camera, reference)
-    for one in reversed(unknown):
-        to_reference, is_new = _register(camera, one.image)
+    for picture in reversed(unknown):
+        to_reference, is_new = _register(camera, picture.image)
         if is_new or camera.view != "steady":
             break
-        found.appendleft(one._replace(to_reference=to_reference, is_lost=False))
-    return [*found]
+        registered.appendleft(picture._replace(to_reference=to_reference, is_lost=False))
+    return [*registered]
 
 
 def _picture(frame: Frame, max_pixels: int) -> tuple[Image, int]:
-    """The picture (H, W, 3), halved until it is small enough, and how often; grey is three equal colours."""
+    """The picture (H, W, 3), halved until it is small enough, and how often; grey pictures get three equal channels."""
     image, halvings = halve(frame.rows, max_pixels)
     return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2), halvings
 

@@ -85,11 +85,11 @@ def _middle(images: Sequence[Image]) -> Image:
     at = len(images) // 2
     out = np.zeros_like(images[0])
     for row in range(0, len(out), _STRIP):  # in strips, which stay in the processor's cache
-        strip, found = np.stack([image[row : row + _STRIP] for image in images]), out[row : row + _STRIP]
+        strip, median = np.stack([image[row : row + _STRIP] for image in images]), out[row : row + _STRIP]
         for bit in (128, 64, 32, 16, 8, 4, 2, 1):
-            candidate = found | np.uint8(bit)
+            candidate = median | np.uint8(bit)
             below = (strip < candidate).view(np.uint8).sum(axis=0, dtype=np.uint8)
-            np.copyto(found, candidate, where=below <= at)
+            np.copyto(median, candidate, where=below <= at)
     return out
 
 
@@ -145,7 +145,7 @@ class Background:
 
     @cached_property
     def _light(self) -> NDArray[np.float32]:
-        """Its colours on a grid, one brighter than they are."""
+        """The background's colours on a coarse grid, plus 1, so that they can be divided by."""
         return self.median[::_GRID, ::_GRID].astype(np.float32) + 1
 
     @property
@@ -168,7 +168,7 @@ class Background:
         return cls(median, limit, not np.ptp(median, axis=-1).any(), is_blurred)
 
     def swaying(self, samples: Sequence[Image], person_px: float) -> Background:
-        """The same, with a wider range at places that sway in ``samples``.
+        """The background with a wider range at places that sway in ``samples``.
 
         ``person_px`` is how tall people are, in pixels.
         """
@@ -199,8 +199,8 @@ class Background:
         mask = np.asarray(cv2.bitwise_not(cv2.inRange(image, *self._usual)), np.uint8)
         if shadows and not self.is_grey:
             at = np.flatnonzero(mask.view(np.bool_))
-            seen, known = (np.take(colours.reshape(-1, 3), at, axis=0).T for colours in (image, self.median))
-            blue, green, red = (seen.astype(np.float32) + 1) / (known.astype(np.float32) + 1)
+            seen, usual = (np.take(colours.reshape(-1, 3), at, axis=0).T for colours in (image, self.median))
+            blue, green, red = (seen.astype(np.float32) + 1) / (usual.astype(np.float32) + 1)
             darker = (blue + green + red) / 3
             tint = np.maximum(np.maximum(blue, green), red) - np.minimum(np.minimum(blue, green), red)
             is_shadow = (darker > _SHADOW[0]) & (darker < _SHADOW[1]) & (tint < _SHADOW_TINT)

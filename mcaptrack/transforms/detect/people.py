@@ -53,7 +53,7 @@ _LEAST_WORK: Final = 200_000
 _PASSES: Final = 2
 #: What a region costs in addition to its filtered pixels, in pixels.
 _REGION_WORK: Final = 5_000
-#: A region that more people would have to fill is no group of people that its outline could tell apart.
+#: A region that more people would have to fill is not separated: its outline couldn't tell them apart.
 _MOST_PEOPLE: Final = 32
 #: More regions in a picture than this are noise, such as rain: they are not compared with each other.
 _MOST_PARTS: Final = 500
@@ -95,26 +95,26 @@ class Separator:
         x, y, w, h = cv2.boundingRect(mask)  # all that follows costs time for each pixel
         if not w:
             return np.empty((0, 4)), np.empty(0, np.int64)
-        labels, found = regions(np.ascontiguousarray(mask[y : y + h, x : x + w]), join_px)
-        is_member = np.zeros(len(found) + 1, np.bool_)
-        numbers = np.flatnonzero(found[:, 4] >= MIN_AREA_PX)
-        found = found[numbers] + (x, y, 0, 0, 0)
-        expected = self._person.heights(found[:, 1] + found[:, 3])
-        is_large = found[:, 4] >= MIN_AREA * expected**2
-        numbers, found, expected = numbers[is_large], found[is_large], expected[is_large]
-        large, is_rest = self._contradicting(found, expected)
-        numbers, found, expected = numbers[is_rest], found[is_rest], expected[is_rest]
-        alone, groups = _joined_parts(found, expected)
-        is_one = self._is_one(found[alone, 2], found[alone, 3], expected[alone])
+        labels, stats = regions(np.ascontiguousarray(mask[y : y + h, x : x + w]), join_px)
+        is_member = np.zeros(len(stats) + 1, np.bool_)
+        numbers = np.flatnonzero(stats[:, 4] >= MIN_AREA_PX)
+        stats = stats[numbers] + (x, y, 0, 0, 0)
+        expected = self._person.heights(stats[:, 1] + stats[:, 3])
+        is_large = stats[:, 4] >= MIN_AREA * expected**2
+        numbers, stats, expected = numbers[is_large], stats[is_large], expected[is_large]
+        large, is_rest = self._contradicting(stats, expected)
+        numbers, stats, expected = numbers[is_rest], stats[is_rest], expected[is_rest]
+        alone, groups = _joined_parts(stats, expected)
+        is_one = self._is_one(stats[alone, 2], stats[alone, 3], expected[alone])
         groups += [np.array([at]) for at in alone[~is_one]]
-        one, tall = found[alone[is_one]], expected[alone[is_one]]
-        is_cut = (one[:, :2] <= 1).any(axis=1) | (one[:, :2] + one[:, 2:4] >= (width - 1, height - 1)).any(axis=1)
-        is_seen = is_cut | (one[:, 4] >= 3 * MIN_AREA * tall**2) | (one[:, 3] >= 0.5 * tall)
+        lone, tall = stats[alone[is_one]], expected[alone[is_one]]
+        is_cut = (lone[:, :2] <= 1).any(axis=1) | (lone[:, :2] + lone[:, 2:4] >= (width - 1, height - 1)).any(axis=1)
+        is_seen = is_cut | (lone[:, 4] >= 3 * MIN_AREA * tall**2) | (lone[:, 3] >= 0.5 * tall)
         boxes: list[_Counted] = []
         self._begin(mask)
-        groups.sort(key=lambda members: int(found[members, 4].sum()))  # one large region must not use up the work
+        groups.sort(key=lambda members: int(stats[members, 4].sum()))  # one large region must not use up the work
         for members in groups:
-            some = found[members]
+            some = stats[members]
             x0, y0 = some[:, :2].min(axis=0).tolist()
             x1, y1 = (some[:, :2] + some[:, 2:4]).max(axis=0).tolist()
             is_member[numbers[members] + 1] = True
@@ -122,22 +122,22 @@ class Separator:
             is_member[numbers[members] + 1] = False
             boxes.extend(self._separate(region, x0, y0, (width, height)))
         separated = np.array(boxes, np.float64).reshape(-1, 5)
-        out = np.concatenate([np.insert(one[is_seen, :4], 4, 1, axis=1), large, separated])
+        out = np.concatenate([np.insert(lone[is_seen, :4], 4, 1, axis=1), large, separated])
         return out[:, :4], out[:, 4].astype(np.int64)
 
-    def _contradicting(self, found: Ints, expected: Floats) -> tuple[Ints, Bools]:
-        """Boxes and counts (M, 5) of regions (N, 5) that are no group of people as tall as expected, and the others.
+    def _contradicting(self, boxes: Ints, expected: Floats) -> tuple[Ints, Bools]:
+        """Boxes and counts (M, 5) of regions (N, 5) too tall for people of their height; and a mask of the others.
 
         What lies inside of the box of such a region, such as a shoe or a bag, is a part of it and no person beside it.
         The second array (N,) is false for both.
         """
-        is_large = is_too_tall(found[:, 3], expected) & ~self._person.holds(found[:, 1] + found[:, 3])
-        large, is_rest = found[is_large], ~is_large
+        is_large = is_too_tall(boxes[:, 3], expected) & ~self._person.holds(boxes[:, 1] + boxes[:, 3])
+        large, is_rest = boxes[is_large], ~is_large
         for x, y, w, h in large[:, :4].tolist():
-            wide = np.minimum(found[:, 0] + found[:, 2], x + w) - np.maximum(found[:, 0], x)
-            high = np.minimum(found[:, 1] + found[:, 3], y + h) - np.maximum(found[:, 1], y)
+            wide = np.minimum(boxes[:, 0] + boxes[:, 2], x + w) - np.maximum(boxes[:, 0], x)
+            high = np.minimum(boxes[:, 1] + boxes[:, 3], y + h) - np.maximum(boxes[:, 1], y)
             shared = np.maximum(wide, 0) * np.maximum(high, 0)
-            is_rest &= shared < _INSIDE * found[:, 2] * found[:, 3]
+            is_rest &= shared < _INSIDE * boxes[:, 2] * boxes[:, 3]
         count = (large[:, 2] <= large[:, 3]).astype(np.int64)  # who is wider than tall may be anything
         return np.column_stack([large[:, :4], count]), is_rest
 
@@ -154,9 +154,9 @@ class Separator:
         rest = np.flatnonzero(~is_one & ~contradicts)
         for at in rest[np.argsort((w * h)[rest], kind="stable")].tolist():
             region = mask[y[at] : y[at] + h[at], x[at] : x[at] + w[at]] > 0
-            found = self._explained(region, int(x[at]), int(y[at]), size)
-            if found and found.is_by_people:
-                out[at] = len(found.people) + len(found.hidden)
+            explained = self._explained(region, int(x[at]), int(y[at]), size)
+            if explained and explained.is_by_people:
+                out[at] = len(explained.people) + len(explained.hidden)
         return out
 
     def _is_one(self, wide: Ints, high: Ints, tall: Floats) -> Bools:
@@ -354,14 +354,14 @@ class _Explanation(NamedTuple):
     is_by_people: bool
 
 
-def _joined_parts(found: Ints, expected: Floats) -> tuple[Ints, list[Ints]]:
+def _joined_parts(boxes: Ints, expected: Floats) -> tuple[Ints, list[Ints]]:
     """Regions (N, 5) that stand alone, and groups of those that may be parts of a person behind something."""
-    count = len(found)
-    is_part = found[:, 3] < _PART * expected
+    count = len(boxes)
+    is_part = boxes[:, 3] < _PART * expected
     if count < 2 or count > _MOST_PARTS or not is_part.any():
         return np.arange(count), []
-    x0, y0 = found[:, 0], found[:, 1]
-    x1, y1 = x0 + found[:, 2], y0 + found[:, 3]
+    x0, y0 = boxes[:, 0], boxes[:, 1]
+    x1, y1 = x0 + boxes[:, 2], y0 + boxes[:, 3]
     aside, gap = _PART_ASIDE * expected, _PART_GAP * expected
     beside = ((x0 - aside)[:, None] < x1) & (x0 < (x1 + aside)[:, None])
     above = ((y0 - gap)[:, None] < y1) & (y0 < (y1 + gap)[:, None])

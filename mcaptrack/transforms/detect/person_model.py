@@ -140,11 +140,11 @@ def regions(mask: Image, join_px: int) -> tuple[Labels, Ints]:
     labels = np.zeros(mask.shape, np.uint16 if kind == cv2.CV_16U else np.int32)
     if not w:
         return labels, np.empty((0, 5), np.int64)
-    _, inner, found, _ = cv2.connectedComponentsWithStats(
+    _, inner, stats, _ = cv2.connectedComponentsWithStats(
         np.ascontiguousarray(mask[y : y + h, x : x + w]), connectivity=8, ltype=kind
     )
     labels[y : y + h, x : x + w] = inner
-    return cast("Labels", labels), np.asarray(found[1:], np.int64) + np.array([x, y, 0, 0, 0])
+    return cast("Labels", labels), np.asarray(stats[1:], np.int64) + np.array([x, y, 0, 0, 0])
 
 
 def typical_heights(masks: Sequence[Image]) -> tuple[float, float]:
@@ -155,8 +155,8 @@ def typical_heights(masks: Sequence[Image]) -> tuple[float, float]:
     """
     sizes: list[tuple[int, int]] = []
     for mask in masks:
-        _, found = regions(closed(mask, 3, 3), 1)
-        large = found[(found[:, 4] >= MIN_AREA_PX) & (found[:, 3] < mask.shape[0] / 2)]
+        _, boxes = regions(closed(mask, 3, 3), 1)
+        large = boxes[(boxes[:, 4] >= MIN_AREA_PX) & (boxes[:, 3] < mask.shape[0] / 2)]
         sizes += zip(large[:, 3].tolist(), (large[:, 2] * large[:, 3]).tolist(), strict=True)
     if not sizes:
         return INITIAL_HEIGHT_PX, INITIAL_HEIGHT_PX
@@ -169,8 +169,8 @@ def typical_heights(masks: Sequence[Image]) -> tuple[float, float]:
 
 def region_boxes(mask: Image, person_px: float) -> Floats:
     """Boxes (N, 4) around the regions of a mask in which people are about ``person_px`` tall."""
-    _, found = regions(mask, odd(JOIN * person_px))
-    return found[found[:, 4] >= max(MIN_AREA_PX, MIN_AREA * person_px**2), :4].astype(np.float64)
+    _, boxes = regions(mask, odd(JOIN * person_px))
+    return boxes[boxes[:, 4] >= max(MIN_AREA_PX, MIN_AREA * person_px**2), :4].astype(np.float64)
 
 
 class Learner:
@@ -189,11 +189,11 @@ class Learner:
             self._smaller = self._usual.copy()
         for mask in masks:
             self._size = mask.shape
-            found = self._usual.add(mask, person_px)
+            boxes = self._usual.add(mask, person_px)
             if self._smaller is not None:
-                found = self._smaller.add(mask, smaller_px or person_px)
-            found = found[found[:, 4] >= MIN_AREA_PX]
-            self._seen.append(found[np.argsort(-found[:, 4], kind="stable")[:_MOST_COMPARED]])
+                boxes = self._smaller.add(mask, smaller_px or person_px)
+            boxes = boxes[boxes[:, 4] >= MIN_AREA_PX]
+            self._seen.append(boxes[np.argsort(-boxes[:, 4], kind="stable")[:_MOST_COMPARED]])
 
     def person(self) -> Person | None:
         """The appearance of people; None if too few regions are alike, or if they don't look like people."""
@@ -221,7 +221,7 @@ class Learner:
         return float(np.sqrt(area[fits]).sum())
 
     def _checked(self, person: Person | None) -> Person | None:
-        """The same, with the rows where the heights hold; None if the shape isn't one of people."""
+        """The appearance of people, with the rows where their heights hold; None if the shape isn't one of people."""
         if person is None or person.template.sum() < _LEAST_WIDTH * ROWS**2:
             return None
         foot, area, fits, contradicts = self._judged(person)
@@ -242,7 +242,7 @@ class _Sample:
         self._cuts: list[Image] = []
 
     def copy(self) -> _Sample:
-        """The same regions, to which others are added than here."""
+        """A copy, to which regions can be added independently."""
         other = _Sample()
         other._boxes, other._cuts = [*self._boxes], [*self._cuts]
         return other
@@ -250,15 +250,15 @@ class _Sample:
     def add(self, mask: Image, person_px: float) -> Ints:
         """Take the regions of a mask in which people are about ``person_px`` tall; returns all regions (N, 5)."""
         picture_px, width = mask.shape
-        labels, found = regions(mask, odd(JOIN * person_px))
-        for number, (x, y, w, h, area) in enumerate(found.tolist(), start=1):
+        labels, boxes = regions(mask, odd(JOIN * person_px))
+        for number, (x, y, w, h, area) in enumerate(boxes.tolist(), start=1):
             is_cut = x <= 1 or y <= 1 or x + w >= width - 1 or y + h >= picture_px - 1
             if is_cut or area < max(MIN_AREA_PX, MIN_AREA * person_px**2) or len(self._boxes) >= _MAX_REGIONS:
                 continue
             own = (labels[y : y + h, x : x + w] == number) & (mask[y : y + h, x : x + w] > 0)
             self._boxes.append((x, y, w, h, area))
             self._cuts.append(_scaled(own))
-        return found
+        return boxes
 
     def person(self, picture_px: int) -> Person | None:
         """The appearance of people in a picture of this height; None if too few regions are alike."""
@@ -304,12 +304,12 @@ def _scaled(region: Bools) -> Image:
 def _fit_height(foot: Floats, height: Floats, weight: Floats, picture_px: int) -> tuple[float, float]:
     """Slope and level of the line of height over the row of feet that most regions follow (RANSAC)."""
     rng = np.random.default_rng(0)
-    one, two = rng.integers(0, len(foot), (2, _DRAWS))
-    apart = foot[two] - foot[one]
+    first, two = rng.integers(0, len(foot), (2, _DRAWS))
+    apart = foot[two] - foot[first]
     is_apart = np.abs(apart) > _MIN_SPREAD * picture_px
-    slope = np.where(is_apart, (height[two] - height[one]) / np.where(is_apart, apart, 1.0), 0.0)
+    slope = np.where(is_apart, (height[two] - height[first]) / np.where(is_apart, apart, 1.0), 0.0)
     slope = np.maximum(slope, 0.0)  # who is farther away is not taller
-    level = height[one] - slope * foot[one]
+    level = height[first] - slope * foot[first]
     expected = slope[:, None] * foot + level[:, None]
     agrees = (expected > 0) & (np.abs(height - expected) < _TOLERANCE * expected)
     best = agrees[int((agrees * weight).sum(axis=1).argmax())]

@@ -36,7 +36,7 @@ _STRANGERS: Final = 0.25
 
 
 class Shared(NamedTuple):
-    """The number of people that two cameras should see, over all frames, and of those that two do see."""
+    """Over all frames: how many people two cameras should both see, and how many both do see."""
 
     expected: int
     seen: int
@@ -114,10 +114,10 @@ def compare(
         speed, last = _velocities(last, block, block.centre.xy_m[sure], sizes)
         for number in range(count):
             others = by - seen[:, number]
-            there = (others >= _OTHERS) & (visible[:, number] > 0)
-            at = np.minimum(np.searchsorted(SHARES, visible[there, number], "right"), len(SHARES) - 1)
+            is_seen = (others >= _OTHERS) & (visible[:, number] > 0)
+            at = np.minimum(np.searchsorted(SHARES, visible[is_seen, number], "right"), len(SHARES) - 1)
             tries[number] += np.bincount(at, minlength=len(SHARES))
-            hits[number] += np.bincount(at, seen[there, number], len(SHARES))
+            hits[number] += np.bincount(at, seen[is_seen, number], len(SHARES))
             is_tested = seen[:, number] & (rate.sum(axis=1) - rate[:, number] >= _EXPECTED)
             boxes[number] += is_tested.sum()
             false[number] += (is_tested & (others == 0)).sum()
@@ -139,7 +139,7 @@ def compare(
             pace = (moving**2).sum(axis=1)
             fast = pace > _MOVES_M_PER_S**2  # False where it isn't known
             box = mine[which[fast]]
-            times = np.array([one.t_ns for one in block.frames])[frame[box]]
+            times = np.array([each.t_ns for each in block.frames])[frame[box]]
             away_s = (block.rows["picture_ns"][box] - offset_ns[number] - times) / NS_PER_S
             late[number].append(away_s - (difference[fast] * moving[fast]).sum(axis=1) / pace[fast])
     compared = tuple(
@@ -158,7 +158,7 @@ def _velocities(
     """
     out = np.full(xy_m.shape, np.nan)
     before = np.empty((0, 2)) if last is None else last[1]
-    times = np.array([block.frames[0].t_ns if last is None else last[0], *(one.t_ns for one in block.frames)])
+    times = np.array([block.frames[0].t_ns if last is None else last[0], *(frame.t_ns for frame in block.frames)])
     which, nearest = _pairs(xy_m, sizes, np.concatenate([before, xy_m]), np.append(len(before), sizes[:-1]))
     step_s = (np.diff(times) / NS_PER_S)[group_index(sizes)[which]]
     rises = step_s > 0

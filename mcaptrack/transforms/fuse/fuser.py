@@ -28,7 +28,7 @@ from mcaptrack.transforms.protocol import Suited, check_options, context, option
 _STAYS, _PERSISTENCE_CHANCE = 0.85, 0.3
 #: How far people walk, in metres per second; and how far at most they seem to be from where they were.
 _PACE_M_PER_S, _FARTHEST_M = 1.0, 2.5
-#: A frame that is longer ago says nothing.
+#: A frame longer ago than this is ignored.
 _MOST_S: Final = 1.0
 #: Groups that are less probable than this are no people of the frame before.
 _PERSISTENCE_LEAST: Final = 0.02
@@ -64,13 +64,10 @@ def persistence(
     """
     count, sizes = len(certainty), np.bincount(block.frame, minlength=len(block.frames))
     ends = np.cumsum(sizes)
-    times = np.array([one.t_ns for one in block.frames], np.int64)
+    times = np.array([frame.t_ns for frame in block.frames], np.int64)
     last = slice(int(ends[-1] - sizes[-1]), int(ends[-1]))
     after = LastFrame(
-        int(times[-1]),
-        Places(block.centre.xy_m[last], block.centre.cov[last]),
-        certainty[last],
-        bool(block.counts[-1]),
+        int(times[-1]), Places(block.centre.xy_m[last], block.centre.cov[last]), certainty[last], bool(block.counts[-1])
     )
     begun = before or LastFrame(int(times[0]), Places(np.empty((0, 2)), np.empty((0, 3))), np.empty(0), is_known=False)
     # Groups of the frame before the block come first; frames are numbered from it.
@@ -96,12 +93,12 @@ def persistence(
     now, then, apart = now[fits], then[fits], apart[fits]
     order = np.lexsort((then, now, apart - 2 * np.log(probable[now]) - 2 * np.log(probable[then])))
     stays = np.zeros(extra + count)
-    taken, given = set[int](), set[int]()
-    for one, other in zip(now[order].tolist(), then[order].tolist(), strict=True):
-        if one not in taken and other not in given:
-            taken.add(one)
-            given.add(other)
-            stays[one] = probable[other]
+    taken, continued = set[int](), set[int]()
+    for new, other in zip(now[order].tolist(), then[order].tolist(), strict=True):
+        if new not in taken and other not in continued:
+            taken.add(new)
+            continued.add(other)
+            stays[new] = probable[other]
     stays = stays[extra:]
     odds = np.log(stays * (_STAYS / _PERSISTENCE_CHANCE) + (1 - stays) * ((1 - _STAYS) / (1 - _PERSISTENCE_CHANCE)))
     return np.where(counts[block.frame], odds, 0.0), after
@@ -192,7 +189,7 @@ class FootFuser:
         number[kept] = ragged_range(0, sizes)
         classes = np.zeros(len(seen), np.int64)
         classes[of] = block.rows["class_id"]
-        found = DETECTIONS.rows(
+        rows = DETECTIONS.rows(
             x_m=centre.xy_m[kept, 0],
             y_m=centre.xy_m[kept, 1],
             cov_xx_m2=centre.cov[kept, 0],
@@ -205,9 +202,9 @@ class FootFuser:
         )
         members = block.rows.copy()
         members["detection"] = number[of]
-        when, index = [one.t_ns for one in block.frames], [one.index for one in block.frames]
+        when, index = [frame.t_ns for frame in block.frames], [frame.index for frame in block.frames]
         yield from zip(
-            split_rows(when, index, found, np.cumsum(sizes)),
+            split_rows(when, index, rows, np.cumsum(sizes)),
             split_rows(when, index, members, np.cumsum(block.counts)),
             strict=True,
         )

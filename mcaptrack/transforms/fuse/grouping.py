@@ -60,13 +60,13 @@ def group(camera: Ints, places: Places, gate: float, farthest_m: float, part: In
     fits = np.flatnonzero(distance <= gate)
     order = fits[np.lexsort((second[fits], first[fits], distance[fits]))]
     # Numbers of Python, because a step concerns two groups and NumPy takes longer for so few.
-    owner, members = list(range(count)), [[one] for one in range(count)]
-    seen = [1 << one for one in camera.tolist()]
-    known = list(zip(*(column.tolist() for part_ in places.information() for column in part_.T), strict=True))
-    at = _mean(*np.array(known, float).reshape(-1, 5).T)
+    owner, members = list(range(count)), [[box] for box in range(count)]
+    seen = [1 << number for number in camera.tolist()]
+    sums = list(zip(*(column.tolist() for part_ in places.information() for column in part_.T), strict=True))
+    at = _mean(*np.array(sums, float).reshape(-1, 5).T)
     x_, y_, xx_, xy_, yy_ = (column.tolist() for column in at)
-    for one, other in zip(first[order].tolist(), second[order].tolist(), strict=True):
-        i, j = owner[one], owner[other]
+    for box, other in zip(first[order].tolist(), second[order].tolist(), strict=True):
+        i, j = owner[box], owner[other]
         if i == j or seen[i] & seen[j]:
             continue
         dx, dy = x_[i] - x_[j], y_[i] - y_[j]
@@ -75,8 +75,8 @@ def group(camera: Ints, places: Places, gate: float, farthest_m: float, part: In
             continue
         low, high = (i, j) if i < j else (j, i)
         seen[low] |= seen[high]
-        (a, b, c, u, v), (d, e, f, w, z) = known[low], known[high]
-        known[low] = joint = (a + d, b + e, c + f, u + w, v + z)
+        (a, b, c, u, v), (d, e, f, w, z) = sums[low], sums[high]
+        sums[low] = joint = (a + d, b + e, c + f, u + w, v + z)
         x_[low], y_[low], xx_[low], xy_[low], yy_[low] = _mean(*joint)
         for member in members[high]:
             owner[member] = low
@@ -95,10 +95,10 @@ def pairs_along_x(xy_m: Floats, part: Ints, farthest_m: float) -> tuple[Ints, In
     reach = farthest_m + _MARGIN * float(along.max(initial=0.0))
     after = np.arange(1, len(x) + 1)
     count = np.searchsorted(along, along + reach, "right") - after
-    one, other = group_index(count), ragged_range(after, count)
-    same = part[one] == part[other]
-    one, other = order[one[same]], order[other[same]]
-    return np.minimum(one, other), np.maximum(one, other)
+    near, other = group_index(count), ragged_range(after, count)
+    same = part[near] == part[other]
+    near, other = order[near[same]], order[other[same]]
+    return np.minimum(near, other), np.maximum(near, other)
 
 
 def _dissolved(camera: Ints, places: Places, of: Ints, gate: float, farthest_m: float, part: Ints) -> Ints:
@@ -112,17 +112,17 @@ def _dissolved(camera: Ints, places: Places, of: Ints, gate: float, farthest_m: 
     centre = means(places, of, count)
     part_of = np.zeros(count, np.int64)
     part_of[of] = part
-    one, other = pairs_along_x(centre.xy_m, part_of, 2 * farthest_m)
-    x, y = (centre.xy_m[one] - centre.xy_m[other]).T
+    mine, other = pairs_along_x(centre.xy_m, part_of, 2 * farthest_m)
+    x, y = (centre.xy_m[mine] - centre.xy_m[other]).T
     near = x * x + y * y <= (2 * farthest_m) ** 2
-    one, other = np.concatenate([one[near], other[near]]), np.concatenate([other[near], one[near]])
-    if not len(one):
+    mine, other = np.concatenate([mine[near], other[near]]), np.concatenate([other[near], mine[near]])
+    if not len(mine):
         return of
     # Each box with each group near its own one.
     size = np.bincount(of, minlength=count)
     by_group = np.argsort(of, kind="stable")
     begins = np.cumsum(size) - size
-    box, to = by_group[ragged_range(begins[one], size[one])], np.repeat(other, size[one])
+    box, to = by_group[ragged_range(begins[mine], size[mine])], np.repeat(other, size[mine])
     apart = places.xy_m[box] - centre.xy_m[to]
     away = squared_sigmas(*apart.T, *(places.cov[box] + centre.cov[to]).T)
     fits = (away <= gate) & ((apart**2).sum(axis=1) <= farthest_m**2)
@@ -155,19 +155,19 @@ def _moves(
 ) -> list[tuple[int, int]] | None:
     """The boxes that move if a group is dissolved, each with its new group; None if one has no place."""
     moves: list[tuple[int, int]] = []
-    for of_camera, one in slots[group_].items():
+    for of_camera, slot in slots[group_].items():
         best: tuple[float, list[tuple[int, int]]] | None = None
-        for away, to in choices.get(one, ()):
+        for away, to in choices.get(slot, ()):
             if not slots[to] or (best and away >= best[0]):
                 continue
             other = slots[to].get(of_camera)
             if other is None:
-                best = away, [(one, to)]
+                best = away, [(slot, to)]
                 continue
             for further, next_ in choices.get(other, ()):
                 if next_ != group_ and slots[next_] and of_camera not in slots[next_]:
                     if not best or away + further < best[0]:
-                        best = away + further, [(one, to), (other, next_)]
+                        best = away + further, [(slot, to), (other, next_)]
                     break
         if best is None:
             return None

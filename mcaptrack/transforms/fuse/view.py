@@ -82,7 +82,7 @@ def joined(frames: Iterable[Frame], views: Views, max_sigma: float, max_distance
         seen = np.zeros((count, max(len(views), int(camera.max(initial=0)) + 1)), bool)
         seen[of, camera] = True
         visible = np.empty((count, len(views)))
-        sizes, times = np.bincount(frame, minlength=len(block)), [one.t_ns for one in block]
+        sizes, times = np.bincount(frame, minlength=len(block)), [each.t_ns for each in block]
         for column, view in enumerate(views):
             visible[:, column] = _visible(view, centre.xy_m, sizes, times)
         yield Joined(block, rows, counts, of, frame, centre, seen, visible)
@@ -142,7 +142,7 @@ class CameraView:
     width: ClassVar[float] = 0.4
 
     def with_heights_in(self, frames: Iterable[Frame]) -> Self:
-        """The same camera with heights as in the boxes of the first of its frames of detections."""
+        """The camera with heights as in the boxes of the first frames of its detections."""
         boxes = [columns_to_boxes(frame.rows) for frame in islice(frames, _MOST_FRAMES)]
         joined = np.concatenate([np.empty((0, len(BOX_PX))), *boxes])
         return self.with_heights(joined[np.isfinite(joined).all(axis=1)])

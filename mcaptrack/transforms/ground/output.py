@@ -140,9 +140,9 @@ class Waiting:
         number = np.append(self._late_in[~waits] - self._written, group_index([part.shape[1] for part in own]))
         self._late, self._late_in = self._late.compress(waits, axis=1), self._late_in[waits]
         ids = rows[_ID].astype(np.int64)
-        known = np.minimum(ids, len(self._written_as) - 1)
-        is_in_time = (ids == known) & (self._since[known] <= np.array(self._released_at, np.int64)[number])
-        rows[_ID] = np.where(is_in_time, self._written_as[known], 0)
+        written_id = np.minimum(ids, len(self._written_as) - 1)
+        is_in_time = (ids == written_id) & (self._since[written_id] <= np.array(self._released_at, np.int64)[number])
+        rows[_ID] = np.where(is_in_time, self._written_as[written_id], 0)
         self._written, self._released_at = self._released, []
         kept = rows[_ID] > 0
         return _to_frames(frames, rows.compress(kept, axis=1), number[kept])

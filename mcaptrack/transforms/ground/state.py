@@ -92,19 +92,19 @@ class Covariances:
     def means(self) -> Floats:
         """The means over both axes, (6, K), as in the constructor."""
         p = self.values
-        one = (p[:, :3, :3] + p[:, 3:, 3:]) / 2
-        return np.stack([one[:, i, j] for i in range(3) for j in range(i, 3)])
+        mean = (p[:, :3, :3] + p[:, 3:, 3:]) / 2
+        return np.stack([mean[:, i, j] for i in range(3) for j in range(i, 3)])
 
 
 def _of_axes(along_one_axis: Floats) -> Floats:
     """Covariances (K, 6, 6) of independent axes with the same covariance (6, K)."""
     count = along_one_axis.shape[1]
-    one = np.empty((count, 3, 3))
+    block = np.empty((count, 3, 3))
     upper = [(i, j) for i in range(3) for j in range(i, 3)]
     for (i, j), values in zip(upper, along_one_axis, strict=True):
-        one[:, i, j] = one[:, j, i] = values
+        block[:, i, j] = block[:, j, i] = values
     out = np.zeros((count, _COVARIANCES_SIZE, _COVARIANCES_SIZE))
-    out[:, :3, :3] = out[:, 3:, 3:] = one
+    out[:, :3, :3] = out[:, 3:, 3:] = block
     return out
 
 
@@ -235,21 +235,21 @@ class GroundTracks:
         cos2, sin2 = cos * cos - sin * sin, 2 * sin * cos
         t[_COS], t[_SIN] = cos2 * t[_COS] - sin2 * t[_SIN], sin2 * t[_COS] + cos2 * t[_SIN]
 
-    def update(self, track: Indices, found: Floats, is_same_class: Bools, frame: int) -> tuple[Floats, Floats]:
+    def update(self, track: Indices, detections: Floats, is_same_class: Bools, frame: int) -> tuple[Floats, Floats]:
         """Correct tracks (N,) with one detection each, (rows, N), at a frame; returns their table before and after."""
         before = self.table.take(track, axis=1)
         t = before.copy()
         if self.covariances:
-            gain = self.covariances.correct(track, measured(t[NOISE], found))
-            _move(t, *along_axes(gain, found[PLACE] - t[PLACE]))
+            gain = self.covariances.correct(track, measured(t[NOISE], detections))
+            _move(t, *along_axes(gain, detections[PLACE] - t[PLACE]))
             t[_COVARIANCE] = self.covariances.means()[:, track]
         else:
-            _correct(t, found)
-        self._vote(track, found)
+            _correct(t, detections)
+        self._vote(track, detections)
         weight = is_same_class.astype(float)
-        _follow_box(t, found, weight)
-        t[SCORE], t[SOURCE] = found[SCORE], found[SOURCE]
-        score = np.where(np.isnan(found[SCORE]), 0.5, found[SCORE])
+        _follow_box(t, detections, weight)
+        t[SCORE], t[SOURCE] = detections[SCORE], detections[SOURCE]
+        score = certainty(detections)
         t[SCORES] += score
         t[HITS] += 1
         t[MISSED_S] = 0
@@ -259,53 +259,53 @@ class GroundTracks:
         self.table[:, track] = t
         return before, t
 
-    def initiate(self, first_id: int, found: Floats, limits: Mapping[int, MotionLimits], frame: int) -> None:
+    def initiate(self, first_id: int, detections: Floats, limits: Mapping[int, MotionLimits], frame: int) -> None:
         """Start a track at each of these detections, (rows, N)."""
-        count = found.shape[1]
+        count = detections.shape[1]
         t = np.zeros((_ROWS, count))
-        t[:DETECTION_ROWS] = found[:DETECTION_ROWS]
-        rows = [limits[int(one)] for one in found[CLASS].tolist()]
+        t[:DETECTION_ROWS] = detections[:DETECTION_ROWS]
+        rows = [limits[int(number)] for number in detections[CLASS].tolist()]
         t[NOISE] = [row.noise_m for row in rows]
         t[GATE_M] = [row.gate_m for row in rows]
         t[MAX_SPEED] = [row.max_speed_m_per_s for row in rows]
         t[_DRIFT] = [row.drift_m_per_s for row in rows]
         t[TURNS] = [row.turns for row in rows]
         t[SPEED] = [row.speed_m_per_s for row in rows]
-        is_given = np.isfinite(found[VX]) & np.isfinite(found[VY])
-        t[_VELOCITY] = np.where(is_given, found[_VELOCITY], 0.0)
+        is_given = np.isfinite(detections[VX]) & np.isfinite(detections[VY])
+        t[_VELOCITY] = np.where(is_given, detections[_VELOCITY], 0.0)
         t[_PP] = t[NOISE] ** 2
         t[_VV] = np.where(is_given, _GIVEN_SPEED, t[SPEED]) ** 2
         t[_AA] = (t[_DRIFT] * (1 - _NOISE_SHARE)) ** 2 * t[TURNS]
-        has_heading = np.isfinite(found[HEADING])
-        angle = np.where(has_heading, found[HEADING], 0.0)
+        has_heading = np.isfinite(detections[HEADING])
+        angle = np.where(has_heading, detections[HEADING], 0.0)
         t[_COS], t[_SIN] = np.cos(2 * angle) * has_heading, np.sin(2 * angle) * has_heading
         t[_FACING] = np.where(has_heading, 1.0, 0.0)
-        t[_SIZED] = np.isfinite(found[LENGTH])
+        t[_SIZED] = np.isfinite(detections[LENGTH])
         t[ID] = np.arange(first_id, first_id + count)
-        t[SCORES] = np.where(np.isnan(found[SCORE]), 0.5, found[SCORE])
+        t[SCORES] = certainty(detections)
         t[HITS] = 1
         t[LAST_FRAME] = frame
         t[LAST], t[LAST_VELOCITY], t[LAST_SPREAD], t[FIRST] = t[BOX], t[_VELOCITY], t[_VV], t[PLACE]
         if self.covariances:
-            self.covariances.add(t[_COVARIANCE], measured(t[NOISE], found))
+            self.covariances.add(t[_COVARIANCE], measured(t[NOISE], detections))
         self.table = np.concatenate([self.table, t], axis=1)
         self.votes = np.concatenate([self.votes, np.zeros((len(self.votes), count))], axis=1)
-        self._vote(np.arange(len(self) - count, len(self)), found)
+        self._vote(np.arange(len(self) - count, len(self)), detections)
 
     def continue_tracks(self, which: Indices, lost: Floats) -> None:
         """Let tracks (N,) continue lost ones, (rows, N): they get their ids and sizes."""
         self.table[ID, which] = lost[ID]
-        known = lost[_SIZED] > self.table[_SIZED, which]
-        self.table[_SIZE, which] = np.where(known, lost[_SIZE], self.table[_SIZE, which])
+        is_larger = lost[_SIZED] > self.table[_SIZED, which]
+        self.table[_SIZE, which] = np.where(is_larger, lost[_SIZE], self.table[_SIZE, which])
         self.table[_SIZED, which] += lost[_SIZED]
 
-    def _vote(self, track: Indices, found: Floats) -> None:
-        classes = found[CLASS].tolist()
-        for one in sorted(set(classes) - self._classes.keys()):
-            self._classes[one] = len(self._classes)
+    def _vote(self, track: Indices, detections: Floats) -> None:
+        classes = detections[CLASS].tolist()
+        for number in sorted(set(classes) - self._classes.keys()):
+            self._classes[number] = len(self._classes)
             self.votes = np.concatenate([self.votes, np.zeros((1, self.votes.shape[1]))])
-        which = [self._classes[one] for one in classes]
-        self.votes[which, track] += np.where(np.isnan(found[SCORE]), 0.5, found[SCORE])
+        which = [self._classes[number] for number in classes]
+        self.votes[which, track] += certainty(detections)
 
     def _winners(self, track: Indices, before: Floats) -> Floats:
         """The class with the highest sum of scores, of each of some tracks (N,) with these classes (N,) before."""
@@ -315,19 +315,24 @@ class GroundTracks:
         return np.asarray(classes[self.votes.take(track, axis=1).argmax(axis=0)], float)
 
 
-def measured(noise_m: Floats, found: Floats) -> Floats:
+def measured(noise_m: Floats, detections: Floats) -> Floats:
     """The covariances (N, 3) of detections (rows, N) of tracks with this noise (N,).
 
     Their own covariance says how well the cameras place them; people and boxes sway by the noise of their class, too.
     """
     out = np.stack([noise_m**2, np.zeros_like(noise_m), noise_m**2], axis=-1)
-    return out + own_covariances(found) if found.shape[0] > DETECTION_ROWS else out
+    return out + own_covariances(detections) if detections.shape[0] > DETECTION_ROWS else out
 
 
-def own_covariances(found: Floats) -> Floats:
+def certainty(detections: Floats) -> Floats:
+    """The scores (N,) of detections (rows, N); 0.5 for those without a score."""
+    return np.where(np.isnan(detections[SCORE]), 0.5, detections[SCORE])
+
+
+def own_covariances(detections: Floats) -> Floats:
     """The covariances (N, 3) that detections (rows, N) came with; 0 where they have none."""
-    has = found.shape[0] > DETECTION_ROWS
-    return np.asarray(np.nan_to_num(found[COVARIANCE].T) if has else np.zeros((found.shape[1], 3)))
+    has = detections.shape[0] > DETECTION_ROWS
+    return np.asarray(np.nan_to_num(detections[COVARIANCE].T) if has else np.zeros((detections.shape[1], 3)))
 
 
 def variance(table: Floats) -> Floats:
@@ -361,9 +366,9 @@ def _transition(drift: Floats, turns: Floats, dt: float) -> tuple[Floats, Floats
     return np.array([[1.0, dt, f], [0.0, 1.0, g], [0.0, 0.0, fade]]), out
 
 
-def _correct(t: Floats, found: Floats) -> None:
+def _correct(t: Floats, detections: Floats) -> None:
     """Correct the motion of tracks (rows, N) with the positions of detections, in place."""
-    off = found[PLACE] - t[PLACE]
+    off = detections[PLACE] - t[PLACE]
     pp, pv, pa, vv, va, aa = t[_COVARIANCE].copy()
     s = pp + t[NOISE] ** 2
     kp, kv, ka = pp / s, pv / s, pa / s
@@ -380,32 +385,32 @@ def _move(t: Floats, place: Floats, velocity: Floats, acceleration: Floats) -> N
     t[_VELOCITY] *= np.minimum(1.0, t[MAX_SPEED] / np.maximum(speed, 1e-9))
 
 
-def _follow_box(t: Floats, found: Floats, weight: Floats) -> None:
+def _follow_box(t: Floats, detections: Floats, weight: Floats) -> None:
     """Correct z, size and heading of tracks (rows, N), in place; sizes and headings with ``weight`` 0 don't count."""
-    if weight.all() and np.isfinite(found[_SHAPE]).all() and not np.isnan(t[_SHAPE]).any():
+    if weight.all() and np.isfinite(detections[_SHAPE]).all() and not np.isnan(t[_SHAPE]).any():
         # What nearly all detections are. All else comes to the same then.
-        t[Z] += _HEIGHT_RATE * (found[Z] - t[Z])
+        t[Z] += _HEIGHT_RATE * (detections[Z] - t[Z])
         t[_SIZED] += 1
         before = t[_SIZE]
         limit = np.where(t[_SIZED] <= _FIRST_SIZES, np.inf, _SIZE_LIMIT * before)
-        change = np.minimum(np.maximum(found[_SIZE] - before, -limit), limit)
+        change = np.minimum(np.maximum(detections[_SIZE] - before, -limit), limit)
         before += np.maximum(_SIZE_RATE, 1 / t[_SIZED]) * change
-        _follow_heading(t, found[HEADING], weight)
+        _follow_heading(t, detections[HEADING], weight)
         return
-    given = np.isfinite(found[Z])
-    step = np.where(given, _HEIGHT_RATE * (found[Z] - np.where(np.isnan(t[Z]), found[Z], t[Z])), 0.0)
-    t[Z] = np.where(np.isnan(t[Z]), found[Z], t[Z] + step)
+    has_height = np.isfinite(detections[Z])
+    step = np.where(has_height, _HEIGHT_RATE * (detections[Z] - np.where(np.isnan(t[Z]), detections[Z], t[Z])), 0.0)
+    t[Z] = np.where(np.isnan(t[Z]), detections[Z], t[Z] + step)
     # Size: a mean with limited steps, which outliers move little.
-    sized = np.isfinite(found[LENGTH]) * weight
+    sized = np.isfinite(detections[LENGTH]) * weight
     t[_SIZED] += sized
     rate = np.maximum(_SIZE_RATE, 1 / np.maximum(t[_SIZED], 1))
     before = t[_SIZE]
     is_new = np.isnan(before)
     limit = np.where(is_new | (t[_SIZED] <= _FIRST_SIZES), np.inf, _SIZE_LIMIT * before)
-    change = np.clip(np.where(np.isnan(found[_SIZE]) | is_new, 0.0, found[_SIZE] - before), -limit, limit)
-    t[_SIZE] = np.where(is_new, found[_SIZE], before + rate * change * weight)
-    turned = np.isfinite(found[HEADING]) * weight
-    _follow_heading(t, np.where(turned > 0, found[HEADING], 0.0), turned)
+    change = np.clip(np.where(np.isnan(detections[_SIZE]) | is_new, 0.0, detections[_SIZE] - before), -limit, limit)
+    t[_SIZE] = np.where(is_new, detections[_SIZE], before + rate * change * weight)
+    turned = np.isfinite(detections[HEADING]) * weight
+    _follow_heading(t, np.where(turned > 0, detections[HEADING], 0.0), turned)
 
 
 def _follow_heading(t: Floats, measured: Floats, turned: Floats) -> None:

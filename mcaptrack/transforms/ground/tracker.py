@@ -49,6 +49,7 @@ from mcaptrack.transforms.ground.state import (
     GroundTracks,
     X,
     Y,
+    certainty,
     measured,
     no_tracks,
     own_covariances,
@@ -62,7 +63,7 @@ from mcaptrack.transforms.motion_limits import (
     limits_by_class,
     read_limits,
 )
-from mcaptrack.transforms.protocol import check_options, context, option
+from mcaptrack.transforms.protocol import check_options, context, option, setting
 
 _ASSOCIATION: Final = "Association"
 _DETECTIONS: Final = "Detections"
@@ -113,7 +114,7 @@ _OTHER_HITS: Final = 2
 
 def associate(
     table: Floats,
-    found: Floats,
+    detections: Floats,
     cost: Cost,
     min_iou: float,
     across_classes: bool,
@@ -123,29 +124,29 @@ def associate(
 
     With the ``covariances`` of the tracks, these and those of the detections count instead of usual ones.
     """
-    if not table.shape[1] or not found.shape[1]:
+    if not table.shape[1] or not detections.shape[1]:
         nothing = np.empty(0, np.intp)
         return nothing, nothing, np.empty(0, bool)
     reach = table[GATE_M] * (1 + table[MISSED_S])
-    pairs = Pairing(table[[X, Y]], found[[X, Y]], reach)
-    apart = _Apart(table, found, covariances, pairs)
-    same = pairs.of_first(table[CLASS]) == pairs.of_second(found[CLASS])
+    pairs = Pairing(table[[X, Y]], detections[[X, Y]], reach)
+    apart = _Apart(table, detections, covariances, pairs)
+    same = pairs.of_first(table[CLASS]) == pairs.of_second(detections[CLASS])
     near = apart.within(_GATE, reach)
     if across_classes:
         same = np.ones_like(same)
-    track, row = _assigned(table, found, apart, near & same, cost, min_iou)
+    track, row = _assigned(table, detections, apart, near & same, cost, min_iou)
     is_same = np.ones(len(track), bool)
-    if across_classes or len(row) == found.shape[1]:
+    if across_classes or len(row) == detections.shape[1]:
         return track, row, is_same
-    lost, free = table[HITS] >= _OTHER_HITS, np.ones(found.shape[1], bool)
+    lost, free = table[HITS] >= _OTHER_HITS, np.ones(detections.shape[1], bool)
     lost[track], free[row] = False, False
-    if not lost.any() or len({*table[CLASS].tolist(), *found[CLASS].tolist()}) == 1:
+    if not lost.any() or len({*table[CLASS].tolist(), *detections[CLASS].tolist()}) == 1:
         return track, row, is_same
     other = near & pairs.of_first(lost) & pairs.of_second(free)
     if not other.any():
         return track, row, is_same
     nearer = apart.within(_OTHER_GATE, np.maximum(_OTHER_SHARE * reach, 3 * table[NOISE]))
-    more = _assigned(table, found, apart, other & nearer, cost, min_iou)
+    more = _assigned(table, detections, apart, other & nearer, cost, min_iou)
     is_same = np.concatenate([is_same, np.zeros(len(more[0]), bool)])
     return np.concatenate([track, more[0]]), np.concatenate([row, more[1]]), is_same
 
@@ -153,19 +154,21 @@ def associate(
 class _Apart:
     """Distances of detections (rows, N) from the predicted positions of tracks (rows, K), for each of their pairs."""
 
-    def __init__(self, table: Floats, found: Floats, covariances: Covariances | None, pairs: Pairing) -> None:
+    def __init__(self, table: Floats, detections: Floats, covariances: Covariances | None, pairs: Pairing) -> None:
         self.pairs = pairs
-        x = pairs.of_second(found[X]) - pairs.of_first(table[X])
-        y = pairs.of_second(found[Y]) - pairs.of_first(table[Y])
+        x = pairs.of_second(detections[X]) - pairs.of_first(table[X])
+        y = pairs.of_second(detections[Y]) - pairs.of_first(table[Y])
         self._squared = x * x + y * y
         self._spread = variance(table)
         self._deviations: Floats | None = None
         if covariances is not None:
             place = pairs.of_first(covariances.places())
-            noise = pairs.of_first(measured(table[NOISE], found[:0]).T) + pairs.of_second(own_covariances(found).T)
+            noise = pairs.of_first(measured(table[NOISE], detections[:0]).T) + pairs.of_second(
+                own_covariances(detections).T
+            )
             xx, xy, yy = place + noise
             #: Twice the log-odds that detections are true; their scores are probabilities.
-            share = np.clip(np.where(np.isnan(found[SCORE]), 0.5, found[SCORE]), _LEAST_SCORE, 1 - _LEAST_SCORE)
+            share = np.clip(certainty(detections), _LEAST_SCORE, 1 - _LEAST_SCORE)
             self._odds = 2 * np.log(share / (1 - share))
             self._area = xx * yy - xy * xy
             self._deviations = (yy * x * x - 2 * xy * x * y + xx * y * y) / self._area
@@ -188,14 +191,14 @@ class _Apart:
 
 
 def _assigned(
-    table: Floats, found: Floats, apart: _Apart, allowed: Bools, cost: Cost, min_iou: float
+    table: Floats, detections: Floats, apart: _Apart, allowed: Bools, cost: Cost, min_iou: float
 ) -> tuple[Indices, Indices]:
     """The best assignment of the allowed pairs."""
     track, row = apart.pairs.chosen(allowed)
     if not len(track):
         return track, row
     if cost == "iou":
-        gain = bev_iou_of_pairs(table[BOX, track].T, found[BOX, row].T)
+        gain = bev_iou_of_pairs(table[BOX, track].T, detections[BOX, row].T)
         good = gain >= max(min_iou, 1e-6)
         track, row, gain = track[good], row[good], gain[good]
     else:
@@ -245,43 +248,38 @@ class GroundTracker:
     max_age_s: float = option(
         1.6, "a track ends after this many seconds without a detection", least=0.0, search=(0.2, 4.0), theme=_LIFE
     )
-    delay_s: float = option(
+    delay_s: float = setting(
         1.0,
         "rows are written this many seconds late, so that false births are taken back and short gaps are filled; 0 for "
         "results that depend on the past alone",
         least=0.0,
         theme=_LIFE,
-        flag=False,
     )
-    link_s: float = option(
+    link_s: float = setting(
         8.0,
         "a new track continues a lost one that it fits, up to this many seconds after its last detection; 0 for never",
         least=0.0,
         theme=_LIFE,
-        flag=False,
     )
-    confirm_score: float = option(
+    confirm_score: float = setting(
         0.9,
         "a track is confirmed once the scores of its detections add up to this; detections without a score count 0.5",
         least=0.0,
         search=(0.3, 4.0),
         theme=_LIFE,
-        flag=False,
     )
-    birth_score: float = option(
+    birth_score: float = setting(
         0.2,
         "detections with a lower score continue tracks, but start none",
         least=0.0,
         most=1.0,
         search=(0.0, 0.8),
         theme=_LIFE,
-        flag=False,
     )
-    cost: Cost = option(
+    cost: Cost = setting(
         "metres",
         "how detections and tracks are compared: distance of their centres, or overlap of their boxes seen from above",
         theme=_ASSOCIATION,
-        flag=False,
     )
     min_iou: float = option(
         0.05,
@@ -291,13 +289,8 @@ class GroundTracker:
         theme=_ASSOCIATION,
     )
     min_score: float | None = option(None, "ignore detections with a lower score", theme=_DETECTIONS)
-    class_id: int | None = option(
-        None,
-        "ignore detections of other classes",
-        least=0,
-        most=2**31 - 1,
-        theme=_DETECTIONS,
-        flag=False,
+    class_id: int | None = setting(
+        None, "ignore detections of other classes", least=0, most=2**31 - 1, theme=_DETECTIONS
     )
     across_classes: bool = option(
         False,
@@ -325,8 +318,8 @@ class GroundTracker:
         run = _Run(self)
         coming = iter(frames)
         while block := list(islice(coming, _BLOCK_FRAMES)):
-            for frame, found in zip(block, run.detections(block), strict=True):
-                run.step(frame, found)
+            for frame, boxes in zip(block, run.detections(block), strict=True):
+                run.step(frame, boxes)
             yield from ((frame,) for frame in run.waiting.written())
         run.waiting.release(np.inf)
         yield from ((frame,) for frame in run.waiting.written())
@@ -359,21 +352,21 @@ _BACKWARDS: Final = 2.0
 
 
 def fast_starts(
-    table: Floats, found: Floats, taken: tuple[Indices, Indices], across_classes: bool
+    table: Floats, detections: Floats, taken: tuple[Indices, Indices], across_classes: bool
 ) -> tuple[Indices, Indices]:
     """Tracks with one detection (rows, K), and detections (rows, N) of the same objects: numbers of both, (P,) each.
 
     Those of ``taken``, which are associated already, are no others.
     """
     nothing = np.empty(0, np.intp)
-    if len(taken[1]) == found.shape[1]:
+    if len(taken[1]) == detections.shape[1]:
         return nothing, nothing
-    is_free, is_left = table[HITS] == 1, np.ones(found.shape[1], bool)
+    is_free, is_left = table[HITS] == 1, np.ones(detections.shape[1], bool)
     is_free[taken[0]] = is_left[taken[1]] = False
     if not is_free.any():
         return nothing, nothing
     first, left = is_free.nonzero()[0], is_left.nonzero()[0]
-    old, new = table[:, first], found[:, left]
+    old, new = table[:, first], detections[:, left]
     reach = old[MAX_SPEED] * old[MISSED_S] + _NOISE * old[NOISE]
     pairs = Pairing(old[FIRST], new[[X, Y]], reach)
     x = pairs.of_second(new[X]) - pairs.of_first(old[FIRST][0])
@@ -402,7 +395,7 @@ def fast_starts(
 
 
 def _is_only(can_be: Bools, pairs: Pairing) -> Bools:
-    """Pairs of a track and a detection that have no other."""
+    """Mask the pairs of a track and a detection that are both in no other pair."""
     track, row = pairs.chosen(can_be)
     out = can_be.copy()
     out[can_be] = (np.bincount(track)[track] == 1) & (np.bincount(row)[row] == 1)
@@ -496,35 +489,35 @@ class _Run:
         self._frame, self._next_id = 0, 1
         self._left_out = 0
 
-    def step(self, frame: Frame, found: Floats) -> None:
+    def step(self, frame: Frame, detections: Floats) -> None:
         """Take one frame with these detections, (rows, N)."""
         options, tracks = self._options, self.tracks
         dt = 0.0 if self._last_ns is None else (frame.t_ns - self._last_ns) / NS_PER_S
         self._last_ns = frame.t_ns
-        if len(found) > DETECTION_ROWS:
+        if len(detections) > DETECTION_ROWS:
             tracks.expect_covariances()
         if dt > max(JUMP_S, options.max_age_s, options.link_s):
             tracks.keep(np.zeros(len(tracks), bool))
         tracks.predict(dt)
         self._lost.wait(dt)
         track, row, is_same = associate(
-            tracks.table, found, options.cost, options.min_iou, options.across_classes, tracks.covariances
+            tracks.table, detections, options.cost, options.min_iou, options.across_classes, tracks.covariances
         )
-        fast, at = fast_starts(tracks.table, found, (track, row), options.across_classes)
+        fast, at = fast_starts(tracks.table, detections, (track, row), options.across_classes)
         if len(fast):
             tracks.allow_speed(fast)
             track, row = np.concatenate([track, fast]), np.concatenate([row, at])
             is_same = np.concatenate([is_same, np.ones(len(fast), bool)])
         if len(track):
-            before, after = tracks.update(track, found.take(row, axis=1), is_same, self._frame)
+            before, after = tracks.update(track, detections.take(row, axis=1), is_same, self._frame)
             # One more detection has to be where the velocity says before such a track is confirmed.
             tracks.table[SCORES, fast] = before[SCORES, len(track) - len(fast) :]
             self.waiting.close_gaps(before, after, self._frame, frame.t_ns)
-        count = found.shape[1]
+        count = detections.shape[1]
         if len(row) < count:
-            starts = ~(found[SCORE] < options.birth_score)  # a missing score is not lower
+            starts = ~(detections[SCORE] < options.birth_score)  # a missing score is not lower
             starts[row] = False
-            self._initiate(found[:, starts])
+            self._initiate(detections[:, starts])
         table = tracks.table
         is_found = table[LAST_FRAME] == self._frame
         is_new = (table[IS_CONFIRMED] == 0) & (table[SCORES] >= options.confirm_score)
@@ -563,38 +556,38 @@ class _Run:
             tracks.keep(kept)
         return kept
 
-    def _initiate(self, found: Floats) -> None:
+    def _initiate(self, detections: Floats) -> None:
         """Start a track at each of these detections, (rows, N)."""
-        count = found.shape[1]
+        count = detections.shape[1]
         if not count:
             return
-        if new := {int(one) for one in np.unique(found[CLASS])} - self._limits.keys():
+        if new := {int(number) for number in np.unique(detections[CLASS])} - self._limits.keys():
             self._limits |= limits_by_class(sorted(new), self._options.class_names, self._options.class_limits)
-        self.tracks.initiate(self._next_id, found, self._limits, self._frame)
+        self.tracks.initiate(self._next_id, detections, self._limits, self._frame)
         self._next_id += count
 
     def detections(self, frames: Sequence[Frame]) -> Iterator[Floats]:
         """For each frame the detections that are used, in an order of their own: (rows, N)."""
         joined, options = join_frames(DETECTIONS, frames), self._options
         rows = joined.rows
-        found = np.stack([rows[name] for name in _COLUMNS], dtype=float)
-        xx, xy, yy = given = np.stack([rows[name] for name in COVARIANCE_M2])
-        is_given = (xx > 0) & (yy > 0) & (xy * xy < xx * yy) & np.isfinite(given).all(axis=0)
+        table = np.stack([rows[name] for name in _COLUMNS], dtype=float)
+        xx, xy, yy = covariances = np.stack([rows[name] for name in COVARIANCE_M2])
+        is_given = (xx > 0) & (yy > 0) & (xy * xy < xx * yy) & np.isfinite(covariances).all(axis=0)
         has_any = np.bincount(joined.frame, is_given, len(frames)) > 0
         if has_any.any():
-            found = np.concatenate([found, np.where(is_given, given, np.nan)])
-        used = np.isfinite(found[X]) & np.isfinite(found[Y])
+            table = np.concatenate([table, np.where(is_given, covariances, np.nan)])
+        used = np.isfinite(table[X]) & np.isfinite(table[Y])
         self._left_out += len(rows) - int(used.sum())
         if options.min_score is not None:
-            used &= ~(found[SCORE] < options.min_score)
+            used &= ~(table[SCORE] < options.min_score)
         if options.class_id is not None:
-            used &= found[CLASS] == options.class_id
-        order = np.lexsort((*found[::-1], joined.frame))
+            used &= table[CLASS] == options.class_id
+        order = np.lexsort((*table[::-1], joined.frame))
         order = order[used[order]]
-        found = found.take(order, axis=1)
+        table = table.take(order, axis=1)
         ends = np.append(0, np.cumsum(np.bincount(joined.frame[order], minlength=len(frames)))).tolist()
         for low, high, has_covariances in zip(ends[:-1], ends[1:], has_any.tolist(), strict=True):
-            yield found[: None if has_covariances else DETECTION_ROWS, low:high]
+            yield table[: None if has_covariances else DETECTION_ROWS, low:high]
 
     def warn(self) -> None:
         """Warn of detections without a position in metres."""

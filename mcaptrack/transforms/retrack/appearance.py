@@ -54,14 +54,14 @@ class Descriptors(NamedTuple):
         who = np.minimum(np.searchsorted(ids, track_id), len(ids) - 1)
         want = at * len(ids) + who
         row = np.minimum(np.searchsorted(have, want), len(have) - 1)
-        found = (have[row] == want) & (times[at] == t_ns) & (ids[who] == track_id)
-        return np.where(found, row, -1)
+        is_stored = (have[row] == want) & (times[at] == t_ns) & (ids[who] == track_id)
+        return np.where(is_stored, row, -1)
 
     def tracks_of(self, t_ns: Ints, track_id: Ints, track: Ints) -> Ints:
         """The ``track`` of each descriptor (S,), or -1, by those of samples (C,)."""
-        found = self.find(t_ns, track_id)
+        row = self.find(t_ns, track_id)
         out = np.full(len(self.t_ns), -1)
-        out[found[found >= 0]] = track[found >= 0]
+        out[row[row >= 0]] = track[row >= 0]
         return out
 
 
@@ -76,7 +76,7 @@ class Appearance(NamedTuple):
     def of(
         cls, descriptors: Descriptors | None, t_ns: Ints, step: Ints, source: Ints, xy_m: Floats, step_s: float
     ) -> Appearance | None:
-        """That of assignments (C,) of samples of input tracks (``source``); None if nothing is seen of them."""
+        """The appearance of assignments (C,) of samples of input tracks (``source``); None if none was seen."""
         if descriptors is None or len(descriptors.t_ns) == 0 or len(t_ns) == 0:
             return None
         sample = descriptors.find(t_ns, source)
@@ -85,11 +85,11 @@ class Appearance(NamedTuple):
         return None if calibration is None else cls(descriptors, sample, calibration)
 
     def take(self, order: Ints) -> Appearance:
-        """The same of assignments in another order."""
+        """The appearance of these assignments, in this order."""
         return self._replace(sample=self.sample[order])
 
     def between(self, step: Ints, track: Ints, step_s: float) -> Sides:
-        """For comparing parts of these tracks (C,): assignments as those that this was made of."""
+        """Compare parts of tracks (C,); assignments are the same as in ``of``."""
         return Sides(self, step, track, step_s)
 
 
@@ -127,14 +127,14 @@ class Sides:
         return np.where(self._at_border[stop - 1] & self._at_border[start], np.minimum(ratio, 0), ratio)
 
     def of_assignments(self, before: Ints, after: Ints) -> Floats:
-        """The same for a track up to an assignment and for one from an assignment on."""
+        """The log likelihood ratio (E,) that a track up to an assignment and one from another on are one person."""
         before, after = self._place[before], self._place[after]
         return self._compare(self._number[before], before + 1, self._number[after], after)
 
-    def of_swaps(self, one: Ints, other: Ints, since: Ints, until: Ints) -> Floats:
+    def of_swaps(self, track: Ints, other: Ints, since: Ints, until: Ints) -> Floats:
         """The log likelihood ratio (E,) that two tracks were exchanged from step ``since`` to ``until``."""
-        ratio = np.zeros(len(one))
-        for before, after, sign in ((one, other, 1), (other, one, 1), (one, one, -1), (other, other, -1)):
+        ratio = np.zeros(len(track))
+        for before, after, sign in ((track, other, 1), (other, track, 1), (track, track, -1), (other, other, -1)):
             ratio += sign * self._compare(before, self._from(before, since), after, self._from(after, until + 1))
         return ratio
 
@@ -144,7 +144,7 @@ class Sides:
         return np.searchsorted(self._when, track * self._steps + since)
 
     def _compare(self, left: Ints, end: Ints, right: Ints, begin: Ints) -> Floats:
-        """The log likelihood ratio (E,) that ``left`` before assignments ``end`` is ``right`` from ``begin`` on."""
+        """The log likelihood ratio (E,) that ``left`` up to ``end`` and ``right`` from ``begin`` on are one person."""
         ratio = np.zeros(len(left))
         for low in range(0, len(left), BATCH):
             part = slice(low, low + BATCH)

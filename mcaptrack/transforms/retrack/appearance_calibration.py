@@ -89,21 +89,21 @@ class AppearanceCalibration(NamedTuple):
         return self.separation - self.error >= LEAST_SEPARATION and self.slope > 0
 
 
-def usual_distance(values: NDArray[np.uint8], one: Ints, is_one: Bools, other: Ints, is_other: Bools) -> Floats:
+def usual_distance(values: NDArray[np.uint8], mine: Ints, is_one: Bools, other: Ints, is_other: Bools) -> Floats:
     """A low quantile of the squared distances of some descriptors to others, (E,): rows of ``values``, (E, WINDOW).
 
     A pole before a person changes one descriptor, and a mean with it; most pairs stay as they are.
     """
-    a, b = values[one] / np.float32(255), values[other] / np.float32(255)
+    a, b = values[mine] / np.float32(255), values[other] / np.float32(255)
     squared = np.square(a).sum(2)[:, :, None] + np.square(b).sum(2)[:, None] - 2 * (a @ b.swapaxes(1, 2))
     squared = np.where(is_one[:, :, None] & is_other[:, None], squared, np.inf).reshape(
-        len(one), one.shape[1] * other.shape[1]
+        len(mine), mine.shape[1] * other.shape[1]
     )
     squared.sort(axis=1)
     count = is_one.sum(axis=1) * is_other.sum(axis=1)
     at = np.floor(_QUANTILE * np.maximum(count - 1, 0)).astype(np.int64)
-    found = squared[np.arange(len(one)), at]
-    return np.where(np.isfinite(found), np.maximum(found, 0), 0).astype(np.float64)
+    distances = squared[np.arange(len(mine)), at]
+    return np.where(np.isfinite(distances), np.maximum(distances, 0), 0).astype(np.float64)
 
 
 class _Blocks(NamedTuple):
@@ -136,23 +136,23 @@ def calibrate(
     blocks, noise = _blocks(values, which[seen], step[seen], source[seen], xy_m[seen], step_s)
     which, has = blocks.which, blocks.has
     parts = [
-        (part, usual_distance(values, which[part.one], has[part.one], which[part.other], has[part.other]))
+        (part, usual_distance(values, which[part.before], has[part.before], which[part.after], has[part.after]))
         for part in _pairs(blocks, step_s)
     ]
     if not parts:
         return None
     pairs = _Pairs(*(np.concatenate([getattr(part, name) for part, _ in parts]) for name in _Pairs._fields))
-    distance = np.concatenate([one for _, one in parts])
+    distance = np.concatenate([distances for _, distances in parts])
     lag = np.searchsorted(_LAGS_S, pairs.gap_s, "right") - 1
-    is_same = blocks.track[pairs.one] == blocks.track[pairs.other]
-    tracks = len(np.unique(blocks.track[pairs.one[is_same]]))
+    is_same = blocks.track[pairs.before] == blocks.track[pairs.after]
+    tracks = len(np.unique(blocks.track[pairs.before[is_same]]))
     if tracks < 2 or is_same.all():  # nothing to compare with
         return None
-    drift = _drift(distance - noise, lag, blocks.track[pairs.one], is_same, noise)
+    drift = _drift(distance - noise, lag, blocks.track[pairs.before], is_same, noise)
     calibration = AppearanceCalibration(noise, drift, 0.0, 0.0, 0.5, 0.5, tracks)
     excess = calibration.excess(distance, pairs.gap_s)
-    low = np.minimum(blocks.track[pairs.one], blocks.track[pairs.other])
-    high = np.maximum(blocks.track[pairs.one], blocks.track[pairs.other])
+    low = np.minimum(blocks.track[pairs.before], blocks.track[pairs.after])
+    high = np.maximum(blocks.track[pairs.before], blocks.track[pairs.after])
     _, who, often = np.unique(low * (high.max() + 1) + high, return_inverse=True, return_counts=True)
     weight = 1 / often[who]
     bias, slope, separation = _fit(excess, is_same, weight)
@@ -164,8 +164,8 @@ def calibrate(
 class _Pairs(NamedTuple):
     """Pairs of blocks (P,) and the seconds between them."""
 
-    one: Ints
-    other: Ints
+    before: Ints
+    after: Ints
     gap_s: Floats
 
 
@@ -216,7 +216,7 @@ def _fewer(blocks: _Blocks, step_s: float) -> _Blocks:
 
 
 def _pairs(blocks: _Blocks, step_s: float) -> Iterator[_Pairs]:
-    """Pairs of blocks, one after the other, of one track or of two that are there at one time and within reach."""
+    """Pairs of successive blocks: of one track, or of two tracks that exist at the same time within reach."""
     order = np.argsort(blocks.first, kind="stable")
     begins = blocks.first[order]
     low = np.searchsorted(begins, blocks.last, "right")
@@ -224,14 +224,16 @@ def _pairs(blocks: _Blocks, step_s: float) -> Iterator[_Pairs]:
     part = np.cumsum(many) // BATCH
     for number in np.unique(part).tolist():
         own = np.flatnonzero(part == number)
-        one = own[group_index(many[own])]
-        other = order[ragged_range(low[own], many[own])]
-        gap_s = np.asarray((blocks.first[other] - blocks.last[one]) * step_s, np.float64)
-        way = blocks.from_m[other] - blocks.to_m[one]
-        meet = np.minimum(blocks.ends[one], blocks.ends[other]) > np.maximum(blocks.begins[one], blocks.begins[other])
+        before = own[group_index(many[own])]
+        after = order[ragged_range(low[own], many[own])]
+        gap_s = np.asarray((blocks.first[after] - blocks.last[before]) * step_s, np.float64)
+        way = blocks.from_m[after] - blocks.to_m[before]
+        meet = np.minimum(blocks.ends[before], blocks.ends[after]) > np.maximum(
+            blocks.begins[before], blocks.begins[after]
+        )
         meet &= np.hypot(way[:, 0], way[:, 1]) <= _REACH_M + _SPEED_M_PER_S * gap_s
-        kept = meet | (blocks.track[one] == blocks.track[other])
-        yield _Pairs(one[kept], other[kept], gap_s[kept])
+        kept = meet | (blocks.track[before] == blocks.track[after])
+        yield _Pairs(before[kept], after[kept], gap_s[kept])
 
 
 def _drift(beyond: Floats, lag: Ints, track: Ints, is_same: Bools, noise: float) -> Floats:
@@ -261,13 +263,13 @@ def _fit(excess: Floats, is_same: Bools, weight: Floats) -> tuple[float, float, 
     below = np.cumsum(same) - same / 2
     separation = float((below * different).sum() / total**2)
     x = np.stack([np.ones(2 * _BINS + 1), -_BIN * (np.arange(2 * _BINS + 1) - _BINS)], axis=1)
-    found = np.zeros(2)
+    estimate = np.zeros(2)
     for _ in range(50):
-        is_one = 1 / (1 + np.exp(-np.clip(x @ found, -30, 30)))
-        slope = x.T @ (same - (same + different) * is_one) - found / _PRIOR_SD**2
+        is_one = 1 / (1 + np.exp(-np.clip(x @ estimate, -30, 30)))
+        slope = x.T @ (same - (same + different) * is_one) - estimate / _PRIOR_SD**2
         curve = (x * ((same + different) * is_one * (1 - is_one))[:, None]).T @ x + np.eye(2) / _PRIOR_SD**2
         change = np.linalg.solve(curve, slope)
-        found = found + change
+        estimate = estimate + change
         if np.abs(change).max() < 1e-9:
             break
-    return float(found[0]), float(found[1]), separation
+    return float(estimate[0]), float(estimate[1]), separation

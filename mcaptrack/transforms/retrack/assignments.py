@@ -72,9 +72,9 @@ def _find(ids: Ints, steps: Ints, wanted_ids: Ints, wanted_steps: Ints) -> Ints:
     order = np.argsort(have, kind="stable")
     want = key(wanted_ids, wanted_steps)
     at = np.minimum(np.searchsorted(have[order], want), len(have) - 1)
-    found = order[at]
-    is_there = np.isin(wanted_ids, names) & (have[found] == want)
-    return np.where(is_there, found, -1)
+    rows = order[at]
+    is_there = np.isin(wanted_ids, names) & (have[rows] == want)
+    return np.where(is_there, rows, -1)
 
 
 # Re-tracking of each class by itself: links, swaps and gaps never join tracks of different classes.
@@ -149,14 +149,14 @@ def split_classes(frames: FrameColumns) -> list[FrameColumns]:
     classes, first = np.unique(class_id, return_index=True)
     # Ids of tracks tell classes apart that appear in one frame: the order of rows has no influence.
     begins = zip(classes.tolist(), frame_of[first].tolist(), strict=True)
-    lowest = [track_id[(frame_of == frame) & (class_id == one)].min() for one, frame in begins]
+    lowest = [track_id[(frame_of == frame) & (class_id == number)].min() for number, frame in begins]
     order = np.lexsort((np.array(lowest), frame_of[first]))
     numbers = frame_numbers(frames)
     out = [FrameCollector(TRACKS) for _ in classes]
     for low, high, part in joined_parts(TRACKS, frames):
         here = class_id[ends[low] : ends[high]]
-        for one, collector in zip(classes[order].tolist(), out, strict=True):
-            mine = here == one
+        for number, collector in zip(classes[order].tolist(), out, strict=True):
+            mine = here == number
             collector.extend(part.t_ns, numbers[low:high], np.append(0, mine.cumsum())[part.ends], part.rows[mine])
     return [collector.done() for collector in out]
 
@@ -179,9 +179,9 @@ def _highest_id(frames: FrameColumns) -> int:
 def _joined(frames: Sequence[FrameColumns], above: Ints) -> Iterator[Frame]:
     """One output of all classes (C,) as one; ids of each are raised ``above`` those of the classes before."""
     schema = frames[0].schema
-    for low, high in spans_of(np.sum([one.ends for one in frames], axis=0)):
-        counts = [np.diff(one.ends[low : high + 1]) for one in frames]
-        rows = schema.joined([one.rows(low, high) for one in frames])
+    for low, high in spans_of(np.sum([frame.ends for frame in frames], axis=0)):
+        counts = [np.diff(frame.ends[low : high + 1]) for frame in frames]
+        rows = schema.joined([frame.rows(low, high) for frame in frames])
         raised = rows["track_id"] + np.repeat(above[: len(frames)], [int(count.sum()) for count in counts])
         rows["track_id"] = np.where(rows["track_id"] < 0, rows["track_id"], raised)
         order = np.argsort(np.concatenate([group_index(count) for count in counts]), kind="stable")

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -47,14 +47,18 @@ class SmoothedHistory:
     """The smoothed histories of K tracks, of constant size whatever their age.
 
     ``last_m`` (K, 2) is the last observed position. ``level`` and ``trend`` (K, 2) are those of Holt's smoothing,
-    ``displacements`` (K, L - 1, 2) the last smoothed displacements, of which the last ``known`` (K,) exist.
+    ``displacements`` (K, L - 1, 2) the last smoothed displacements, of which the last ``count`` (K,) exist.
     """
 
     last_m: Floats
     level: Floats
     trend: Floats
     displacements: Floats
-    known: Ints
+    count: Ints
+
+    def __iter__(self) -> Iterator[Any]:
+        """The arrays, in their order."""
+        return (getattr(self, field.name) for field in fields(self))
 
     @classmethod
     def of_observations(cls, holt: Holt, past_m: Floats, valid: Bools) -> SmoothedHistory:
@@ -81,19 +85,19 @@ class SmoothedHistory:
 
     def _smooth(self, holt: Holt, which: Bools, displacement: Floats) -> None:
         """Eq. 3 of the paper: smooth one more displacement (K, 2) of some tracks (K,)."""
-        started = (self.known > 0)[:, None]
+        started = (self.count > 0)[:, None]
         first, flat = holt.start(displacement)
         level, trend = holt.step(self.level, self.trend, displacement)
         self.level = np.where(which[:, None], np.where(started, level, first), self.level)
         self.trend = np.where(which[:, None], np.where(started, trend, flat), self.trend)
         shifted = np.concatenate([self.displacements[:, 1:], self.level[:, None]], axis=1)
         self.displacements = np.where(which[:, None, None], shifted, self.displacements)
-        self.known = np.where(which, np.minimum(self.known + 1, self.displacements.shape[1]), self.known)
+        self.count = np.where(which, np.minimum(self.count + 1, self.displacements.shape[1]), self.count)
 
     def positions(self) -> tuple[Floats, Bools]:
         """Past positions (K, L, 2), rebuilt from the smoothed displacements, and which of them are known (K, L)."""
         length = self.displacements.shape[1] + 1
-        valid = np.arange(length) >= length - 1 - self.known[:, None]
+        valid = np.arange(length) >= length - 1 - self.count[:, None]
         return rebuild_positions(self.last_m, self.displacements), valid
 
 
@@ -121,17 +125,14 @@ class ActiveTracks:
         return cls(nothing, nothing, nothing, nothing, history, prediction)
 
     def __getitem__(self, which: Ints | Bools) -> ActiveTracks:
-        history = SmoothedHistory(*(getattr(self.history, field.name)[which] for field in fields(SmoothedHistory)))
+        history = SmoothedHistory(*(values[which] for values in self.history))
         prediction = Forecast(self.prediction.mean[which], self.prediction.cov[which])
         return ActiveTracks(
             self.ids[which], self.last_step[which], self.hits[which], self.source[which], history, prediction
         )
 
     def __add__(self, other: ActiveTracks) -> ActiveTracks:
-        names = [field.name for field in fields(SmoothedHistory)]
-        history = SmoothedHistory(
-            *(np.concatenate([getattr(self.history, name), getattr(other.history, name)]) for name in names)
-        )
+        history = SmoothedHistory(*(np.concatenate(pair) for pair in zip(self.history, other.history, strict=True)))
         prediction = Forecast(*(np.concatenate(pair) for pair in zip(self.prediction, other.prediction, strict=True)))
         return ActiveTracks(
             np.concatenate([self.ids, other.ids]),

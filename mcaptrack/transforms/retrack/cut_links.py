@@ -66,7 +66,7 @@ class CutTracks(NamedTuple):
 
     @classmethod
     def of(cls, step: Ints, track: Ints, source: Ints, cuts: Cuts) -> CutTracks:
-        """Those of assignments (C,)."""
+        """The tracks of assignments (C,)."""
         order = np.lexsort((step, track))
         starts = run_starts(track[order])
         first, last = np.flatnonzero(starts), np.flatnonzero(run_ends(starts))
@@ -105,17 +105,17 @@ def find_candidates(
     pieces: CutTracks,
     evidence: Evidence | None = None,
 ) -> CandidateLinks:
-    """The links that may be made: those with a chance as without cuts, and at cuts those of one track or input id.
+    """Candidate links: plausible ones as without cuts, and at cuts those within one track or input id.
 
     ``evidence`` is what else tells whether both sides are one person.
     """
     i, j, gap_s = linking.candidates(trajectories, forward, backward, step_s, max_gap_s)
     first, last = trajectories.first[:-1], trajectories.first[1:] - 1
-    found = linking.features(model, forward.take(last[i]), backward.take(first[j]), gap_s)
+    usual = linking.features(model, forward.take(last[i]), backward.take(first[j]), gap_s)
     cut_before, cut_after = np.isfinite(pieces.odds_after[i]), np.isfinite(pieces.odds_before[j])
     same_track, same_id = pieces.went_on[i] == j, pieces.last_source[i] == pieces.first_source[j]
     is_known = same_track | (same_id & (cut_before | cut_after) & (gap_s < _SAME_ID_S))
-    log_odds, beside = linking.log_odds(found), np.zeros(len(i))
+    log_odds, beside = linking.log_odds(usual), np.zeros(len(i))
     if evidence is not None:
         near = np.flatnonzero(is_known | linking.has_chance(log_odds + MOST))
         beside[near] = evidence(i[near], j[near])
@@ -134,7 +134,7 @@ def find_candidates(
         gap_s < 1.5 * step_s,
         gap_s < _SHORT_S,
     )
-    features = np.column_stack([found, *extra]).astype(np.float64)
+    features = np.column_stack([usual, *extra]).astype(np.float64)
     all_of = CandidateLinks(i, j, gap_s, cut_before | cut_after, log_odds, features, beside)
     return CandidateLinks(*(values[may_be] for values in all_of))
 
@@ -153,19 +153,21 @@ def link_pieces(
     """For each of the tracks after cutting the one that continues it, or -1; (K,)."""
     count = len(trajectories.first) - 1
     continued_by = np.full(count, -1)
-    found = find_candidates(model, trajectories, forward, backward, step_s, max_gap_s, pieces, evidence)
-    if len(found.ends) == 0:
+    candidates = find_candidates(model, trajectories, forward, backward, step_s, max_gap_s, pieces, evidence)
+    if len(candidates.ends) == 0:
         return continued_by
-    at_cut = found.features @ _RELINKS_WEIGHTS + _RELINKS_BIAS + found.evidence
-    log_odds = np.where(found.at_cut, at_cut, found.log_odds)
+    at_cut = candidates.features @ _RELINKS_WEIGHTS + _RELINKS_BIAS + candidates.evidence
+    log_odds = np.where(candidates.at_cut, at_cut, candidates.log_odds)
     shift = np.zeros(len(log_odds))
-    made = np.empty(0, np.int64)
+    links = np.empty(0, np.int64)
     for _ in range(2):  # the share of right links that is usual in this log is known after the first round
-        made = linking.best_links(found.ends, found.begins, log_odds + np.where(found.at_cut, 0.0, shift), count)
-        elsewhere = made[~found.at_cut[made]]
-        shifts = linking.prior_shifts(log_odds[elsewhere], found.gap_s[elsewhere])
-        shift = shifts[linking.gap_classes(found.gap_s)]
-    log_odds += np.where(found.at_cut, -np.log(_ENOUGH_AT_CUTS), shift - np.log(linking.ENOUGH))
-    made = made[log_odds[made] > np.log(min_confidence / (1 - min_confidence))]
-    continued_by[found.ends[made]] = found.begins[made]
+        links = linking.best_links(
+            candidates.ends, candidates.begins, log_odds + np.where(candidates.at_cut, 0.0, shift), count
+        )
+        elsewhere = links[~candidates.at_cut[links]]
+        shifts = linking.prior_shifts(log_odds[elsewhere], candidates.gap_s[elsewhere])
+        shift = shifts[linking.gap_classes(candidates.gap_s)]
+    log_odds += np.where(candidates.at_cut, -np.log(_ENOUGH_AT_CUTS), shift - np.log(linking.ENOUGH))
+    links = links[log_odds[links] > np.log(min_confidence / (1 - min_confidence))]
+    continued_by[candidates.ends[links]] = candidates.begins[links]
     return continued_by

@@ -88,17 +88,17 @@ def features(model: MotionModel, trajectories: Trajectories, smoothed: State, st
 
 
 def stand_throughout(
-    trajectories: Trajectories, smoothed: State, found: Floats, log: tuple[int, int], step_s: float
+    trajectories: Trajectories, smoothed: State, values: Floats, log: tuple[int, int], step_s: float
 ) -> Bools:
     """Which tracks (K,) stand still from the first step of the log to its last one, ``log``, and are no doubles.
 
-    People may stand for longer than a log is; most clutter comes and goes. ``found`` (K, F) are the features.
+    People may stand for longer than a log is; most clutter comes and goes. ``values`` (K, F) are the features.
     """
     first, last = trajectories.first[:-1], trajectories.first[1:] - 1
     most = _MISSED_S / step_s
     border = min(most, _BORDER_SHARE * (log[1] - log[0]))
     begins, ends = trajectories.step[first] <= log[0] + border, trajectories.step[last] >= log[1] - border
-    stays = (_extent(smoothed.mean[:, :2], first) < _STANDS_M) & (found[:, FEATURES.index("in step")] < _DOUBLE)
+    stays = (_extent(smoothed.mean[:, :2], first) < _STANDS_M) & (values[:, FEATURES.index("in step")] < _DOUBLE)
     is_long = (log[1] - log[0]) * step_s >= _SHORTEST_S - 1e-9
     track, missed = _gaps(trajectories)
     is_missed = np.bincount(track[missed > most], minlength=len(first)) > 0
@@ -225,22 +225,22 @@ def log_odds_in_log(
     """
     from scipy.optimize import minimize
 
-    found = features(model, trajectories, smoothed, step_s)
-    standard = (found - _MEAN) / _SPREAD
-    known = np.column_stack([standard, np.ones(len(standard))])
+    values = features(model, trajectories, smoothed, step_s)
+    standard = (values - _MEAN) / _SPREAD
+    columns = np.column_stack([standard, np.ones(len(standard))])
     # not a feature: its weight doesn't follow the log, and is no reason to think less of others who stand
-    extra = _THROUGHOUT * stand_throughout(trajectories, smoothed, found, log, step_s)
+    extra = _THROUGHOUT * stand_throughout(trajectories, smoothed, values, log, step_s)
     counts = _EACH_STEP * np.minimum(np.diff(trajectories.first), _MOST_STEPS)
     fitted = np.append(_WEIGHTS * _SPREAD, _BIAS + _WEIGHTS @ _MEAN)
 
     def loss(weights: Floats) -> tuple[float, Floats]:
-        value, off = known @ weights + extra, weights - fitted
+        value, off = columns @ weights + extra, weights - fitted
         likely = probability(value)
         entropy = np.logaddexp(0, value) - likely * value
-        slope = known.T @ (counts * -value * likely * (1 - likely))
+        slope = columns.T @ (counts * -value * likely * (1 - likely))
         return float(counts @ entropy + _STAYS / 2 * (off @ off)), slope + _STAYS * off
 
-    return np.asarray(known @ minimize(loss, fitted, jac=True, method="L-BFGS-B").x + extra)
+    return np.asarray(columns @ minimize(loss, fitted, jac=True, method="L-BFGS-B").x + extra)
 
 
 def scored_log_odds(xy_m: Floats, first: Ints, score: Floats, observed: Bools, usual: float, step_s: float) -> Floats:

@@ -87,19 +87,19 @@ def compatible(pair: Ints, low: Ints, high: Ints, gain: Floats) -> Ints:
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
-    ends = np.cumsum([0, *(len(one) for one in rivals)])
+    ends = np.cumsum([0, *(len(rival) for rival in rivals)])
     limits = csr_array((np.ones(ends[-1]), np.concatenate(rivals), ends), shape=(len(rivals), len(gain)))
     _, part = connected_components(limits.T @ limits, directed=False)
     chosen = np.bincount(part)[part] == 1
-    for one in np.unique(part[~chosen]):
-        among = np.flatnonzero(part == one)
+    for number in np.unique(part[~chosen]):
+        among = np.flatnonzero(part == number)
         of_these = limits[:, among]
         chosen[among] = _solved(of_these[np.diff(of_these.indptr) > 0], np.round(gain[among], 6))
     return np.flatnonzero(chosen)
 
 
 def _rivals(pair: Ints, low: Ints, high: Ints) -> list[Ints]:
-    """Groups of encounters that need one track at one time: those of a track that last when another one begins.
+    """Groups of encounters that compete for a track: those of it that are under way when another one begins.
 
     None is a part of another one.
     """
@@ -112,7 +112,7 @@ def _rivals(pair: Ints, low: Ints, high: Ints) -> list[Ints]:
         if len(lasting) < len(group):
             out.append(group)
         group, before = np.append(lasting, new), track
-    return [one for one in [*out, group] if len(one) > 1]
+    return [rivals for rivals in [*out, group] if len(rivals) > 1]
 
 
 def _solved(limits: csr_array, gain: Floats) -> Bools:
@@ -120,22 +120,22 @@ def _solved(limits: csr_array, gain: Floats) -> Bools:
     from scipy.optimize import Bounds, LinearConstraint, milp
 
     if len(gain) <= _MOST_TOGETHER:
-        found = milp(
+        solution = milp(
             -gain,
             integrality=np.ones(len(gain)),
             bounds=Bounds(0, 1),
             constraints=LinearConstraint(limits, ub=1),
             options={"node_limit": _NODES, "mip_rel_gap": 0.0},
         )
-        if found.status == 0:
-            return np.asarray(found.x > 0.5)
+        if solution.status == 0:
+            return np.asarray(solution.x > 0.5)
     warn(f"{len(gain)} encounters were decided one after another: too many people meet to decide them at once")
     chosen, is_taken = np.zeros(len(gain), bool), np.zeros(limits.shape[0], bool)
     groups = limits.tocsc()
-    for one in np.argsort(-gain, kind="stable").tolist():
-        own = groups.indices[groups.indptr[one] : groups.indptr[one + 1]]
+    for encounter in np.argsort(-gain, kind="stable").tolist():
+        own = groups.indices[groups.indptr[encounter] : groups.indptr[encounter + 1]]
         if not is_taken[own].any():
-            chosen[one] = is_taken[own] = True
+            chosen[encounter] = is_taken[own] = True
     return chosen
 
 
@@ -153,12 +153,12 @@ def swapped_by_pace(
     span = round(_MOST_S / step_s)
     came, came_s = _paces(trajectories, pair, meet - span, meet, step_s)
     left, left_s = _paces(trajectories, pair, part_ways, part_ways + span, step_s)
-    known = (np.minimum(came_s, left_s) >= _LEAST_S - 1e-9).all(axis=0)
+    is_judged = (np.minimum(came_s, left_s) >= _LEAST_S - 1e-9).all(axis=0)
     came_s, left_s = np.maximum(came_s, _LEAST_S), np.maximum(left_s, _LEAST_S)
     # the mean of both people: the variance of a pace, of two positions, is 2 noise^2 / time^2
     variance = _CHANGE_M_PER_S**2 + (noise_m**2 * (1 / came_s**2 + 1 / left_s**2)).sum(axis=0)
     ratio = -(came[0] - came[1]) * (left[0] - left[1]) / variance
-    return np.where(known, np.clip(ratio, -_MOST, _MOST), 0.0)
+    return np.where(is_judged, np.clip(ratio, -_MOST, _MOST), 0.0)
 
 
 def _paces(trajectories: Trajectories, track: Ints, since: Ints, until: Ints, step_s: float) -> tuple[Floats, Floats]:
@@ -171,9 +171,9 @@ def _paces(trajectories: Trajectories, track: Ints, since: Ints, until: Ints, st
     low = np.searchsorted(seen, np.maximum(begin + since, first))
     high = np.searchsorted(seen, np.minimum(begin + until + 1, end)) - 1
     is_known = high > low
-    one, other = (seen[np.where(is_known, at, 0)] for at in (low, high))
-    seconds = (other - one) * step_s
-    way = trajectories.xy_m[other] - trajectories.xy_m[one]
+    before, other = (seen[np.where(is_known, at, 0)] for at in (low, high))
+    seconds = (other - before) * step_s
+    way = trajectories.xy_m[other] - trajectories.xy_m[before]
     return np.hypot(way[..., 0], way[..., 1]) / np.where(is_known, seconds, 1.0), np.asarray(seconds, np.float64)
 
 
@@ -205,7 +205,7 @@ def resolve_swaps(
     if seen is not None:
         evidence += seen.of_swaps(i, j, meet, part_ways)
     begin = trajectories.first[:-1] - trajectories.step[trajectories.first[:-1]]
-    found: dict[int, _Swaps] = {}
+    swaps: dict[int, _Swaps] = {}
     gain = np.zeros(len(i))
     for part in _batches(high - low + 1):
         steps = low[part, None] + np.arange(int((high - low)[part].max()) + 1)
@@ -217,12 +217,12 @@ def resolve_swaps(
         cost = np.maximum(_SWAP_COST + _SAME_ID_COST * _continuity(id_i, id_j), _LEAST_COST)
         noise = model.noise_m, model.speed_m_per_s
         paths, gain[part] = find_swaps(relative, cost, step_s, *noise, evidence[part])
-        for one, path, length in zip(part.tolist(), paths, (high - low)[part].tolist(), strict=True):
-            if gain[one] >= _MIN_GAIN:
-                found[one] = _Swaps(int(i[one]), int(j[one]), int(low[one]), path[: length + 1].copy())
-    which = np.array(sorted(found), np.int64)
-    made = which[compatible(np.stack([i, j], axis=1)[which], low[which], high[which], gain[which])]
-    return _exchanged(trajectories, track, [found[one] for one in made.tolist()]), len(made)
+        for at, path, length in zip(part.tolist(), paths, (high - low)[part].tolist(), strict=True):
+            if gain[at] >= _MIN_GAIN:
+                swaps[at] = _Swaps(int(i[at]), int(j[at]), int(low[at]), path[: length + 1].copy())
+    which = np.array(sorted(swaps), np.int64)
+    chosen = which[compatible(np.stack([i, j], axis=1)[which], low[which], high[which], gain[which])]
+    return _exchanged(trajectories, track, [swaps[at] for at in chosen.tolist()]), len(chosen)
 
 
 class _Swaps(NamedTuple):
@@ -248,14 +248,14 @@ def _exchanged(trajectories: Trajectories, track: Ints, encounters: list[_Swaps]
     )
     for step, a, b in swaps:
         now[a], now[b] = now.get(b, b), now.get(a, a)
-        for one in (a, b):
-            first, last = trajectories.first[one : one + 2]
-            owner[first + step - trajectories.step[first] : last] = now[one]
+        for number in (a, b):
+            first, last = trajectories.first[number : number + 2]
+            owner[first + step - trajectories.step[first] : last] = now[number]
     return owner
 
 
 def _batches(length: Ints) -> Iterator[Ints]:
-    """Encounters of similar length together, each once, as many as are computed with at once."""
+    """Batches of encounters of similar length; each encounter is in one."""
     order = np.argsort(length, kind="stable")
     first = 0
     while first < len(order):
@@ -273,8 +273,8 @@ def find_encounters(trajectories: Trajectories) -> tuple[Ints, Ints, Ints, Ints,
     count = len(first) - 1
     track = group_index(np.diff(first))
     observed = np.flatnonzero(np.isfinite(trajectories.xy_m[:, 0]))
-    one, other = near_pairs(trajectories.step[observed], trajectories.xy_m[observed], _NEAR_M)
-    a, b = observed[one], observed[other]
+    mine, other = near_pairs(trajectories.step[observed], trajectories.xy_m[observed], _NEAR_M)
+    a, b = observed[mine], observed[other]
     pair = np.minimum(track[a], track[b]) * count + np.maximum(track[a], track[b])
     when = trajectories.step[a]
     order = np.lexsort((when, pair))
@@ -317,8 +317,8 @@ def find_swaps(
     else is known. The gain (C,) is a difference of log likelihoods.
     """
     swapped = np.zeros(len(relative_m)) if evidence is None else evidence
-    given = relative_m, swap_cost, step_s, noise_m, speed_m_per_s, swapped
-    models = (_viterbi(*given, drift**2) for drift in DRIFTS_M_PER_S)
+    inputs = relative_m, swap_cost, step_s, noise_m, speed_m_per_s, swapped
+    models = (_viterbi(*inputs, drift**2) for drift in DRIFTS_M_PER_S)
     best, best_gain, likelihood = next(models)
     for path, gain, total in models:
         better = total > likelihood

@@ -86,20 +86,20 @@ def link_in_picture(
     before, after = _links(tracks, min(max_gap_s, MAX_GAP_S), min_confidence, across_classes, seen)
     root = np.arange(len(tracks.ids))
     holds = np.isin(tracks.ids, np.array(sorted(fixed), np.int64))
-    made = np.ones(len(before), bool)
+    is_allowed = np.ones(len(before), bool)
     for link in np.argsort(tracks.t_s[tracks.first[after]], kind="stable").tolist():  # a continuation begins later
         first = root[before[link]]
-        made[link] = not (holds[first] and holds[after[link]])
-        if made[link]:
+        is_allowed[link] = not (holds[first] and holds[after[link]])
+        if is_allowed[link]:
             root[after[link]] = first
             holds[first] |= holds[after[link]]
-    before, after = before[made], after[made]
+    before, after = before[is_allowed], after[is_allowed]
     name = dict(zip(tracks.ids.tolist(), tracks.ids[root].tolist(), strict=True))
     last = tracks.first[1:] - 1
     ends = {int(tracks.ids[i]): int(tracks.ids[j]) for i, j in zip(before, after, strict=True)}
     lost = dict(zip(tracks.ids[before].tolist(), tracks.frame[last[before]].tolist(), strict=True))
-    found = dict(zip(tracks.ids[after].tolist(), tracks.frame[tracks.first[after]].tolist(), strict=True))
-    gaps = _Gaps(frames, {one: (lost[one], other, found[other]) for one, other in ends.items()})
+    begin_of = dict(zip(tracks.ids[after].tolist(), tracks.frame[tracks.first[after]].tolist(), strict=True))
+    gaps = _Gaps(frames, {end: (lost[end], other, begin_of[other]) for end, other in ends.items()})
     return Linked(_renamed(frames, name, gaps), tracks.ids, tracks.ids[root], calibration)
 
 
@@ -107,10 +107,10 @@ def _renamed(frames: FrameColumns, name: Mapping[int, int], gaps: _Gaps) -> Iter
     """The rows of each frame and those of gaps there, under the new name of each id."""
     for number, frame in enumerate(frames):
         rows = frame.rows.copy()
-        ids = np.array([name.get(one, one) for one in rows["track_id"].tolist()], rows["track_id"].dtype)
+        ids = np.array([name.get(track, track) for track in rows["track_id"].tolist()], rows["track_id"].dtype)
         filled = gaps.rows_at(number)
         if len(filled):
-            filled["track_id"] = [name[one] for one in filled["track_id"].tolist()]
+            filled["track_id"] = [name[track] for track in filled["track_id"].tolist()]
         renamed = ids != rows["track_id"]
         rows["source_id"][renamed] = rows["track_id"][renamed]
         rows["track_id"] = ids
@@ -174,11 +174,11 @@ def _ends(tracks: _Tracks, at: Ints) -> _Ends:
         return np.bincount(track, values, minlength=count).astype(np.float64)
 
     height_px = total(boxes[:, 3]) / total(np.ones(len(track)))
-    zero, one, two = total(np.ones(len(track))), total(since), total(since**2)
+    zero, first, two = total(np.ones(len(track))), total(since), total(since**2)
 
     def fitted(values: Floats, noise: float, speed: float) -> tuple[Floats, Floats, Floats, Floats]:
         """Value and slope at the end, and their variances: a line, with slopes of about ``speed``."""
-        low, mixed, high = zero / noise**2, one / noise**2, two / noise**2 + 1 / speed**2
+        low, mixed, high = zero / noise**2, first / noise**2, two / noise**2 + 1 / speed**2
         a, b = total(values) / noise**2, total(values * since) / noise**2
         determinant = low * high - mixed**2
         return (
@@ -217,15 +217,15 @@ def _links(
     count = len(tracks.ids)
     if count < 2 or max_gap_s <= 0:
         return nothing
-    lost, found = _ends(tracks, tracks.first[1:] - 1), _ends(tracks, tracks.first[:-1])
-    order = np.argsort(found.t_s, kind="stable")
-    low = np.searchsorted(found.t_s[order], lost.t_s, "right")
-    high = np.searchsorted(found.t_s[order], lost.t_s + max_gap_s, "right")
+    lost, begun = _ends(tracks, tracks.first[1:] - 1), _ends(tracks, tracks.first[:-1])
+    order = np.argsort(begun.t_s, kind="stable")
+    low = np.searchsorted(begun.t_s[order], lost.t_s, "right")
+    high = np.searchsorted(begun.t_s[order], lost.t_s + max_gap_s, "right")
     i, j = group_index(high - low), order[ragged_range(low, high - low)]
     if not across_classes:
         same = tracks.classes[i] == tracks.classes[j]
         i, j = i[same], j[same]
-    gain = _log_odds(lost, found, i, j, _births(tracks)) - np.log(min_confidence / (1 - min_confidence))
+    gain = _log_odds(lost, begun, i, j, _births(tracks)) - np.log(min_confidence / (1 - min_confidence))
     gain += 0.0 if seen is None else seen(i, j)
     good = gain > 0
     if not good.any():
@@ -243,19 +243,19 @@ def _births(tracks: _Tracks) -> float:
     return len(tracks.ids) / (seconds * max(float(far.prod()) / usual_px**2, 1.0))
 
 
-def _log_odds(lost: _Ends, found: _Ends, i: Ints, j: Ints, births: float) -> Floats:
+def _log_odds(lost: _Ends, begun: _Ends, i: Ints, j: Ints, births: float) -> Floats:
     """The log odds that the beginnings ``j`` (E,) continue the ends ``i`` (E,), and are not those of other people.
 
     The misfit is the distance from where the mean of both velocities leads.
     """
-    gap_s = found.t_s[j] - lost.t_s[i]
-    height_px = np.sqrt(lost.height_px[i] * found.height_px[j])
-    way = found.xy_px[j] - lost.xy_px[i] - (lost.v_px_per_s[i] + found.v_px_per_s[j]) / 2 * gap_s[:, None]
-    spread = lost.variance[i] + found.variance[j] + _END_NOISE**2 + _DRIFT**2 * gap_s**3 / 12
-    spread += gap_s**2 / 4 * (lost.speed_variance[i] + found.speed_variance[j])
+    gap_s = begun.t_s[j] - lost.t_s[i]
+    height_px = np.sqrt(lost.height_px[i] * begun.height_px[j])
+    way = begun.xy_px[j] - lost.xy_px[i] - (lost.v_px_per_s[i] + begun.v_px_per_s[j]) / 2 * gap_s[:, None]
+    spread = lost.variance[i] + begun.variance[j] + _END_NOISE**2 + _DRIFT**2 * gap_s**3 / 12
+    spread += gap_s**2 / 4 * (lost.speed_variance[i] + begun.speed_variance[j])
     moved = -((way / height_px[:, None]) ** 2).sum(axis=1) / spread / 2 - np.log(2 * np.pi * spread)
     tall = _HEIGHT_END_NOISE**2 + (_HEIGHT_DRIFT * gap_s) ** 2
-    grown = -((found.log_height[j] - lost.log_height[i]) ** 2) / tall / 2 - np.log(tall / _HEIGHTS**2) / 2
+    grown = -((begun.log_height[j] - lost.log_height[i]) ** 2) / tall / 2 - np.log(tall / _HEIGHTS**2) / 2
     lasted = -gap_s / _GAP_S + np.log(_RETURNS / _GAP_S)
     return np.asarray(moved + grown + lasted - np.log(births))
 
@@ -265,13 +265,13 @@ class _Gaps:
 
     def __init__(self, frames: FrameColumns, links: dict[int, tuple[int, int, int]]) -> None:
         self._t_ns = frames.t_ns
-        wanted = [(low, one) for one, (low, _, _) in links.items()]
+        wanted = [(low, ended) for ended, (low, _, _) in links.items()]
         wanted += [(high, other) for _, other, high in links.values()]
         rows: dict[tuple[int, int], Rows] = {}
         for number, own in sorted(wanted):
-            found = frames[number].rows
-            rows[number, own] = found[found["track_id"] == own].copy()
-        self._ends = [(low, high, rows[low, one], rows[high, other]) for one, (low, other, high) in links.items()]
+            tracked = frames[number].rows
+            rows[number, own] = tracked[tracked["track_id"] == own].copy()
+        self._ends = [(low, high, rows[low, ended], rows[high, other]) for ended, (low, other, high) in links.items()]
         self._open: dict[int, list[int]] = {}
         for link, (low, high, _, _) in enumerate(self._ends):
             for number in range(low + 1, high):

@@ -37,7 +37,7 @@ FEATURES: Final = (
     "log rate",
     "log elsewhere",
 )
-#: Margins beyond this say no more; what is that much less likely is no alternative.
+#: The limit of margins: an assignment that is less likely by this much is no alternative.
 _MARGIN: Final = 12.0
 #: Samples of another input track that last less, within one of the same input track, are no joins. Seconds.
 _BRIEF_S: Final = 1.0
@@ -157,8 +157,8 @@ def find_joins(tracked: Tracked, model: MotionModel, step_s: float) -> Joins:
         np.full(count, np.log((count + 1) / (len(tracked.track) + _RATE_SAMPLES))),
         np.full(count, np.log((np.count_nonzero(elsewhere) + 0.5) / (count + 1))),
     )
-    found = linking.features(model, *_sides(tracked, before, after, step_s))
-    return Joins(before, after, alternative, np.column_stack([found, *extra]).astype(np.float64))
+    usual = linking.features(model, *_sides(tracked, before, after, step_s))
+    return Joins(before, after, alternative, np.column_stack([usual, *extra]).astype(np.float64))
 
 
 def _runs(tracked: Tracked, step_s: float) -> tuple[Ints, Ints]:
@@ -191,8 +191,8 @@ def _alternatives(
     the other track with those of the join (the two are exchanged), or it would begin there.
     """
 
-    def fit(one: Ints, other: Ints) -> Floats:
-        return linking.log_likelihood(model, *_sides(tracked, one, other, step_s))
+    def fit(earlier: Ints, other: Ints) -> Floats:
+        return linking.log_likelihood(model, *_sides(tracked, earlier, other, step_s))
 
     by_step = np.argsort(tracked.step, kind="stable")
     low, high = (np.searchsorted(tracked.step[by_step], tracked.step[after], side) for side in ("left", "right"))
@@ -208,9 +208,9 @@ def _alternatives(
         near = (np.hypot(off[:, 0], off[:, 1]) <= reach_m) & (other != after[join])
         join, other = join[near], other[near]
         margin = own[join] - fit(before[join], other)
-        there = np.flatnonzero(previous[other] >= 0)
-        theirs = previous[other[there]]
-        margin[there] += fit(theirs, other[there]) - fit(theirs, after[join[there]])
+        has_previous = np.flatnonzero(previous[other] >= 0)
+        theirs = previous[other[has_previous]]
+        margin[has_previous] += fit(theirs, other[has_previous]) - fit(theirs, after[join[has_previous]])
         order = np.lexsort((tracked.source[other], margin, join))
         order = order[run_starts(join[order])]
         order = order[margin[order] < _MARGIN]
@@ -234,9 +234,9 @@ def _elsewhere(tracked: Tracked, before: Ints, after: Ints) -> tuple[Bools, Bool
 
     def other(at: Ints, way: int) -> Bools:
         beside = place[at] + way
-        there = order[np.clip(beside, 0, len(order) - 1)]
+        row = order[np.clip(beside, 0, len(order) - 1)]
         inside = (beside >= 0) & (beside < len(order))
-        same = inside & (tracked.source[there] == tracked.source[at])
-        return np.asarray(same & (tracked.track[there] != tracked.track[at]))
+        same = inside & (tracked.source[row] == tracked.source[at])
+        return np.asarray(same & (tracked.track[row] != tracked.track[at]))
 
     return other(after, -1), other(before, 1)

@@ -45,7 +45,7 @@ _MIN_SPREAD: Final = 1e-3
 # Letters: R steps, N observations of all of them, L past positions.
 
 
-#: How many times as large noise may be as bends of the input say: trackers smooth their tracks.
+#: The limit of noise, as a multiple of what bends of the input show: trackers smooth their tracks.
 _FACTOR: Final = 1.5
 #: Noise may be so large in any case: smooth tracks may be off for long. In metres.
 _LEAST_M: Final = 0.3
@@ -85,8 +85,8 @@ class RecentPositions:
         for back in range(1, self._length if len(have) else 0):
             want = track * width + step - back
             place = np.minimum(np.searchsorted(have, want), len(have) - 1)
-            found = (have[place] == want) & (step >= back)
-            past[found, self._length - 1 - back] = xy[place[found]]
+            is_stored = (have[place] == want) & (step >= back)
+            past[is_stored, self._length - 1 - back] = xy[place[is_stored]]
         past[:, -1] = now
         return past, np.isfinite(past[..., 0])
 
@@ -132,11 +132,11 @@ class Unpredicted(NamedTuple):
     step: Ints
 
     def part(self, which: slice | Ints) -> Unpredicted:
-        ids, past, known, coasts, step = self
-        return Unpredicted(ids[which], past[which], known[which], coasts[which], step[which])
+        ids, past, is_known, coasts, step = self
+        return Unpredicted(ids[which], past[which], is_known[which], coasts[which], step[which])
 
 
-class _Made(NamedTuple):
+class _Predicted(NamedTuple):
     """Predictions as the predictor made them: ids, past positions, whether tracks coast, means and covariances."""
 
     ids: Ints
@@ -145,11 +145,11 @@ class _Made(NamedTuple):
     mean: Floats
     cov: Floats
 
-    def part(self, which: slice) -> _Made:
-        return _Made(self.ids[which], self.past[which], self.coasts[which], self.mean[which], self.cov[which])
+    def part(self, which: slice) -> _Predicted:
+        return _Predicted(self.ids[which], self.past[which], self.coasts[which], self.mean[which], self.cov[which])
 
-    def copied(self) -> _Made:
-        return _Made(self.ids.copy(), self.past.copy(), self.coasts.copy(), self.mean.copy(), self.cov.copy())
+    def copied(self) -> _Predicted:
+        return _Predicted(self.ids.copy(), self.past.copy(), self.coasts.copy(), self.mean.copy(), self.cov.copy())
 
 
 class OnlineForecasts:
@@ -162,7 +162,7 @@ class OnlineForecasts:
         self._waiting: list[Unpredicted] = []
         nothing = np.empty((0, predictor.steps, 2, 2))
         ids, past, coasts = np.empty(0, np.int64), np.empty((0, predictor.past, 2)), np.empty(0, bool)
-        self._left = _Made(ids, past, coasts, nothing[..., 0], nothing)  # of a frame that is not complete
+        self._left = _Predicted(ids, past, coasts, nothing[..., 0], nothing)  # of a frame that is not complete
         self._frames: list[tuple[int, int, int, int]] = []  # time, number, step and tracks of frames in neither
 
     def add(self, t_ns: Ints, numbers: Ints, steps: Ints, ends: Ints, tracks: Unpredicted) -> None:
@@ -186,26 +186,28 @@ class OnlineForecasts:
             end = done + _BATCH
             if uses_people(self._predictor):  # whole steps, because their tracks are predicted together
                 end = int(np.searchsorted(waiting.step, waiting.step[min(end, len(waiting.ids)) - 1], "right"))
-            ids, past, known, coasts, steps = waiting.part(slice(done, end))
+            ids, past, is_known, coasts, steps = waiting.part(slice(done, end))
             units = past / self._unit_m
-            people = PeopleSeen(units, known, steps, np.arange(len(ids)))
-            mean, cov = predict_among(self._predictor, units, known, people)
-            self._write(_Made(ids, past, coasts, mean * self._unit_m, cov * self._unit_m**2))
+            people = PeopleSeen(units, is_known, steps, np.arange(len(ids)))
+            mean, cov = predict_among(self._predictor, units, is_known, people)
+            self._write(_Predicted(ids, past, coasts, mean * self._unit_m, cov * self._unit_m**2))
             done += len(ids)
         self._waiting = [waiting.part(slice(done, None))]
         self._write(self._left.part(slice(0)))  # frames without tracks
 
-    def _write(self, new: _Made) -> None:
+    def _write(self, new: _Predicted) -> None:
         """Write the frames that are complete with these predictions."""
-        made = (
-            new if new is self._left else _Made(*(np.concatenate(both) for both in zip(self._left, new, strict=True)))
+        waiting = (
+            new
+            if new is self._left
+            else _Predicted(*(np.concatenate(both) for both in zip(self._left, new, strict=True)))
         )
         ends = np.cumsum([0, *(count for *_, count in self._frames)])
-        count = int(np.searchsorted(ends, len(made.ids), "right")) - 1
-        self._left = made.part(slice(ends[count], None)).copied()  # so that the larger arrays are not held
+        count = int(np.searchsorted(ends, len(waiting.ids), "right")) - 1
+        self._left = waiting.part(slice(ends[count], None)).copied()  # so that the larger arrays are not held
         if not count:
             return
-        ids, past, coasts, mean, cov = made.part(slice(ends[count]))
+        ids, past, coasts, mean, cov = waiting.part(slice(ends[count]))
         tails = None
         if self._calibration is not None:  # by the predictions of the steps before
             step = np.repeat([step for _, _, step, _ in self._frames[:count]], np.diff(ends[: count + 1]))
@@ -380,11 +382,11 @@ class LikelihoodPass:
         seen = samples[sample[is_matched]]
         seen_m = np.stack([seen["x_m"], seen["y_m"]], axis=-1)
         self._recent.add(int(steps[0]), ids[is_matched], steps[tick[is_matched]], seen_m)
-        past, known = self._recent.before(ids[shown], steps[tick[shown]], xy_m)
+        past, is_known = self._recent.before(ids[shown], steps[tick[shown]], xy_m)
         ticks = np.arange(len(steps) + 1)
         self._online.extend(read.t_ns, read.numbers, np.searchsorted(tick[shown], ticks), rows)
         confirmed = np.flatnonzero(tracks[HITS, shown] >= self._confirm_hits)  # before, little is known of velocities
-        waiting = Unpredicted(names[shown], past, known, coasts, steps[tick[shown]]).part(confirmed)
+        waiting = Unpredicted(names[shown], past, is_known, coasts, steps[tick[shown]]).part(confirmed)
         self._forecasts.add(read.t_ns, read.numbers, steps, np.searchsorted(tick[shown[confirmed]], ticks), waiting)
         self._written += len(rows)
         is_last = tick == len(steps) - 1

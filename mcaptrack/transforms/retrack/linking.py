@@ -76,16 +76,16 @@ def link_tracks(
     gain = log_odds(features(model, forward.take(last[i]), backward.take(first[j]), gap_s))
     if evidence is not None:
         gain = gain + evidence(i, j)
-    made = best_links(i, j, gain, len(first))
-    shift = prior_shift(gain[made])
-    made = made[gain[made] + shift > np.log(min_confidence / (1 - min_confidence))]
-    continued_by[i[made]] = j[made]
+    links = best_links(i, j, gain, len(first))
+    shift = prior_shift(gain[links])
+    links = links[gain[links] + shift > np.log(min_confidence / (1 - min_confidence))]
+    continued_by[i[links]] = j[links]
     return continued_by
 
 
-def log_odds(found: Floats) -> Floats:
+def log_odds(values: Floats) -> Floats:
     """The log odds that links with these features (E, F) are right, where as many are as usual."""
-    return np.asarray(found @ _WEIGHTS + _BIAS)
+    return np.asarray(values @ _WEIGHTS + _BIAS)
 
 
 def has_chance(log_odds: Floats) -> Bools:
@@ -104,8 +104,8 @@ def best_links(i: Ints, j: Ints, log_odds: Floats, count: int) -> Ints:
         pairs = np.searchsorted(own, ends[edges]), np.searchsorted(other, begins[edges])
         row, column = _assigned(pairs, gain[edges], (len(own), len(other)))
         continued_by[own[row]] = other[column]
-    made = good[continued_by[ends] == begins]
-    return np.asarray(made[np.argsort(i[made], kind="stable")])
+    links = good[continued_by[ends] == begins]
+    return np.asarray(links[np.argsort(i[links], kind="stable")])
 
 
 def candidates(

@@ -99,7 +99,7 @@ class Retrack(LikelihoodOptions):
         seen: Sequence[AppearanceCalibration] | None = getattr(self, "_seen", None)
         if seen is None or self.looks is None:
             return ModelCard()
-        most = max(seen, key=lambda one: one.tracks, default=None)
+        most = max(seen, key=lambda calibration: calibration.tracks, default=None)
         return ModelCard(facts={"appearance": "not used"} if most is None else most.facts())
 
 
@@ -132,7 +132,7 @@ Retracking: TypeAlias = Retrack | RetrackByConsistency
 
 
 class KeptIds:
-    """Tracks as their input has them.
+    """Online re-tracking that keeps the ids of the input.
 
     Parameters
     ----------
@@ -183,9 +183,9 @@ class KeptIds:
     def _numbers(self, source: Ints) -> Ints:
         """The number of the track of each input id (R,): from 1 on in the order in which they come."""
         ids, first, which = np.unique(source, return_index=True, return_inverse=True)
-        for one in ids[np.argsort(first)].tolist():
-            self._number.setdefault(one, len(self._number) + 1)
-        return np.array([self._number[one] for one in ids.tolist()], np.int64)[which]
+        for number in ids[np.argsort(first)].tolist():
+            self._number.setdefault(number, len(self._number) + 1)
+        return np.array([self._number[number] for number in ids.tolist()], np.int64)[which]
 
     def predictions(self) -> FrameColumns:
         """The predictions of the online tracks, from the past alone."""
@@ -229,23 +229,23 @@ def _keep_ids(
     options: RetrackOptions, frames: Iterable[Frame], seen: list[AppearanceCalibration]
 ) -> Iterator[tuple[Frame, ...]]:
     """For each frame tracks that are linked in the picture, if the method does that; the input and its predictions."""
-    given = options.predictor, options.horizon_s, options.min_history, options.rate_hz
-    forecaster = Forecaster(*given, adapt=options.follows_log)
+    settings = options.predictor, options.horizon_s, options.min_history, options.rate_hz
+    forecaster = Forecaster(*settings, adapt=options.follows_log)
     linked: Iterator[Rows] | None = None
     stored: Iterator[Rows] = repeat(APPEARANCE.empty())
     if options.links_in_picture:
         frames = collect(TRACKS, frames)
         limits = options.link_s, options.link_confidence, options.across_classes
-        found = link_in_picture(frames, *limits, options.fixed_ids, options.looks, options.rate_hz)
-        seen.extend([] if found.calibration is None else [found.calibration])
-        linked = found.rows
+        result = link_in_picture(frames, *limits, options.fixed_ids, options.looks, options.rate_hz)
+        seen.extend([] if result.calibration is None else [result.calibration])
+        linked = result.rows
         if (looks := options.stored_looks) is not None:
-            stored = appearance_rows(looks, found.track_of(looks.track_id), frames.t_ns)
+            stored = appearance_rows(looks, result.track_of(looks.track_id), frames.t_ns)
     for frame in frames:
         online = frame.rows[frame.rows["observed"]]
         offline = frame.rows if linked is None else next(linked)
         rows = offline, online, forecaster.predict(frame), DECISIONS.empty(), next(stored)
-        yield tuple(frame._replace(rows=one) for one in rows[: len(options.writes)])
+        yield tuple(frame._replace(rows=row) for row in rows[: len(options.writes)])
     forecaster.warn()
 
 
@@ -272,23 +272,23 @@ def _frame_by_frame(
     further = zip(offline.decisions, offline.looks, strict=True)
     for frame, rows, causal, others in zip(frames, offline.tracks, run.outputs(), further, strict=True):
         # copies, because what is kept can't be written to
-        outputs = rows, *(one.rows.copy() for one in causal), *others
-        yield tuple(frame._replace(rows=one) for one in outputs[: len(options.writes)])
+        outputs = rows, *(part.rows.copy() for part in causal), *others
+        yield tuple(frame._replace(rows=output) for output in outputs[: len(options.writes)])
 
 
 def _whole(options: Options, frames: FrameColumns, run: OnlinePass | KeptIds, offline: Offline) -> list[FrameColumns]:
     """The outputs of re-tracking, each with all of its frames."""
-    made = [FrameCollector(schema) for schema in options.writes.values()]
+    collectors = [FrameCollector(schema) for schema in options.writes.values()]
     if not isinstance(run, KeptIds):
         for outputs in _frame_by_frame(options, frames, run, offline):
-            for collector, frame in zip(made, outputs, strict=True):
+            for collector, frame in zip(collectors, outputs, strict=True):
                 collector.append(frame)
-        return [collector.done() for collector in made]
+        return [collector.done() for collector in collectors]
     offline_rows = zip(offline.tracks, offline.decisions, offline.looks, strict=True)
     for frame, all_rows in zip(frames, offline_rows, strict=True):
-        for collector, rows in zip((made[0], *made[3:]), all_rows, strict=False):
+        for collector, rows in zip((collectors[0], *collectors[3:]), all_rows, strict=False):
             collector.append(frame._replace(rows=rows))
-    return [made[0].done(), run.online, run.predictions(), *(collector.done() for collector in made[3:])]
+    return [collectors[0].done(), run.online, run.predictions(), *(collector.done() for collector in collectors[3:])]
 
 
 _PAPER: Final = RetrackByConsistency(

@@ -17,7 +17,7 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.ragged import group_index, ragged_range
 
-#: Standard deviation of measured positions per axis, before any is estimated.
+#: Standard deviation of measured positions per axis in metres, until it is estimated.
 DEFAULT_NOISE_M: Final = 0.2
 
 

@@ -77,20 +77,20 @@ def fix_tracks(step: Ints, track: Ints, source: Ints, fixed: Collection[int]) ->
     out = np.full(len(track), -1, np.int64)
     following = int(track.max()) + 1
     ends: dict[int, tuple[int, int]] = {}
-    for one in np.unique(source[is_fixed]).tolist():
-        own = np.flatnonzero(source == one)
-        ends[one] = int(own[step[own].argmin()]), int(own[step[own].argmax()])
+    for name in np.unique(source[is_fixed]).tolist():
+        own = np.flatnonzero(source == name)
+        ends[name] = int(own[step[own].argmin()]), int(own[step[own].argmax()])
     taken: set[int] = set()
     node: dict[int, int] = {}
-    for one in sorted(ends, key=lambda key: -int((source == key).sum())):
-        names, counts = np.unique(track[source == one], return_counts=True)
+    for name in sorted(ends, key=lambda key: -int((source == key).sum())):
+        names, counts = np.unique(track[source == name], return_counts=True)
         free = [int(name) for name in names[np.argsort(-counts, kind="stable")] if int(name) not in taken]
-        node[one] = free[0] if free else following
+        node[name] = free[0] if free else following
         following += not free
-        taken.add(node[one])
-        out[source == one] = node[one]
-    for one in np.unique(track[is_fixed]).tolist():
-        own = np.flatnonzero(track == one)
+        taken.add(node[name])
+        out[source == name] = node[name]
+    for name in np.unique(track[is_fixed]).tolist():
+        own = np.flatnonzero(track == name)
         own = own[np.argsort(step[own], kind="stable")]
         rest = following  # of this track, what belongs to no fixed id, if one has taken its name
         for low, high in _runs(is_fixed[own]):
@@ -102,7 +102,7 @@ def fix_tracks(step: Ints, track: Ints, source: Ints, fixed: Collection[int]) ->
             elif after is not None and ends[after][0] == own[high]:
                 out[run] = node[after]
             else:
-                out[run] = rest if one in taken else one
+                out[run] = rest if name in taken else name
                 following = rest + 1
     untouched = out < 0
     out[untouched] = track[untouched]
@@ -134,7 +134,7 @@ _NO_ID: Final = -1
 
 
 class Decided(NamedTuple):
-    """All tracks of a log as they were decided, those that were left out included.
+    """The tracks of a log as they were decided, including those that are left out as false.
 
     ``sample`` (C,) is the sample of each assignment. ``log_odds`` (K,) that tracks are people, of the test of false
     tracks, and which were ``kept`` (K,), are ordered by id. ``appearance`` is that of the assignments, None where it
@@ -153,7 +153,7 @@ def decision_rows(
 ) -> Iterator[Rows]:
     """The decisions at each of ``steps``: rows of Decisions, ordered by kind and track."""
     parts = _joined(decided, find_kept_joins(decided, model, step_s), step_s), _persons(decided, step_s)
-    at, rows = np.concatenate([one for one, _ in parts]), DECISIONS.joined([rows for _, rows in parts])
+    at, rows = np.concatenate([places for places, _ in parts]), DECISIONS.joined([rows for _, rows in parts])
     places = samples.take(decided.sample[at])
     rows["x_m"], rows["y_m"] = places["x_m"], places["y_m"]
     rows["x_px"], rows["y_px"] = places["x_px"] + places["w_px"] / 2, places["y_px"] + places["h_px"] / 2
@@ -331,13 +331,13 @@ def offline_tracks(
         ordered = None if appearance is None else appearance.take(order)
         decided = Decided(tracked, sample, np.where(is_fixed, np.inf, odds), keeps, ordered)
         decisions = decision_rows(decided, model, samples, steps, step_s)
-    made = rows_by_step(rows.take(left), samples, moved and moved.take(left), steps)
+    by_step = rows_by_step(rows.take(left), samples, moved and moved.take(left), steps)
     looks: Iterator[Rows] = repeat(APPEARANCE.empty(), len(steps))
     if (stored := options.stored_looks) is not None:
         kept = np.flatnonzero(keeps[np.searchsorted(ids, track)])
         seen_ns = times_ns[np.searchsorted(steps, step[kept])]
         looks = appearance_rows(stored, stored.tracks_of(seen_ns, source[kept], track[kept]), times_ns)
-    return Offline(made, decisions, looks, seen and seen.calibration)
+    return Offline(by_step, decisions, looks, seen and seen.calibration)
 
 
 def _without_swaps(
@@ -349,7 +349,7 @@ def _without_swaps(
     step_s: float,
     appearance: Appearance | None = None,
 ) -> Ints:
-    """The track of each assignment (C,) after deciding again which track is which where two of them met."""
+    """The track of each assignment (C,) after undoing swaps of tracks that met."""
     examined: Ints | None = None  # tracks that were changed: the encounters of all others stay as they are
     for _ in range(_ROUNDS):
         ids, row, trajectories = to_trajectories(step, track, xy, model.noise_m)
@@ -386,6 +386,6 @@ def _linked(
         continued_by = link_pieces(model, trajectories, forward, backward, step_s, *limits, pieces, seen)
     root = np.arange(len(ids))
     order = np.argsort(trajectories.step[trajectories.first[:-1]], kind="stable")  # a continuation begins later
-    for one in order[continued_by[order] >= 0].tolist():
-        root[continued_by[one]] = root[one]
+    for earlier in order[continued_by[order] >= 0].tolist():
+        root[continued_by[earlier]] = root[earlier]
     return np.asarray(ids[root][np.searchsorted(ids, track)])

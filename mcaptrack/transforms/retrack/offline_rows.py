@@ -75,7 +75,7 @@ class Moved(NamedTuple):
     shift_px: Floats | None
 
     def take(self, which: Ints) -> Moved:
-        """Those of some of the rows."""
+        """The movements of some of the rows."""
         return Moved(self.xy_m[which], None if self.shift_px is None else self.shift_px[which])
 
 
@@ -174,13 +174,13 @@ def rows_by_step(rows: TrackRows, samples: LogSamples, moved: Moved | None, step
     order = np.lexsort((rows.track, rows.step))
     rows, moved = rows.take(order), moved and moved.take(order)
     ends = np.append(0, np.searchsorted(rows.step, steps, "right"))
-    known = np.empty(len(order), [("track_id", np.int64), ("class_id", np.uint32)])
-    known["track_id"], known["class_id"] = rows.track, samples.column("class_id")[rows.before]
-    vote(known)
+    votes = np.empty(len(order), [("track_id", np.int64), ("class_id", np.uint32)])
+    votes["track_id"], votes["class_id"] = rows.track, samples.column("class_id")[rows.before]
+    vote(votes)
     for low, high in spans_of(ends):
         here = slice(ends[low], ends[high])
         part = _rows(rows.take(here), samples)
-        part["class_id"] = known["class_id"][here]
+        part["class_id"] = votes["class_id"][here]
         if moved is not None:
             part["x_m"], part["y_m"] = moved.xy_m[here].T
             if moved.shift_px is not None:

@@ -100,7 +100,7 @@ class OnlineLinks:
         self._names: dict[int, int] = {}  # the ids under which tracks are written, of those that were
         self._alive, self._lost = _NOTHING, _NOTHING  # lost ones are over, were written, and are continued by no other
         self._links: deque[tuple[float, float]] = deque(maxlen=_LINKS)  # log odds and seconds
-        self._made, self._estimated = 0, 0
+        self._link_count, self._estimated = 0, 0
         self._shifts = linking.prior_shifts(np.empty(0), np.empty(0))
 
     def __call__(
@@ -114,41 +114,41 @@ class OnlineLinks:
         """
         if self._max_gap_s <= 0:
             return np.asarray(tracks[IDS]), is_written
-        known, which = self._known(steps, tick, tracks, state, is_observed)
+        alive, which = self._known(steps, tick, tracks, state, is_observed)
         count = len(tick)
-        first = np.full(len(known.ids), count)  # the row from which on a track is written in any case
+        first = np.full(len(alive.ids), count)  # the row from which on a track is written in any case
         written = np.flatnonzero(is_written)
         np.minimum.at(first, which[written], written)
         rows = np.flatnonzero(
-            (is_written | is_observed) & (np.arange(count) <= first[which]) & ~self._are_named(known.ids)[which]
+            (is_written | is_observed) & (np.arange(count) <= first[which]) & ~self._are_named(alive.ids)[which]
         )
         of = which[rows]
-        new = known.take(of)._replace(last=steps[tick[rows]], hits=tracks[HITS, rows], state=state.take(rows))
-        over = np.flatnonzero(known.over < _NEVER)
-        lost = self._lost.joined(known.take(over))
+        new = alive.take(of)._replace(last=steps[tick[rows]], hits=tracks[HITS, rows], state=state.take(rows))
+        over = np.flatnonzero(alive.over < _NEVER)
+        lost = self._lost.joined(alive.take(over))
         # a lost track was written before it was over; or else it has to continue another one
         was_written = np.append(np.ones(len(self._lost.ids), bool), first[over] < count)
         order = np.argsort(lost.ids)  # however many steps are read at once, links of equal odds are chosen by ids
         lost, was_written = lost.take(order), was_written[order]
         is_first = rows == first[of]
         links = self._candidates(lost, new, is_first)
-        since = np.full(len(known.ids), count)  # those that continue another one are written whenever they are observed
-        since[[self._names.get(track, track) != track for track in known.ids.tolist()]] = 0
+        since = np.full(len(alive.ids), count)  # those that continue another one are written whenever they are observed
+        since[[self._names.get(track, track) != track for track in alive.ids.tolist()]] = 0
         used = np.zeros(len(lost.ids), bool)
         for at_once in np.split(np.arange(len(links.new)), np.flatnonzero(np.diff(tick[rows[links.new]])) + 1):
             may_be = ~used[links.lost[at_once]] & (since[of[links.new[at_once]]] == count)
             may_be &= was_written[links.lost[at_once]] | self._are_named(lost.ids[links.lost[at_once]])
             edges = links.take(at_once[may_be])
-            made = self._decide(edges, is_first[edges.new])
-            for one, other in zip(edges.lost[made].tolist(), edges.new[made].tolist(), strict=True):
-                self._names[int(new.ids[other])] = self._names.get(int(lost.ids[one]), int(lost.ids[one]))
-                used[one], since[of[other]] = True, rows[other]
-        for track in known.ids[first < count].tolist():
+            chosen = self._decide(edges, is_first[edges.new])
+            for ended, other in zip(edges.lost[chosen].tolist(), edges.new[chosen].tolist(), strict=True):
+                self._names[int(new.ids[other])] = self._names.get(int(lost.ids[ended]), int(lost.ids[ended]))
+                used[ended], since[of[other]] = True, rows[other]
+        for track in alive.ids[first < count].tolist():
             self._names.setdefault(track, track)
         reached = lost.last >= steps[-1] - self._max_gap_s / self._step_s
         self._lost = lost.take(reached & ~used & self._are_named(lost.ids))
-        self._alive = known.take(known.over == _NEVER)
-        names = np.array([self._names.get(track, track) for track in known.ids.tolist()], np.int64)
+        self._alive = alive.take(alive.over == _NEVER)
+        names = np.array([self._names.get(track, track) for track in alive.ids.tolist()], np.int64)
         kept = {*self._alive.ids.tolist(), *self._lost.ids.tolist()}
         self._names = {track: name for track, name in self._names.items() if track in kept}
         return np.asarray(names[which]), is_written | (is_observed & (np.arange(count) >= since[which]))
@@ -168,17 +168,17 @@ class OnlineLinks:
             gaps_s = (new.last[part, None] - lost.last) * self._step_s
             fits = (lost.over <= new.last[part, None]) & (gaps_s <= self._max_gap_s)
             fits &= (lost.last < new.began[part, None]) & (is_written[part, None] | (lost.hits >= self._confirm_hits))
-            row, one = np.nonzero(fits)
-            row, gap_s = row + low, np.asarray(gaps_s[row, one], np.float64)
-            before, after = lost.state.take(one), new.state.take(row)
+            row, candidate = np.nonzero(fits)
+            row, gap_s = row + low, np.asarray(gaps_s[row, candidate], np.float64)
+            before, after = lost.state.take(candidate), new.state.take(row)
             is_near = linking.are_in_reach(before, after, gap_s)
-            one, row, gap_s = one[is_near], row[is_near], gap_s[is_near]
+            candidate, row, gap_s = candidate[is_near], row[is_near], gap_s[is_near]
             before, after = before.take(is_near), after.take(is_near)
             # nothing is known of the velocity of what was observed once: it may be that of the lost one
             single = new.hits[row] == 1
             after.mean[single, 2:], after.cov[single, 2] = before.mean[single, 2:], before.cov[single, 2]
             log_odds = linking.log_odds(linking.features(self._model, before, after, gap_s))
-            parts.append(_Links(one, row, gap_s, log_odds).take(linking.has_chance(log_odds)))
+            parts.append(_Links(candidate, row, gap_s, log_odds).take(linking.has_chance(log_odds)))
         return _Links(*(np.concatenate(members) for members in zip(*parts, strict=True)))
 
     def _decide(self, links: _Links, is_written: Bools) -> Bools:
@@ -224,7 +224,7 @@ class OnlineLinks:
     def _learn(self, log_odds: Floats, gap_s: Floats) -> None:
         """Learn from the best links so far how many are right after gaps of what length."""
         self._links.extend(zip(log_odds.tolist(), gap_s.tolist(), strict=True))
-        self._made += len(log_odds)
-        if self._made > self._estimated + min(_GROWS * self._estimated, _GROWS * _LINKS):
-            self._estimated = self._made
+        self._link_count += len(log_odds)
+        if self._link_count > self._estimated + min(_GROWS * self._estimated, _GROWS * _LINKS):
+            self._estimated = self._link_count
             self._shifts = linking.prior_shifts(*np.array(self._links).T)

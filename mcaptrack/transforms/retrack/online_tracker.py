@@ -227,7 +227,7 @@ class OnlineTracker:
         gain += (pairs.of_first(tracks[SOURCE]) == pairs.of_second(source)) * pairs.of_second(bonus)
         names = source.tolist()
         if not self.known_sources.issuperset(names):
-            is_new = np.array([one not in self.known_sources for one in names])
+            is_new = np.array([name not in self.known_sources for name in names])
             gain -= association.new_id * (pairs.of_second(is_new) & pairs.of_first(tracks[MISSED] == 1))
         gain = np.where(squared <= association.gate, np.round(gain, 6), -1.0)
         if gain.ndim == 2:

@@ -22,7 +22,7 @@ from mcaptrack.schema import APPEARANCE, DECISIONS, PREDICTIONS, TRACKS, Frame, 
 from mcaptrack.schema.framing import join_frames
 from mcaptrack.transforms.forecasts import ADAPT_HELP
 from mcaptrack.transforms.motion_limits import LIMITS_HELP, LIMITS_PATTERN, ClassNames, read_limits
-from mcaptrack.transforms.protocol import check_options, context, option
+from mcaptrack.transforms.protocol import check_options, context, option, setting
 from mcaptrack.transforms.retrack.appearance import Descriptors
 
 # Headings of the options in the help.
@@ -58,13 +58,12 @@ class RetrackOptions:
         theme=_PREDICTIONS,
     )
     horizon_s: float = option(4.8, "how far ahead to predict, in seconds", least=0.1, most=60.0, theme=_PREDICTIONS)
-    min_history: int = option(
+    min_history: int = setting(
         2,
         "number of positions, the current one included, that a prediction needs",
         least=1,
         most=100,
         theme=_PREDICTIONS,
-        flag=False,
     )
     noise_m: float | None = option(
         None,
@@ -73,34 +72,24 @@ class RetrackOptions:
         least=0.0,
         theme=_MOTION,
     )
-    speed_m_per_s: float = option(
+    speed_m_per_s: float = setting(
         1.75,
         "expected speed of tracks without a history: standard deviation per axis in metres per second",
         least=0.0,
         theme=_MOTION,
-        flag=False,
     )
-    drift_m_per_s: float = option(
-        0.12,
-        "how much velocities change within a second, in metres per second",
-        least=0.0,
-        theme=_MOTION,
-        flag=False,
+    drift_m_per_s: float = setting(
+        0.12, "how much velocities change within a second, in metres per second", least=0.0, theme=_MOTION
     )
-    drift_ratio: float = option(
-        0.08,
-        "how much velocities change within a second, as a share of the speed",
-        least=0.0,
-        theme=_MOTION,
-        flag=False,
+    drift_ratio: float = setting(
+        0.08, "how much velocities change within a second, as a share of the speed", least=0.0, theme=_MOTION
     )
-    same_id_bonus: float = option(
+    same_id_bonus: float = setting(
         12.0,
         "how much a pair gains if the observation has the input id that the track had last, in squared standard "
         "deviations (likelihood) or standard deviations (consistency); the paper ignores input ids",
         least=0.0,
         theme=_ASSOCIATION,
-        flag=False,
     )
     max_age_s: float = option(
         2.0,
@@ -108,13 +97,9 @@ class RetrackOptions:
         least=0.0,
         theme=_LIFE,
     )
-    interpolated: bool = option(False, "use interpolated samples as observations, too", theme=_ASSOCIATION, flag=False)
-    min_track_s: float = option(
-        2.0,
-        "leave out tracks that last less than this many seconds (probation)",
-        least=0.0,
-        theme=_LIFE,
-        flag=False,
+    interpolated: bool = setting(False, "use interpolated samples as observations, too", theme=_ASSOCIATION)
+    min_track_s: float = setting(
+        2.0, "leave out tracks that last less than this many seconds (probation)", least=0.0, theme=_LIFE
     )
     link_s: float = option(
         20.0,
@@ -123,28 +108,25 @@ class RetrackOptions:
         least=0.0,
         theme=_OFFLINE,
     )
-    link_confidence: float = option(
+    link_confidence: float = setting(
         0.5,
         "link two tracks if they are one person with at least this probability; with a ground plane people are linked "
         "from a third of these odds on, and from an eleventh where a track was cut, because a person goes on there",
         least=0.01,
         most=0.99,
         theme=_OFFLINE,
-        flag=False,
     )
-    resolve_swaps: bool = option(
+    resolve_swaps: bool = setting(
         True,
         "decide again which track is which where two tracks met, from what was before and after (identity switches)",
         theme=_OFFLINE,
-        flag=False,
     )
-    track_confidence: float = option(
+    track_confidence: float = setting(
         0.5,
         "leave out tracks that are a person with less than this probability (false tracks)",
         least=0.0,
         most=1.0,
         theme=_OFFLINE,
-        flag=False,
     )
     across_classes: bool = option(
         False,
@@ -154,9 +136,7 @@ class RetrackOptions:
     class_limits: str = option("", LIMITS_HELP, pattern=LIMITS_PATTERN, theme=_MOTION)
     smooth: bool = option(True, "smooth positions by past and future", theme=_OFFLINE)
     side_view: bool = option(
-        False,
-        "re-track also where no ground plane is known and the camera looks along the ground",
-        theme=_ASSOCIATION,
+        False, "re-track also where no ground plane is known and the camera looks along the ground", theme=_ASSOCIATION
     )
     rate_hz: float = context(lambda: 2.5)
     ground_planes: Planes = context(tuple)
@@ -201,12 +181,12 @@ class RetrackOptions:
 
     @property
     def looks(self) -> Descriptors | None:
-        """The descriptors of the samples, where these are compared."""
+        """The descriptors of samples; None if appearance is not compared."""
         return None
 
     @property
     def stored_looks(self) -> Descriptors | None:
-        """The descriptors of the samples, where what tracks look like is written."""
+        """The descriptors of samples; None if appearance is not stored."""
         return None
 
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
@@ -222,7 +202,7 @@ Value = TypeVar("Value")
 
 
 class _OfOutputs(Generic[Value]):
-    """A value for each output: of the class those of all outputs, of an object those of the outputs that it writes."""
+    """A value for each output: on the class for all outputs, on an object for those that it writes."""
 
     def __init__(self, of_all: Mapping[str, Value]) -> None:
         self._of_all = MappingProxyType(of_all)
@@ -251,44 +231,33 @@ class LikelihoodOptions(RetrackOptions):
     def follows_log(self) -> bool:
         return self.adapt
 
-    merge_distance_m: float = option(
+    merge_distance_m: float = setting(
         1.0,
         "two tracks may be merged into one detection that lies between them (occlusion), this many metres from both; 0 "
         "for never",
         least=0.0,
         theme=_ASSOCIATION,
-        flag=False,
     )
-    merge_timeout_s: float = option(
-        3.0,
-        "longest time that tracks stay merged into one detection, in seconds",
-        least=0.0,
-        theme=_ASSOCIATION,
-        flag=False,
+    merge_timeout_s: float = setting(
+        3.0, "longest time that tracks stay merged into one detection, in seconds", least=0.0, theme=_ASSOCIATION
     )
-    confirm_s: float = option(
+    confirm_s: float = setting(
         1.2,
         "online, a track is confirmed once it was observed for this many seconds: predicted, and written if it was "
         "not before",
         least=0.0,
         theme=_LIFE,
-        flag=False,
     )
-    coast_s: float = option(
-        1.2,
-        "online, a track is written for up to this many seconds without an observation",
-        least=0.0,
-        theme=_LIFE,
-        flag=False,
+    coast_s: float = setting(
+        1.2, "online, a track is written for up to this many seconds without an observation", least=0.0, theme=_LIFE
     )
-    adapt_online: bool = option(
+    adapt_online: bool = setting(
         True,
         "online, follow the log so far: write new tracks at once if most tracks last, and lost ones only as long as it "
         "is likely that they come back",
         theme=_LIFE,
-        flag=False,
     )
-    adapt: bool = option(True, ADAPT_HELP, theme=_PREDICTIONS, flag=False)
+    adapt: bool = setting(True, ADAPT_HELP, theme=_PREDICTIONS)
     appearance: bool | None = option(
         None,
         "compare the colours of what people wear before and after gaps and encounters; by default where the log has "
@@ -391,84 +360,53 @@ def position_distances(tracks: Forecast, age: Ints, xy_m: Floats, noise_m: float
 class ConsistencyOptions(RetrackOptions):
     """The options of re-tracking by prediction consistency (Algorithm 1 of the paper)."""
 
-    distance: Distance = option(
+    distance: Distance = setting(
         "mean",
         "how a track and an observation are compared: mean, max or first distance between their predicted steps, or "
         "that between expected and measured position (now)",
         theme=_ASSOCIATION,
-        flag=False,
     )
-    max_distance: float = option(
+    max_distance: float = setting(
         3.0,
         "gate: pairs further apart, in standard deviations of their predictions (d_min in the paper), are not matched",
         least=0.0,
         theme=_ASSOCIATION,
-        flag=False,
     )
-    gate_m: float | None = option(
+    gate_m: float | None = setting(
         3.0,
         "gate: a track is not matched further than this from its predicted current position, in metres",
         least=0.0,
         theme=_ASSOCIATION,
-        flag=False,
     )
-    priority_distance: float = option(
+    priority_distance: float = setting(
         0.0,
         "pairs nearer than this, in standard deviations, are matched before all others; 0 for never",
         least=0.0,
         theme=_ASSOCIATION,
-        flag=False,
     )
-    covariance: Covariance = option(
-        "predictor",
-        "covariance of predictions: the predictor's, or the paper's (u - t) sigma^2",
-        theme=_PREDICTIONS,
-        flag=False,
+    covariance: Covariance = setting(
+        "predictor", "covariance of predictions: the predictor's, or the paper's (u - t) sigma^2", theme=_PREDICTIONS
     )
-    sigma_m: float = option(
-        1.0, "sigma of the paper's covariance, in metres", least=1e-6, theme=_PREDICTIONS, flag=False
+    sigma_m: float = setting(1.0, "sigma of the paper's covariance, in metres", least=1e-6, theme=_PREDICTIONS)
+    alpha: float = setting(
+        1.0, "smoothing of displacements (Eq. 3 of the paper); 1 for none", least=0.0, most=1.0, theme=_PREDICTIONS
     )
-    alpha: float = option(
-        1.0,
-        "smoothing of displacements (Eq. 3 of the paper); 1 for none",
-        least=0.0,
-        most=1.0,
-        theme=_PREDICTIONS,
-        flag=False,
+    beta: float = setting(
+        0.0, "smoothing of the trend of displacements (Eq. 3 of the paper)", least=0.0, most=1.0, theme=_PREDICTIONS
     )
-    beta: float = option(
-        0.0,
-        "smoothing of the trend of displacements (Eq. 3 of the paper)",
-        least=0.0,
-        most=1.0,
-        theme=_PREDICTIONS,
-        flag=False,
+    birth: Literal["raw", "smoothed"] = setting(
+        "raw", "what a new track predicts from: its past as observed, or smoothed", theme=_PREDICTIONS
     )
-    birth: Literal["raw", "smoothed"] = option(
-        "raw",
-        "what a new track predicts from: its past as observed, or smoothed",
-        theme=_PREDICTIONS,
-        flag=False,
+    min_hits: int = setting(
+        1, "online, a track is written from this many matches in a row", least=0, most=1000, theme=_LIFE
     )
-    min_hits: int = option(
-        1,
-        "online, a track is written from this many matches in a row",
-        least=0,
-        most=1000,
-        theme=_LIFE,
-        flag=False,
+    trim_ends: bool = setting(
+        False, "offline, leave out what a track matched after its last min_hits matches in a row", theme=_LIFE
     )
-    trim_ends: bool = option(
-        False,
-        "offline, leave out what a track matched after its last min_hits matches in a row",
-        theme=_LIFE,
-        flag=False,
-    )
-    backfill: Literal["none", "unclaimed", "all"] = option(
+    backfill: Literal["none", "unclaimed", "all"] = setting(
         "unclaimed",
         "whether a new track gets the past of its first observation: not at all, what no other track has, or all",
         theme=_OFFLINE,
-        flag=False,
     )
 
     @property

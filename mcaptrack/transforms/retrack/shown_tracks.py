@@ -278,13 +278,13 @@ class ShownTracks:
         order = np.lexsort((at, all_[0]))
         (ids, level, age, outside), at = all_[:, order], at[order]
         goes_on = np.append(ids[1:] == ids[:-1], False)[: len(ids)]
-        known = goes_on | (at < count - 1)  # what became of those of the last step is not known yet
+        is_judged = goes_on | (at < count - 1)  # what became of those of the last step is not known yet
         then = np.minimum(at + 1, count - 1)
-        known &= passed[then] == 1  # a gap of the log ends tracks, and says nothing about them
-        next_level, next_age = (np.append(one[1:], 0)[: len(ids)] for one in (level, age))
+        is_judged &= passed[then] == 1  # a gap of the log ends tracks, and says nothing about them
+        next_level, next_age = (np.append(values[1:], 0)[: len(ids)] for values in (level, age))
         lasting, back = level >= self._levels, goes_on & (next_age == 0)
-        is_new = known & ~lasting & (~goes_on | (next_level > level))
-        is_lost = known & (age > 0) & (~lasting | (outside > 0)) & (~goes_on | back | (next_age > age))
+        is_new = is_judged & ~lasting & (~goes_on | (next_level > level))
+        is_lost = is_judged & (age > 0) & (~lasting | (outside > 0)) & (~goes_on | back | (next_age > age))
         place = then * levels + level
         counts = np.stack([_counted(place[which], count, (levels,)) for which in (is_new, is_new & ~goes_on)])
         shape = 2, self._ages + 1

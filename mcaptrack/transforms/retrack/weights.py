@@ -21,5 +21,5 @@ _FILE: Final[Mapping[str, Any]] = json.loads(WEIGHTS.read_text(encoding="utf-8")
 
 def weights_of(model: str, features: Sequence[str]) -> tuple[Floats, Mapping[str, Any]]:
     """The weight of each of the features (F,) of a model as a log odds ratio, and its other numbers by name."""
-    found = _FILE[model]
-    return np.array([found["weights"][name] for name in features]), found
+    entry = _FILE[model]
+    return np.array([entry["weights"][name] for name in features]), entry

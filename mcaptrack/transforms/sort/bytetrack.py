@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Indices
-from mcaptrack.transforms.protocol import option
+from mcaptrack.transforms.protocol import setting
 from mcaptrack.transforms.sort.state import SINCE_UPDATE, Measurements, associate
 from mcaptrack.transforms.sort.tracker import AssociationInput, Sort
 
@@ -36,22 +36,16 @@ class ByteTrack(Sort):
     Y. Zhang et al., "ByteTrack: Multi-Object Tracking by Associating Every Detection Box", ECCV 2022.
     """
 
-    high_score: float = option(
-        0.5,
-        "detections with at least this score, or without a score, are matched first",
-        search=(0.2, 0.9),
-        flag=False,
+    high_score: float = setting(
+        0.5, "detections with at least this score, or without a score, are matched first", search=(0.2, 0.9)
     )
-    new_score: float = option(
-        0.6, "detections with at least this score may begin a track", search=(0.2, 0.9), flag=False
-    )
-    low_min_iou: float = option(
+    new_score: float = setting(0.6, "detections with at least this score may begin a track", search=(0.2, 0.9))
+    low_min_iou: float = setting(
         0.5,
         "least overlap (IoU) for detections with a low score, which are matched second",
         least=0.0,
         most=1.0,
         search=(0.2, 0.8),
-        flag=False,
     )
 
     def _associate(self, step: AssociationInput) -> tuple[Indices, Indices]:

@@ -18,7 +18,7 @@ import numpy as np
 from mcaptrack.geometry import kalman
 from mcaptrack.geometry.affine import move_boxes, move_points
 from mcaptrack.geometry.arrays import Floats, Indices
-from mcaptrack.transforms.protocol import option
+from mcaptrack.transforms.protocol import setting
 from mcaptrack.transforms.sort.state import SHARED_ROWS, CandidatePairs, Measurements, Tracks, associate, iou_pairs
 from mcaptrack.transforms.sort.tracker import AssociationInput, Sort
 
@@ -54,19 +54,12 @@ class OcSort(Sort):
     J. Cao et al., "Observation-Centric SORT: Rethinking SORT for Robust Multi-Object Tracking", CVPR 2023.
     """
 
-    inertia: float = option(
-        0.2, "weight of the direction of motion, beside overlap", least=0.0, search=(0.0, 0.6), flag=False
+    inertia: float = setting(0.2, "weight of the direction of motion, beside overlap", least=0.0, search=(0.0, 0.6))
+    direction_frames: int = setting(
+        3, "number of frames over which the direction of motion is measured", least=2, most=100, search=(2, 10)
     )
-    direction_frames: int = option(
-        3,
-        "number of frames over which the direction of motion is measured",
-        least=2,
-        most=100,
-        search=(2, 10),
-        flag=False,
-    )
-    recover: bool = option(True, "match lost tracks once more by their last detection", flag=False)
-    reupdate: bool = option(True, "recompute the filter over the gap when a track is found again", flag=False)
+    recover: bool = setting(True, "match lost tracks once more by their last detection")
+    reupdate: bool = setting(True, "recompute the filter over the gap when a track is found again")
 
     def _empty_tracks(self) -> Tracks:
         return Tracks(_CENTRES - SHARED_ROWS + 2 * (self.direction_frames + 1))
@@ -98,10 +91,10 @@ class OcSort(Sort):
         """
         table, detections = step.tracks.table, step.detections
         centres, tracks = table[_CENTRES:].reshape(-1, 2, table.shape[1]), np.arange(table.shape[1])
-        known = np.isfinite(centres[:, 0])
+        is_known = np.isfinite(centres[:, 0])
         # The oldest and the newest known centre: if they are the same or NaN, the direction is unknown.
-        oldest = centres[known.argmax(axis=0), :, tracks].T
-        newest = centres[-1 - known[::-1].argmax(axis=0), :, tracks].T
+        oldest = centres[is_known.argmax(axis=0), :, tracks].T
+        newest = centres[-1 - is_known[::-1].argmax(axis=0), :, tracks].T
         before = (newest - oldest)[:, pairs.track]
         now = detections.measured[:2, pairs.detection] - oldest[:, pairs.track]
         length = np.hypot(before[0], before[1]) * np.hypot(now[0], now[1])
@@ -119,9 +112,9 @@ class OcSort(Sort):
         detections, tracks = np.flatnonzero(detection_left), np.flatnonzero(track_left)
         last = step.tracks.table[_LAST_BOX][:, tracks]
         area = (last[2] - last[0]) * (last[3] - last[1])
-        found = iou_pairs(step.detections.corners[:, detections], last, step.detections.measured[2, detections], area)
+        near = iou_pairs(step.detections.corners[:, detections], last, step.detections.measured[2, detections], area)
         shape = (len(detection_left), len(track_left))
-        pairs = CandidatePairs(detections[found.detection], tracks[found.track], found.similarity, shape)
+        pairs = CandidatePairs(detections[near.detection], tracks[near.track], near.similarity, shape)
         return self._of_same_class(step, pairs)
 
     def _move(self, tracks: Tracks, motion: Floats) -> None:

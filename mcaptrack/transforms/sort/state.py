@@ -191,9 +191,9 @@ def distance_pairs(boxes: Floats, predicted: Floats, gate: float, plane: GroundP
 
     Similarity is 1 at distance 0 and falls to 0 at the gate; gating excludes pairs beyond it.
     """
-    here, there = (_positions(corners, plane) for corners in (boxes, predicted))
-    pairs = Pairing(here, there, np.full(here.shape[1], gate))
-    distance = np.hypot(*(pairs.of_first(here) - pairs.of_second(there)))
+    here, predicted_at = (_positions(corners, plane) for corners in (boxes, predicted))
+    pairs = Pairing(here, predicted_at, np.full(here.shape[1], gate))
+    distance = np.hypot(*(pairs.of_first(here) - pairs.of_second(predicted_at)))
     is_near = distance < gate  # NaN, above the horizon, is beyond every gate
     return CandidatePairs(*pairs.chosen(is_near), 1 - distance[is_near] / gate, pairs.shape)
 
@@ -216,8 +216,11 @@ def associate(pairs: CandidatePairs, min_similarity: float) -> tuple[Indices, In
         return pairs.detection, pairs.track
     if pairs.class_id is not None:
         alone = pairs._replace(class_id=None)
-        found = [associate(alone.select(pairs.class_id == one), min_similarity) for one in np.unique(pairs.class_id)]
-        return np.concatenate([one for one, _ in found]), np.concatenate([one for _, one in found])
+        by_class = [
+            associate(alone.select(pairs.class_id == kind), min_similarity) for kind in np.unique(pairs.class_id)
+        ]
+        detections, tracks = zip(*by_class, strict=True)
+        return np.concatenate(detections), np.concatenate(tracks)
     above = pairs.similarity > min_similarity
     count = np.count_nonzero(above)
     if count:

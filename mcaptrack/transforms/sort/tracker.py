@@ -25,7 +25,7 @@ from mcaptrack.geometry.clocks import NS_PER_S, FrameClock
 from mcaptrack.geometry.plane import GroundPlane, Planes, moved_planes, plane_at
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
-from mcaptrack.transforms.protocol import check_options, context, option
+from mcaptrack.transforms.protocol import check_options, context, option, setting
 from mcaptrack.transforms.sort.state import (
     CLASS,
     HIT_STREAK,
@@ -113,12 +113,8 @@ class Sort:
     max_age_s: float = option(
         1.4, "a track ends after this many seconds without a detection", least=0.0, search=(0.2, 4.0), theme=_LIFE
     )
-    max_age_frames: int | None = option(
-        None,
-        "a track ends after this many frames without a detection, instead of --max-age-s",
-        least=0,
-        theme=_LIFE,
-        flag=False,
+    max_age_frames: int | None = setting(
+        None, "a track ends after this many frames without a detection, instead of --max-age-s", least=0, theme=_LIFE
     )
     min_hits_s: float = option(
         0.3,
@@ -133,11 +129,10 @@ class Sort:
         least=0,
         theme=_LIFE,
     )
-    cost: Cost = option(
+    cost: Cost = setting(
         "iou",
         "how detections and tracks are compared: overlap of boxes (iou), or distance in pixels or in metres",
         theme=_ASSOCIATION,
-        flag=False,
     )
     min_iou: float = option(
         0.2,
@@ -147,28 +142,21 @@ class Sort:
         search=(0.05, 0.6),
         theme=_ASSOCIATION,
     )
-    max_distance_px: float = option(
+    max_distance_px: float = setting(
         60.0,
         "with cost pixels: largest distance of a box's centre from the predicted one, in pixels",
         least=0.0,
         theme=_ASSOCIATION,
-        flag=False,
     )
-    max_distance_m: float = option(
+    max_distance_m: float = setting(
         1.0,
         "with cost metres: largest distance on the ground from the predicted position, in metres",
         least=0.0,
         theme=_ASSOCIATION,
-        flag=False,
     )
     min_score: float | None = option(None, "ignore detections with a lower score", theme=_DETECTIONS)
-    class_id: int | None = option(
-        None,
-        "ignore detections of other classes",
-        least=0,
-        most=2**31 - 1,
-        theme=_DETECTIONS,
-        flag=False,
+    class_id: int | None = setting(
+        None, "ignore detections of other classes", least=0, most=2**31 - 1, theme=_DETECTIONS
     )
     across_classes: bool = option(
         False,
@@ -200,8 +188,8 @@ class Sort:
             spans = pairwise(ends.tolist())
             parts = [self._step(run, f, Measurements(columns[:, a:b])) for f, (a, b) in zip(block, spans, strict=True)]
             written, written_ends = np.concatenate(parts, axis=1), np.cumsum([0, *(p.shape[1] for p in parts)])
-            made = tracks_to_frames(block, written, written_ends.tolist(), run.planes)
-            yield from ((frame,) for frame in made)
+            tracked = tracks_to_frames(block, written, written_ends.tolist(), run.planes)
+            yield from ((frame,) for frame in tracked)
         report.warn()
 
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
@@ -337,11 +325,11 @@ class _FilterReport:
         if self._kept or not self._count:
             return
         if wanted is not None and wanted not in self._classes:
-            there = ", ".join(map(str, sorted(self._classes)[:_MAX_LISTED]))
-            warn(f"no detection has class {wanted}, so there are no tracks; the classes are {there}", "left-out")
+            listed = ", ".join(map(str, sorted(self._classes)[:_MAX_LISTED]))
+            warn(f"no detection has class {wanted}, so there are no tracks; the classes are {listed}", "left-out")
         elif least is not None and self._highest < least:
-            words = f"the highest is {self._highest:g}"
-            warn(f"no detection has a score of {least:g} or more, so there are no tracks; {words}", "left-out")
+            text = f"the highest is {self._highest:g}"
+            warn(f"no detection has a score of {least:g} or more, so there are no tracks; {text}", "left-out")
 
 
 class _Run:

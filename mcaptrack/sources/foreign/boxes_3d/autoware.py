@@ -45,11 +45,11 @@ _HEADING_UNKNOWN: Final = 0
 def boxes_of(message: Any) -> Message3d:
     """The objects of a message."""
     head = head_of(message)
-    return Message3d(*head, [_box(one, head) for one in message.objects])
+    return Message3d(*head, [_box(item, head) for item in message.objects])
 
 
-def _box(one: Any, head: tuple[int, str]) -> Box3d:
-    kinematics, shape = one.kinematics, one.shape
+def _box(item: Any, head: tuple[int, str]) -> Box3d:
+    kinematics, shape = item.kinematics, item.shape
     pose = kinematics.pose_with_covariance.pose
     centre, orientation, size = vector(pose.position), quaternion(part(pose, "orientation")), vector(shape.dimensions)
     if integer(shape.type) == _CYLINDER:  # x is the diameter
@@ -60,8 +60,8 @@ def _box(one: Any, head: tuple[int, str]) -> Box3d:
     velocity = UNKNOWN_VECTOR
     if getattr(kinematics, "has_twist", True):  # along the axes of the object
         velocity = rotated(orientation, vector(kinematics.twist_with_covariance.twist.linear))
-    name, probability = _class_of(one)
-    existence = number(one.existence_probability)
+    name, probability = _class_of(item)
+    existence = number(item.existence_probability)
     return Box3d(
         *head,
         centre,
@@ -69,19 +69,19 @@ def _box(one: Any, head: tuple[int, str]) -> Box3d:
         size,
         name,
         existence if existence > 0 else probability,
-        _id(one),
+        _id(item),
         velocity,
         integer(kinematics.orientation_availability) != _HEADING_UNKNOWN,
     )
 
 
-def _class_of(one: Any) -> tuple[str, float]:
+def _class_of(item: Any) -> tuple[str, float]:
     """The likeliest class, and its probability; "" and NaN if there is none."""
-    found = [(number(guess.probability), guess) for guess in one.classification]
-    known = [(share if isfinite(share) else -1.0, guess) for share, guess in found]
-    if not known:
+    guesses = [(number(guess.probability), guess) for guess in item.classification]
+    shares = [(share if isfinite(share) else -1.0, guess) for share, guess in guesses]
+    if not shares:
         return "", nan
-    share, guess = max(known, key=lambda pair: pair[0])
+    share, guess = max(shares, key=lambda pair: pair[0])
     return named(enumeration(guess) or _CLASSES, guess.label), share if share > 0 else nan
 
 
@@ -93,7 +93,7 @@ def _footprint(points: list[Vector], height: float) -> tuple[Vector, Vector]:
     return (x, y, 0.0), (length, width, height)
 
 
-def _id(one: Any) -> str | None:
+def _id(item: Any) -> str | None:
     """The UUID of a tracked object, in hexadecimal; None for a detected one."""
-    found = part(one, "object_id")
-    return None if found is None else to_bytes(found.uuid).hex()
+    uuid = part(item, "object_id")
+    return None if uuid is None else to_bytes(uuid.uuid).hex()

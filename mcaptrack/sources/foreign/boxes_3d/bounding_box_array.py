@@ -12,7 +12,7 @@ from mcaptrack.sources.foreign.decoding import integer
 def boxes_of(message: Any) -> Message3d:
     """The boxes of a message."""
     head = head_of(message)
-    return Message3d(*head, [_box(one, head) for one in message.boxes])
+    return Message3d(*head, [_box(box, head) for box in message.boxes])
 
 
 def _box(box: Any, around: tuple[int, str]) -> Box3d:

@@ -48,7 +48,7 @@ class Box3d(NamedTuple):
 
 @dataclass
 class Message3d:
-    """The boxes of a message, and what of it is no box, in words with its count.
+    """The boxes of a message, and a count of its other parts for each description of them.
 
     ``is_measured`` is false for a message that only takes boxes away from a viewer: nothing was measured then.
     """
@@ -139,8 +139,8 @@ def enumeration(message: Any, prefix: str = "") -> Mapping[int, str]:
 @lru_cache(maxsize=64)
 def _constants(kind: Any, prefix: str) -> Mapping[int, str]:
     whole = {name: value for name, value in vars(kind).items() if name.isupper() and isinstance(value, int)}
-    found = {value: name.removeprefix(prefix).lower() for name, value in whole.items() if name.startswith(prefix)}
-    return {value: "" if name == "unknown" else name for value, name in found.items()}
+    names = {value: name.removeprefix(prefix).lower() for name, value in whole.items() if name.startswith(prefix)}
+    return {value: "" if name == "unknown" else name for value, name in names.items()}
 
 
 def words_of(said: str) -> tuple[str, float]:

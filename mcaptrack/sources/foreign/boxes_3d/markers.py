@@ -10,16 +10,7 @@ from collections import Counter
 from math import isnan
 from typing import Any, Final
 
-from mcaptrack.sources.foreign.boxes_3d.box import (
-    Box3d,
-    Message3d,
-    head_of,
-    moved,
-    part,
-    quaternion,
-    vector,
-    words_of,
-)
+from mcaptrack.sources.foreign.boxes_3d.box import Box3d, Message3d, head_of, moved, part, quaternion, vector, words_of
 from mcaptrack.sources.foreign.decoding import integer, text
 
 _CUBE, _CUBE_LIST, _TEXT, _ADD = 1, 6, 9, 0
@@ -44,8 +35,8 @@ def boxes_of(message: Any) -> Message3d:
             label, share = words_of(labels.get(integer(marker.id), ""))
             name, score = name or label, share if isnan(score) else score
             pose = _pose(marker)
-            found = Box3d(*head_of(marker), *pose, vector(marker.scale), name, score, integer(marker.id))
-            out.boxes.append(found)
+            box = Box3d(*head_of(marker), *pose, vector(marker.scale), name, score, integer(marker.id))
+            out.boxes.append(box)
         elif kind == _CUBE_LIST:
             name, score = _class_of(marker)
             centre, orientation = _pose(marker)
@@ -62,11 +53,13 @@ def boxes_of(message: Any) -> Message3d:
 
 def _labels(markers: list[Any]) -> dict[int, str]:
     """The texts of markers beside cubes, by the id that they share with one cube."""
-    cubes, texts = (Counter(integer(one.id) for one in markers if integer(one.type) == kind) for kind in (_CUBE, _TEXT))
+    cubes, texts = (
+        Counter(integer(marker.id) for marker in markers if integer(marker.type) == kind) for kind in (_CUBE, _TEXT)
+    )
     return {
-        integer(one.id): text(part(one, "text") or "")
-        for one in markers
-        if integer(one.type) == _TEXT and cubes[integer(one.id)] == texts[integer(one.id)] == 1
+        integer(marker.id): text(part(marker, "text") or "")
+        for marker in markers
+        if integer(marker.type) == _TEXT and cubes[integer(marker.id)] == texts[integer(marker.id)] == 1
     }
 
 

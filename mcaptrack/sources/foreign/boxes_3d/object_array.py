@@ -50,12 +50,12 @@ _BOX, _SPHERE, _CYLINDER, _CONE = 1, 2, 3, 4
 def boxes_of(message: Any) -> Message3d:
     """The objects of a message. Those without a shape, as of radars, have the size of their polygon, or none."""
     head = head_of(message)
-    return Message3d(*head, [_box(one, head) for one in message.objects])
+    return Message3d(*head, [_box(seen, head) for seen in message.objects])
 
 
 def _size(shape: Any) -> Vector:
     """The size of the box around a shape; NaN if it has none."""
-    kind, lengths = integer(shape.type), [number(one) for one in shape.dimensions]
+    kind, lengths = integer(shape.type), [number(dimension) for dimension in shape.dimensions]
     if kind == _BOX and len(lengths) >= 3:
         return lengths[0], lengths[1], lengths[2]
     if kind == _SPHERE and lengths:
@@ -65,21 +65,22 @@ def _size(shape: Any) -> Vector:
     return UNKNOWN_VECTOR
 
 
-def _box(one: Any, head: tuple[int, str]) -> Box3d:
-    certainty = integer(one.classification_certainty)
-    centre, orientation, size = vector(one.pose.position), quaternion(part(one.pose, "orientation")), _size(one.shape)
-    if isnan(size[0]) and (points := [vector(point) for point in part(part(one, "polygon"), "points") or ()]):
+def _box(seen: Any, head: tuple[int, str]) -> Box3d:
+    certainty = integer(seen.classification_certainty)
+    centre, size = vector(seen.pose.position), _size(seen.shape)
+    orientation = quaternion(part(seen.pose, "orientation"))
+    if isnan(size[0]) and (points := [vector(point) for point in part(part(seen, "polygon"), "points") or ()]):
         x, y, z, w = orientation
         along = [rotated((-x, -y, -z, w), point) for point in points]  # the polygon is in the frame of the message
         middle, (length, width, _) = around(along)
         centre, size = rotated(orientation, middle), (length, width, nan)
     return Box3d(
-        *own_head(one, head),
+        *own_head(seen, head),
         centre,
         orientation,
         size,
-        named(enumeration(one, _PREFIX) or _CLASSES, one.classification),
+        named(enumeration(seen, _PREFIX) or _CLASSES, seen.classification),
         certainty / _CERTAIN if certainty else nan,
-        integer(one.id),
-        vector(one.twist.linear) if integer(one.detection_level) == _TRACKED else UNKNOWN_VECTOR,
+        integer(seen.id),
+        vector(seen.twist.linear) if integer(seen.detection_level) == _TRACKED else UNKNOWN_VECTOR,
     )

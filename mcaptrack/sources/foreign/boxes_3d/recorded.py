@@ -67,7 +67,7 @@ def find_sweeps(t_ns: Ints, log_ns: Ints, place: Ints, centre_m: Floats, class_i
 
 
 def are_mixed(t_ns: Ints, place: Ints, centre_m: Floats) -> bool:
-    """Whether most of T rising times have one box, and it is of another object than the one before."""
+    """Whether most of T rising times have a single box, of another object than the box before it."""
     counts = np.bincount(place, minlength=len(t_ns))
     if len(t_ns) < 4 * _MIN_SWEEPS or not len(place) or (counts[counts > 0] == 1).mean() < 0.9:
         return False
@@ -85,7 +85,7 @@ def _limits(gaps: Ints) -> list[int]:
     ratio = lengths[1:] / lengths[:-1]
     ratio[-1] = 0  # one gap alone may be a pause
     likely = np.argsort(-ratio, kind="stable")[:_TRIED]
-    return [int(lengths[one]) for one in likely.tolist() if ratio[one] >= _MIN_RATIO]
+    return [int(lengths[place]) for place in likely.tolist() if ratio[place] >= _MIN_RATIO]
 
 
 def _chains(times: Ints, limit: int) -> Ints:
@@ -120,16 +120,16 @@ def _share_repeated(sweep: Ints, centre_m: Floats, class_id: Ints) -> float:
     parts = np.split(order, begins[1:])
     judged = np.unique(np.linspace(0, len(numbers) - 2, min(len(numbers) - 1, _JUDGED)).astype(int))
     compared = repeated = 0
-    for one in judged.tolist():
-        own = _nearest(parts[one], parts[one], centre_m, class_id)
-        later = _nearest(parts[one], parts[one + 1], centre_m, class_id)
+    for number in judged.tolist():
+        own = _nearest(parts[number], parts[number], centre_m, class_id)
+        later = _nearest(parts[number], parts[number + 1], centre_m, class_id)
         compared += int(np.isfinite(later).sum())
         repeated += int((own < later).sum() - (np.isfinite(own) & np.isinf(later)).sum())
     return repeated / compared if compared else 1.0
 
 
 def _nearest(some: Ints, others: Ints, centre_m: Floats, class_id: Ints) -> Floats:
-    """The distance of boxes (S,) to the nearest of others of their class; those at the same place don't count."""
+    """The distance (S,) of boxes to the nearest other box of their class, except boxes at the same place."""
     places = np.nan_to_num(centre_m)
     away = np.linalg.norm(places[some][:, None] - places[others], axis=2)
     is_other = (class_id[some][:, None] == class_id[others]) & (away > 0)
@@ -194,7 +194,7 @@ class Recorded3d:
         return np.where(is_off, self.log_ns, self.stamp_ns), int(is_off.sum())
 
     def in_usual_frame(self) -> tuple[Recorded3d, int]:
-        """The same boxes, those that name no frame in the frame that most others name, and their number."""
+        """Put boxes without a frame into the frame that most boxes name; also returns their number."""
         counts = np.bincount(self.frame, minlength=len(self.names))
         unnamed = [number for number, name in enumerate(self.names) if not name]
         counts[unnamed] = 0
@@ -204,7 +204,7 @@ class Recorded3d:
         return replace(self, frame=np.where(is_unnamed, counts.argmax(), self.frame)), int(is_unnamed.sum())
 
     def is_repeated(self, frame: Ints) -> Bools:
-        """Whether each box (N,) is an earlier one of its frame (N,) again, as where messages are recorded twice."""
+        """Mark boxes (N,) that repeat an earlier box of their frame (N,), as in messages recorded twice."""
         out = np.zeros(len(frame), bool)
         many = max(len(self.message_ns), 1)
         several = np.bincount(np.unique(frame * many + self.message) // many) > 1  # frames of several messages
@@ -217,7 +217,7 @@ class Recorded3d:
         return out
 
     def of_several_messages(self, frame: Ints) -> int:
-        """The number of frames with boxes of several messages, if most have those of one; boxes are in ``frame`` (N,).
+        """Count frames with boxes of several messages, if most have one; ``frame`` (N,) is by box.
 
         0 where each message has one box: then they are parts of a frame.
         """
@@ -264,8 +264,8 @@ class Recorded3d:
         log_ns[frame[::-1]] = self.log_ns[::-1]
         sweep = find_sweeps(starts, log_ns, frame, self.centre, self.class_id)
         if sweep is None:
-            words = "messages have one box each, and their times don't show which are of one sweep: each is a frame"
-            return starts, frame, words if are_mixed(starts, frame, self.centre) else ""
+            text = "messages have one box each, and their times don't show which are of one sweep: each is a frame"
+            return starts, frame, text if are_mixed(starts, frame, self.centre) else ""
         t_ns = starts[np.unique(sweep, return_index=True)[1]]
         for number, some in _groups(sweep[frame], box_ns):
             t_ns[number] = np.sort(some)[(len(some) - 1) // 2]
@@ -273,8 +273,8 @@ class Recorded3d:
         place = np.empty(len(order), np.int64)
         place[order] = np.arange(len(order))
         apart_ms = max(int(np.ptp(some)) for _, some in _groups(sweep[frame], box_ns)) / 1e6
-        words = f"messages are gathered to {len(order):,} frames, one for each sweep"
-        return t_ns[order], place[sweep][frame], f"{words}: times up to {apart_ms:.0f} ms apart, then longer gaps"
+        text = f"messages are gathered to {len(order):,} frames, one for each sweep"
+        return t_ns[order], place[sweep][frame], f"{text}: times up to {apart_ms:.0f} ms apart, then longer gaps"
 
 
 def _is_off(stamp_ns: Ints, log_ns: Ints) -> Bools:
@@ -300,9 +300,9 @@ def _usual_step(t_ns: Ints) -> float:
 def _starts(t_ns: Ints) -> Ints:
     """The first times of groups, each within ``_SAME_NS``."""
     out: list[int] = []
-    for one in np.unique(t_ns).tolist():
-        if not out or one - out[-1] > _SAME_NS:
-            out.append(one)
+    for time_ns in np.unique(t_ns).tolist():
+        if not out or time_ns - out[-1] > _SAME_NS:
+            out.append(time_ns)
     return np.array(out, np.int64)
 
 
@@ -315,11 +315,11 @@ def recorded(messages: Iterable[tuple[int, Message3d]]) -> Recorded3d:
     owner: list[int] = []
     heads: list[tuple[int, int, bool]] = []
     remarks: Counter[str] = Counter()
-    for number, (t_ns, one) in enumerate(messages):
-        boxes += one.boxes
-        owner += [number] * len(one.boxes)
-        heads.append((t_ns, one.stamp_ns, one.is_measured))
-        remarks.update({f"{words} are left out": count for words, count in one.ignored.items()})
+    for number, (t_ns, of_message) in enumerate(messages):
+        boxes += of_message.boxes
+        owner += [number] * len(of_message.boxes)
+        heads.append((t_ns, of_message.stamp_ns, of_message.is_measured))
+        remarks.update({f"{remark} are left out": count for remark, count in of_message.ignored.items()})
     head_ns = np.array([head[:2] for head in heads], np.int64).reshape(-1, 2)
     names = sorted({plain_frame(box.frame_id) for box in boxes})
     place = {name: number for number, name in enumerate(names)}
@@ -352,16 +352,16 @@ def _columns(values: Sequence[tuple[float, ...]], width: int) -> Floats:
     return np.array(values, np.float64).reshape(-1, width)
 
 
-def _ids(found: Sequence[int | str | None]) -> Ints:
+def _ids(ids: Sequence[int | str | None]) -> Ints:
     """Ids of boxes: numbers as they are, also as text; other texts are numbered in alphabetical order after these."""
     numbers: list[int] = []
     texts: dict[int, str] = {}
-    for at, one in enumerate(found):
-        words = str(one if one is not None else "").strip()
-        is_number = _NUMBER.fullmatch(words)
-        numbers.append(int(words) if is_number else -1)
-        if words and not is_number and not isinstance(one, int):
-            texts[at] = words
+    for at, own in enumerate(ids):
+        text = str(own if own is not None else "").strip()
+        is_number = _NUMBER.fullmatch(text)
+        numbers.append(int(text) if is_number else -1)
+        if text and not is_number and not isinstance(own, int):
+            texts[at] = text
     first = max(numbers, default=-1) + 1
     place = {name: first + order for order, name in enumerate(sorted(set(texts.values())))}
     for at, name in texts.items():
@@ -369,39 +369,39 @@ def _ids(found: Sequence[int | str | None]) -> Ints:
     return np.array(numbers, np.int64)
 
 
-def _checked(found: Recorded3d) -> Recorded3d:
+def _checked(boxes: Recorded3d) -> Recorded3d:
     """The boxes that have a position; sizes and orientations that can't be are unknown, and counted as remarks."""
     with np.errstate(invalid="ignore"):
         # Radars know no height: x and y are a position.
-        is_there = (np.abs(found.centre) < _FARTHEST_M) | (np.isnan(found.centre) & [False, False, True])
+        is_there = (np.abs(boxes.centre) < _FARTHEST_M) | (np.isnan(boxes.centre) & [False, False, True])
         is_far: Bools = ~np.asarray(is_there.all(axis=1))
-        found = found.select(~is_far)
-        size, turn = found.size, found.orientation
+        boxes = boxes.select(~is_far)
+        size, turn = boxes.size, boxes.orientation
         odd_turn: Bools = ~np.asarray(np.isfinite(turn).all(axis=1))
         length = np.linalg.norm(np.where(odd_turn[:, None], 0.0, turn), axis=1)
         is_unturned = ~odd_turn & (length < np.finfo(np.float64).tiny)
         kinds = {
             "boxes have no position (no finite number) and are left out": is_far,
-            "boxes have no z: it is unknown, and 0 in their frame for x and y": np.isnan(found.centre[:, 2]),
+            "boxes have no z: it is unknown, and 0 in their frame for x and y": np.isnan(boxes.centre[:, 2]),
             "boxes have a size that is no finite number: it is unknown": ~np.isfinite(size).all(axis=1),
             "boxes have a negative size: it is unknown": (size < 0).any(axis=1),
             "boxes have a size of 0: it is unknown": (size == 0).any(axis=1),
             "boxes have an orientation that is no finite number: it is unknown": odd_turn,
             "boxes have an orientation of zeros: they count as not turned": is_unturned,
         }
-        velocity = found.velocity
+        velocity = boxes.velocity
         # Programs that don't measure velocities leave them at 0; objects that move can't all have one of 0.
         if (is_stated := np.isfinite(velocity).all(axis=1)).any() and not velocity[is_stated].any():
             kinds["boxes have a velocity of 0, and no box has another: it is unknown"] = is_stated
             velocity = np.full_like(velocity, np.nan)
-        score = found.score
+        score = boxes.score
         if (is_scored := np.isfinite(score)).any() and not score[is_scored].any():
             kinds["boxes have a score of 0, and no box has another: it is unknown"] = is_scored
             score = np.full_like(score, np.nan)
         size = np.where(np.isfinite(size) & (size > 0), size, np.nan)
     turn = np.where((odd_turn | is_unturned)[:, None], [0.0, 0.0, 0.0, 1.0], turn)
-    remarks = found.remarks | {words: int(which.sum()) for words, which in kinds.items() if which.any()}
-    has_heading = found.has_heading & ~odd_turn
+    remarks = boxes.remarks | {remark: int(which.sum()) for remark, which in kinds.items() if which.any()}
+    has_heading = boxes.has_heading & ~odd_turn
     return replace(
-        found, size=size, orientation=turn, velocity=velocity, score=score, has_heading=has_heading, remarks=remarks
+        boxes, size=size, orientation=turn, velocity=velocity, score=score, has_heading=has_heading, remarks=remarks
     )

@@ -35,8 +35,8 @@ def limit_of(packed: int) -> int:
 def too_large(size: int | None, most: int) -> NotUnpackedError:
     """The error for data that are larger, or declare to be larger, than ``most`` bytes."""
     mib = f"{most / 2**20:.0f} MiB"
-    words = f"it has more than {mib}" if size is None else f"it says that it has {size} bytes, more than {mib}"
-    return NotUnpackedError(f"{words} when decompressed, which is unusual; {ENVIRONMENT} sets another limit")
+    text = f"it has more than {mib}" if size is None else f"it says that it has {size} bytes, more than {mib}"
+    return NotUnpackedError(f"{text} when decompressed, which is unusual; {ENVIRONMENT} sets another limit")
 
 
 def unzstd(data: bytes, most: int) -> bytes:

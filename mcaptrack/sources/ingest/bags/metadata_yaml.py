@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import follow_links, publish_bytes
+from mcaptrack.files import follow_links, publish_bytes, read_beginning
 from mcaptrack.notices import warn
 from mcaptrack.schema.encodings import CDR
 from mcaptrack.schema.provenance import Provenance
@@ -35,7 +35,7 @@ class Bag:
 
 def holds_metadata(path: Path) -> bool:
     """Whether a file exists and looks like the metadata of a bag."""
-    return path.is_file() and ROOT.encode() in _start(path)
+    return path.is_file() and ROOT.encode() in read_beginning(path, plain_yaml.MAX_BYTES + 1)
 
 
 def names_file(path: Path, name: str) -> bool:
@@ -43,7 +43,7 @@ def names_file(path: Path, name: str) -> bool:
     if not holds_metadata(path):
         return False
     try:
-        return name in [PurePath(one).name for one in read_metadata(path)[1]]
+        return name in [PurePath(file).name for file in read_metadata(path)[1]]
     except McaptrackError:
         return True
 
@@ -59,18 +59,9 @@ def is_packed(path: Path, name: str) -> bool:
     return bag.packed and name in names
 
 
-def _start(path: Path) -> bytes:
-    """The first bytes up to the limit, and one more if there are more."""
-    try:
-        with path.open("rb") as stream:
-            return stream.read(plain_yaml.MAX_BYTES + 1)
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
-
-
 def read_metadata(path: Path) -> tuple[Bag, list[str]]:
     """Read a metadata.yaml; returns it and the files that it names. Raises McaptrackError if it is invalid."""
-    text = _start(path)
+    text = read_beginning(path, plain_yaml.MAX_BYTES + 1)
     try:
         fields = Fields(plain_yaml.load(text), "it").map(ROOT)
         mode, compression = fields.text("compression_mode", ""), fields.text("compression_format", "")
@@ -92,8 +83,8 @@ def _topic(entry: Fields) -> tuple[str, str, str, str, str, int]:
     name, kind, encoding = topic.text("name"), topic.text("type"), topic.text("serialization_format", "cdr")
     qos = topic.any("offered_qos_profiles")
     # Text before ROS 2 Jazzy; since then nested YAML.
-    words = "" if qos is None else str(qos) if isinstance(qos, str) else plain_yaml.dump(qos)
-    return name, kind, encoding, words, topic.text("type_description_hash", ""), entry.whole("message_count")
+    profiles = "" if qos is None else str(qos) if isinstance(qos, str) else plain_yaml.dump(qos)
+    return name, kind, encoding, profiles, topic.text("type_description_hash", ""), entry.whole("message_count")
 
 
 def _name(entry: Any) -> str:
@@ -124,7 +115,7 @@ _HASH: Final = 7
 
 
 class _Content(NamedTuple):
-    """All topics of a file, and of those with ROS messages their messages and types, and which hold results.
+    """The topics of a file; for those with ROS messages also counts and types, and which of them hold results.
 
     The times are those of all messages.
     """
@@ -160,17 +151,17 @@ def _update(metadata: Path) -> bool:
     whole = plain_yaml.load(bag.text)
     before, info = plain_yaml.dump(whole), whole[ROOT]
     old = [(name, count) for name, *_, count in bag.topics]
-    there = _totals(files.values())
+    totals = _totals(files.values())
     kinds = {topic: kind for file in files.values() for topic, kind in file.kinds.items()}
     results = {topic for file in files.values() for topic in file.results}
     entries = [
-        entry | ({"message_count": _number(there[name])} if name in results else {})
+        entry | ({"message_count": _number(totals[name])} if name in results else {})
         for entry, (name, count) in zip(info["topics_with_message_count"] or [], old, strict=True)
         if not count or any(name in file.topics for file in files.values())
     ]
     version = info.get("version", "")
     version = int(version) if str(version).isdecimal() else 0
-    entries += [_entry(topic, kinds[topic], there[topic], version) for topic in sorted(there.keys() - dict(old))]
+    entries += [_entry(topic, kinds[topic], totals[topic], version) for topic in sorted(totals.keys() - dict(old))]
     info["topics_with_message_count"] = entries
     new = [(str(entry["topic_metadata"]["name"]), int(entry["message_count"])) for entry in entries]
     if "message_count" in info and str(info["message_count"]).isdecimal():
@@ -191,12 +182,12 @@ def _update(metadata: Path) -> bool:
 def _read(path: Path) -> _Content:
     with log.read(path, sidecar=False) as opened:
         # ROS tools refuse a recording that names other encodings.
-        known = [one for one in opened.recorded if one.message_encoding == CDR and one.messages]
+        recorded = [channel for channel in opened.recorded if channel.message_encoding == CDR and channel.messages]
         messages: Counts = {}
-        for channel in known:
+        for channel in recorded:
             messages[channel.topic] = messages.get(channel.topic, 0) + channel.messages
-        kinds = {channel.topic: opened.record_name(channel) for channel in known}
-        results = {channel.topic for channel in known if Provenance.from_metadata(channel.metadata)}
+        kinds = {channel.topic: opened.record_name(channel) for channel in recorded}
+        results = {channel.topic for channel in recorded if Provenance.from_metadata(channel.metadata)}
         topics = {channel.topic for channel in opened.recorded}
         return _Content(topics, messages, kinds, results, opened.start_ns, opened.end_ns)
 

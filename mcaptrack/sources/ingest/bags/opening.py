@@ -25,7 +25,6 @@ def open_recording(path: Path) -> RecordingReader | None:
     """
     if path.is_dir():
         return _open_folder(path)
-    refuse_special(path)
     head = read_beginning(path, 16)
     if head.startswith(_ROS1):
         return Bag1(path)

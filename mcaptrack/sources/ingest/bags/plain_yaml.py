@@ -115,14 +115,14 @@ def dump(value: Any) -> str:
 def _events(yaml: Any, value: Any) -> Iterator[Any]:
     if isinstance(value, list):
         yield yaml.SequenceStartEvent(None, None, True, flow_style=False)
-        for one in value:
-            yield from _events(yaml, one)
+        for item in value:
+            yield from _events(yaml, item)
         yield yaml.SequenceEndEvent()
     elif isinstance(value, dict):
         yield yaml.MappingStartEvent(None, None, True, flow_style=False)
-        for key, one in value.items():
+        for key, item in value.items():
             yield from _events(yaml, key)
-            yield from _events(yaml, one)
+            yield from _events(yaml, item)
         yield yaml.MappingEndEvent()
     else:
         value = value if isinstance(value, Scalar) else Scalar.of(value, is_plain=True)

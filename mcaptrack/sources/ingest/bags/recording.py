@@ -50,7 +50,7 @@ class RecordingReader(Protocol):
     def as_log(self) -> log.Log | None:
         """The recording as a log, if it is a single MCAP file; else None."""
 
-    def messages(self, found: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
+    def messages(self, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
         """All messages in the order of the recording; every call starts from the beginning."""
 
     def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:

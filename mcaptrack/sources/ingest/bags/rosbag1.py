@@ -72,23 +72,23 @@ class Bag1:
     def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:
         """A bag holds nothing but messages."""
 
-    def messages(self, found: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
-        """All messages in the order of the bag. Parts that can't be read are reported in ``found``."""
+    def messages(self, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
+        """All messages in the order of the bag. Parts that can't be read are reported in ``report``."""
         at, sequence = self._start, dict[int, int]()
         if self._why_unindexed:  # without an index there is no way to tell whether messages are missing
-            words = found.lost if self._index_at else found.notes
-            words.append(f"{self.path} {self._why_unindexed}; what is complete in it is read")
+            lines = report.lost if self._index_at else report.notes
+            lines.append(f"{self.path} {self._why_unindexed}; what is complete in it is read")
         while at < self._end:
             try:
                 record = self._record(at, self._end)
             except _InvalidRecord as error:
-                found.lost.append(f"{self.path}: byte {at} and what follows: {error}")
+                report.lost.append(f"{self.path}: byte {at} and what follows: {error}")
                 return
-            parts = self._chunk(record, found) if record.op == _CHUNK else self._unchunked(record, found)
+            parts = self._chunk(record, report) if record.op == _CHUNK else self._unchunked(record, report)
             for number, t_ns, payload in parts:
                 connection = self._known.get(number)
                 if connection is None:
-                    found.lost.append(f"{self.path}: a message of connection {number}, which is not described")
+                    report.lost.append(f"{self.path}: a message of connection {number}, which is not described")
                     continue
                 count = sequence.get(number, 0)
                 sequence[number] = count + 1
@@ -171,22 +171,22 @@ class Bag1:
 
     def _describe(self, fields: Fields, data: bytes) -> None:
         number, described = self._number(fields, b"conn"), _connection(fields, _fields(data))
-        known = self._known.setdefault(number, described)
-        if (known.topic, known.schema) != (described.topic, described.schema):
+        before = self._known.setdefault(number, described)
+        if (before.topic, before.schema) != (described.topic, described.schema):
             raise _InvalidRecord(
-                f"connection {number} is of {known.topic}, and of {described.topic} or of other words here"
+                f"connection {number} is of {before.topic}, and of {described.topic} or of other words here"
             )
 
-    def _unchunked(self, record: _Record, found: ReadingNotes) -> Iterator[tuple[int, int, bytes]]:
+    def _unchunked(self, record: _Record, report: ReadingNotes) -> Iterator[tuple[int, int, bytes]]:
         """A record outside of chunks: messages of a chunk that was never finished."""
         if record.op in (_MESSAGE, _CONNECTION):
             try:
                 whole = self._at(record.data, record.end)
                 yield from self._take(record.op, record.fields, whole)
             except _InvalidRecord as error:
-                found.lost.append(f"{self.path}: byte {record.data}: {error}")
+                report.lost.append(f"{self.path}: byte {record.data}: {error}")
 
-    def _chunk(self, record: _Record, found: ReadingNotes) -> Iterator[tuple[int, int, bytes]]:
+    def _chunk(self, record: _Record, report: ReadingNotes) -> Iterator[tuple[int, int, bytes]]:
         """The messages of a chunk, or of its complete part."""
         where = f"{self.path}: the chunk at byte {record.data}"
         try:
@@ -194,7 +194,7 @@ class Bag1:
             data = self._at(record.data, min(record.end, self._end))
             content = _decompress(data, record.fields.get(b"compression", b"none"), size)
         except _InvalidRecord as error:
-            found.lost.append(f"{where}: {error}")
+            report.lost.append(f"{where}: {error}")
             return
         at = 0
         try:
@@ -206,7 +206,7 @@ class Bag1:
                 raise _InvalidRecord("its records end there")
         except _InvalidRecord as error:
             cut = "which is cut off, " if record.end > self._end else ""
-            found.lost.append(f"{where}, {cut}from its byte {at} of {size} on: {error}")
+            report.lost.append(f"{where}, {cut}from its byte {at} of {size} on: {error}")
 
     def _take(self, op: int, fields: Fields, data: bytes) -> Iterator[tuple[int, int, bytes]]:
         if op == _CONNECTION:

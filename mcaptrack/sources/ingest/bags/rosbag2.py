@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import follow_links, refuse_special, temporary_folder
+from mcaptrack.files import follow_links, read_beginning, temporary_folder
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.ingest.bags import decompression
@@ -48,8 +48,8 @@ def open_bag(folder: Path) -> RecordingReader:
         )
     places: dict[tuple[int, int], Path] = {}
     for path in paths:
-        found = path.stat()
-        other = places.setdefault((found.st_dev, found.st_ino), path)
+        status = path.stat()
+        other = places.setdefault((status.st_dev, status.st_ino), path)
         if other is not path:
             raise McaptrackError(f"{folder / METADATA} names {other.name} and {path.name}, which are one file")
     source = open_files(paths, folder, bag) if paths else _Files([], folder, bag)
@@ -73,15 +73,15 @@ def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> Re
         bag = _own_metadata(paths)
     with ExitStack() as opened:
         parts = [_decompressed_file(path, opened) for path in paths]
-        heads = [_first_bytes(path) for path in parts]
+        heads = [read_beginning(path, 16) for path in parts]
         source: _Files
         if all(head.startswith(_SQLITE_MAGIC) for head in heads):
             source = Databases(parts, whole, bag)
         elif all(head.startswith(_MCAP_MAGIC) for head in heads):
             source = Logs(parts, whole, bag)
         else:
-            known = (_MCAP_MAGIC, _SQLITE_MAGIC)
-            wrong = [path for path, head in zip(paths, heads, strict=True) if not head.startswith(known)]
+            magics = (_MCAP_MAGIC, _SQLITE_MAGIC)
+            wrong = [path for path, head in zip(paths, heads, strict=True) if not head.startswith(magics)]
             if not wrong:
                 raise McaptrackError(f"{whole} holds both MCAP files and databases; one bag is made of either")
             raise McaptrackError(f"{wrong[0]} is neither an MCAP file nor a rosbag2 database; it may be damaged")
@@ -89,18 +89,9 @@ def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> Re
         return source
 
 
-def _first_bytes(path: Path) -> bytes:
-    refuse_special(path)
-    try:
-        with path.open("rb") as stream:
-            return stream.read(16)
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
-
-
 def _decompressed_file(path: Path, opened: ExitStack) -> Path:
     """The file, or its decompressed copy if it is compressed as a whole."""
-    if not _first_bytes(path).startswith(_ZSTD_MAGIC):
+    if not read_beginning(path, 16).startswith(_ZSTD_MAGIC):
         return path
     out = Path(opened.enter_context(temporary_folder())) / path.name.removesuffix(".zstd")
     decompression.unzstd_file(path, out)
@@ -147,11 +138,11 @@ class _Files:
         """Close the files."""
         self.closing.close()
 
-    def messages(self, found: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
+    def messages(self, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
         """All messages, file by file, in their order there."""
         self._message_counts = {}
         for number in range(len(self.paths)):
-            yield from self._messages(number, found)
+            yield from self._messages(number, report)
 
     def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:
         """Write metadata.yaml, which a copied MCAP file doesn't contain."""
@@ -161,17 +152,17 @@ class _Files:
     def _open(self, number: int) -> None:
         raise NotImplementedError
 
-    def _messages(self, number: int, found: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
+    def _messages(self, number: int, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
         yield from ()
 
-    def _connection(self, repeats: dict[object, int], known: Connection, messages: int) -> Connection:
+    def _connection(self, repeats: dict[object, int], described: Connection, messages: int) -> Connection:
         """The connection that a part of the recording describes: the parts have the same ones.
 
         ``repeats`` counts, in one part, those that are described in the same words.
         """
-        words = (known.topic, known.schema, known.encoding, *sorted(known.metadata.items()))
-        repeats[words] = repeats.get(words, 0) + 1
-        connection = self._known_connections.setdefault((*words, repeats[words]), known)
+        key = (described.topic, described.schema, described.encoding, *sorted(described.metadata.items()))
+        repeats[key] = repeats.get(key, 0) + 1
+        connection = self._known_connections.setdefault((*key, repeats[key]), described)
         self.declared_counts[connection] = self.declared_counts.get(connection, 0) + messages
         return connection
 
@@ -225,8 +216,8 @@ class Databases(_Files):
         self._undefined: dict[str, str] = {}
         super().__init__(paths, whole, bag)
         for kind, where in sorted(self._undefined.items()):
-            words = f"its definition is that of {where}" if where else "its definition is not known: it has no schema"
-            self.findings.notes.append(f"{whole} does not say what {kind} is; {words}")
+            text = f"its definition is that of {where}" if where else "its definition is not known: it has no schema"
+            self.findings.notes.append(f"{whole} does not say what {kind} is; {text}")
 
     def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:
         """Write metadata.yaml and the metadata in the databases, as rosbag2 writes them to MCAP files."""
@@ -249,12 +240,12 @@ class Databases(_Files):
         has = database.columns("topics")
         optional = [name for name in ("offered_qos_profiles", "type_description_hash") if name in has]
         described: dict[int, Connection] = {}
-        for key, *words in database.rows("topics", ["id", "name", "type", "serialization_format", *optional]):
-            topic, kind, encoding, *more = map(_text, words)
-            given = dict(zip(optional, more, strict=True))
-            digest = given.get("type_description_hash", "")
+        for key, *values in database.rows("topics", ["id", "name", "type", "serialization_format", *optional]):
+            topic, kind, encoding, *more = map(_text, values)
+            extra = dict(zip(optional, more, strict=True))
+            digest = extra.get("type_description_hash", "")
             schema, defined_digest = definitions.get(kind) or (self._schema(kind, digest), "")
-            qos = given.get("offered_qos_profiles", "")
+            qos = extra.get("offered_qos_profiles", "")
             metadata = {"offered_qos_profiles": qos, "topic_type_hash": digest or defined_digest}
             described[key] = Connection(topic, schema, encoding, metadata)
         counts = self._count(database, described)
@@ -272,10 +263,10 @@ class Databases(_Files):
                 counts[key] += 1
             else:
                 strange[key if key in strange or len(strange) < _MAX_STRANGE else "other numbers"] += 1
-        total, there = database.count("messages"), counts.total() + strange.total()
-        if total != there:
+        total, counted = database.count("messages"), counts.total() + strange.total()
+        if total != counted:
             raise McaptrackError(
-                f"{database.path} does not add up: its index counts {total} messages, and {there} are there"
+                f"{database.path} does not add up: its index counts {total} messages, and {counted} are there"
             )
         self.findings.lost += [
             f"{database.path}: {count} messages of topic {_text(key)[:80]}, which is not described"
@@ -294,8 +285,8 @@ class Databases(_Files):
         wanted += ["type_description_hash"] * ("type_description_hash" in has)
         rows = [[*map(_text, row), ""] for row in database.rows("message_definitions", wanted)]
         return {
-            kind: ((kind, encoding, text.encode()), given)
-            for kind, encoding, text, given, *_ in rows
+            kind: ((kind, encoding, text.encode()), type_hash)
+            for kind, encoding, text, type_hash, *_ in rows
             if encoding in ("ros2msg", "ros2idl") and (text or kind.endswith("/Empty"))
         }
 
@@ -304,11 +295,11 @@ class Databases(_Files):
         text, self._undefined[kind] = known_definition(kind, self._distro.lower(), digest)
         return (kind, "ros2msg", text.encode()) if self._undefined[kind] else (kind, "", b"")
 
-    def _messages(self, number: int, found: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
-        known, path = self._topics[number], self.paths[number]
+    def _messages(self, number: int, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
+        connections, path = self._topics[number], self.paths[number]
         left = decompression.limit_of(path.stat().st_size)
         for key, t_ns, data in self._databases[number].rows("messages", ["topic_id", "timestamp", "data"]):
-            connection = known.get(key)
+            connection = connections.get(key)
             if connection is None:
                 continue
             if not isinstance(t_ns, int) or not isinstance(data, bytes):
@@ -346,25 +337,25 @@ class Logs(_Files):
         if log.results_path(path).exists():
             warn(f"{log.results_path(path)} holds results of {path.name}; they are left out", "left-out")
         self.logs.append(opened)
-        known: dict[int, Connection] = {}
+        connections: dict[int, Connection] = {}
         repeats: dict[object, int] = {}
         for channel in opened.index.channels.values():
-            found = opened.index.schemas.get(channel.schema_id)
-            schema = (found.name, found.encoding, found.data) if found else ("", "", b"")
+            record = opened.index.schemas.get(channel.schema_id)
+            schema = (record.name, record.encoding, record.data) if record else ("", "", b"")
             described = Connection(channel.topic, schema, channel.message_encoding, channel.metadata)
-            known[channel.id] = self._connection(repeats, described, opened.index.counts.get(channel.id, 0))
-        self._channels.append(known)
+            connections[channel.id] = self._connection(repeats, described, opened.index.counts.get(channel.id, 0))
+        self._channels.append(connections)
 
-    def _messages(self, number: int, found: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
-        known, path = self._channels[number], self.paths[number]
+    def _messages(self, number: int, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
+        connections, path = self._channels[number], self.paths[number]
         left = decompression.limit_of(path.stat().st_size)
         for channel, message in log.stream(self.logs[number]):
             if self.bag.packed:
                 payload = _unpack_message(message.payload, path, message.t_ns, left)
                 left -= len(payload)
-                yield known[channel], message._replace(payload=payload)
+                yield connections[channel], message._replace(payload=payload)
             else:
-                yield known[channel], message
+                yield connections[channel], message
 
 
 def _text(value: Any) -> str:

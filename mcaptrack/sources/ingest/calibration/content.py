@@ -11,8 +11,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NoReturn
-from xml.parsers import expat
+from typing import Any, Final
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import read_beginning, refuse_special
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.sources.ingest.bags.plain_yaml import Scalar, UnsupportedYamlError, load
+from mcaptrack.sources.ingest.xml_reader import XmlReader
 
 #: Names of values in files of OpenCV, in small letters and without "_", "-" and blanks.
 _MATRIX: Final = ("cameramatrix", "intrinsicmatrix", "intrinsics", "intrinsic", "mtx", "k", "m1")
@@ -45,7 +45,7 @@ _READ: Final = "plumb_bob (radtan), rational_polynomial and equidistant (kannala
 #: Numbers of coefficients that the models have in messages.
 _COUNTS: Final = {POLYNOMIAL: 5, RATIONAL: 8, EQUIDISTANT: 4}
 _MOST_PX: Final = 1e5
-#: A rotation is one if R R^T is the identity but for so much.
+#: R is a rotation if R R^T differs from the identity by less than this.
 _ORTHONORMAL: Final = 1e-3
 _NAMED: Final = 12
 
@@ -86,7 +86,7 @@ _ROOT: Final = "opencv_storage"
 _MAX_BYTES: Final = 2**20
 _MAX_DEPTH: Final = 16
 _MAX_NODES: Final = 20_000
-#: OpenCV's tags; what they hold says what it is, too.
+#: OpenCV's tags, which are ignored: their content says as much.
 _TAGS: Final = tuple(f"tag:yaml.org,2002:opencv-{kind}" for kind in ("matrix", "nd-matrix"))
 #: The first line of OpenCV's YAML, which YAML itself doesn't allow, and the line that ends a document.
 _HEAD: Final = re.compile(rb"\A(\xef\xbb\xbf)?%YAML[: ]1\.[0-9][^\n]*\n")
@@ -112,7 +112,6 @@ def read_tree(path: Path) -> dict[str, Any]:
 
     Raises McaptrackError if it is none, or too large.
     """
-    refuse_special(path)
     data = read_beginning(path, _MAX_BYTES + 1)
     if len(data) > _MAX_BYTES:
         raise McaptrackError(f"{path} has more than {_MAX_BYTES} bytes; a calibration is a small file")
@@ -132,92 +131,80 @@ def read_tree(path: Path) -> dict[str, Any]:
     return tree
 
 
-class _Xml:
+class _Xml(XmlReader):
     """Reads OpenCV's XML: elements with elements become maps (or lists, if they are named ``_``), others text."""
 
+    writer = "OpenCV"
+
     def __init__(self, path: Path) -> None:
-        self._path, self._nodes = path, 0
+        super().__init__(path)
+        self._nodes = 0
         self._open: list[tuple[str, list[tuple[str, Any]], list[str]]] = [("", [], [])]
-        self._reader = expat.ParserCreate()
-        self._reader.buffer_text = True
-        self._reader.StartDoctypeDeclHandler = self._refuse_doctype
-        self._reader.StartElementHandler = self._start
-        self._reader.EndElementHandler = self._end
-        self._reader.CharacterDataHandler = self._text
 
     def read(self, data: bytes) -> dict[str, Any]:
-        try:
-            self._reader.Parse(data, True)
-        except expat.ExpatError as error:
-            why = expat.ErrorString(error.code)
-            raise McaptrackError(f"{self._path}:{error.lineno}: not valid XML: {why}") from None
+        self.parse([data])
         ((name, tree),) = self._open[0][1]
         if name != _ROOT:
-            raise McaptrackError(f"{self._path} is XML of <{name:.40}>; calibrations of OpenCV are of <{_ROOT}>")
+            raise McaptrackError(f"{self.path} is XML of <{name:.40}>; calibrations of OpenCV are of <{_ROOT}>")
         return tree if isinstance(tree, dict) else {}
 
-    def _fail(self, words: str) -> NoReturn:
-        raise McaptrackError(f"{self._path}:{self._reader.CurrentLineNumber}: {words}")
-
-    def _refuse_doctype(self, *_: object) -> NoReturn:
-        self._fail("a document type, which OpenCV doesn't write; it may hold entities, and isn't read")
-
-    def _start(self, name: str, _: dict[str, str]) -> None:
+    def start(self, name: str, attributes: dict[str, str]) -> None:
         self._nodes += 1
         if self._nodes > _MAX_NODES or len(self._open) > _MAX_DEPTH:
-            self._fail(f"it has more than {_MAX_NODES} elements, or is nested more than {_MAX_DEPTH} deep")
+            self.fail(f"it has more than {_MAX_NODES} elements, or is nested more than {_MAX_DEPTH} deep")
         self._open.append((name, [], []))
 
-    def _text(self, text: str) -> None:
+    def text(self, text: str) -> None:
         self._open[-1][2].append(text)
 
-    def _end(self, name: str) -> None:
+    def end(self, name: str) -> None:
         _, inner, text = self._open.pop()
         value: Any = Scalar.of("".join(text).strip().strip('"'), is_plain=True)
         if inner and all(key == "_" for key, _ in inner):
-            value = [one for _, one in inner]
+            value = [item for _, item in inner]
         elif inner:
             value = dict(inner)
             if len(value) != len(inner):
                 twice = next(key for number, (key, _) in enumerate(inner) if key in dict(inner[:number]))
-                self._fail(f"<{twice:.40}> is there twice")
+                self.fail(f"<{twice:.40}> is there twice")
         self._open[-1][1].append((name, value))
 
 
 def read_cameras(path: Path) -> list[CameraFile]:
     """Return the cameras of a file. Raises McaptrackError, with what is wrong, if it holds no calibration."""
     tree = read_tree(path)
-    chain = {name: one for name, one in tree.items() if re.fullmatch(r"cam\d+", name) and isinstance(one, dict)}
+    chain = {name: cam for name, cam in tree.items() if re.fullmatch(r"cam\d+", name) and isinstance(cam, dict)}
     if chain:
-        return [_of_kalibr(path, name, one) for name, one in chain.items()]
-    known = {_plain(name): value for name, value in tree.items()}
-    if "camerainfo" in known and isinstance(known["camerainfo"], dict):
-        known = {_plain(name): value for name, value in known["camerainfo"].items()}
-    if "distortionmodel" in known and ({"cameramatrix", "k"} & known.keys()):
-        return [_of_ros(path, known)]
-    return [_of_opencv(path, known, tree)]
+        return [_of_kalibr(path, name, cam) for name, cam in chain.items()]
+    by_plain_name = {_plain(name): value for name, value in tree.items()}
+    if "camerainfo" in by_plain_name and isinstance(by_plain_name["camerainfo"], dict):
+        by_plain_name = {_plain(name): value for name, value in by_plain_name["camerainfo"].items()}
+    if "distortionmodel" in by_plain_name and ({"cameramatrix", "k"} & by_plain_name.keys()):
+        return [_of_ros(path, by_plain_name)]
+    return [_of_opencv(path, by_plain_name, tree)]
 
 
-def _of_ros(path: Path, known: Mapping[str, Any]) -> CameraFile:
-    width = known.get("imagewidth", known.get("width"))
-    height = known.get("imageheight", known.get("height"))
-    bent = known.get("distortioncoefficients", known.get("d", []))
-    model, coefficients = _distortion(path, str(known["distortionmodel"]), _numbers(path, "distortion", bent))
-    rectified = known.get("rectificationmatrix", known.get("r"))
-    projection = known.get("projectionmatrix", known.get("p"))
-    is_binned = any(_is_set(known.get(name)) and known[name] != "1" for name in ("binningx", "binningy"))
-    if is_binned or _is_cropped(known.get("roi")):
+def _of_ros(path: Path, fields: Mapping[str, Any]) -> CameraFile:
+    width = fields.get("imagewidth", fields.get("width"))
+    height = fields.get("imageheight", fields.get("height"))
+    bent = fields.get("distortioncoefficients", fields.get("d", []))
+    model, coefficients = _distortion(path, str(fields["distortionmodel"]), _numbers(path, "distortion", bent))
+    rectified = fields.get("rectificationmatrix", fields.get("r"))
+    projection = fields.get("projectionmatrix", fields.get("p"))
+    is_binned = any(_is_set(fields.get(name)) and fields[name] != "1" for name in ("binningx", "binningy"))
+    if is_binned or _is_cropped(fields.get("roi")):
         raise McaptrackError(
             f"{path} is for pictures that are binned or a region of others; give that of whole pictures"
         )
-    name = known.get("cameraname", "")
-    header = known.get("header")
+    matrix = fields.get("cameramatrix", fields.get("k"))
+    name = fields.get("cameraname", "")
+    header = fields.get("header")
     name = (
         name if isinstance(name, str) and name else str(header.get("frame_id", "")) if isinstance(header, dict) else ""
     )
     return CameraFile(
         path, name,
-        matrix=_camera_matrix(path, _matrix(path, "camera_matrix", known.get("cameramatrix", known.get("k")), (3, 3))),
+        matrix=_camera_matrix(path, _matrix(path, "camera_matrix", matrix, (3, 3))),
         bent=coefficients,
         model=model,
         size=_size(path, width, height),
@@ -226,22 +213,22 @@ def _of_ros(path: Path, known: Mapping[str, Any]) -> CameraFile:
     )  # fmt: skip
 
 
-def _of_kalibr(path: Path, name: str, one: Mapping[str, Any]) -> CameraFile:
+def _of_kalibr(path: Path, name: str, fields: Mapping[str, Any]) -> CameraFile:
     where = f"{path}: {name}"
-    kind = str(one.get("camera_model", ""))
+    kind = str(fields.get("camera_model", ""))
     if kind != "pinhole":
         raise McaptrackError(f"{where} is of the camera model {kind or 'unknown'!r:.40}; pinhole is read")
-    inner = _numbers(where, "intrinsics", one.get("intrinsics"))
+    inner = _numbers(where, "intrinsics", fields.get("intrinsics"))
     if len(inner) != 4:
         raise McaptrackError(f"{where} has {len(inner)} intrinsics; a pinhole camera has 4: fu, fv, pu, pv")
     fu, fv, pu, pv = inner
-    bent = _numbers(where, "distortion_coeffs", one.get("distortion_coeffs", []))
-    model, coefficients = _distortion(where, str(one.get("distortion_model", "")), bent)
-    sizes = one.get("resolution")
+    bent = _numbers(where, "distortion_coeffs", fields.get("distortion_coeffs", []))
+    model, coefficients = _distortion(where, str(fields.get("distortion_model", "")), bent)
+    sizes = fields.get("resolution")
     width, height = sizes if isinstance(sizes, list) and len(sizes) == 2 else (None, None)
-    poses = [key for key in ("T_cam_imu", "T_cn_cnm1") if key in one]
+    poses = [key for key in ("T_cam_imu", "T_cn_cnm1") if key in fields]
     for key in poses:
-        _rigid(where, key, _matrix(where, key, one[key], (4, 4)))
+        _rigid(where, key, _matrix(where, key, fields[key], (4, 4)))
     relative = {"T_cam_imu": "the IMU", "T_cn_cnm1": "the camera before it"}
     return CameraFile(
         path, name,
@@ -250,25 +237,25 @@ def _of_kalibr(path: Path, name: str, one: Mapping[str, Any]) -> CameraFile:
         model=model,
         size=_size(where, width, height),
         relative=" and ".join(f"{relative[key]} ({key})" for key in poses),
-        topic=str(one.get("rostopic", "")),
+        topic=str(fields.get("rostopic", "")),
     )  # fmt: skip
 
 
-def _of_opencv(path: Path, known: Mapping[str, Any], tree: Mapping[str, Any]) -> CameraFile:
-    matrix, bent = _first(known, _MATRIX), _first(known, _BENT)
+def _of_opencv(path: Path, fields: Mapping[str, Any], tree: Mapping[str, Any]) -> CameraFile:
+    matrix, bent = _first(fields, _MATRIX), _first(fields, _BENT)
     names = ", ".join(list(tree)[:_NAMED]) + (" ..." if len(tree) > _NAMED else "") or "nothing"
-    if (second := _first(known, _SECOND)) is not None and matrix is not None:
+    if (second := _first(fields, _SECOND)) is not None and matrix is not None:
         raise McaptrackError(f"{path} holds two cameras ({names}), of which {second[0]} is one; save each to a file")
     model, coefficients = POLYNOMIAL, tuple[float, ...]()
     if bent is not None:
-        is_fisheye = any(_is_set(known.get(name)) for name in _FISHEYE)
-        named = str(known.get("distortionmodel", "")) or ("equidistant" if is_fisheye else "")
+        is_fisheye = any(_is_set(fields.get(name)) for name in _FISHEYE)
+        named = str(fields.get("distortionmodel", "")) or ("equidistant" if is_fisheye else "")
         model, coefficients = _distortion(path, named, _numbers(path, bent[0], bent[1]), is_open=not named)
-    size = known.get("imagesize")
+    size = fields.get("imagesize")
     width, height = size if isinstance(size, list) and len(size) == 2 else _words(size)
-    width = known.get("imagewidth", known.get("width", width))
-    height = known.get("imageheight", known.get("height", height))
-    rotation, translation = _pose(path, known)
+    width = fields.get("imagewidth", fields.get("width", width))
+    height = fields.get("imageheight", fields.get("height", height))
+    rotation, translation = _pose(path, fields)
     if matrix is None and rotation is None:
         raise McaptrackError(
             f"{path} holds {names}; a calibration has a camera matrix (camera_matrix), a pose (rvec and tvec, or R and "
@@ -285,9 +272,9 @@ def _of_opencv(path: Path, known: Mapping[str, Any], tree: Mapping[str, Any]) ->
     )
 
 
-def _pose(path: Path, known: Mapping[str, Any]) -> tuple[Floats | None, Floats | None]:
+def _pose(path: Path, fields: Mapping[str, Any]) -> tuple[Floats | None, Floats | None]:
     """The rotation and the translation of a file of OpenCV; None if it has neither."""
-    rvec, tvec, turn, both = (_first(known, names) for names in (_RVEC, _TVEC, _ROTATION, _POSE))
+    rvec, tvec, turn, both = (_first(fields, names) for names in (_RVEC, _TVEC, _ROTATION, _POSE))
     if rvec is None and turn is None and both is not None:
         name, value = both
         numbers = _numbers(path, name, value)
@@ -299,15 +286,15 @@ def _pose(path: Path, known: Mapping[str, Any]) -> tuple[Floats | None, Floats |
     if rvec is None and turn is None and tvec is None:
         return None, None
     if tvec is None or (rvec is None and turn is None):
-        there, lacks = ("a rotation", "translation (tvec)") if tvec is None else ("a translation", "rotation (rvec)")
-        raise McaptrackError(f"{path} has {there} and no {lacks}; a pose is both")
+        has, lacks = ("a rotation", "translation (tvec)") if tvec is None else ("a translation", "rotation (rvec)")
+        raise McaptrackError(f"{path} has {has} and no {lacks}; a pose is both")
     translation = np.array(_numbers(path, *tvec))
-    given = rvec or turn
-    assert given is not None
-    numbers = _numbers(path, *given)
+    stated = rvec or turn
+    assert stated is not None
+    numbers = _numbers(path, *stated)
     if len(translation) != 3 or len(numbers) not in (3, 9):
         raise McaptrackError(
-            f"{path}: {given[0]} has {len(numbers)} numbers and {tvec[0]} {len(translation)}; the pose of a camera is "
+            f"{path}: {stated[0]} has {len(numbers)} numbers and {tvec[0]} {len(translation)}; the pose of a camera is "
             "3 (or a matrix of 9) and 3. Poses of pictures of a board aren't that of the camera in the world"
         )
     if len(numbers) == 3:
@@ -315,7 +302,7 @@ def _pose(path: Path, known: Mapping[str, Any]) -> tuple[Floats | None, Floats |
 
         return np.asarray(cv2.Rodrigues(np.array(numbers))[0], np.float64), translation
     rotation = np.reshape(numbers, (3, 3))
-    _rigid(path, given[0], np.vstack([np.column_stack([rotation, translation]), [0, 0, 0, 1.0]]))
+    _rigid(path, stated[0], np.vstack([np.column_stack([rotation, translation]), [0, 0, 0, 1.0]]))
     return rotation, translation
 
 
@@ -392,8 +379,8 @@ def _numbers(where: object, name: str, value: Any) -> list[float]:
     if not np.isfinite(numbers).all():
         raise McaptrackError(f"{where}: {name} holds something else than finite numbers")
     counts = [value.get(key) for key in ("rows", "cols")] if is_matrix else []
-    if all(isinstance(one, str) and one.isascii() and one.isdigit() for one in counts) and counts:
-        rows, columns = (int(one[:9]) for one in counts)
+    if all(isinstance(count, str) and count.isascii() and count.isdigit() for count in counts) and counts:
+        rows, columns = (int(count[:9]) for count in counts)
         if rows * columns != len(numbers):
             raise McaptrackError(f"{where}: {name} has {len(numbers)} numbers, and says that it is {rows} x {columns}")
     return numbers
@@ -403,8 +390,8 @@ def _flat(data: Any) -> Iterable[str]:
     if isinstance(data, str):
         yield from data.replace(",", " ").split()
     elif isinstance(data, list):
-        for one in data:
-            yield from _flat(one)
+        for item in data:
+            yield from _flat(item)
     else:
         raise ValueError("no numbers")
 
@@ -418,9 +405,9 @@ def _plain(name: str) -> str:
     return re.sub(r"[_\-\s]", "", name).lower()
 
 
-def _first(known: Mapping[str, Any], names: Iterable[str]) -> tuple[str, Any] | None:
+def _first(fields: Mapping[str, Any], names: Iterable[str]) -> tuple[str, Any] | None:
     """The first of these names that is known, and its value."""
-    return next(((name, known[name]) for name in names if name in known), None)
+    return next(((name, fields[name]) for name in names if name in fields), None)
 
 
 def _is_set(value: Any) -> bool:

@@ -22,7 +22,7 @@ from mcaptrack.sources.ingest.calibration.content import CameraFile, read_camera
 _METRES: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 #: Heights of a camera, as numbers, that are taken for metres (up to), centimetres and millimetres (between).
 _IN_M, _IN_CM, _IN_MM = 30.0, (30.0, 1500.0), (3000.0, 30_000.0)
-#: Pictures of another size have been resized if their shape is the same but for so much.
+#: Pictures were resized, not cropped, if their ratio of width to height differs by less than this share.
 _SHAPE: Final = 0.02
 #: A centre that is farther from the middle than this share of the picture's size is named.
 _OFF_CENTRE: Final = 0.2
@@ -87,7 +87,7 @@ class GivenCalibration:
     @property
     def has_pose(self) -> bool:
         """Whether a ground plane follows from it."""
-        return any(one.rotation is not None for cameras in self.files for one in cameras)
+        return any(camera.rotation is not None for cameras in self.files for camera in cameras)
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -110,18 +110,22 @@ class GivenCalibration:
         of boxes; ``frame_id`` is that of their messages; ``is_rectified``: they have no distortion any more. Raises
         McaptrackError if the calibration is not of such pictures.
         """
-        one = self._joined([self._of_camera(cameras, prefix, pictures) for cameras in self.files])
-        if not is_stated and one.size is None and min(size) > 0:
+        camera = self._joined([self._of_camera(cameras, prefix, pictures) for cameras in self.files])
+        if not is_stated and camera.size is None and min(size) > 0:
             taken = f"{size[0]} x {size[1]} is taken, the extent of boxes; `size='WIDTHxHEIGHT'` sets it"
-            warn(f"{one.path} doesn't say the size of its pictures: {taken}")
-        whole, remarks = _fitted(one, size if is_stated or one.size is None else one.size)
+            warn(f"{camera.path} doesn't say the size of its pictures: {taken}")
+        whole, remarks = _fitted(camera, size if is_stated or camera.size is None else camera.size)
         message = _message(whole, frame_id)
         read = calibration_of(message, is_rectified)
         names = ", ".join(path.name for path in self.paths)
         parameters: dict[str, Any] = {"files": [path.name for path in self.paths]}
-        parameters |= {"name": one.name} if one.name else {}
-        if one.rotation is None or one.translation is None:
-            why = f"the pose in it is relative to {one.relative}" if one.relative else "it has no pose of the camera"
+        parameters |= {"name": camera.name} if camera.name else {}
+        if camera.rotation is None or camera.translation is None:
+            why = (
+                f"the pose in it is relative to {camera.relative}"
+                if camera.relative
+                else "it has no pose of the camera"
+            )
             warn(
                 f"{names}: {why}, so that no ground plane follows; the calibration is kept. Give a pose in the world "
                 "(rvec and tvec) with another `calibration=`, or a homography with `ground_plane=`",
@@ -130,12 +134,12 @@ class GivenCalibration:
             if self.unit != "auto":
                 warn(f"`calibration_unit={self.unit!r}` changes nothing here: {why}", "option-not-used")
             return Calibrated(message, None, (*remarks, f"{names}: {_in_words(whole)}"), parameters)
-        unit = _unit(one.rotation, one.translation, self.unit, names)
-        rotation, translation = read.turn @ one.rotation, read.turn @ one.translation * _METRES[unit]
+        unit = _unit(camera.rotation, camera.translation, self.unit, names)
+        rotation, translation = read.turn @ camera.rotation, read.turn @ camera.translation * _METRES[unit]
         plane = _plane(read.lens, rotation, translation, whole.size, point, names)
         height_m = float(-(rotation.T @ translation)[2])
-        words = f"{names}: {_in_words(whole)}; the camera is {abs(height_m):.2f} m from the ground (lengths in {unit})"
-        return Calibrated(message, plane, (*remarks, words), parameters | {"unit": unit})
+        text = f"{names}: {_in_words(whole)}; the camera is {abs(height_m):.2f} m from the ground (lengths in {unit})"
+        return Calibrated(message, plane, (*remarks, text), parameters | {"unit": unit})
 
     def _of_camera(self, cameras: Sequence[CameraFile], prefix: str, pictures: str) -> CameraFile:
         """The camera of a file that belongs to a camera of the log."""
@@ -144,13 +148,13 @@ class GivenCalibration:
         if self.name is not None:
             return self._named(cameras, self.name)
         camera = prefix.strip("/")
-        for found in (
-            [one for one in cameras if one.topic and one.topic == pictures],
-            [one for one in cameras if one.name == camera],
-            [one for one in cameras if one.topic.strip("/").rpartition("/")[0] == camera],
+        for matching in (
+            [file for file in cameras if file.topic and file.topic == pictures],
+            [file for file in cameras if file.name == camera],
+            [file for file in cameras if file.topic.strip("/").rpartition("/")[0] == camera],
         ):
-            if len(found) == 1:
-                return found[0]
+            if len(matching) == 1:
+                return matching[0]
         raise McaptrackError(
             f"{cameras[0].path} has {_listed(cameras)}, and none is of {prefix.strip('/')}; choose one with "
             f"`calibration_name={cameras[0].name!r}`"
@@ -158,18 +162,18 @@ class GivenCalibration:
 
     @staticmethod
     def _named(cameras: Sequence[CameraFile], name: str) -> CameraFile:
-        found = [one for one in cameras if name in (one.name, one.topic)]
-        if not found:
+        matching = [camera for camera in cameras if name in (camera.name, camera.topic)]
+        if not matching:
             raise McaptrackError(f"{cameras[0].path} has no camera {name!r:.40}; it has {_listed(cameras)}")
-        return found[0]
+        return matching[0]
 
     def _joined(self, parts: Sequence[CameraFile]) -> CameraFile:
         """One camera from the parts that are in several files."""
-        inner = [one for one in parts if one.matrix is not None]
-        posed = [one for one in parts if one.rotation is not None]
-        for what, found in (("camera matrices", inner), ("poses", posed)):
-            if len(found) > 1:
-                names = " and ".join(str(one.path) for one in found)
+        inner = [part for part in parts if part.matrix is not None]
+        posed = [part for part in parts if part.rotation is not None]
+        for what, several in (("camera matrices", inner), ("poses", posed)):
+            if len(several) > 1:
+                names = " and ".join(str(part.path) for part in several)
                 raise McaptrackError(f"{names} both hold {what}; give the files of one camera")
         if not inner:
             raise McaptrackError(
@@ -182,28 +186,30 @@ class GivenCalibration:
 
 
 def _listed(cameras: Sequence[CameraFile]) -> str:
-    return ", ".join(one.name + (f" ({one.topic})" if one.topic else "") for one in cameras)
+    return ", ".join(camera.name + (f" ({camera.topic})" if camera.topic else "") for camera in cameras)
 
 
-def _in_words(one: _Whole) -> str:
-    bent = f"{len(one.bent)} coefficients of distortion ({one.model})" if any(one.bent) else "no distortion"
-    return f"focal length {one.matrix[0, 0]:.0f} px in pictures of {one.size[0]} x {one.size[1]}, {bent}"
+def _in_words(whole: _Whole) -> str:
+    bent = f"{len(whole.bent)} coefficients of distortion ({whole.model})" if any(whole.bent) else "no distortion"
+    return f"focal length {whole.matrix[0, 0]:.0f} px in pictures of {whole.size[0]} x {whole.size[1]}, {bent}"
 
 
-def _fitted(one: CameraFile, final: tuple[int, int]) -> tuple[_Whole, tuple[str, ...]]:
+def _fitted(camera: CameraFile, final: tuple[int, int]) -> tuple[_Whole, tuple[str, ...]]:
     """The calibration for pictures of this size, and what was done.
 
     Raises McaptrackError if it is for pictures of another shape, or if no size is known.
     """
-    matrix, projection, remarks = one.matrix, one.projection, tuple[str, ...]()
+    matrix, projection, remarks = camera.matrix, camera.projection, tuple[str, ...]()
     assert matrix is not None  # ``_joined`` has checked it
     if min(final) <= 0:
         raise McaptrackError(
-            f"{one.path} doesn't say the size of its pictures, and there are none; give it with `size='WIDTHxHEIGHT'`"
+            f"{camera.path} doesn't say the size of its pictures, and there are none; "
+            "give it with `size='WIDTHxHEIGHT'`"
         )
-    if one.size is not None and one.size != final:
-        across, down = final[0] / one.size[0], final[1] / one.size[1]
-        was = f"{one.path} is for pictures of {one.size[0]} x {one.size[1]}, and these are {final[0]} x {final[1]}"
+    if camera.size is not None and camera.size != final:
+        width, height = camera.size
+        across, down = final[0] / width, final[1] / height
+        was = f"{camera.path} is for pictures of {width} x {height}, and these are {final[0]} x {final[1]}"
         if abs(across / down - 1) > _SHAPE:
             raise McaptrackError(f"{was}: they are of another shape, so that they show another part; calibrate these")
         scale = np.array([[across, 0, 0.5 * across - 0.5], [0, down, 0.5 * down - 0.5], [0, 0, 1.0]])
@@ -211,23 +217,23 @@ def _fitted(one: CameraFile, final: tuple[int, int]) -> tuple[_Whole, tuple[str,
         remarks += (f"{was}: its focal lengths and centre are scaled by {across:.4g}",)
     off = np.abs(matrix[:2, 2] / final - 0.5).max()
     if off > _OFF_CENTRE:
-        said = f"{one.path}: the optical axis is at ({matrix[0, 2]:.0f}, {matrix[1, 2]:.0f}) of pictures of"
-        words = f"{said} {final[0]} x {final[1]}, far from their middle"
-        if off > _OUTSIDE and one.size is None:
-            raise McaptrackError(f"{words}: the calibration, which states no size, is for pictures of another one")
-        warn(words + ("; it may be for pictures of another size, which it doesn't state" if one.size is None else ""))
-    return _Whole(matrix, final, one.model, one.bent, one.rectified, projection), remarks
+        said = f"{camera.path}: the optical axis is at ({matrix[0, 2]:.0f}, {matrix[1, 2]:.0f}) of pictures of"
+        text = f"{said} {final[0]} x {final[1]}, far from their middle"
+        if off > _OUTSIDE and camera.size is None:
+            raise McaptrackError(f"{text}: the calibration, which states no size, is for pictures of another one")
+        warn(text + ("; it may be for pictures of another size, which it doesn't state" if camera.size is None else ""))
+    return _Whole(matrix, final, camera.model, camera.bent, camera.rectified, projection), remarks
 
 
-def _message(one: _Whole, frame_id: str) -> Any:
+def _message(whole: _Whole, frame_id: str) -> Any:
     """The message for viewers, without its time."""
-    message = foxglove.message_class(foxglove.CALIBRATION)(frame_id=frame_id, distortion_model=one.model)
-    message.width, message.height = one.size
-    message.D.extend(one.bent)
-    message.K.extend(one.matrix.ravel().tolist())
-    projection, rectified = np.column_stack([one.matrix, np.zeros(3)]), np.eye(3)
-    if one.projection is not None and one.projection[0, 0] > 0:
-        projection, rectified = one.projection, rectified if one.rectified is None else one.rectified
+    message = foxglove.message_class(foxglove.CALIBRATION)(frame_id=frame_id, distortion_model=whole.model)
+    message.width, message.height = whole.size
+    message.D.extend(whole.bent)
+    message.K.extend(whole.matrix.ravel().tolist())
+    projection, rectified = np.column_stack([whole.matrix, np.zeros(3)]), np.eye(3)
+    if whole.projection is not None and whole.projection[0, 0] > 0:
+        projection, rectified = whole.projection, rectified if whole.rectified is None else whole.rectified
     message.R.extend(rectified.ravel().tolist())
     message.P.extend(projection.ravel().tolist())
     return message

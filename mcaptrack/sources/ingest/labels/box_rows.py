@@ -91,13 +91,11 @@ class BoxRows:
         if first is None:
             first = min(int(labelled[0]), 1)
             if labelled[0] > 0:
-                words = (
-                    f"{self.path}: frames begin with {labelled[0]}; frame {first} is assumed to be the first picture"
-                )
-                self.doubts.append((f"{words}, `first_frame=` sets the number", "clock"))
+                text = f"{self.path}: frames begin with {labelled[0]}; frame {first} is assumed to be the first picture"
+                self.doubts.append((f"{text}, `first_frame=` sets the number", "clock"))
         crowd = np.zeros(len(frame), bool) if self.crowd is None else self.crowd
         ignored = IgnoredBoxes(frame[crowd], self.boxes[crowd], ~crowd[crowd], crowd[crowd]) if crowd.any() else None
-        there = set(np.unique(class_id[kept]).tolist())
+        occurring = set(np.unique(class_id[kept]).tolist())
         return Labels(
             self.format,
             first,
@@ -108,7 +106,7 @@ class BoxRows:
             self.score[kept],
             labelled,
             class_id[kept],
-            {number: name for number, name in classes.items() if number in there},
+            {number: name for number, name in classes.items() if number in occurring},
             left,
             ignored if role == "truth" else None,
             tuple(self.remarks),
@@ -124,11 +122,11 @@ class BoxRows:
         is_small = len(self.boxes) > 0 and bool((np.abs(self.boxes) <= _MOST_SHARE).all())
         if is_small and (self.boxes != np.rint(self.boxes)).any():
             self.is_normalised = True
-            words = f"no number of a box is above {_MOST_SHARE:g}, so they are taken as shares of the picture's size"
-            self.remarks.append(f"{self.path}: {words}")
+            text = f"no number of a box is above {_MOST_SHARE:g}, so they are taken as shares of the picture's size"
+            self.remarks.append(f"{self.path}: {text}")
 
     def leave_out_empty(self, is_empty: Bools) -> None:
-        """Take rows (N,) without a box as frames in which there are none."""
+        """Remove rows (N,) without a box; their frames stay labelled, as frames without boxes."""
         if not is_empty.any():
             return
         self.labelled = np.unique(self._whole(self.frame, _FRAME, 0, MAX_FRAME))
@@ -140,16 +138,16 @@ class BoxRows:
             f"{self.path}: {len(is_empty) - len(kept)} rows have no box; they only say that frames exist"
         )
 
-    def refuse(self, wrong: Any, words: Callable[[int], str]) -> None:
+    def refuse(self, wrong: Any, describe: Callable[[int], str]) -> None:
         """Raise McaptrackError for the first row where ``wrong`` (N,) is true."""
         if wrong.any():
             row = int(wrong.argmax())
-            raise McaptrackError(f"{self.at(row)}: {words(row)}")
+            raise McaptrackError(f"{self.at(row)}: {describe(row)}")
 
     def doubt_outside(self, size: Floats) -> None:
         """Warn of boxes that lie outside of their pictures, of these sizes (N, 2)."""
-        if words := outside(self.path, self.boxes, size):
-            self.doubts.append((words, "other"))
+        if text := outside(self.path, self.boxes, size):
+            self.doubts.append((text, "other"))
 
     def _whole(self, values: Floats, what: str, least: int, most: int) -> Ints:
         wrong = ~((values == np.rint(values)) & (values >= least) & (values <= most))
@@ -178,9 +176,9 @@ class BoxRows:
         left = []
         if others.any():
             counts = Counter(class_id[others].tolist()).most_common()
-            words = [f"{count} {_name(number, classes)}" for number, count in counts[:_SHOWN]]
+            counted = [f"{count} {_name(number, classes)}" for number, count in counts[:_SHOWN]]
             more = sum(count for _, count in counts[_SHOWN:])
-            left.append(", ".join(words) + (f", {more} of other classes" if more else ""))
+            left.append(", ".join(counted) + (f", {more} of other classes" if more else ""))
         if crowd.any():
             left.append(f"{int(crowd.sum())} regions of crowds (iscrowd)")
         if lacks_id.any():
@@ -197,15 +195,15 @@ class BoxRows:
         if high.any() or low.any():
             parts = [f"{int(high.sum())} above 1 (up to {self.score[high].max():g})"] if high.any() else []
             parts += [f"{int(low.sum())} below 0"] if low.any() else []
-            words = f"{self.path}: of {len(self.score)} scores {' and '.join(parts)}; they stay as they are"
-            self.doubts.append((words, "other"))
+            text = f"{self.path}: of {len(self.score)} scores {' and '.join(parts)}; they stay as they are"
+            self.doubts.append((text, "other"))
 
     def _doubt_repeated(self, frame: Ints, track_id: Ints, class_id: ClassIds) -> None:
         columns = np.column_stack([frame, track_id, class_id, self.boxes])
         repeated = len(columns) - len(np.unique(columns, axis=0))
         if repeated:
-            words = f"{self.path}: {repeated} of {len(columns)} boxes are there before, with the same frame and class"
-            self.doubts.append((f"{words}; they stay as they are", "other"))
+            text = f"{self.path}: {repeated} of {len(columns)} boxes are there before, with the same frame and class"
+            self.doubts.append((f"{text}; they stay as they are", "other"))
 
 
 def outside(path: Path, boxes: Floats, size: Floats) -> str:
@@ -227,8 +225,8 @@ def fitted(path: Path, labels: Labels, size: tuple[int, int]) -> Labels:
     boxes, doubts = labels.boxes_px, labels.doubts
     if labels.is_normalised:
         boxes = boxes * np.array([*size, *size], float)
-    words = outside(path, boxes, np.array(size, float)) if labels.format != "coco" else ""  # has sizes of its own
-    doubts += ((words, "other"),) if words else ()
+    text = outside(path, boxes, np.array(size, float)) if labels.format != "coco" else ""  # has sizes of its own
+    doubts += ((text, "other"),) if text else ()
     return replace(labels, boxes_px=boxes, doubts=doubts, is_normalised=False)
 
 
@@ -243,54 +241,54 @@ def class_ids(rows: BoxRows) -> tuple[ClassIds, dict[int, str]]:
     the largest. Without names, numbers that begin with 0 are taken to begin with people, as in COCO, and are raised by
     one. What is said about it is added to the rows.
     """
-    number = rows.number.astype(np.int64)
-    stated = number != NO_CLASS
+    kind = rows.number.astype(np.int64)
+    stated = kind != NO_CLASS
     if not stated.any():
         rows.remarks.append(f"{rows.path} states no classes; all boxes are taken as people")
-        return np.full(len(number), PERSON, np.uint32), {}
+        return np.full(len(kind), PERSON, np.uint32), {}
     if not stated.all():
         rows.doubts.append((f"{rows.path}: {int((~stated).sum())} boxes without a class have class_id 0", "classes"))
     if rows.names is None:
-        return _unnamed(rows, number, stated), {}
+        return _unnamed(rows, kind, stated), {}
     largest = max(max(rows.names, default=0), PERSON)
     places: dict[int, int] = {}
     classes: dict[int, str] = {}
-    for one, name in sorted(rows.names.items()):
+    for own_number, name in sorted(rows.names.items()):
         if is_person(name):
             place = PERSON
-        elif one == UNKNOWN and name.casefold() == "unknown":
+        elif own_number == UNKNOWN and name.casefold() == "unknown":
             place = UNKNOWN
-        elif one > PERSON:
-            place = one
+        elif own_number > PERSON:
+            place = own_number
         else:
             place = largest = largest + 1
-        places[one] = place
+        places[own_number] = place
         classes.setdefault(place, name)
-    used = np.unique(number[stated]).tolist()
-    nameless = [one for one in used if one not in places]
+    used = np.unique(kind[stated]).tolist()
+    nameless = [kind for kind in used if kind not in places]
     if nameless:
-        count = int(np.isin(number, nameless).sum())
+        count = int(np.isin(kind, nameless).sum())
         shown = ", ".join(map(str, nameless[:_SHOWN])) + (", ..." if len(nameless) > _SHOWN else "")
         rows.doubts.append(
             (f"{rows.path}: {count} boxes have classes without a name ({shown}); their class_id is 0", "classes")
         )
-    moved = [f"{rows.names[one]} ({one}) is {places[one]}" for one in used if places.get(one, one) != one]
+    moved = [f"{rows.names[kind]} ({kind}) is {places[kind]}" for kind in used if places.get(kind, kind) != kind]
     if moved:
         shown = ", ".join(moved[:_SHOWN]) + (", ..." if len(moved) > _SHOWN else "")
         rows.remarks.append(f"{rows.path}: in class_id 1 is a person: {shown}")
-    ids = np.array([places.get(one, UNKNOWN) for one in used], np.uint32)
-    out = np.full(len(number), UNKNOWN, np.uint32)
-    out[stated] = ids[np.searchsorted(used, number[stated])]
+    ids = np.array([places.get(kind, UNKNOWN) for kind in used], np.uint32)
+    out = np.full(len(kind), UNKNOWN, np.uint32)
+    out[stated] = ids[np.searchsorted(used, kind[stated])]
     return out, classes
 
 
 def _unnamed(rows: BoxRows, number: Ints, stated: Bools) -> ClassIds:
     """Class ids of numbers without names: as they are, or raised by one if they begin with 0."""
     begins_with_0 = bool((number == 0).any()) or rows.format == "yolo"
-    words = f"{rows.path} has no class names; class {0 if begins_with_0 else 1} is taken as people"
+    text = f"{rows.path} has no class names; class {0 if begins_with_0 else 1} is taken as people"
     if begins_with_0:
-        words += ", and class_id is one higher than the file's numbers"
-    rows.doubts.append((words, "classes"))
+        text += ", and class_id is one higher than the file's numbers"
+    rows.doubts.append((text, "classes"))
     return np.where(stated, number + begins_with_0, UNKNOWN).astype(np.uint32)
 
 
@@ -311,11 +309,11 @@ class TrackIds:
         ids = np.nan_to_num(values, nan=NO_ID)
         if not self._texts:
             return ids, []
-        known = ids != NO_ID
-        _, first, which = np.unique(ids[known], return_index=True, return_inverse=True)
+        has_id = ids != NO_ID
+        _, first, which = np.unique(ids[has_id], return_index=True, return_inverse=True)
         rank = np.empty(len(first), np.int64)
         rank[np.argsort(first)] = np.arange(1, len(first) + 1)
-        ids[known] = rank[which]
+        ids[has_id] = rank[which]
         shown = list(self._texts)[:_TEXTS_SHOWN]
         shown = [f"{text!r:.40} is {int(ids[(values == self.number(text)).argmax()])}" for text in shown]
         more = ", ..." if len(self._texts) > len(shown) else ""
@@ -330,17 +328,17 @@ class FrameNames:
 
     def number(self, name: str) -> int:
         """The number of a name. Raises ValueError if it has none, or if names differ in more than their number."""
-        found = _NUMBERED.fullmatch(_HASHED.sub("", PurePath(name.replace("\\", "/")).stem))
-        if found is None:
+        match = _NUMBERED.fullmatch(_HASHED.sub("", PurePath(name.replace("\\", "/")).stem))
+        if match is None:
             raise ValueError("the column of frames holds names without a number")
-        around = (found[1], found[3])
+        around = (match[1], match[3])
         self._around = self._around or around
         if around != self._around:
             raise ValueError(
                 f"the column of frames has names of several sequences, {''.join(self._around)!r:.40} and "
                 f"{''.join(around)!r:.40}"
             )
-        return int(found[2])
+        return int(match[2])
 
 
 def numbers_of_names(names: list[str]) -> list[int] | None:

@@ -48,13 +48,13 @@ def choose_camera(where: object, camera: str, topics: Collection[str]) -> Camera
     for at in (prefix, *_above(prefix)):
         if at in topics:
             return CameraTopics(camera_prefix(at) if at == prefix else prefix, at)
-        found = sorted(topic for topic in topics if camera_prefix(topic) == at)
-        if len(found) == 1 or f"{at}/video" in found:
-            return CameraTopics(prefix, f"{at}/video" if len(found) > 1 else found[0])
-        if found:
+        fitting = sorted(topic for topic in topics if camera_prefix(topic) == at)
+        if len(fitting) == 1 or f"{at}/video" in fitting:
+            return CameraTopics(prefix, f"{at}/video" if len(fitting) > 1 else fitting[0])
+        if fitting:
             raise McaptrackError(
-                f"{where}: {at} has several topics of pictures, {', '.join(found)}; name one with "
-                f"`camera={found[0].strip('/')!r}`"
+                f"{where}: {at} has several topics of pictures, {', '.join(fitting)}; name one with "
+                f"`camera={fitting[0].strip('/')!r}`"
             )
     if camera != DEFAULT or not topics:
         return CameraTopics(prefix, "")
@@ -107,10 +107,10 @@ def timeline_of(opened: log.Log, topic: str) -> Timeline:
     """The pictures of a channel. Raises McaptrackError if it is damaged, or holds no pictures."""
     t_ns: NDArray[np.int64] = opened.times(topic)
     index, every, of = np.arange(len(t_ns)), 1, f"the pictures of {topic}"
-    made = Provenance.from_metadata(opened.channel(topic).metadata)
-    if made:
-        given = made.parameters.get("every")
-        every = given if isinstance(given, int) and given > 0 else 1
+    provenance = Provenance.from_metadata(opened.channel(topic).metadata)
+    if provenance:
+        value = provenance.parameters.get("every")
+        every = value if isinstance(value, int) and value > 0 else 1
         last = max(message.sequence for message in opened.messages(topic, int(t_ns[-1])))
         if last + 1 != len(t_ns):  # some pictures could not be read; the others keep their numbers
             index = np.array([message.sequence for message in opened.messages(topic)], np.int64)
@@ -126,8 +126,8 @@ def timeline_of(opened: log.Log, topic: str) -> Timeline:
 def detections_topic(opened: log.Log, prefix: str) -> str:
     """The topic of detections made from pictures that were dropped since; "" if there is none."""
     channel = opened.channels.get(f"{prefix}/detections")
-    made = Provenance.from_metadata(channel.metadata) if channel else None
-    stage = STAGES.get(made.transform) if made else None
+    provenance = Provenance.from_metadata(channel.metadata) if channel else None
+    stage = STAGES.get(provenance.transform) if provenance else None
     is_of_pictures = stage is not None and stage.default.reads is VIDEO
     return channel.topic if channel and channel.messages and is_of_pictures else ""
 
@@ -156,11 +156,11 @@ def labels_of(opened: log.Log, prefix: str) -> dict[str, ExistingLabels]:
     out = {}
     for role in get_args(Role):
         channel = opened.channels.get(f"{prefix}/{role}")
-        made = Provenance.from_metadata(channel.metadata) if channel else None
-        if channel and channel.messages and made and made.transform == "ingest":
+        provenance = Provenance.from_metadata(channel.metadata) if channel else None
+        if channel and channel.messages and provenance and provenance.transform == "ingest":
             t_ns = opened.times(channel.topic)
-            given = made.parameters.get("fps")
-            fps = parse_fps(given) if isinstance(given, str) else None
+            value = provenance.parameters.get("fps")
+            fps = parse_fps(value) if isinstance(value, str) else None
             frames = 1 + max(message.sequence for message in opened.messages(channel.topic, int(t_ns[-1])))
             out[channel.topic] = ExistingLabels(t_ns, frames, fps)
     return out

@@ -59,24 +59,24 @@ def parse_columns(text: str) -> dict[str, str]:
 
 def check_keys(columns: Mapping[str, str]) -> dict[str, str]:
     """Check the keys of columns. Raises McaptrackError, with the known ones."""
-    known = (*KEYS, *KEYS_3D)
-    unknown = [key for key in columns if key not in known]
+    allowed = (*KEYS, *KEYS_3D)
+    unknown = [key for key in columns if key not in allowed]
     if unknown:
-        raise McaptrackError(f"`columns=` knows no {str(unknown[0])!r:.40}; it knows {', '.join(known)}")
+        raise McaptrackError(f"`columns=` knows no {str(unknown[0])!r:.40}; it knows {', '.join(allowed)}")
     return dict(columns)
 
 
-def choose_columns(where: str, header: Sequence[str], given: Mapping[str, str]) -> dict[str, int]:
-    """The index of the column for each key: those ``given`` by name, and guesses for the other keys.
+def choose_columns(where: str, header: Sequence[str], chosen: Mapping[str, str]) -> dict[str, int]:
+    """The index of the column for each key: those ``chosen`` by name, and guesses for the other keys.
 
     Raises McaptrackError if a column doesn't exist, if guesses are ambiguous, or if no box or frame can be made.
     """
     shown = f"its columns are {', '.join(header)}"[:300]
-    out = {key: _named(where, header, key, column, shown) for key, column in given.items()}
+    out = {key: _named(where, header, key, column, shown) for key, column in chosen.items()}
     plain = [IGNORED.sub("", name.strip().lower()) for name in header]
     skipped = _superseded(out)
     for key, names in HEADERS.items():
-        fits = [at for name in names for at, one in enumerate(plain) if one == name and at not in out.values()]
+        fits = [at for name in names for at, cell in enumerate(plain) if cell == name and at not in out.values()]
         if key in out or key in skipped or not fits:
             continue
         # In headers of MOTChallenge (bb_left, ..., conf, x, y, z), x and y are a place in the world.
@@ -84,22 +84,22 @@ def choose_columns(where: str, header: Sequence[str], given: Mapping[str, str]) 
         if len(fits) > 1 and key not in _RANKED:
             if len({header[at] for at in fits}) < len(fits):
                 raise McaptrackError(f"{where}: several columns are named {header[fits[0]]}; {shown}")
-            words = " and ".join(header[at] for at in fits)
+            text = " and ".join(header[at] for at in fits)
             raise McaptrackError(
-                f"{where}: {words} could both be {key}; choose with `columns={key + '=' + header[fits[0]]!r}`"
+                f"{where}: {text} could both be {key}; choose with `columns={key + '=' + header[fits[0]]!r}`"
             )
         out[key] = fits[0]
     for axis in _SPANS:
-        found = [pair for pair in axis if all(key in out for key in pair)]
-        found.sort(key=lambda pair: -len(given.keys() & pair))
-        if not found:
+        complete = [pair for pair in axis if all(key in out for key in pair)]
+        complete.sort(key=lambda pair: -len(chosen.keys() & pair))
+        if not complete:
             raise McaptrackError(
                 f"{where}: no columns for {' and '.join(axis[0])} (or {' and '.join(axis[1])}) of boxes; {shown}; name "
                 "them with `columns='x=left,y=top,w=width,h=height,frame=frame'`"
             )
-        for key in {key for pair in axis for key in pair} - set(found[0]):
+        for key in {key for pair in axis for key in pair} - set(complete[0]):
             out.pop(key, None)
-    if "name" not in given and "class" not in out and "name" in out and plain[out["name"]] == "name":
+    if "name" not in chosen and "class" not in out and "name" in out and plain[out["name"]] == "name":
         out.pop("name")  # of anything: beside a number of a class it is that of the class
     if "frame" in out:
         out.pop("t", None)
@@ -108,24 +108,24 @@ def choose_columns(where: str, header: Sequence[str], given: Mapping[str, str]) 
             f"{where}: no column for the frame or the time of boxes; {shown}; name it with `columns='frame=NAME'` or "
             "`columns='t=NAME'` (in seconds)"
         )
-    if unread := [key for key in given if key not in out]:
-        read = ", ".join(key for key in given if key in out)
+    if unread := [key for key in chosen if key not in out]:
+        read = ", ".join(key for key in chosen if key in out)
         raise McaptrackError(f"{where}: {unread[0]} is not read beside {read}, which `columns=` names; leave it out")
     return out
 
 
 def _named(where: str, header: Sequence[str], key: str, column: str, shown: str) -> int:
-    found = [at for at, name in enumerate(header) if name.strip() == column.strip()]
-    if len(found) != 1:
-        what = f"{len(found)} columns are named {column}" if found else f"no column is named {column}"
+    places = [at for at, name in enumerate(header) if name.strip() == column.strip()]
+    if len(places) != 1:
+        what = f"{len(places)} columns are named {column}" if places else f"no column is named {column}"
         raise McaptrackError(f"{where}: {what}, as `columns=` says for {key}; {shown}")
-    return found[0]
+    return places[0]
 
 
-def _superseded(given: Mapping[str, int]) -> set[str]:
+def _superseded(chosen: Mapping[str, int]) -> set[str]:
     """Keys that aren't guessed, because others that the user named say the same."""
-    out = {key for key, other in (("frame", "t"), ("t", "frame")) if other in given}
+    out = {key for key, other in (("frame", "t"), ("t", "frame")) if other in chosen}
     for axis in _SPANS:
-        if any(all(key in given for key in pair) for pair in axis):
-            out |= {key for pair in axis for key in pair} - given.keys()
+        if any(all(key in chosen for key in pair) for pair in axis):
+            out |= {key for pair in axis for key in pair} - chosen.keys()
     return out

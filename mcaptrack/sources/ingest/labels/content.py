@@ -108,7 +108,7 @@ class Labels:
         return corner
 
     def take(self, rows: Ints | slice) -> Labels:
-        """These rows alone, or in this order; what is known of the file stays."""
+        """Select or reorder rows; facts about the file stay."""
         boxes, xy, observed = self.boxes_px, self.xy_m, self.observed
         return replace(
             self,
@@ -163,23 +163,23 @@ class WantedClasses:
         """
         if self.text.strip().casefold() == _ALL:
             return np.ones(len(class_id), bool)
-        there = np.unique(class_id).tolist()
+        occurring = np.unique(class_id).tolist()
         by_name: dict[str, set[int]] = {}
-        for number in there:
+        for number in occurring:
             by_name.setdefault(names.get(number, "").strip().casefold(), set()).add(number)
         wanted: set[int] = set()
         for word in (word.strip() for word in self.text.split(",")):
-            found = by_name.get(word.casefold(), set()) if word else set()
-            found = {PERSON} & {*there} if is_person(word) else found
-            if not found and word.isascii() and word.isdecimal() and int(word[:12]) in there:
-                found = {int(word)}
-            if not found and not (self.may_lack and word):
-                called = [names.get(number) or f"{number}" for number in there]
+            numbers = by_name.get(word.casefold(), set()) if word else set()
+            numbers = {PERSON} & {*occurring} if is_person(word) else numbers
+            if not numbers and word.isascii() and word.isdecimal() and int(word[:12]) in occurring:
+                numbers = {int(word)}
+            if not numbers and not (self.may_lack and word):
+                called = [names.get(number) or f"{number}" for number in occurring]
                 more = f" and {len(called) - _SHOWN} more" if len(called) > _SHOWN else ""
                 raise McaptrackError(
                     f"{path} has no class {word!r:.60}; `classes=` takes {', '.join(called[:_SHOWN])}{more}, or {_ALL}"
                 )
-            wanted |= found
+            wanted |= numbers
         return np.isin(class_id, sorted(wanted))
 
 

@@ -18,18 +18,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, Final, NoReturn
-from xml.parsers import expat
+from typing import IO, Any, Final
 
 import numpy as np
 
 from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import read_beginning, refuse_special
+from mcaptrack.files import read_beginning
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.schema.classes import PERSON, is_person
 from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows
 from mcaptrack.sources.ingest.labels.content import NO_ID, Labels, WantedClasses
+from mcaptrack.sources.ingest.xml_reader import XmlReader
 
 _MAX_BYTES: Final = 512 * 2**20
 _MAX_ROWS: Final = 10_000_000
@@ -77,7 +77,6 @@ _SHOWN: Final = 5
 
 def is_cvat(path: Path) -> bool:
     """Whether a file is XML, or a zip file: of label files, only those of CVAT are."""
-    refuse_special(path)
     head = read_beginning(path, 4096)
     return head.startswith((_ZIP, _EMPTY_ZIP)) or head.removeprefix(b"\xef\xbb\xbf").lstrip()[:1] == b"<"
 
@@ -101,13 +100,13 @@ def opened_xml(path: Path) -> Iterator[IO[bytes]]:
 
 def _member(path: Path, names: list[str]) -> str:
     """The name of the only member with annotations. Raises McaptrackError if there is none, or if there are several."""
-    found = [name for name in names if name.replace("\\", "/").rsplit("/", 1)[-1] == _MEMBER]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise McaptrackError(f"{path} holds {len(found)} of {_MEMBER}; give each as a file ({_listed(found)})")
-    there = f"it holds {_listed(names)}" if names else "it is empty"
-    raise McaptrackError(f"{path} is a zip file without the {_MEMBER} of CVAT: {there}; unpack other formats")
+    members = [name for name in names if name.replace("\\", "/").rsplit("/", 1)[-1] == _MEMBER]
+    if len(members) == 1:
+        return members[0]
+    if members:
+        raise McaptrackError(f"{path} holds {len(members)} of {_MEMBER}; give each as a file ({_listed(members)})")
+    content = f"it holds {_listed(names)}" if names else "it is empty"
+    raise McaptrackError(f"{path} is a zip file without the {_MEMBER} of CVAT: {content}; unpack other formats")
 
 
 def _listed(names: list[str]) -> str:
@@ -116,8 +115,10 @@ def _listed(names: list[str]) -> str:
 
 
 @dataclass
-class _Parser:
+class _Parser(XmlReader):
     """The content of a file, as far as it was read. ``meta`` are the texts of the description of the task, by name."""
+
+    writer = "CVAT"
 
     path: Path
     values: array[float] = field(default_factory=lambda: array("d"))
@@ -137,66 +138,50 @@ class _Parser:
         self._image: int | None = None
         self._text: list[str] | None = None
         self._attribute = ""
-        self._size = 0
         self._steps: tuple[int, int, int] | None = None
-        self._reader = expat.ParserCreate()
-        self._reader.buffer_text = True
-        self._reader.StartDoctypeDeclHandler = self._refuse_doctype
-        self._reader.StartElementHandler = self._start
-        self._reader.EndElementHandler = self._end
-        self._reader.CharacterDataHandler = self._character
+        super().__init__(self.path)
 
-    def read(self) -> None:
-        """Read the whole file. Raises McaptrackError, with the line, if it isn't what CVAT writes."""
-        try:
-            with opened_xml(self.path) as stream:
-                while block := stream.read(_BLOCK):
-                    self._size += len(block)
-                    if self._size > _MAX_BYTES:
-                        self._fail(f"there are more than {_MAX_BYTES} bytes of XML; give it in parts")
-                    self._reader.Parse(block, False)
-                self._reader.Parse(b"", True)
-        except expat.ExpatError as error:
-            why = expat.ErrorString(error.code)
-            raise McaptrackError(f"{self.path}:{error.lineno}: not valid XML: {why}") from None
-        except (LookupError, ValueError) as error:  # what expat says of encodings that it doesn't know
-            raise McaptrackError(f"{self.path}:{self._reader.CurrentLineNumber}: not read: {error}") from None
+    def pieces(self) -> Iterator[bytes]:
+        """The XML of the file, in blocks. Raises McaptrackError if there is too much."""
+        size = 0
+        with opened_xml(self.path) as stream:
+            while block := stream.read(_BLOCK):
+                size += len(block)
+                if size > _MAX_BYTES:
+                    self.fail(f"there are more than {_MAX_BYTES} bytes of XML; give it in parts")
+                yield block
 
-    def _fail(self, words: str) -> NoReturn:
-        raise McaptrackError(f"{self.path}:{self._reader.CurrentLineNumber}: {words}")
-
-    def _refuse_doctype(self, *_: object) -> NoReturn:
-        self._fail("a document type, which CVAT doesn't write; it may hold entities, and isn't read")
-
-    def _start(self, name: str, given: dict[str, str]) -> None:
+    def start(self, name: str, attributes: dict[str, str]) -> None:
         self.names.append(name)
         if len(self.names) > _MAX_DEPTH:
-            self._fail("nested deeper than annotations of CVAT are")
+            self.fail("nested deeper than annotations of CVAT are")
         if len(self.names) == 1 and name != "annotations":
-            self._fail(f"XML that begins with <{name[:40]}>; of XML, <annotations> of CVAT are read")
+            self.fail(f"XML that begins with <{name[:40]}>; of XML, <annotations> of CVAT are read")
         if "meta" in self.names[:2]:
             self._text = []
         elif name == _TRACK and len(self.names) == 2:
-            self._check_task(given)
-            line = self._reader.CurrentLineNumber
-            number = len(self.tracks) if "id" not in given else self._whole(given["id"], "the id of a track")
-            self._track = _Track(number, self._label(given), line)
+            self._check_task(attributes)
+            line = self.line
+            number = len(self.tracks) if "id" not in attributes else self._whole(attributes["id"], "the id of a track")
+            self._track = _Track(number, self._label(attributes), line)
         elif name == "image" and len(self.names) == 2:
-            self._check_task(given)
-            self._image = self._whole(given.get("id", ""), "the id of an image")
+            self._check_task(attributes)
+            self._image = self._whole(attributes.get("id", ""), "the id of an image")
             if self._image in self.images:
-                self._fail(f"image {self._image} is there before; give one file for each task")
+                self.fail(f"image {self._image} is there before; give one file for each task")
             self.images[self._image] = None
         elif name == "box" and self._track is not None:
-            self._add_to_track(self._track, given)
+            self._add_to_track(self._track, attributes)
         elif name == "box" and self._image is not None:
-            self._add(self._image, self._corners(given), NO_ID, self._label(given), _is(given, "occluded"))
+            self._add(
+                self._image, self._corners(attributes), NO_ID, self._label(attributes), _is(attributes, "occluded")
+            )
         elif name in _OTHER_SHAPES:
             self.others[name] += 1
         elif name == "attribute":
-            self._attribute, self._text = given.get("name", ""), []
+            self._attribute, self._text = attributes.get("name", ""), []
 
-    def _end(self, name: str) -> None:
+    def end(self, name: str) -> None:
         text = "".join(self._text or ()).strip()
         if "meta" in self.names[:2] and text and len(self.names) <= 4:
             self.meta.setdefault(name, text)
@@ -205,24 +190,24 @@ class _Parser:
         elif name == _TRACK and self._track is not None:
             self.tracks.append(self._track)
             if len(self.tracks) > _MAX_ROWS:
-                self._fail(f"more than {_MAX_ROWS} tracks; give it in parts")
+                self.fail(f"more than {_MAX_ROWS} tracks; give it in parts")
             self._track = None
         elif name == "image":
             self._image = None
         self._text = None
         self.names.pop()
 
-    def _character(self, text: str) -> None:
+    def text(self, text: str) -> None:
         if self._text is not None:
             self._text.append(text[:_MAX_TEXT])
             if len(self._text) > _MAX_TEXT:
-                self._fail("a text is longer than those of CVAT are")
+                self.fail("a text is longer than those of CVAT are")
 
-    def _check_task(self, given: dict[str, str]) -> None:
+    def _check_task(self, attributes: dict[str, str]) -> None:
         """Fail at the second task of a file of a whole project: frames of all tasks are counted from 0."""
-        task = given.get("task_id")
+        task = attributes.get("task_id")
         if task is not None and self.task not in (None, task):
-            self._fail(f"tasks {self.task} and {task:.20} of a project; export each task, and give one file for each")
+            self.fail(f"tasks {self.task} and {task:.20} of a project; export each task, and give one file for each")
         self.task = self.task or task
 
     def _take_id(self, text: str) -> None:
@@ -237,51 +222,51 @@ class _Parser:
         elif self._image is not None:
             self.values[_ID - _COLUMNS] = int(text)
 
-    def _label(self, given: dict[str, str]) -> int:
-        name = " ".join(given.get("label", "").split())[:256]
+    def _label(self, attributes: dict[str, str]) -> int:
+        name = " ".join(attributes.get("label", "").split())[:256]
         if name not in self.labels and len(self.labels) >= _MAX_CLASSES:
-            self._fail(f"more than {_MAX_CLASSES} labels")
+            self.fail(f"more than {_MAX_CLASSES} labels")
         return self.labels.setdefault(name, len(self.labels))
 
     def _whole(self, text: str, what: str) -> int:
         if not (text.isascii() and text.isdecimal() and len(text) < 16):
-            self._fail(f"{what} is a whole number from 0 on, not {text[:40]!r}")
+            self.fail(f"{what} is a whole number from 0 on, not {text[:40]!r}")
         return int(text)
 
-    def _corners(self, given: dict[str, str]) -> tuple[float, ...]:
+    def _corners(self, attributes: dict[str, str]) -> tuple[float, ...]:
         try:
-            corners = tuple(float(given[name]) for name in ("xtl", "ytl", "xbr", "ybr"))
+            corners = tuple(float(attributes[name]) for name in ("xtl", "ytl", "xbr", "ybr"))
         except KeyError as error:
-            self._fail(f"a box without {error}")
+            self.fail(f"a box without {error}")
         except ValueError:
-            self._fail(f"a box with corners that aren't numbers: {str(given)[:80]}")
-        self.rotated += given.get("rotation", "0.0").strip("0.") != ""
+            self.fail(f"a box with corners that aren't numbers: {str(attributes)[:80]}")
+        self.rotated += attributes.get("rotation", "0.0").strip("0.") != ""
         return corners
 
     def _add(self, frame: int, corners: tuple[float, ...], track: int, label: int, is_occluded: bool) -> None:
         left, top, right, bottom = corners
-        line = self._reader.CurrentLineNumber
+        line = self.line
         self.values.extend((frame, left, top, right - left, bottom - top, track, label, is_occluded, line))
         if len(self.values) > _MAX_ROWS * _COLUMNS:
-            self._fail(f"more than {_MAX_ROWS} boxes, interpolated ones among them; give it in parts")
+            self.fail(f"more than {_MAX_ROWS} boxes, interpolated ones among them; give it in parts")
 
-    def _add_to_track(self, track: _Track, given: dict[str, str]) -> None:
+    def _add_to_track(self, track: _Track, attributes: dict[str, str]) -> None:
         """Add a box, and those between it and the one before."""
-        frame, corners = self._whole(given.get("frame", ""), "the frame of a box"), self._corners(given)
+        frame, corners = self._whole(attributes.get("frame", ""), "the frame of a box"), self._corners(attributes)
         own = len(self.tracks)
         if track.last is not None:
             before, *start = track.last
             if frame <= before:
-                self._fail(f"the frame of a box is {frame}, and that of the box before is {before:.0f}")
+                self.fail(f"the frame of a box is {frame}, and that of the box before is {before:.0f}")
             if not track.is_outside and frame - before > _MAX_FRAMES:
-                self._fail(f"{frame - before - 1:.0f} boxes would be interpolated; at most {_MAX_FRAMES} are")
+                self.fail(f"{frame - before - 1:.0f} boxes would be interpolated; at most {_MAX_FRAMES} are")
             for between in self._between(int(before), frame) if not track.is_outside else ():
                 share = (between - before) / (frame - before)
                 box = tuple(a + share * (b - a) for a, b in zip(start, corners, strict=True))
                 self._add(between, box, own, track.label, track.is_occluded)
                 self.interpolated += 1
         track.last = (frame, *corners)
-        track.is_outside, track.is_occluded = _is(given, "outside"), _is(given, "occluded")
+        track.is_outside, track.is_occluded = _is(attributes, "outside"), _is(attributes, "occluded")
         if not track.is_outside:
             self._add(frame, corners, own, track.label, track.is_occluded)
 
@@ -304,14 +289,14 @@ class _Parser:
         return first, last, every
 
 
-def _is(given: dict[str, str], name: str) -> bool:
-    return given.get(name, "").lower() in ("1", "true")
+def _is(attributes: dict[str, str], name: str) -> bool:
+    return attributes.get(name, "").lower() in ("1", "true")
 
 
 def read_cvat(path: Path, role: Role, wanted: WantedClasses) -> Labels:
     """Read annotations of CVAT. Raises McaptrackError, with the line, if they are damaged or hold no boxes."""
     parser = _Parser(path)
-    parser.read()
+    parser.parse(parser.pieces())
     if parser.tracks and parser.images:
         raise McaptrackError(f"{path} holds both tracks and images; CVAT writes one of them")
     if not parser.values:
@@ -336,9 +321,9 @@ def read_cvat(path: Path, role: Role, wanted: WantedClasses) -> Labels:
     rows.doubts += [(f"{path}: {doubt}", "clock")] if doubt else []
     if parser.tracks:
         own = values[:, _ID].astype(int)
-        ids, made, words = _ids(path, parser.tracks, np.bincount(own, minlength=len(parser.tracks)))
-        rows.id, rows.made_ids = ids[own].astype(float), made
-        rows.remarks += words
+        ids, new_ids, remarks = _ids(path, parser.tracks, np.bincount(own, minlength=len(parser.tracks)))
+        rows.id, rows.made_ids = ids[own].astype(float), new_ids
+        rows.remarks += remarks
     if parser.unread:
         shown = ", ".join(repr(text) for text in list(parser.unread)[:3])
         unread = f"{path}: {parser.unread.total()} boxes have a track_id that is not a whole number ({shown})"
@@ -377,11 +362,11 @@ def _frames(parser: _Parser, frame: Floats) -> tuple[Ints, str]:
     others = ~np.isin(frame, frames)
     if not others.any():
         return frames, ""
-    there = f"frames {first} to {last}" + (f" in steps of {every}" if every > 1 else "")
-    words = (
-        f"{int(others.sum())} boxes are in frames that its task doesn't have ({there}), as in {frame[others][0]:.0f}"
+    listed = f"frames {first} to {last}" + (f" in steps of {every}" if every > 1 else "")
+    text = (
+        f"{int(others.sum())} boxes are in frames that its task doesn't have ({listed}), as in {frame[others][0]:.0f}"
     )
-    return np.unique(frame.astype(np.int64)), f"{words}; frames are taken as they are, and only those with boxes count"
+    return np.unique(frame.astype(np.int64)), f"{text}; frames are taken as they are, and only those with boxes count"
 
 
 def _is_count(text: str) -> bool:
@@ -398,7 +383,7 @@ def _ids(path: Path, tracks: list[_Track], counts: Any) -> tuple[Ints, Ints | No
     renamed = sum(track.is_renamed for track in tracks)
     remarks = [f"{path}: {renamed} tracks change their track_id; the first of each is taken"] if renamed else []
     ids = np.full(len(tracks), -1, np.int64)
-    if not any(one is not None for one in stated):
+    if not any(number is not None for number in stated):
         numbers = np.array([track.number for track in tracks], np.int64)
         if len(np.unique(numbers)) == len(numbers):
             return numbers, None, remarks
@@ -407,18 +392,18 @@ def _ids(path: Path, tracks: list[_Track], counts: Any) -> tuple[Ints, Ints | No
     taken: set[int] = set()
     split: Counter[int] = Counter()
     for at in np.argsort(-counts, kind="stable").tolist():
-        one = stated[at]
-        if one is None or one in taken:
-            split.update([one] if one is not None else [])
+        number = stated[at]
+        if number is None or number in taken:
+            split.update([number] if number is not None else [])
             continue
-        taken.add(one)
-        ids[at] = one
+        taken.add(number)
+        ids[at] = number
     new = np.flatnonzero(ids < 0)
     ids[new] = max(taken) + 1 + np.arange(len(new))
     if split:
         shown = ", ".join(map(str, sorted(split)[:8])) + (", ..." if len(split) > 8 else "")
         remarks.append(f"{path}: several tracks state one track_id ({shown}): {split.total()} of them get new ids")
-    drawn = sum(one is None for one in stated)
+    drawn = sum(number is None for number in stated)
     if drawn:
         remarks.append(f"{path}: {drawn} tracks state no track_id and get new ids")
     return ids, ids[new] if len(new) else None, remarks

@@ -52,7 +52,7 @@ def header_of(path: Path, line: str) -> list[str]:
     """The names of columns if a line is a header, otherwise an empty list: none of its cells is a number."""
     cells = [cell.strip() for cell in split_row(path, delimiter_of(line), line)]
     is_header = len(cells) >= _LEAST_COLUMNS and not any(_is_number(cell) for cell in cells)
-    return cells if is_header and any(line.count(one) for one in _DELIMITERS) else []
+    return cells if is_header and any(line.count(delimiter) for delimiter in _DELIMITERS) else []
 
 
 def comment_header(path: Path, row: str) -> list[str]:
@@ -90,8 +90,8 @@ def split_row(path: Path, delimiter: str, line: str) -> list[str]:
         raise McaptrackError(f"{path}: {error}: {line[:60]!r}") from None
 
 
-def read_csv(path: Path, role: Role, given: Mapping[str, str], name: Format, wanted: WantedClasses) -> Labels:
-    """Read a table with a header; ``given`` are names of columns by key, see ``columns.KEYS``."""
+def read_csv(path: Path, role: Role, chosen: Mapping[str, str], name: Format, wanted: WantedClasses) -> Labels:
+    """Read a table with a header; ``chosen`` are names of columns by key, see ``columns.KEYS``."""
     lines = lines_of(path, MAX_LINE)
     number, first = next(lines, (0, ""))
     if not number:
@@ -106,10 +106,10 @@ def read_csv(path: Path, role: Role, given: Mapping[str, str], name: Format, wan
         )
     delimiter = delimiter_of(first)
     split = partial(split_row, path, delimiter)
-    return _read_table(path, number, header, lines, split, role, given, name, wanted, delimiter)
+    return _read_table(path, number, header, lines, split, role, chosen, name, wanted, delimiter)
 
 
-def read_rows(path: Path, content: list[Any], role: Role, given: Mapping[str, str], wanted: WantedClasses) -> Labels:
+def read_rows(path: Path, content: list[Any], role: Role, chosen: Mapping[str, str], wanted: WantedClasses) -> Labels:
     """Read rows of supervision's JSONSink: objects with the same keys."""
     header = [str(key) for key in content[0]][: _MAX_COLUMNS + 1]
 
@@ -122,7 +122,7 @@ def read_rows(path: Path, content: list[Any], role: Role, given: Mapping[str, st
     def split(line: str) -> list[str]:
         return line.split(_SEPARATOR)
 
-    return _read_table(path, 1, header, lines(), split, role, given, "supervision", wanted)
+    return _read_table(path, 1, header, lines(), split, role, chosen, "supervision", wanted)
 
 
 def _read_table(
@@ -132,14 +132,14 @@ def _read_table(
     lines: Lines,
     split: Callable[[str], list[str]],
     role: Role,
-    given: Mapping[str, str],
+    chosen: Mapping[str, str],
     name: Format,
     wanted: WantedClasses,
     delimiter: str = "",
 ) -> Labels:
     if len(header) > _MAX_COLUMNS:
         raise McaptrackError(f"{path}:{number}: more than {_MAX_COLUMNS} columns")
-    at = choose_columns(f"{path}:{number}", header, given)
+    at = choose_columns(f"{path}:{number}", header, chosen)
     classes, names, frames, ids = ClassNames(), ClassNames(), FrameNames(), TrackIds()
 
     def number_of(text: str) -> float:
@@ -170,10 +170,10 @@ def _read_table(
         except ValueError as error:
             if "column" in str(error):
                 raise
-            words = f"the column {header[at[key]]} holds {text.strip()[:40]!r}, which is no number"
+            problem = f"the column {header[at[key]]} holds {text.strip()[:40]!r}, which is no number"
             if delimiter == "," in text:
-                words += "; decimal commas are read where semicolons or tabs separate the columns"
-            raise ValueError(words) from None
+                problem += "; decimal commas are read where semicolons or tabs separate the columns"
+            raise ValueError(problem) from None
 
     what = f"a row of {', '.join(header[at[key]] for key in keys)}"
     table = NumberTable(path, lines, what, len(keys), parse, split)
@@ -185,7 +185,7 @@ def _read_table(
     remarks = [f"{path}: columns {used}" + (f"; not read: {', '.join(unused)}"[:300] if unused else "")]
     track_id, said = ids.of(path, columns.get("id", none))
     remarks += said
-    if "id" in at and header[at["id"]].lower() == "id" and "id" not in given and _are_row_numbers(track_id):
+    if "id" in at and header[at["id"]].lower() == "id" and "id" not in chosen and _are_row_numbers(track_id):
         remarks.append(f"{path}: every box has another {header[at['id']]}, so it numbers rows, not tracks")
         track_id = np.full(len(none), float(NO_ID))
     kind, class_names = _classes(columns, classes, names)
@@ -233,9 +233,9 @@ def _boxes(columns: Mapping[str, Floats]) -> Floats:
 
 def unit_of(header: str) -> tuple[str, float]:
     """The unit of a column of times, by its name, and its seconds: s, unless it ends with _ms, _us or _ns."""
-    words = header.strip().lower()
-    found = (unit for unit in _UNITS.items() if words.endswith((f"_{unit[0]}", f" {unit[0]}", f"({unit[0]})")))
-    return next(found, ("s", 1.0))
+    text = header.strip().lower()
+    units = (unit for unit in _UNITS.items() if text.endswith((f"_{unit[0]}", f" {unit[0]}", f"({unit[0]})")))
+    return next(units, ("s", 1.0))
 
 
 def _number_times(rows: BoxRows, seconds: Floats) -> None:
@@ -264,8 +264,8 @@ def _classes(
             return none, None
         both = stated & np.isfinite(columns["name"])
         pairs = set(zip(none[both].tolist(), columns["name"][both].tolist(), strict=True))
-        if len({one for one, _ in pairs}) == len(pairs) and all(one == int(one) for one, _ in pairs):
-            return none, {int(one): names.names[int(other)] for one, other in pairs}
+        if len({number for number, _ in pairs}) == len(pairs) and all(number == int(number) for number, _ in pairs):
+            return none, {int(number): names.names[int(other)] for number, other in pairs}
     column, texts = (columns["name"], names.names) if "name" in columns else (number, classes.names)
     if column is None or not texts:
         return none, None

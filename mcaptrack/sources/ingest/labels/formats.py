@@ -85,10 +85,10 @@ class ClassNames:
         counts = Counter(numbers.astype(int).tolist())
         return ", ".join(f"{count} {self.names[number]}" for number, count in counts.most_common())
 
-    def ids(self, numbers: Floats, known: Mapping[str, int]) -> tuple[ClassIds, dict[int, str]]:
+    def ids(self, numbers: Floats, usual: Mapping[str, int]) -> tuple[ClassIds, dict[int, str]]:
         """Convert a column to class ids; returns them and their names."""
-        others = sorted({name.lower() for name in self._numbers} - known.keys())
-        places = {**known, **{name: number for number, name in enumerate(others, start=max(known.values()) + 1)}}
+        others = sorted({name.lower() for name in self._numbers} - usual.keys())
+        places = {**usual, **{name: number for number, name in enumerate(others, start=max(usual.values()) + 1)}}
         ids = np.array([places[name.lower()] for name in self._numbers], np.uint32)
         names = dict(zip(ids.tolist(), self._numbers, strict=True))
         column = ids[numbers.astype(int)]
@@ -180,7 +180,7 @@ def read_mot(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Lab
         score[kept] if role != "truth" else np.full(int(kept.sum()), np.nan),
         np.unique(frame),
         class_id[kept],
-        {one: MOT_CLASSES[one] for one in np.unique(class_id[kept]).tolist() if has_others and one in MOT_CLASSES},
+        {kind: MOT_CLASSES[kind] for kind in np.unique(class_id[kept]).tolist() if has_others and kind in MOT_CLASSES},
         left_out=others,
         ignored=ignored if (kind > 0).any() else None,
     )
@@ -202,9 +202,9 @@ def read_kitti(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> L
     truncated, occluded = table.values[:, 2], table.values[:, 3]
     people, region = names.are(kind, "pedestrian"), names.are(kind, _KITTI_REGION)
     if role != "detections" and not wanted.is_people:
-        ids, known = names.ids(kind, _KITTI_CLASSES)
+        ids, class_names = names.ids(kind, _KITTI_CLASSES)
         people = ~region
-        people[~region] = wanted.mask(path, ids[~region], known)
+        people[~region] = wanted.mask(path, ids[~region], class_names)
     if role == "detections":
         kept = ~region
         if not kept.any():

@@ -17,15 +17,9 @@ import numpy as np
 from mcaptrack import files
 from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import read_beginning, refuse_special
+from mcaptrack.files import read_beginning
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.sources.ingest.labels.box_rows import (
-    NO_CLASS,
-    BoxRows,
-    FrameNames,
-    TrackIds,
-    numbers_of_names,
-)
+from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows, FrameNames, TrackIds, numbers_of_names
 from mcaptrack.sources.ingest.labels.content import NO_ID, Format, Labels, WantedClasses
 from mcaptrack.sources.ingest.labels.delimited import read_rows
 
@@ -44,23 +38,22 @@ _COLUMNS: Final = 10
 
 def is_json(path: Path) -> bool:
     """Whether the first character of a file is that of a JSON list or object."""
-    refuse_special(path)
     return read_beginning(path, 4096).removeprefix(b"\xef\xbb\xbf").lstrip()[:1] in (b"{", b"[")
 
 
-def read_json(path: Path, label_format: Format, role: Role, given: Mapping[str, str], wanted: WantedClasses) -> Labels:
+def read_json(path: Path, label_format: Format, role: Role, chosen: Mapping[str, str], wanted: WantedClasses) -> Labels:
     """Read JSON of COCO or of supervision, as its content tells. Raises McaptrackError if it is neither."""
     content = files.read_json(path, "JSON", _MAX_BYTES)
-    labels = _read_content(path, content, role, given, wanted)
+    labels = _read_content(path, content, role, chosen, wanted)
     if label_format not in ("auto", labels.format):
         raise McaptrackError(f"{path} is of the format {labels.format}, not {label_format}")
     return labels
 
 
-def _read_content(path: Path, content: Any, role: Role, given: Mapping[str, str], wanted: WantedClasses) -> Labels:
+def _read_content(path: Path, content: Any, role: Role, chosen: Mapping[str, str], wanted: WantedClasses) -> Labels:
     if isinstance(content, list) and not content:
         raise McaptrackError(f"{path} holds no boxes")
-    if given and not (isinstance(content, list) and isinstance(content[0], dict) and "x_min" in content[0]):
+    if chosen and not (isinstance(content, list) and isinstance(content[0], dict) and "x_min" in content[0]):
         raise McaptrackError(f"{path}: `columns=` is for tables with a header, not for COCO")
     first = content[0] if isinstance(content, list) and isinstance(content[0], dict) else {}
     if isinstance(content, dict) and isinstance(content.get("annotations"), list):
@@ -68,10 +61,10 @@ def _read_content(path: Path, content: Any, role: Role, given: Mapping[str, str]
     if "bbox" in first and "image_id" in first:
         return _results(path, content).labels(role, wanted)
     if "x_min" in first:
-        return read_rows(path, content, role, given, wanted)
-    found = f"an object with {', '.join(content) or 'nothing'}"[:100] if isinstance(content, dict) else "a list"
+        return read_rows(path, content, role, chosen, wanted)
+    kind = f"an object with {', '.join(content) or 'nothing'}"[:100] if isinstance(content, dict) else "a list"
     raise McaptrackError(
-        f"{path} is JSON ({found}{' of ' + ', '.join(first) if first else ''}"[:300]
+        f"{path} is JSON ({kind}{' of ' + ', '.join(first) if first else ''}"[:300]
         + "), but neither annotations (images, annotations, categories) nor results (image_id, category_id, bbox, "
         "score) of COCO, nor rows of supervision (x_min, y_min, x_max, y_max, ...)"
     )
@@ -108,8 +101,8 @@ class _Rows:
         try:
             frame = frame_of(entry.get("image_id"))
         except (ValueError, KeyError, TypeError) as error:
-            words = str(error).strip('"')
-            self.refuse(number, f"has a wrong image_id: {words}" if "column" in words else words)
+            text = str(error).strip('"')
+            self.refuse(number, f"has a wrong image_id: {text}" if "column" in text else text)
         self._values.extend(
             (
                 frame,
@@ -134,8 +127,8 @@ class _Rows:
         x, y = ([_float(value) for part in flat for value in part[axis : len(part) // 2 * 2 : 2]] for axis in (0, 1))
         return [min(x), min(y), max(x) - min(x), max(y) - min(y)]
 
-    def refuse(self, number: int, words: str) -> NoReturn:
-        raise McaptrackError(f"{self.at(number)} {words}")
+    def refuse(self, number: int, problem: str) -> NoReturn:
+        raise McaptrackError(f"{self.at(number)} {problem}")
 
     def at(self, number: int) -> str:
         return f"{self._path}: {self._kind} {number}"
@@ -219,13 +212,11 @@ def _annotations(path: Path, content: Mapping[str, Any]) -> BoxRows:
     out.first_frame = int(out.labelled[0]) if len(frames) else 0
     out.remarks.append(f"{path}: {len(images)} images, in order of {order}")
     if order == _BY_LIST and len(images) > 1:
-        words = (
-            f"{path}: its images have neither frame_id nor names with numbers of one sequence; the order in `images`"
-        )
-        out.doubts.append((f"{words} is taken as that of the pictures", "clock"))
+        text = f"{path}: its images have neither frame_id nor names with numbers of one sequence; the order in `images`"
+        out.doubts.append((f"{text} is taken as that of the pictures", "clock"))
     if out.first_frame > 1:
-        words = f"{path}: its first image has the number {out.first_frame}, and is assumed to be the first picture"
-        out.doubts.append((f"{words}; `first_frame=` sets the number", "clock"))
+        text = f"{path}: its first image has the number {out.first_frame}, and is assumed to be the first picture"
+        out.doubts.append((f"{text}; `first_frame=` sets the number", "clock"))
     if not out.is_normalised:
         _doubt_outside(out, images, frames)
     return out
@@ -244,9 +235,9 @@ def _check_count(path: Path, entries: list[Any]) -> None:
 def _frames(images: list[dict[str, Any]]) -> tuple[list[int], str]:
     """The frame numbers of images, and what they are from: a field, the numbers in names, or the order in the list."""
     for key in _FRAMES:
-        found = [image.get(key) for image in images]
-        numbers = [number for number in found if isinstance(number, int) and 0 <= number < 2**31]
-        if len(numbers) == len(found) and len(set(numbers)) == len(numbers):
+        values = [image.get(key) for image in images]
+        numbers = [number for number in values if isinstance(number, int) and 0 <= number < 2**31]
+        if len(numbers) == len(values) and len(set(numbers)) == len(numbers):
             return numbers, key
     names = [name for name in (image.get("file_name") for image in images) if isinstance(name, str)]
     numbered = numbers_of_names(names) if len(names) == len(images) else None
@@ -255,20 +246,20 @@ def _frames(images: list[dict[str, Any]]) -> tuple[list[int], str]:
     return list(range(len(images))), _BY_LIST
 
 
-def _categories(path: Path, found: Any) -> dict[int, str] | None:
+def _categories(path: Path, categories: Any) -> dict[int, str] | None:
     """Class names by number; None if there are none."""
-    if not isinstance(found, list) or not found:
+    if not isinstance(categories, list) or not categories:
         return None
-    if len(found) > _MAX_CLASSES:
-        raise McaptrackError(f"{path} has {len(found)} categories; at most {_MAX_CLASSES} are read")
+    if len(categories) > _MAX_CLASSES:
+        raise McaptrackError(f"{path} has {len(categories)} categories; at most {_MAX_CLASSES} are read")
     out: dict[int, str] = {}
-    for number, entry in enumerate(found):
-        one, name = (_whole_of_text(entry.get("id")), entry.get("name")) if isinstance(entry, dict) else (None, None)
-        if not isinstance(one, int) or not 0 <= one < 2**31 or not isinstance(name, str) or isinstance(one, bool):
+    for number, entry in enumerate(categories):
+        key, name = (_whole_of_text(entry.get("id")), entry.get("name")) if isinstance(entry, dict) else (None, None)
+        if not isinstance(key, int) or not 0 <= key < 2**31 or not isinstance(name, str) or isinstance(key, bool):
             raise McaptrackError(f"{path}: category {number} has no whole number as its id, or no name")
-        if one in out:
-            raise McaptrackError(f"{path}: {one} is the id of several categories, {out[one]} and {name[:_MAX_NAME]}")
-        out[one] = " ".join(name.split())[:_MAX_NAME]
+        if key in out:
+            raise McaptrackError(f"{path}: {key} is the id of several categories, {out[key]} and {name[:_MAX_NAME]}")
+        out[key] = " ".join(name.split())[:_MAX_NAME]
     return out
 
 

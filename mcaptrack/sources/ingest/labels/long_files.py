@@ -126,9 +126,9 @@ class LongLabels:
 
     def _part(self, stored: Mapping[str, Stored]) -> Labels:
         columns: dict[str, Any] = {}
-        for name, there in stored.items():
+        for name, place in stored.items():
             like = getattr(self.kind, name)
-            columns[name] = np.frombuffer(self.file.get(there), like.dtype).reshape(-1, *like.shape[1:])
+            columns[name] = np.frombuffer(self.file.get(place), like.dtype).reshape(-1, *like.shape[1:])
         return in_order(replace(self.kind, **columns), self.has_ids)
 
 
@@ -170,7 +170,7 @@ def _read_in_parts(path: Path, name: Format, role: Role, wanted: WantedClasses) 
 
 def _merged(counts: Sequence[tuple[_Values, Ints]]) -> tuple[_Values, Ints]:
     """The values of parts, sorted, and how many rows have each."""
-    values, which = np.unique(np.concatenate([one for one, _ in counts]), return_inverse=True)
+    values, which = np.unique(np.concatenate([part for part, _ in counts]), return_inverse=True)
     return values, np.bincount(which, np.concatenate([count for _, count in counts])).astype(np.int64)
 
 
@@ -178,8 +178,8 @@ def _joined(first: Labels, second: Labels) -> Labels:
     """The rows of both, one after the other."""
     columns: dict[str, Any] = {}
     for name in _COLUMNS:
-        one, other = getattr(first, name), getattr(second, name)
-        columns[name] = None if other is None else np.concatenate([one, other])
+        before, other = getattr(first, name), getattr(second, name)
+        columns[name] = None if other is None else np.concatenate([before, other])
     return replace(second, **columns)
 
 
@@ -189,6 +189,6 @@ def _put(file: SpillFile, part: Labels) -> dict[str, Stored]:
 
 
 def _summed(texts: Sequence[str]) -> str:
-    """Texts that differ in their first number as one with the sum; "" for none."""
+    """Merge texts that differ only in their first number, which is summed; "" if there are none."""
     total = sum(int(number[0]) for text in texts if (number := re.search(r"\d+", text)))
     return re.sub(r"\d+", str(total), texts[0], count=1) if texts else ""

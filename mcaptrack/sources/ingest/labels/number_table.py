@@ -91,13 +91,11 @@ class NumberTable:
         self.values: Floats = np.frombuffer(values, np.float64).reshape(-1, columns)
         self.line: Ints = np.frombuffer(numbers, np.int64)
 
-    def refuse(self, wrong: Any, words: Callable[[int], str]) -> None:
-        """Raise McaptrackError for the first row where ``wrong`` (N,) is true, with the text that ``words`` returns for
-        it.
-        """
+    def refuse(self, wrong: Any, describe: Callable[[int], str]) -> None:
+        """Raise McaptrackError for the first row where ``wrong`` (N,) is true, with its text by ``describe``."""
         if wrong.any():
             row = int(wrong.argmax())
-            raise McaptrackError(f"{self._path}:{self.line[row]}: {words(row)}")
+            raise McaptrackError(f"{self._path}:{self.line[row]}: {describe(row)}")
 
     def within(self, columns: slice, what: str, most: float) -> Floats:
         """Columns (N, C) of finite numbers with absolute values up to ``most``."""
@@ -173,7 +171,7 @@ def motion_frames(motions: Floats, index: Ints, t_ns: Ints, size: tuple[int, int
     poses = poses_of(np.array(kept), *size)
     frames = []
     for pose, number, t in zip(poses, index.tolist(), t_ns.tolist(), strict=True):
-        known = pose if number < len(motions) else pose._replace(verdict=Verdict.LOST)
-        reference = known._replace(reference=int(index[known.reference]))
+        judged = pose if number < len(motions) else pose._replace(verdict=Verdict.LOST)
+        reference = judged._replace(reference=int(index[judged.reference]))
         frames.append(Frame(t, number, pose_to_rows(reference, *size)))
     return frames

@@ -156,16 +156,16 @@ def read_homography(path: Path) -> tuple[float, ...]:
 
     Raises McaptrackError if invalid.
     """
-    words = f"{path} is not a homography: it needs 3 rows of 3 numbers"
+    text = f"{path} is not a homography: it needs 3 rows of 3 numbers"
     rows: list[list[float]] = []
     for _, line in lines_of(path):
         try:
             rows.append([float(part) for part in split(line)])
         except ValueError:
-            raise McaptrackError(f"{words}, separated by commas or blanks") from None
+            raise McaptrackError(f"{text}, separated by commas or blanks") from None
         if len(rows) > 3:
             break
     if len(rows) != 3 or any(len(row) != 3 for row in rows):
         shape = " + ".join(str(len(row)) for row in rows) or "no"
-        raise McaptrackError(f"{words}, not {shape}{' + ...' if len(rows) > 3 else ''} numbers")
+        raise McaptrackError(f"{text}, not {shape}{' + ...' if len(rows) > 3 else ''} numbers")
     return tuple(number for row in rows for number in row)

@@ -94,12 +94,12 @@ class Timeline:
             is_regular, count = False, len(seconds)
         all_seconds = np.interp(np.arange(count), index, seconds) if is_regular else seconds
         t_ns = np.rint(all_seconds * NS_PER_S).astype(np.int64)
-        words = f"{count} frames by the times, about {rate:.4g} a second, {count - len(seconds)} of them without boxes"
+        text = f"{count} frames by the times, about {rate:.4g} a second, {count - len(seconds)} of them without boxes"
         if not is_regular:
-            words = f"{count} frames by the times, which are irregular; frames without boxes are not known"
+            text = f"{count} frames by the times, which are irregular; frames without boxes are not known"
         if (np.diff(t_ns) <= 0).any():
             raise McaptrackError(f"{path}: its times are less than a nanosecond apart")
-        return cls(np.arange(count), t_ns, "the frames by the times in the file"), words
+        return cls(np.arange(count), t_ns, "the frames by the times in the file"), text
 
     def fits(self, fps: Fraction) -> bool:
         """Whether the pictures match a frame rate, within half a frame."""
@@ -138,8 +138,10 @@ class Timeline:
         if missing:
             lost.append(f"{path}: {missing} labels are of frames with missing pictures")
         step = labels.step // every or 1
-        known = self.index % step == (int(labels.labelled[0]) - labels.first_frame) // every % step
-        return Placed(every * self.index[known] + labels.first_frame, self.index[known], self.t_ns[known])
+        is_labelled = self.index % step == (int(labels.labelled[0]) - labels.first_frame) // every % step
+        return Placed(
+            every * self.index[is_labelled] + labels.first_frame, self.index[is_labelled], self.t_ns[is_labelled]
+        )
 
     def _place_by_time(self, path: Path, seconds: Floats) -> Placed:
         """Assign frames that have times to the nearest pictures: times of the log, or times since the first picture."""
@@ -166,8 +168,8 @@ class Timeline:
             )
         same = np.flatnonzero(np.diff(nearest) == 0)
         if len(same):
-            one, other = seconds[same[0]], seconds[same[0] + 1]
-            raise McaptrackError(f"{path}: {one:.9g} and {other:.9g} s are nearest to the same of {self.of}")
+            first_s, other = seconds[same[0]], seconds[same[0] + 1]
+            raise McaptrackError(f"{path}: {first_s:.9g} and {other:.9g} s are nearest to the same of {self.of}")
         number = np.full(len(self.t_ns), -1)
         number[nearest] = np.arange(len(seconds))
         return Placed(number, self.index, self.t_ns)
@@ -185,13 +187,13 @@ class Timeline:
         frame, count = labels.frame_counts()
         first, last = int(frame[0]), int(frame[-1])
         some = "all" if beyond == count.sum() else beyond
-        words = (
+        text = (
             f"{path}: {some} labels are of frames after the last picture: {self.of} end with frame "
             f"{end}, the labels with frame {last}"
         )
         if last - first <= end - labels.first_frame and first != labels.first_frame:
-            return f"{words}; if frame {first} of the file is the first picture, say so with `first_frame={first}`"
-        return f"{words}; give the labels of these pictures, or the part of the file that is of them"
+            return f"{text}; if frame {first} of the file is the first picture, say so with `first_frame={first}`"
+        return f"{text}; give the labels of these pictures, or the part of the file that is of them"
 
 
 def frame_times_ns(index: Ints, fps: Fraction) -> Ints:

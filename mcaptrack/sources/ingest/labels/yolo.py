@@ -45,12 +45,12 @@ def label_files(folder: Path) -> list[Path]:
     """The label files of a folder, or of its subfolder "labels", in natural order; none if there are none."""
     for place in (folder, folder / "labels"):
         try:
-            found = [path for path in place.iterdir() if path.suffix.lower() == ".txt"]
+            files = [path for path in place.iterdir() if path.suffix.lower() == ".txt"]
         except OSError:
             continue
-        found = [path for path in found if path.name.lower() not in _NOT_LABELS]
-        if found:
-            return sorted(found, key=natural_order)
+        files = [path for path in files if path.name.lower() not in _NOT_LABELS]
+        if files:
+            return sorted(files, key=natural_order)
     return []
 
 
@@ -149,12 +149,12 @@ def _class_names(
                 return dict(enumerate(lines[:_MAX_CLASSES])), place / name
         for name in _DATA:
             try:
-                found = _names_of_yaml(place / name) if (place / name).is_file() else None
+                names = _names_of_yaml(place / name) if (place / name).is_file() else None
             except McaptrackError as error:
                 doubts.append((f"{error}; class names are not known", "classes"))
                 continue
-            if found:
-                return found, place / name
+            if names:
+                return names, place / name
     return None, None
 
 

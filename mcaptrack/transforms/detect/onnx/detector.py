@@ -40,7 +40,7 @@ from mcaptrack.transforms.detect.onnx.layouts import (
 from mcaptrack.transforms.detect.onnx.nms import Boxes, Size, Tile, join_tiles, place, suppress, tiles_of
 from mcaptrack.transforms.detect.onnx.outputs import SURE, MisreadError
 from mcaptrack.transforms.detect.onnx.session import DetectorNetwork, workers
-from mcaptrack.transforms.protocol import Colour, ModelCard, Suited, check_options, option
+from mcaptrack.transforms.protocol import Colour, ModelCard, Suited, check_options, option, setting
 
 LayoutChoice = Literal["auto", "yolox", "yolox-legacy", "nanodet", "rtdetr", "dfine", "rfdetr", "ultralytics"]
 
@@ -54,7 +54,7 @@ _LEAST_PIXELS, _MOST_PIXELS = 700_000, 1_000_000
 _MOST_TILES: Final = 64
 #: So many pictures in which nothing was found are kept, to try other layouts on.
 _KEPT: Final = 4
-#: So many classes without a name are listed.
+#: The most classes without a name that are listed.
 _SHOWN: Final = 8
 
 
@@ -125,14 +125,14 @@ def wanted(names: Mapping[int, str], classes: str, where: str) -> list[int]:
     out: set[int] = set()
     for word in filter(None, (word.strip().casefold() for word in classes.split(","))):
         people = _people(names) if word == PEOPLE[0] else None
-        found = by_name.get(word) or ([] if people is None else by_name[names[people].casefold()])
-        if not found and word.isdecimal() and int(word) in names:
-            found = [int(word)]
-        if not found:
+        indices = by_name.get(word) or ([] if people is None else by_name[names[people].casefold()])
+        if not indices and word.isdecimal() and int(word) in names:
+            indices = [int(word)]
+        if not indices:
             close = difflib.get_close_matches(word, by_name, 1)
             meant = f"did you mean {close[0]}? " if close else ""
             raise McaptrackError(f"{where} has no class {word!r}; {meant}`classes=` takes {_known(names)}")
-        out.update(found)
+        out.update(indices)
     if not out:
         raise McaptrackError(f"`classes=` names none; {where} has {_known(names)}")
     return sorted(out)
@@ -190,13 +190,8 @@ class OnnxDetector:
     tiles: str = option(
         "1x1", "columns and rows of tiles that each picture is cut into, as in 3x2, for small objects", theme=_BOXES
     )
-    overlap: float = option(
-        0.2,
-        "how much of its width or height a tile shares with the next one",
-        least=0.0,
-        most=0.5,
-        theme=_BOXES,
-        flag=False,
+    overlap: float = setting(
+        0.2, "how much of its width or height a tile shares with the next one", least=0.0, most=0.5, theme=_BOXES
     )
     classes: str = option(
         "person", "classes to detect, by name or index with commas between them; `all` for every one", theme=_BOXES
@@ -204,14 +199,13 @@ class OnnxDetector:
     min_score: float = option(
         0.1, "boxes with a lower score are left out", least=0.0, most=1.0, search=(0.05, 0.6), theme=_BOXES
     )
-    max_iou: float = option(
+    max_iou: float = setting(
         0.45,
         "boxes of one class that overlap more are one object",
         least=0.0,
         most=1.0,
         search=(0.3, 0.8),
         theme=_BOXES,
-        flag=False,
     )
 
     reads: ClassVar[Schema] = VIDEO
@@ -294,8 +288,8 @@ def choose(path: Path, name: str, seen: NetworkSignature) -> list[Layout]:
     """
     fitting = possible(seen)
     if name == "auto":
-        if found := recognised(seen):
-            return found
+        if suited := recognised(seen):
+            return suited
         if fitting:
             names = ", ".join(layout.name for layout in fitting)
             raise McaptrackError(f"{path} {_outputs(seen)}; its layout may be one of {names}: choose with `layout=`")
@@ -324,16 +318,16 @@ class Contest:
         """Whether one layout is left."""
         return len(self.layouts) == 1
 
-    def see(self, found: Mapping[str, Found]) -> None:
+    def see(self, results: Mapping[str, Found]) -> None:
         """Judge by what each layout finds in a picture.
 
         Raises McaptrackError if none is left, or if it can't be told.
         """
         if self.is_settled:
             return
-        boxes = {name: one for name, one in found.items() if isinstance(one, Boxes)}
+        boxes = {name: result for name, result in results.items() if isinstance(result, Boxes)}
         if not any(layout.name in boxes for layout in self.layouts):
-            why = "; ".join(f"read as {layout.name}, {found[layout.name]}" for layout in self.layouts)
+            why = "; ".join(f"read as {layout.name}, {results[layout.name]}" for layout in self.layouts)
             raise McaptrackError(f"{self._path} fits no layout: {why}")
         self._keep([layout for layout in self.layouts if layout.name in boxes])
         for layout in self.layouts:
@@ -361,7 +355,7 @@ class Contest:
 
 
 def refuse_if_misread(
-    path: Path, layout: Layout, pictures: int, found: Mapping[str, Sequence[Found]], is_chosen: bool
+    path: Path, layout: Layout, pictures: int, results: Mapping[str, Sequence[Found]], is_chosen: bool
 ) -> None:
     """Refuse a network that found nothing in any picture though another layout finds boxes in some of them.
 
@@ -379,10 +373,10 @@ def refuse_if_misread(
         Whether the layout was named.
 
     """
-    for name, boxes in found.items():
-        with_boxes = [one for one in boxes if isinstance(one, Boxes) and evidence(one) > 0]
+    for name, boxes in results.items():
+        with_boxes = [picture for picture in boxes if isinstance(picture, Boxes) and evidence(picture) > 0]
         if with_boxes:
-            count = sum(int((one.score >= SURE).sum()) for one in with_boxes)
+            count = sum(int((picture.score >= SURE).sum()) for picture in with_boxes)
             instead = f"choose `layout={name!r}`" if is_chosen else "choose with `layout=`"
             raise McaptrackError(
                 f"{path}, read as {layout.name}, finds nothing in {pictures} pictures, and read as {name} finds "
@@ -408,7 +402,7 @@ class _Seen(NamedTuple):
     t_ns: int
     frame: int
     size: Size
-    found: Mapping[str, Found]
+    results: Mapping[str, Found]
 
 
 class _Run:
@@ -433,19 +427,19 @@ class _Run:
         kept: list[Image] = []
         pictures, anything = 0, False
         for image, seen in self._look(frames):
-            self._contest.see(seen.found)
+            self._contest.see(seen.results)
             waiting.append(seen)
             pictures += 1
             if not anything and (pictures & (pictures - 1)) == 0:  # the first, second, fourth, eighth ...
                 kept = [*kept, image][-_KEPT:]
             if self._contest.is_settled:
-                for one, boxes in self._drain(waiting):
+                for looked_at, boxes in self._drain(waiting):
                     anything |= len(boxes.score) > 0
-                    yield one, boxes
+                    yield looked_at, boxes
         self._contest.end()
-        for one, boxes in self._drain(waiting):
+        for looked_at, boxes in self._drain(waiting):
             anything |= len(boxes.score) > 0
-            yield one, boxes
+            yield looked_at, boxes
         if not anything:
             self._refuse_if_misread(pictures, kept)
         self._warn_of_unknown()
@@ -474,7 +468,7 @@ class _Run:
         """The pictures that wait, with the boxes of the layout that was settled on."""
         layout = self._contest.layouts[0]
         for seen in waiting:
-            boxes = seen.found[layout.name]
+            boxes = seen.results[layout.name]
             if isinstance(boxes, MisreadError):
                 raise McaptrackError(self._misread(seen.frame, layout, boxes))
             yield seen, boxes
@@ -482,7 +476,9 @@ class _Run:
 
     def _misread(self, frame: int, layout: Layout, error: MisreadError) -> str:
         # RT-DETR and D-FINE differ in nothing but the name.
-        others = [one.name for one in possible(self._network.signature) if replace(one, name=layout.name) != layout]
+        others = [
+            other.name for other in possible(self._network.signature) if replace(other, name=layout.name) != layout
+        ]
         then = f"choose another `layout=` ({', '.join(others)})" if others else "no other layout fits it"
         return f"{self._path}, read as {layout.name}: in frame {frame} {error}; {then}"
 
@@ -507,13 +503,13 @@ class _Run:
                     self._network.close()
 
     def _look_at(self, frames: list[Frame]) -> list[tuple[Image, _Seen]]:
-        found: list[dict[str, Found]] = [{} for _ in frames]
+        results: list[dict[str, Found]] = [{} for _ in frames]
         for layout in self._contest.layouts:
-            for one, boxes in zip(found, self._boxes(layout, frames), strict=True):
-                one[layout.name] = boxes
+            for by_layout, boxes in zip(results, self._boxes(layout, frames), strict=True):
+                by_layout[layout.name] = boxes
         return [
-            (frame.rows, _Seen(frame.t_ns, frame.index, (frame.rows.shape[1], frame.rows.shape[0]), one))
-            for frame, one in zip(frames, found, strict=True)
+            (frame.rows, _Seen(frame.t_ns, frame.index, (frame.rows.shape[1], frame.rows.shape[0]), by_layout))
+            for frame, by_layout in zip(frames, results, strict=True)
         ]
 
     def _boxes(self, layout: Layout, frames: list[Frame]) -> list[Found]:
@@ -547,20 +543,20 @@ class _Run:
 
     def _merged(self, layout: Layout, parts: list[Found], tiles: list[Tile]) -> Found:
         """The boxes of a picture from those of its tiles."""
-        known = [boxes for boxes in parts if isinstance(boxes, Boxes)]
-        if len(known) < len(parts):
+        readable = [boxes for boxes in parts if isinstance(boxes, Boxes)]
+        if len(readable) < len(parts):
             return next(error for error in parts if isinstance(error, MisreadError))
-        if len(known) == 1:
-            return known[0] if layout.suppresses else suppress(known[0], self._options.max_iou)
-        suppressed = known if layout.suppresses else [suppress(boxes, self._options.max_iou) for boxes in known]
+        if len(readable) == 1:
+            return readable[0] if layout.suppresses else suppress(readable[0], self._options.max_iou)
+        suppressed = readable if layout.suppresses else [suppress(boxes, self._options.max_iou) for boxes in readable]
         return join_tiles(suppressed, tiles, self._options.max_iou)
 
     def _refuse_if_misread(self, pictures: int, kept: Sequence[Image]) -> None:
         layout = self._contest.layouts[0]
-        others = [one for one in recognised(self._network.signature) if one.name != layout.name]
+        others = [other for other in recognised(self._network.signature) if other.name != layout.name]
         frames = [Frame(0, 0, image) for image in kept]
-        found = {str(one.name): [self._boxes(one, [frame])[0] for frame in frames] for one in others}
-        refuse_if_misread(self._path, layout, pictures, found, self._options.layout != "auto")
+        results = {str(other.name): [self._boxes(other, [frame])[0] for frame in frames] for other in others}
+        refuse_if_misread(self._path, layout, pictures, results, self._options.layout != "auto")
 
     def _warn_of_unknown(self) -> None:
         """Warn of boxes of classes that names don't include: the names may be of other classes, too."""
@@ -568,8 +564,8 @@ class _Run:
             classes = sorted(self._unknown)
             shown = ", ".join(map(str, classes[:_SHOWN])) + (", ..." if len(classes) > _SHOWN else "")
             which = "in the file" if self._is_named else "of COCO, which are assumed"
-            words = f"{self._path}: {self._unknown.total()} boxes are of classes ({shown}) without a name"
-            warn(f"{words} among the {len(self._names)} {which}; they are left out", "classes")
+            text = f"{self._path}: {self._unknown.total()} boxes are of classes ({shown}) without a name"
+            warn(f"{text} among the {len(self._names)} {which}; they are left out", "classes")
 
 
 def _input_size(options: OnnxDetector, first: Image) -> Size | None:

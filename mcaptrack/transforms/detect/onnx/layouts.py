@@ -83,8 +83,8 @@ class Layout:
         mean = tuple(value * self.divide for value in self.mean)
         swap = self.order == "rgb"
         # The mean is subtracted in the order of the result; the stubs of OpenCV 4 and 5 differ.
-        made: Any = cv2.dnn.blobFromImage(canvas, 1 / self.divide, mean=mean, swapRB=swap)
-        out = np.asarray(made[0], np.float32)
+        blob: Any = cv2.dnn.blobFromImage(canvas, 1 / self.divide, mean=mean, swapRB=swap)
+        out = np.asarray(blob[0], np.float32)
         if self.deviation != (1.0, 1.0, 1.0):
             out /= np.array(self.deviation, np.float32)[:, None, None]
         return out
@@ -135,11 +135,7 @@ def _ultralytics_count(kind: read.Kind, shape: tuple[int, ...]) -> int | None:
 
 
 #: ImageNet's mean and standard deviation, of red, green and blue from 0 to 1.
-_IMAGENET: Final[dict[str, Any]] = {
-    "divide": 255.0,
-    "mean": (0.485, 0.456, 0.406),
-    "deviation": (0.229, 0.224, 0.225),
-}
+_IMAGENET: Final[dict[str, Any]] = {"divide": 255.0, "mean": (0.485, 0.456, 0.406), "deviation": (0.229, 0.224, 0.225)}
 _DETR: Final[dict[str, Any]] = {
     "divide": 255.0,
     "suppresses": True,
@@ -197,5 +193,5 @@ def class_count(layout: Layout, seen: NetworkSignature) -> int | None:
     if layout.name == "ultralytics":
         kind = read.ultralytics_kind(seen.outputs, seen.size)
         return _ultralytics_count(kind, seen.shapes[0]) if kind else None
-    found = read.rfdetr_parts(seen.outputs)
-    return found[1].shape[2] if found else None
+    arrays = read.rfdetr_parts(seen.outputs)
+    return arrays[1].shape[2] if arrays else None

@@ -90,7 +90,7 @@ def join_tiles(parts: list[Boxes], tiles: list[tuple[int, int, int, int]], max_i
     """
     boxes = Boxes.joined(parts)
     tile = np.repeat(np.arange(len(parts)), [len(part.score) for part in parts])
-    cut = np.concatenate([_cut(part.xyxy, one, tiles) for part, one in zip(parts, tiles, strict=True)])
+    cut = np.concatenate([_cut(part.xyxy, tile, tiles) for part, tile in zip(parts, tiles, strict=True)])
     order = _by_score(boxes)[:_MOST]
     boxes, tile, cut = boxes.take(order), tile[order], cut[order]
     overlap, inner = _overlaps(boxes.xyxy)

@@ -82,9 +82,9 @@ def _kind_of_places(boxes: NDArray[Any], size: Size, anchors: int = 1) -> Litera
 
 def _follows(values: NDArray[Any], places: Floats) -> float:
     """The correlation of numbers with places, up to 1."""
-    one, other = values - values.mean(dtype=np.float64), places - places.mean()
-    norm = float(np.sqrt((one**2).sum() * (other**2).sum()))
-    return float(one @ other) / norm if norm > 0 else 0.0
+    mine, other = values - values.mean(dtype=np.float64), places - places.mean()
+    norm = float(np.sqrt((mine**2).sum() * (other**2).sum()))
+    return float(mine @ other) / norm if norm > 0 else 0.0
 
 
 def _boxes(xyxy: Floats, scores: Floats, labels: NDArray[Any], least: float) -> Boxes:
@@ -135,10 +135,10 @@ def read_yolox(outputs: Outputs, size: Size, least: float) -> list[Boxes]:
     """Offsets and log sizes on grids, or centres and sizes in pixels; objectness, and classes."""
     places, stride = grid(size)
     out = []
-    for one in _only(outputs):
-        is_decoded = _kind_of_places(one[:, :4], size) == "pixels"  # exported with --decode_in_inference
-        likely = np.flatnonzero(likelihoods(one[:, 4:])[:, 0] >= least)
-        rows = one[likely].astype(np.float64)
+    for output in _only(outputs):
+        is_decoded = _kind_of_places(output[:, :4], size) == "pixels"  # exported with --decode_in_inference
+        likely = np.flatnonzero(likelihoods(output[:, 4:])[:, 0] >= least)
+        rows = output[likely].astype(np.float64)
         score, label = _best(rows[:, 5:])
         boxes = rows[:, :4]
         if not is_decoded:
@@ -156,7 +156,7 @@ def nanodet_parts(outputs: Outputs, size: Size) -> tuple[NDArray[Any], NDArray[A
         return None
     if len(arrays) > 1:
         sides = [array for name, array in outputs.items() if array.shape[2] == SIDES and "cls" not in name]
-        kinds = [array for array in arrays if not any(array is one for one in sides)]
+        kinds = [array for array in arrays if not any(array is side for side in sides)]
         pairs = [sorted(some, key=lambda array: -array.shape[1]) for some in (kinds, sides)]
         if [a.shape[1] for a in pairs[0]] != [a.shape[1] for a in pairs[1]] or len({a.shape[2] for a in kinds}) != 1:
             return None
@@ -192,16 +192,16 @@ def read_nanodet(outputs: Outputs, size: Size, least: float) -> list[Boxes]:
 def detr_parts(outputs: Outputs) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None:
     """Labels (B, Q), boxes (B, Q, 4) and scores (B, Q): by name, or else by shape and kind."""
     if {"labels", "boxes", "scores"} <= set(outputs):
-        found = [outputs[name] for name in ("labels", "boxes", "scores")]
+        parts = [outputs[name] for name in ("labels", "boxes", "scores")]
     elif len(outputs) == 3:
         arrays = list(outputs.values())
         kinds = [(array.ndim, array.dtype.kind) for array in arrays]
         if sorted(kinds) != [(2, "f"), (2, "i"), (3, "f")]:
             return None
-        found = [arrays[kinds.index(kind)] for kind in ((2, "i"), (3, "f"), (2, "f"))]
+        parts = [arrays[kinds.index(kind)] for kind in ((2, "i"), (3, "f"), (2, "f"))]
     else:
         return None
-    labels, boxes, scores = found
+    labels, boxes, scores = parts
     fits = labels.ndim == scores.ndim == 2 and boxes.ndim == 3 and boxes.shape[2] == 4
     return (labels, boxes, scores) if fits and boxes.shape[:2] == labels.shape == scores.shape else None
 
@@ -268,11 +268,11 @@ def ultralytics_kind(outputs: Outputs, size: Size) -> Kind | None:
 def read_ultralytics(outputs: Outputs, size: Size, least: float) -> list[Boxes]:
     """Centres, sizes and scores of all places, perhaps with objectness; or corners, scores and classes of boxes."""
     kind, out = ultralytics_kind(outputs, size), []
-    for one in _only(outputs):
+    for output in _only(outputs):
         if kind == "boxes":
-            out.append(_boxes(one[:, :4], one[:, 4], one[:, 5], least))
+            out.append(_boxes(output[:, :4], output[:, 4], output[:, 5], least))
             continue
-        rows = one.T if kind == "columns" else one
+        rows = output.T if kind == "columns" else output
         if _kind_of_places(rows[:, :4], size, ANCHORS if kind == "anchors" else 1) != "pixels":
             raise MisreadError("boxes are not centres in pixels at the places of a grid")
         scores = likelihoods(rows[:, 4:])

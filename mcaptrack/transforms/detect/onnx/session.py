@@ -136,9 +136,9 @@ def check(model: Model, sha256: str, size: int, where: Path) -> None:
     if sha256 != model.sha256:
         again = f"; {call('get_model', model.name)} fetches it again" if where == model.path else ""
         is_other = size != model.size_bytes
-        found = f"{size:,} bytes, not {model.size_bytes:,}" if is_other else f"SHA-256 {sha256[:12]}..."
-        known = "" if is_other else f", not {model.sha256[:12]}..."
-        raise McaptrackError(f"{where} is not the file of {model.name}: it has {found}{known}{again}")
+        has = f"{size:,} bytes, not {model.size_bytes:,}" if is_other else f"SHA-256 {sha256[:12]}..."
+        expected = "" if is_other else f", not {model.sha256[:12]}..."
+        raise McaptrackError(f"{where} is not the file of {model.name}: it has {has}{expected}{again}")
 
 
 def stored(model: Model) -> Path:
@@ -185,7 +185,7 @@ class DetectorNetwork:
             raise McaptrackError(f"{self._file.path} takes pictures of any size; choose one with `input_size='WxH'`")
         #: Width and height of the input.
         self.size: Size = wanted
-        is_other = any(one is not None and one != two for one, two in zip(own, wanted, strict=True))
+        is_other = any(mine is not None and mine != two for mine, two in zip(own, wanted, strict=True))
         self._check_size(is_other or _known(own) is None)
         if is_other and (old := _known(own)):
             try:
@@ -212,17 +212,17 @@ class DetectorNetwork:
             if is_other and not isinstance(error, NetworkLimitError):
                 raise self._refused_size(_known(own)) from error
             raise
-        #: What it takes and gives.
+        #: The inputs and outputs of the network.
         self.signature = NetworkSignature(tuple(name for name, _, _ in inputs), outputs, wanted, len(self.names))
 
     def run(self, blob: NDArray[np.float32]) -> Outputs:
         """The outputs by name for pictures (B, 3, height, width). Raises McaptrackError if they can't be computed."""
-        given: dict[str, Any] = {self._image: blob.astype(_TYPES[self._type], copy=False)}
+        feeds: dict[str, Any] = {self._image: blob.astype(_TYPES[self._type], copy=False)}
         if self._sizes:
             name, kind = self._sizes
-            given[name] = np.tile(np.array([self.size], _SIZE_TYPES[kind]), (len(blob), 1))
+            feeds[name] = np.tile(np.array([self.size], _SIZE_TYPES[kind]), (len(blob), 1))
         out = {}
-        for (name, _, kind), values in zip(self._network.facts["outputs"], self._network.run(given), strict=True):
+        for (name, _, kind), values in zip(self._network.facts["outputs"], self._network.run(feeds), strict=True):
             if values.dtype.kind not in "fiu":
                 raise McaptrackError(f"{self._file.path} gives {kind} in {name}; no detector does")
             out[name] = values.astype(np.float32, copy=False) if values.dtype == np.float16 else values
@@ -233,15 +233,15 @@ class DetectorNetwork:
         self._network.close()
 
     def _image_input(self, inputs: Sequence[Value]) -> Value:
-        found = [one for one in inputs if len(one[1]) == 4 and _are_channels_first(one[1])]
-        if not found or found[0][2] not in _TYPES:
+        pictures = [value for value in inputs if len(value[1]) == 4 and _are_channels_first(value[1])]
+        if not pictures or pictures[0][2] not in _TYPES:
             raise McaptrackError(f"{self._describe(inputs)}; it needs pictures B x 3 x H x W of floats")
-        batch = found[0][1][0]
+        batch = pictures[0][1][0]
         if isinstance(batch, int) and batch != 1:
             raise McaptrackError(
                 f"{self._file.path} takes {batch} pictures at a time; export it for one, or for any number"
             )
-        return found[0]
+        return pictures[0]
 
     def _describe(self, inputs: Sequence[Value]) -> str:
         takes = ", ".join(f"{name} {_shape(shape)} {kind}" for name, shape, kind in inputs[:4])

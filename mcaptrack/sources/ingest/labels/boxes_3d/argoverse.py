@@ -57,7 +57,9 @@ def read_argoverse(path: Path) -> BoxRows3D:
         raise McaptrackError(f"{at(table['track_uuid'].index(None))} has no track_uuid")
     names, unknown = ClassNames(), table["category"].count(None)
     try:
-        kind = np.array([-1 if one is None else names.number(str(one)) for one in table["category"]], np.int64)
+        kind = np.array(
+            [-1 if category is None else names.number(str(category)) for category in table["category"]], np.int64
+        )
     except ValueError as error:
         raise McaptrackError(f"{path}: {error}") from None
     doubts: list[tuple[str, Code]] = []
@@ -69,7 +71,7 @@ def read_argoverse(path: Path) -> BoxRows3D:
         "argoverse",
         at,
         np.column_stack([place, _floats(path, table, _SIZE), heading]),
-        numbered([f"#{one}" for one in table["track_uuid"]])[0],
+        numbered([f"#{track}" for track in table["track_uuid"]])[0],
         kind,
         names.names,
         np.full(count, np.nan),
@@ -85,9 +87,9 @@ def read_argoverse(path: Path) -> BoxRows3D:
 def _in_city(path: Path, t_ns: Ints, place: Floats, quaternions: Floats) -> tuple[Floats, Floats]:
     """Boxes of the vehicle's frame in the city's: positions (N, 3) and quaternions (N, 4), by the pose at each time."""
     table = _table(path, ("timestamp_ns", *_QUATERNION, *_PLACE))
-    known, first = np.unique(_whole(path, table, "timestamp_ns"), return_index=True)
-    which = np.minimum(np.searchsorted(known, t_ns), max(len(known) - 1, 0))
-    without = known[which] != t_ns if len(known) else np.ones(len(t_ns), bool)
+    pose_ns, first = np.unique(_whole(path, table, "timestamp_ns"), return_index=True)
+    which = np.minimum(np.searchsorted(pose_ns, t_ns), max(len(pose_ns) - 1, 0))
+    without = pose_ns[which] != t_ns if len(pose_ns) else np.ones(len(t_ns), bool)
     if without.any():
         times = len(np.unique(t_ns[without]))
         raise McaptrackError(f"{path} has no pose at {times} times of boxes, the first {t_ns[without.argmax()]} ns")
@@ -105,7 +107,7 @@ def _rotated(quaternions: Floats, points: Floats) -> Floats:
 
 def _product(a: Floats, b: Floats) -> Floats:
     """The products (N, 4) of quaternions: the rotation by ``b``, then by ``a``."""
-    (aw, av), (bw, bv) = ((one[:, :1], one[:, 1:]) for one in (a, b))
+    (aw, av), (bw, bv) = ((quaternion[:, :1], quaternion[:, 1:]) for quaternion in (a, b))
     return np.column_stack([aw * bw - (av * bv).sum(axis=1, keepdims=True), aw * bv + bw * av + np.cross(av, bv)])
 
 
@@ -122,8 +124,8 @@ def _table(path: Path, columns: tuple[str, ...]) -> dict[str, Any]:
         raise McaptrackError(f"{path} is no table in Feather format: {str(error).splitlines()[0][:80]}") from None
     missing = [name for name in columns if name not in table.column_names]
     if missing:
-        there = ", ".join(table.column_names)[:200]
-        raise McaptrackError(f"{path} has no column {missing[0]}, as Argoverse 2 has; its columns are {there}")
+        listed = ", ".join(table.column_names)[:200]
+        raise McaptrackError(f"{path} has no column {missing[0]}, as Argoverse 2 has; its columns are {listed}")
     return {name: table.column(name).to_pylist() for name in columns}
 
 

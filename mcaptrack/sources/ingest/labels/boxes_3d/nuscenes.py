@@ -44,12 +44,14 @@ def tables_folder(path: Path) -> Path | None:
     if not path.is_dir():
         return None
     folders = [path, *sorted(path.glob("v1.0-*"))]
-    found = [one for one in folders if (one / "sample_annotation.json").is_file()]
-    found = found or [one for one in folders if all((one / f"{name}.json").is_file() for name in TABLES[:2])][:1]
-    if len(found) > 1:
-        names = ", ".join(one.name for one in found)
+    complete = [place for place in folders if (place / "sample_annotation.json").is_file()]
+    complete = (
+        complete or [place for place in folders if all((place / f"{name}.json").is_file() for name in TABLES[:2])][:1]
+    )
+    if len(complete) > 1:
+        names = ", ".join(place.name for place in complete)
         raise McaptrackError(f"{path} has several sets of tables, {names}; give the folder of one")
-    return found[0] if found else None
+    return complete[0] if complete else None
 
 
 def read_nuscenes(path: Path, scene: str | None) -> BoxRows3D:
@@ -106,7 +108,7 @@ def read_nuscenes(path: Path, scene: str | None) -> BoxRows3D:
         "nuscenes",
         at,
         values,
-        numbered([f"#{one}" for one in ids])[0],
+        numbered([f"#{track}" for track in ids])[0],
         np.array(kinds, np.int64),
         names.names,
         np.full(len(boxes), np.nan),
@@ -165,8 +167,8 @@ def _number(folder: Path, table: str, row: Mapping[str, Any], key: str) -> int:
 def _numbers(folder: Path, row: Mapping[str, Any], key: str, count: int) -> list[float]:
     value = row.get(key)
     numbers = value if isinstance(value, list) else []
-    if len(numbers) != count or not all(isinstance(one, int | float) and not isinstance(one, bool) for one in numbers):
+    if len(numbers) != count or not all(type(number) in (int, float) for number in numbers):
         raise McaptrackError(
             f"{folder / 'sample_annotation'}.json: {key} has to be {count} numbers, not {str(value)[:60]}"
         )
-    return [float(one) for one in numbers]
+    return [float(number) for number in numbers]

@@ -117,15 +117,15 @@ class BoxRows3D:
     @property
     def number(self) -> Ints:
         """The time or the frame number of each row (N,)."""
-        found = self.t_ns if self.t_ns is not None else self.frame
-        assert found is not None
-        return found
+        number = self.t_ns if self.t_ns is not None else self.frame
+        assert number is not None
+        return number
 
-    def refuse(self, wrong: Any, words: Callable[[int], str]) -> None:
+    def refuse(self, wrong: Any, describe: Callable[[int], str]) -> None:
         """Raise McaptrackError for the first row where ``wrong`` (N,) is true."""
         if wrong.any():
             row = int(wrong.argmax())
-            raise McaptrackError(f"{self.at(row)}: {words(row)}")
+            raise McaptrackError(f"{self.at(row)}: {describe(row)}")
 
     def check(self, role: Role) -> None:
         """Check that the rows are boxes in metres with z up, each id once in a frame. Raises McaptrackError if not."""
@@ -144,7 +144,7 @@ class BoxRows3D:
         is_odd = ~np.isfinite(boxes) & ~np.isnan(boxes).all(axis=0)
 
         def odd(row: int) -> str:
-            names = ", ".join(name for name, one in zip(_NAMES, is_odd[row].tolist(), strict=True) if one)
+            names = ", ".join(name for name, odd in zip(_NAMES, is_odd[row].tolist(), strict=True) if odd)
             return f"a number of the box is missing or not finite ({names}), which other boxes have"
 
         self.refuse(is_odd.any(axis=1), odd)
@@ -194,12 +194,12 @@ class BoxRows3D:
         x, y, z = (float(np.ptp(np.percentile(part, [5, 95]))) for part in self.boxes[:, :3].T)
         if z > _WIDE_M and min(x, y) < _FLAT_M:
             flat = "x" if x < y else "y"
-            words = f"{self.path}: positions spread over {z:.0f} m along z, and {min(x, y):.1f} m along {flat}"
-            self.doubts.append((f"{words}; z has to be the vertical axis", "other"))
+            text = f"{self.path}: positions spread over {z:.0f} m along z, and {min(x, y):.1f} m along {flat}"
+            self.doubts.append((f"{text}; z has to be the vertical axis", "other"))
         across, moving = self._moving_across()
         if moving >= _MANY_MOVING and across > moving / 2:
-            words = f"{self.path}: {across} of {moving} boxes of moving objects move across their heading"
-            self.doubts.append((f"{words}; the axes, the zero of the heading, or length and width may differ", "other"))
+            text = f"{self.path}: {across} of {moving} boxes of moving objects move across their heading"
+            self.doubts.append((f"{text}; the axes, the zero of the heading, or length and width may differ", "other"))
 
     def _moving_across(self) -> tuple[int, int]:
         """The number of rows that move more across than along their heading, and that of all moving ones."""
@@ -225,14 +225,14 @@ class BoxRows3D:
         order = np.flatnonzero(kept)
         order = order[np.lexsort((self.track_id[order], t_ns[order]))]
         frames = np.union1d(labelled_ns, t_ns)
-        there = set(np.unique(class_id[order]).tolist())
+        occurring = set(np.unique(class_id[order]).tolist())
         return TimedLabels(
             frames,
             np.searchsorted(t_ns[order], frames, "right"),
             self.boxes[order],
             self.track_id[order] if role != "detections" else np.full(len(order), NO_ID),
             class_id[order],
-            {number: name for number, name in classes.items() if number in there},
+            {number: name for number, name in classes.items() if number in occurring},
             self.score[order],
             self.velocity[order],
         )
@@ -251,12 +251,12 @@ class BoxRows3D:
             self.doubts.append((f"{self.path} has no class names; class 1 is taken as people", "classes"))
             ids, classes = [int(name) for name in self.names], {}
         else:
-            found = {self.names[one] for one in np.unique(self.kind[stated]).tolist()}
-            unusual = {name.casefold() for name in found - (self.usual or found)}
-            others = sorted({name.casefold() for name in found} - set(PEOPLE), key=lambda name: (name in unusual, name))
+            used = {self.names[number] for number in np.unique(self.kind[stated]).tolist()}
+            unusual = {name.casefold() for name in used - (self.usual or used)}
+            others = sorted({name.casefold() for name in used} - set(PEOPLE), key=lambda name: (name in unusual, name))
             places = {name: place for place, name in enumerate(others, start=PERSON + 1)}
             ids = [places.get(name.casefold(), PERSON) for name in self.names]
-            named = [(number, name) for number, name in zip(ids, self.names, strict=True) if name in found]
+            named = [(number, name) for number, name in zip(ids, self.names, strict=True) if name in used]
             classes = dict(reversed(named))
         out = np.full(len(self.kind), UNKNOWN, np.uint32)
         out[stated] = np.array(ids, np.uint32)[self.kind[stated]]
@@ -271,10 +271,10 @@ class BoxRows3D:
             kept = np.isin(class_id, [number for number, name in classes.items() if name in self.usual])
         if not kept.all():
             counts = Counter(class_id[~kept].tolist()).most_common()
-            words = [f"{count} {classes.get(number, f'of class {number}')}" for number, count in counts[:_SHOWN]]
+            counted = [f"{count} {classes.get(number, f'of class {number}')}" for number, count in counts[:_SHOWN]]
             more = sum(count for _, count in counts[_SHOWN:])
             self.left_out = " and ".join(
-                filter(None, [self.left_out, ", ".join(words) + (f", {more} of other classes" if more else "")])
+                filter(None, [self.left_out, ", ".join(counted) + (f", {more} of other classes" if more else "")])
             )
         if not kept.any():
             raise McaptrackError(f"{self.path} holds none of the wanted boxes, only {self.left_out}")

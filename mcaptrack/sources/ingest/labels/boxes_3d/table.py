@@ -52,7 +52,7 @@ _HEADERS_3D: Final[Mapping[str, tuple[str, ...]]] = {
     "height_m": ("heightm", "height", "hm", "h", "dz", "sizez"),
     "heading_rad": ("headingrad", "heading", "yawrad", "yaw", "theta"),
     "heading_deg": ("headingdeg", "yawdeg", "headingdegrees", "yawdegrees"),
-    **{one: (one, f"quat{one[1]}", f"rotation{one[1]}", f"orientation{one[1]}") for one in _QUATERNION},
+    **{axis: (axis, f"quat{axis[1]}", f"rotation{axis[1]}", f"orientation{axis[1]}") for axis in _QUATERNION},
     "vx_m_per_s": ("vxmpers", "vxms", "vxm/s", "vx", "velocityx"),
     "vy_m_per_s": ("vympers", "vyms", "vym/s", "vy", "velocityy"),
 }
@@ -62,9 +62,9 @@ _OF_BOXES: Final = frozenset(("zm", "tzm", "lengthm", "headingrad", "headingdeg"
 _OTHER_UNIT: Final = re.compile(r"(?:^|[_ \[(])(mm|cm|km|ft|feet|inch|inches|px)[\])]?$", re.IGNORECASE)
 
 
-def holds_boxes_3d(path: Path, first: str, given: Mapping[str, str]) -> bool:
-    """Whether a table has 3D boxes, by its first line and the columns that are ``given`` by key."""
-    if set(given) & set(KEYS_3D):
+def holds_boxes_3d(path: Path, first: str, chosen: Mapping[str, str]) -> bool:
+    """Whether a table has 3D boxes, by its first line and the columns that are ``chosen`` by key."""
+    if set(chosen) & set(KEYS_3D):
         return True
     header = header_of(path, first)
     if not header:
@@ -72,19 +72,19 @@ def holds_boxes_3d(path: Path, first: str, given: Mapping[str, str]) -> bool:
     plain = [IGNORED.sub("", name.strip().lower()) for name in header]
     if {"xm", "ym"} <= set(plain) or _OF_BOXES & set(plain):
         return True
-    found = {key for key, names in _HEADERS_3D.items() if set(names) & set(plain)}
-    return set(_PLACE) <= found and bool(found & {*_HEADING, "qw"})
+    keys = {key for key, names in _HEADERS_3D.items() if set(names) & set(plain)}
+    return set(_PLACE) <= keys and bool(keys & {*_HEADING, "qw"})
 
 
-def read_table(path: Path, given: Mapping[str, str]) -> BoxRows3D:
-    """Read a table; ``given`` are names of columns by key. Raises McaptrackError, with the line, if it is invalid."""
+def read_table(path: Path, chosen: Mapping[str, str]) -> BoxRows3D:
+    """Read a table; ``chosen`` are names of columns by key. Raises McaptrackError, with the line, if it is invalid."""
     lines = lines_of(path, MAX_LINE)
     number, first = next(lines, (0, ""))
     header = header_of(path, first) if number else []
     if not header:
         raise McaptrackError(f"{path}:{number}: a table needs a header that names its columns: {first.strip()[:60]}")
     where = f"{path}:{number}"
-    at = _columns(where, header, given)
+    at = _columns(where, header, chosen)
     delimiter = delimiter_of(first)
     has_decimal_commas = delimiter == ";"
     unit = unit_of(header[at["t"]]) if "t" in at else ("s", 1.0)
@@ -166,25 +166,25 @@ def _rows(
     )
 
 
-def _columns(where: str, header: Sequence[str], given: Mapping[str, str]) -> dict[str, int]:
+def _columns(where: str, header: Sequence[str], chosen: Mapping[str, str]) -> dict[str, int]:
     """The index of the column for each key. Raises McaptrackError if one is missing, or in another unit."""
     shown = f"its columns are {', '.join(header)}"[:300]
     out: dict[str, int] = {}
-    for key, column in given.items():
+    for key, column in chosen.items():
         if key not in (*KEYS_3D, *_SHARED):
             raise McaptrackError(
                 f"{where}: `columns=` names {key}, and 3D boxes have none; they have {', '.join(KEYS_3D)}"
             )
-        found = [at for at, name in enumerate(header) if name.strip() == column.strip()]
-        if len(found) != 1:
-            what = f"{len(found)} columns are named {column}" if found else f"no column is named {column}"
+        places = [at for at, name in enumerate(header) if name.strip() == column.strip()]
+        if len(places) != 1:
+            what = f"{len(places)} columns are named {column}" if places else f"no column is named {column}"
             raise McaptrackError(f"{where}: {what}, as `columns=` says for {key}; {shown}")
-        out[key] = found[0]
+        out[key] = places[0]
     plain = [IGNORED.sub("", name.strip().lower()) for name in header]
     either = ({*_HEADING, *_QUATERNION}, {"t", "frame"})
     for key, names in (*_HEADERS_3D.items(), *((key, HEADERS[key]) for key in _SHARED)):
-        fits = [at for name in names for at, one in enumerate(plain) if one == name and at not in out.values()]
-        if key in out or not fits or any(key in group and group & given.keys() for group in either):
+        fits = [at for name in names for at, cell in enumerate(plain) if cell == name and at not in out.values()]
+        if key in out or not fits or any(key in group and group & chosen.keys() for group in either):
             continue
         out[key] = fits[0]
     for other in (
@@ -195,7 +195,7 @@ def _columns(where: str, header: Sequence[str], given: Mapping[str, str]) -> dic
         {"frame"} if "t" in out else set(),
         {"class"} if "name" in out and "class" in out else set(),
     ):
-        for key in other - given.keys():
+        for key in other - chosen.keys():
             out.pop(key, None)
     for key in _PLACE[:2]:
         if key not in out:
@@ -228,7 +228,7 @@ def _seconds_and_ns(text: str, unit: float) -> tuple[int, int]:
 
 
 def _leave_out_empty(rows: BoxRows3D) -> None:
-    """Take rows without a box as times at which there is none."""
+    """Remove rows without a box; their times stay, as times without boxes."""
     is_row = ~np.isnan(rows.boxes[:, :6]).all(axis=1)
     rows.labelled = np.unique(rows.number)
     if is_row.all():
