@@ -251,10 +251,10 @@ _URL: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/+([^\s]+)")
 
 def refuse_url(path: Path | str) -> None:
     """Raise McaptrackError for a URL, with the slashes that it had."""
-    found = _URL.fullmatch(str(path))
-    if found and not Path(path).exists():
-        url = hide_secrets(f"{found[1]}://{found[2]}")
-        if found[1].lower() in SCHEMES:
+    match = _URL.fullmatch(str(path))
+    if match and not Path(path).exists():
+        url = hide_secrets(f"{match[1]}://{match[2]}")
+        if match[1].lower() in SCHEMES:
             raise McaptrackError(f"{url} is in a store, from which only logs are read; give a file here")
         raise McaptrackError(
             f"{url} is a URL; only files, and logs at s3://, gs:// and az://, are read: copy it here first"

@@ -92,7 +92,7 @@ def _kinds(function: Callable[..., object]) -> dict[str, tuple[Any, ...]]:
 def _ranges(function: Callable[..., object]) -> dict[str, tuple[float, float]]:
     """The ranges that the annotations of a function declare."""
     options = {name: option_of(hint) for name, hint in hints_of(function).items()}
-    return {name: (one.least, one.most) for name, one in options.items() if one.is_bounded}
+    return {name: (option.least, option.most) for name, option in options.items() if option.is_bounded}
 
 
 def _paths_in(value: Any, kinds: Iterable[Any]) -> Iterable[Any]:
@@ -126,7 +126,7 @@ def _check_range(name: str, value: Any, ends: tuple[float, float], *, is_whole: 
     values = list(value) if isinstance(value, Iterable) and not isinstance(value, str | bytes) else [value]
     for one in values:
         if not isinstance(one, kind) or isinstance(one, bool) or not least <= one <= most:
-            words = "a whole number" if is_whole else "a number"
-            raise McaptrackError(f"`{name}=` is {words} from {least:.12g} to {most:.12g}, not {one!r:.40}")
+            text = "a whole number" if is_whole else "a number"
+            raise McaptrackError(f"`{name}=` is {text} from {least:.12g} to {most:.12g}, not {one!r:.40}")
     if not values:
         raise McaptrackError(f"`{name}=` needs at least one number")

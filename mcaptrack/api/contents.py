@@ -232,7 +232,7 @@ def info(log: PathLike, *, frames: bool = False) -> LogInfo:
 
 
 def _channel(opened: logs.Log, part: logs.Log, channel: logs.Channel, camera: str | None) -> ChannelInfo:
-    made = Provenance.from_metadata(channel.metadata)
+    provenance = Provenance.from_metadata(channel.metadata)
     replaced = opened.part(channel.topic) is not part
     return ChannelInfo(
         topic=channel.topic,
@@ -243,12 +243,12 @@ def _channel(opened: logs.Log, part: logs.Log, channel: logs.Channel, camera: st
         encoding=channel.message_encoding,
         messages=channel.messages,
         rate_hz=_rate(opened, channel.messages),
-        transform=made.transform if made else None,
-        input=made.input or None if made else None,
-        version=made.version if made else None,
-        references=dict(made.references) if made else None,
-        plugins={part: plugin._asdict() for part, plugin in made.plugins.items()} if made else None,
-        parameters=dict(made.parameters) if made else None,
+        transform=provenance.transform if provenance else None,
+        input=provenance.input or None if provenance else None,
+        version=provenance.version if provenance else None,
+        references=dict(provenance.references) if provenance else None,
+        plugins={part: plugin._asdict() for part, plugin in provenance.plugins.items()} if provenance else None,
+        parameters=dict(provenance.parameters) if provenance else None,
         frame=frame_id_of(channel.metadata) or None,
         stale=not replaced and pipeline.is_stale(opened, channel.topic),
         camera=camera,

@@ -129,19 +129,23 @@ def options_of(function: Callable[..., Any]) -> list[Parameter]:
     words, hints = words_of(function), hints_of(function)
     flags = {name: f"--{(option_of(hint).flag or name).replace('_', '-')}" for name, hint in hints.items()}
     out = []
-    for name, one in inspect.signature(function).parameters.items():
+    for name, parameter in inspect.signature(function).parameters.items():
         about = _about(hints[name])
-        if one.kind is one.VAR_KEYWORD or PYTHON_ONLY in about or any(isinstance(each, OneOfMany) for each in about):
+        if (
+            parameter.kind is parameter.VAR_KEYWORD
+            or PYTHON_ONLY in about
+            or any(isinstance(each, OneOfMany) for each in about)
+        ):
             continue
         option, (kind, many) = option_of(hints[name]), on_command_line(bare(hints[name]))
         text, shown = _split_default(words.parameters.get(name, [""])[0])
         flag, _, off = flags[name].partition("/")
-        if kind is bool and (off or one.default is not False):
+        if kind is bool and (off or parameter.default is not False):
             off = f"--{off or f'no-{flag[2:]}'}"
             text = text.replace("(True)", f"({flag})").replace("(False)", f"({off})")
         names = (f"{flag}/{off}" if off else flag, *([f"-{option.short}"] if option.short else []))
         default = shown if option.shown is None else option.shown
-        out.append(Parameter(name, kind, many, names, one.default, option, with_dashes(text, flags), default))
+        out.append(Parameter(name, kind, many, names, parameter.default, option, with_dashes(text, flags), default))
     return out
 
 
@@ -168,7 +172,7 @@ def on_command_line(hint: Any) -> tuple[Any, bool]:
 
 def _parts(hint: Any) -> list[Any]:
     if get_origin(hint) in (Union, types.UnionType):
-        return [part for one in get_args(hint) for part in _parts(one)]
+        return [part for inner in get_args(hint) for part in _parts(inner)]
     return [hint]
 
 
@@ -187,8 +191,8 @@ def words_of(function: Callable[..., Any]) -> Words:
 
 def _split_default(text: str) -> tuple[str, str | None]:
     """Split "Width; by default that of the video." into the help and the default that it shows."""
-    found = re.fullmatch(r"(.+?)(?:;|\.) [Bb]y default (.+?)\.", text)
-    return (f"{found[1]}.", found[2]) if found else (text, None)
+    match = re.fullmatch(r"(.+?)(?:;|\.) [Bb]y default (.+?)\.", text)
+    return (f"{match[1]}.", match[2]) if match else (text, None)
 
 
 def with_dashes(text: str, flags: dict[str, str]) -> str:

@@ -431,10 +431,10 @@ def _packages() -> tuple[dict[str, str], dict[str, tuple[str, ...]], list[str]]:
     lacking: dict[str, list[str]] = {}
     faults = []
     for text in _requirements():
-        found = _REQUIREMENT.match(text)
-        if found is None:
+        match = _REQUIREMENT.match(text)
+        if match is None:
             continue
-        name, least, marker = found.groups(default="")
+        name, least, marker = match.groups(default="")
         extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", marker)
         have = _version_of(name)
         is_enough = bool(have) and _numbers(have) >= _numbers(least)
@@ -465,8 +465,8 @@ def _version_of(name: str) -> str:
 
 def _numbers(version: str) -> tuple[int, ...]:
     """Return the numbers at the beginning of a version; zeros at their end say nothing."""
-    found = re.match(r"\d+(?:\.\d+)*", version)
-    numbers = [int(number) for number in found[0].split(".")] if found else []
+    match = re.match(r"\d+(?:\.\d+)*", version)
+    numbers = [int(number) for number in match[0].split(".")] if match else []
     while numbers and not numbers[-1]:
         numbers.pop()
     return tuple(numbers)

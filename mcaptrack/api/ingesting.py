@@ -322,12 +322,12 @@ def _changes(path: Path, report: IngestReport) -> dict[str, Any] | None:
 
     (topic,) = (topic for topic in report.messages if topic.endswith(f"/{CORRECTED}"))
     with logs.read(path) as opened:
-        found = changes_in(opened, topic)
-    if found is None:
+        changes = changes_in(opened, topic)
+    if changes is None:
         report.remarks.append(f"{path} has no tracks to compare {topic} with")
         return None
-    report.remarks.append(f"{topic}: {found.words}; {call('run', path)} takes it over")
-    return found.to_json()
+    report.remarks.append(f"{topic}: {changes.words}; {call('run', path)} takes it over")
+    return changes.to_json()
 
 
 def default_log(source: Path) -> Path:

@@ -156,7 +156,7 @@ def show_tables() -> None:
     if shell is None:
         return
     html = shell.display_formatter.formatters["text/html"]
-    if _ARROW not in html.deferred_printers and not any(_name_of(one) == _ARROW for one in html.type_printers):
+    if _ARROW not in html.deferred_printers and not any(_name_of(printer) == _ARROW for printer in html.type_printers):
         html.for_type_by_name(*_ARROW, arrow_html)
 
 
@@ -215,11 +215,11 @@ def _still(opened: logs.Log, source: PictureSource, number: int, width_px: int |
     seconds = source.seconds(int(source.t_ns[number]))
     image = source.still(number, width_px)
     jpeg = still_jpeg(image)
-    made = Player(
+    player = Player(
         opened.path, source.topic, source.is_above, source.views, 1, 1, 1, seconds, seconds, html="", still=jpeg
     )
-    title = f"{opened.path.name}: {made.caption}"
-    return replace(made, html=still_html(jpeg, image.shape[1], title))
+    title = f"{opened.path.name}: {player.caption}"
+    return replace(player, html=still_html(jpeg, image.shape[1], title))
 
 
 def _player(opened: logs.Log, source: PictureSource, choice: Choice, max_mb: float, progress: Progress) -> Player:
@@ -227,9 +227,9 @@ def _player(opened: logs.Log, source: PictureSource, choice: Choice, max_mb: flo
     moments = find_moments(opened)
     at_ns, _ = opening_moment(opened, moments)
     events = [
-        (source.seconds(one.t_ns), one.text)
-        for one in moments
-        if any(f"{view}/".startswith(f"{one.topic}/") for view in source.views)
+        (source.seconds(moment.t_ns), moment.text)
+        for moment in moments
+        if any(f"{view}/".startswith(f"{moment.topic}/") for view in source.views)
     ]
     every = choice.every or source.step(numbers, _PLANNED * max_mb * _MB, choice.width_px)
     taken = source.take(numbers[::every], choice.width_px, progress)
@@ -239,14 +239,14 @@ def _player(opened: logs.Log, source: PictureSource, choice: Choice, max_mb: flo
         image = source.still(taken.numbers[opens_at], choice.width_px or min(PLAYER_PX, taken.sizes[0][0]))
         still = Still(still_jpeg(image), image.shape[1])
         span = seconds[0], seconds[-1]
-        made = Player(
+        player = Player(
             opened.path, source.topic, source.is_above, source.views,
             len(seconds), len(numbers), every, *span, html="", still=still.jpeg,
         )  # fmt: skip
         inside = [(at, text) for at, text in events if span[0] <= at <= span[1]]
-        html = player_html(taken, seconds, inside, opens_at, still, f"{opened.path.name}: {made.caption}")
+        html = player_html(taken, seconds, inside, opens_at, still, f"{opened.path.name}: {player.caption}")
         if len(html) <= max_mb * _MB or len(seconds) == 1:
-            return replace(made, html=html)
+            return replace(player, html=html)
         if choice.every is not None:
             raise McaptrackError(
                 f"{opened.path}: {len(seconds)} {source.noun} make a player of {len(html) / _MB:.1f} MB, and "

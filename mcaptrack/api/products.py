@@ -69,8 +69,8 @@ def write_products(
             exported = export(opened, default_folder(log), progress, force=force, boxes=boxes)
             done.owed.append(main_file(log, default_folder(log)))
             done.rows, done.tables = exported.rows, exported.written
-            for words in exported.notes:
-                warn(words, "left-out")
+            for note in exported.notes:
+                warn(note, "left-out")
     return done
 
 

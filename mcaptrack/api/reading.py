@@ -415,6 +415,6 @@ class LogReader:
 
     def _decoded(self, topic: str, wanted: Mapping[int, int] | None, colour: Colour) -> Iterator[Frame]:
         pixels = decode_gray if colour == "grey" else decode_bgr
-        found = Pictures(self._log, topic)
-        for frame in found.frames(range(len(found.t_ns)) if wanted is None else wanted, pixels):
+        pictures = Pictures(self._log, topic)
+        for frame in pictures.frames(range(len(pictures.t_ns)) if wanted is None else wanted, pixels):
             yield frame._replace(rows=frame.rows[..., ::-1]) if colour == "rgb" else frame

@@ -232,7 +232,7 @@ def detections(
         if any(values is not None for values in in_space.values()):
             raise McaptrackError("supervision.Detections are boxes in pixels; give positions without them")
         return frame_of_supervision(boxes, t_ns, index, DETECTIONS)
-    given = columns_in_space(in_space)
+    columns = columns_in_space(in_space)
     if boxes is None and positions_m is None:
         raise McaptrackError("detections need boxes in pixels (`boxes=`), or positions in metres (`positions_m=`)")
     if boxes is None and box_format is not None:
@@ -240,9 +240,9 @@ def detections(
     if boxes is not None and box_format not in ("xyxy", "xywh"):
         raise McaptrackError("say what the columns of boxes are with `box_format='xyxy'` or `box_format='xywh'`")
     classes = classes if class_names is None else numbers_of(classes, class_names)
-    given |= {"score": scores, "class_id": classes}
+    columns |= {"score": scores, "class_id": classes}
     pixels = None if boxes is None or box_format is None else boxes_of(boxes, box_format)
-    return frame_of(DETECTIONS, pixels, given, t_ns, index)
+    return frame_of(DETECTIONS, pixels, columns, t_ns, index)
 
 
 def frames_of(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame], dict[int, str]]:
@@ -288,7 +288,7 @@ def _of_frames(rows: Any, schema: Schema | None, names: dict[int, str]) -> tuple
         )
     if not isinstance(rows, Iterable) or isinstance(rows, str | bytes):
         raise McaptrackError(f"rows are frames, an array, a table or supervision.Detections, not {kind_of(rows)}")
-    frames = [_frame(one, schema, names) for one in (rows.items() if hasattr(rows, "items") else rows)]
+    frames = [_frame(item, schema, names) for item in (rows.items() if hasattr(rows, "items") else rows)]
     if schema is None:
         found = {frame.rows.dtype.names for frame in [frame for frame in frames if len(frame.rows)] or frames}
         fitting = [one for one in (DETECTIONS, TRACKS) if found and all(map(one.has_columns, found))]

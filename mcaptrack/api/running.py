@@ -266,7 +266,9 @@ def change(
         counted = {}
         if report.has_zones:
             with logs.read(target) as opened:
-                found = [one for camera in done for one in pipeline.counted_zones(opened, camera.prefix)]
+                found = [
+                    counted_zone for camera in done for counted_zone in pipeline.counted_zones(opened, camera.prefix)
+                ]
                 counted = {one.topic: one.totals for one in found}
         summaries: dict[str, Summary] = {}
         if tables is not None:

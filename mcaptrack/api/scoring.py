@@ -194,7 +194,7 @@ class Scores:
         """
         rows = [row for row in self.rows() if row["class"] == of_class]
         if not rows and of_class is not None:
-            there = ", ".join(dict.fromkeys(one.of_class for one in self.results if one.of_class is not None))
+            there = ", ".join(dict.fromkeys(result.of_class for result in self.results if result.of_class is not None))
             raise McaptrackError(f"no class {of_class!r:.60} was scored by itself; there are {there or 'none'}")
         return [row for row in rows if row["sequence"] == COMBINED] or rows
 
@@ -229,7 +229,7 @@ class Scores:
         """
         from mcaptrack.viewing.report.formatting import curves_svg
 
-        whole = [one for one in self.results if one.of_class is None and one.displacement is not None]
+        whole = [result for result in self.results if result.of_class is None and result.displacement is not None]
         whole = [one for one in whole if one.sequence == COMBINED] or whole
         found = {one.tracks: one.displacement for one in whole if one.displacement is not None}
         if not found:
@@ -369,8 +369,8 @@ def evaluate(
 
         outcome = score_sequences(sequences, options, tell)
         progress("evaluate", total, total)
-        for words in outcome.notes:
-            warn(words, "not-compared")
+        for note in outcome.notes:
+            warn(note, "not-compared")
         has_point, has_plane = point != "foot", ground_plane is not None
         if truth is None:
             reason = "it is about label files; logs have theirs inside"
@@ -420,13 +420,15 @@ def _smoothed(opened: logs.Log, prefix: str) -> Candidate:
     samples, forecasts = (f"{prefix}/{name}" for name in (stage.input_topic, stage.output_topic))
     if forecasts not in opened.channels or samples not in opened.channels:
         raise McaptrackError(f"{opened.path} has no {forecasts}; {call('run', opened.path)} makes them")
-    made = Provenance.from_metadata(opened.channel(forecasts).metadata)
-    transform = rebuild(stage, made, {}) if made is not None and made.transform == stage.name else None
-    if made is None or not isinstance(transform, Predict):
+    provenance = Provenance.from_metadata(opened.channel(forecasts).metadata)
+    transform = (
+        rebuild(stage, provenance, {}) if provenance is not None and provenance.transform == stage.name else None
+    )
+    if provenance is None or not isinstance(transform, Predict):
         raise McaptrackError(f"{forecasts} of {opened.path} is recorded: how it was predicted is not known")
     names = class_names(opened.channel(samples).metadata)
     class_of = tuple(names.items())
-    rate_hz = float(made.parameters.get("rate_hz", transform.rate_hz))
+    rate_hz = float(provenance.parameters.get("rate_hz", transform.rate_hz))
     frames = opened.frames(samples, TRACKS)
     predictions = list(smoothed_predictions(frames, replace(transform, rate_hz=rate_hz, class_names=class_of)))
     name = f"{samples}, smoothed"

@@ -198,9 +198,9 @@ def unfitting(
     """
     space = "ground" if pipeline.camera_at(opened, prefix).in_space else "picture"
     found = set()
-    for stage, one in transforms.items():
-        if one.reads is DETECTIONS and one.writes[""] is TRACKS and traits_of(one).space != space:
-            say(f"{prefix[1:]} is not tracked by {STAGES[stage].choice(one)}, which is for other boxes")
+    for stage, transform in transforms.items():
+        if transform.reads is DETECTIONS and transform.writes[""] is TRACKS and traits_of(transform).space != space:
+            say(f"{prefix[1:]} is not tracked by {STAGES[stage].choice(transform)}, which is for other boxes")
             found.add(stage)
     return found
 
@@ -208,17 +208,17 @@ def unfitting(
 def together(reports: Sequence[Report]) -> Report:
     """Return the reports on several cameras as one."""
     out = Report()
-    for one in reports:
-        out.stages += one.stages
-        out.frames |= one.frames
-        out.rows |= one.rows
-        out.tracks |= one.tracks
-        out.events |= one.events
-        out.is_written |= one.is_written
-        out.stale = [*dict.fromkeys([*out.stale, *one.stale])]
-        out.warnings += one.warnings
-        out.has_zones |= one.has_zones
-        for name, seconds in one.watch.seconds.items():
+    for report in reports:
+        out.stages += report.stages
+        out.frames |= report.frames
+        out.rows |= report.rows
+        out.tracks |= report.tracks
+        out.events |= report.events
+        out.is_written |= report.is_written
+        out.stale = [*dict.fromkeys([*out.stale, *report.stale])]
+        out.warnings += report.warnings
+        out.has_zones |= report.has_zones
+        for name, seconds in report.watch.seconds.items():
             out.watch.seconds[name] = out.watch.seconds.get(name, 0.0) + seconds
     return out
 

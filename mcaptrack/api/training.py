@@ -234,8 +234,8 @@ def _windows(
     if paths:
         scenes = read_scenes(paths, options, recipe.step_s)
         first = 0 if not parts else int(parts[0].scene.max()) + 1
-        found = windows_of(scenes, recipe)
-        parts.append(Windows(found.past, found.known, found.future, found.scene + first))
+        windows = windows_of(scenes, recipe)
+        parts.append(Windows(windows.past, windows.known, windows.future, windows.scene + first))
         words.append(f"{len(scenes)} scenes: {', '.join(scene.name for scene in scenes)[:500]}")
     licence = _LICENCE if paths else "Apache-2.0"
     card = {"data": "; ".join(words), "licence": licence, "made_by": f"mcaptrack {__version__}"}

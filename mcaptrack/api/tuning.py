@@ -233,8 +233,8 @@ def _ranges(kind: type[Transform], search: Search | None) -> dict[str, Range]:
     out = {}
     for name, span in asked.items():
         if name not in declared:
-            known = ", ".join(declared) or "none"
-            raise McaptrackError(f"`search=` has {name}, which can't be searched; there are {known}")
+            text = ", ".join(declared) or "none"
+            raise McaptrackError(f"`search=` has {name}, which can't be searched; there are {text}")
         out[name] = declared[name]
         if span is not None:
             low, high = span

@@ -94,8 +94,8 @@ class LogServer:
         }
         self.links = links_to(first, contents.at_ns)
         self.events = tuple(
-            one._replace(link=links_to(first, links.before(one.t_ns, contents.start_ns))["Lichtblick"])
-            for one in contents.events
+            event._replace(link=links_to(first, links.before(event.t_ns, contents.start_ns))["Lichtblick"])
+            for event in contents.events
         )
         self.report = None
         if contents.report is not None:
@@ -286,8 +286,8 @@ def _chosen_layouts(
         return {file.stem.removesuffix(".layout"): (f"{file.stem}.json", file)}
     found = _layouts(path, opened, notes)
     if chosen is not None and str(chosen) not in found:
-        there = ", ".join(found) or "none"
-        raise McaptrackError(f"{path} has no layout {chosen}; it has {there}. A file of a layout ends with .json")
+        text = ", ".join(found) or "none"
+        raise McaptrackError(f"{path} has no layout {chosen}; it has {text}. A file of a layout ends with .json")
     return {
         name: (layout_path(path, name).name, content)
         for name, content in found.items()

@@ -318,7 +318,7 @@ def run(
         renewed: Collection[str],
     ) -> list[Job]:
         others = unfitting(opened, prefix, transforms, say) if len(names) != 1 and topic is None else set()
-        kept = {stage: one for stage, one in transforms.items() if stage not in others}
+        kept = {stage: transform for stage, transform in transforms.items() if stage not in others}
         options = chosen.keys() - {STAGES[stage].option for stage in others}
         return pipeline.plan_all(
             opened, prefix, say, topic, kept, force, options, shared, plane, frame or "", changed, renewed
@@ -338,7 +338,7 @@ def _log_before(log: Location, follows: PathLike | Sequence[PathLike] | None) ->
     if follows is None or isinstance(follows, str | os.PathLike):
         found = None if follows is None else as_location(follows)
     else:
-        order = [as_location(one) for one in follows]
+        order = [as_location(log_before) for log_before in follows]
         if log not in order:
             raise McaptrackError(f"{log} is not one of the logs of `follows=`; their order says which one it follows")
         at = order.index(log)

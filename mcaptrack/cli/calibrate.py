@@ -99,7 +99,7 @@ def _in_short(result: CalibrateResult) -> str:
 def _print(result: CalibrateResult, talk: common.Talk) -> None:
     took = f" in {result.seconds:.1f} s" if result.seconds else ""
     talk.say(f"{result.log}: {_in_short(result)}{took}")
-    lines = [(name, _words(one, name in result.unchanged)) for name, one in result.cameras.items()]
+    lines = [(name, _words(camera, name in result.unchanged)) for name, camera in result.cameras.items()]
     dropped = "would be dropped" if result.is_dry_run else "dropped"
     lines += [(dropped, f"{topic}: the camera agrees without it") for topic in result.dropped]
     if result.written_because and result.written_to:
@@ -114,19 +114,19 @@ def _words(one: CameraCorrection, is_unchanged: bool) -> str:
     before = _distances(one.median_before_m, one.p90_before_m)
     if not one.correction:
         compared = f"; feet are {before} from those of the others ({one.pairs:,} compared)" if one.pairs else ""
-        words = f"as it was: {with_flags(one.why)}{compared}"
+        text = f"as it was: {with_flags(one.why)}{compared}"
     else:
         after = _distances(one.median_after_m, one.p90_after_m)
         corrected = "corrected already by" if is_unchanged else "corrected by"
-        words = (
+        text = (
             f"{corrected} {_IN_WORDS[one.correction]}, which moves feet by {one.moved_m:.2f} m: they are {after} from "
             f"those of the others, and were {before} ({one.pairs:,} compared)"
         )
-        words += f"; {one.limit}" if one.limit else ""
+        text += f"; {one.limit}" if one.limit else ""
     if one.clock_offset_s:
         late = "late" if one.clock_offset_s > 0 else "early"
-        words += f"; its times are {abs(one.clock_offset_s):.2f} s {late}"
-    return words
+        text += f"; its times are {abs(one.clock_offset_s):.2f} s {late}"
+    return text
 
 
 def _distances(median_m: float | None, p90_m: float | None) -> str:
@@ -139,7 +139,7 @@ def _as_json(result: CalibrateResult) -> dict[str, Any]:
     """Return the result as values of JSON."""
     return {
         "log": str(result.log),
-        "cameras": {name: _camera_as_json(one) for name, one in result.cameras.items()},
+        "cameras": {name: _camera_as_json(camera) for name, camera in result.cameras.items()},
         "corrected": dict(result.corrected),
         "unchanged": list(result.unchanged),
         "dropped": list(result.dropped),

@@ -56,20 +56,20 @@ def _message(error: Any) -> str:
 def _unknown_option(error: Any) -> str:
     """Return the message about an unknown option: which commands have it, and which options have similar names."""
     name, context = error.option_name, error.ctx
-    words = f"no such option: {name}"
+    text = f"no such option: {name}"
     if context is None or context.parent is None:
-        return words
+        return text
     theirs = {command: _options_of(found) for command, found in context.parent.command.commands.items()}
     if having := [command for command, options in theirs.items() if name in options]:
-        words += f" ({', '.join(having)} {'has' if len(having) == 1 else 'have'} it)"
+        text += f" ({', '.join(having)} {'has' if len(having) == 1 else 'have'} it)"
     parameter = name.removeprefix("--").removeprefix("no-").replace("-", "_")
     if parameter in getattr(context.command, "settable", ()):
-        return f"{words}; did you mean --set {parameter}=VALUE?"
+        return f"{text}; did you mean --set {parameter}=VALUE?"
     known = theirs.get(context.info_name, [])
     stem = name.replace("_", "-")
     alike = [option for option in known if option == stem or option.startswith(f"{stem}-")]
     alike = alike or difflib.get_close_matches(name, known, 1, 0.75)
-    return f"{words}; did you mean {' or '.join(alike)}?" if alike else words
+    return f"{text}; did you mean {' or '.join(alike)}?" if alike else text
 
 
 def _options_of(command: Any) -> list[str]:
@@ -182,8 +182,8 @@ class Command(TyperCommand):
             rank, where = _rank(ctx, setting.parameter, found)
             if rank != _DEFAULT and setting.parameter in ctx.params:
                 value = ctx.params[setting.parameter]
-                words = " ".join(map(str, value)) if setting.many else str(value)
-                parts.append(f"{setting.name}={words} ({where or 'command line'})")
+                text = " ".join(map(str, value)) if setting.many else str(value)
+                parts.append(f"{setting.name}={text} ({where or 'command line'})")
         return f"options: {', '.join(parts)}"
 
 

@@ -93,8 +93,8 @@ def option(
 
 def output(shown: str | bool = False) -> Any:
     """Return the option --output; ``shown`` is its default in the help."""
-    words = "Write to this file; the input stays unchanged."
-    return option("--output", "-o", panel=FILES, help=words, show_default=shown)
+    text = "Write to this file; the input stays unchanged."
+    return option("--output", "-o", panel=FILES, help=text, show_default=shown)
 
 
 Output = Annotated[Path | None, output()]
@@ -182,8 +182,8 @@ class Talk:
         if is_json():
             if now - self._shown >= PROGRESS_S:
                 self._shown = now
-                words = f"{stage}: {done:g}" + (f" of {total:g}" if total is not None else "")
-                self.event(words, "progress", stage=stage, done=done, total=total)
+                text = f"{stage}: {done:g}" + (f" of {total:g}" if total is not None else "")
+                self.event(text, "progress", stage=stage, done=done, total=total)
             return
         if total is None or self.quiet or not sys.stderr.isatty():
             return
@@ -268,7 +268,7 @@ def expand(paths: Sequence[Path], *, each: bool = False, folders: bool = False) 
     """Return the inputs that arguments name; see ``fleet.expansion.find_inputs``."""
     from mcaptrack.fleet.expansion import find_inputs
 
-    return [one.path for one in find_inputs(paths, each=each, folders=folders)]
+    return [found_log.path for found_log in find_inputs(paths, each=each, folders=folders)]
 
 
 def only_one_output(paths: Sequence[Location], output: Path | None) -> None:
@@ -315,7 +315,9 @@ def one_line(command: Callable[P, None]) -> Callable[P, None]:
             raise typer.Exit(LOST)
 
     hints = hints_of(command)
-    own = [one.replace(annotation=hints[name]) for name, one in inspect.signature(command).parameters.items()]
+    own = [
+        parameter.replace(annotation=hints[name]) for name, parameter in inspect.signature(command).parameters.items()
+    ]
     added = inspect.Parameter("log_format", inspect.Parameter.KEYWORD_ONLY, default="text", annotation=LogFormat)
     guarded.__signature__ = inspect.Signature([*own, added])  # type: ignore[attr-defined]
     guarded.__annotations__ = {**hints, added.name: LogFormat}

@@ -38,7 +38,7 @@ class EachLog(Generic[T]):
     def function_of(cls, name: str) -> Callable[..., None]:
         """Return the function of the command: with its options as Typer takes them."""
         declared = getattr(mcaptrack, name)
-        names = [one.name for one in options_of(declared) if one.name != "output"]
+        names = [option.name for option in options_of(declared) if option.name != "output"]
 
         def run(given: Mapping[str, Any]) -> None:
             cls(given)._run(name, names)
@@ -91,7 +91,7 @@ class EachLog(Generic[T]):
             )
             results, totals = process(logs, work, talk, given["output"])
         if given["json"]:
-            common.print_json({"results": [self.data(one) for one in results], **totals})
+            common.print_json({"results": [self.data(result) for result in results], **totals})
         if code := self.code(results):
             raise typer.Exit(code)
 
@@ -108,8 +108,8 @@ def command(
     """
     annotations: dict[str, tuple[Any, Any]] = {}
     if each := one_of_many(declared):
-        words = typer.Argument(metavar=each.metavar, help=each.help, show_default=False)
-        annotations[each.name] = Annotated[list[Path], words], inspect.Parameter.empty
+        argument = typer.Argument(metavar=each.metavar, help=each.help, show_default=False)
+        annotations[each.name] = Annotated[list[Path], argument], inspect.Parameter.empty
     annotations |= {one.name: (annotation_of(one), one.default) for one in options_of(declared)}
     annotations |= dict(more or {})
     annotations |= {option: (hint, False) for option, hint in _OF_ALL.items()} | {"config": (common.Config, None)}
@@ -151,6 +151,6 @@ def annotation_of(one: Parameter) -> Any:
 def help_of(declared: Callable[..., Any]) -> str:
     """Return the help of a command: the docstring of its function, with options as the command line writes them."""
     words = words_of(declared)
-    flags = {one.name: one.flags[0] for one in options_of(declared)}
+    flags = {option.name: option.flags[0] for option in options_of(declared)}
     examples = [f"Example: {line}" for line in words.examples]
     return "\n\n".join([with_dashes(words.text, flags), *examples])

@@ -241,8 +241,8 @@ def _print_forecasts(out: Console, forecasts: Mapping[_Key, Displacement], sever
     table, first = _table_of_forecasts("forecasts of", forecasts, several)
     for name in _FORECAST_COLUMNS.values():
         table.add_column(name, justify="right", no_wrap=True)
-    for key, found in forecasts.items():
-        values = found.summary()
+    for key, forecast in forecasts.items():
+        values = forecast.summary()
         numbers = ["-" if values[name] is None else f"{values[name]:.3f}" for name in _FORECAST_COLUMNS]
         table.add_row(*first(key), *numbers)
     out.print()

@@ -199,4 +199,4 @@ def drop(
         work = LogWork("drop", mcaptrack.drop, options, lambda _, one: talk.say(f"{one.log}: {line(one)}"), data, line)
         results, totals = process(find_logs([path]), work, talk, output)
     if json:
-        common.print_json({"results": [data(one) for one in results], **totals})
+        common.print_json({"results": [data(result) for result in results], **totals})

@@ -32,7 +32,7 @@ def _command(found: re.Match[str]) -> str:
         call = ast.parse(f"call({arguments})", mode="eval").body
         assert isinstance(call, ast.Call)
         values = [ast.literal_eval(value) for value in call.args]
-        options = {one.arg or "": ast.literal_eval(one.value) for one in call.keywords}
+        options = {keyword.arg or "": ast.literal_eval(keyword.value) for keyword in call.keywords}
     except (SyntaxError, ValueError, AssertionError):
         return found[0]
     words: list[str | Path] = [Path(value) if value.startswith("-") else value for value in values]

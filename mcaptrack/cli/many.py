@@ -142,7 +142,7 @@ class ManyOptions:
 
 #: The options of the running command.
 _OPTIONS: Final[ContextVar[ManyOptions]] = ContextVar("many")
-NAMES: Final = tuple(one.name for one in fields(ManyOptions))
+NAMES: Final = tuple(field.name for field in fields(ManyOptions))
 
 
 def many_options() -> ManyOptions:
@@ -177,7 +177,7 @@ def takes_many(*, outputs: bool = True) -> Callable[[Callable[..., None]], Calla
 
         with_options.__name__, with_options.__doc__ = command.__name__, command.__doc__
         with_options.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        with_options.__annotations__ = {one.name: one.annotation for one in parameters}
+        with_options.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
         return with_options
 
     return decorate
@@ -292,7 +292,7 @@ def process(
     if work.shares_output and folder is not None:
         options, folder = {**options, "output": folder}, None
     elif not work.shares_output:
-        only_one_output([one.path for one in logs], output)
+        only_one_output([log.path for log in logs], output)
     if len(logs) == 1 and not many.concern_one:
         path = logs[0].path
         with notices.about(output or path):
@@ -304,7 +304,7 @@ def process(
         return [result], {}
     from mcaptrack.fleet import run as run_fleet
 
-    listener: _Printer[T] = _Printer(work, talk, [one.path for one in logs])
+    listener: _Printer[T] = _Printer(work, talk, [log.path for log in logs])
     try:
         is_hidden = talk.quiet or work.line is None or many.json_lines or is_json()
         with LiveTable.on_terminal(is_hidden) as table:
@@ -328,7 +328,7 @@ def process(
             )
         raise
     _summarise(done, talk)
-    return [done.results[one.path] for one in logs if one.path in done.results], {"fleet": done.to_json()}
+    return [done.results[log.path] for log in logs if log.path in done.results], {"fleet": done.to_json()}
 
 
 class _Printer(Generic[T]):
@@ -375,8 +375,8 @@ class _Printer(Generic[T]):
         self._shown = monotonic()
         ended = status.logs - status.left
         running = [{**asdict(one), "log": str(one.log), "seconds": round(one.seconds, 1)} for one in status.running]
-        words = f"{ended} of {status.logs} logs"
-        self._talk.event(words, "progress", done=ended, total=status.logs, states=dict(status.ended), running=running)
+        text = f"{ended} of {status.logs} logs"
+        self._talk.event(text, "progress", done=ended, total=status.logs, states=dict(status.ended), running=running)
 
     def _print_line(self, outcome: LogOutcome[T]) -> None:
         """Print the outcome as a line of JSON to stdout."""
@@ -385,7 +385,9 @@ class _Printer(Generic[T]):
             "schema_version": SCHEMA_VERSION,
             **_about(outcome),
             "error": with_flags(outcome.error) or None,
-            "warnings": [{"code": one.code, "message": with_flags(one.message)} for one in outcome.warnings],
+            "warnings": [
+                {"code": warning.code, "message": with_flags(warning.message)} for warning in outcome.warnings
+            ],
             "result": result,
         }
         print_line_of_json(line, sys.stdout)
@@ -418,7 +420,7 @@ def _summarise(done: FleetResult[Any], talk: common.Talk) -> None:
     rate = len(done.outcomes) / max(done.seconds, 1e-3)
     line = f"{len(done.outcomes)} logs in {done.seconds:.1f} s ({rate:.1f} a second): {', '.join(words)}"
     if done.peak_bytes:
-        ran = [one for one in done.outcomes if one.tries]
+        ran = [outcome for outcome in done.outcomes if outcome.tries]
         used = done.cpu_seconds / max(1, len(ran))
         line += f"; at most {done.peak_bytes / 1e6:,.0f} MB of memory, {used:.2f} s of processor time a log"
     talk.say(line, "info", "summary", **done.to_json())
@@ -434,7 +436,7 @@ def _seconds(text: str | None) -> float | None:
     """Return a time such as 90s, 10m or 2h in seconds; None for None."""
     if text is None:
         return None
-    found = _TIME.fullmatch(text.strip().lower())
-    if found is None or not float(found[1]):
+    match = _TIME.fullmatch(text.strip().lower())
+    if match is None or not float(match[1]):
         raise McaptrackError(f"--timeout needs a time such as 90s, 10m or 2h, not {text!r:.40}")
-    return float(found[1]) * _SECONDS[found[2]]
+    return float(match[1]) * _SECONDS[match[2]]

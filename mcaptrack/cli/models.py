@@ -43,9 +43,9 @@ def models(
         _list(json, verbose)
         return
     if action != "get" or name is None:
-        words = " ".join(filter(None, (action, name)))
+        text = " ".join(filter(None, (action, name)))
         raise McaptrackError(
-            f"models takes nothing, or get and a name, not {words}; {command('models')} lists the names"
+            f"models takes nothing, or get and a name, not {text}; {command('models')} lists the names"
         )
     path = mcaptrack.get_model(name, source=source)
     if json:

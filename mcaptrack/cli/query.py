@@ -189,10 +189,10 @@ def _form(form: Form | None, output: Path | None, json: bool) -> Form:
 
 def _named(files: Sequence[str]) -> dict[str, Path]:
     out = {}
-    for words in files:
-        name, equals, path = words.partition("=")
+    for file in files:
+        name, equals, path = file.partition("=")
         if not equals or not path:
-            raise McaptrackError(f"--with {words}: give a name and a file, such as --with zones=zones.csv")
+            raise McaptrackError(f"--with {file}: give a name and a file, such as --with zones=zones.csv")
         out[name] = Path(path)
     return out
 

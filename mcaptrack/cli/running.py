@@ -54,7 +54,7 @@ def in_order(logs: Sequence[Path], output: Path | None) -> list[Location]:
     """
     from mcaptrack.fleet import find_logs
 
-    many, found = many_options(), [one.path for one in find_logs(logs)]
+    many, found = many_options(), [log.path for log in find_logs(logs)]
     order, place = "one log is done after the other", "ids go on in the logs themselves"
     given: dict[str, tuple[object, str]] = {
         "--jobs": ((many.jobs or 1) > 1, order),
@@ -90,7 +90,7 @@ def _as_json(result: RunResult) -> dict[str, Any]:
         data |= {
             "tables": result.tables,
             "summary": None if result.summary is None else result.summary.to_json(),
-            "cameras": {name: _camera_as_json(one) for name, one in result.cameras.items()},
+            "cameras": {name: _camera_as_json(camera) for name, camera in result.cameras.items()},
         }
     elif result.summary is not None:
         data |= {"tables": result.tables, "summary": result.summary.to_json()}
@@ -167,7 +167,7 @@ def _line_of(result: RunResult, shows_events: bool) -> str:
     """Return the result for one of many logs in one line."""
     words = [_did(result)]
     if result.cameras:
-        words.append(f"{sum(not one.is_scene for one in result.cameras.values())} cameras")
+        words.append(f"{sum(not camera.is_scene for camera in result.cameras.values())} cameras")
     if shows_events:
         counts = Counter({kind: n for kinds in result.events.values() for kind, n in kinds.items() if n})
         words.append(", ".join(f"{kind} {count}" for kind, count in counts.items()) or "nothing happened")
@@ -235,21 +235,21 @@ def _lines_of_summary(summary: Summary) -> Iterator[tuple[str, str]]:
         yield "corrected", f"{count:,} boxes of {tracks:,} tracks by people, in {pictures:,} pictures"
     if summary.repair is not None:
         done = (("joined", "gaps closed"), ("parted", "split"), ("left_out", "left out"))
-        words = ", ".join(f"{getattr(summary.repair, name):,} {word}" for name, word in done)
+        text = ", ".join(f"{getattr(summary.repair, name):,} {word}" for name, word in done)
         count = summary.repair.tracks
-        yield "re-tracked", f"{count:,} {'track' if count == 1 else 'tracks'}: {words}"
+        yield "re-tracked", f"{count:,} {'track' if count == 1 else 'tracks'}: {text}"
     if summary.appearance is not None and summary.appearance.separation is None:
         yield "colours", "not compared: too few people were seen well before and after gaps"
     elif summary.appearance is not None:
         looks, share = summary.appearance, f"{summary.appearance.separation:.0%}"
         over = f"{looks.tracks:,} {'track' if looks.tracks == 1 else 'tracks'}"
-        words = f"compared: two people differ more than one does in {share} of cases ({over})"
+        text = f"compared: two people differ more than one does in {share} of cases ({over})"
         no = f"not compared: two people differ more than one does in only {share} of cases ({over})"
-        yield "colours", words if looks.used else no
+        yield "colours", text if looks.used else no
     if summary.scores is not None:
         (was, now), (before, after) = summary.scores.idf1, summary.scores.switches
-        words = f"IDF1 {was:.1%} before re-tracking, {now:.1%} after; identity switches {before:,}, then {after:,}"
-        yield "ground truth", f"{words} (matched {summary.scores.by})"
+        text = f"IDF1 {was:.1%} before re-tracking, {now:.1%} after; identity switches {before:,}, then {after:,}"
+        yield "ground truth", f"{text} (matched {summary.scores.by})"
     if summary.forecasts is not None:
         ahead = "" if summary.horizon_s is None else f", {summary.horizon_s:g} s ahead"
         yield "forecasts", f"{summary.forecasts:,}{ahead}"

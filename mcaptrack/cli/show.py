@@ -138,16 +138,16 @@ def _lineage(channels: list[dict[str, Any]], verbose: bool) -> Tree:
         label.append(f"  {printable(channel['transform'])}" if channel["transform"] else "", "dim")
         for plugin in (channel["plugins"] or {}).values():
             package = f"{plugin['distribution']} {plugin['version']}".strip()
-            words = f"  {plugin['name']}" + (f" ({package})" if package else "")
-            label.append(printable(words), "dim")
+            text = f"  {plugin['name']}" + (f" ({package})" if package else "")
+            label.append(printable(text), "dim")
         corrections = [topic for topic in channel.get("references") or () if topic.endswith("/corrected")]
         label.append(f"  with {printable(corrections[0])}" if corrections else "", "dim")
         label.append(f"  in {printable(channel['frame'])}" if channel["frame"] else "", "dim")
         label.append("  out of date" if channel["stale"] else "", "red")
         node = parent.add(label)
         if verbose and channel["parameters"]:
-            words = ", ".join(f"{key}={value}" for key, value in sorted(channel["parameters"].items()))
-            node.add(Text(printable(words), "dim"))
+            text = ", ".join(f"{key}={value}" for key, value in sorted(channel["parameters"].items()))
+            node.add(Text(printable(text), "dim"))
         below = node if depth < _DEEPEST else parent
         waiting += [(below, other, depth + 1) for other in reversed(made_from.get(channel["topic"], []))]
     return root
@@ -302,4 +302,4 @@ def export(
         if folder is not None and form == "parquet" and len(found) > 1:
             refresh(folder)
     if json:
-        common.print_json({"results": [data(one) for one in results], **totals})
+        common.print_json({"results": [data(result) for result in results], **totals})

@@ -86,7 +86,7 @@ class StageCommand:
 def stage_help(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> str:
     """Return the help of the command of a stage; the docstrings of plug-ins come first."""
     where = f"From /camera/{stage.input_topic} to /camera/{stage.output_topic}. Inputs that are missing are made first."
-    others = [f"{name}: {text}" for name, one in plugins.items() if (text := _own_doc(one))]
+    others = [f"{name}: {text}" for name, plugin in plugins.items() if (text := _own_doc(plugin))]
     docs = [*others, *(inspect.cleandoc(one.__doc__ or "") for one in stage.built_in().values())]
     words = [re.split(r"\n\n\w+\n---", doc)[0] for doc in docs]  # without the sections on use from Python
     return "\n\n".join(
@@ -117,8 +117,8 @@ def _option(field: Field[Any], annotation: Any, of: Sequence[str] = ()) -> Any:
     flag = "--" + field.name.replace("_", "-")
     switch = f"{flag}/--no-{flag[2:]}" if kind is bool and not is_tuple else flag
     tuning = _NAME if about.get("kind") else about.get("pattern") or bool(choices(kind)) or kind is not str
-    words = f"parameter {field.name} of {' and '.join(of)}"
-    info = option_of(field, switch, _panel(about.get("theme", ""), of), tuning, words)
+    text = f"parameter {field.name} of {' and '.join(of)}"
+    info = option_of(field, switch, _panel(about.get("theme", ""), of), tuning, text)
     values: Any = list[kind] if is_tuple else kind  # type: ignore[valid-type]
     return Annotated[values | None, info]
 
@@ -194,8 +194,8 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
     pairs = [*taken.items(), *((option, hint) for option, (hint, _) in more.items())]
     flags = Counter(flag for option, hint in pairs for flag in _flags(option, hint)) + Counter(RESERVED)
     if twice := {flag.replace("-", "_") for flag, count in flags.items() if count > 1}:
-        words = f"{' and '.join(plugins)} can't have a parameter {' or '.join(sorted(twice))}"
-        raise McaptrackError(f"{words}: that is the name of an option of {stage.name}")
+        text = f"{' and '.join(plugins)} can't have a parameter {' or '.join(sorted(twice))}"
+        raise McaptrackError(f"{text}: that is the name of an option of {stage.name}")
     if stage.kind:
         more[stage.kind] = taken[stage.kind], None if stage.profiles else usual
 

@@ -120,7 +120,7 @@ def zones(
 
 def zones_in_short(result: RunResult) -> str:
     """The number of zones and lines that were counted, and of channels of tracks, in words."""
-    zones = len({one.zone for totals in result.zones.values() for one in totals})
+    zones = len({total.zone for totals in result.zones.values() for total in totals})
     topics = len(result.zones)
     named = "zone or line" if zones == 1 else "zones and lines"
     return f"{zones} {named}, of {topics} channel{'' if topics == 1 else 's'} of tracks"
@@ -128,7 +128,7 @@ def zones_in_short(result: RunResult) -> str:
 
 def zones_as_json(result: RunResult) -> dict[str, Any]:
     """The totals as values of JSON: by the topic of tracks, a list of zones."""
-    return {topic: [one.to_json() for one in totals] for topic, totals in result.zones.items()}
+    return {topic: [total.to_json() for total in totals] for topic, totals in result.zones.items()}
 
 
 def _as_json(result: RunResult) -> dict[str, Any]:
@@ -158,7 +158,7 @@ def print_zones(result: RunResult) -> None:
         False: ("zone", "tracks of", "tracks", "visits", "entered", "left", "mean stay", "most inside"),
         True: ("line", "tracks of", "tracks", "forward", "backward"),
     }
-    names = dict.fromkeys((one.zone, one.is_line) for totals in result.zones.values() for one in totals)
+    names = dict.fromkeys((total.zone, total.is_line) for totals in result.zones.values() for total in totals)
     for is_line, head in heads.items():
         table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
         for place, name in enumerate(head):

@@ -186,8 +186,8 @@ class Processes:
             try:
                 self._own.child = Child(self._limits)
             except OSError as error:  # no folder for temporary files, or no room there
-                words = f"{request.log}: no worker process can be started ({error.strerror or error})"
-                return Reply("failed", error=words)
+                text = f"{request.log}: no worker process can be started ({error.strerror or error})"
+                return Reply("failed", error=text)
             with self._lock:
                 self._children.append(self._own.child)
         child: Child = self._own.child

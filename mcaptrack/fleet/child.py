@@ -70,10 +70,10 @@ def size_in_bytes(size: str | float | None, name: str) -> int | None:
     """
     if size is None:
         return None
-    found = _SIZE.fullmatch(str(size).strip())
-    if found is None:
+    match = _SIZE.fullmatch(str(size).strip())
+    if match is None:
         raise McaptrackError(f"`{name}=` needs a size such as 2GB or 500MB, not {str(size)!r:.40}")
-    number, unit, binary = found.groups()
+    number, unit, binary = match.groups()
     amount = int(float(number) * (1024 if binary else 1000) ** (" kmgt".index(unit.lower() or " ")))
     if amount < 1_000_000:
         raise McaptrackError(f"`{name}=` needs a size such as 2GB or 500MB, not {str(size)!r:.40}: that is too little")

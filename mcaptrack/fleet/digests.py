@@ -69,7 +69,7 @@ def _digest_in_store(url: Url) -> str:
 
 def digest_of_settings(*settings: object) -> str:
     """Return a digest of a function and its options; it is the same in every process."""
-    text = json.dumps([_plain(one) for one in settings], sort_keys=True)
+    text = json.dumps([_plain(setting) for setting in settings], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
@@ -84,7 +84,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, partial):
         return [_plain(value.func), _plain(value.args), _plain(value.keywords)]
     if is_dataclass(value) and not isinstance(value, type):
-        return [_name(type(value)), {one.name: _plain(getattr(value, one.name)) for one in fields(value)}]
+        return [_name(type(value)), {field.name: _plain(getattr(value, field.name)) for field in fields(value)}]
     if isinstance(value, Mapping):
         return {str(key): _plain(one) for key, one in value.items()}
     if isinstance(value, AbstractSet):

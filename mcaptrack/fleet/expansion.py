@@ -182,13 +182,13 @@ def outputs_in(folder: Path, logs: Sequence[NamedLog], suffix: str) -> list[Path
     Raises McaptrackError if two logs have the same name.
     """
     names: dict[Path, Location] = {}
-    for one in logs:
-        stem = one.below.name.removesuffix(one.below.suffix) if one.below.suffix.lower() == _SUFFIX else one.below.name
-        name = folder / sibling(one.below, suffix, of=stem)
-        other = names.setdefault(name, one.path)
-        if other != one.path:
+    for log in logs:
+        stem = log.below.name.removesuffix(log.below.suffix) if log.below.suffix.lower() == _SUFFIX else log.below.name
+        name = folder / sibling(log.below, suffix, of=stem)
+        other = names.setdefault(name, log.path)
+        if other != log.path:
             raise McaptrackError(
-                f"the results of {other} and {one.path} would both be {name}; give the folder that holds both logs, "
+                f"the results of {other} and {log.path} would both be {name}; give the folder that holds both logs, "
                 "which keeps the folders below it apart, or process them one by one"
             )
     return list(names)
@@ -248,7 +248,7 @@ def _matching(pattern: Path, leave_out: str | None) -> Iterator[NamedLog]:
     for name in names:
         path = Path(name)
         if leave_out is not None and path.is_dir():
-            yield from (replace(one, below=path.relative_to(fixed) / one.below) for one in _logs_in(path, leave_out))
+            yield from (replace(log, below=path.relative_to(fixed) / log.below) for log in _logs_in(path, leave_out))
         else:
             yield NamedLog(path, path.relative_to(fixed))
 

@@ -79,8 +79,8 @@ def do(request: Request, progress: Callable[[str, float, float | None], None]) -
         reply = Reply("out-of-memory", error=f"{request.log}: the memory of this machine is not enough")
     except Exception as error:
         last = " ".join(traceback.format_exception_only(error)[-1].split())
-        words = f"{request.log}: {last}; this is a fault of the program, the ledger and -v have its traceback"
-        reply = Reply("failed", error=words, detail=traceback.format_exc())
+        text = f"{request.log}: {last}; this is a fault of the program, the ledger and -v have its traceback"
+        reply = Reply("failed", error=text, detail=traceback.format_exc())
     seconds, cpu = round(monotonic() - began, 3), round(_cpu_seconds() - used, 3)
     found = tuple(dict.fromkeys(warnings))
     return replace(reply, seconds=seconds, cpu_seconds=cpu, peak_bytes=_peak_bytes(), warnings=found)

@@ -122,12 +122,12 @@ def content_to_recover(path: Location, source: ByteSource, file: ReadFile) -> By
 
     The log itself is not written to, so a journal is good enough that doesn't prove that it belongs to this file.
     """
-    found = find_journal(path, file)
-    if found is None or isinstance(path, Url) or not isinstance(file, OpenFile):
+    journal = find_journal(path, file)
+    if journal is None or isinstance(path, Url) or not isinstance(file, OpenFile):
         return source
-    before = found.journal.old_content() if found.journal else load_old_content(follow_links(path), file)
-    if before is None or (not found.journal and is_sound(source)) or not is_sound(before):
-        notices.warn(found.message, "journal")
+    before = journal.journal.old_content() if journal.journal else load_old_content(follow_links(path), file)
+    if before is None or (not journal.journal and is_sound(source)) or not is_sound(before):
+        notices.warn(journal.message, "journal")
         return source
     notices.warn(
         f"{path} was left half written by an interrupted change; its state before that is recovered with the help "
@@ -211,10 +211,10 @@ def jumps_text(jumps: list[ClockJump], start_ns: int) -> str:
         return ""
     longest = max(jumps, key=lambda jump: jump.after_ns - jump.before_ns)
     after_s = (longest.before_ns - start_ns) / NS_PER_S
-    words = f"there is no message for {_long((longest.after_ns - longest.before_ns) / NS_PER_S)} after {after_s:.3f} s"
+    text = f"there is no message for {_long((longest.after_ns - longest.before_ns) / NS_PER_S)} after {after_s:.3f} s"
     if len(jumps) > 1:
-        words += f", the longest of {len(jumps)} gaps of more than {JUMP_S:g} s"
-    return words
+        text += f", the longest of {len(jumps)} gaps of more than {JUMP_S:g} s"
+    return text
 
 
 def _long(seconds: float) -> str:
@@ -365,17 +365,17 @@ class _Checker:
         if not indexes:
             self._describe_all(content, record.start)
             if entries:
-                words = "a chunk without message indexes: finding a message takes a scan"
-                self._find("no-message-index", record.start, words, "warning")
+                text = "a chunk without message indexes: finding a message takes a scan"
+                self._find("no-message-index", record.start, text, "warning")
         self._count(entries, record.start)
         times = [int(edge) for e in entries.values() if len(e) for edge in (e[:, 0].min(), e[:, 0].max())]
         span = (min(times), max(times)) if times else (0, 0)
         if (head.start_ns, head.end_ns) != span:
-            words = (
+            text = (
                 f"a chunk declares times from {head.start_ns} to {head.end_ns} ns; its messages are from "
                 f"{span[0]} to {span[1]}"
             )
-            self._find("chunk-times", record.start, words)
+            self._find("chunk-times", record.start, text)
         last = max((records.record_at(buffer, at).end for at in indexes.values()), default=record.end)
         sizes = (head.compression, head.end - head.start, head.uncompressed_size)
         place = (record.start, record.end - record.start, dict(indexes), last - record.end)
@@ -448,12 +448,12 @@ class _Checker:
             topic = known.topic if known else f"channel {channel}"
             behind = t_ns < np.maximum(np.maximum.accumulate(t_ns), np.uint64(latest))
             if behind.any():
-                words = f"messages of {topic} that follow later ones"
-                self._find("order", where, words, "warning", int(behind.sum()))
+                text = f"messages of {topic} that follow later ones"
+                self._find("order", where, text, "warning", int(behind.sum()))
             late = t_ns > np.uint64(MAX_NS)
             if late.any():
-                words = f"messages of {topic} later than the year 2262, which are kept, but nothing is computed with"
-                self._find("late", where, words, "warning", int(late.sum()))
+                text = f"messages of {topic} later than the year 2262, which are kept, but nothing is computed with"
+                self._find("late", where, text, "warning", int(late.sum()))
             self._latest[channel] = max(latest, int(t_ns.max()))
             if not self.found.counts:
                 self.found.start_ns = int(t_ns.min())

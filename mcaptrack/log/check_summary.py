@@ -86,11 +86,11 @@ class _Checker:
         if length != FOOTER_BODY.size:  # readers that read the footer as a record take its length from here
             self._find("footer", at, f"the footer declares a length of {length} bytes; it has {FOOTER_BODY.size}")
         if start == 0:
-            words = "there is no summary: opening the log takes a scan"
-            self._find("no-summary", at, words, "warning")
+            text = "there is no summary: opening the log takes a scan"
+            self._find("no-summary", at, text, "warning")
             if offsets_start:
-                words = f"the footer places summary offsets at byte {offsets_start}, but there is no summary"
-                self._find("footer", at, words, "warning")
+                text = f"the footer places summary offsets at byte {offsets_start}, but there is no summary"
+                self._find("footer", at, text, "warning")
             self._compare_checksum(at, crc)
             if behind != at and found.data_end:
                 self._find("footer", at, "there are records after the data section, and the footer names no summary")
@@ -143,8 +143,8 @@ class _Checker:
                     )
             missing = ours.keys() - theirs.keys()
             if missing and theirs:
-                words = f"{name} {min(missing)} is missing in the summary"
-                self._find(f"summary-no-{name}", where, words, "error" if name == "channel" else "warning")
+                text = f"{name} {min(missing)} is missing in the summary"
+                self._find(f"summary-no-{name}", where, text, "error" if name == "channel" else "warning")
         self._compare_chunks(summary, where)
         for name, listed, there in (
             ("attachment", summary.attachments, found.attachments),
@@ -158,8 +158,8 @@ class _Checker:
     def _compare_chunks(self, summary: Index, where: int) -> None:
         ours = self._found.chunks
         if len(ours) and not len(summary.chunks):
-            words = "the summary lists no chunks: finding a message takes a scan"
-            self._find("no-chunk-index", where, words, "warning")
+            text = "the summary lists no chunks: finding a message takes a scan"
+            self._find("no-chunk-index", where, text, "warning")
             return
         missing = np.ones(len(ours), bool)
         for chunk in summary.chunks:
@@ -174,11 +174,11 @@ class _Checker:
             missing[row] = False
             names = [name for name, one, two in zip(chunk._fields, chunk, ours[row], strict=True) if one != two]
             if names:
-                words = f"the chunk index differs from the chunk at byte {chunk.offset}: {', '.join(names)}"
-                self._find("chunk-index", where, words)
+                text = f"the chunk index differs from the chunk at byte {chunk.offset}: {', '.join(names)}"
+                self._find("chunk-index", where, text)
         if missing.any():
-            words = "a chunk that the summary does not list"
-            self._find("chunk-not-listed", int(ours.offsets[missing].min()), words, times=int(missing.sum()))
+            text = "a chunk that the summary does not list"
+            self._find("chunk-not-listed", int(ours.offsets[missing].min()), text, times=int(missing.sum()))
 
     def _compare_statistics(self, reader: Reader, summary: Index, where: int) -> None:
         found = self._found
@@ -202,15 +202,15 @@ class _Checker:
             opcode, low, size = reader.number(1), reader.number(8), reader.number(8)
             listed.add(opcode)
             if size == 0:
-                words = (
+                text = (
                     f"a summary offset of an empty group of {record_name(opcode)} records; some readers report "
                     "it as damage"
                 )
-                self._find("empty-group", record.start, words, "warning")
+                self._find("empty-group", record.start, text, "warning")
             elif groups.get(opcode) != (low, low + size, size):
-                words = f"the {record_name(opcode)} records are not at their summary offset"
-                self._find("summary-offset", record.start, words)
+                text = f"the {record_name(opcode)} records are not at their summary offset"
+                self._find("summary-offset", record.start, text)
         missing = groups.keys() - listed
         if missing:
-            words = f"the {record_name(min(missing))} records have no summary offset"
-            self._find("no-summary-offset", start, words, "warning")
+            text = f"the {record_name(min(missing))} records have no summary offset"
+            self._find("no-summary-offset", start, text, "warning")

@@ -351,9 +351,9 @@ class _Descriptions:
     def of(self, channels: Iterable[ChannelRecord]) -> list[int]:
         """The ids of kept channels that need a new description: no kept chunk holds one so far."""
         return [
-            one.id
-            for one in channels
-            if (one.id in self.channels or one.schema_id in self.schemas) and one.id not in self.described
+            channel.id
+            for channel in channels
+            if (channel.id in self.channels or channel.schema_id in self.schemas) and channel.id not in self.described
         ]
 
 

@@ -188,8 +188,8 @@ class _Recovery:
             self._pending, at = None, uncertain_from
         self._copy_pending()
         is_half = following == len(self._buffer) and not self._known_offsets and self._buffer[at] in DATA_OPCODES
-        words = f"an incomplete {record_name(self._buffer[at])} record" if is_half else "no record can be read here"
-        self._report_lost(at, following, self._words(at, words))
+        text = f"an incomplete {record_name(self._buffer[at])} record" if is_half else "no record can be read here"
+        self._report_lost(at, following, self._words(at, text))
         return following
 
     def _next(self, start: int) -> int:
@@ -201,11 +201,11 @@ class _Recovery:
         low, step, size = start, _FIRST_STEP, len(self._buffer)
         while low < size:
             block = self._buffer[low : min(low + step + _LONGEST, size)]  # a match may end in the next step
-            found = pattern.search(block)
-            while found and found.start() < step:
-                if is_one(low + found.start()):
-                    return low + found.start()
-                found = pattern.search(block, found.start() + 1)
+            match = pattern.search(block)
+            while match and match.start() < step:
+                if is_one(low + match.start()):
+                    return low + match.start()
+                match = pattern.search(block, match.start() + 1)
             low, step = low + step, min(2 * step, BLOCK)
         return size
 
@@ -336,9 +336,11 @@ class _Recovery:
             numbers = (first, last, head.uncompressed_size, head.uncompressed_crc)
             whole = records.pack_chunk(numbers, head.compression, bytes(self._buffer[head.start : head.end]))
         sizes = (head.compression, head.end - head.start, head.uncompressed_size)
-        known = ChunkIndexRecord(first, last, 0, len(whole), {}, 0, *sizes)
+        chunk_index_record = ChunkIndexRecord(first, last, 0, len(whole), {}, 0, *sizes)
         self._saved.update({number: len(listed) for number, listed in entries.items()})
-        self._writer.copy_chunk(whole, known, {number: listed.tobytes() for number, listed in entries.items()})
+        self._writer.copy_chunk(
+            whole, chunk_index_record, {number: listed.tobytes() for number, listed in entries.items()}
+        )
 
     def _describe(self, record: Record) -> None:
         if record.opcode == Opcode.SCHEMA:

@@ -50,7 +50,7 @@ class Snapshot:
             if fresh is None:
                 return
             if all(
-                self.index.has_same_channel(fresh.index, one) for one in channels
+                self.index.has_same_channel(fresh.index, channel) for channel in channels
             ) and self.messages.are_unchanged_in(fresh.source):
                 return
         except Damaged:
@@ -168,23 +168,23 @@ def _look(path: Location, file: ReadFile) -> Snapshot | McaptrackError:
     signature = file.signature()
     is_certain = signature.is_certain
     try:
-        found = find_journal(path, file)
-        source = found.journal.old_content() if found and found.journal else ByteSource.of(file)
+        journal = find_journal(path, file)
+        source = journal.journal.old_content() if journal and journal.journal else ByteSource.of(file)
         if not len(source):
             raise Damaged("it is empty")
         index = read_index(source)
     except Damaged as error:
         hint = f"; {recover_hint(path)}" if _looks_like_mcap(file, signature.size) else ""
-        words = McaptrackError(f"{path} can't be read as an MCAP file: {error}{hint}")
+        refusal = McaptrackError(f"{path} can't be read as an MCAP file: {error}{hint}")
         if not _is_unchanged(path, file, signature):
-            return words
-        if found:
-            notices.warn(found.message, "journal")
-        raise words from None
-    if file.signature() != signature and not (found and found.is_busy):
+            return refusal
+        if journal:
+            notices.warn(journal.message, "journal")
+        raise refusal from None
+    if file.signature() != signature and not (journal and journal.is_busy):
         return McaptrackError(f"{path} is being changed by another process; try again when it is done")
-    if found:
-        notices.warn(found.message, "journal")
+    if journal:
+        notices.warn(journal.message, "journal")
     return Snapshot(path, file, source, index, signature, is_certain)
 
 

@@ -305,8 +305,10 @@ class LogWriter:
 
             compression, data = "zstd", zstandard.ZstdCompressor(_ZSTD_LEVEL[chunk.kind]).compress(content)
         record = records.pack_chunk((first, last, len(content), zlib.crc32(content)), compression, data)
-        known = ChunkIndexRecord(first, last, 0, len(record), {}, 0, compression, len(data), len(content))
-        self.copy_chunk(record, known, {channel: entries.tobytes() for channel, entries in indexes.items()})
+        chunk_index_record = ChunkIndexRecord(first, last, 0, len(record), {}, 0, compression, len(data), len(content))
+        self.copy_chunk(
+            record, chunk_index_record, {channel: entries.tobytes() for channel, entries in indexes.items()}
+        )
 
 
 def _joined(entries: Iterable[bytes]) -> Iterator[bytes]:

@@ -157,8 +157,8 @@ def _lack(opened: log.Log, camera: Camera) -> str:
 def begins_with(opened: log.Log, prefix: str) -> str:
     """Describe the input of the run of one of several cameras; "" for the usual one, pictures alone."""
     camera, detections = camera_at(opened, prefix), f"{prefix}/{STAGES['detect'].output_topic}"
-    made = provenance_of(opened, detections)
-    if detections in opened.channels and (made is None or made.transform not in STAGES):
+    provenance = provenance_of(opened, detections)
+    if detections in opened.channels and (provenance is None or provenance.transform not in STAGES):
         return f"{prefix[1:]} has detections in {detections} already: it is tracked from these, nothing is detected"
     if camera.pictures is None and camera.boxes:
         return f"{prefix[1:]} has no pictures: it is tracked from the boxes in {camera.boxes}"

@@ -100,7 +100,10 @@ def _compared(opened: log.Log, names: Sequence[str]) -> tuple[list[Camera], dict
     """The cameras to compare, and the names in the results of all cameras by each of their names."""
     scenes = scenes_of(opened)
     names_of = {
-        name.strip("/"): one.prefix[1:] for one in cameras_of(opened) if one.prefix not in scenes for name in one.names
+        name.strip("/"): camera.prefix[1:]
+        for camera in cameras_of(opened)
+        if camera.prefix not in scenes
+        for name in camera.names
     }
     for name in names:
         if name.strip("/") not in names_of:
@@ -138,8 +141,8 @@ def _why_held(opened: log.Log, camera: Camera, planes: Planes, reference: Sequen
     """The reason why a plane stays as it is; "" if it may be corrected."""
     if camera.prefix[1:] in reference:
         return REFERENCE
-    made = provenance_of(opened, given_plane(camera))
-    if made is not None and made.transform not in ("ingest",):
+    provenance = provenance_of(opened, given_plane(camera))
+    if provenance is not None and provenance.transform not in ("ingest",):
         return "its plane follows from the transforms of the recording, which stay as they are"
     if len(planes) > 1:
         return "its ground plane changes over time"
@@ -155,9 +158,9 @@ def _in_turns(
 ) -> tuple[list[Refined], dict[str, float], dict[str, GroundPlane]]:
     """Correct planes, estimate the offsets of clocks with them, and correct them again at the right times."""
     fuser = FootFuser()
-    offset_s = {one.view.name: given.get(one.view.name, 0.0) for one in sources}
+    offset_s = {source.view.name: given.get(source.view.name, 0.0) for source in sources}
     refined: list[Refined] = []
-    planes = {one.view.name: one.view.planes[0][1] for one in sources}
+    planes = {source.view.name: source.view.planes[0][1] for source in sources}
     for turn in range(_TURNS):
         gathered = Gathered(sources, fuser)
 
@@ -167,10 +170,10 @@ def _in_turns(
         refined = _refiner(gathered, sources, held, reference, fuser, report).refine()
         planes = {one.name: corrected(one, sources) for one in refined}
         right = [
-            one._replace(view=replace(one.view, planes=((one.view.planes[0][0], planes[one.view.name]),)))
-            if len(one.view.planes) == 1
-            else one
-            for one in sources
+            source._replace(view=replace(source.view, planes=((source.view.planes[0][0], planes[source.view.name]),)))
+            if len(source.view.planes) == 1
+            else source
+            for source in sources
         ]
         if turn == _TURNS - 1:
             break
@@ -180,7 +183,9 @@ def _in_turns(
             progress(1, 1)
             break
         offset_s |= late
-        sources = [one._replace(t_ns=one.t_ns - round(late.get(one.view.name, 0.0) * NS_PER_S)) for one in sources]
+        sources = [
+            source._replace(t_ns=source.t_ns - round(late.get(source.view.name, 0.0) * NS_PER_S)) for source in sources
+        ]
     return refined, offset_s, {one.name: planes[one.name] for one in refined if one.model}
 
 
@@ -287,7 +292,7 @@ def write_changes(opened: log.Log, changes: CorrectedPlanes, output: Path | None
     is_changed = bool(changes.new or changes.dropped)
     if is_changed or output is not None:
         outlines = {plane.provenance.input + views.SCENE_SUFFIX for plane in changes.new.values()}
-        drop = {*changes.new, *changes.dropped, *(one for one in outlines if one in opened.channels)}
+        drop = {*changes.new, *changes.dropped, *(outline for outline in outlines if outline in opened.channels)}
         encoding = encoding_for(opened)
         check_topics({*changes.new}, encoding)
         with log.extend(opened, output, drop=drop) as writer:
@@ -299,8 +304,8 @@ def write_changes(opened: log.Log, changes: CorrectedPlanes, output: Path | None
 
 
 def _is_there(opened: log.Log, topic: str, made: Made) -> bool:
-    known = provenance_of(opened, topic)
-    return known is not None and known.to_metadata() == made.provenance.to_metadata()
+    provenance = provenance_of(opened, topic)
+    return provenance is not None and provenance.to_metadata() == made.provenance.to_metadata()
 
 
 def as_json(one: Refined) -> dict[str, Any]:

@@ -59,9 +59,9 @@ def superseded(opened: log.Log, job: Job) -> list[str]:
 
 def main_topic(opened: log.Log, stage: str, topic: str) -> str:
     """Return the main output topic of the stage that makes ``topic``: itself, or the topic above its last part."""
-    made = provenance_of(opened, topic)
-    if made and made.output:
-        return topic.removesuffix("/" + made.output)
+    provenance = provenance_of(opened, topic)
+    if provenance and provenance.output:
+        return topic.removesuffix("/" + provenance.output)
     above = topic.rpartition("/")[0]
     has_outputs = any(below in opened.channels for below in STAGES[stage].outputs(topic)[1:])
     return above if topic in STAGES[stage].outputs(above)[1:] and not has_outputs else topic

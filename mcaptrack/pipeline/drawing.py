@@ -60,8 +60,8 @@ def find_views(opened: log.Log, prefix: str, topics: Sequence[str] = ()) -> Show
     if pictures is not None:
         for scene in scenes_of(opened):
             if found := _best(opened, scene, views.SUFFIX + pictures):
-                words = f"drawing the tracks of {scene} on {pictures}; `topic=` names those of {prefix}"
-                warn(words, "chosen-camera")
+                text = f"drawing the tracks of {scene} on {pictures}; `topic=` names those of {prefix}"
+                warn(text, "chosen-camera")
                 return Shown(found, pictures)
         if found := _best(opened, prefix, views.SUFFIX):
             return Shown(found, pictures)
@@ -87,8 +87,8 @@ def _given(opened: log.Log, prefix: str, topics: Sequence[str], pictures: str | 
     found = [opened.channel(_view_of(opened, topic, suffix)).topic for topic in topics]
     places = {_place_of(topic, pictures) for topic in found}
     if len(places) > 1:
-        words = ", ".join(sorted(place or "scenes" for place in places))
-        raise McaptrackError(f"{opened.path}: views on {words} can't be drawn in one video; name those of one")
+        text = ", ".join(sorted(place or "scenes" for place in places))
+        raise McaptrackError(f"{opened.path}: views on {text} can't be drawn in one video; name those of one")
     return Shown(found, places.pop())
 
 

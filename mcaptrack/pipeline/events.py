@@ -144,15 +144,15 @@ def _forecast_errors(
     forecasts, digest_of_forecasts = _rows(opened, topic, made, PREDICTIONS)
     (history, of_tracks), (offline, of_later) = (_rows(opened, one, made) for one in (tracks, later))
     try:
-        found = find_forecast_errors(forecasts, history, truth().frames, offline, topic)
+        forecast_errors = find_forecast_errors(forecasts, history, truth().frames, offline, topic)
     except McaptrackError as error:
         warn(f"no errors of forecasts: {error}", "not-compared")
         return {}
     references = truth().digests | {tracks: of_tracks, later: of_later}
     provenance = Provenance(STAGE, {}, topic, digest_of_forecasts, references=references)
     return {
-        topics[0]: Made.of(FORECAST_ERRORS, found.errors, provenance),
-        topics[1]: Made.of(FORECAST_SCORES, found.scores, provenance),
+        topics[0]: Made.of(FORECAST_ERRORS, forecast_errors.errors, provenance),
+        topics[1]: Made.of(FORECAST_SCORES, forecast_errors.scores, provenance),
     }
 
 
@@ -206,8 +206,8 @@ def _default_topics(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> l
 
 def _options_for(opened: log.Log, topic: str, given: EventOptions) -> EventOptions:
     """Return the given options if they differ from the defaults, else those that the log's events were found with."""
-    known = provenance_of(opened, topic + _EVENTS)
-    asked: Any = known.parameters.get("asked") if known and known.transform == STAGE else None
+    provenance = provenance_of(opened, topic + _EVENTS)
+    asked: Any = provenance.parameters.get("asked") if provenance and provenance.transform == STAGE else None
     if given != EventOptions() or not isinstance(asked, dict):
         return given
     similarity = asked.get("similarity")
@@ -231,8 +231,8 @@ def _is_outdated(opened: log.Log, topics: Sequence[str], made: Mapping[str, Made
 
 def _input_digests(opened: log.Log, topic: str) -> dict[str, str]:
     """Return the digests of a channel's inputs when it was made, by topic."""
-    known = Provenance.from_metadata(opened.channel(topic).metadata)
-    return known.made_from() if known else {}
+    provenance = Provenance.from_metadata(opened.channel(topic).metadata)
+    return provenance.made_from() if provenance else {}
 
 
 def _find_conflict(opened: log.Log, topics: Sequence[str]) -> str:

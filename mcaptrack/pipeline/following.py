@@ -85,7 +85,7 @@ class Continued:
 
 def begins_here(before: log.Log, opened: log.Log, prefix: str) -> str:
     """Return why the ids of one of several cameras go on from none, where the log before has others of them; or ""."""
-    there, here = ({one.prefix for one in cameras(each)} for each in (before, opened))
+    there, here = ({camera.prefix for camera in cameras(each)} for each in (before, opened))
     if prefix in there or not there & here:
         return ""
     return f"{before.path} has no camera {prefix[1:]}: its ids begin with {opened.path}"
@@ -118,14 +118,14 @@ class Before:
 
     def _check_camera(self, opened: log.Log) -> None:
         before, prefix = self._log, self._prefix
-        there = [one.prefix[1:] for one in cameras(before)]
+        there = [camera.prefix[1:] for camera in cameras(before)]
         if prefix[1:] not in there:
             raise McaptrackError(
                 f"{opened.path} is of the camera {prefix[1:]}, and {before.path} is of "
                 f"{', '.join(sorted(there)) or 'none'}; ids go on from one recording of a camera to the next"
             )
-        made, again = provenance_of(before, self.tracks), call("run", before.path)
-        if made is None or not _is_tracker(made) or not before.channels[self.tracks].messages:
+        provenance, again = provenance_of(before, self.tracks), call("run", before.path)
+        if provenance is None or not _is_tracker(provenance) or not before.channels[self.tracks].messages:
             raise McaptrackError(f"{before.path} has no tracks that ids could go on from; {again} makes them")
         if is_stale(before, self.tracks):
             raise McaptrackError(f"{before.path}: {self.tracks} is out of date; {again} brings it up to date")
@@ -136,9 +136,9 @@ class Before:
             )
         sizes = [picture_size(one, camera_at(one, prefix).pictures) for one in (before, opened)]
         if None not in sizes and sizes[0] != sizes[1]:
-            words = " and ".join("{} x {}".format(*size) for size in sizes if size)
+            text = " and ".join("{} x {}".format(*size) for size in sizes if size)
             raise McaptrackError(
-                f"{before.path} and {opened.path} have pictures of {words} pixels; they are not of one camera"
+                f"{before.path} and {opened.path} have pictures of {text} pixels; they are not of one camera"
             )
 
     def _check_times(self, opened: log.Log, first_ns: int) -> None:
@@ -171,8 +171,8 @@ class Before:
 
     def renewed(self, opened: log.Log) -> set[str]:
         """The channels of ids that were not made as the continuation of this log, and have to be made again."""
-        made = provenance_of(opened, self.tracks)
-        is_new = made is not None and made.continued.get(AFTER) != digest_of(self._log, self.tracks)
+        provenance = provenance_of(opened, self.tracks)
+        is_new = provenance is not None and provenance.continued.get(AFTER) != digest_of(self._log, self.tracks)
         return {self.tracks} if is_new else set()
 
     def lead(self, job: Job, numbers: Ints, planes: Planes) -> list[Frame]:
@@ -180,19 +180,19 @@ class Before:
 
         Their numbers are those before ``numbers`` (N,), which are of the frames of this log.
         """
-        made = provenance_of(self._log, job.target)
-        source = made.input if made and made.transform == job.stage else job.source
+        provenance = provenance_of(self._log, job.target)
+        source = provenance.input if provenance and provenance.transform == job.stage else job.source
         if not _is_led(job) or not self.is_bridged or source not in self._log.channels:
             return []
         found = read_named_frames(self._log, source, job.transform.reads, job.frame_id).frames
         low = int(np.searchsorted(frame_times(found), self._lead_ns))
         frames = found[low:]
         if job.transform.reads is TRACKS and _differ(read_planes(self._log, self._prefix), planes):
-            frames = [one._replace(rows=_in_planes(one, planes)) for one in frames]
+            frames = [frame._replace(rows=_in_planes(frame, planes)) for frame in frames]
         missing = round(self.result.gap_s * NS_PER_S / self._period_ns) if self._period_ns else 1
         first = int(numbers[0]) if len(numbers) else 0
         shift = first - max(missing, 1) - (frames[-1].index if frames else 0)
-        return [one._replace(index=one.index + shift) for one in frames]
+        return [frame._replace(index=frame.index + shift) for frame in frames]
 
     def in_context(self, transform: Transform) -> Transform:
         """The transform with the clock of the log before, if it samples."""
@@ -205,7 +205,7 @@ class Before:
             return [*outputs], {}
         schemas, topics = list(job.transform.writes.values()), list(job.outputs())
         if not _gives_ids(job) or not self._has(job.target, TRACKS):
-            return [self._kept(schema, one, None) for schema, one in zip(schemas, outputs, strict=True)], {}
+            return [self._kept(schema, output, None) for schema, output in zip(schemas, outputs, strict=True)], {}
         last_id = self._last_id(job)
         maps: dict[str, dict[int, int]] = {}
         for topic, schema, frames in zip(topics, schemas, outputs, strict=True):
@@ -228,8 +228,8 @@ class Before:
 
     def _last_id(self, job: Job) -> int:
         """The largest id up to the end of the log before, also in those before it."""
-        made = provenance_of(self._log, job.target)
-        known = made.continued.get(LAST_ID, "") if made else ""
+        provenance = provenance_of(self._log, job.target)
+        known = provenance.continued.get(LAST_ID, "") if provenance else ""
         largest = int(known) if known.isascii() and known.isdigit() and len(known) < 19 else 0
         for topic, schema in job.outputs().items():
             if schema is TRACKS and self._has(topic, TRACKS):
@@ -317,8 +317,8 @@ def _start_ns(opened: log.Log, prefix: str) -> int:
 
 def warn_unfollowed(opened: log.Log, job: Job) -> None:
     """Warn of ids that went on from another log, and begin at 1 again, since no log before is named."""
-    made = provenance_of(opened, job.target)
-    if _gives_ids(job) and made is not None and made.continued:
+    provenance = provenance_of(opened, job.target)
+    if _gives_ids(job) and provenance is not None and provenance.continued:
         warn(
             f"{job.target} went on from another log, and its ids are made without it now; name both, in order, with "
             "`follows=` to go on again",

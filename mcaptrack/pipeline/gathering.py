@@ -87,7 +87,7 @@ class Gathered:
             yield block
 
     def _from(self, begin: int) -> Iterator[Frame]:
-        nearest = [_nearest(one.t_ns, self.at.t_ns) for one in self._sources]
+        nearest = [_nearest(source.t_ns, self.at.t_ns) for source in self._sources]
         for first in range(begin, len(self.at.t_ns), _TOGETHER):
             yield from self._frames(range(first, min(first + _TOGETHER, len(self.at.t_ns))), nearest)
 
@@ -165,12 +165,12 @@ def read_sources(
     for camera in chosen:
         name, topic = camera.prefix[1:], detections_of(opened, camera)
         assert topic is not None
-        found = read_named_frames(opened, topic, DETECTIONS)
-        if not len(found.frames):
+        named_frames = read_named_frames(opened, topic, DETECTIONS)
+        if not len(named_frames.frames):
             warn(f"{name} is left out: {topic} has no messages", "left-out")
             continue
         references |= {topic: digest_of(opened, topic), camera.ground_plane: digest_of(opened, camera.ground_plane)}
-        for number, word in found.classes.items():
+        for number, word in named_frames.classes.items():
             if classes.setdefault(str(number), word) != word:
                 raise McaptrackError(
                     f"{opened.path}: class {number} is {classes[str(number)]} in one camera and {word} in {topic}; "
@@ -178,10 +178,10 @@ def read_sources(
                 )
         frames_of[name] = frame_of_plane(opened, camera)
         view = CameraView(name=name, planes=tuple(read_planes(opened, camera.prefix) or ()))
-        view = view.with_heights_in(found.frames)
-        t_ns = frame_times(found.frames)
+        view = view.with_heights_in(named_frames.frames)
+        t_ns = frame_times(named_frames.frames)
         offset_ns = round(clock_offset_s.get(name, 0.0) * NS_PER_S)
-        sources.append(Source(topic, found.frames, t_ns - offset_ns, view))
+        sources.append(Source(topic, named_frames.frames, t_ns - offset_ns, view))
     if not sources:
         raise McaptrackError(f"{opened.path} has no detections to fuse: all channels are empty")
     if len(set(frames_of.values())) > 1:
@@ -193,14 +193,14 @@ def compared_cameras(
     sources: list[Source], fuser: FootFuser, given: Mapping[str, float]
 ) -> tuple[Gathered, FootFuser, tuple[Offset, ...], dict[str, float], Shared]:
     """Estimate how well the cameras agree, and the offsets of clocks that are not given."""
-    offset_s = {one.view.name: given.get(one.view.name, 0.0) for one in sources}
+    offset_s = {source.view.name: given.get(source.view.name, 0.0) for source in sources}
     for _ in range(3):
         gathered = Gathered(sources, fuser)
-        fuser = replace(fuser, views=tuple(one.view for one in sources))
+        fuser = replace(fuser, views=tuple(source.view for source in sources))
         every = max(len(gathered) // _COMPARED, 1)
         part = (frame for number, frame in enumerate(gathered) if number // 2 % every == 0)
         blocks = gathered.joined(fuser, keeps=True) if every == 1 else fuser.joined(part)
-        taken_ns = [round(offset_s[one.view.name] * NS_PER_S) for one in sources]
+        taken_ns = [round(offset_s[source.view.name] * NS_PER_S) for source in sources]
         views, offsets, shared = compare(blocks, fuser.views, taken_ns)
         late = {
             view.name: round(offset.late_s, 3)
@@ -213,7 +213,9 @@ def compared_cameras(
         # One camera at a time, the worst first, because those that are right look late beside it.
         offset_s[worst] = round(offset_s[worst] + late[worst], 3)
         shift_ns = round(late[worst] * NS_PER_S)
-        sources = [one._replace(t_ns=one.t_ns - shift_ns) if one.view.name == worst else one for one in sources]
+        sources = [
+            source._replace(t_ns=source.t_ns - shift_ns) if source.view.name == worst else source for source in sources
+        ]
     return gathered, replace(fuser, views=views), offsets, offset_s, shared
 
 

@@ -119,12 +119,12 @@ class Ahead:
         self._frames = frames
 
     def __iter__(self) -> Iterator[Frame]:
-        made: Queue[Frame | BaseException | None] = Queue(_WAITING)
+        queue: Queue[Frame | BaseException | None] = Queue(_WAITING)
         is_over = Event()
-        thread = Thread(target=copy_context().run, args=(_make, self._frames, made, is_over), daemon=True)
+        thread = Thread(target=copy_context().run, args=(_make, self._frames, queue, is_over), daemon=True)
         thread.start()
         try:
-            while isinstance(frame := made.get(), Frame):
+            while isinstance(frame := queue.get(), Frame):
                 yield frame
             if frame is not None:
                 raise frame

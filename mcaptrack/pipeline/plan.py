@@ -159,7 +159,7 @@ def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: st
     """
     sources = {job.source for job in jobs if job.source in opened.channels}
     is_calibrated = any(map(holds_calibrations, opened.channels.values()))
-    has_boxes = camera_at(opened, prefix).in_space or any(holds_boxes_3d(opened, one) for one in sources)
+    has_boxes = camera_at(opened, prefix).in_space or any(holds_boxes_3d(opened, source) for source in sources)
     if frame_id and not has_boxes and not is_calibrated:
         warn("`frame=` has no effect: only recorded 3D boxes are brought to a frame", "option-not-used")
     for job in jobs:
@@ -187,8 +187,10 @@ _STAGE: Final = "sample"
 
 def are_new(opened: log.Log, prefix: str, made: Provenance) -> bool:
     """Whether samples were made before their tracks were corrected."""
-    found = corrections_of(opened, camera_at(opened, prefix).prefix, made.input) if made.transform == _STAGE else None
-    return found is not None and found not in made.references
+    corrections = (
+        corrections_of(opened, camera_at(opened, prefix).prefix, made.input) if made.transform == _STAGE else None
+    )
+    return corrections is not None and corrections not in made.references
 
 
 def corrected_input(
@@ -219,8 +221,8 @@ def is_of_corrections(opened: log.Log, prefix: str, made: Provenance) -> bool:
         return False
     ending = f"/{CORRECTED}"
     then = {topic: digest for topic, digest in made.references.items() if topic.endswith(ending)}
-    found = corrections_of(opened, camera_at(opened, prefix).prefix, made.input)
-    return then != ({} if found is None else {found: digest_of(opened, found)})
+    corrections = corrections_of(opened, camera_at(opened, prefix).prefix, made.input)
+    return then != ({} if corrections is None else {corrections: digest_of(opened, corrections)})
 
 
 def fixed_in(opened: log.Log, prefix: str, source: str, made: Mapping[str, Made]) -> tuple[int, ...]:
@@ -235,21 +237,21 @@ def fixed_in(opened: log.Log, prefix: str, source: str, made: Mapping[str, Made]
 
 def is_stale(opened: log.Log, topic: str) -> bool:
     """Return whether an input or reference of ``topic``, or its ground plane, has changed since it was made."""
-    made = Provenance.from_metadata(opened.channel(topic).metadata)
-    if made is None:
+    provenance = Provenance.from_metadata(opened.channel(topic).metadata)
+    if provenance is None:
         return False
     prefix = name_above(chain_of(opened, topic)[-1])
-    if "ground_planes" in made.parameters:
+    if "ground_planes" in provenance.parameters:
         planes = read_planes(opened, prefix)
-        if planes_to_json(planes or ()) != made.parameters["ground_planes"]:
+        if planes_to_json(planes or ()) != provenance.parameters["ground_planes"]:
             return True
-    if motion.is_motion_new(opened, prefix, made) or are_new(opened, prefix, made):
+    if motion.is_motion_new(opened, prefix, provenance) or are_new(opened, prefix, provenance):
         return True
-    if _has_other_planes(opened, made):
+    if _has_other_planes(opened, provenance):
         return True
-    if any((name in opened.channels) != bool(then) for name, then in made.references.items()):
+    if any((name in opened.channels) != bool(then) for name, then in provenance.references.items()):
         return True
-    for name, then in made.made_from().items():
+    for name, then in provenance.made_from().items():
         now = provenance_of(opened, name)
         if now and now.digest and now.digest != then:
             return True
@@ -305,8 +307,8 @@ class _Planner:
             raise McaptrackError(self._refusal())
         check_inputs(self._opened, self._prefix, self.jobs)
         check_spaces(self._opened, self._prefix, self.jobs, self._frame_id)
-        for words in self._notes:
-            say(words)
+        for note in self._notes:
+            say(note)
         return self.jobs
 
     def source_of(self, stage: str) -> str:
@@ -343,15 +345,15 @@ class _Planner:
 
     def _plan(self, topic: str) -> bool:
         usual = USUAL.get(topic.removeprefix(self._prefix + "/"), "") if topic.startswith(self._prefix + "/") else ""
-        made = provenance_of(self._opened, topic)
+        provenance = provenance_of(self._opened, topic)
         if topic not in self._opened.channels:
             sibling = self._sibling(usual, topic)
             return self._make_again(sibling, usual, topic) if sibling else bool(usual) and self._make(usual, topic)
-        if made is None or made.transform not in STAGES:
+        if provenance is None or provenance.transform not in STAGES:
             if usual in self._sources and topic != self._sources[usual]:
                 raise McaptrackError(self._not_made(usual, topic))
             return False  # no stage makes recorded and ingested channels
-        return self._make_again(made, made.transform, topic)
+        return self._make_again(provenance, provenance.transform, topic)
 
     def _sibling(self, stage: str, topic: str) -> Provenance | None:
         """Return the provenance of another output of the stage that makes ``topic``; None if there is none."""
@@ -366,8 +368,8 @@ class _Planner:
         if not self._is_of_older_version:
             self._is_of_older_version = True
             force = call("run", self._opened.path, force=True)
-            words = f"made by an older version ({made.version}), and left as it is; {force} makes all again"
-            warn(f"{topic} was {words}", "out-of-date")
+            text = f"made by an older version ({made.version}), and left as it is; {force} makes all again"
+            warn(f"{topic} was {text}", "out-of-date")
         return False
 
     def _make(self, stage: str, topic: str, why: str = "is missing") -> bool:
@@ -410,18 +412,20 @@ class _Planner:
         for job in self.jobs:
             if topic in job.outputs():
                 return job.transform
-        made = provenance_of(self._opened, topic)
-        if made and made.transform == FUSE:
-            return fuser_of(made)[0]
-        return self._before(made.transform, made)[0] if made and made.transform in STAGES else None
+        provenance = provenance_of(self._opened, topic)
+        if provenance and provenance.transform == FUSE:
+            return fuser_of(provenance)[0]
+        return (
+            self._before(provenance.transform, provenance)[0] if provenance and provenance.transform in STAGES else None
+        )
 
     def _is_made_by_another(self, topic: str) -> bool:
         """Return whether this run makes a channel by another class of transforms than before."""
-        made = provenance_of(self._opened, topic)
+        provenance = provenance_of(self._opened, topic)
         jobs = [job for job in self.jobs if topic in job.outputs()]
-        if not jobs or made is None or made.transform not in STAGES:
+        if not jobs or provenance is None or provenance.transform not in STAGES:
             return False
-        stage, before = STAGES[made.transform], self._before(made.transform, made)[0]
+        stage, before = STAGES[provenance.transform], self._before(provenance.transform, provenance)[0]
         return before is None or stage.choice(before) != stage.choice(jobs[0].transform)
 
     def _make_again(self, made: Provenance, stage: str, topic: str) -> bool:

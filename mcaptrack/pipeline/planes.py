@@ -127,20 +127,20 @@ def planes_to_json(planes: Planes) -> list[Any]:
 
 def is_plane_due(opened: log.Log, prefix: str, source: str, choice: PlaneChoice) -> bool:
     """Return whether the camera's plane was made from these boxes, or calibrated, and would be made otherwise now."""
-    made = provenance_of(opened, camera_at(opened, prefix).ground_plane)
-    if made is None or (made.input != source and made.transform != _CALIBRATE):
+    provenance = provenance_of(opened, camera_at(opened, prefix).ground_plane)
+    if provenance is None or (provenance.input != source and provenance.transform != _CALIBRATE):
         return False
-    is_untried = _UNCALIBRATED not in made.parameters or any(choice.frames(made))
-    is_new = made.transform in (_ASSUME, _ESTIMATE) and is_untried and _is_calibrated(opened)
-    is_new = is_new or _is_recalibrated(opened, prefix, made)
-    return choice.is_another(made) or is_new
+    is_untried = _UNCALIBRATED not in provenance.parameters or any(choice.frames(provenance))
+    is_new = provenance.transform in (_ASSUME, _ESTIMATE) and is_untried and _is_calibrated(opened)
+    is_new = is_new or _is_recalibrated(opened, prefix, provenance)
+    return choice.is_another(provenance) or is_new
 
 
 def warn_unused(opened: log.Log, prefix: str, choice: PlaneChoice) -> None:
     """Warn of choices that change nothing, because the plane is given, or the camera isn't calibrated."""
     topic = camera_at(opened, prefix).ground_plane
-    made = provenance_of(opened, topic)
-    is_given = topic in opened.channels and (made is None or made.transform not in _MADE)
+    provenance = provenance_of(opened, topic)
+    is_given = topic in opened.channels and (provenance is None or provenance.transform not in _MADE)
     if choice.estimate and is_given:
         warn("a ground plane is given, so that none is estimated", "option-not-used")
     if choice.ground_frame and (is_given or not _is_calibrated(opened)):
@@ -166,8 +166,8 @@ def _is_calibrated(opened: log.Log) -> bool:
 def _is_recalibrated(opened: log.Log, prefix: str, made: Provenance | None) -> bool:
     """Return whether a calibration was ingested for a camera after its planes were made from a calibration."""
     topic = f"{prefix}/calibration"
-    given = provenance_of(opened, topic)
-    if made is None or made.transform != _CALIBRATE or given is None or given.transform != INGEST:
+    provenance = provenance_of(opened, topic)
+    if made is None or made.transform != _CALIBRATE or provenance is None or provenance.transform != INGEST:
         return False
     return made.input != topic or made.input_digest != digest_of(opened, topic)
 
@@ -341,10 +341,10 @@ def without_unseen(channels: Channels, picture_size: Callable[[], PictureSize]) 
     """
     out = dict(channels)
     for topic, (schema, frames) in channels.items():
-        found = _find_unseen(frames, picture_size) if schema is TRACKS else None
-        if found is None:
+        unseen = _find_unseen(frames, picture_size) if schema is TRACKS else None
+        if unseen is None:
             continue
-        is_unseen, count = found
+        is_unseen, count = unseen
         rows = "row is" if count == 1 else "rows are"
         warn(f"{topic}: {count:,} {rows} left out, outside of the picture and without a detection", "left-out")
         stem, _, name = topic.rpartition("/")
@@ -440,8 +440,8 @@ def plane_in_words(planes: Planes, made: Provenance | None) -> str:
     give = f"Give one with {call('ingest', 'INPUT', ground_plane='HOMOGRAPHY')}"
     _, person_m = AS_BEFORE.settled(made)
     if fit := fit_of(made):
-        words = f"one was estimated from {fit_in_words(fit)}, with people {person_m:g} m high"
-        return f"no ground plane is known: {words}. {give}"
+        text = f"one was estimated from {fit_in_words(fit)}, with people {person_m:g} m high"
+        return f"no ground plane is known: {text}. {give}"
     metres = 1 / planes[0][1].homography[0]
     refused = made.parameters.get("refused", "") if made else ""
     why = f", and boxes don't tell it ({refused})" if refused else ""

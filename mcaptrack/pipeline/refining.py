@@ -119,17 +119,17 @@ class Refiner:
 
     def refine(self) -> list[Refined]:
         """Return what was found about each camera, in order."""
-        self.maps = {one.name: np.eye(3) for one in self.cameras}
+        self.maps = {camera.name: np.eye(3) for camera in self.cameras}
         found: dict[str, _Found | str] = {}
         if self.trusted:
             self._outwards(found)
         else:
             self._worst_first(found)
-        return [self._result(one, found.get(one.name, "")) for one in self.cameras]
+        return [self._result(camera, found.get(camera.name, "")) for camera in self.cameras]
 
     def _outwards(self, found: dict[str, _Found | str]) -> None:
         """Compare cameras with those that are right, and then count them to these, the one with most pairs first."""
-        settled, left = set(self.trusted), [one for one in self.cameras if one.name not in self.trusted]
+        settled, left = set(self.trusted), [camera for camera in self.cameras if camera.name not in self.trusted]
         while left:
             places = self._places("", settled, 1)
             seen = [self._suspect(one, places) for one in left]
@@ -141,13 +141,13 @@ class Refiner:
 
     def _worst_first(self, found: dict[str, _Found | str]) -> None:
         """Correct the camera with the most to gain until none gains; later corrections may change earlier ones."""
-        names = {one.name for one in self.cameras}
+        names = {camera.name for camera in self.cameras}
         least = min(len(names) - 1, 2)
         settled: set[str] = set()
         seen: dict[str, tuple[Feet, float, list[Floats], int]] = {}
         turns, most = dict.fromkeys(names, 0), 4 * len(names)
         for number in range(most):
-            left = [one for one in self.cameras if one.name not in settled and turns[one.name] < 3]
+            left = [camera for camera in self.cameras if camera.name not in settled and turns[camera.name] < 3]
             if not left:
                 break
             for one in left:

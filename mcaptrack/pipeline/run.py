@@ -223,8 +223,8 @@ def warn_findings(opened: log.Log, prefix: str, made: Mapping[str, Provenance], 
         for code, message in known[topic].warnings:
             warn(message, known_code(code))
     if is_assumed(planes) and stages & _IN_METRES:
-        words = plane_in_words(planes, known.get(camera_at(opened, prefix).ground_plane))
-        warn(words, "estimated-ground-plane" if is_estimated(planes) else "assumed-ground-plane")
+        plane = plane_in_words(planes, known.get(camera_at(opened, prefix).ground_plane))
+        warn(plane, "estimated-ground-plane" if is_estimated(planes) else "assumed-ground-plane")
     given = [known[topic].parameters for topic in topics]
     held_back = [one for one in given if one.get("poor_scale") and not one.get("side_view")]
     if held_back:
@@ -349,8 +349,8 @@ def _gone(opened: log.Log, jobs: Sequence[Job], made: Mapping[str, Made]) -> set
             gone.update(topic for topic in empty if may_replace(opened, topic, job.stage))
     gone -= {*made}
     for topic in sorted(opened.channels, key=len):  # what is made of a channel has a longer topic
-        known = Provenance.from_metadata(opened.channels[topic].metadata)
-        if known and known.transform in (EVENTS_STAGE, ZONES_STAGE, VIEW) and known.input in gone:
+        provenance = Provenance.from_metadata(opened.channels[topic].metadata)
+        if provenance and provenance.transform in (EVENTS_STAGE, ZONES_STAGE, VIEW) and provenance.input in gone:
             gone.add(topic)
     return gone - {*made}
 
@@ -359,9 +359,9 @@ def outdated_by(opened: log.Log, digests: Mapping[str, str]) -> list[str]:
     """Return the other channels that stages made from earlier contents of these topics, or compared with them."""
     found = []
     for topic, there in sorted(opened.channels.items()):
-        known = Provenance.from_metadata(there.metadata)
-        if topic not in digests and known and known.transform in {*STAGES, EVENTS_STAGE, ZONES_STAGE, FUSE}:
-            is_late = any(digests.get(name, then) != then for name, then in known.made_from().items())
+        provenance = Provenance.from_metadata(there.metadata)
+        if topic not in digests and provenance and provenance.transform in {*STAGES, EVENTS_STAGE, ZONES_STAGE, FUSE}:
+            is_late = any(digests.get(name, then) != then for name, then in provenance.made_from().items())
             found += [topic] if is_late else []
     return found
 
@@ -475,8 +475,8 @@ def _warn_of_limits(class_limits: str, names: ClassNames) -> None:
     """Warn of limits of classes that there are not."""
     if unknown := unknown_limits(class_limits, names):
         there = ", ".join(sorted({name for _, name in names if name})) or "none with a name"
-        words = f"`class_limits=` names {', '.join(unknown)}: no such class is in the table of limits or in the boxes"
-        warn(f"{words} (classes of these are: {there})", "option-not-used")
+        text = f"`class_limits=` names {', '.join(unknown)}: no such class is in the table of limits or in the boxes"
+        warn(f"{text} (classes of these are: {there})", "option-not-used")
 
 
 def _clock_start(opened: log.Log, prefix: str) -> int | None:

@@ -164,8 +164,8 @@ def _frame_id(opened: log.Log, tracks: str) -> str | None:
 
 def _corrected(opened: log.Log, prefix: str, tracks: str, samples: str) -> Corrected | None:
     """Count the corrections that the samples were made with; None if there are none."""
-    topic, made = corrections_of(opened, prefix, tracks), provenance_of(opened, samples)
-    if topic is None or made is None or topic not in made.references:
+    topic, provenance = corrections_of(opened, prefix, tracks), provenance_of(opened, samples)
+    if topic is None or provenance is None or topic not in provenance.references:
         return None
     frames = opened.frame_columns(topic, TRACKS)
     return Corrected(int(row_ends(frames)[-1]), len(unique_values(TRACKS, frames, "track_id")), len(frames))
@@ -211,8 +211,8 @@ def _forecasts(opened: log.Log, topic: str) -> tuple[int, float | None] | None:
 
 def _count_boxes(opened: log.Log, tracks: str, usual: str, boxes_read: BoxesRead) -> int | None:
     """Return the number of boxes that tracks were made from."""
-    made = provenance_of(opened, tracks)
-    source = opened.channels.get(made.input if made else usual) or opened.channels.get(usual)
+    provenance = provenance_of(opened, tracks)
+    source = opened.channels.get(provenance.input if provenance else usual) or opened.channels.get(usual)
     if source is None:
         return None
     if holds_boxes(opened, source.topic):
@@ -241,7 +241,7 @@ def _scores(opened: log.Log, prefix: str, truth: str, topics: tuple[str, str]) -
     names = {topic: class_names(opened.channel(topic).metadata) for topic in (truth, *topics)}
     candidates = [Candidate(topic, None, opened.frames(topic, TRACKS), classes=names[topic]) for topic in topics]
     sequence = EvaluationInput(opened.path.stem, read_ground_truth(opened, prefix), candidates, names[truth])
-    is_3d = all(are_3d(sequence.ground_truth, one.frames) for one in candidates)
+    is_3d = all(are_3d(sequence.ground_truth, candidate.frames) for candidate in candidates)
     gate_m = GATE_3D_M if is_3d else GATE_M
     rules = {
         f"within {gate_m:g} m": EvaluateOptions(similarities=("metres",), gates_m=(gate_m,)),

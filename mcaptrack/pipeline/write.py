@@ -136,9 +136,9 @@ class DrawnMessages(Collection[tuple[int, int, bytes]]):
 
 def digest_of(opened: log.Log, topic: str) -> str:
     """Return the digest of a channel's messages: from its provenance if possible, else computed."""
-    known = Provenance.from_metadata(opened.channel(topic).metadata)
-    if known and known.digest:
-        return known.digest
+    provenance = Provenance.from_metadata(opened.channel(topic).metadata)
+    if provenance and provenance.digest:
+        return provenance.digest
     return digest((message.t_ns, message.sequence, message.payload) for message in opened.messages(topic))
 
 
@@ -234,7 +234,7 @@ def write(
     drawn_first = [view for view in drawn.views(first, start_ns) if view.topic not in recorded]
     drawn_last = [view for view in drawn.views(last, start_ns) if view.topic not in recorded]
     topics = {*opened.channels} - outdated | {*made} | {view.topic for view in (*drawn_first, *drawn_last)}
-    by_viewers |= {one + views.SCENE_SUFFIX: True for one in sources if one + views.SCENE_SUFFIX in topics}
+    by_viewers |= {source + views.SCENE_SUFFIX: True for source in sources if source + views.SCENE_SUFFIX in topics}
     names = frozenset(topic.removeprefix(prefix + "/") for topic in topics if topic.startswith(prefix + "/"))
     frame_id = frame_id or views.ground.frame_of(prefix)
     channels = layouts.CameraChannels(
@@ -285,16 +285,18 @@ def _channels_to_draw(opened: log.Log, camera: Camera, made: Mapping[str, Made])
     inputs = {topic: channel.provenance.input for topic, channel in made.items()}
     for topic, channel in sorted(opened.channels.items()):
         schema = SCHEMAS.get(channel.schema_name)
-        known = Provenance.from_metadata(channel.metadata)
-        if topic in shown or topic not in camera.topics or not known or known.transform != INGEST:
+        provenance = Provenance.from_metadata(channel.metadata)
+        if topic in shown or topic not in camera.topics or not provenance or provenance.transform != INGEST:
             continue
         drawn = opened.channels.get(topic + (views.SUFFIX if schema is DETECTIONS else views.SCENE_SUFFIX))
         drawn_from = Provenance.from_metadata(drawn.metadata) if drawn else None
-        is_new = drawn_from is None or drawn_from.input_digest != known.digest
+        is_new = drawn_from is None or drawn_from.input_digest != provenance.digest
         if schema in (*views.DRAWN, GROUND_PLANE) and is_new:
-            names, frame_id = class_names(channel.metadata), known.frame_id
-            shown[topic] = ChannelToDraw(schema, opened.frame_columns(topic, schema), known.digest, "", names, frame_id)
-            inputs[topic] = known.input
+            names, frame_id = class_names(channel.metadata), provenance.frame_id
+            shown[topic] = ChannelToDraw(
+                schema, opened.frame_columns(topic, schema), provenance.digest, "", names, frame_id
+            )
+            inputs[topic] = provenance.input
     for topic, one in shown.items():
         if one.schema is PREDICTIONS:
             shown[topic] = one._replace(bodies=_bodies(opened, shown, topic, inputs[topic]))
@@ -309,9 +311,9 @@ def _nothing(opened: log.Log, topic: str) -> ChannelToDraw:
 def _boxes_to_draw(opened: log.Log, boxes: Mapping[str, foreign.NamedFrames]) -> dict[str, ChannelToDraw]:
     """Return the recorded boxes that viewers can't draw, by topic."""
     return {
-        topic: ChannelToDraw(DETECTIONS, one.frames, digest_of(opened, topic), "", one.classes, one.frame_id)
-        for topic, one in boxes.items()
-        if not is_drawn_by_viewers(opened.channel(topic)) and has_bodies(DETECTIONS, one.frames)
+        topic: ChannelToDraw(DETECTIONS, box.frames, digest_of(opened, topic), "", box.classes, box.frame_id)
+        for topic, box in boxes.items()
+        if not is_drawn_by_viewers(opened.channel(topic)) and has_bodies(DETECTIONS, box.frames)
     }
 
 

@@ -112,12 +112,16 @@ def make_zones(
         wanted = _parameters(zones, options, planes)
         if not watch.force and not _is_due(opened, topic, made, wanted):
             continue
-        taken = [one for one in outputs(topic) if not may_replace(opened, one, VIEW if "/view/" in one else STAGE)]
+        taken = [
+            output
+            for output in outputs(topic)
+            if not may_replace(opened, output, VIEW if "/view/" in output else STAGE)
+        ]
         if taken:
-            words = f"no zones of {topic}: they would replace {taken[0]}, which {describe_origin(opened, taken[0])}"
+            text = f"no zones of {topic}: they would replace {taken[0]}, which {describe_origin(opened, taken[0])}"
             if watch.topics:
-                raise McaptrackError(f"{opened.path}: {words}")
-            warn(words, "left-out")
+                raise McaptrackError(f"{opened.path}: {text}")
+            warn(text, "left-out")
             continue
         try:
             pictures = picture_clock(opened, prefix, stamps)
@@ -153,20 +157,20 @@ def _counted(
     still = scene_planes(planes, path)
     placed: list[PlacedZone] = [place_zone(zone, still) for zone in zones]
     positions = positions_of(frames, still, path, _class_names(opened, topic, made))
-    found = find_zone_events(frames, positions, placed, options, topic)
-    for note in found.notes:
+    zone_events = find_zone_events(frames, positions, placed, options, topic)
+    for note in zone_events.notes:
         warn(note, "not-compared")
     names = {str(zone.number): zone.name for zone in zones}
     provenance = Provenance(
         STAGE, parameters, topic, source, references=motion, zones=names, frame_id=_frame_id(opened, topic, made)
     )
-    rows = (found.visits, found.crossings, found.counts)
+    rows = (zone_events.visits, zone_events.crossings, zone_events.counts)
     out = {
         topic + _BELOW + name: Made.of(schema, some, provenance)
         for (name, schema), some in zip(_SCHEMAS.items(), rows, strict=True)
     }
     visited, crossed = (topic + _BELOW + name for name in list(_SCHEMAS)[:2])
-    text = list(zone_messages(found.visits, found.crossings, zones, topic, opened.start_ns))
+    text = list(zone_messages(zone_events.visits, zone_events.crossings, zones, topic, opened.start_ns))
     crossings = {crossed: out[crossed].provenance.digest}
     view = Provenance(VIEW, {}, visited, out[visited].provenance.digest, references=crossings)
     out[topic + _BELOW + SUFFIX] = Made(ZONE_VISITS, [], view, text, foxglove.LOG)
@@ -182,7 +186,7 @@ def _counted(
     ]
     view = replace(view, input=(counts := topic + _BELOW + "/counts"), input_digest=out[counts].provenance.digest)
     view = replace(view, references={})
-    captions = drawn_zones.ZoneCaptions.of(zones, found.counts)
+    captions = drawn_zones.ZoneCaptions.of(zones, zone_events.counts)
     moving, frame_id = moved_planes(planes, path), provenance.frame_id or views.ground.frame_of(prefix)
     if len(pictures.t_ns):
         clock = PictureTimes(pictures.t_ns, pictures.stamp_ns)
@@ -193,7 +197,7 @@ def _counted(
                 shapes, captions, clock, moving, path, height_px)),
             foxglove.ANNOTATIONS,
         )  # fmt: skip
-    if any(one.ground for one in shapes):
+    if any(shape.ground for shape in shapes):
         scenes = DrawnMessages(len(captions.t_ns), lambda: drawn_zones.on_ground(shapes, captions, frame_id))
         out[topic + _BELOW + views.SCENE_SUFFIX] = Made(ZONE_COUNTS, [], view, scenes, foxglove.SCENE)
     return out
@@ -207,8 +211,8 @@ def counted_zones(opened: log.Log, prefix: str) -> list[CountedZones]:
         schemas = _SCHEMAS.values()
         if not all(_holds(opened, name, schema) for name, schema in zip(names, schemas, strict=True)):
             continue
-        known = provenance_of(opened, names[0])
-        zones = zones_from_json(known.parameters.get("zones")) if known else ()
+        provenance = provenance_of(opened, names[0])
+        zones = zones_from_json(provenance.parameters.get("zones")) if provenance else ()
         rows = [opened.frame_columns(name, schema) for name, schema in zip(names, schemas, strict=True)]
         out.append(CountedZones(topic, zones, zone_totals(zones, *rows)))
     return out
@@ -225,10 +229,10 @@ class _Before(NamedTuple):
 def _before(opened: log.Log, prefix: str) -> _Before:
     topics = tuple(_with_counts(opened, prefix))
     for topic in topics:
-        known = provenance_of(opened, topic + _BELOW + next(iter(_SCHEMAS)))
-        zones = zones_from_json(known.parameters.get("zones")) if known else ()
-        if known and zones:
-            values = {one.name: known.parameters.get(one.name) for one in fields(ZoneOptions)}
+        provenance = provenance_of(opened, topic + _BELOW + next(iter(_SCHEMAS)))
+        zones = zones_from_json(provenance.parameters.get("zones")) if provenance else ()
+        if provenance and zones:
+            values = {field.name: provenance.parameters.get(field.name) for field in fields(ZoneOptions)}
             numbers = {
                 name: float(value)
                 for name, value in values.items()
@@ -279,17 +283,17 @@ def _is_due(opened: log.Log, topic: str, made: Mapping[str, Made], wanted: Mappi
     names = outputs(topic)[: len(_SCHEMAS) + 1]
     if not all(name in opened.channels for name in names) or is_stale(opened, names[0]):
         return True
-    known = provenance_of(opened, names[0])
-    if known is None or not _is_same(known.parameters, wanted):
+    provenance = provenance_of(opened, names[0])
+    if provenance is None or not _is_same(provenance.parameters, wanted):
         return True
-    return any(name in made and made[name].provenance.digest != then for name, then in known.made_from().items())
+    return any(name in made and made[name].provenance.digest != then for name, then in provenance.made_from().items())
 
 
 def _is_same(before: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
     """Whether parameters are the same, as JSON has them."""
-    known = zones_from_json(before.get("zones"))
+    zones = zones_from_json(before.get("zones"))
     rest = [{key: value for key, value in one.items() if key != "zones"} for one in (before, wanted)]
-    return zones_to_json(known) == wanted["zones"] and rest[0] == rest[1]
+    return zones_to_json(zones) == wanted["zones"] and rest[0] == rest[1]
 
 
 def _class_names(opened: log.Log, topic: str, made: Mapping[str, Made]) -> dict[int, str]:

@@ -86,8 +86,8 @@ def pair_files(tracks: Sequence[Path], ground_truths: Sequence[Path]) -> tuple[l
         found = dict(zip(ground_truth_names, ground_truths, strict=True))
         return [(name, path, found[name]) for name, path in zip(track_names, tracks, strict=True)], ""
     pairs = list(zip(track_names, tracks, ground_truths, strict=True))
-    words = ", ".join(f"{path} with {other}" for _, path, other in pairs)
-    return pairs, f"names of tracks and ground truth differ: taken in the order given, {words}"
+    text = ", ".join(f"{path} with {other}" for _, path, other in pairs)
+    return pairs, f"names of tracks and ground truth differ: taken in the order given, {text}"
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
@@ -117,8 +117,8 @@ def compare_files(
     if all(have_3d):
         return _boxes_3d(tracks, ground_truth, fps, ground_plane, classes)
     if any(have_3d):
-        words = f"{tracks if have_3d[0] else ground_truth} holds 3D boxes, and {tracks if have_3d[1] else ground_truth}"
-        raise McaptrackError(f"{words} does not; they can't be compared")
+        text = f"{tracks if have_3d[0] else ground_truth} holds 3D boxes, and {tracks if have_3d[1] else ground_truth}"
+        raise McaptrackError(f"{text} does not; they can't be compared")
     both: dict[Role, tuple[Path, Labels]] = {
         "truth": (ground_truth, _read(ground_truth, "truth", topics, WantedClasses(classes or ONLY_PEOPLE.text))),
         "tracks": (tracks, _read(tracks, "tracks", topics, WantedClasses(classes or ONLY_PEOPLE.text, may_lack=True))),
@@ -294,11 +294,11 @@ def _without_ignored(ground_truth: Sequence[Frame], tracks: Sequence[Frame], lab
     ignored = _rows(ignored, order)
     at = ignored.frame - labels.first_frame
     out, gone = [], 0
-    for true, found in zip(ground_truth, tracks, strict=True):
+    for true, track in zip(ground_truth, tracks, strict=True):
         low, high = np.searchsorted(at, [true.index, true.index + 1])
-        kept = ~_is_ignored(_boxes(true), _boxes(found), _rows(ignored, slice(low, high)), labels.format == "kitti")
+        kept = ~_is_ignored(_boxes(true), _boxes(track), _rows(ignored, slice(low, high)), labels.format == "kitti")
         gone += int((~kept).sum())
-        out.append(found if kept.all() else found._replace(rows=found.rows[kept]))
+        out.append(track if kept.all() else track._replace(rows=track.rows[kept]))
     return out, gone
 
 

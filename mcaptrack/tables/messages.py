@@ -60,7 +60,9 @@ def messages_table(
         for count, values in kept.parts():
             empty = [None] * count
             arrays = [
-                pa.array([None if one is None else maker.make(one) for one in values.get(path, empty)], maker.type)
+                pa.array(
+                    [None if value is None else maker.make(value) for value in values.get(path, empty)], maker.type
+                )
                 for path, maker in makers.items()
             ]
             yield pa.table([*head.slice(low, count).columns, *arrays], schema=schema)

@@ -233,8 +233,8 @@ class Database:
         if not parts and columns is None:
             return False
         for recording, part in parts:
-            words = f"from {part}" if isinstance(part, Path) else "read from the log; exported tables would be quicker"
-            self.notes.append(f"{recording}: {name} {words}")
+            text = f"from {part}" if isinstance(part, Path) else "read from the log; exported tables would be quicker"
+            self.notes.append(f"{recording}: {name} {text}")
         self._connection.register(name, tables.join(parts, columns))
         self._loaded.add(name)
         return True

@@ -305,9 +305,9 @@ def _composed(
     top = header + height
     _write(out, clock, (line // 3, top + round(line * 1.6)), round(line * 1.7), _INK, space)
     lines = int((total - top - line * 2.2) // (line * 1.25))
-    for number, words in enumerate(captions[: max(lines, 0)]):
+    for number, caption in enumerate(captions[: max(lines, 0)]):
         at = (line // 3, top + round(line * (3.2 + 1.25 * number)))
-        _write(out, words, at, line, _INK if number == 0 else _FAINT, space)
+        _write(out, caption, at, line, _INK if number == 0 else _FAINT, space)
     return out
 
 

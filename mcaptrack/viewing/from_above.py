@@ -153,7 +153,7 @@ def drawing(scene: Any, sight: Sight) -> Any:
         for line in entity.lines:
             points = np.array([(point.x, point.y, point.z) for point in line.points], float).reshape(-1, 3)
             px = sight.to_pixels(_placed(line.pose, points))
-            shades: list[Shade] = [(one.r, one.g, one.b, one.a) for one in line.colors]
+            shades: list[Shade] = [(color.r, color.g, color.b, color.a) for color in line.colors]
             plain = (line.color.r, line.color.g, line.color.b, line.color.a)
             shades = shades[1::2] if line.type == _LIST else shades
             _line(out, _ANNOTATED.get(line.type, _ANNOTATED[_STRIP]), px, plain, line.thickness / 2, shades)

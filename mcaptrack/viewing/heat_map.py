@@ -387,13 +387,13 @@ def _with_legend(image: Image, most: float, total_s: float, topic: str) -> Image
     strip[line // 2 : line // 2 + line, line : line + long] = colours
     font, size = cv2.FONT_HERSHEY_SIMPLEX, line / 34
     for share in (0.0, 0.5, 1.0) if long > line * 8 else (0.0, 1.0):
-        words = f"{most * share**2:.2g}" + (" s/m2" if share == 1 else "")
+        text = f"{most * share**2:.2g}" + (" s/m2" if share == 1 else "")
         cv2.putText(
-            strip, words, (line + round(long * share * 0.96), round(line * 2.6)), font, size, _INK, 1, cv2.LINE_AA
+            strip, text, (line + round(long * share * 0.96), round(line * 2.6)), font, size, _INK, 1, cv2.LINE_AA
         )
     amount = f"{total_s:.0f} person-seconds" if total_s < 600 else f"{total_s / 60:.0f} person-minutes"
-    words = f"{amount} of {topic}"
-    wide = cv2.getTextSize(words, font, size, 1)[0][0]
+    text = f"{amount} of {topic}"
+    wide = cv2.getTextSize(text, font, size, 1)[0][0]
     size *= min(1.0, (width - long - 4.5 * line) / max(wide, 1))
-    cv2.putText(strip, words, (round(long + 3.5 * line), round(line * 1.4)), font, size, _INK, 1, cv2.LINE_AA)
+    cv2.putText(strip, text, (round(long + 3.5 * line), round(line * 1.4)), font, size, _INK, 1, cv2.LINE_AA)
     return np.concatenate([image, strip])

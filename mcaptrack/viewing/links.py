@@ -71,9 +71,9 @@ _TIME: Final = re.compile(rb'<span class="at" data-ns="(-?[0-9]{1,19})">([^<>]{1
 
 def is_about(page: bytes, fingerprint: str) -> bool:
     """Return whether a page is a report on one log with this fingerprint, in its current state."""
-    found = _DATA.search(page)
+    match = _DATA.search(page)
     try:
-        data: Any = json.loads(found[1]) if found else None
+        data: Any = json.loads(match[1]) if match else None
         logs = data["logs"]
         return bool(len(logs) == 1 and logs[0]["digest"] == fingerprint)
     except (ValueError, TypeError, KeyError, RecursionError):
@@ -144,8 +144,8 @@ def find_moments(opened: log.Log) -> list[LinkedEvent]:
     for topic, channel in sorted(opened.channels.items()):
         if not channel.holds(EVENTS):
             continue
-        made = Provenance.from_metadata(channel.metadata)
-        tracks = made.input if made else topic.removesuffix("/events")
+        provenance = Provenance.from_metadata(channel.metadata)
+        tracks = provenance.input if provenance else topic.removesuffix("/events")
         try:
             joined = join_frames(EVENTS, opened.frame_columns(topic, EVENTS))
             nouns = _nouns(opened, tracks)
@@ -181,7 +181,7 @@ def opening_moment(opened: log.Log, moments: Sequence[LinkedEvent]) -> tuple[int
     half as many of them as there are at most; without any tracks, the start of the log.
     """
     for name in _BEST:
-        first = next((one for one in moments if one.topic.endswith(f"/{name}")), None)
+        first = next((moment for moment in moments if moment.topic.endswith(f"/{name}")), None)
         if first is not None:
             return before(first.t_ns, opened.start_ns), f"a second before event {first.event} ({first.text})"
     for name in _BEST:

@@ -363,9 +363,9 @@ def _errors(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
     }
     if not paths:
         return []
-    words = "ground truth" if camera.is_truth_known else "later tracks"
+    text = "ground truth" if camera.is_truth_known else "later tracks"
     most = limit_of(camera.highest.get(ERRORS))
-    panels["Plot!errors"] = plot_panel(f"Prediction errors (m), against {words}", paths, most)
+    panels["Plot!errors"] = plot_panel(f"Prediction errors (m), against {text}", paths, most)
     return ["Plot!errors"]
 
 

@@ -99,14 +99,14 @@ def on_ground(zones: Sequence[ZoneShape], captions: ZoneCaptions, frame_id: str)
         span = slice(start, min(start + BATCH, len(t_ns)))
         scene = SceneMessages(t_ns[span], frame_id, life_ns)
         frame = np.arange(len(t_ns[span]))
-        for place, one in enumerate(zones):
-            rings = one.rings_m()
+        for place, zone in enumerate(zones):
+            rings = zone.rings_m()
             if not rings:
                 continue
-            rgb = _LINE if one.zone.is_line else _ZONE
+            rgb = _LINE if zone.zone.is_line else _ZONE
             label = rings[0].mean(axis=0)
             texts = captions.texts[place][span]
-            scene.zone(frame, one.zone.name, rings, not one.zone.is_line, label, texts, (*rgb, _ALPHA), one.height_m)
+            scene.zone(frame, zone.zone.name, rings, not zone.zone.is_line, label, texts, (*rgb, _ALPHA), zone.height_m)
         yield from zip(t_ns[span].tolist(), range(span.start, span.stop), scene.messages(), strict=True)
 
 
@@ -128,14 +128,14 @@ def on_pictures(
         t_ns = pictures.t_ns[span]
         which = np.searchsorted(since, t_ns, "right")
         taken: list[Floats] = []
-        for place, one in enumerate(zones):
+        for place, zone in enumerate(zones):
             texts = np.array(captions.at(place, t_ns), object)
             down_px: float | None = None  # the same in all pictures of a batch, so that labels don't jump
-            for frame, rings in _seen(one, t_ns, which, planes, path, height_px):
+            for frame, rings in _seen(zone, t_ns, which, planes, path, height_px):
                 if _is_drawn(rings):
                     size, corner = _label_of(rings[0], height_px)
                     down_px = _free_place(taken, corner, size, texts[frame]) if down_px is None else down_px
-                    _draw(drawn, frame, rings, one, texts, height_px, corner + np.array([0.0, down_px]), size)
+                    _draw(drawn, frame, rings, zone, texts, height_px, corner + np.array([0.0, down_px]), size)
         yield from pictures.numbered(span, drawn)
 
 

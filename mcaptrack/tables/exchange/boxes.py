@@ -131,8 +131,8 @@ def read_boxes(opened: log.Log, topic: str) -> BoxTable:
 def _frame_numbers(topic: str, numbers: Ints) -> tuple[Ints, list[str]]:
     """The numbers of frames (F,), and notes: numbers that don't rise are replaced by the order of the frames."""
     if len(numbers) and (numbers[0] < 0 or (np.diff(numbers) <= 0).any()):
-        words = f"{topic}: several of its frames are of one picture; its frames are counted instead, from 0"
-        return np.arange(len(numbers)), [words]
+        text = f"{topic}: several of its frames are of one picture; its frames are counted instead, from 0"
+        return np.arange(len(numbers)), [text]
     return numbers, []
 
 

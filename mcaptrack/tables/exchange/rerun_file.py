@@ -179,7 +179,7 @@ class _Job:
         solid = placed & np.isfinite(size).all(axis=1)
         labels = np.array(texts, object)
         if solid.any():
-            turns = [rr.RotationAxisAngle(axis=[0, 0, 1], radians=one) for one in rows["heading_rad"][solid].tolist()]
+            turns = [rr.RotationAxisAngle(axis=[0, 0, 1], radians=row) for row in rows["heading_rad"][solid].tolist()]
             boxes = rr.Boxes3D(
                 centers=xyz[solid],
                 sizes=size[solid],

@@ -118,7 +118,7 @@ def about_channels(opened: log.Log) -> dict[str, Any]:
 
 def worst_score(topics: Sequence[str], scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The scores of the camera with the lowest IDF1, of the tracks in ``topics``; empty without ground truth."""
-    found = [row for topic in topics if (row := _headline([one for one in scores if one["topic"] == topic]))]
+    found = [row for topic in topics if (row := _headline([score for score in scores if score["topic"] == topic]))]
     if not found:
         return {}
     worst = min(found, key=lambda row: row["IDF1"])
@@ -207,10 +207,14 @@ class LogTables:
         while todo:
             topic = todo.pop()
             channel = self.opened.channels.get(topic)
-            made = Provenance.from_metadata(channel.metadata) if channel and topic not in out else None
-            if made and made.transform != "view":
-                out[topic] = {"transform": made.transform, "input": made.input, "parameters": made.parameters}
-                todo.append(made.input)
+            provenance = Provenance.from_metadata(channel.metadata) if channel and topic not in out else None
+            if provenance and provenance.transform != "view":
+                out[topic] = {
+                    "transform": provenance.transform,
+                    "input": provenance.input,
+                    "parameters": provenance.parameters,
+                }
+                todo.append(provenance.input)
         return json.dumps(out, sort_keys=True, separators=(",", ":"))
 
     # Foreign channels
@@ -286,17 +290,17 @@ class LogTables:
 
     def _track_names(self, topic: str) -> TrackNames:
         """The names of the classes of the tracks, and of the ground truth, that the rows of a channel are about."""
-        made = provenance_of(self.opened, topic)
+        provenance = provenance_of(self.opened, topic)
         base = topic
         for beside in ("/events", "/errors", "/decisions", "/appearance"):
             base = base.removesuffix(beside)
-        if made and made.zones:
-            base = made.input
+        if provenance and provenance.zones:
+            base = provenance.input
         beside = base.removesuffix("/predictions")
         near = (base,) if base == beside else (f"{beside}/online", beside, input_of(self.opened.channel(base).metadata))
         there = set(self.topics("tracks"))
         tracks = next((one for one in near if one in there), "")
-        truth = next((one for one in made.references if one in there), "") if made else ""
+        truth = next((reference for reference in provenance.references if reference in there), "") if provenance else ""
 
         def names(of: str) -> dict[int, str]:
             return tables.names_by_track(self._frames(of), self._class_names.get(of, {})) if of else {}
@@ -305,8 +309,10 @@ class LogTables:
 
     def _zone_names(self, topic: str) -> dict[int, str]:
         """The names of the zones that the rows of a channel are about."""
-        made = provenance_of(self.opened, topic)
-        return {int(number): name for number, name in made.zones.items() if number.isdecimal()} if made else {}
+        provenance = provenance_of(self.opened, topic)
+        return (
+            {int(number): name for number, name in provenance.zones.items() if number.isdecimal()} if provenance else {}
+        )
 
     def _note(self, name: str, words: str) -> None:
         self.notes[name] = "; ".join([*filter(None, [self.notes.get(name)]), words])
@@ -357,9 +363,9 @@ class LogTables:
         rows = [row for topic in self.topics("ground_planes") for row in self._frames(topic).rows()]
         planes = {_origin_of_plane(row) for row in rows}
         sources = {
-            channel.topic: dict(made.parameters)
+            channel.topic: dict(provenance.parameters)
             for channel in opened.channels.values()
-            if (made := Provenance.from_metadata(channel.metadata)) and made.transform == "ingest"
+            if (provenance := Provenance.from_metadata(channel.metadata)) and provenance.transform == "ingest"
         }
         span: tuple[int | None, int | None] = (opened.start_ns, opened.end_ns) if messages else (None, None)
         if messages and opened.end_ns > LAST_NS:
@@ -385,7 +391,7 @@ class LogTables:
     def _as_a_whole(self) -> dict[str, Any]:
         """The columns that tell a log from thousands of others."""
         there = self.topics("tracks")
-        best = [topic for one in cameras(self.opened) if (topic := best_tracks(one, there))]
+        best = [topic for camera in cameras(self.opened) if (topic := best_tracks(camera, there))]
         return {
             "location": location_of(self.opened.path),
             "cameras": len(cameras(self.opened)),
@@ -413,18 +419,20 @@ def _order_of_scores(row: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def _channel(channel: log.Channel) -> dict[str, object]:
-    made = Provenance.from_metadata(channel.metadata)
+    provenance = Provenance.from_metadata(channel.metadata)
     out: dict[str, object] = {
         "topic": channel.topic,
         "schema": channel.schema_name or None,
         "messages": channel.messages,
         "encoding": channel.message_encoding or None,
     }
-    if made:
+    if provenance:
         names = ("transform", "input", "version", "digest", "input_digest", "weights_sha256", "frame_id")
-        out |= {name: getattr(made, name) or None for name in names}
-        out["parameters"] = json.dumps(made.parameters, sort_keys=True, separators=(",", ":"))
-        out["compared_with"] = json.dumps(dict(made.references), sort_keys=True) if made.references else None
+        out |= {name: getattr(provenance, name) or None for name in names}
+        out["parameters"] = json.dumps(provenance.parameters, sort_keys=True, separators=(",", ":"))
+        out["compared_with"] = (
+            json.dumps(dict(provenance.references), sort_keys=True) if provenance.references else None
+        )
     return out
 
 

@@ -248,7 +248,7 @@ class _Job:
         tree = transforms_of(self._opened)
         out = []
         for topic, is_static in (("/tf_static", True), ("/tf", False)):
-            found = [one for one in (tree.series.values() if tree else ()) if one.is_static == is_static]
+            found = [series for series in (tree.series.values() if tree else ()) if series.is_static == is_static]
             poses = sorted(
                 (int(t_ns), number, at)
                 for number, one in enumerate(found)

@@ -336,7 +336,7 @@ class HiddenPeople:
         usual = float(np.median(np.diff(self._at_ns))) if len(self._at_ns) > 1 else 0.0
         near_ns = round(min(_NEAR_PICTURES * usual, seconds_to_ns(_NEAR_S)))
         pieces, topics, looked = [], [], [np.empty(0, np.int64)]
-        known = {topic for one in of_pictures for topic in (*one.topics, one.truth, one.boxes or "")}
+        known = {topic for camera in of_pictures for topic in (*camera.topics, camera.truth, camera.boxes or "")}
         for topic in sorted(known & set(opened.channels)):
             found = _people(opened, topic)
             if found is not None:

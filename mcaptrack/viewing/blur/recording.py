@@ -104,7 +104,7 @@ def warn_of_rest(opened: log.Log, blurred: Sequence[str]) -> None:
     if rest:
         warn(f"{opened.path}: {', '.join(rest)} are kept as recorded and may show people", "not-blurred")
     ours = {attachment_of(name) for name in LAYOUTS}
-    kept = sorted({one.name for part in opened.parts for one in part.index.attachments} - ours)
+    kept = sorted({attachment.name for part in opened.parts for attachment in part.index.attachments} - ours)
     if kept:
         warn(f"{opened.path}: the attachments {', '.join(kept)} are kept as they are", "not-blurred")
 

@@ -243,14 +243,14 @@ def _full(opened: log.Log, prefix: str, topic: str) -> str:
 def _has_view(opened: log.Log, topic: str) -> bool:
     begin = tuple(one + suffix for one in (topic, topic + FULL) for suffix in views.SUFFIXES)
     is_view = any(suffix in topic for suffix in views.SUFFIXES)
-    return is_view or any(one.startswith(begin) for one in opened.channels)
+    return is_view or any(channel.startswith(begin) for channel in opened.channels)
 
 
 def _candidates(opened: log.Log, prefix: str) -> list[str]:
     """Return the channels of a camera that can be drawn, the best ones first."""
     best = [f"{prefix}/{name}" for name in _BEST]
     there = [*best, *sorted(pipeline.camera_at(opened, prefix).topics)]
-    return [one for one in dict.fromkeys(there) if one in opened.channels and _kind(opened.channels[one])]
+    return [topic for topic in dict.fromkeys(there) if topic in opened.channels and _kind(opened.channels[topic])]
 
 
 def _kind(channel: log.Channel) -> Schema | None:
@@ -261,8 +261,8 @@ def _schema_of(opened: log.Log, topic: str) -> Schema:
     """Return the schema of a channel to draw. Raises McaptrackError if it can't be drawn."""
     schema = _kind(opened.channel(topic))
     if schema is None:
-        there = list_names(sorted(one.topic for one in opened.channels.values() if _kind(one)))
-        raise McaptrackError(f"{opened.path}: {topic} has no boxes, tracks or predictions to draw; there are {there}")
+        names = list_names(sorted(channel.topic for channel in opened.channels.values() if _kind(channel)))
+        raise McaptrackError(f"{opened.path}: {topic} has no boxes, tracks or predictions to draw; there are {names}")
     return schema
 
 
@@ -374,7 +374,7 @@ class PictureSource:
             out.sizes.append(size)
             if self._pictures is not None:
                 out.jpegs.append(encode_image(self._small(image, width_px), "jpeg", _QUALITY))
-            out.drawn.append([out.strokes.of(one) if one is not None else [[], []] for one in drawings])
+            out.drawn.append([out.strokes.of(drawing) if drawing is not None else [[], []] for drawing in drawings])
             progress("show", done, len(numbers))
         if not out.t_ns:
             raise McaptrackError(f"{self._opened.path}: no picture of {self.topic} in this period can be decoded")
@@ -385,8 +385,8 @@ class PictureSource:
         for _, size, image, drawings in self._drawn_on(np.array([number]), width_px or _STILL_PX):
             width = width_px or min(_STILL_PX, size[0])
             out = scaled(image, width) if self._pictures is not None else image
-            for one in drawings:
-                out = draw(out, one, out.shape[1] / size[0]) if one is not None else out
+            for drawing in drawings:
+                out = draw(out, drawing, out.shape[1] / size[0]) if drawing is not None else out
             return out
         where = f"{self._opened.path}: {self.topic} at {self.seconds(int(self.t_ns[number])):.3f} s"
         raise McaptrackError(f"{where} can't be decoded: the video has no key picture before it")

@@ -141,8 +141,8 @@ def draw(report: LogReport, at: int, total: int) -> None:
     )
     report.background, report.sequence, report.highlights = None, None, []
     report.doubts, report.doubtful_tracks = [], []
-    for one in report.track_sets.values():
-        one.frames = []
+    for track_set in report.track_sets.values():
+        track_set.frames = []
 
 
 def page(reports: Sequence[LogReport]) -> str:

@@ -103,13 +103,13 @@ class LogReport:
     @property
     def on_prediction_clock(self) -> dict[str, TrackSet]:
         """The tracks at the prediction rate; without any, those of the tracker."""
-        there = {role: one for role, one in self.track_sets.items() if role in ("samples", "offline")}
-        return there or {role: one for role, one in self.track_sets.items() if role == "tracks"}
+        there = {role: track_set for role, track_set in self.track_sets.items() if role in ("samples", "offline")}
+        return there or {role: track_set for role, track_set in self.track_sets.items() if role == "tracks"}
 
     @property
     def headline(self) -> BeforeAfter | None:
         """The scores before and after re-tracking that the whole page counts by; None without scores."""
-        return compared({role: one.topic for role, one in self.track_sets.items()}, self.results)
+        return compared({role: track_set.topic for role, track_set in self.track_sets.items()}, self.results)
 
     @property
     def compared_roles(self) -> tuple[str, str]:
@@ -254,7 +254,7 @@ def gather(
         out.doubtful_tracks = find_doubtful_tracks(decisions)
     progress(f"{opened.path}: pictures")
     _read_pictures(opened, out)
-    out.zones = zone_section(opened, prefix, {role: one.name for role, one in out.track_sets.items()})
+    out.zones = zone_section(opened, prefix, {role: track_set.name for role, track_set in out.track_sets.items()})
     out.data = plain(
         _recording(opened) | {"name": out.name, "camera": prefix} | _statistics(out) | {"notes": out.notes}
     )
@@ -271,7 +271,7 @@ def _read(opened: log.Log, out: LogReport) -> None:
     camera = pipeline.camera_at(opened, out.prefix)
     tracker = tracker_name(provenance_of(opened, f"{out.prefix}/tracks"))
     sampled = provenance_of(opened, f"{out.prefix}/samples")
-    is_corrected = sampled is not None and any(one.endswith(f"/{CORRECTED}") for one in sampled.references)
+    is_corrected = sampled is not None and any(reference.endswith(f"/{CORRECTED}") for reference in sampled.references)
     names = {
         "tracks": f"{tracker}{EVERY_PICTURE}" if f"{out.prefix}/samples" in opened.channels else tracker,
         "samples": f"{tracker}, corrected" if is_corrected else tracker,
@@ -296,8 +296,8 @@ def _read(opened: log.Log, out: LogReport) -> None:
             continue
         out.track_sets[role] = TrackSet(topic, role, names[role], frames)
     out.has_only_people = all(
-        nouns_of(one.frames, (), (class_names(opened.channel(one.topic).metadata), {})) is PEOPLE
-        for one in out.track_sets.values()
+        nouns_of(track_set.frames, (), (class_names(opened.channel(track_set.topic).metadata), {})) is PEOPLE
+        for track_set in out.track_sets.values()
     )
     try:
         out.planes = pipeline.read_planes(opened, out.prefix) or ()
@@ -386,11 +386,11 @@ def _decisions(opened: log.Log, topic: str) -> list[Frame]:
 def _recorded(opened: log.Log, topic: str) -> tuple[list[Frame], MatchRule | None] | None:
     """The events in the log and the rule of their matches; None if there are none or they are out of date."""
     channel = opened.channels.get(topic)
-    made = Provenance.from_metadata(channel.metadata) if channel else None
-    if channel is None or made is None or channel.schema_name != EVENTS.name or pipeline.is_stale(opened, topic):
+    provenance = Provenance.from_metadata(channel.metadata) if channel else None
+    if channel is None or provenance is None or channel.schema_name != EVENTS.name or pipeline.is_stale(opened, topic):
         return None
-    similarity: Any = made.parameters.get("similarity")
-    gate = made.parameters.get("gate")
+    similarity: Any = provenance.parameters.get("similarity")
+    gate = provenance.parameters.get("gate")
     rule = None
     if similarity in get_args(Similarity) and isinstance(gate, float | int):
         rule = MatchRule(similarity, float(gate))
@@ -409,7 +409,7 @@ def _read_pictures(opened: log.Log, out: LogReport) -> None:
             add_thumbnails(events, _with_boxes(out, channel.topic), pictures, out.start_ns)
         if out.doubts and out.repairs is not None:
             tracks = _with_boxes(out, out.repairs.topic)
-            add_thumbnails([one.event for one in out.doubts], tracks, pictures, out.start_ns)
+            add_thumbnails([doubt.event for doubt in out.doubts], tracks, pictures, out.start_ns)
     except DamagedError:
         raise
     except McaptrackError as error:
@@ -421,15 +421,16 @@ def _read_pictures(opened: log.Log, out: LogReport) -> None:
 
 def _with_boxes(out: LogReport, topic: str) -> list[Frame]:
     """The rows of tracks with boxes in pictures: of the tracker instead of its samples, with the same ids."""
-    role = next(one.role for one in out.track_sets.values() if one.topic == topic)
+    role = next(track_set.role for track_set in out.track_sets.values() if track_set.topic == topic)
     return out.track_sets["tracks" if role == "samples" and "tracks" in out.track_sets else role].frames
 
 
 def _statistics(out: LogReport) -> dict[str, Any]:
     """All statistics, as JSON."""
     track_sets = [
-        {"topic": one.topic, "name": one.name, "role": one.role} | statistics.track_statistics(one.frames)
-        for one in out.track_sets.values()
+        {"topic": track_set.topic, "name": track_set.name, "role": track_set.role}
+        | statistics.track_statistics(track_set.frames)
+        for track_set in out.track_sets.values()
     ]
     resampled = {one.topic: one.frames for one in out.on_prediction_clock.values()}
     if "truth" in out.track_sets:
@@ -468,16 +469,16 @@ def _recording(opened: log.Log) -> dict[str, Any]:
 
 
 def _channel(opened: log.Log, channel: log.Channel) -> dict[str, Any]:
-    made = Provenance.from_metadata(channel.metadata)
+    provenance = Provenance.from_metadata(channel.metadata)
     names = ("transform", "input", "version", "weights_sha256", "digest", "input_digest")
     return {
         "topic": channel.topic,
         "schema": channel.schema_name,
         "encoding": channel.message_encoding,
         "messages": channel.messages,
-        **{key: (getattr(made, key) or None) if made else None for key in names},
-        "references": dict(made.references) if made else {},
-        "parameters": dict(made.parameters) if made else None,
+        **{key: (getattr(provenance, key) or None) if provenance else None for key in names},
+        "references": dict(provenance.references) if provenance else {},
+        "parameters": dict(provenance.parameters) if provenance else None,
         "stale": pipeline.is_stale(opened, channel.topic),
     }
 

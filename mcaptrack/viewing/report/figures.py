@@ -91,13 +91,13 @@ def identity_events(report: LogReport) -> dict[str, Any]:
         "timelines": [_timeline(channel, shown, report) for channel, shown in pairs],
         "highlights": [_highlights(channel, shown, report) for channel, shown in pairs if channel.events],
         "doubts": [
-            _event(one.event, one.text(), report) | {"is_wrong": one.is_right is False} for one in report.doubts
+            _event(doubt.event, doubt.text(), report) | {"is_wrong": doubt.is_right is False} for doubt in report.doubts
         ],
-        "have_odds": any(one.probability is not None for one in report.doubts),
+        "have_odds": any(doubt.probability is not None for doubt in report.doubts),
         "doubtful_tracks": [
-            {"text": one.text("person" if report.has_only_people else "object"), "t_ns": one.t_ns}
-            | {"clock": clock((one.t_ns - report.start_ns) / NS_PER_S), "is_wrong": False, "thumbnails": []}
-            for one in report.doubtful_tracks
+            {"text": doubtful_track.text("person" if report.has_only_people else "object"), "t_ns": doubtful_track.t_ns}
+            | {"clock": clock((doubtful_track.t_ns - report.start_ns) / NS_PER_S), "is_wrong": False, "thumbnails": []}
+            for doubtful_track in report.doubtful_tracks
         ],
         "view": command("view", Path(report.file)),
     }
@@ -118,7 +118,7 @@ def _event(event: IdentityEvent, text: str, report: LogReport) -> dict[str, Any]
 
 
 def _set_of(report: LogReport, channel: ChannelEvents) -> TrackSet:
-    return next(one for one in report.track_sets.values() if one.topic == channel.topic)
+    return next(track_set for track_set in report.track_sets.values() if track_set.topic == channel.topic)
 
 
 def _title(channel: ChannelEvents, name: str) -> str:

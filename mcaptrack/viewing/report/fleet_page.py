@@ -112,19 +112,19 @@ def _cells(row: Row) -> list[str]:
 
 
 def _text(found: Mapping[str, Any]) -> str:
-    words = f"{counted(found['logs'], 'log')}, {number(found['hours'], 1)} hours"
-    words += f", {counted(found['tracks'], 'track')}." if found["tracks"] else "."
+    text = f"{counted(found['logs'], 'log')}, {number(found['hours'], 1)} hours"
+    text += f", {counted(found['tracks'], 'track')}." if found["tracks"] else "."
     if found["scored"]:
-        words += f" {counted(found['scored'], 'log')} with ground truth: half of them keep more than "
-        words += f"{percent(found['median_IDF1'])} of identities (IDF1)."
+        text += f" {counted(found['scored'], 'log')} with ground truth: half of them keep more than "
+        text += f"{percent(found['median_IDF1'])} of identities (IDF1)."
     else:
-        words += " How good the tracks are is not known without ground truth."
+        text += " How good the tracks are is not known without ground truth."
     lacking = [
         f"{counted(found[name], 'log')} {said}"
         for name, said in (("empty", "without messages"), ("without_tracks", "without tracks"))
         if found[name]
     ]
-    return words + (f" {' and '.join(lacking)}." if lacking else "")
+    return text + (f" {' and '.join(lacking)}." if lacking else "")
 
 
 def _tiles(found: Mapping[str, Any]) -> list[dict[str, str]]:

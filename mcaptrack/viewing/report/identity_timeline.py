@@ -92,11 +92,11 @@ def _of_people(report: LogReport, sides: Sequence[PersonScores]) -> list[dict[st
     out = []
     for person, low, high in _groups(truth["track_id"]):
         lanes = [("truth", pieces(np.zeros(high - low, np.int64), t_ns[low:high], report.start_ns, interval_ns))]
-        for one in sides:
-            low_match, high_match = np.searchsorted(one.person, [person, person + 1])
+        for side in sides:
+            low_match, high_match = np.searchsorted(side.person, [person, person + 1])
             own = slice(int(low_match), int(high_match))
-            step_ns = _interval_ns(one.frame_ns)
-            lanes.append(("ids", pieces(one.track[own], one.t_ns[own], report.start_ns, step_ns)))
+            step_ns = _interval_ns(side.frame_ns)
+            lanes.append(("ids", pieces(side.track[own], side.t_ns[own], report.start_ns, step_ns)))
         out.append(_row(person, lanes))
     return out
 

@@ -62,7 +62,7 @@ def _columns(results: Sequence[EvaluationRow]) -> list[str]:
 
 def _score_groups(results: Sequence[EvaluationRow], report: LogReport) -> list[dict[str, Any]]:
     """A group of rows for each rule, and for each class; the best value of a group is marked."""
-    known = {one.topic: (one.name, one.role) for one in report.track_sets.values()}
+    known = {track_set.topic: (track_set.name, track_set.role) for track_set in report.track_sets.values()}
     groups: dict[tuple[str, float, str], list[EvaluationRow]] = {}
     for row in results:
         groups.setdefault((row.similarity, row.gate, row.of_class or ""), []).append(row)
@@ -86,7 +86,7 @@ def _score_groups(results: Sequence[EvaluationRow], report: LogReport) -> list[d
 
 def _best(values: Sequence[float | None], key: str) -> float | None:
     """The best value of a column; None if none is known."""
-    known = [one for one in values if one is not None]
+    known = [value for value in values if value is not None]
     return (min if key in _LOWEST else max)(known) if known else None
 
 
@@ -97,7 +97,10 @@ def _score_text(key: str, value: float | None) -> str:
 
 
 def _track_rows(report: LogReport) -> list[dict[str, Any]]:
-    repairs = {one.topic: one.counts["joined"] + one.counts["parted"] for one in report.channel_events}
+    repairs = {
+        channel_event.topic: channel_event.counts["joined"] + channel_event.counts["parted"]
+        for channel_event in report.channel_events
+    }
     return [
         {
             "name": one["name"],
@@ -123,7 +126,7 @@ def forecasts(report: LogReport) -> dict[str, Any]:
         if not any(channel["schema"] == "mcaptrack.Predictions" for channel in report.data["channels"]):
             reason = f"the log holds none; {command('predict', Path(report.file))} makes them"
         return {"figures": [], "missing": [f"There are no forecasts that could be scored: {reason}."]}
-    known = {one.topic: (one.name, one.role) for one in report.track_sets.values()}
+    known = {track_set.topic: (track_set.name, track_set.role) for track_set in report.track_sets.values()}
     members = [(one, *known.get(one["tracks"], (one["tracks"], "truth"))) for one in found]
     figures = [_by_recall(members)]
     parts = [part for one in found for part in (one["by_horizon"], one["constant_velocity"]) if part]
@@ -216,7 +219,7 @@ def motion(report: LogReport) -> dict[str, Any]:
 def _histogram(
     report: LogReport, found: dict[str, Any], title: str, x: str, note: str, unit: str, of: str, digits: int
 ) -> Figure:
-    known = {one.topic: one for one in report.track_sets.values()}
+    known = {track_set.topic: track_set for track_set in report.track_sets.values()}
     edges = np.array(found["edges"])
     bars, texts = [], []
     for part in found["series"]:
@@ -228,7 +231,7 @@ def _histogram(
         bars.append(Bars(short(one.name), one.role, shares, part["median"], median))
         beyond = f" ({number(part['above'])} of them beyond)" if part["above"] else ""
         texts.append(f"{short(one.name)} {counted(part['n'], of)}{beyond}")
-    high = f"the highest bar is {percent(max(float(one.shares.max(initial=0)) for one in bars), 0)}"
+    high = f"the highest bar is {percent(max(float(bar.shares.max(initial=0)) for bar in bars), 0)}"
     return {
         "chart": histogram_chart(f"Histograms: {x}", bars, edges, x),
         "title": title,

@@ -108,7 +108,7 @@ def forecast_statistics(sequence: EvaluationInput, results: Sequence[EvaluationR
     """The errors of the forecasts of a sequence, by recall and by horizon, beside those of constant velocity."""
     out = []
     for candidate in sequence.candidates:
-        of_all = [one for one in results if one.tracks == candidate.name and one.of_class is None]
+        of_all = [result for result in results if result.tracks == candidate.name and result.of_class is None]
         found = next((one.displacement for one in of_all if one.displacement), None)
         rows = next((frame.rows for frame in candidate.forecasts or () if len(frame.rows)), None)
         if found is None or rows is None:

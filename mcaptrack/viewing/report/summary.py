@@ -16,7 +16,7 @@ from mcaptrack.viewing.report.headline import BEFORE, BeforeAfter, compared, rul
 
 def before_after(report: LogReport, results: Sequence[EvaluationRow]) -> BeforeAfter | None:
     """The scores that the summary compares: before and after re-tracking, at the prediction rate if possible."""
-    return compared({role: one.topic for role, one in report.track_sets.items()}, results)
+    return compared({role: track_set.topic for role, track_set in report.track_sets.items()}, results)
 
 
 def combined_results(reports: Sequence[LogReport]) -> list[EvaluationRow]:
@@ -101,13 +101,13 @@ def _without_ground_truth(reports: Sequence[LogReport]) -> str:
         return f"This log has no tracks yet; {run} makes them."
 
     def total(role: str) -> int:
-        return sum(one["tracks"] for one in tracks if one["role"] == role)
+        return sum(track["tracks"] for track in tracks if track["role"] == role)
 
     text = f"Tracking found {counted(total('tracks'), 'track')}"
     offline = {report.track_sets["offline"].topic for report in reports if "offline" in report.track_sets}
     if offline:
         events = [one for report in reports for one in report.data["events"] if one["topic"] in offline]
-        joined = sum(one["counts"]["joined"] for one in events)
+        joined = sum(event["counts"]["joined"] for event in events)
         text += (
             f"; re-tracked there are {number(total('offline'))}, and "
             f"{counted(joined, 'gap or mix-up', 'gaps and mix-ups')} {'was' if joined == 1 else 'were'} repaired by "
