@@ -68,17 +68,17 @@ def keep_attributes(path: Path, new: Path) -> list[str]:
 
     Returns the names of those that could not be copied.
     """
-    there, here = path.stat(), new.stat()
+    old, here = path.stat(), new.stat()
     lost: list[str] = []
-    for name, wanted, given, owner in (
-        ("owner", there.st_uid, here.st_uid, (there.st_uid, -1)),
-        ("group", there.st_gid, here.st_gid, (-1, there.st_gid)),
+    for name, wanted, value, owner in (
+        ("owner", old.st_uid, here.st_uid, (old.st_uid, -1)),
+        ("group", old.st_gid, here.st_gid, (-1, old.st_gid)),
     ):
-        if wanted != given:
+        if wanted != value:
             with _noting(name, lost):
                 os.chown(new, *owner)
     with _noting("permissions", lost):
-        new.chmod(there.st_mode & (0o777 if lost else 0o7777))  # no set-user-id bit for another user
+        new.chmod(old.st_mode & (0o777 if lost else 0o7777))  # no set-user-id bit for another user
     with _noting("extended attributes", lost):
         _keep_extended(path, new)
     return lost
@@ -192,11 +192,11 @@ def place_of(location: Location) -> Location:
     return location if isinstance(location, Url) else follow_links(location)
 
 
-def is_same_file(one: Location, other: Location) -> bool:
+def is_same_file(path: Location, other: Location) -> bool:
     """Whether two paths lead to the same existing file."""
-    if isinstance(one, Url) or isinstance(other, Url):
-        return one == other
-    return one.exists() and other.exists() and one.samefile(other)
+    if isinstance(path, Url) or isinstance(other, Url):
+        return path == other
+    return path.exists() and other.exists() and path.samefile(other)
 
 
 def read_beginning(path: Path, count: int) -> bytes:

@@ -198,8 +198,8 @@ def distinct_names(names: Sequence[str], places: Sequence[Location]) -> list[str
         if not again:
             break
         distinct = [
-            "/".join([*place.parts[:-1][-depth:], name]) if known in again else known
-            for name, known, place in zip(names, distinct, places, strict=True)
+            "/".join([*place.parts[:-1][-depth:], name]) if current in again else current
+            for name, current, place in zip(names, distinct, places, strict=True)
         ]
     first: dict[str, Location] = {}
     for name, place in zip(distinct, places, strict=True):

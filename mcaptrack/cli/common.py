@@ -73,22 +73,22 @@ def option(
     tuning: bool | str = False,
     least: float = -math.inf,
     most: float = math.inf,
-    **given: Any,
+    **settings: Any,
 ) -> Any:
     """Return a Typer option below the heading ``panel``; ``Declared`` explains the other parameters.
 
     The help names the range. Options of ``COMMON`` and of ``FILES`` show no defaults, and none shows its environment
     variable.
     """
-    if words := limits(least, most):
-        given["help"] += f" {words[0].upper()}{words[1:]}."
+    if range_text := limits(least, most):
+        settings["help"] += f" {range_text[0].upper()}{range_text[1:]}."
     if panel:
-        given["rich_help_panel"] = panel
+        settings["rich_help_panel"] = panel
     if panel in (COMMON, FILES):
-        given.setdefault("show_default", False)
-    made: Any = typer.Option(*names, show_envvar=False, **given)
-    made.declared = Declared(tuning, least, most)
-    return made
+        settings.setdefault("show_default", False)
+    info: Any = typer.Option(*names, show_envvar=False, **settings)
+    info.declared = Declared(tuning, least, most)
+    return info
 
 
 def output(shown: str | bool = False) -> Any:
@@ -152,25 +152,25 @@ class Talk:
         self._tasks: dict[str, Any] = {}
         self._shown = 0.0
 
-    def say(self, words: str, level: Level = "info", event: str = "", **about: Any) -> None:
+    def say(self, line: str, level: Level = "info", event: str = "", **about: Any) -> None:
         """Print a line to stderr; see ``text.say``."""
         if not self.quiet:
             self._stop()
-            say(words, level, event, **about)
+            say(line, level, event, **about)
 
-    def detail(self, words: str) -> None:
+    def detail(self, line: str) -> None:
         """Print a line to stderr with --verbose."""
         if self.verbose:
-            self.say(words, "debug")
+            self.say(line, "debug")
 
-    def event(self, words: str, event: str, **about: Any) -> None:
+    def event(self, line: str, event: str, **about: Any) -> None:
         """Print a line that is for programs: with ``--log-format json`` only."""
         if is_json():
-            self.say(words, "info", event, **about)
+            self.say(line, "info", event, **about)
 
-    def warn(self, words: str, code: Code = "other") -> None:
+    def warn(self, message: str, code: Code = "other") -> None:
         """Print a warning, also with ``quiet``, and add it to the JSON; see ``mcaptrack.notices``."""
-        notices.warn(words, code)
+        notices.warn(message, code)
 
     def _hear(self, notice: Notice) -> None:
         self._stop()
@@ -251,12 +251,12 @@ def _printing_notes(talk: Talk) -> Iterator[None]:
 _LOGS: Final = ("logs", "path", "inputs")
 
 
-def check_paths(given: Mapping[str, Any]) -> None:
+def check_paths(values: Mapping[str, Any]) -> None:
     """Raise McaptrackError if a path among the values of a command's options is a URL, a pipe or a device.
 
     Logs may be URLs of objects in a store.
     """
-    for name, value in given.items():
+    for name, value in values.items():
         for path in value if isinstance(value, list | tuple) else [value]:
             if isinstance(path, Path):
                 if name not in _LOGS or not is_remote(parse(path)):
@@ -309,7 +309,7 @@ def one_line(command: Callable[P, None]) -> Callable[P, None]:
             say(f"a fault of the program: {last}", "error", traceback=traceback.format_exc())
             raise typer.Exit(REFUSED) from None
         if batch.failed:
-            names = ", ".join(one.input for one in batch.failed)
+            names = ", ".join(failure.input for failure in batch.failed)
             say(f"{len(batch.failed)} of {batch.tried} failed: {names}", "error", failed=len(batch.failed))
         if batch.failed or batch.is_early:
             raise typer.Exit(LOST)
@@ -346,10 +346,10 @@ def record_failure(path: Location, error: str, state: str = "failed", **about: A
 
     ``about`` is what else ``--log-format json`` prints.
     """
-    words = error.strip()
-    words = words if str(path) in words else f"{path}: {words}"
-    say(words, "error", "log", **({"log": str(path), "state": state} | about))
-    _BATCH.get().failed.append(Failed(str(path), with_flags(words), state))
+    message = error.strip()
+    message = message if str(path) in message else f"{path}: {message}"
+    say(message, "error", "log", **({"log": str(path), "state": state} | about))
+    _BATCH.get().failed.append(Failed(str(path), with_flags(message), state))
 
 
 def with_progress(function: Callable[..., Any], progress: Any) -> Callable[..., Any]:
@@ -389,8 +389,8 @@ def print_json(data: dict[str, Any]) -> None:
     The output is flushed, so that other programs get it while this one continues, as ``view`` does.
     """
     added = {
-        "failed": [one._asdict() for one in _BATCH.get().failed],
-        "warnings": [one._asdict() for one in _WARNED.get()],
+        "failed": [failure._asdict() for failure in _BATCH.get().failed],
+        "warnings": [warning._asdict() for warning in _WARNED.get()],
     }
     whole = {"schema_version": SCHEMA_VERSION} | data | added
     print(json.dumps(whole, indent=2, allow_nan=False), flush=True)

@@ -171,9 +171,9 @@ def takes_many(*, outputs: bool = True) -> Callable[[Callable[..., None]], Calla
             for name in names
         ]
 
-        def with_options(**given: Any) -> None:
-            _OPTIONS.set(ManyOptions(**{name: given.pop(name) for name in names}))
-            command(**given)
+        def with_options(**values: Any) -> None:
+            _OPTIONS.set(ManyOptions(**{name: values.pop(name) for name in names}))
+            command(**values)
 
         with_options.__name__, with_options.__doc__ = command.__name__, command.__doc__
         with_options.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -264,10 +264,10 @@ def table_of(status: FleetStatus) -> Any:
     table.add_column("log", overflow="ellipsis", no_wrap=True, ratio=1)
     for name in ("stage", "done", "seconds", "MB"):
         table.add_column(name, justify="left" if name == "stage" else "right", no_wrap=True)
-    for one in sorted(status.running, key=lambda running: -running.seconds):
-        done = f"{one.done / one.total:.0%}" if one.total else ""
-        cells = (printable(one.stage), done, f"{one.seconds:.0f}", f"{one.resident_bytes / 1e6:,.0f}")
-        table.add_row(Text(printable(str(one.log))), *cells)
+    for log in sorted(status.running, key=lambda running: -running.seconds):
+        done = f"{log.done / log.total:.0%}" if log.total else ""
+        cells = (printable(log.stage), done, f"{log.seconds:.0f}", f"{log.resident_bytes / 1e6:,.0f}")
+        table.add_row(Text(printable(str(log.log))), *cells)
     return table
 
 
@@ -374,7 +374,7 @@ class _Printer(Generic[T]):
             return
         self._shown = monotonic()
         ended = status.logs - status.left
-        running = [{**asdict(one), "log": str(one.log), "seconds": round(one.seconds, 1)} for one in status.running]
+        running = [{**asdict(log), "log": str(log.log), "seconds": round(log.seconds, 1)} for log in status.running]
         text = f"{ended} of {status.logs} logs"
         self._talk.event(text, "progress", done=ended, total=status.logs, states=dict(status.ended), running=running)
 
@@ -416,17 +416,17 @@ def _about(outcome: LogOutcome[Any]) -> dict[str, Any]:
 def _summarise(done: FleetResult[Any], talk: common.Talk) -> None:
     """Print the totals, and with many logs once more why some failed."""
     common.tried(len(done.outcomes))
-    words = [f"{count} {state}" for state, count in done.counts.items()]
+    counts = [f"{count} {state}" for state, count in done.counts.items()]
     rate = len(done.outcomes) / max(done.seconds, 1e-3)
-    line = f"{len(done.outcomes)} logs in {done.seconds:.1f} s ({rate:.1f} a second): {', '.join(words)}"
+    line = f"{len(done.outcomes)} logs in {done.seconds:.1f} s ({rate:.1f} a second): {', '.join(counts)}"
     if done.peak_bytes:
         ran = [outcome for outcome in done.outcomes if outcome.tries]
         used = done.cpu_seconds / max(1, len(ran))
         line += f"; at most {done.peak_bytes / 1e6:,.0f} MB of memory, {used:.2f} s of processor time a log"
     talk.say(line, "info", "summary", **done.to_json())
     if len(done.outcomes) >= _REPEATED:
-        for one in done.failed:
-            say(f"  {one.state}: {one.error}", "info", "log", **_about(one))
+        for outcome in done.failed:
+            say(f"  {outcome.state}: {outcome.error}", "info", "log", **_about(outcome))
     if done.stopped:
         left = done.counts.get("not-tried", 0)
         common.end_early(f"{done.stopped}; {left} of {len(done.outcomes)} logs are left, and the same command goes on")

@@ -90,10 +90,12 @@ def zones(
     if str(logs[0]) == _DRAW and len(logs) == 1 and not Path(_DRAW).exists():
         raise McaptrackError("`zones draw` needs a log: name it after draw")
     if str(logs[0]) == _DRAW and len(logs) > 1:
-        given = {"--zones": zones, "--topic": topic, "--margin-m": margin_m, "--max-gap-s": max_gap_s}
-        given |= {"--sidecar": sidecar}
-        if len(logs) > 2 or any(one is not None for one in given.values()):
-            unused = next((name for name, one in given.items() if one is not None), f"another log ({logs[-1]})")
+        unused_options = {"--zones": zones, "--topic": topic, "--margin-m": margin_m, "--max-gap-s": max_gap_s}
+        unused_options |= {"--sidecar": sidecar}
+        if len(logs) > 2 or any(value is not None for value in unused_options.values()):
+            unused = next(
+                (name for name, value in unused_options.items() if value is not None), f"another log ({logs[-1]})"
+            )
             raise McaptrackError(f"`zones draw` takes one log, --camera, --output and --force, not {unused}")
         page = mcaptrack.draw_zones(logs[1], camera=camera, output=output, force=force)
         if json:
@@ -165,12 +167,23 @@ def print_zones(result: RunResult) -> None:
             table.add_column(name, justify="left" if place < 2 else "right", overflow="fold")
         for name, _ in (pair for pair in names if pair[1] == is_line):
             for topic, totals in result.zones.items():
-                one = next((found for found in totals if (found.zone, found.is_line) == (name, is_line)), None)
-                if one is None:
+                totals_of_zone = next(
+                    (total for total in totals if (total.zone, total.is_line) == (name, is_line)), None
+                )
+                if totals_of_zone is None:
                     continue
-                stay = "" if one.mean_dwell_s is None else f"{one.mean_dwell_s:.1f} s"
-                of_zone = (one.visits, one.entered, one.left, stay, one.most_inside)
-                cells = (one.tracks, *((one.forward, one.backward) if is_line else of_zone))
+                stay = "" if totals_of_zone.mean_dwell_s is None else f"{totals_of_zone.mean_dwell_s:.1f} s"
+                of_zone = (
+                    totals_of_zone.visits,
+                    totals_of_zone.entered,
+                    totals_of_zone.left,
+                    stay,
+                    totals_of_zone.most_inside,
+                )
+                cells = (
+                    totals_of_zone.tracks,
+                    *((totals_of_zone.forward, totals_of_zone.backward) if is_line else of_zone),
+                )
                 table.add_row(name, topic, *map(str, cells))
         if table.row_count:
             console().print(table)

@@ -100,18 +100,22 @@ def choose_cameras(opened: log.Log, names: Sequence[str] = ()) -> ChosenCameras 
     McaptrackError if no camera has anything to begin with, and for names that the log doesn't have, or that can't be
     run.
     """
-    known, scenes = cameras(opened), scenes_of(opened)
+    all_cameras, scenes = cameras(opened), scenes_of(opened)
     if names:
-        found = {name.strip("/"): camera for camera in known for name in camera.names}
+        by_name = {name.strip("/"): camera for camera in all_cameras for name in camera.names}
         for name in names:
-            if name.strip("/") not in found:
-                raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(found)) or 'none'}")
-        wanted = list(dict.fromkeys(found[name.strip("/")] for name in names))
+            if name.strip("/") not in by_name:
+                raise McaptrackError(
+                    f"{opened.path} has no camera {name}; it has {', '.join(sorted(by_name)) or 'none'}"
+                )
+        wanted = list(dict.fromkeys(by_name[name.strip("/")] for name in names))
         wanted_scenes = tuple(camera.prefix for camera in wanted if camera.prefix in scenes)
         wanted = [camera for camera in wanted if camera.prefix not in scenes]
     else:
         wanted_scenes = ()
-        wanted = [camera for camera in known if camera.prefix not in scenes and not _is_truth_of_scene(opened, camera)]
+        wanted = [
+            camera for camera in all_cameras if camera.prefix not in scenes and not _is_truth_of_scene(opened, camera)
+        ]
         wanted = [camera for camera in wanted if not camera.in_space or has_own_channels(opened, camera)] or wanted
         if len(wanted) + len(scenes) < 2 or all(camera.in_space for camera in wanted):
             return None
@@ -139,9 +143,9 @@ def _lack(opened: log.Log, camera: Camera) -> str:
     if camera.boxes or not _is_bare(opened, camera):
         return ""
     if camera.pictures is None:
-        there = sorted(one for one in camera.topics if foreign.holds_pictures(opened.channels[one]))
-        if there:
-            return f"has pictures in {list_names(there)}; `topic=` runs it on one of them"
+        with_pictures = sorted(topic for topic in camera.topics if foreign.holds_pictures(opened.channels[topic]))
+        if with_pictures:
+            return f"has pictures in {list_names(with_pictures)}; `topic=` runs it on one of them"
         has = sorted(topic for topic in camera.topics if "/view/" not in topic)
         return f"has neither pictures nor boxes, but {list_names(has, 5)}"
     if not opened.channels[camera.pictures].messages:

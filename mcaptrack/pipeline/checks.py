@@ -120,8 +120,8 @@ def read_named_frames(
     """
     channel = opened.channel(topic)
     if schema is DETECTIONS and channel.schema_name != DETECTIONS.name:
-        found = (BoxesRead() if boxes is None else boxes).read(opened, topic, frame_id)
-        return found._replace(frames=collect(DETECTIONS, found.frames))
+        boxes_read = (BoxesRead() if boxes is None else boxes).read(opened, topic, frame_id)
+        return boxes_read._replace(frames=collect(DETECTIONS, boxes_read.frames))
     return foreign.NamedFrames(
         opened.frame_columns(topic, schema), class_names(channel.metadata), frame_id_of(channel.metadata)
     )
@@ -129,10 +129,10 @@ def read_named_frames(
 
 def _lacks(opened: log.Log, prefix: str, job: Job) -> str:
     """Return the message for a missing input: what is missing, what the log has, and what to do."""
-    there = [topic for topic in sorted(opened.channels) if "/view/" not in topic]
-    has, hint = f"it has {list_names(there)}", f"{call('info', opened.path)} shows more"
+    topics = [topic for topic in sorted(opened.channels) if "/view/" not in topic]
+    has, hint = f"it has {list_names(topics)}", f"{call('info', opened.path)} shows more"
     if job.transform.reads is VIDEO and job.source == f"{prefix}/{STAGES[job.stage].input_topic}":
-        pictures = [topic for topic in there if foreign.holds_pictures(opened.channels[topic])]
+        pictures = [topic for topic in topics if foreign.holds_pictures(opened.channels[topic])]
         if pictures:
             has, hint = f"it has pictures in {list_names(pictures)}", "choose one with `topic=`"
         else:
@@ -168,15 +168,15 @@ def _check_outputs(opened: log.Log, prefix: str, job: Job) -> None:
 
 def may_replace(opened: log.Log, topic: str, transform: str) -> bool:
     """Return whether a topic is free, or holds only channels that the same transform made."""
-    return all(made is not None and made.transform == transform for made, _ in _making(opened, topic))
+    return all(provenance is not None and provenance.transform == transform for provenance, _ in _making(opened, topic))
 
 
 def describe_origin(opened: log.Log, topic: str) -> str:
     """Describe the origin of a channel as text; if several channels share the topic, a recorded one goes first."""
-    made, schema_name = min(_making(opened, topic), key=lambda found: found[0] is not None)
-    if made is None:
+    provenance, schema_name = min(_making(opened, topic), key=lambda pair: pair[0] is not None)
+    if provenance is None:
         return f"was recorded by others ({schema_name or 'no schema'})"
-    return "was ingested" if made.transform == INGEST else f"was made by {made.transform}"
+    return "was ingested" if provenance.transform == INGEST else f"was made by {provenance.transform}"
 
 
 def _making(opened: log.Log, topic: str) -> list[tuple[Provenance | None, str]]:

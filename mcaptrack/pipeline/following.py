@@ -64,10 +64,10 @@ class Continued:
     @classmethod
     def joined(cls, each: Sequence[Continued]) -> Continued:
         """Return the outcomes of several cameras as one, with the longest of their gaps."""
-        out = cls(each[0].log, max(one.gap_s for one in each))
-        for one in each:
-            out.at_cut |= one.at_cut
-            out.kept |= one.kept
+        out = cls(each[0].log, max(camera.gap_s for camera in each))
+        for camera in each:
+            out.at_cut |= camera.at_cut
+            out.kept |= camera.kept
         return out
 
     def to_json(self) -> dict[str, Any]:
@@ -85,8 +85,8 @@ class Continued:
 
 def begins_here(before: log.Log, opened: log.Log, prefix: str) -> str:
     """Return why the ids of one of several cameras go on from none, where the log before has others of them; or ""."""
-    there, here = ({camera.prefix for camera in cameras(each)} for each in (before, opened))
-    if prefix in there or not there & here:
+    before_cameras, here = ({camera.prefix for camera in cameras(each)} for each in (before, opened))
+    if prefix in before_cameras or not before_cameras & here:
         return ""
     return f"{before.path} has no camera {prefix[1:]}: its ids begin with {opened.path}"
 
@@ -118,11 +118,11 @@ class Before:
 
     def _check_camera(self, opened: log.Log) -> None:
         before, prefix = self._log, self._prefix
-        there = [camera.prefix[1:] for camera in cameras(before)]
-        if prefix[1:] not in there:
+        names = [camera.prefix[1:] for camera in cameras(before)]
+        if prefix[1:] not in names:
             raise McaptrackError(
                 f"{opened.path} is of the camera {prefix[1:]}, and {before.path} is of "
-                f"{', '.join(sorted(there)) or 'none'}; ids go on from one recording of a camera to the next"
+                f"{', '.join(sorted(names)) or 'none'}; ids go on from one recording of a camera to the next"
             )
         provenance, again = provenance_of(before, self.tracks), call("run", before.path)
         if provenance is None or not _is_tracker(provenance) or not before.channels[self.tracks].messages:
@@ -134,7 +134,7 @@ class Before:
             raise McaptrackError(
                 f"{opened.path}: {self.tracks} wasn't made by `track`, so that its ids stay as they are"
             )
-        sizes = [picture_size(one, camera_at(one, prefix).pictures) for one in (before, opened)]
+        sizes = [picture_size(each, camera_at(each, prefix).pictures) for each in (before, opened)]
         if None not in sizes and sizes[0] != sizes[1]:
             text = " and ".join("{} x {}".format(*size) for size in sizes if size)
             raise McaptrackError(
@@ -184,9 +184,9 @@ class Before:
         source = provenance.input if provenance and provenance.transform == job.stage else job.source
         if not _is_led(job) or not self.is_bridged or source not in self._log.channels:
             return []
-        found = read_named_frames(self._log, source, job.transform.reads, job.frame_id).frames
-        low = int(np.searchsorted(frame_times(found), self._lead_ns))
-        frames = found[low:]
+        input_frames = read_named_frames(self._log, source, job.transform.reads, job.frame_id).frames
+        low = int(np.searchsorted(frame_times(input_frames), self._lead_ns))
+        frames = input_frames[low:]
         if job.transform.reads is TRACKS and _differ(read_planes(self._log, self._prefix), planes):
             frames = [frame._replace(rows=_in_planes(frame, planes)) for frame in frames]
         missing = round(self.result.gap_s * NS_PER_S / self._period_ns) if self._period_ns else 1
@@ -196,7 +196,7 @@ class Before:
 
     def in_context(self, transform: Transform) -> Transform:
         """The transform with the clock of the log before, if it samples."""
-        is_clocked = self.is_bridged and "start_ns" in {one.name for one in fields(transform)}
+        is_clocked = self.is_bridged and "start_ns" in {field.name for field in fields(transform)}
         return replace(transform, start_ns=self._lead_ns) if is_clocked else transform
 
     def own(self, job: Job, outputs: Sequence[Sequence[Frame]]) -> tuple[list[Sequence[Frame]], dict[str, str]]:
@@ -229,8 +229,8 @@ class Before:
     def _last_id(self, job: Job) -> int:
         """The largest id up to the end of the log before, also in those before it."""
         provenance = provenance_of(self._log, job.target)
-        known = provenance.continued.get(LAST_ID, "") if provenance else ""
-        largest = int(known) if known.isascii() and known.isdigit() and len(known) < 19 else 0
+        last_id = provenance.continued.get(LAST_ID, "") if provenance else ""
+        largest = int(last_id) if last_id.isascii() and last_id.isdigit() and len(last_id) < 19 else 0
         for topic, schema in job.outputs().items():
             if schema is TRACKS and self._has(topic, TRACKS):
                 ids = unique_values(TRACKS, self._log.frame_columns(topic, TRACKS), "track_id")
@@ -255,16 +255,18 @@ class Before:
             if frame.t_ns >= self.start_ns + round(_AT_CUT_S * NS_PER_S):
                 break
             if frame.t_ns >= self.start_ns:
-                for source, one in zip(frame.rows["source_id"].tolist(), frame.rows["track_id"].tolist(), strict=True):
-                    if source >= 0 and source in last and one not in begun:
-                        votes[one, last[source]] += _OF_SOURCE
-                    begun.add(one)
+                for source, track_id in zip(
+                    frame.rows["source_id"].tolist(), frame.rows["track_id"].tolist(), strict=True
+                ):
+                    if source >= 0 and source in last and track_id not in begun:
+                        votes[track_id, last[source]] += _OF_SOURCE
+                    begun.add(track_id)
             elif frame.t_ns in at:
                 weight = 0.5 ** ((self.start_ns - frame.t_ns) / NS_PER_S / _HALF_S)
                 for pair in _pairs(frame.rows, before[at[frame.t_ns]].rows):
                     votes[pair] += weight
         out: dict[int, int] = {}
-        for (mine, theirs), _ in sorted(votes.items(), key=lambda one: (-one[1], one[0])):
+        for (mine, theirs), _ in sorted(votes.items(), key=lambda vote: (-vote[1], vote[0])):
             if mine not in out and theirs not in out.values():
                 out[mine] = theirs
         return out
@@ -286,9 +288,9 @@ class Before:
         """Count the ids at the cut, and those of them that go on."""
         before = self._log.frame_columns(topic, TRACKS)
         low = int(np.searchsorted(frame_times(before), self._end_ns - round(_AT_CUT_S * NS_PER_S)))
-        there = set(np.unique(before.rows(low)["track_id"]).tolist())
-        self.result.at_cut[topic] = len(there)
-        self.result.kept[topic] = len(there & set(unique_values(TRACKS, frames, "track_id").tolist()))
+        ids_at_cut = set(np.unique(before.rows(low)["track_id"]).tolist())
+        self.result.at_cut[topic] = len(ids_at_cut)
+        self.result.kept[topic] = len(ids_at_cut & set(unique_values(TRACKS, frames, "track_id").tolist()))
 
 
 def _is_led(job: Job) -> bool:
@@ -301,9 +303,9 @@ def _gives_ids(job: Job) -> bool:
     return job.transform.reads is DETECTIONS or STAGES[job.stage].repairs_tracks
 
 
-def _is_tracker(made: Provenance) -> bool:
+def _is_tracker(provenance: Provenance) -> bool:
     """Return whether a stage made tracks of detections."""
-    return made.transform in STAGES and STAGES[made.transform].default.reads is DETECTIONS
+    return provenance.transform in STAGES and STAGES[provenance.transform].default.reads is DETECTIONS
 
 
 def _start_ns(opened: log.Log, prefix: str) -> int:
@@ -361,10 +363,10 @@ def _pairs(mine: Rows, theirs: Rows) -> list[tuple[int, int]]:
 def _distances(mine: Rows, theirs: Rows) -> Floats:
     """Distances (T, U) of rows, as shares of those at which they are of one person."""
     boxes, others = columns_to_boxes(mine), columns_to_boxes(theirs)
-    middle, other = (one[:, :2] + one[:, 2:] / 2 for one in (boxes, others))
+    middle, other = (box[:, :2] + box[:, 2:] / 2 for box in (boxes, others))
     apart = np.hypot(*(middle[:, None] - other).transpose(2, 0, 1))
     away = apart / np.maximum(_NEAR_HEIGHTS * others[:, 3], 1e-9)
-    on_ground = [np.stack([one["x_m"], one["y_m"]], axis=-1) for one in (mine, theirs)]
+    on_ground = [np.stack([rows["x_m"], rows["y_m"]], axis=-1) for rows in (mine, theirs)]
     metres = np.hypot(*(on_ground[0][:, None] - on_ground[1]).transpose(2, 0, 1)) / _NEAR_M
     out: Floats = np.nan_to_num(np.where(np.isfinite(away), away, metres), nan=np.inf)
     return out

@@ -124,7 +124,7 @@ def fuse_again(
     if wanted is None:
         raise McaptrackError(f"{opened.path}: {target} can't be made again: {why_not}")
     offset_s = dict(zip(names, provenance.parameters["clock_offset_s"], strict=True))
-    given = {name: float(offset_s[name]) for name in provenance.parameters.get("clock_offsets_given", ())}
+    given_offset_s = {name: float(offset_s[name]) for name in provenance.parameters.get("clock_offsets_given", ())}
     why = f"was made by the {FUSION.entry(type(before))}" if is_other and before else "was made by another fuser"
     if not is_other:
         why = f"was made without {', '.join(more)}" if more else "was made from earlier detections or ground planes"
@@ -132,7 +132,7 @@ def fuse_again(
     how = f"by the {FUSION.entry(type(wanted))}" if is_other else "as before"
     say(f"{target} {why}: fusing {', '.join(names)} again, {how}")
     is_chosen = bool(provenance.parameters.get("cameras_given"))
-    return _fuse(opened, names, prefix, wanted, given, progress, is_asked=is_chosen, is_again=True)
+    return _fuse(opened, names, prefix, wanted, given_offset_s, progress, is_asked=is_chosen, is_again=True)
 
 
 def fusable(opened: log.Log, names: Sequence[str] = (), scene: str = "/world") -> tuple[list[str], str]:
@@ -145,15 +145,15 @@ def fusable(opened: log.Log, names: Sequence[str] = (), scene: str = "/world") -
         camera for camera in cameras(opened) if camera.prefix not in scenes and (not names or _has_name(camera, names))
     ]
     lacks = {our: _lack(opened, our) for our in ours}
-    able = [one for one, why in lacks.items() if not why]
-    listed = [one.prefix[1:] for one in able]
-    frames = {name: frame_of_plane(opened, one) for name, one in zip(listed, able, strict=True)}
+    able = [camera for camera, why in lacks.items() if not why]
+    listed = [camera.prefix[1:] for camera in able]
+    frames = {name: frame_of_plane(opened, camera) for name, camera in zip(listed, able, strict=True)}
     if len(able) < 2:
-        why = "; ".join(f"{one.prefix[1:]} {reason}" for one, reason in lacks.items() if reason)
+        why = "; ".join(f"{camera.prefix[1:]} {reason}" for camera, reason in lacks.items() if reason)
         return [], f"only {listed[0]} can be fused, since {why}" if able else why
     if len(set(frames.values())) > 1:
         return [], f"their ground planes are in different frames, {frames_in_words(frames)}"
-    return listed, "; ".join(f"{one.prefix[1:]} {why}" for one, why in lacks.items() if why)
+    return listed, "; ".join(f"{camera.prefix[1:]} {why}" for camera, why in lacks.items() if why)
 
 
 def _has_name(camera: Camera, names: Sequence[str]) -> bool:
@@ -253,11 +253,11 @@ def _with_views(fuser: Transform, feet: FootFuser) -> Transform:
 
 def _chosen(opened: log.Log, names: Sequence[str], scene: str) -> list[Camera]:
     """The cameras to fuse. Raises McaptrackError if one is not there, or lacks something."""
-    known = {name.strip("/"): camera for camera in cameras(opened) for name in camera.names if camera.prefix != scene}
+    by_name = {name.strip("/"): camera for camera in cameras(opened) for name in camera.names if camera.prefix != scene}
     for name in names:
-        if name.strip("/") not in known:
-            raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(known)) or 'none'}")
-    wanted = [known[name.strip("/")] for name in names] if names else list(dict.fromkeys(known.values()))
+        if name.strip("/") not in by_name:
+            raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(by_name)) or 'none'}")
+    wanted = [by_name[name.strip("/")] for name in names] if names else list(dict.fromkeys(by_name.values()))
     lacks = {camera.prefix[1:]: why for camera in wanted if (why := _lack(opened, camera))}
     if names and lacks:
         raise McaptrackError(f"{opened.path}: {next(iter(lacks))} {next(iter(lacks.values()))}")

@@ -114,9 +114,9 @@ def summarise(opened: log.Log, prefix: str, boxes_read: BoxesRead | None = None)
     motion = _rows(opened, motion_topic(prefix), CAMERA_MOTION)
     tracked, repaired = _sources(opened, tracks), _sources(opened, retracks)
     corrected = _corrected(opened, prefix, tracks, samples)
-    given = tracked
+    compared = tracked
     if corrected:
-        given = _pairs(corrected_tracks(opened, prefix, tracks, opened.frame_columns(tracks, TRACKS)))
+        compared = _pairs(corrected_tracks(opened, prefix, tracks, opened.frame_columns(tracks, TRACKS)))
     forecasts = _forecasts(opened, f"{retracks}/predictions") or _forecasts(opened, predictions)
     planes = read_planes(opened, prefix)
     scores = _scores(opened, prefix, camera.truth, (samples, retracks))
@@ -130,7 +130,7 @@ def summarise(opened: log.Log, prefix: str, boxes_read: BoxesRead | None = None)
         pictures=opened.channels[camera.pictures].messages if camera.pictures else None,
         boxes=_count_boxes(opened, tracks, boxes, boxes_read or BoxesRead()),
         tracks=None if tracked is None else len(np.unique(tracked[0])),
-        repair=None if given is None or repaired is None else _repair(given, repaired),
+        repair=None if compared is None or repaired is None else _repair(compared, repaired),
         forecasts=None if forecasts is None else forecasts[0],
         horizon_s=None if forecasts is None else forecasts[1],
         scores=scores,
@@ -143,9 +143,9 @@ def summarise(opened: log.Log, prefix: str, boxes_read: BoxesRead | None = None)
     )
 
 
-def _appearance(made: Provenance | None) -> Looks | None:
+def _appearance(provenance: Provenance | None) -> Looks | None:
     """Return what re-tracking found of the appearance of people; None if it didn't look."""
-    facts = made.model if made else {}
+    facts = provenance.model if provenance else {}
     separation = facts.get("separation")
     try:
         was = None if separation is None else float(separation)
@@ -235,8 +235,8 @@ def _repair(tracked: Ints, repaired: Ints) -> Repair:
 
 def _scores(opened: log.Log, prefix: str, truth: str, topics: tuple[str, str]) -> SummaryScores | None:
     """Score tracks before and after re-tracking, at their common sample times; None if they can't be compared."""
-    there = [opened.channels.get(topic) for topic in (truth, *topics)]
-    if not all(channel and channel.schema_name == TRACKS.name for channel in there):
+    channels = [opened.channels.get(topic) for topic in (truth, *topics)]
+    if not all(channel and channel.schema_name == TRACKS.name for channel in channels):
         return None
     names = {topic: class_names(opened.channel(topic).metadata) for topic in (truth, *topics)}
     candidates = [Candidate(topic, None, opened.frames(topic, TRACKS), classes=names[topic]) for topic in topics]
@@ -249,10 +249,10 @@ def _scores(opened: log.Log, prefix: str, truth: str, topics: tuple[str, str]) -
     }
     for by, options in rules.items():
         try:
-            found = evaluate([sequence], options).results
+            results = evaluate([sequence], options).results
         except McaptrackError:
             continue  # one of them has no positions in this unit
-        rows = [result.to_json() for result in found if result.of_class is None]
+        rows = [result.to_json() for result in results if result.of_class is None]
         idf1, switches = (tuple(row[name] for row in rows) for name in ("IDF1", "IDSW"))
         return SummaryScores((idf1[0], idf1[1]), (switches[0], switches[1]), by)
     return None

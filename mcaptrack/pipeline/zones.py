@@ -81,14 +81,14 @@ def outputs(topic: str) -> tuple[str, ...]:
 def make_zones(
     opened: log.Log,
     prefix: str,
-    made: Mapping[str, Made],
+    new_channels: Mapping[str, Made],
     planes: Planes,
     watch: ZoneWatch,
     stamps: Mapping[str, Sequence[int]] = {},
 ) -> dict[str, Made]:
     """Count the zones of channels of tracks that are not counted yet, or that have changed since.
 
-    ``made`` are the channels of this run, by topic, ``stamps`` the capture times of pictures, as for ``write``. Returns
+    ``new_channels`` are the channels of this run, by topic, ``stamps`` the capture times of pictures, as for ``write``. Returns
     the new channels by topic. Raises McaptrackError for given topics that hold no tracks, and for zones that none of
     the tracks can be compared with.
     """
@@ -98,7 +98,7 @@ def make_zones(
         return {}
     options = watch.options or (before.options if before.options else ZoneOptions())
     zones = _of_camera(opened, prefix, zones, is_given=bool(watch.zones))
-    topics = watch.topics or _default_topics(opened, prefix, made, before)
+    topics = watch.topics or _default_topics(opened, prefix, new_channels, before)
     if not topics:
         if not watch.zones:
             return {}
@@ -106,11 +106,11 @@ def make_zones(
     out: dict[str, Made] = {}
     faults: list[McaptrackError] = []
     for topic in topics:
-        if not _has_tracks(opened, topic, made):
-            there = opened.channel(topic).schema_name  # raises if there is no such channel
-            raise McaptrackError(f"{opened.path}: {topic} holds {there or 'no schema'}, not tracks")
+        if not _has_tracks(opened, topic, new_channels):
+            schema_name = opened.channel(topic).schema_name  # raises if there is no such channel
+            raise McaptrackError(f"{opened.path}: {topic} holds {schema_name or 'no schema'}, not tracks")
         wanted = _parameters(zones, options, planes)
-        if not watch.force and not _is_due(opened, topic, made, wanted):
+        if not watch.force and not _is_due(opened, topic, new_channels, wanted):
             continue
         taken = [
             output
@@ -125,7 +125,7 @@ def make_zones(
             continue
         try:
             pictures = picture_clock(opened, prefix, stamps)
-            out |= _counted(opened, prefix, topic, made, planes, zones, options, wanted, pictures)
+            out |= _counted(opened, prefix, topic, new_channels, planes, zones, options, wanted, pictures)
         except McaptrackError as error:
             faults.append(error)
     if faults and (not out or watch.topics) and watch.zones:
@@ -139,7 +139,7 @@ def _counted(
     opened: log.Log,
     prefix: str,
     topic: str,
-    made: Mapping[str, Made],
+    new_channels: Mapping[str, Made],
     planes: Planes,
     zones: Sequence[Zone],
     options: ZoneOptions,
@@ -147,22 +147,28 @@ def _counted(
     pictures: PictureClock,
 ) -> dict[str, Made]:
     """The channels of one channel of tracks."""
-    source = made[topic].provenance.digest if topic in made else digest_of(opened, topic)
+    source = new_channels[topic].provenance.digest if topic in new_channels else digest_of(opened, topic)
     frames: Sequence[Frame]
     if topic == camera_at(opened, prefix).truth:
-        frames = ground_truth_with(opened, prefix, made)
+        frames = ground_truth_with(opened, prefix, new_channels)
     else:
-        frames = made[topic].frames if topic in made else opened.frame_columns(topic, TRACKS)
-    path, motion = path_with(opened, prefix, topic, made)
+        frames = new_channels[topic].frames if topic in new_channels else opened.frame_columns(topic, TRACKS)
+    path, motion = path_with(opened, prefix, topic, new_channels)
     still = scene_planes(planes, path)
     placed: list[PlacedZone] = [place_zone(zone, still) for zone in zones]
-    positions = positions_of(frames, still, path, _class_names(opened, topic, made))
+    positions = positions_of(frames, still, path, _class_names(opened, topic, new_channels))
     zone_events = find_zone_events(frames, positions, placed, options, topic)
     for note in zone_events.notes:
         warn(note, "not-compared")
     names = {str(zone.number): zone.name for zone in zones}
     provenance = Provenance(
-        STAGE, parameters, topic, source, references=motion, zones=names, frame_id=_frame_id(opened, topic, made)
+        STAGE,
+        parameters,
+        topic,
+        source,
+        references=motion,
+        zones=names,
+        frame_id=_frame_id(opened, topic, new_channels),
     )
     rows = (zone_events.visits, zone_events.crossings, zone_events.counts)
     out = {
@@ -176,13 +182,13 @@ def _counted(
     out[topic + _BELOW + SUFFIX] = Made(ZONE_VISITS, [], view, text, foxglove.LOG)
     shapes = [
         drawn_zones.ZoneShape(
-            one.zone,
-            one.zone.shape(),
-            one.shape if one.units == "metres" else None,
-            one.forward,
-            ground_height_m(positions, one.shape) if one.units == "metres" else 0.0,
+            zone.zone,
+            zone.zone.shape(),
+            zone.shape if zone.units == "metres" else None,
+            zone.forward,
+            ground_height_m(positions, zone.shape) if zone.units == "metres" else 0.0,
         )
-        for one in placed
+        for zone in placed
     ]
     view = replace(view, input=(counts := topic + _BELOW + "/counts"), input_digest=out[counts].provenance.digest)
     view = replace(view, references={})
@@ -245,9 +251,11 @@ def _before(opened: log.Log, prefix: str) -> _Before:
 def _with_counts(opened: log.Log, prefix: str) -> list[str]:
     """The channels of a camera's tracks with visits that this stage counted."""
     ending = _BELOW + next(iter(_SCHEMAS))
-    found = (topic for topic in sorted(camera_at(opened, prefix).topics) if topic.endswith(ending))
-    made = ((topic, provenance_of(opened, topic)) for topic in found)
-    return [topic.removesuffix(ending) for topic, known in made if known and known.transform == STAGE]
+    visits = (topic for topic in sorted(camera_at(opened, prefix).topics) if topic.endswith(ending))
+    provenances = ((topic, provenance_of(opened, topic)) for topic in visits)
+    return [
+        topic.removesuffix(ending) for topic, provenance in provenances if provenance and provenance.transform == STAGE
+    ]
 
 
 def _of_camera(opened: log.Log, prefix: str, zones: tuple[Zone, ...], is_given: bool) -> tuple[Zone, ...]:
@@ -265,11 +273,11 @@ def _of_camera(opened: log.Log, prefix: str, zones: tuple[Zone, ...], is_given: 
     return kept
 
 
-def _default_topics(opened: log.Log, prefix: str, made: Mapping[str, Made], before: _Before) -> tuple[str, ...]:
+def _default_topics(opened: log.Log, prefix: str, new_channels: Mapping[str, Made], before: _Before) -> tuple[str, ...]:
     full = f"{prefix}/retracks{FULL}"
-    retracked = full if _has_tracks(opened, full, made) else f"{prefix}/retracks"
+    retracked = full if _has_tracks(opened, full, new_channels) else f"{prefix}/retracks"
     usual = (f"{prefix}/tracks", retracked, camera_at(opened, prefix).truth)
-    return tuple(topic for topic in dict.fromkeys((*usual, *before.topics)) if _has_tracks(opened, topic, made))
+    return tuple(topic for topic in dict.fromkeys((*usual, *before.topics)) if _has_tracks(opened, topic, new_channels))
 
 
 def _parameters(zones: Sequence[Zone], options: ZoneOptions, planes: Planes) -> dict[str, Any]:
@@ -278,7 +286,7 @@ def _parameters(zones: Sequence[Zone], options: ZoneOptions, planes: Planes) -> 
     return values | ({"ground_planes": planes_to_json(planes)} if planes else {})
 
 
-def _is_due(opened: log.Log, topic: str, made: Mapping[str, Made], wanted: Mapping[str, Any]) -> bool:
+def _is_due(opened: log.Log, topic: str, new_channels: Mapping[str, Made], wanted: Mapping[str, Any]) -> bool:
     """Whether the zones of a channel were never counted, in another way, or of what has changed since."""
     names = outputs(topic)[: len(_SCHEMAS) + 1]
     if not all(name in opened.channels for name in names) or is_stale(opened, names[0]):
@@ -286,32 +294,35 @@ def _is_due(opened: log.Log, topic: str, made: Mapping[str, Made], wanted: Mappi
     provenance = provenance_of(opened, names[0])
     if provenance is None or not _is_same(provenance.parameters, wanted):
         return True
-    return any(name in made and made[name].provenance.digest != then for name, then in provenance.made_from().items())
+    return any(
+        name in new_channels and new_channels[name].provenance.digest != then
+        for name, then in provenance.made_from().items()
+    )
 
 
 def _is_same(before: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
     """Whether parameters are the same, as JSON has them."""
     zones = zones_from_json(before.get("zones"))
-    rest = [{key: value for key, value in one.items() if key != "zones"} for one in (before, wanted)]
+    rest = [{key: value for key, value in parameters.items() if key != "zones"} for parameters in (before, wanted)]
     return zones_to_json(zones) == wanted["zones"] and rest[0] == rest[1]
 
 
-def _class_names(opened: log.Log, topic: str, made: Mapping[str, Made]) -> dict[int, str]:
+def _class_names(opened: log.Log, topic: str, new_channels: Mapping[str, Made]) -> dict[int, str]:
     """The names of the classes of tracks."""
-    if topic in made:
-        return {int(number): name for number, name in made[topic].provenance.classes.items()}
+    if topic in new_channels:
+        return {int(number): name for number, name in new_channels[topic].provenance.classes.items()}
     return class_names(opened.channel(topic).metadata)
 
 
-def _frame_id(opened: log.Log, topic: str, made: Mapping[str, Made]) -> str:
+def _frame_id(opened: log.Log, topic: str, new_channels: Mapping[str, Made]) -> str:
     """The frame of the metres of tracks."""
-    if topic in made:
-        return made[topic].provenance.frame_id
+    if topic in new_channels:
+        return new_channels[topic].provenance.frame_id
     return frame_id_of(opened.channel(topic).metadata)
 
 
-def _has_tracks(opened: log.Log, topic: str, made: Mapping[str, Made]) -> bool:
-    return made[topic].schema is TRACKS if topic in made else _holds(opened, topic, TRACKS)
+def _has_tracks(opened: log.Log, topic: str, new_channels: Mapping[str, Made]) -> bool:
+    return new_channels[topic].schema is TRACKS if topic in new_channels else _holds(opened, topic, TRACKS)
 
 
 def _holds(opened: log.Log, topic: str, schema: Schema) -> bool:

@@ -116,9 +116,9 @@ def _channel(opened: log.Log, prefix: str, topics: Sequence[str]) -> str:
             raise McaptrackError(f"{opened.path}: {topics[0]} holds {channel.schema_name}, not tracks to count")
         return channel.topic
     for name in _BEST:
-        found = opened.channels.get(f"{prefix}/{name}")
-        if found is not None and found.holds(TRACKS):
-            return found.topic
+        channel_found = opened.channels.get(f"{prefix}/{name}")
+        if channel_found is not None and channel_found.holds(TRACKS):
+            return channel_found.topic
     raise McaptrackError(f"{opened.path} has no tracks of {prefix} yet; {call('run', opened.path)} makes them")
 
 
@@ -242,8 +242,8 @@ def occupancy(
 
 def _steps(t_ns: Ints, track_id: NDArray[Any], xy_m: Floats, max_gap_ns: int) -> tuple[Floats, Floats, Floats]:
     """The steps of all tracks: where each begins, how far it goes, and how long it takes, in seconds."""
-    known = np.isfinite(xy_m).all(axis=1)
-    times, ids, at = t_ns[known], track_id[known], xy_m[known]
+    has_place = np.isfinite(xy_m).all(axis=1)
+    times, ids, at = t_ns[has_place], track_id[has_place], xy_m[has_place]
     order = np.lexsort((times, ids))
     times, ids, at = times[order], ids[order], at[order]
     last = run_ends(run_starts(ids, times=times, max_gap=max_gap_ns))
@@ -293,7 +293,11 @@ def _heat(opened: log.Log, topic: str, pictures: str | None, options: RenderOpti
     for _, _, joined in joined_parts(TRACKS, frames):
         rows, t_ns = joined.rows, joined.row_ns
         classes = rows["class_id"].astype(np.int64)
-        wanted = [one for one in np.unique(classes).tolist() if one == UNKNOWN or is_person(class_name(one, names))]
+        wanted = [
+            number
+            for number in np.unique(classes).tolist()
+            if number == UNKNOWN or is_person(class_name(number, names))
+        ]
         kept = np.isin(classes, wanted) & (t_ns >= first) & (t_ns <= (t_ns if last is None else last))
         parts.append((t_ns[kept], rows["track_id"][kept].astype(np.int64), rows["x_m"][kept], rows["y_m"][kept]))
     if not parts or not sum(len(part[0]) for part in parts):
@@ -321,8 +325,8 @@ def _smooth(heat: Occupancy) -> Floats:
     import cv2
 
     padded = np.pad(heat.person_s, 2)
-    found = np.asarray(cv2.GaussianBlur(padded, (0, 0), 0.8), np.float64)
-    return found / max(float(found.max()), 1e-12)
+    smoothed = np.asarray(cv2.GaussianBlur(padded, (0, 0), 0.8), np.float64)
+    return smoothed / max(float(smoothed.max()), 1e-12)
 
 
 def _over_picture(scene: Image, heat: Occupancy, plane: GroundPlane) -> Image:
@@ -341,8 +345,8 @@ def _over_picture(scene: Image, heat: Occupancy, plane: GroundPlane) -> Image:
     cells[~is_ground] = -10
     grid = _smooth(heat)
     place = cells.astype(np.float32).reshape(height, width, 2)
-    found = cv2.remap(grid.astype(np.float32), place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderValue=0)
-    return _painted((scene * 0.75).astype(np.uint8), np.asarray(found, np.float64))
+    density = cv2.remap(grid.astype(np.float32), place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderValue=0)
+    return _painted((scene * 0.75).astype(np.uint8), np.asarray(density, np.float64))
 
 
 def _from_above(heat: Occupancy, width_px: int) -> Image:
@@ -358,8 +362,8 @@ def _from_above(heat: Occupancy, width_px: int) -> Image:
     y = -(np.arange(size[1]) + 0.5 - size[1] / 2) / scale + middle[1]
     across, up = (x - low[0]) / heat.cell_m + 1.5, (y - low[1]) / heat.cell_m + 1.5
     column, row = np.meshgrid(across.astype(np.float32), up.astype(np.float32))
-    found = cv2.remap(_smooth(heat).astype(np.float32), column, row, cv2.INTER_LINEAR, borderValue=0)
-    return draw(_painted(from_above.ground(sight), np.asarray(found, np.float64)), from_above.grid(sight))
+    density = cv2.remap(_smooth(heat).astype(np.float32), column, row, cv2.INTER_LINEAR, borderValue=0)
+    return draw(_painted(from_above.ground(sight), np.asarray(density, np.float64)), from_above.grid(sight))
 
 
 def _painted(image: Image, share: Floats) -> Image:

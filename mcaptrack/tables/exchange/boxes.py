@@ -74,14 +74,14 @@ class BoxTable:
     def left_out(self, form: str, holds: frozenset[str]) -> str:
         """The contents of rows that the file lacks, as text; "" if nothing is missing."""
         scored = np.isfinite(self.score)
-        there = {
+        has_contents = {
             "sizes and headings of 3D boxes": self.has_3d,
             "positions in metres": "metres" not in holds and bool(np.isfinite(self.xy_m).any()),
             "scores": "scores" not in holds and bool(scored.any()),
             "which boxes were filled in": "observed" not in holds and not self.observed.all(),
         }
-        words = [what for what, is_there in there.items() if is_there]
-        out = [f"{_NAMES[form]} has no place for {' and '.join(words)}; they are left out"] if words else []
+        lacking = [what for what, is_there in has_contents.items() if is_there]
+        out = [f"{_NAMES[form]} has no place for {' and '.join(lacking)}; they are left out"] if lacking else []
         if form in ("mot", "kitti") and scored.any() and not scored.all():
             out.append(f"{int((~scored).sum()):,} boxes without a score have 1 there")
         return "; ".join(out)

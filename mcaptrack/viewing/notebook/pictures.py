@@ -213,23 +213,23 @@ def find_drawings(opened: log.Log, prefix: str, topics: Sequence[str]) -> ToShow
     with a warning. Raises McaptrackError if there is nothing to see, if a given channel can't be drawn, or if the views
     of given ones don't fit together.
     """
-    given = [_full(opened, prefix, topic) for topic in topics]
-    if len(given) == 1 and given[0] in opened.channels and holds_pictures(opened.channels[given[0]]):
-        return ToShow([], given[0], opened.times(given[0]))
-    without = [topic for topic in given if not _has_view(opened, topic)]
+    full_topics = [_full(opened, prefix, topic) for topic in topics]
+    if len(full_topics) == 1 and full_topics[0] in opened.channels and holds_pictures(opened.channels[full_topics[0]]):
+        return ToShow([], full_topics[0], opened.times(full_topics[0]))
+    without = [topic for topic in full_topics if not _has_view(opened, topic)]
     if without:
-        for topic in given:
+        for topic in full_topics:
             _schema_of(opened, topic)
-        return _drawn_now(opened, prefix, given)
+        return _drawn_now(opened, prefix, full_topics)
     try:
-        shown = pipeline.find_views(opened, prefix, given)
+        shown = pipeline.find_views(opened, prefix, full_topics)
     except McaptrackError as error:
-        found = [topic for topic in _candidates(opened, prefix) if not given][:1]
-        if not found and (given or pipeline.camera_at(opened, prefix).pictures is None):
+        usable = [topic for topic in _candidates(opened, prefix) if not full_topics][:1]
+        if not usable and (full_topics or pipeline.camera_at(opened, prefix).pictures is None):
             raise
-        if not found:
+        if not usable:
             warn(f"nothing is drawn on the pictures: {error}", "nothing-found")
-        return _drawn_now(opened, prefix, found)
+        return _drawn_now(opened, prefix, usable)
     t_ns = opened.times(shown.pictures or shown.views[0])
     return ToShow([_recorded(opened, topic) for topic in shown.views], shown.pictures, t_ns)
 
@@ -241,7 +241,7 @@ def _full(opened: log.Log, prefix: str, topic: str) -> str:
 
 
 def _has_view(opened: log.Log, topic: str) -> bool:
-    begin = tuple(one + suffix for one in (topic, topic + FULL) for suffix in views.SUFFIXES)
+    begin = tuple(name + suffix for name in (topic, topic + FULL) for suffix in views.SUFFIXES)
     is_view = any(suffix in topic for suffix in views.SUFFIXES)
     return is_view or any(channel.startswith(begin) for channel in opened.channels)
 
@@ -249,8 +249,8 @@ def _has_view(opened: log.Log, topic: str) -> bool:
 def _candidates(opened: log.Log, prefix: str) -> list[str]:
     """Return the channels of a camera that can be drawn, the best ones first."""
     best = [f"{prefix}/{name}" for name in _BEST]
-    there = [*best, *sorted(pipeline.camera_at(opened, prefix).topics)]
-    return [topic for topic in dict.fromkeys(there) if topic in opened.channels and _kind(opened.channels[topic])]
+    names = [*best, *sorted(pipeline.camera_at(opened, prefix).topics)]
+    return [topic for topic in dict.fromkeys(names) if topic in opened.channels and _kind(opened.channels[topic])]
 
 
 def _kind(channel: log.Channel) -> Schema | None:
@@ -358,7 +358,7 @@ class PictureSource:
         if self._pictures is not None:
             tried = numbers[np.unique(np.linspace(0, len(numbers) - 1, _TRIED).astype(int))]
             small = (self._small(frame.rows, width_px) for frame in self._pictures.frames(tried.tolist()))
-            sizes = [len(encode_image(one, "jpeg", _QUALITY)) for one in small]
+            sizes = [len(encode_image(picture, "jpeg", _QUALITY)) for picture in small]
             each += _AS_TEXT * float(np.mean(sizes)) if sizes else 0.0
         return max(1, ceil(len(numbers) / max(1.0, min(_MOST, most_bytes / each))))
 

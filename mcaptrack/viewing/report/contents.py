@@ -103,8 +103,8 @@ class LogReport:
     @property
     def on_prediction_clock(self) -> dict[str, TrackSet]:
         """The tracks at the prediction rate; without any, those of the tracker."""
-        there = {role: track_set for role, track_set in self.track_sets.items() if role in ("samples", "offline")}
-        return there or {role: track_set for role, track_set in self.track_sets.items() if role == "tracks"}
+        resampled = {role: track_set for role, track_set in self.track_sets.items() if role in ("samples", "offline")}
+        return resampled or {role: track_set for role, track_set in self.track_sets.items() if role == "tracks"}
 
     @property
     def headline(self) -> BeforeAfter | None:
@@ -114,9 +114,9 @@ class LogReport:
     @property
     def compared_roles(self) -> tuple[str, str]:
         """The roles of tracks before and after re-tracking; "" for those that are missing."""
-        found = self.headline
-        if found is not None:
-            return found.roles
+        headline = self.headline
+        if headline is not None:
+            return headline.roles
         before, after = (next((role for role in roles if role in self.track_sets), "") for roles in (BEFORE, AFTER))
         return before, after
 
@@ -151,27 +151,35 @@ def zone_section(opened: log.Log, prefix: str, names: Mapping[str, str]) -> dict
     counted = pipeline.counted_zones(opened, prefix)
     if not counted:
         return {"columns": _OF_ZONES, "rows": [], "line_columns": _OF_LINES, "lines": [], "figures": [], "data": {}}
-    shown = [(one, _ROLES.get(one.topic.removeprefix(prefix + "/"), "samples")) for one in counted]
+    shown = [
+        (zones_counted, _ROLES.get(zones_counted.topic.removeprefix(prefix + "/"), "samples"))
+        for zones_counted in counted
+    ]
     shown.sort(key=lambda pair: ([*_ROLES.values(), "samples"].index(pair[1]), pair[0].topic))
-    called = {one.topic: names.get(role, one.topic) if role != "samples" else one.topic for one, role in shown}
-    zones = list({zone.name: zone for one in counted for zone in one.zones}.values())
+    called = {
+        zones_counted.topic: names.get(role, zones_counted.topic) if role != "samples" else zones_counted.topic
+        for zones_counted, role in shown
+    }
+    zones = list({zone.name: zone for zones_counted in counted for zone in zones_counted.zones}.values())
     groups: dict[bool, list[dict[str, Any]]] = {False: [], True: []}
     for zone in zones:
         rows = [
-            {"name": called[one.topic], "role": role, "topic": one.topic, "cells": _cells(total)}
-            for one, role in shown
-            for total in one.totals
+            {"name": called[zones_counted.topic], "role": role, "topic": zones_counted.topic, "cells": _cells(total)}
+            for zones_counted, role in shown
+            for total in zones_counted.totals
             if (total.zone, total.is_line) == (zone.name, zone.is_line)
         ]
         groups[zone.is_line].append({"zone": zone.name, "rows": rows})
     some = [zone for zone in zones if not zone.is_line][:_CHARTS]
-    inside = {one.topic: _inside(opened, one.topic, one.zones) for one in counted}
+    inside = {
+        zones_counted.topic: _inside(opened, zones_counted.topic, zones_counted.zones) for zones_counted in counted
+    }
     figures = []
     for zone in some:
         lines = [
-            Line(short(called[one.topic]), role, *inside[one.topic][zone.name])
-            for one, role in shown
-            if zone.name in inside[one.topic]
+            Line(short(called[zones_counted.topic]), role, *inside[zones_counted.topic][zone.name])
+            for zones_counted, role in shown
+            if zone.name in inside[zones_counted.topic]
         ]
         figures.append(_chart(zone.name, lines))
     left = sum(not zone.is_line for zone in zones) - len(some)
@@ -182,18 +190,18 @@ def zone_section(opened: log.Log, prefix: str, names: Mapping[str, str]) -> dict
         "lines": groups[True],
         "figures": figures,
         "left_out": left,
-        "data": {one.topic: [total.to_json() for total in one.totals] for one in counted},
+        "data": {zones_counted.topic: [total.to_json() for total in zones_counted.totals] for zones_counted in counted},
     }
 
 
-def _cells(one: ZoneTotals) -> list[str]:
-    if one.is_line:
-        return [number(value) for value in (one.tracks, one.forward, one.backward)]
+def _cells(totals: ZoneTotals) -> list[str]:
+    if totals.is_line:
+        return [number(value) for value in (totals.tracks, totals.forward, totals.backward)]
     return [
-        *(number(value) for value in (one.tracks, one.visits, one.entered, one.left)),
-        *(NONE if value is None else number(value, 1, "s") for value in (one.mean_dwell_s, one.median_dwell_s)),
-        number(one.most_inside),
-        NONE if one.mean_inside is None else number(one.mean_inside, 2),
+        *(number(value) for value in (totals.tracks, totals.visits, totals.entered, totals.left)),
+        *(NONE if value is None else number(value, 1, "s") for value in (totals.mean_dwell_s, totals.median_dwell_s)),
+        number(totals.most_inside),
+        NONE if totals.mean_inside is None else number(totals.mean_inside, 2),
     ]
 
 
@@ -281,11 +289,11 @@ def _read(opened: log.Log, out: LogReport) -> None:
     }
     for below, role in ROLES.items():
         topic = camera.truth if role == "truth" else f"{out.prefix}/{below}"
-        there = opened.channels.get(topic)
-        if there is None:
+        channel = opened.channels.get(topic)
+        if channel is None:
             continue
-        if not there.holds(TRACKS):
-            out.notes.append(f"{topic} holds {there.schema_name or 'no schema'}, not tracks; it is left out")
+        if not channel.holds(TRACKS):
+            out.notes.append(f"{topic} holds {channel.schema_name or 'no schema'}, not tracks; it is left out")
             continue
         try:
             frames = read_ground_truth(opened, out.prefix) if role == "truth" else opened.frames(topic, TRACKS)
@@ -336,14 +344,16 @@ def _classes(opened: log.Log, out: LogReport, topic: str) -> tuple[dict[int, str
 
 def _compare_people(opened: log.Log, out: LogReport) -> None:
     """Compare tracks before and after re-tracking with each true person, by the rule of the headline."""
-    found = out.headline
-    if found is None:
+    headline = out.headline
+    if headline is None:
         return
-    for role in filter(None, found.roles):
-        one = out.track_sets[role]
-        rule = MatchRule(*found.rule)  # type: ignore[arg-type]  # a similarity
-        classes = _classes(opened, out, one.topic)
-        scores = person_scores(out.track_sets["truth"].frames, one.frames, rule, (out.name, one.topic), classes)
+    for role in filter(None, headline.roles):
+        track_set = out.track_sets[role]
+        rule = MatchRule(*headline.rule)  # type: ignore[arg-type]  # a similarity
+        classes = _classes(opened, out, track_set.topic)
+        scores = person_scores(
+            out.track_sets["truth"].frames, track_set.frames, rule, (out.name, track_set.topic), classes
+        )
         if scores is not None:
             out.people[role] = scores
 
@@ -360,13 +370,13 @@ def _find_events(opened: log.Log, out: LogReport) -> None:
         tracks = out.track_sets[role]
         if not any(len(frame.rows) for frame in tracks.frames):
             continue
-        known = _recorded(opened, tracks.topic + "/events")
+        counted_events = _recorded(opened, tracks.topic + "/events")
         classes = _classes(opened, out, tracks.topic)
-        if known is None or (headline is not None and known[1] != headline.rule):
+        if counted_events is None or (headline is not None and counted_events[1] != headline.rule):
             frames = repaired_tracks(tracks.frames, provenance_of(opened, tracks.topic))
-            found = find_events(frames, ground_truth, options, out.name, tracks.topic, classes)
-            known = found.events, found.rule
-        events, rule = known
+            track_events = find_events(frames, ground_truth, options, out.name, tracks.topic, classes)
+            counted_events = track_events.events, track_events.rule
+        events, rule = counted_events
         span_ns = (out.start_ns, out.end_ns)
         args = (tracks.frames, ground_truth, span_ns, classes)
         out.channel_events.append(summarize_events(tracks.topic, events, rule, *args))
@@ -432,7 +442,7 @@ def _statistics(out: LogReport) -> dict[str, Any]:
         | statistics.track_statistics(track_set.frames)
         for track_set in out.track_sets.values()
     ]
-    resampled = {one.topic: one.frames for one in out.on_prediction_clock.values()}
+    resampled = {track_set.topic: track_set.frames for track_set in out.on_prediction_clock.values()}
     if "truth" in out.track_sets:
         ground_truth = out.track_sets["truth"]
         at_ns = np.unique(np.concatenate([np.empty(0, np.int64), *map(frame_times, resampled.values())]))
