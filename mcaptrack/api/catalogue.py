@@ -161,9 +161,9 @@ def _fetch(model: Model, url: str) -> Path:
                 raise McaptrackError(f"{url} ends after {file.tell():,} of {model.size_bytes:,} bytes")
 
     pooch.get_logger().setLevel(logging.ERROR)
-    known = f"sha256:{model.sha256}"
+    digest = f"sha256:{model.sha256}"
     try:
-        return Path(pooch.retrieve(url, known, fname=model.path.name, path=model.path.parent, downloader=download))
+        return Path(pooch.retrieve(url, digest, fname=model.path.name, path=model.path.parent, downloader=download))
     except requests.RequestException as error:
         raise McaptrackError(f"{url}: {_reason(error)}") from None
     except ValueError:  # of pooch: another digest

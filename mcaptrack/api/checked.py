@@ -81,10 +81,10 @@ def declared(*, most_used: tuple[str, ...] = ()) -> Callable[[Callable[P, T]], C
 @cache
 def _kinds(function: Callable[..., object]) -> dict[str, tuple[Any, ...]]:
     """The types that each parameter may have. That of the result is left out: it may be known to type checkers only."""
-    known = {name: bare(hint) for name, hint in hints_of(function).items()}
+    types_of = {name: bare(hint) for name, hint in hints_of(function).items()}
     return {
         name: get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
-        for name, hint in known.items()
+        for name, hint in types_of.items()
     }
 
 
@@ -124,9 +124,9 @@ def _check_range(name: str, value: Any, ends: tuple[float, float], *, is_whole: 
     kind: Any = Integral if is_whole else Real
     least, most = ends
     values = list(value) if isinstance(value, Iterable) and not isinstance(value, str | bytes) else [value]
-    for one in values:
-        if not isinstance(one, kind) or isinstance(one, bool) or not least <= one <= most:
+    for number in values:
+        if not isinstance(number, kind) or isinstance(number, bool) or not least <= number <= most:
             text = "a whole number" if is_whole else "a number"
-            raise McaptrackError(f"`{name}=` is {text} from {least:.12g} to {most:.12g}, not {one!r:.40}")
+            raise McaptrackError(f"`{name}=` is {text} from {least:.12g} to {most:.12g}, not {number!r:.40}")
     if not values:
         raise McaptrackError(f"`{name}=` needs at least one number")

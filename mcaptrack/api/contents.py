@@ -214,7 +214,7 @@ def info(log: PathLike, *, frames: bool = False) -> LogInfo:
     with warnings_about(path) as warnings, logs.read(path) as opened:
         pipeline.warn_clock_jumps(opened)
         every = [(channel, part) for part in opened.parts for channel in part.recorded]
-        every.sort(key=lambda found: (found[0].topic, found[1] is opened, found[0].id))
+        every.sort(key=lambda pair: (pair[0].topic, pair[1] is opened, pair[0].id))
         names = names_by_topic(opened)
         channels = tuple(_channel(opened, part, channel, names.get(channel.topic)) for channel, part in every)
         return LogInfo(
@@ -264,19 +264,19 @@ def _rate(opened: logs.Log, messages: int) -> float | None:
 def _frames(opened: logs.Log) -> tuple[FrameInfo, ...]:
     """Return the frames of a log, each after its parent, and warn of what contradicts or lacks."""
     read = read_frames(opened)
-    for words in read.unread:
-        warn(f"{opened.path}: {words}", "lost")
+    for why in read.unread:
+        warn(f"{opened.path}: {why}", "lost")
     if read.tree is None:
         return ()
     for remark in read.tree.remarks:
         warn(f"{opened.path}: transforms: {remark.text}", "transforms")
     waiting = read.tree.roots()[::-1]
-    found: list[FrameInfo] = []
+    infos: list[FrameInfo] = []
     while waiting:
         frame = waiting.pop()
-        found.append(_frame(frame, read.tree.series.get(frame)))
+        infos.append(_frame(frame, read.tree.series.get(frame)))
         waiting += read.tree.children_of(frame)[::-1]
-    return tuple(found)
+    return tuple(infos)
 
 
 def _frame(frame: str, series: TransformSeries | None) -> FrameInfo:

@@ -111,13 +111,13 @@ def bare(hint: Any) -> Any:
 
 def option_of(hint: Any) -> Option:
     """The facts about an option in an annotation."""
-    return next((one for one in _about(hint) if isinstance(one, Option)), Option())
+    return next((part for part in _about(hint) if isinstance(part, Option)), Option())
 
 
 def one_of_many(function: Callable[..., Any]) -> OneOfMany | None:
     """The facts about the parameter of which the command takes many; None without one."""
-    about = (one for hint in hints_of(function).values() for one in _about(hint))
-    return next((one for one in about if isinstance(one, OneOfMany)), None)
+    about = (part for hint in hints_of(function).values() for part in _about(hint))
+    return next((part for part in about if isinstance(part, OneOfMany)), None)
 
 
 def _about(hint: Any) -> tuple[Any, ...]:
@@ -126,7 +126,7 @@ def _about(hint: Any) -> tuple[Any, ...]:
 
 def options_of(function: Callable[..., Any]) -> list[Parameter]:
     """The parameters of a declared function that are options of its command, in order."""
-    words, hints = words_of(function), hints_of(function)
+    doc, hints = words_of(function), hints_of(function)
     flags = {name: f"--{(option_of(hint).flag or name).replace('_', '-')}" for name, hint in hints.items()}
     out = []
     for name, parameter in inspect.signature(function).parameters.items():
@@ -138,7 +138,7 @@ def options_of(function: Callable[..., Any]) -> list[Parameter]:
         ):
             continue
         option, (kind, many) = option_of(hints[name]), on_command_line(bare(hints[name]))
-        text, shown = _split_default(words.parameters.get(name, [""])[0])
+        text, shown = _split_default(doc.parameters.get(name, [""])[0])
         flag, _, off = flags[name].partition("/")
         if kind is bool and (off or parameter.default is not False):
             off = f"--{off or f'no-{flag[2:]}'}"
@@ -185,7 +185,9 @@ def words_of(function: Callable[..., Any]) -> Words:
     for block in re.split(r"^(?=\S)", sections.get("Parameters", ""), flags=re.M):
         names, _, lines = block.partition("\n")
         for name in names.partition(" : ")[0].split(", "):
-            parameters[name.lstrip("*")] = [" ".join(one.split()) for one in inspect.cleandoc(lines).split("\n\n")]
+            parameters[name.lstrip("*")] = [
+                " ".join(paragraph.split()) for paragraph in inspect.cleandoc(lines).split("\n\n")
+            ]
     return Words(text.strip(), parameters, re.findall(r"^ +(mcaptrack .+)$", sections.get("Examples", ""), re.M))
 
 
@@ -198,8 +200,8 @@ def _split_default(text: str) -> tuple[str, str | None]:
 def with_dashes(text: str, flags: dict[str, str]) -> str:
     """Return text of a docstring for the command line: ``max_fps`` and `max_fps=` become --max-fps."""
 
-    def option(found: re.Match[str]) -> str:
-        name = found[1] or found[2]
-        return flags[name].partition("/")[0] if name in flags else name if found[1] else found[0]
+    def option(match: re.Match[str]) -> str:
+        name = match[1] or match[2]
+        return flags[name].partition("/")[0] if name in flags else name if match[1] else match[0]
 
     return re.sub(r"``(\w+)``|`(\w+)=`", option, text).replace("``", "")

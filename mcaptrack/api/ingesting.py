@@ -354,10 +354,10 @@ def parse_size(size: str | tuple[int, int] | None) -> tuple[int, int] | None:
 
     if size is None:
         return None
-    found = boxes.parse_size(size if isinstance(size, str) else "x".join(map(str, size)))
-    if found is None:
+    parsed = boxes.parse_size(size if isinstance(size, str) else "x".join(map(str, size)))
+    if parsed is None:
         raise McaptrackError(f"`size=` is the width and height of pictures in pixels, like 1920x1080, not {size!r:.40}")
-    return found
+    return parsed
 
 
 def parse_start_time(time: float | str | dt.datetime | None) -> int | None:

@@ -160,8 +160,8 @@ def show_tables() -> None:
         html.for_type_by_name(*_ARROW, arrow_html)
 
 
-def _name_of(one: type) -> tuple[str, str]:
-    return one.__module__, one.__qualname__
+def _name_of(cls: type) -> tuple[str, str]:
+    return cls.__module__, cls.__qualname__
 
 
 def arrow_html(table: pa.Table) -> str | None:
@@ -174,7 +174,7 @@ def arrow_html(table: pa.Table) -> str | None:
     True
     """
     about = [{key.decode(): text.decode() for key, text in (field.metadata or {}).items()} for field in table.schema]
-    if not any("unit" in one and "description" in one for one in about):
+    if not any("unit" in metadata and "description" in metadata for metadata in about):
         return None
     rows = table.num_rows
     is_whole = rows <= FIRST + LAST
@@ -182,9 +182,9 @@ def arrow_html(table: pa.Table) -> str | None:
     texts += [] if is_whole else tables.cells(table.slice(rows - LAST), LAST)[1]
     columns = [
         ShownColumn(
-            name, found.get("unit", ""), found.get("description", ""), is_number, [line[place] for line in texts]
+            name, metadata.get("unit", ""), metadata.get("description", ""), is_number, [line[place] for line in texts]
         )
-        for place, (name, found, is_number) in enumerate(zip(table.column_names, about, numbers, strict=True))
+        for place, (name, metadata, is_number) in enumerate(zip(table.column_names, about, numbers, strict=True))
     ]
     return table_html(columns, rows)
 
@@ -203,12 +203,12 @@ def show_log(
     with warnings_about(opened.path) as warnings:
         source = PictureSource(opened, pipeline.find_camera(opened, camera), topics)
         if at_s is None:
-            made = _player(opened, source, choice, max_mb, progress)
+            shown = _player(opened, source, choice, max_mb, progress)
         else:
-            given = {"start_s": choice.start_s > 0, "end_s": choice.end_s is not None, "every": bool(choice.every)}
-            warn_unused("a still is one picture", **given)
-            made = _still(opened, source, source.number_at(at_s), choice.width_px)
-    return replace(made, warnings=tuple(dict.fromkeys(warnings)))
+            unused = {"start_s": choice.start_s > 0, "end_s": choice.end_s is not None, "every": bool(choice.every)}
+            warn_unused("a still is one picture", **unused)
+            shown = _still(opened, source, source.number_at(at_s), choice.width_px)
+    return replace(shown, warnings=tuple(dict.fromkeys(warnings)))
 
 
 def _still(opened: logs.Log, source: PictureSource, number: int, width_px: int | None) -> Player:

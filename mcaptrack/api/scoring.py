@@ -158,10 +158,10 @@ class Scores:
         whole = [row for row in rows if row["tracks"] == tracks or row["tracks"].endswith(f"/{tracks}")]
         rows = whole or rows
         if len(rows) != 1:
-            there = ", ".join(f"{row['tracks']} {row['similarity']} {row['gate']:g}" for row in rows or final)
+            choices = ", ".join(f"{row['tracks']} {row['similarity']} {row['gate']:g}" for row in rows or final)
             raise McaptrackError(
                 f"{len(rows) or 'no'} results fit `tracks={tracks!r}`, `similarity={similarity!r}` and `gate={gate}`; "
-                f"choose one of: {there}"
+                f"choose one of: {choices}"
             )
         _check_name(name, rows[0])
         return float(rows[0][name])
@@ -194,8 +194,8 @@ class Scores:
         """
         rows = [row for row in self.rows() if row["class"] == of_class]
         if not rows and of_class is not None:
-            there = ", ".join(dict.fromkeys(result.of_class for result in self.results if result.of_class is not None))
-            raise McaptrackError(f"no class {of_class!r:.60} was scored by itself; there are {there or 'none'}")
+            scored = ", ".join(dict.fromkeys(result.of_class for result in self.results if result.of_class is not None))
+            raise McaptrackError(f"no class {of_class!r:.60} was scored by itself; there are {scored or 'none'}")
         return [row for row in rows if row["sequence"] == COMBINED] or rows
 
     @checked()
@@ -230,13 +230,13 @@ class Scores:
         from mcaptrack.viewing.report.formatting import curves_svg
 
         whole = [result for result in self.results if result.of_class is None and result.displacement is not None]
-        whole = [one for one in whole if one.sequence == COMBINED] or whole
-        found = {one.tracks: one.displacement for one in whole if one.displacement is not None}
-        if not found:
+        whole = [result for result in whole if result.sequence == COMBINED] or whole
+        displacements = {result.tracks: result.displacement for result in whole if result.displacement is not None}
+        if not displacements:
             raise McaptrackError("no predictions were scored; there are no curves to draw")
         path = as_path(output)
         refuse_overwrite(path, force)
-        publish_bytes(path, curves_svg(found).encode())
+        publish_bytes(path, curves_svg(displacements).encode())
         return path
 
     def below(self, limits: Mapping[str, float]) -> list[str]:
@@ -445,9 +445,9 @@ def _from_files(
     classes: str | None,
     notes: Notes,
 ) -> list[EvaluationInput]:
-    pairs, words = pair_files(tracks, truths)
-    if words:
-        notes.say(words)
+    pairs, note_on_pairs = pair_files(tracks, truths)
+    if note_on_pairs:
+        notes.say(note_on_pairs)
     sequences = []
     for name, path, labels in pairs:
         both = compare_files(path, labels, fps, ground_plane, point, topics, classes)

@@ -98,8 +98,8 @@ class EveryCamera:
             listed = ", ".join(prefix[1:] for prefix in self.prefixes)
             notes.say(f"running {len(self.prefixes)} cameras, {listed}; `camera=` names those to run")
         for prefix in self.prefixes:
-            if words := pipeline.begins_with(opened, prefix):
-                notes.say(words)
+            if reason := pipeline.begins_with(opened, prefix):
+                notes.say(reason)
         return True
 
     def run(
@@ -122,8 +122,8 @@ class EveryCamera:
             scenes = self.scenes or (pipeline.scenes_of(opened) if self.is_fused else ())
             joined: list[str] = []
             if self.is_fused and not scenes:
-                given = [prefix[1:] for prefix in self.prefixes]
-                joined, why = pipeline.fusable(opened, given)
+                names = [prefix[1:] for prefix in self.prefixes]
+                joined, why = pipeline.fusable(opened, names)
                 self.not_fused = "" if joined else why
                 if joined and why:
                     steps.notes.say(f"not in the scene: {why}")
@@ -160,7 +160,7 @@ class _Steps:
     @property
     def failed(self) -> list[str]:
         """The names of the cameras that failed."""
-        return [one.name for one in self.done if one.failure]
+        return [camera.name for camera in self.done if camera.failure]
 
     def opened(self) -> logs.Log:
         """The log as it is now."""
@@ -178,10 +178,10 @@ class _Steps:
                 prefix, report = act(opened, output, self.notes, BoxesRead())
             except McaptrackError as error:
                 why = str(error).replace(str(self.part), str(self.output))
-                self.done = [one for one in self.done if one.name != name]
+                self.done = [step for step in self.done if step.name != name]
                 self.done.append(Done(name, f"/{name}", Report(), is_scene, why))
                 return False
-        before = next((one for one in self.done if one.name == name), None)
+        before = next((step for step in self.done if step.name == name), None)
         if before is None:
             self.done.append(Done(name, prefix, report, is_scene))
         else:
@@ -197,12 +197,12 @@ def unfitting(
     A tracker that is named is for the cameras, or for the scene: of boxes in pictures, or of positions in metres.
     """
     space = "ground" if pipeline.camera_at(opened, prefix).in_space else "picture"
-    found = set()
+    stages = set()
     for stage, transform in transforms.items():
         if transform.reads is DETECTIONS and transform.writes[""] is TRACKS and traits_of(transform).space != space:
             say(f"{prefix[1:]} is not tracked by {STAGES[stage].choice(transform)}, which is for other boxes")
-            found.add(stage)
-    return found
+            stages.add(stage)
+    return stages
 
 
 def together(reports: Sequence[Report]) -> Report:
@@ -225,9 +225,9 @@ def together(reports: Sequence[Report]) -> Report:
 
 def refuse_failed(log: Location, done: Sequence[Done]) -> None:
     """Raise McaptrackError if any camera failed, with its reason."""
-    failed = [one for one in done if one.failure]
+    failed = [camera for camera in done if camera.failure]
     if failed:
-        why = "; ".join(f"{one.name}: {one.failure}" for one in failed)
-        good = ", ".join(one.name for one in done if not one.failure)
+        why = "; ".join(f"{camera.name}: {camera.failure}" for camera in failed)
+        good = ", ".join(camera.name for camera in done if not camera.failure)
         rest = f". What was made of {good} is written; `camera=` names cameras to run" if good else ""
         raise McaptrackError(f"{log}: {len(failed)} of {len(done)} cameras failed: {why}{rest}")

@@ -182,9 +182,9 @@ def tune(
         elif not has_tracker:
             raise McaptrackError(f"files of detections are for `stage='track'`; to tune {stage} give logs")
         else:
-            pairs, words = pair_files(paths_of(inputs), paths_of(truth))
-            if words:
-                notes.say(words)
+            pairs, note_on_pairs = pair_files(paths_of(inputs), paths_of(truth))
+            if note_on_pairs:
+                notes.say(note_on_pairs)
             tasks = _tasks_of_files(pairs, parse_fps(fps), optional_path(ground_plane), point)
         if force and trials_file is not None:
             trials_file.unlink(missing_ok=True)
@@ -252,8 +252,8 @@ def _tasks_of_files(
 ) -> list[Task]:
     tasks = []
     for name, path, labels in pairs:
-        found = detections_and_ground_truth(path, labels, fps, ground_plane, point)
-        tasks.append(Task(name, found.detections, found.ground_truth, {"ground_planes": found.planes}))
+        detected = detections_and_ground_truth(path, labels, fps, ground_plane, point)
+        tasks.append(Task(name, detected.detections, detected.ground_truth, {"ground_planes": detected.planes}))
     return tasks
 
 

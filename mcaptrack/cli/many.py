@@ -364,8 +364,8 @@ class _Printer(Generic[T]):
         elif outcome.result is not None and self._talk.verbose:
             self._work.show(outcome.log, outcome.result)
         elif outcome.result is not None:
-            words = self._work.line(outcome.result)
-            self._talk.say(f"{outcome.log}: {words}", "info", "log", **_about(outcome))
+            summary = self._work.line(outcome.result)
+            self._talk.say(f"{outcome.log}: {summary}", "info", "log", **_about(outcome))
 
     def watch(self, status: FleetStatus, table: LiveTable) -> None:
         """Show how far the logs are: in a table, or now and then in a line for programs."""

@@ -121,24 +121,24 @@ def run(
     for what, value, least in (("jobs", jobs, 1), ("tries", tries, 1), ("timeout_s", timeout_s, 0.001)):
         if value is not None and not least <= value < float("inf"):
             raise McaptrackError(f"`{what}=` has to be at least {least}, not {value}")
-    found = _named(logs)
-    if not found:
+    named_logs = _named(logs)
+    if not named_logs:
         raise McaptrackError("there are no logs to process")
-    given, command = dict(options or {}), name or _name_of(function)
+    keywords, command = dict(options or {}), name or _name_of(function)
     folder = None if output_dir is None else Path(output_dir)
-    settings = digest_of_settings(function, given, str(folder.absolute()) if folder else None)
+    settings = digest_of_settings(function, keywords, str(folder.absolute()) if folder else None)
     entries = None if ledger is None else Ledger(Path(ledger), command, settings)
     claims_in = folder or (None if ledger is None else Path(ledger).absolute().parent)
     work = []
-    outputs = outputs_in(folder, found, suffix) if folder is not None else []
-    for number, one in enumerate(found):
+    outputs = outputs_in(folder, named_logs, suffix) if folder is not None else []
+    for number, named_log in enumerate(named_logs):
         own = {"output": outputs[number]} if outputs else {}
-        place = _claimed_in(one.path, claims_in) if writes and folder is None else claims_in
-        work.append(QueuedLog(number, one.path, location_of(one.path), own, place))
+        place = _claimed_in(named_log.path, claims_in) if writes and folder is None else claims_in
+        work.append(QueuedLog(number, named_log.path, location_of(named_log.path), own, place))
     for output in outputs:
         _make_folder(output.parent)
     limits = WorkerLimits(
-        min(jobs or 1, len(found)), os.getcwd(), timeout_s, size_in_bytes(memory_limit, "memory_limit")
+        min(jobs or 1, len(named_logs)), os.getcwd(), timeout_s, size_in_bytes(memory_limit, "memory_limit")
     )
 
     def hear(outcome: LogOutcome[T]) -> None:
@@ -152,7 +152,7 @@ def run(
             on_status(status)
 
     crew = _crew(scheduler, limits, jobs)
-    fleet = Fleet(function, given, work, crew, entries, tries, keep_going, hear, watch, on_note or _ignore)
+    fleet = Fleet(function, keywords, work, crew, entries, tries, keep_going, hear, watch, on_note or _ignore)
     return fleet.run()
 
 
@@ -232,7 +232,7 @@ def _named(logs: Any) -> list[NamedLog]:
     if isinstance(logs, str | os.PathLike):
         return find_logs([logs])
     several = list(logs)
-    return several if all(isinstance(one, NamedLog) for one in several) else find_logs(several)
+    return several if all(isinstance(log, NamedLog) for log in several) else find_logs(several)
 
 
 def _name_of(function: Any) -> str:

@@ -109,8 +109,8 @@ class Child:
             try:
                 self._start()
             except OSError as error:
-                words = f"{request.log}: no worker process can be started in {self._limits.folder or '.'}"
-                return Reply("failed", error=f"{words} ({error.strerror or error})")
+                reason = f"{request.log}: no worker process can be started in {self._limits.folder or '.'}"
+                return Reply("failed", error=f"{reason} ({error.strerror or error})")
             deadline = began + _START_S
         else:
             deadline = self._deadline()
@@ -133,13 +133,13 @@ class Child:
             self.resident = resident_bytes_with_children(self._process.pid)
             peak = max(peak, self.resident)
             if over := self._over(deadline, peak):
-                state, words = over
+                state, reason = over
                 if not is_started and state == "timed-out":
-                    words = f"its worker process did not start within {_START_S:g} s (the machine may be too busy)"
+                    reason = f"its worker process did not start within {_START_S:g} s (the machine may be too busy)"
                 self.end(grace_s=_GRACE_S if state == "timed-out" else 0.0)
                 seconds = round(monotonic() - began, 3)
-                words = f"{request.log}: {words}, and was ended"
-                return Reply(state, error=words, seconds=seconds, peak_bytes=peak, detail=self._printed())
+                reason = f"{request.log}: {reason}, and was ended"
+                return Reply(state, error=reason, seconds=seconds, peak_bytes=peak, detail=self._printed())
             if self._process.poll() is not None and not self._connection.poll(0):
                 return replace(self._died(request), seconds=monotonic() - began, peak_bytes=peak)
 

@@ -38,8 +38,8 @@ class Cluster:
         except ImportError:
             raise McaptrackError("`scheduler=` needs Dask: `pip install 'mcaptrack[fleet]'` installs it") from None
         self._address, self._most = address, most
-        known = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] in _LOGGERS]
-        self._levels = {name: logging.getLogger(name).level for name in (*_LOGGERS, *known)}
+        loggers = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] in _LOGGERS]
+        self._levels = {name: logging.getLogger(name).level for name in (*_LOGGERS, *loggers)}
         for name in self._levels:  # Dask sets the levels of some of them, so that those above don't count
             logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
@@ -75,7 +75,7 @@ class Cluster:
                 f"workers of {self._address} can't use this version of mcaptrack: {text:.200}"
             ) from error
         for name, version in own.items():
-            others = sorted({found[name] for found in theirs.values()} - {version})
+            others = sorted({worker_versions[name] for worker_versions in theirs.values()} - {version})
             if others:
                 warn(f"workers of {self._address} have {name} {', '.join(others)}, not {version}", "other-version")
 

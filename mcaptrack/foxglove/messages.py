@@ -76,10 +76,10 @@ def pack_stamped(message: Any, t_ns: int) -> bytes:
     return payload
 
 
-def pack_log(t_ns: int, level: str, name: str, words: str) -> bytes:
+def pack_log(t_ns: int, level: str, name: str, text: str) -> bytes:
     """A Log message; ``level`` is "DEBUG", "INFO", "WARNING" or "ERROR", ``name`` is that of the source."""
     kind = message_class(LOG)
-    message = kind(level=kind.Level.Value(level), name=name, message=words)
+    message = kind(level=kind.Level.Value(level), name=name, message=text)
     _stamp(message, t_ns)
     payload: bytes = message.SerializeToString(deterministic=True)
     return payload

@@ -54,11 +54,11 @@ _UNKNOWN: Final = (0.75, 0.75, 0.75)
 
 def class_colour(class_id: int, name: str = "") -> tuple[float, float, float]:
     """The colour of a class: by its name, so that cars have one colour in all logs, else by its number; 0 is grey."""
-    words = re.split(r"[\W_]+", name.casefold())
-    found = next((_CLASSES[word] for word in words if word in _CLASSES), None)
-    if found is None and not class_id:
+    parts = re.split(r"[\W_]+", name.casefold())
+    index = next((_CLASSES[word] for word in parts if word in _CLASSES), None)
+    if index is None and not class_id:
         return _UNKNOWN
-    red, green, blue, _ = colour(class_id + len(_HUES) if found is None else found)
+    red, green, blue, _ = colour(class_id + len(_HUES) if index is None else index)
     return red, green, blue
 
 

@@ -88,22 +88,22 @@ def check(path: Location, progress: Progress = lambda *_: None) -> CheckResult:
     """
     with open_bytes(path) as (source, file):
         signature = file.signature()
-        found = find_journal(path, file)
-        if found and found.is_busy:
+        state = find_journal(path, file)
+        if state and state.is_busy:
             raise McaptrackError(f"{path} is being written to by another process; try again when it is done")
-        half = found.journal if found else None
-        if found and not half:
-            notices.warn(found.message, "journal")
+        half = state.journal if state else None
+        if state and not half:
+            notices.warn(state.message, "journal")
         look = _Checker((half.old_content() if half else source).sequential(), progress)
-        if found and half:
-            look.findings.add("half-written", half.start, found.message)
+        if state and half:
+            look.findings.add("half-written", half.start, state.message)
         try:
             look.check_all()
         except Damaged as error:  # an unreadable file; damaged content is a finding
             raise McaptrackError(f"{path} can't be read to its end: {error}") from None
         if file.signature() != signature:
             raise changed(path)
-    findings = sorted(look.findings, key=lambda found: (found.level, found.where))
+    findings = sorted(look.findings, key=lambda finding: (finding.level, finding.where))
     return CheckResult(path, sum(look.found.counts.values()), len(look.found.chunks), findings)
 
 
@@ -181,10 +181,10 @@ def spans_of(span: Span, entries: Mapping[int, Entries]) -> list[Span]:
     return list(zip(t_ns[[0, *(cuts + 1)]].tolist(), t_ns[[*cuts, -1]].tolist(), strict=True))
 
 
-def joined(one: Span, two: Span) -> Span | None:
+def joined(first: Span, two: Span) -> Span | None:
     """The span of both; None if there is a jump between them."""
-    both = min(one[0], two[0]), max(one[1], two[1])
-    return both if max(one[0], two[0]) - min(one[1], two[1]) <= _JUMP_NS else None
+    both = min(first[0], two[0]), max(first[1], two[1])
+    return both if max(first[0], two[0]) - min(first[1], two[1]) <= _JUMP_NS else None
 
 
 def jumps_between(spans: Iterable[Span], messages: int) -> list[ClockJump]:
@@ -300,7 +300,7 @@ class _Checker:
         self._find("no-data-end", end, "the data section has no end: records are missing")
 
     def _at_record(self, record: Record) -> None:
-        buffer, found = self._buffer, self.found
+        buffer, index = self._buffer, self.found
         if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             self._describe(buffer, record, record.start)
         elif record.opcode == Opcode.CHUNK:
@@ -320,9 +320,9 @@ class _Checker:
         elif record.opcode == Opcode.ATTACHMENT:
             if not attachment_is_whole(buffer, record):
                 self._find("attachment-checksum", record.start, "the checksum of an attachment is wrong")
-            found.attachments.append(attachment_entry(buffer, record, record.start))
+            index.attachments.append(attachment_entry(buffer, record, record.start))
         elif record.opcode == Opcode.METADATA:
-            found.metadata.append(metadata_entry(buffer, record, record.start))
+            index.metadata.append(metadata_entry(buffer, record, record.start))
         elif record.opcode == Opcode.HEADER:
             records.read_header(buffer, record)
         elif record.opcode == 0 or record.opcode in (Opcode.FOOTER, Opcode.STATISTICS, Opcode.CHUNK_INDEX):
@@ -444,8 +444,8 @@ class _Checker:
                 self._find("no-channel", where, f"messages of channel {channel}, which was not described before")
             t_ns = listed[:, 0]
             latest = self._latest.get(channel, 0)
-            known = self.found.channels.get(channel)
-            topic = known.topic if known else f"channel {channel}"
+            described = self.found.channels.get(channel)
+            topic = described.topic if described else f"channel {channel}"
             behind = t_ns < np.maximum(np.maximum.accumulate(t_ns), np.uint64(latest))
             if behind.any():
                 text = f"messages of {topic} that follow later ones"

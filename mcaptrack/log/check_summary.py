@@ -45,12 +45,12 @@ class Findings:
         self._times: Counter[tuple[Level, str]] = Counter()
 
     def __iter__(self) -> Iterator[Finding]:
-        for (level, kind), (where, words) in self._first.items():
-            yield Finding(level, kind, where, words, self._times[level, kind])
+        for (level, kind), (where, message) in self._first.items():
+            yield Finding(level, kind, where, message, self._times[level, kind])
 
-    def add(self, kind: str, where: int, words: str, level: Level = "error", times: int = 1) -> None:
+    def add(self, kind: str, where: int, message: str, level: Level = "error", times: int = 1) -> None:
         """Add a finding, or count it if there is one of its kind."""
-        self._first.setdefault((level, kind), (where, words))
+        self._first.setdefault((level, kind), (where, message))
         self._times[level, kind] += times
 
 
@@ -62,26 +62,26 @@ def record_name(opcode: int) -> str:
         return f"{opcode:#04x}"
 
 
-def check_summary(buffer: Bytes, found: Index, findings: Findings) -> None:
-    """Check summary and footer of a log; ``found`` is the index of its data section."""
+def check_summary(buffer: Bytes, data_index: Index, findings: Findings) -> None:
+    """Check summary and footer of a log; ``data_index`` is the index of its data section."""
     try:
-        _Checker(buffer, found, findings).check()
+        _Checker(buffer, data_index, findings).check()
     except Damaged as error:
-        findings.add("summary-structure", found.data_end, f"the summary can't be read: {error}")
+        findings.add("summary-structure", data_index.data_end, f"the summary can't be read: {error}")
 
 
 class _Checker:
-    def __init__(self, buffer: Bytes, found: Index, findings: Findings) -> None:
-        self._buffer, self._found, self._find = buffer, found, findings.add
+    def __init__(self, buffer: Bytes, data_index: Index, findings: Findings) -> None:
+        self._buffer, self._found, self._find = buffer, data_index, findings.add
 
     def check(self) -> None:
-        buffer, found = self._buffer, self._found
+        buffer, data_index = self._buffer, self._found
         footer = read_footer(buffer)
         if footer is None:
             self._find("no-footer", max(len(buffer) - FOOTER_SIZE, 0), "there is no footer at the end of the file")
             return
         at, start, offsets_start, crc = footer
-        behind = found.data_end + DATA_END_SIZE
+        behind = data_index.data_end + DATA_END_SIZE
         length = Reader(buffer, at + 1, len(buffer)).number(8)
         if length != FOOTER_BODY.size:  # readers that read the footer as a record take its length from here
             self._find("footer", at, f"the footer declares a length of {length} bytes; it has {FOOTER_BODY.size}")
@@ -92,10 +92,10 @@ class _Checker:
                 text = f"the footer places summary offsets at byte {offsets_start}, but there is no summary"
                 self._find("footer", at, text, "warning")
             self._compare_checksum(at, crc)
-            if behind != at and found.data_end:
+            if behind != at and data_index.data_end:
                 self._find("footer", at, "there are records after the data section, and the footer names no summary")
             return
-        if not len(MAGIC) <= start <= at or (found.data_end and start != behind):
+        if not len(MAGIC) <= start <= at or (data_index.data_end and start != behind):
             self._find(
                 "footer", at, f"the footer places the summary at byte {start}; the data section ends at {behind}"
             )
@@ -129,10 +129,10 @@ class _Checker:
             self._find("summary-checksum", start, "the checksum of the summary is wrong")
 
     def _compare(self, summary: Index, where: int) -> None:
-        found = self._found
+        data_index = self._found
         for name, theirs, ours in (
-            ("schema", summary.schemas, found.schemas),
-            ("channel", summary.channels, found.channels),
+            ("schema", summary.schemas, data_index.schemas),
+            ("channel", summary.channels, data_index.channels),
         ):
             for number, record in theirs.items():
                 if ours.get(number, record) != record:
@@ -146,14 +146,14 @@ class _Checker:
                 text = f"{name} {min(missing)} is missing in the summary"
                 self._find(f"summary-no-{name}", where, text, "error" if name == "channel" else "warning")
         self._compare_chunks(summary, where)
-        for name, listed, there in (
-            ("attachment", summary.attachments, found.attachments),
-            ("metadata", summary.metadata, found.metadata),
+        for name, listed, in_data in (
+            ("attachment", summary.attachments, data_index.attachments),
+            ("metadata", summary.metadata, data_index.metadata),
         ):
-            if listed and sorted(part.entry for part in listed) != sorted(part.entry for part in there):
+            if listed and sorted(part.entry for part in listed) != sorted(part.entry for part in in_data):
                 self._find(f"{name}-index", where, f"the {name} index differs from the {name} records in the log")
-            if there and not listed:
-                self._find(f"no-{name}-index", where, f"the summary does not list {len(there)} {name}", "warning")
+            if in_data and not listed:
+                self._find(f"no-{name}-index", where, f"the summary does not list {len(in_data)} {name}", "warning")
 
     def _compare_chunks(self, summary: Index, where: int) -> None:
         ours = self._found.chunks
@@ -172,7 +172,7 @@ class _Checker:
                 )
                 continue
             missing[row] = False
-            names = [name for name, one, two in zip(chunk._fields, chunk, ours[row], strict=True) if one != two]
+            names = [name for name, listed, two in zip(chunk._fields, chunk, ours[row], strict=True) if listed != two]
             if names:
                 text = f"the chunk index differs from the chunk at byte {chunk.offset}: {', '.join(names)}"
                 self._find("chunk-index", where, text)
@@ -181,15 +181,20 @@ class _Checker:
             self._find("chunk-not-listed", int(ours.offsets[missing].min()), text, times=int(missing.sum()))
 
     def _compare_statistics(self, reader: Reader, summary: Index, where: int) -> None:
-        found = self._found
-        loose = [sum(found.counts.values()), len(found.schemas), len(found.channels), len(found.attachments)]
-        there = [*loose, len(found.metadata), len(found.chunks), found.start_ns, found.end_ns]
-        for (name, size), number in zip(_STATISTICS.items(), there, strict=True):
+        data_index = self._found
+        loose = [
+            sum(data_index.counts.values()),
+            len(data_index.schemas),
+            len(data_index.channels),
+            len(data_index.attachments),
+        ]
+        actual = [*loose, len(data_index.metadata), len(data_index.chunks), data_index.start_ns, data_index.end_ns]
+        for (name, size), number in zip(_STATISTICS.items(), actual, strict=True):
             value = reader.number(size)
             only_described = name in ("schemas", "channels") and value == len(getattr(summary, name))
             if value != number and not only_described:
                 self._find("statistics", where, f"the statistics say {value} for {name}; it is {number}")
-        if {n: count for n, count in summary.counts.items() if count} != found.counts:
+        if {n: count for n, count in summary.counts.items() if count} != data_index.counts:
             self._find("statistics-counts", where, "the statistics have a wrong number of messages for a channel")
 
     def _compare_offsets(self, start: int, end: int, groups: Mapping[int, tuple[int, int, int]]) -> None:

@@ -102,7 +102,7 @@ class ChunkList:
         """Whether the same entries follow in the same order."""
         if not isinstance(other, ChunkList):
             return NotImplemented
-        return self._numbers == other._numbers and all(one == two for one, two in zip(self, other, strict=True))
+        return self._numbers == other._numbers and all(mine == two for mine, two in zip(self, other, strict=True))
 
     __hash__ = None  # type: ignore[assignment]
 

@@ -100,10 +100,10 @@ class Checksums:
         """The checksum of a chunk, which is read once."""
         if not len(self._numbers):
             self._numbers = np.full(len(index.chunks), -1)
-        found = int(self._numbers[row])
-        if found > 0:
-            return found
-        if found < 0:
+        checksum = int(self._numbers[row])
+        if checksum > 0:
+            return checksum
+        if checksum < 0:
             chunk = index.chunks[row]
             head = records.read_chunk(buffer, chunk_record(buffer, chunk))
             self._numbers[row] = head.uncompressed_crc
@@ -124,8 +124,8 @@ def fingerprint(buffer: Bytes, index: Index, channel_id: int | None = None, chec
     checksums = checksums or Checksums()
     total = hashlib.sha256()
 
-    def say(*words: object) -> None:
-        total.update(repr(words).encode())
+    def say(*values: object) -> None:
+        total.update(repr(values).encode())
 
     for number in sorted(index.channels) if channel_id is None else [channel_id]:
         channel = index.channels[number]

@@ -64,17 +64,17 @@ class Snapshot:
 
     def consistent(self, look: Callable[[Messages], T], are_equal: Callable[[T, T], bool]) -> T:
         """The result of ``look``; if the file was changed meanwhile, a second look must give an equal result."""
-        found, fresh = look(self.messages), self._now()
-        if fresh is not None and not are_equal(found, look(fresh)):
+        result, fresh = look(self.messages), self._now()
+        if fresh is not None and not are_equal(result, look(fresh)):
             raise changed(self.path)
-        return found
+        return result
 
     def record(self, offset: int) -> memoryview:
         """The record at an offset of the file."""
 
         def whole(messages: Messages) -> memoryview:
-            found = records.record_at(messages.source, offset)
-            return messages.source[found.start : found.end]
+            record = records.record_at(messages.source, offset)
+            return messages.source[record.start : record.end]
 
         return self.consistent(whole, memoryview.__eq__)
 
@@ -109,10 +109,10 @@ class Snapshot:
         """Whether the log is read through a journal, as it was before an unfinished change."""
         return len(self.source.pieces) > 1
 
-    def is_on_disk(self, there: os.stat_result) -> bool:
+    def is_on_disk(self, status: os.stat_result) -> bool:
         """Whether a file is the one that was opened, with the same content on the disk."""
         try:
-            if not isinstance(self.file, OpenFile) or not os.path.samestat(there, os.fstat(self.file.handle)):
+            if not isinstance(self.file, OpenFile) or not os.path.samestat(status, os.fstat(self.file.handle)):
                 return False
             if self.file.signature() == self._signature and self._is_certain:
                 return not self.is_through_journal
@@ -151,15 +151,15 @@ def open_snapshot(path: Location) -> Snapshot:
     while True:
         file = open_file(path)
         try:
-            found = _look(path, file)
+            outcome = _look(path, file)
         except BaseException:
             file.close()
             raise
-        if isinstance(found, Snapshot):
-            return found
+        if isinstance(outcome, Snapshot):
+            return outcome
         file.close()
         if time.monotonic() > until:
-            raise found
+            raise outcome
         time.sleep(_PAUSE_S)
 
 

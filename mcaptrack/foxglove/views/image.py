@@ -182,8 +182,8 @@ def predictions(
     # Planes are those of pictures, and forecasts are made between them.
     last = np.searchsorted(pictures.t_ns, made_ns, "right") - 1
     seen_ns = pictures.t_ns[np.maximum(last, 0)] if len(pictures.t_ns) else made_ns
-    for first, until, found in forecasts_in_parts(frames, wanted, BATCH):
-        futures = found if planes else []
+    for first, until, forecasts in forecasts_in_parts(frames, wanted, BATCH):
+        futures = forecasts if planes else []
         once = [] if has_own else [_in_pixels(future, planes, made_ns[future.message]) for future in futures]
         for span, drawn in pictures.batches(first, until):
             for number, future in enumerate(futures):

@@ -51,9 +51,9 @@ class ZoneCaptions(NamedTuple):
                 rows = joined.rows[joined.rows["zone_id"] == zone.number]
                 names = ("forward", "backward") if zone.is_line else ("inside", "tracks")
                 pairs = zip(*(rows[name].tolist() for name in names), strict=True)
-                known: dict[tuple[int, int], str] = {}
+                texts_of_counts: dict[tuple[int, int], str] = {}
                 form = "{}: {} forward, {} back" if zone.is_line else "{}: {} inside, {} so far"
-                kept.extend(known.setdefault(pair, form.format(zone.name, *pair)) for pair in pairs)
+                kept.extend(texts_of_counts.setdefault(pair, form.format(zone.name, *pair)) for pair in pairs)
         return cls(frame_times(counts), texts)
 
     def at(self, zone: int, t_ns: Ints) -> list[str]:
@@ -61,7 +61,7 @@ class ZoneCaptions(NamedTuple):
         if not len(self.t_ns):
             return [""] * len(t_ns)
         place = np.maximum(np.searchsorted(self.t_ns, t_ns, "right") - 1, 0)
-        return [self.texts[zone][one] for one in place.tolist()]
+        return [self.texts[zone][frame] for frame in place.tolist()]
 
 
 class ZoneShape(NamedTuple):
@@ -140,14 +140,17 @@ def on_pictures(
 
 
 def _seen(
-    one: ZoneShape, t_ns: Ints, which: Ints, planes: Planes, path: CameraPath | None, height_px: float
+    shape: ZoneShape, t_ns: Ints, which: Ints, planes: Planes, path: CameraPath | None, height_px: float
 ) -> Iterator[tuple[Ints, list[Floats]]]:
     """The rings of a zone in pictures: groups of pictures in which they are at the same place."""
-    if one.zone.units == "metres":
+    if shape.zone.units == "metres":
         for number in np.unique(which).tolist() if planes else ():
-            yield np.flatnonzero(which == number), [planes[number][1].metres_to_pixels(ring) for ring in one.rings_m()]
+            yield (
+                np.flatnonzero(which == number),
+                [planes[number][1].metres_to_pixels(ring) for ring in shape.rings_m()],
+            )
         return
-    rings = one.rings_px(height_px)
+    rings = shape.rings_px(height_px)
     if path is None:
         yield np.arange(len(t_ns)), rings
         return
@@ -191,7 +194,7 @@ def _draw(
     drawn: Annotations,
     frame: Ints,
     rings: Sequence[Floats],
-    one: ZoneShape,
+    shape: ZoneShape,
     texts: NDArray[Any],
     height_px: float,
     corner: Floats,
@@ -199,16 +202,16 @@ def _draw(
 ) -> None:
     """Draw a zone in some pictures, with a label of this size that begins at ``corner`` (2,)."""
     count = len(frame)
-    rgb = np.broadcast_to(_LINE if one.zone.is_line else _ZONE, (count, 3))
+    rgb = np.broadcast_to(_LINE if shape.zone.is_line else _ZONE, (count, 3))
     thickness = max(1.5, height_px / 240)
     alpha = np.full(count, _ALPHA)
-    if one.zone.is_line:
+    if shape.zone.is_line:
         pairs = np.concatenate([np.repeat(line, 2, axis=0)[1:-1] for line in rings])
         drawn.pairs(
             frame, np.broadcast_to(pairs, (count, *pairs.shape)), rgb, np.full(len(pairs) // 2, _ALPHA), thickness
         )
     fill = _FILL if len(rings) == 1 else 0.0
-    for ring in () if one.zone.is_line else rings:
+    for ring in () if shape.zone.is_line else rings:
         drawn.loops(frame, np.broadcast_to(ring, (count, *ring.shape)), rgb, alpha, thickness, fill)
     drawn.labels(frame, np.broadcast_to(corner, (count, 2)), texts[frame], rgb, size)
 
