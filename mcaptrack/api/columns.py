@@ -1,4 +1,4 @@
-"""Columns of a user as frames of rows: what is a time, a frame number, a box, a position, and what is none.
+"""Check columns that a user gives (times, frame numbers, boxes, positions), and make frames of rows from them.
 
 Letters: N rows.
 """
@@ -39,7 +39,7 @@ _IN_NS: Final = "whole nanoseconds, such as `round(seconds * 1e9)`"
 def frame_of(
     schema: Schema, boxes: Floats | None, named: Mapping[str, Any], t_ns: int | np.datetime64, index: int
 ) -> Frame:
-    """Return a frame of boxes (N, 4), or of positions in ``named``, with the other columns that are given."""
+    """Return a frame of boxes (N, 4), or of positions, with the columns in ``named``."""
     columns: dict[str, Any] = {} if boxes is None else dict(zip(BOX_PX, boxes.T, strict=True))
     count = len(named["x_m"]) if boxes is None else len(boxes)
     for name, values in named.items():
@@ -120,7 +120,7 @@ def frames_of_columns(columns: dict[str, Any], schema: Schema | None) -> tuple[S
 
 
 def _rows(schema: Schema, values_by_name: Mapping[str, Any], count: int, where: str) -> Rows:
-    """Rows of columns; those that have usual values may be left out."""
+    """Return the rows of columns; columns with a default may be left out."""
     columns = {
         name: _whole(values) if schema.dtype[name].kind in "iu" else values for name, values in values_by_name.items()
     }

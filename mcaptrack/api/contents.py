@@ -262,7 +262,7 @@ def _rate(opened: logs.Log, messages: int) -> float | None:
 
 
 def _frames(opened: logs.Log) -> tuple[FrameInfo, ...]:
-    """Return the frames of a log, each after its parent, and warn of what contradicts or lacks."""
+    """Return the frames of a log, each after its parent, and warn of transforms that contradict or are missing."""
     read = read_frames(opened)
     for why in read.unread:
         warn(f"{opened.path}: {why}", "lost")

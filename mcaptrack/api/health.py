@@ -171,7 +171,7 @@ def _tries(url: Url) -> Iterator[tuple[str, str]]:
 
 
 def _why(attempt: Callable[[], object]) -> str:
-    """Return why something can't be done; "" if it was."""
+    """Do something, and return why it failed; "" if it didn't."""
     try:
         attempt()
     except McaptrackError as error:

@@ -1,4 +1,4 @@
-"""The files that a run owes beside a log, all of them made from the log as it stands.
+"""The files beside a log (layouts, tables), all of them made from the content of the log.
 
 A log is written as a whole, with its views and its layouts; what stands beside it is written afterwards, so a run that
 is killed may leave the log without. ``write_products`` is what every command calls after it has written, or found

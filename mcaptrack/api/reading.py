@@ -93,7 +93,7 @@ def _whole(value: Any) -> int | None:
 
 
 def shown_pictures(opened: Log, topic: str, times: Sequence[int] | NDArray[Any]) -> dict[int, int]:
-    """The numbers of the pictures that are shown at these times, and how often each is asked for."""
+    """Return the numbers of the pictures that are shown at these times, and how often each occurs."""
     wanted = times_of(times, "`times=`")
     at = np.searchsorted(opened.times(topic), wanted, "right") - 1
     if len(at) and at.min() < 0:

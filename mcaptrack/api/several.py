@@ -86,7 +86,7 @@ class EveryCamera:
     scenes: tuple[str, ...] = ()
 
     def chooses(self, opened: logs.Log, notes: Notes) -> bool:
-        """Return whether the log has several cameras, or several are named; says which are run, and which are not."""
+        """Return whether the log has several cameras, or several are named; note which are run."""
         chosen = pipeline.choose_cameras(opened, self.names)
         if chosen is None:
             return False
@@ -192,7 +192,7 @@ class _Steps:
 def unfitting(
     opened: logs.Log, prefix: str, transforms: Mapping[str, Transform], say: Callable[[str], None]
 ) -> set[str]:
-    """Return the stages with a transform that can't take the boxes of one of several cameras, or of a scene.
+    """Return the stages whose transform can't take the boxes of this camera or scene.
 
     A tracker that is named is for the cameras, or for the scene: of boxes in pictures, or of positions in metres.
     """

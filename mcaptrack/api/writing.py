@@ -1,4 +1,4 @@
-"""Rows of a user into a log, as a channel like any other."""
+"""Write rows of a user into a log, as a channel like any other."""
 
 from __future__ import annotations
 

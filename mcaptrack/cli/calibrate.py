@@ -119,8 +119,8 @@ def _words(camera: CameraCorrection, is_unchanged: bool) -> str:
         after = _distances(camera.median_after_m, camera.p90_after_m)
         corrected = "corrected already by" if is_unchanged else "corrected by"
         text = (
-            f"{corrected} {_IN_WORDS[camera.correction]}, which moves feet by {camera.moved_m:.2f} m: they are {after} from "
-            f"those of the others, and were {before} ({camera.pairs:,} compared)"
+            f"{corrected} {_IN_WORDS[camera.correction]}, which moves feet by {camera.moved_m:.2f} m: they are {after} "
+            f"from those of the others, and were {before} ({camera.pairs:,} compared)"
         )
         text += f"; {camera.limit}" if camera.limit else ""
     if camera.clock_offset_s:

@@ -331,7 +331,7 @@ def hints_of(command: Callable[..., Any]) -> dict[str, Any]:
 
 
 def tried(inputs: int) -> None:
-    """Count inputs that the running command has tried."""
+    """Add to the number of inputs that the running command has tried."""
     _BATCH.get().tried += inputs
 
 

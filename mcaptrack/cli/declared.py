@@ -25,7 +25,7 @@ _OF_ALL: dict[str, Any] = {"json": common.Json, "quiet": common.Quiet, "verbose"
 class EachLog(Generic[T]):
     """A command that calls its function with each log: how it prints what this returns.
 
-    ``given`` has the options of the call. Subclasses say what is not the usual way.
+    ``given`` has the options of the call. Subclasses override what differs.
     """
 
     #: As in ``LogWork``.

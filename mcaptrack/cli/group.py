@@ -208,7 +208,7 @@ class Commands(MutableMapping[str, Any]):
         return name in self._entries
 
     def changed(self, functions: Mapping[str, Any]) -> Commands:
-        """The same commands, but for those of other functions."""
+        """Return a copy of the table, with other functions for some commands."""
         changed = {name: make(self._entries[name], function) for name, function in functions.items()}
         return Commands(changed, self._made)
 

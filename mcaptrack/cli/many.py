@@ -124,7 +124,7 @@ class ManyOptions:
 
     @property
     def concern_one(self) -> bool:
-        """Whether any of them matters for a single log, so that it is processed as many are."""
+        """Whether an option is set for which a single log, too, has to be processed by workers."""
         return any((self.scheduler, self.output_dir, self.ledger, self.timeout, self.memory_limit, self.json_lines))
 
     def for_fleet(self) -> dict[str, Any]:
@@ -274,7 +274,7 @@ def table_of(status: FleetStatus) -> Any:
 def process(
     logs: Sequence[NamedLog], work: LogWork[T], talk: common.Talk, output: Path | None = None
 ) -> tuple[list[T], dict[str, Any]]:
-    """Process logs: one as ever, several in workers. Returns the results, and totals for the JSON of several.
+    """Process one log here, or several in workers. Returns the results, and totals for the JSON of several.
 
     ``output`` is that of a single log. An error in one of several logs is printed and does not stop the others; the
     command ends with exit code 3 then.

@@ -63,8 +63,9 @@ def _list(json: bool, verbose: bool) -> None:
         return
     for model in models:
         where = model["path"] or f"not fetched; {command('models', 'get', model['name'])} fetches it"
+        size = f"{model['size_bytes'] / 1e6:.1f} MB"
         lines = [
-            f"{model['name']}  {model['size_bytes'] / 1e6:.1f} MB, {model['licence']}, trained on {model['trained_on']}",
+            f"{model['name']}  {size}, {model['licence']}, trained on {model['trained_on']}",
             f"  good for  {model['good_for']}",
             f"  source    {model['source']}",
             f"  file      {where}",

@@ -95,7 +95,7 @@ class Child:
         self.resident = 0
 
     def do(self, request: Request, is_stopping: Callable[[], bool]) -> Reply:
-        """Let the worker process a log. Whatever that does to the worker becomes a reply.
+        """Let the worker process a log. If the worker dies or exceeds a limit, the reply says so.
 
         Raises StoppedError when ``is_stopping`` returns true; the worker is ended then.
         """

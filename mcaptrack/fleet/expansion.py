@@ -236,7 +236,7 @@ def _logs_in(folder: Path, leave_out: str) -> Iterator[NamedLog]:
 
 
 def _matching(pattern: Path, leave_out: str | None) -> Iterator[NamedLog]:
-    """Yield the files that a pattern matches, and the logs in folders that it matches; the folders for None."""
+    """Yield the files that a pattern matches, and the logs in folders (the folders if ``leave_out`` is None)."""
     names = sorted(glob.glob(str(pattern), recursive=True))
     if not names:
         raise McaptrackError(f"no file matches {pattern}")

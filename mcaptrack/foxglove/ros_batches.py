@@ -111,7 +111,7 @@ class _Shape:
 
 
 def _places(copies: Sequence[tuple[int, int, int]], width: int) -> tuple[Ints, Ints]:
-    """Where each item of this width in copies (from, to, length) is from, and where it goes."""
+    """Return source and target of each item of this width in ``copies`` (from, to, length)."""
     table = np.array(copies, np.int64).reshape(-1, 3)
     counts = table[:, 2] // width
     steps = ragged_range(0, counts) * width
@@ -211,11 +211,11 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
 
 
 class Batches:
-    """Messages of one type, which consists of lists of messages, and of times: ``fields`` are these."""
+    """Converts messages of one type, whose ``fields`` are lists of messages, and times."""
 
     @staticmethod
     def take(fields: Mapping[int, FieldType]) -> bool:
-        """Whether messages with these fields are of such a type."""
+        """Whether messages with these fields can be converted here."""
         return all(field.fields and (field.is_list or field.is_time) for field in fields.values())
 
     def __init__(self, fields: Mapping[int, FieldType], check_seconds: Callable[[int], None]) -> None:

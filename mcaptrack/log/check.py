@@ -382,7 +382,7 @@ class _Checker:
         self.found.chunks.append(ChunkIndexRecord(head.start_ns, head.end_ns, *place, *sizes))
 
     def _add_spans(self, entries: Mapping[int, Entries], where: int) -> None:
-        """Note when there are messages; those of one record, by channel."""
+        """Keep the spans of time of messages: those of one record, by channel."""
         edges = [int(edge) for listed in entries.values() for edge in (listed[:, 0].min(), listed[:, 0].max())]
         for span in spans_of((min(edges), max(edges)), entries) if edges else ():
             if self._spans and (both := joined(self._spans[-1], span)):

@@ -125,7 +125,7 @@ class ChunkList:
         return np.unique(rows[ragged_range(low, high - low)])
 
     def first_rows(self, channels: Collection[int]) -> dict[int, list[int]]:
-        """The channels of these that have messages, by the number of the first entry of a chunk that holds them."""
+        """Return the numbers of the first entries with messages of these channels, and for each its channels."""
         order, rows = self._rows_by_channel()
         out: dict[int, list[int]] = {}
         for channel in channels:

@@ -342,7 +342,7 @@ class _Rewrite:
 
 @dataclass
 class _Descriptions:
-    """Channels that kept chunks hold and so ``described``; and what chunks described that were dropped."""
+    """The channels that kept chunks have ``described``, and the channels and schemas that dropped chunks described."""
 
     described: set[int]
     channels: set[int] = field(default_factory=set)

@@ -59,7 +59,7 @@ _MAX_TORN_ROWS: Final = 2
 
 
 class UnusableJournal(Exception):
-    """Why the file at LOG.journal can't be used, in words that follow its name."""
+    """The file at LOG.journal can't be used; the message goes on after its name."""
 
 
 def journal_of(path: Path) -> Path:

@@ -100,7 +100,7 @@ def calibrate_cameras(
 
 
 def _compared(opened: log.Log, names: Sequence[str]) -> tuple[list[Camera], dict[str, str]]:
-    """The cameras to compare, and the names in the results of all cameras by each of their names."""
+    """Return the cameras to compare, and for each name of a camera the one that results use."""
     scenes = scenes_of(opened)
     names_of = {
         name.strip("/"): camera.prefix[1:]
@@ -212,7 +212,7 @@ def _refiner(
     fuser: FootFuser,
     progress: Callable[[int, int], None],
 ) -> Refiner:
-    """The feet that each camera sees at the times of the slowest one, ready to be compared."""
+    """Gather the feet that each camera sees at the times of the slowest one, for a ``Refiner``."""
     every = -(-len(gathered) // _COMPARED)
     frames = [frame for number, frame in enumerate(gathered) if number % every == 0]
     size = [len(frame.rows) for frame in frames]
@@ -255,7 +255,7 @@ class CorrectedPlanes:
 
 
 def changes_of(opened: log.Log, refined: Sequence[Refined], planes: Mapping[str, GroundPlane]) -> CorrectedPlanes:
-    """Return what is to be written and dropped.
+    """Return the corrected planes to write, and those to drop.
 
     Raises McaptrackError if other software recorded a channel with the name of a corrected plane.
     """
@@ -312,7 +312,7 @@ def _is_there(opened: log.Log, topic: str, channel: Made) -> bool:
 
 
 def as_json(camera: Refined) -> dict[str, Any]:
-    """The findings about a camera, as values of JSON."""
+    """Return what was found about a camera as values of JSON."""
 
     def residual(distances: Any) -> dict[str, Any] | None:
         if distances is None:

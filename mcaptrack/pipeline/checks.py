@@ -50,7 +50,7 @@ class Job(NamedTuple):
 
 
 def superseded(opened: log.Log, job: Job) -> list[str]:
-    """Return results that the job's stage made before, beside those of now, and that its transform doesn't make."""
+    """Return channels below the job's target that its stage made before, and that its transform doesn't make."""
     now, stage = {*job.outputs(), job.target + FULL}, job.stage
     before = (topic for topic in opened.channels if topic not in now and topic.startswith(job.target + "/"))
     own = (topic for topic in before if may_replace(opened, topic, stage))

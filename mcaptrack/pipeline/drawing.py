@@ -285,7 +285,7 @@ def frame_of(prefix: str, channel: ChannelToDraw) -> str:
 
 
 def new_frames(prefix: str, shown: Mapping[str, ChannelToDraw], existing: Collection[str]) -> list[str]:
-    """Return the coordinate frames of drawings that are not ``existing``, in order."""
+    """Return the coordinate frames of drawings that are not among the ``existing`` ones, in order."""
     wanted = [frame_of(prefix, channel) for channel in shown.values() if channel.is_on_ground()]
     return [frame_id for frame_id in dict.fromkeys(wanted) if frame_id not in existing]
 
@@ -336,7 +336,7 @@ def is_drawn_by_viewers(channel: log.Channel) -> bool:
 
 def recorded_sources(opened: log.Log, topics: Iterable[str]) -> list[str]:
     """Return the recorded topics that these were made from."""
-    origins = {topic for one in topics for topic in chain_of(opened, one)[-1:]} & set(opened.channels)
+    origins = {topic for made_topic in topics for topic in chain_of(opened, made_topic)[-1:]} & set(opened.channels)
     return sorted(topic for topic in origins if Provenance.from_metadata(opened.channels[topic].metadata) is None)
 
 

@@ -75,8 +75,9 @@ def outputs(topic: str) -> tuple[str, ...]:
 def make_events(opened: log.Log, prefix: str, new_channels: Mapping[str, Made], watch: Watch) -> dict[str, Made]:
     """Find the events of tracks and the errors of forecasts that are missing or out of date.
 
-    ``new_channels`` are the channels of this run, by topic. Returns the new channels by topic. A channel that can't be compared
-    with the ground truth is left out, with a warning. Raises McaptrackError for given topics that hold no tracks.
+    ``new_channels`` are those of this run, by topic. Returns the channels that it makes by topic. A channel that can't
+    be compared with the ground truth is left out, with a warning. Raises McaptrackError for given topics that hold no
+    tracks.
     """
     out: dict[str, Made] = {}
     topics = watch.topics or _default_topics(opened, prefix, new_channels)

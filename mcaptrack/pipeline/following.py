@@ -84,7 +84,7 @@ class Continued:
 
 
 def begins_here(before: log.Log, opened: log.Log, prefix: str) -> str:
-    """Return why the ids of one of several cameras go on from none, where the log before has others of them; or ""."""
+    """Return why a camera continues no ids, if the log before has other cameras of this log but not this one; or ""."""
     before_cameras, here = ({camera.prefix for camera in cameras(each)} for each in (before, opened))
     if prefix in before_cameras or not before_cameras & here:
         return ""
@@ -170,7 +170,7 @@ class Before:
         return channel is not None and channel.schema_name == schema.name and channel.messages > 0
 
     def renewed(self, opened: log.Log) -> set[str]:
-        """The channels of ids that were not made as the continuation of this log, and have to be made again."""
+        """Return the channels with ids that don't continue those of the log before, and have to be made again."""
         provenance = provenance_of(opened, self.tracks)
         is_new = provenance is not None and provenance.continued.get(AFTER) != digest_of(self._log, self.tracks)
         return {self.tracks} if is_new else set()
@@ -200,7 +200,7 @@ class Before:
         return replace(transform, start_ns=self._lead_ns) if is_clocked else transform
 
     def own(self, job: Job, outputs: Sequence[Sequence[Frame]]) -> tuple[list[Sequence[Frame]], dict[str, str]]:
-        """The outputs of a job without the lead, under ids that go on; and how they go on, for the provenance."""
+        """Return the outputs of a job without the lead, with continued ids, and facts about that for the provenance."""
         if not _is_led(job):
             return [*outputs], {}
         schemas, topics = list(job.transform.writes.values()), list(job.outputs())
@@ -227,7 +227,7 @@ class Before:
         return out, {AFTER: digest_of(self._log, job.target), LAST_ID: str(largest)}
 
     def _last_id(self, job: Job) -> int:
-        """The largest id up to the end of the log before, also in those before it."""
+        """Return the largest id in the log before, and in all logs that it continues."""
         provenance = provenance_of(self._log, job.target)
         last_id = provenance.continued.get(LAST_ID, "") if provenance else ""
         largest = int(last_id) if last_id.isascii() and last_id.isdigit() and len(last_id) < 19 else 0
@@ -238,7 +238,7 @@ class Before:
         return largest
 
     def _same(self, topic: str, frames: Sequence[Frame]) -> dict[int, int]:
-        """The ids of a channel in the log before, by those of the same tracks in this one."""
+        """Return the ids of tracks in the log before, by the ids of the same tracks in this log."""
         if not self.is_bridged or not self._has(topic, TRACKS):
             return {}
         before = self._log.frame_columns(topic, TRACKS)
@@ -272,7 +272,7 @@ class Before:
         return out
 
     def _kept(self, schema: Schema, frames: Sequence[Frame], number: Callable[[Ints], Ints] | None) -> Sequence[Frame]:
-        """Frames of this log, without those of the lead; ``number`` gives the ids of rows."""
+        """Return the frames of this log without those of the lead; ``number`` returns the new ids of rows."""
         collector = FrameCollector(schema)
         for frame in frames:
             if frame.t_ns < self.start_ns:
@@ -318,7 +318,7 @@ def _start_ns(opened: log.Log, prefix: str) -> int:
 
 
 def warn_unfollowed(opened: log.Log, job: Job) -> None:
-    """Warn of ids that went on from another log, and begin at 1 again, since no log before is named."""
+    """Warn that ids which continued those of another log begin at 1 again, because this run names no log before."""
     provenance = provenance_of(opened, job.target)
     if _gives_ids(job) and provenance is not None and provenance.continued:
         warn(
@@ -329,7 +329,7 @@ def warn_unfollowed(opened: log.Log, job: Job) -> None:
 
 
 def led(lead: Sequence[Frame], frames: Sequence[Frame], schema: Schema) -> Sequence[Frame]:
-    """Frames after those of a lead."""
+    """Return the frames of a lead, followed by ``frames``."""
     collector = FrameCollector(schema)
     for frame in chain(lead, frames):
         collector.append(frame)
@@ -337,7 +337,7 @@ def led(lead: Sequence[Frame], frames: Sequence[Frame], schema: Schema) -> Seque
 
 
 def numbers_of(frames: Sequence[Frame]) -> Ints:
-    """The number of the first frame, (1,), or none."""
+    """Return the number of the first frame, (1,); (0,) without frames."""
     return frame_numbers(frames[:1])
 
 
@@ -361,7 +361,7 @@ def _pairs(mine: Rows, theirs: Rows) -> list[tuple[int, int]]:
 
 
 def _distances(mine: Rows, theirs: Rows) -> Floats:
-    """Distances (T, U) of rows, as shares of those at which they are of one person."""
+    """Distances (T, U) between rows, divided by the largest at which two rows can be of one person."""
     boxes, others = columns_to_boxes(mine), columns_to_boxes(theirs)
     middle, other = (box[:, :2] + box[:, 2:] / 2 for box in (boxes, others))
     apart = np.hypot(*(middle[:, None] - other).transpose(2, 0, 1))
@@ -377,7 +377,7 @@ def _differ(before: Planes | None, planes: Planes) -> bool:
 
 
 def _in_planes(frame: Frame, planes: Planes) -> Rows:
-    """Rows with positions by these planes, where they have boxes."""
+    """Return the rows of a frame; those with boxes get their positions by ``planes``."""
     plane, boxes = plane_at(planes, frame.t_ns), columns_to_boxes(frame.rows)
     at = np.flatnonzero(np.isfinite(boxes).all(axis=1))
     if plane is None or not len(at):

@@ -237,7 +237,7 @@ def _fuse(
 
 
 def _feet_of(fuser: Transform) -> FootFuser:
-    """The fuser by which cameras are compared: the same one, or for another one the usual one, with its noise."""
+    """Return the fuser by which cameras are compared: a ``FootFuser`` itself, else the usual one with its noise."""
     if isinstance(fuser, FootFuser):
         return fuser
     return FootFuser(**{name: getattr(fuser, name) for name in ("noise", "noise_m") if hasattr(fuser, name)})

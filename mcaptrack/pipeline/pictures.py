@@ -229,7 +229,7 @@ def with_descriptors(
 
 
 def _why_not(transform: Transform, frames: Sequence[Frame], keep: Collection[str] | None) -> str:
-    """Return why pictures are of no use; "" if they are."""
+    """Return why pictures can't be used; "" if they can."""
     if keep is not None and all(transform.latency_s.get(output) != float("inf") for output in keep):
         return "tracks that use the past alone (online) don't look at pictures"
     if getattr(transform, "leaves_unchanged", False) and not getattr(transform, "links_in_picture", False):
@@ -242,7 +242,7 @@ def _why_not(transform: Transform, frames: Sequence[Frame], keep: Collection[str
 def _descriptors(
     opened: log.Log, topic: str, frames: Sequence[Frame], progress: Callable[[str, int, int], None]
 ) -> tuple[Descriptors | None, str]:
-    """Return what is seen of ``frames`` in the pictures of a channel; or None, and why not."""
+    """Return the descriptors of ``frames`` in the pictures of a channel; or None, and the reason."""
     damaged: list[McaptrackError] = []
     try:
         pictures = Pictures(opened, topic)
@@ -280,7 +280,7 @@ def _described(
     progress: Callable[[int, int], None],
     damaged: list[McaptrackError],
 ) -> Iterator[Descriptors]:
-    """For each frame with a picture what is seen in its samples; pictures that can't be decoded add to ``damaged``."""
+    """Yield the descriptors of each frame with a picture; errors of pictures are added to ``damaged``."""
     shown = np.flatnonzero(nearest >= 0)  # in order of time, as pictures are
     wanted, of_picture = np.unique(nearest[shown], return_index=True)
     decoded = _decodable(pictures, wanted.tolist(), damaged)
@@ -303,7 +303,7 @@ def _described(
 
 
 def _decodable(pictures: Pictures, wanted: list[int], damaged: list[McaptrackError]) -> Iterator[Frame]:
-    """Those of the ``wanted`` pictures that can be decoded; the errors of the others are added to ``damaged``.
+    """Yield the ``wanted`` pictures that can be decoded; the errors of others are added to ``damaged``.
 
     Raises McaptrackError if many in a row can't be.
     """

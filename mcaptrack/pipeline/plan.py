@@ -175,9 +175,6 @@ def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: st
             )
 
 
-# Whether a channel is out of date.
-
-
 # Corrections by people in the pipeline: samples are of corrected tracks, and re-tracking keeps these as they are.
 
 
@@ -186,7 +183,7 @@ _STAGE: Final = "sample"
 
 
 def are_new(opened: log.Log, prefix: str, provenance: Provenance) -> bool:
-    """Whether samples were made before their tracks were corrected."""
+    """Whether samples were made before their tracks had corrections."""
     corrections = (
         corrections_of(opened, camera_at(opened, prefix).prefix, provenance.input)
         if provenance.transform == _STAGE
@@ -198,7 +195,7 @@ def are_new(opened: log.Log, prefix: str, provenance: Provenance) -> bool:
 def corrected_input(
     opened: log.Log, prefix: str, job: Job, frames: Sequence[Frame]
 ) -> tuple[Sequence[Frame], Mapping[str, str]]:
-    """The frames that a job samples, with corrections, and the digests of these by topic; all others as they are."""
+    """Return the input of a job, corrected if it is sampled, and the digests of the corrections by topic."""
     topic = corrections_of(opened, prefix, job.source) if job.stage == _STAGE else None
     if topic is None:
         return frames, {}
@@ -212,7 +209,7 @@ def corrected_tracks(opened: log.Log, prefix: str, source: str, tracks: Sequence
 
 
 def without_filled_in(opened: log.Log, prefix: str, source: str, frames: Sequence[Frame]) -> Sequence[Frame]:
-    """Re-tracked tracks at the rate of those at ``source``, without boxes that corrections of these don't have."""
+    """Leave out boxes that re-tracking filled in where corrections of the tracks at ``source`` have none."""
     topic = corrections_of(opened, prefix, source)
     return frames if topic is None else without_filled(frames, opened.frame_columns(topic, TRACKS))
 
@@ -556,7 +553,7 @@ class _Planner:
         return next((topic for name, topic in self._sources.items() if STAGES[name].default.reads is VIDEO), "")
 
     def _with_choice(self, transform: Any) -> Any:
-        """A transform with the shared options that it has."""
+        """Return a transform with those of the shared options that it has."""
         chosen = {name: value for name, value in self._shared.items() if hasattr(transform, name)}
         return replace(transform, **chosen) if chosen else transform
 

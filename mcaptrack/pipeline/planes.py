@@ -77,7 +77,7 @@ class PlaneChoice(NamedTuple):
     ground_frame: str | None = None
 
     def settled(self, provenance: Provenance | None) -> tuple[bool, float]:
-        """The choice where a plane was made before, or not."""
+        """Return the choice, with what is left open as in ``provenance``, or else the default."""
         before = provenance.parameters if provenance and provenance.transform in (_ASSUME, _ESTIMATE) else {}
         height_m = before.get("person_height_m")
         height_m = float(height_m) if isinstance(height_m, int | float) and height_m > 0 else PERSON_HEIGHT_M
@@ -94,7 +94,7 @@ class PlaneChoice(NamedTuple):
         return (bool(self.estimate) and is_untried) or self.settled(provenance) != AS_BEFORE.settled(provenance)
 
     def frames(self, provenance: Provenance | None) -> tuple[str, str]:
-        """The frame of the metres and the frame of the ground, "" for the default, where planes were made before."""
+        """Return the frames of the metres and of the ground, as chosen or else as in ``provenance``; "": the default."""
         before = provenance.parameters if provenance and provenance.transform == _CALIBRATE else {}
         frame = before.get("frame", "") if self.frame is None else self.frame
         ground_frame = before.get("ground_frame", "") if self.ground_frame is None else self.ground_frame
@@ -221,8 +221,8 @@ def make_plane(
 ) -> tuple[Planes | None, Made | None]:
     """Make a ground plane from boxes, and its channel: an estimated plane, or a scale if boxes don't give one.
 
-    ``source`` is the topic of the boxes and the digest of its messages, ``new_channels`` the channels that jobs before made.
-    ``uncalibrated`` says why the plane doesn't follow from a calibration.
+    ``source`` is the topic of the boxes and the digest of its messages, ``new_channels`` are the channels of earlier
+    jobs. ``uncalibrated`` says why the plane doesn't follow from a calibration.
     Both results are None if no frame has boxes in pixels.
     """
     names = next(
@@ -320,11 +320,10 @@ def _chain(opened: log.Log, topic: str, new_channels: Mapping[str, Made]) -> lis
     return list(lineage(opened, topic, {name: channel.provenance for name, channel in new_channels.items()}))
 
 
-# Leave out rows of people who are outside of the picture: interpolated and coasting boxes that the camera can't
-# see.
+# Leave out interpolated and coasting rows of people who are outside of the picture.
 #
-# A track goes on while its person is occluded, and its row then stands where the person is expected. Outside of the
-# picture, where people come and go unseen, such a row is no statement about that picture.
+# A track goes on while its person is occluded; its rows are then where the person is expected. Outside of the picture
+# people come and go unseen, so such rows would be guesses.
 
 
 #: Width and height of pictures in pixels; None where they aren't known.
@@ -380,7 +379,7 @@ def _seen(frames: Sequence[Frame], is_unseen: Callable[[Rows], Bools]) -> Sequen
 def _find_unseen(
     frames: Sequence[Frame], picture_size: Callable[[], PictureSize]
 ) -> tuple[Callable[[Rows], Bools], int] | None:
-    """Return what masks the rows that are not observed and lie outside of the picture, and their number.
+    """Return a function that masks the rows that are not observed and lie outside of the picture, and their number.
 
     None if there are none.
     """

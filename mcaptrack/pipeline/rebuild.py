@@ -56,7 +56,7 @@ def plugins_of(stage: Stage, transform: Transform) -> dict[str, Plugin]:
 def rebuild(stage: Stage, provenance: Provenance, named_by_user: Mapping[str, Transform]) -> Transform:
     """Return the transform that made a channel, with the same parameters.
 
-    ``named_by_user`` are the transforms that the user named, by stage; their classes may be used in addition to installed ones.
+    ``named_by_user`` are transforms by stage; their classes may be used in addition to installed ones.
     Raises OlderVersionError if an older version made it, MissingPluginError if a class of another package is not
     available, and McaptrackError for parameters that no longer exist.
     """

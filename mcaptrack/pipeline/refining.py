@@ -128,7 +128,7 @@ class Refiner:
         return [self._result(camera, verdicts.get(camera.name, "")) for camera in self.cameras]
 
     def _outwards(self, verdicts: dict[str, _Found | str]) -> None:
-        """Compare cameras with those that are right, and then count them to these, the one with most pairs first."""
+        """Judge the camera with the most pairs against those that are right, count it among them, and so on."""
         settled, left = set(self.trusted), [camera for camera in self.cameras if camera.name not in self.trusted]
         while left:
             places = self._places("", settled, 1)
@@ -169,7 +169,7 @@ class Refiner:
         self.maps[camera.name] = np.eye(3) if isinstance(judged, str) or camera.why_held else judged.matrix
 
     def _places(self, but: str, among: set[str] | frozenset[str], least: int) -> Feet:
-        """Where at least so many of these cameras see people, without one of them."""
+        """Return the places where ``least`` of the cameras ``among`` see a person, leaving out ``but``."""
         parts, cameras, classes = [], [], []
         for number, watched in enumerate(self.cameras):
             if watched.name == but or watched.name not in among:
@@ -197,7 +197,7 @@ class Refiner:
         return Feet(*(np.concatenate(columns) for columns in zip(*out, strict=True)))
 
     def _suspect(self, camera: Watched, places: Feet) -> tuple[float, list[Floats], int]:
-        """The gain of a camera by a correction, maps from which one is searched, and the number of pairs."""
+        """Return how much a correction gains, maps to start its search from, and the number of pairs."""
         if not len(camera.feet.frame) or not len(places.frame):
             return 0.0, [np.eye(3)], 0
         starts = [np.eye(3), vote(camera.feet, places, round(10 * self.rate_hz))]
@@ -215,7 +215,7 @@ class Refiner:
         return float(np.nanmean(loss(moved_feet(matrix, feet)[0], places, self.frames)))
 
     def _judge(self, camera: Watched, places: Feet, starts: Sequence[Floats]) -> _Found | str:
-        """Return the best correction of a camera, of which those at other times are the judge; or why there is none."""
+        """Return the correction that fits best at times it was not fitted to; or why there is none."""
         pairs = pair(moved_feet(starts[0], camera.feet)[0], places, _PAIRED_M, GATE)
         frames = len(np.unique(places.frame[pairs.places]))
         if len(pairs.feet) < LEAST_PAIRS or frames < LEAST_FRAMES:
@@ -251,7 +251,7 @@ class Refiner:
         return _Found(chosen, matrix, moves, *self._residuals(camera, places, fits[chosen], block), limit)
 
     def _determined(self, camera: Watched, xy_m: Floats) -> tuple[tuple[str, ...], str]:
-        """The corrections that people at these places determine, and what they don't."""
+        """Return the kinds of correction that people at these places determine, and a remark on what they don't."""
         x, y = (xy_m - xy_m.mean(axis=0)).T
         cov = np.array([[(x * x).mean(), (x * y).mean()], [(x * y).mean(), (y * y).mean()]])
         small, large = np.sqrt(np.maximum(np.linalg.eigvalsh(cov), 0.0)).tolist()
@@ -321,6 +321,6 @@ def _is_as_good(cost: Floats, best: Floats) -> bool:
 
 
 def _is_sure(gain: Floats) -> bool:
-    """Whether blocks (B,) gain, by more than chance."""
+    """Whether the mean gain of blocks (B,) is more than chance."""
     gain = gain[np.isfinite(gain)]
     return len(gain) > 2 and float(gain.mean()) > _SURE * float(gain.std(ddof=1) / np.sqrt(len(gain)))

@@ -210,8 +210,7 @@ def warn_findings(
 ) -> None:
     """Repeat the warnings that channels carry in their provenance, and warn about an estimated scale.
 
-    This covers the channels in ``new_channels``, by topic, and the channels that they were made from; with ``is_all`` it covers
-    all channels of the camera.
+    This covers ``new_channels`` and the channels that they were made from; with ``is_all`` all channels of the camera.
     """
     provenances = dict(new_channels)
     for topic in sorted(camera_at(opened, prefix).topics):
@@ -344,7 +343,7 @@ def _run(
 
 
 def _gone(opened: log.Log, jobs: Sequence[Job], new_channels: Mapping[str, Made]) -> set[str]:
-    """Return earlier results of jobs that have run which these don't make now, and what was made of them."""
+    """Return channels that these jobs made earlier and don't make now, and the channels made from those."""
     gone: set[str] = set()
     for job in jobs:
         if job.kept() & {*new_channels}:
@@ -468,8 +467,8 @@ def in_context(
             usual = f"{prefix}/{STAGES[job.stage].input_topic}"
             if job.source != usual and context["rate_hz"] > 2 * Sample().rate_hz:
                 warn(
-                    f"{job.source} has {context['rate_hz']:g} frames a second, and {job.stage} takes steps at that rate; "
-                    f"{usual} has {Sample().rate_hz:g} unless it was made otherwise",
+                    f"{job.source} has {context['rate_hz']:g} frames a second, and {job.stage} takes steps at that "
+                    f"rate; {usual} has {Sample().rate_hz:g} unless it was made otherwise",
                     "clock",
                 )
     if "poor_scale" in names and is_assumed(planes):
@@ -478,7 +477,7 @@ def in_context(
 
 
 def _warn_of_limits(class_limits: str, names: ClassNames) -> None:
-    """Warn of limits of classes that there are not."""
+    """Warn of limits for classes that don't exist."""
     if unknown := unknown_limits(class_limits, names):
         classes = ", ".join(sorted({name for _, name in names if name})) or "none with a name"
         text = f"`class_limits=` names {', '.join(unknown)}: no such class is in the table of limits or in the boxes"
@@ -545,15 +544,15 @@ def _run_job(
     left_out = job_input.messages() - max(taken)
     if transform.reads is VIDEO and left_out > 0:
         warn(
-            f"{job.source}: {left_out} of {job_input.messages()} messages were left out: a video has to begin with a key "
-            "picture that has its parameter sets",
+            f"{job.source}: {left_out} of {job_input.messages()} messages were left out: a video has to begin with a "
+            "key picture that has its parameter sets",
             "left-out",
         )
     if job_input.damaged:
         warn(
-            f"{job.source}: {len(job_input.damaged)} of {job_input.messages()} pictures are damaged, number {job_input.damaged[0]} "
-            "first; what can't be decoded there is taken from others, so that detections may be wrong up to the next "
-            "key picture",
+            f"{job.source}: {len(job_input.damaged)} of {job_input.messages()} pictures are damaged, number "
+            f"{job_input.damaged[0]} first; what can't be decoded there is taken from others, so that detections may "
+            "be wrong up to the next key picture",
             "lost",
         )
     provenance = _provenance_of(job, transform, job_input, warnings, {**side.references, **motion, **corrections})

@@ -60,8 +60,8 @@ def picture_clock(opened: log.Log, prefix: str, stamps: Mapping[str, Sequence[in
 def _stamps(opened: log.Log, topic: str, read_before: Sequence[int]) -> Ints:
     """Return the capture times of a channel's pictures in ns, (M,) for M pictures.
 
-    ``read_before`` are times that were read before. Pictures that were ingested have their capture time as log time; in other
-    recordings the messages contain it.
+    ``read_before`` are the times if they were read before. Pictures that were ingested have their capture time as log
+    time; in other recordings the messages contain it.
     """
     if Provenance.from_metadata(opened.channel(topic).metadata):
         return opened.times(topic)
@@ -93,16 +93,16 @@ class SceneOnPictures:
     def on_camera(
         self, camera: SceneCamera, schema: Schema, frames: Sequence[Frame], is_true: bool
     ) -> tuple[Sequence[Frame], Planes]:
-        """Tracks or forecasts, at the times of the pictures of a camera, tracks with boxes in them; and its planes.
+        """Return tracks (with boxes) or forecasts at the times of a camera's pictures, and the camera's planes.
 
-        Tracks that are ground truth have no boxes of detections.
+        The boxes of ground truth are not taken from detections.
         """
         if schema is TRACKS:
             return self._boxes(frames, camera, is_true), camera.view.planes
         return [frame._replace(t_ns=frame.t_ns + camera.late_ns) for frame in frames], camera.view.planes
 
     def _boxes(self, tracks: Sequence[Frame], camera: SceneCamera, is_true: bool) -> FrameColumns:
-        """Tracks with boxes in the pictures of a camera, at the times of these; ground truth has none of detections."""
+        """Return tracks with boxes in a camera's pictures; those of ground truth are not taken from detections."""
         out, numbers, last_ns = FrameCollector(TRACKS), frame_numbers(tracks), -1
         for low, high, joined in joined_parts(TRACKS, tracks):
             rows, box = joined.rows.copy(), np.full((len(joined.rows), 4), np.nan)
@@ -124,7 +124,7 @@ class SceneOnPictures:
         return out.done()
 
     def _detected(self, joined: JoinedFrames, camera: SceneCamera, usual_ns: Ints) -> tuple[Floats, Ints]:
-        """The boxes (N, 4) that a camera has of tracks, NaN where none; and the times (F,) of its pictures."""
+        """Return the camera's detected boxes of tracks (N, 4), NaN without one, and the times of its pictures (F,)."""
         box, t_ns = np.full((len(joined.rows), 4), np.nan), usual_ns.copy()
         detected_ns, box_ns = frame_times(self._detections), frame_times(camera.boxes)
         for number, now_ns in enumerate(joined.t_ns.tolist()):
@@ -150,7 +150,7 @@ class SceneOnPictures:
 
 
 def _matched(tracks: np.ndarray, detections: np.ndarray) -> tuple[Ints, Ints]:
-    """The rows of tracks, and those of the detections that they are at."""
+    """Match tracks with detections at the same place, and return the rows of both."""
     here, places = (np.stack([rows["x_m"], rows["y_m"]], axis=-1) for rows in (tracks, detections))
     apart = here[:, None] - places
     cost = np.where(tracks["observed"][:, None], np.hypot(apart[..., 0], apart[..., 1]), np.inf)

@@ -195,7 +195,7 @@ def write(
     ``boxes`` are recorded boxes in space that this run has read, by topic; those that viewers don't draw get a view.
 
     ``path`` is how the camera moves, if its tracks are compensated for it: so are views, and ``planes`` with it.
-    ``new_channels`` are the channels by topic; ``stamps`` the capture times in ns of pictures that stages have read, by topic.
+    ``new_channels`` and ``stamps``, the capture times in ns of pictures that stages have read, are by topic.
     """
     camera = camera_at(opened, prefix)
     video, picture_ns, stamp_ns = picture_clock(opened, prefix, stamps)

@@ -88,9 +88,8 @@ def make_zones(
 ) -> dict[str, Made]:
     """Count the zones of channels of tracks that are not counted yet, or that have changed since.
 
-    ``new_channels`` are the channels of this run, by topic, ``stamps`` the capture times of pictures, as for ``write``. Returns
-    the new channels by topic. Raises McaptrackError for given topics that hold no tracks, and for zones that none of
-    the tracks can be compared with.
+    ``new_channels`` and ``stamps`` are as for ``write``. Returns the channels that it makes by topic. Raises
+    McaptrackError for given topics that hold no tracks, and for zones that none of the tracks can be compared with.
     """
     before = _before(opened, prefix)
     zones = watch.zones or before.zones
@@ -146,7 +145,7 @@ def _counted(
     parameters: Mapping[str, Any],
     pictures: PictureClock,
 ) -> dict[str, Made]:
-    """The channels of one channel of tracks."""
+    """Count the zones of one channel of tracks, and return the new channels by topic."""
     source = new_channels[topic].provenance.digest if topic in new_channels else digest_of(opened, topic)
     frames: Sequence[Frame]
     if topic == camera_at(opened, prefix).truth:
@@ -287,7 +286,7 @@ def _parameters(zones: Sequence[Zone], options: ZoneOptions, planes: Planes) -> 
 
 
 def _is_due(opened: log.Log, topic: str, new_channels: Mapping[str, Made], wanted: Mapping[str, Any]) -> bool:
-    """Whether the zones of a channel were never counted, in another way, or of what has changed since."""
+    """Whether zones were not counted yet, were counted with other parameters, or are out of date."""
     names = outputs(topic)[: len(_SCHEMAS) + 1]
     if not all(name in opened.channels for name in names) or is_stale(opened, names[0]):
         return True
@@ -301,7 +300,7 @@ def _is_due(opened: log.Log, topic: str, new_channels: Mapping[str, Made], wante
 
 
 def _is_same(before: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
-    """Whether parameters are the same, as JSON has them."""
+    """Whether two sets of parameters are the same in JSON."""
     zones = zones_from_json(before.get("zones"))
     rest = [{key: value for key, value in parameters.items() if key != "zones"} for parameters in (before, wanted)]
     return zones_to_json(zones) == wanted["zones"] and rest[0] == rest[1]

@@ -182,7 +182,7 @@ def _opened(path: Path, local: Any) -> tuple[Any, ...]:
 
 
 def _table(folder: Path, members: Mapping[str, list[int]]) -> Any:
-    """The rows of all logs: those of the file that still hold, and those of logs that changed."""
+    """The rows of all logs: those in the file that are still valid, and those of logs that changed."""
     import pyarrow as pa
     import pyarrow.compute as pc
 

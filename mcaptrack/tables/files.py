@@ -96,7 +96,7 @@ def _release() -> None:
 
 
 def _describes(old: Mapping[str, str], new: Mapping[str, str]) -> bool:
-    """Whether metadata are those, apart from the source, which may change while the content does not."""
+    """Whether metadata are equal apart from source and digest: the source may change while the content does not."""
     apart = {"source": "", "digest": ""}
     return {**old, **apart} == {**new, **apart}
 

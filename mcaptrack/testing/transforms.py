@@ -25,9 +25,6 @@ from mcaptrack.transforms.protocol import Colour, Transform, check_options, trai
 Result = list[tuple[Frame, ...]]
 
 
-# The error of a broken law.
-
-
 class LawError(AssertionError):
     """A transform or a predictor breaks a law; the message says which one, and where."""
 

@@ -130,9 +130,9 @@ class PeopleInParts:
         self._last: tuple[int, People] | None = None
 
     def parts(self, batch: int) -> Iterator[tuple[int, int, People]]:
-        """Parts of the times, as long as so many of them or a multiple: their first and last, and the people at them.
+        """Yield parts of the times, each a multiple of ``batch``: first, last, and the people at these times.
 
-        There are also the people at the times before that trails of these people come from. ``People.frame`` are
+        The people at earlier times that trails need are included. ``People.frame`` are
         indices of all times.
         """
         length = max(round(_PART_ROWS / max(self._each, 1e-9) / batch), 1) * batch
@@ -219,7 +219,7 @@ def _shortened(text: str, length: int) -> str:
 
 
 def trails(people: People, has_place: NDArray[np.bool_], at_ns: Ints) -> Trails:
-    """The trails of people with a ``has_place`` position (S,); trails do not pass unknown positions.
+    """The trails of people that have a place by ``has_place`` (S,); trails do not pass unknown places.
 
     Their points are at the ticks of a slow clock, the same ones in picture after picture: so trails don't move, and a
     compressed log hardly grows by them.

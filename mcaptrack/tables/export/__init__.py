@@ -58,7 +58,7 @@ def default_folder(path: Location) -> Path:
 
 
 def main_file(path: Location, folder: Path, form: Format = "parquet") -> Path:
-    """The file of a log in a folder that is written last: where it stands, all tables do."""
+    """The file of a log that is written last: if it exists, all tables of the log do."""
     return folder / "recordings" / f"recording={recording_name(path)}" / f"part-0.{form}"
 
 

@@ -155,7 +155,7 @@ class LogTables:
         return pieces.table() if isinstance(pieces, TablePieces) else pieces
 
     def pieces(self, name: str) -> Any:
-        """The same; a table with many rows as ``TablePieces``, which are made while they are read."""
+        """As ``table``, but a table with many rows comes as ``TablePieces``, which are made while they are read."""
         table = TABLES[name]
         if table.rows_of is not None:
             channels = {topic: self._frames(topic) for topic in self.topics(name)}

@@ -107,7 +107,7 @@ class Pieces(NamedTuple):
 
 
 def joined(parts: Sequence[Pieces], width: int) -> Pieces:
-    """All pieces of these, of states of so many numbers."""
+    """Join pieces; ``width`` is the number of values of a state."""
     if not parts:
         none, no = np.empty(0, np.int64), np.empty(0, np.bool_)
         return Pieces(none, none, np.empty((0, width)), np.empty((0, width)), (no, no))

@@ -146,7 +146,7 @@ def draw(report: LogReport, at: int, total: int) -> None:
 
 
 def page(reports: Sequence[LogReport]) -> str:
-    """The whole page; logs that are not rendered yet are."""
+    """Return the whole page; logs that were not rendered yet are rendered first."""
     for k, report in enumerate(reports):
         if not report.html:
             draw(report, k, len(reports))

@@ -137,7 +137,7 @@ def _away_m(rows: Any, t_ns: Any, event: IdentityEvent) -> float | None:
 
 
 def _verdict(people: PersonScores, event: IdentityEvent) -> tuple[str, bool | None]:
-    """Compare a repair with the ground truth: words, and whether it is right; None if that is not known."""
+    """Compare a repair with the ground truth: return a text, and whether it is right (None if not known)."""
     own = people.track == int(event.row["track_id"])
     when, who = people.t_ns[own], people.person[own]
     order = np.argsort(when, kind="stable")

@@ -35,7 +35,7 @@ _LEAST_SPREAD: Final = 0.05
 
 
 def per_hour(row: Row, name: str) -> float | None:
-    """A count by hours of the log; None where one of them is not known."""
+    """A count per hour of the log; None if the count or the duration is not known."""
     count, hours = row.get(name), (row.get("duration_s") or 0) / 3600
     return None if count is None or hours <= 0 else count / hours
 
@@ -112,10 +112,16 @@ def outliers(rows: Sequence[Row]) -> list[dict[str, Any]]:
         spread = max(_BY_MAD * float(np.median(np.abs(logs - middle))), _LEAST_SPREAD)
         far = (logs - middle) / spread
         far_off += [
-            {"row": valued[at][0], "measure": name, "unit": unit, "value": valued[at][1], "median": float(np.exp(middle)),
-             "deviations": float(far[at])}
+            {
+                "row": valued[at][0],
+                "measure": name,
+                "unit": unit,
+                "value": valued[at][1],
+                "median": float(np.exp(middle)),
+                "deviations": float(far[at]),
+            }
             for at in np.flatnonzero(np.abs(far) > _FAR).tolist()
-        ]  # fmt: skip
+        ]
     return sorted(far_off, key=lambda outlier: (-abs(outlier["deviations"]), str(outlier["row"]["recording"])))[
         : 2 * _LISTED
     ]

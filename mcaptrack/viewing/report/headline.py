@@ -26,7 +26,7 @@ class BeforeAfter(NamedTuple):
     roles: tuple[str, str] = ("", "")
 
     def values(self, name: str) -> list[float]:
-        """A score of those that exist."""
+        """A score before and after re-tracking, as far as these were scored."""
         return [summary(row.score)[name] for row in (self.tracked, self.retracked) if row is not None]
 
 
