@@ -264,7 +264,7 @@ def changes_of(opened: log.Log, refined: Sequence[Refined], planes: Mapping[str,
     for topic in topics.values():
         if not may_replace(opened, topic, REFINE):
             raise McaptrackError(f"{opened.path}: {topic} {describe_origin(opened, topic)}, and is not replaced")
-    new_channels: dict[str, Made] = {}
+    results: dict[str, Made] = {}
     compared = sorted(camera.name for camera in refined if camera.before is not None)
     for camera in refined:
         if not camera.model:
@@ -275,7 +275,7 @@ def changes_of(opened: log.Log, refined: Sequence[Refined], planes: Mapping[str,
         frame_id = frame_id_of(opened.channels[base].metadata)
         how = Provenance(REFINE, parameters, base, digest_of(opened, base), frame_id=frame_id)
         frame = Frame(before.t_ns, before.index, plane_to_rows(planes[camera.name]))
-        new_channels[topic] = Made.of(GROUND_PLANE, [frame], how)
+        results[topic] = Made.of(GROUND_PLANE, [frame], how)
     dropped = [
         topic
         for camera in refined
@@ -285,8 +285,8 @@ def changes_of(opened: log.Log, refined: Sequence[Refined], planes: Mapping[str,
         and (topic := refined_plane(cameras[camera.name])) in opened.channels
         and may_replace(opened, topic, REFINE)
     ]
-    unchanged = tuple(name for name, topic in topics.items() if _is_there(opened, topic, new_channels[topic]))
-    new = {topic: new_channels[topic] for name, topic in topics.items() if name not in unchanged}
+    unchanged = tuple(name for name, topic in topics.items() if _is_there(opened, topic, results[topic]))
+    new = {topic: results[topic] for name, topic in topics.items() if name not in unchanged}
     return CorrectedPlanes(topics, new, unchanged, tuple(dropped))
 
 

@@ -72,26 +72,26 @@ def outputs(topic: str) -> tuple[str, ...]:
     return topic + _EVENTS, topic + _EVENTS + SUFFIX, topic + _COUNTS
 
 
-def make_events(opened: log.Log, prefix: str, new_channels: Mapping[str, Made], watch: Watch) -> dict[str, Made]:
+def make_events(opened: log.Log, prefix: str, results: Mapping[str, Made], watch: Watch) -> dict[str, Made]:
     """Find the events of tracks and the errors of forecasts that are missing or out of date.
 
-    ``new_channels`` are those of this run, by topic. Returns the channels that it makes by topic. A channel that can't
+    ``results`` are those of this run, by topic. Returns the channels that it makes by topic. A channel that can't
     be compared with the ground truth is left out, with a warning. Raises McaptrackError for given topics that hold no
     tracks.
     """
     out: dict[str, Made] = {}
-    topics = watch.topics or _default_topics(opened, prefix, new_channels)
+    topics = watch.topics or _default_topics(opened, prefix, results)
     if watch.again and not topics:
         raise McaptrackError(f"{opened.path} has no tracks of {prefix}; {call('run', opened.path)} makes them")
 
     @cache
     def truth() -> _GroundTruth:
-        return _read_truth(opened, prefix, new_channels)
+        return _read_truth(opened, prefix, results)
 
     for topic in topics:
         options = watch.options if watch.again else _options_for(opened, topic, watch.options)
         has_same_options = _options_for(opened, topic, EventOptions()) == options
-        is_up_to_date = has_same_options and not _is_outdated(opened, outputs(topic), new_channels)
+        is_up_to_date = has_same_options and not _is_outdated(opened, outputs(topic), results)
         if is_up_to_date and not (watch.again or watch.force):
             continue
         conflict = _find_conflict(opened, outputs(topic))
@@ -100,12 +100,12 @@ def make_events(opened: log.Log, prefix: str, new_channels: Mapping[str, Made], 
                 raise McaptrackError(f"{opened.path}: events would replace {conflict}")
             warn(f"no events of {topic}: they would replace {conflict}", "left-out")
             continue
-        frames, tracks_digest = _rows(opened, topic, new_channels)
+        frames, tracks_digest = _rows(opened, topic, results)
         names = class_names(
-            new_channels[topic].provenance.to_metadata() if topic in new_channels else opened.channel(topic).metadata
+            results[topic].provenance.to_metadata() if topic in results else opened.channel(topic).metadata
         )
         classes = (truth().classes, names)
-        origin = new_channels[topic].provenance if topic in new_channels else provenance_of(opened, topic)
+        origin = results[topic].provenance if topic in results else provenance_of(opened, topic)
         frames = repaired_tracks(frames, origin)
         track_events = find_events(frames, truth().frames, options, opened.path.stem, topic, classes)
         for note in track_events.notes:
@@ -120,7 +120,7 @@ def make_events(opened: log.Log, prefix: str, new_channels: Mapping[str, Made], 
         out[topic + _COUNTS] = Made.of(COUNTS, track_events.counts, provenance)
     if not watch.topics:
         for name in FORECAST_INPUTS:
-            out |= _forecast_errors(opened, prefix, name, new_channels, watch.again or watch.force, truth)
+            out |= _forecast_errors(opened, prefix, name, results, watch.again or watch.force, truth)
     return out
 
 
@@ -128,25 +128,25 @@ def _forecast_errors(
     opened: log.Log,
     prefix: str,
     name: str,
-    new_channels: Mapping[str, Made],
+    results: Mapping[str, Made],
     again: bool,
     truth: Callable[[], _GroundTruth],
 ) -> dict[str, Made]:
     """Find the errors of the forecasts in one channel, if the channel exists and its errors are missing or outdated."""
     topic, tracks, later = (f"{prefix}/{part}" for part in (name, FORECAST_INPUTS[name], _OFFLINE))
-    if not _has_rows(opened, topic, new_channels, PREDICTIONS) or not _has_rows(opened, tracks, new_channels):
+    if not _has_rows(opened, topic, results, PREDICTIONS) or not _has_rows(opened, tracks, results):
         return {}
-    later = later if _has_rows(opened, later, new_channels) else tracks
+    later = later if _has_rows(opened, later, results) else tracks
     topics = (topic + _ERRORS, topic + _SCORES)
-    if not again and not _is_outdated(opened, topics, new_channels) and later in _input_digests(opened, topics[0]):
+    if not again and not _is_outdated(opened, topics, results) and later in _input_digests(opened, topics[0]):
         return {}
     conflict = _find_conflict(opened, topics)
     if conflict:
         warn(f"no errors of {topic}: they would replace {conflict}", "left-out")
         return {}
-    forecasts, digest_of_forecasts = _rows(opened, topic, new_channels, PREDICTIONS)
+    forecasts, digest_of_forecasts = _rows(opened, topic, results, PREDICTIONS)
     (history, of_tracks), (offline, of_later) = (
-        _rows(opened, topic_of_tracks, new_channels) for topic_of_tracks in (tracks, later)
+        _rows(opened, topic_of_tracks, results) for topic_of_tracks in (tracks, later)
     )
     try:
         forecast_errors = find_forecast_errors(forecasts, history, truth().frames, offline, topic)
@@ -161,10 +161,10 @@ def _forecast_errors(
     }
 
 
-def tally(new_channels: Mapping[str, Made]) -> dict[str, dict[str, int]]:
+def tally(results: Mapping[str, Made]) -> dict[str, dict[str, int]]:
     """Count the events of each kind for each channel of tracks: count by name of the kind, by topic of the tracks."""
     out = {}
-    for topic, channel in new_channels.items():
+    for topic, channel in results.items():
         if channel.schema is EVENTS and not channel.drawn:
             kinds = join_frames(EVENTS, channel.frames).rows["kind"]
             counts = np.bincount(kinds, minlength=max(EVENT_KINDS) + 1).tolist()
@@ -184,7 +184,7 @@ class _GroundTruth(NamedTuple):
     classes: Mapping[int, str] = {}
 
 
-def _read_truth(opened: log.Log, prefix: str, new_channels: Mapping[str, Made]) -> _GroundTruth:
+def _read_truth(opened: log.Log, prefix: str, results: Mapping[str, Made]) -> _GroundTruth:
     topic = camera_at(opened, prefix).truth
     if topic not in opened.channels:
         return _GroundTruth(None, {topic: ""})
@@ -192,13 +192,13 @@ def _read_truth(opened: log.Log, prefix: str, new_channels: Mapping[str, Made]) 
         return _GroundTruth(None, {})
     try:
         names = class_names(opened.channel(topic).metadata)
-        return _GroundTruth(ground_truth_with(opened, prefix, new_channels), {topic: digest_of(opened, topic)}, names)
+        return _GroundTruth(ground_truth_with(opened, prefix, results), {topic: digest_of(opened, topic)}, names)
     except McaptrackError as error:
         warn(f"no misses, false tracks and switches: {error}", "not-compared")
         return _GroundTruth(None, {})
 
 
-def _default_topics(opened: log.Log, prefix: str, new_channels: Mapping[str, Made]) -> list[str]:
+def _default_topics(opened: log.Log, prefix: str, results: Mapping[str, Made]) -> list[str]:
     """Return the default channels of tracks, and those of the camera that have events already."""
     topics = [f"{prefix}/{name}" for name in WATCHED]
     topics += [
@@ -206,7 +206,7 @@ def _default_topics(opened: log.Log, prefix: str, new_channels: Mapping[str, Mad
         for topic in sorted(camera_at(opened, prefix).topics)
         if topic.endswith(_EVENTS) and may_replace(opened, topic, STAGE)
     ]
-    return [topic for topic in dict.fromkeys(topics) if _has_rows(opened, topic, new_channels)]
+    return [topic for topic in dict.fromkeys(topics) if _has_rows(opened, topic, results)]
 
 
 def _options_for(opened: log.Log, topic: str, requested: EventOptions) -> EventOptions:
@@ -226,13 +226,13 @@ def _is_gate(value: Any) -> bool:
     return isinstance(value, float | int) and not isinstance(value, bool) and value > 0
 
 
-def _is_outdated(opened: log.Log, topics: Sequence[str], new_channels: Mapping[str, Made]) -> bool:
+def _is_outdated(opened: log.Log, topics: Sequence[str], results: Mapping[str, Made]) -> bool:
     """Return whether one of these topics is missing, or an input of the first one has changed since."""
     if not all(topic in opened.channels for topic in topics) or is_stale(opened, topics[0]):
         return True
     then = _input_digests(opened, topics[0])
     return not then or any(
-        name in new_channels and new_channels[name].provenance.digest != digest for name, digest in then.items()
+        name in results and results[name].provenance.digest != digest for name, digest in then.items()
     )
 
 
@@ -249,18 +249,18 @@ def _find_conflict(opened: log.Log, topics: Sequence[str]) -> str:
     return f"{taken[0]}, which {describe_origin(opened, taken[0])}" if taken else ""
 
 
-def _has_rows(opened: log.Log, topic: str, new_channels: Mapping[str, Made] = {}, schema: Schema = TRACKS) -> bool:
+def _has_rows(opened: log.Log, topic: str, results: Mapping[str, Made] = {}, schema: Schema = TRACKS) -> bool:
     """Return whether a channel of the log or of this run has the given schema."""
-    if topic in new_channels:
-        return new_channels[topic].schema is schema
+    if topic in results:
+        return results[topic].schema is schema
     channel = opened.channels.get(topic)
     return channel is not None and channel.holds(schema)
 
 
 def _rows(
-    opened: log.Log, topic: str, new_channels: Mapping[str, Made], schema: Schema = TRACKS
+    opened: log.Log, topic: str, results: Mapping[str, Made], schema: Schema = TRACKS
 ) -> tuple[Sequence[Frame], str]:
     """Return the frames of a channel, and the digest of its messages."""
-    if topic in new_channels:
-        return new_channels[topic].frames, new_channels[topic].provenance.digest
+    if topic in results:
+        return results[topic].frames, results[topic].provenance.digest
     return opened.frame_columns(topic, schema), digest_of(opened, topic)

@@ -76,20 +76,20 @@ def detects_motion(provenance: Provenance | None) -> bool:
     return traits_of(stage.built_in().get(str(name), stage.default)).needs_still_camera
 
 
-def side_inputs(opened: log.Log, prefix: str, job: Job, new_channels: Mapping[str, Made]) -> SideInputs:
-    """Return the inputs of a job beside its main one. ``new_channels`` are the channels that jobs before it made."""
+def side_inputs(opened: log.Log, prefix: str, job: Job, results: Mapping[str, Made]) -> SideInputs:
+    """Return the inputs of a job beside its main one. ``results`` are the channels that jobs before it made."""
     names = {f.name for f in fields(job.transform) if f.metadata.get("context")}
     if "camera_path" in names and uses_motion(job.transform):
-        return _path(opened, prefix, job, new_channels)
+        return _path(opened, prefix, job, results)
     if "known_boxes" in names and getattr(job.transform, "mask_boxes", False):
-        return _boxes(opened, prefix, new_channels)
+        return _boxes(opened, prefix, results)
     return SideInputs({}, {})
 
 
-def _path(opened: log.Log, prefix: str, job: Job, new_channels: Mapping[str, Made]) -> SideInputs:
+def _path(opened: log.Log, prefix: str, job: Job, results: Mapping[str, Made]) -> SideInputs:
     """Return the path of the camera, if its motion is known."""
     topic = motion_topic(prefix)
-    motion_read = _read(opened, topic, CAMERA_MOTION, new_channels)
+    motion_read = _read(opened, topic, CAMERA_MOTION, results)
     if motion_read is None:
         if getattr(job.transform, "camera_motion", "") == "on":
             warn(f"the motion of the camera is not known: {topic} needs pictures of it in the log", "option-not-used")
@@ -103,37 +103,37 @@ def _path(opened: log.Log, prefix: str, job: Job, new_channels: Mapping[str, Mad
 
 
 def path_with(
-    opened: log.Log, prefix: str, topic: str, new_channels: Mapping[str, Made]
+    opened: log.Log, prefix: str, topic: str, results: Mapping[str, Made]
 ) -> tuple[CameraPath | None, Mapping[str, str]]:
     """Return what ``path_of`` does, with the channels of this run."""
-    return path_of(opened, prefix, topic, *_of_run(new_channels))
+    return path_of(opened, prefix, topic, *_of_run(results))
 
 
-def ground_truth_with(opened: log.Log, prefix: str, new_channels: Mapping[str, Made]) -> list[Frame]:
+def ground_truth_with(opened: log.Log, prefix: str, results: Mapping[str, Made]) -> list[Frame]:
     """Return what ``read_ground_truth`` does, with the channels of this run."""
-    return read_ground_truth(opened, prefix, *_of_run(new_channels))
+    return read_ground_truth(opened, prefix, *_of_run(results))
 
 
-def _of_run(new_channels: Mapping[str, Made]) -> tuple[dict[str, Provenance], dict[str, Sequence[Frame]]]:
-    return {topic: channel.provenance for topic, channel in new_channels.items()}, {
-        topic: channel.frames for topic, channel in new_channels.items()
+def _of_run(results: Mapping[str, Made]) -> tuple[dict[str, Provenance], dict[str, Sequence[Frame]]]:
+    return {topic: channel.provenance for topic, channel in results.items()}, {
+        topic: channel.frames for topic, channel in results.items()
     }
 
 
-def moves(opened: log.Log, prefix: str, new_channels: Mapping[str, Made]) -> bool:
+def moves(opened: log.Log, prefix: str, results: Mapping[str, Made]) -> bool:
     """Whether the camera is known to move, or its pictures to have cuts."""
-    motion_read = _read(opened, motion_topic(prefix), CAMERA_MOTION, new_channels)
+    motion_read = _read(opened, motion_topic(prefix), CAMERA_MOTION, results)
     try:
         return motion_read is not None and frames_to_path(motion_read[0]).matters
     except McaptrackError:
         return False
 
 
-def _boxes(opened: log.Log, prefix: str, new_channels: Mapping[str, Made]) -> SideInputs:
+def _boxes(opened: log.Log, prefix: str, results: Mapping[str, Made]) -> SideInputs:
     """The boxes of people, by the time of their picture."""
     usual = f"{prefix}/{next(s.output_topic for s in STAGES.values() if s.default.writes[''] is DETECTIONS)}"
-    topic = usual if usual in new_channels or usual in opened.channels else camera_at(opened, prefix).boxes
-    boxes_read = None if topic is None else _read(opened, topic, DETECTIONS, new_channels)
+    topic = usual if usual in results or usual in opened.channels else camera_at(opened, prefix).boxes
+    boxes_read = None if topic is None else _read(opened, topic, DETECTIONS, results)
     if topic is None or boxes_read is None or _needs_still_camera(opened, topic, ()):
         return SideInputs({}, {})
     boxes = {frame.t_ns: columns_to_boxes(frame.rows) for frame in boxes_read[0] if len(frame.rows)}
@@ -141,11 +141,11 @@ def _boxes(opened: log.Log, prefix: str, new_channels: Mapping[str, Made]) -> Si
 
 
 def _read(
-    opened: log.Log, topic: str, schema: Schema, new_channels: Mapping[str, Made]
+    opened: log.Log, topic: str, schema: Schema, results: Mapping[str, Made]
 ) -> tuple[Sequence[Frame], str] | None:
     """The frames of a channel and their digest; None if it isn't there or holds something else."""
-    if topic in new_channels:
-        return new_channels[topic].frames, new_channels[topic].provenance.digest
+    if topic in results:
+        return results[topic].frames, results[topic].provenance.digest
     channel = opened.channels.get(topic)
     if channel is None or not fits(channel, schema)[1]:
         return None

@@ -224,13 +224,13 @@ def is_of_corrections(opened: log.Log, prefix: str, provenance: Provenance) -> b
     return then != ({} if corrections is None else {corrections: digest_of(opened, corrections)})
 
 
-def fixed_in(opened: log.Log, prefix: str, source: str, new_channels: Mapping[str, Made]) -> tuple[int, ...]:
+def fixed_in(opened: log.Log, prefix: str, source: str, results: Mapping[str, Made]) -> tuple[int, ...]:
     """The ids of corrected tracks in the samples at ``source``; () if they were made without corrections."""
-    how = new_channels[source].provenance if source in new_channels else provenance_of(opened, source)
+    how = results[source].provenance if source in results else provenance_of(opened, source)
     topic = corrections_of(opened, prefix, how.input) if how and how.transform == _STAGE else None
     if how is None or topic is None or topic not in how.references:
         return ()
-    tracks = new_channels[how.input].frames if how.input in new_channels else opened.frame_columns(how.input, TRACKS)
+    tracks = results[how.input].frames if how.input in results else opened.frame_columns(how.input, TRACKS)
     return fixed_ids(tracks, opened.frame_columns(topic, TRACKS))
 
 

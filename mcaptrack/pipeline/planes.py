@@ -150,10 +150,10 @@ def warn_unused(opened: log.Log, prefix: str, choice: PlaneChoice) -> None:
         warn(f"`ground_frame=` changes nothing here: {why}", "option-not-used")
 
 
-def frame_of_planes(opened: log.Log, prefix: str, new_channels: Mapping[str, Made]) -> str:
+def frame_of_planes(opened: log.Log, prefix: str, results: Mapping[str, Made]) -> str:
     """Return the frame of the metres of a camera's ground planes; "" if it has none, or they name no frame."""
     topic = camera_at(opened, prefix).ground_plane
-    how = new_channels[topic].provenance if topic in new_channels else provenance_of(opened, topic)
+    how = results[topic].provenance if topic in results else provenance_of(opened, topic)
     return how.frame_id if how else ""
 
 
@@ -215,20 +215,20 @@ def make_plane(
     prefix: str,
     frames: Sequence[Frame],
     source: tuple[str, str],
-    new_channels: Mapping[str, Made],
+    results: Mapping[str, Made],
     choice: PlaneChoice = AS_BEFORE,
     uncalibrated: str = "",
 ) -> tuple[Planes | None, Made | None]:
     """Make a ground plane from boxes, and its channel: an estimated plane, or a scale if boxes don't give one.
 
-    ``source`` is the topic of the boxes and the digest of its messages, ``new_channels`` are the channels of earlier
+    ``source`` is the topic of the boxes and the digest of its messages, ``results`` are the channels of earlier
     jobs. ``uncalibrated`` says why the plane doesn't follow from a calibration.
     Both results are None if no frame has boxes in pixels.
     """
     names = next(
         (
             provenance.classes
-            for _, provenance in _chain(opened, source[0], new_channels)
+            for _, provenance in _chain(opened, source[0], results)
             if provenance and provenance.classes
         ),
         {},
@@ -243,11 +243,11 @@ def make_plane(
     plane: GroundPlane | None = None
     if not estimate:
         parameters["fit_plane"] = False
-    elif why_not := _why_not(opened, prefix, source[0], new_channels):
+    elif why_not := _why_not(opened, prefix, source[0], results):
         if why_not != _BY_MOTION or choice.estimate:
             parameters["refused"] = why_not
     else:
-        size = _picture_size(opened, prefix, source[0], new_channels) or (width, height)
+        size = _picture_size(opened, prefix, source[0], results) or (width, height)
         try:
             if not are_people.any():
                 raise McaptrackError("none of them is of a person")
@@ -270,7 +270,7 @@ def planes_for(
     job: Job,
     frames: Sequence[Frame],
     source: tuple[str, str],
-    new_channels: Mapping[str, Made],
+    results: Mapping[str, Made],
     planes: Planes | None,
     choice: PlaneChoice,
 ) -> tuple[Planes | None, dict[str, Made], str]:
@@ -282,15 +282,15 @@ def planes_for(
     topic, stage, uncalibrated = camera_at(opened, prefix).ground_plane, STAGES[job.stage], ""
     channel: Made | None = None
     uses_planes = "ground_planes" in {f.name for f in fields(job.transform)}
-    if uses_planes and topic not in new_channels and _has_pixels(frames):
+    if uses_planes and topic not in results and _has_pixels(frames):
         calibrated, channel, uncalibrated = calibrated_planes(opened, prefix, choice)
         planes = calibrated or planes
     is_usual = job.target == f"{prefix}/{stage.output_topic}"
     is_new = job.transform.reads is DETECTIONS or is_plane_due(opened, prefix, job.source, choice)
     if (is_assumed(planes) and is_usual and is_new) or (planes is None and stage.needs_scale):
-        planes, channel = make_plane(opened, prefix, frames, source, new_channels, choice, uncalibrated)
+        planes, channel = make_plane(opened, prefix, frames, source, results, choice, uncalibrated)
     new = {topic: channel} if channel else {}
-    frame = frame_of_planes(opened, prefix, {**new_channels, **new}) if uses_planes and _has_pixels(frames) else ""
+    frame = frame_of_planes(opened, prefix, {**results, **new}) if uses_planes and _has_pixels(frames) else ""
     return planes, new, frame
 
 
@@ -308,16 +308,16 @@ def recorded_planes(transform: Transform) -> dict[str, Any]:
 _BY_MOTION: Final = "boxes of a motion detector have shadows, and several people in one"
 
 
-def _why_not(opened: log.Log, prefix: str, source: str, new_channels: Mapping[str, Made]) -> str:
+def _why_not(opened: log.Log, prefix: str, source: str, results: Mapping[str, Made]) -> str:
     """Return why no plane can be estimated from these boxes, as a clause; "" if it can be tried."""
-    if any(motion.detects_motion(provenance) for _, provenance in _chain(opened, source, new_channels)):
+    if any(motion.detects_motion(provenance) for _, provenance in _chain(opened, source, results)):
         return _BY_MOTION
-    return "the camera moves" if motion.moves(opened, prefix, new_channels) else ""
+    return "the camera moves" if motion.moves(opened, prefix, results) else ""
 
 
-def _chain(opened: log.Log, topic: str, new_channels: Mapping[str, Made]) -> list[tuple[str, Provenance | None]]:
+def _chain(opened: log.Log, topic: str, results: Mapping[str, Made]) -> list[tuple[str, Provenance | None]]:
     """Return a channel, its input, the input of that and so on, each with its provenance, also of this run."""
-    return list(lineage(opened, topic, {name: channel.provenance for name, channel in new_channels.items()}))
+    return list(lineage(opened, topic, {name: channel.provenance for name, channel in results.items()}))
 
 
 # Leave out interpolated and coasting rows of people who are outside of the picture.
@@ -418,11 +418,9 @@ def _without(frames: Sequence[Frame], gone: Collection[tuple[int, int]]) -> Sequ
     return out.done()
 
 
-def _picture_size(
-    opened: log.Log, prefix: str, source: str, new_channels: Mapping[str, Made]
-) -> tuple[int, int] | None:
+def _picture_size(opened: log.Log, prefix: str, source: str, results: Mapping[str, Made]) -> tuple[int, int] | None:
     """Return width and height of the pictures that boxes were found in, or of their camera; None if there are none."""
-    first = _chain(opened, source, new_channels)[-1][0]
+    first = _chain(opened, source, results)[-1][0]
     channel = opened.channels.get(first)
     topic = first if channel and foreign.holds_pictures(channel) else camera_at(opened, prefix).pictures
     return picture_size(opened, topic)

@@ -206,18 +206,18 @@ def free_memory() -> int | None:
 
 
 def warn_findings(
-    opened: log.Log, prefix: str, new_channels: Mapping[str, Provenance], planes: Planes, is_all: bool
+    opened: log.Log, prefix: str, results: Mapping[str, Provenance], planes: Planes, is_all: bool
 ) -> None:
     """Repeat the warnings that channels carry in their provenance, and warn about an estimated scale.
 
-    This covers ``new_channels`` and the channels that they were made from; with ``is_all`` all channels of the camera.
+    This covers ``results`` and the channels that they were made from; with ``is_all`` all channels of the camera.
     """
-    provenances = dict(new_channels)
+    provenances = dict(results)
     for topic in sorted(camera_at(opened, prefix).topics):
         provenance = Provenance.from_metadata(opened.channels[topic].metadata)
         if provenance is not None:
             provenances.setdefault(topic, provenance)
-    topics = list(provenances) if is_all else list(new_channels)
+    topics = list(provenances) if is_all else list(results)
     for topic in topics:
         if provenances[topic].input in provenances and provenances[topic].input not in topics:
             topics.append(provenances[topic].input)
@@ -284,7 +284,7 @@ def _run(
     fused: Mapping[str, Made],
     before: Before | None,
 ) -> Report:
-    new_channels: dict[str, Made] = dict(fused)
+    results: dict[str, Made] = dict(fused)
     stamps: dict[str, list[int]] = {}
     report = Report(stages=[FUSE] if fused else [])
     for topic, channel in fused.items():
@@ -292,72 +292,72 @@ def _run(
     planes, part = read_planes(opened, prefix), report.watch.part
     for job in jobs:
         with part("read"):
-            job_input = _input(opened, job, new_channels, stamps, progress, boxes, report.watch)
+            job_input = _input(opened, job, results, stamps, progress, boxes, report.watch)
             source = (job.source, job_input.digest())
         with part(job.stage):
             planes, ground, frame_id = planes_for(
-                opened, prefix, job, job_input.frames, source, new_channels, planes, choice
+                opened, prefix, job, job_input.frames, source, results, planes, choice
             )
-        new_channels |= ground
+        results |= ground
         job_input = job_input._replace(frame_id=job_input.frame_id or frame_id)
         if job.transform.reads is DETECTIONS:
             warn_memory(job_input.frames)
         try:
             with part(job.stage):
-                new_channels |= _run_job(opened, prefix, job, job_input, new_channels, planes or (), before, progress)
+                results |= _run_job(opened, prefix, job, job_input, results, planes or (), before, progress)
         except McaptrackError as error:
             if not job.is_optional:
                 raise
             warn(f"{job.target} is left out: {error}", "left-out")
             continue
-        for topic in (topic for topic in job.outputs() if topic in new_channels):
-            report.count(topic, new_channels[topic])
+        for topic in (topic for topic in job.outputs() if topic in results):
+            report.count(topic, results[topic])
         report.stages.append(job.stage)
         del job_input
         release_memory()
     if watch is not None:
         with part(EVENTS_STAGE):
-            events = make_events(opened, prefix, new_channels, watch)
-        new_channels |= events
+            events = make_events(opened, prefix, results, watch)
+        results |= events
         report.frames |= {topic: channel.size() for topic, channel in events.items()}
         report.events = tally(events)
         report.stages += [EVENTS_STAGE] if events else []
     if zones is not None:
         with part(ZONES_STAGE):
-            counted = make_zones(opened, prefix, new_channels, planes or (), zones, stamps)
-        new_channels |= counted
+            counted = make_zones(opened, prefix, results, planes or (), zones, stamps)
+        results |= counted
         report.frames |= {topic: channel.size() for topic, channel in counted.items()}
         report.stages += [ZONES_STAGE] if counted else []
         report.has_zones = True
-    gone = _gone(opened, jobs, new_channels)
-    if new_channels or output is not None:
+    gone = _gone(opened, jobs, results)
+    if results or output is not None:
         with part("write"):
-            path, _ = path_with(opened, prefix, tracks_topic(prefix), new_channels)
-            write(opened, prefix, new_channels, planes or (), stamps, output, path, boxes.in_space(), gone)
+            path, _ = path_with(opened, prefix, tracks_topic(prefix), results)
+            write(opened, prefix, results, planes or (), stamps, output, path, boxes.in_space(), gone)
             report.is_written = True
-    provenances = {topic: channel.provenance for topic, channel in new_channels.items()}
+    provenances = {topic: channel.provenance for topic, channel in results.items()}
     warn_findings(opened, prefix, provenances, planes or (), is_all=watch is not None or not jobs)
-    late = outdated_by(opened, {topic: channel.provenance.digest for topic, channel in new_channels.items()})
+    late = outdated_by(opened, {topic: channel.provenance.digest for topic, channel in results.items()})
     report.stale = [topic for topic in late if topic not in gone]
     return report
 
 
-def _gone(opened: log.Log, jobs: Sequence[Job], new_channels: Mapping[str, Made]) -> set[str]:
+def _gone(opened: log.Log, jobs: Sequence[Job], results: Mapping[str, Made]) -> set[str]:
     """Return channels that these jobs made earlier and don't make now, and the channels made from those."""
     gone: set[str] = set()
     for job in jobs:
-        if job.kept() & {*new_channels}:
+        if job.kept() & {*results}:
             empty = [
                 topic for topic in job.kept() if topic in opened.channels
             ]  # no rows, no tracks at the video's rate
             gone.update(superseded(opened, job))
             gone.update(topic for topic in empty if may_replace(opened, topic, job.stage))
-    gone -= {*new_channels}
+    gone -= {*results}
     for topic in sorted(opened.channels, key=len):  # what is made of a channel has a longer topic
         provenance = Provenance.from_metadata(opened.channels[topic].metadata)
         if provenance and provenance.transform in (EVENTS_STAGE, ZONES_STAGE, VIEW) and provenance.input in gone:
             gone.add(topic)
-    return gone - {*new_channels}
+    return gone - {*results}
 
 
 def outdated_by(opened: log.Log, digests: Mapping[str, str]) -> list[str]:
@@ -413,7 +413,7 @@ def at_video_rate(
     opened: log.Log,
     prefix: str,
     job: Job,
-    new_channels: Mapping[str, Made],
+    results: Mapping[str, Made],
     retracked: Sequence[Frame],
     planes: Planes,
     path: CameraPath | None,
@@ -424,10 +424,10 @@ def at_video_rate(
     ``carry`` gives these tracks the re-tracked ids. Where the camera moves by ``path``, ``planes`` and the boxes of
     ``retracked`` are those of reference pictures.
     """
-    samples = new_channels[job.source].provenance if job.source in new_channels else provenance_of(opened, job.source)
+    samples = results[job.source].provenance if job.source in results else provenance_of(opened, job.source)
     source = samples.input if samples else ""
-    if source in new_channels:
-        tracks = new_channels[source].frames if new_channels[source].schema is TRACKS else ()
+    if source in results:
+        tracks = results[source].frames if results[source].schema is TRACKS else ()
     else:
         holds_tracks = source in opened.channels and opened.channels[source].schema_name == TRACKS.name
         tracks = opened.frame_columns(source, TRACKS) if holds_tracks else ()
@@ -498,16 +498,16 @@ def _run_job(
     prefix: str,
     job: Job,
     job_input: _Input,
-    new_channels: Mapping[str, Made],
+    results: Mapping[str, Made],
     planes: Planes,
     before: Before | None,
     progress: Progress,
 ) -> dict[str, Made]:
-    """Run a job, and return its channels by topic. ``new_channels`` are the channels of earlier jobs."""
-    side = side_inputs(opened, prefix, job, new_channels)
+    """Run a job, and return its channels by topic. ``results`` are the channels of earlier jobs."""
+    side = side_inputs(opened, prefix, job, results)
     job_input, corrections = job_input.corrected(opened, prefix, job)
     shown = job_input.frames
-    path, motion = path_with(opened, prefix, job.source, new_channels) if job.transform.reads is TRACKS else (None, {})
+    path, motion = path_with(opened, prefix, job.source, results) if job.transform.reads is TRACKS else (None, {})
     if path is not None:  # boxes of pictures that the camera moved between can't be joined as they are
         job_input, planes = job_input.in_scene(path), scene_planes(planes, path)
     if before is None:
@@ -517,7 +517,7 @@ def _run_job(
         frames = led(lead, job_input.frames, job.transform.reads)
         job_input = job_input._replace(stream=frames, frames=frames)
     context = in_context(opened, prefix, job, job_input.frames, planes, job_input.classes)
-    fixed = fixed_in(opened, prefix, job.source, new_channels) if hasattr(context, "fixed_ids") else ()
+    fixed = fixed_in(opened, prefix, job.source, results) if hasattr(context, "fixed_ids") else ()
     transform = replace(context, **side.values, **({"fixed_ids": fixed} if fixed else {}))
     transform = before.in_context(transform) if before and lead else transform
     transform = with_descriptors(transform, opened, prefix, shown, progress, job.keep)
@@ -563,7 +563,7 @@ def _run_job(
     }
     if job.target + FULL in job.kept():
         carry = linked_tracks if traits_of(transform).leaves_unchanged else to_video_rate
-        frames = at_video_rate(opened, prefix, job, new_channels, outputs[0], planes, path, carry)
+        frames = at_video_rate(opened, prefix, job, results, outputs[0], planes, path, carry)
         channels |= {job.target + FULL: (TRACKS, frames)} if frames else {}
     seen: Channels = channels
     if not traits_of(transform).keeps_unseen:
@@ -617,14 +617,14 @@ def _provenance_of(
 def _input(
     opened: log.Log,
     job: Job,
-    new_channels: Mapping[str, Made],
+    results: Mapping[str, Made],
     stamps: dict[str, list[int]],
     progress: Progress,
     boxes: BoxesRead,
     watch: Stopwatch,
 ) -> _Input:
     """Return the input of a job; the capture times of pictures in ns are appended to ``stamps``, by topic."""
-    if job.source not in new_channels and job.transform.reads is VIDEO:
+    if job.source not in results and job.transform.reads is VIDEO:
         seen = stamps.setdefault(job.source, [])
         damaged: list[int] = []
         digest, pictures = pictures_of(opened, job, seen, damaged)
@@ -632,8 +632,8 @@ def _input(
         numbers = count(1)
         each = _Repeatable(lambda: _counted(watch.each("decode", pictures), numbers, steps, job.stage, progress))
         return _Input(each, [], digest, lambda: len(seen), damaged=damaged)
-    if job.source in new_channels:
-        frames, how = new_channels[job.source].frames, new_channels[job.source].provenance
+    if job.source in results:
+        frames, how = results[job.source].frames, results[job.source].provenance
         of_rows, names, frame_id = how.digest, class_names(how.to_metadata()), how.frame_id
     else:
         frames, names, frame_id = read_named_frames(opened, job.source, job.transform.reads, job.frame_id, boxes)

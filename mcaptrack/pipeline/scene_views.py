@@ -176,14 +176,14 @@ def _standing(view: CameraView, xy_m: Floats, t_ns: Ints) -> Floats:
 
 
 def scene_on_pictures(
-    opened: log.Log, prefix: str, new_channels: Mapping[str, tuple[Sequence[Frame], Provenance]]
+    opened: log.Log, prefix: str, results: Mapping[str, tuple[Sequence[Frame], Provenance]]
 ) -> SceneOnPictures:
     """The scene below ``prefix`` and its cameras with pictures; no cameras if it is no scene.
 
-    ``new_channels`` are the frames and the provenance of channels that are not written yet, by topic.
+    ``results`` are the frames and the provenance of channels that are not written yet, by topic.
     """
     target = f"{prefix}/{STAGES['detect'].output_topic}"
-    how = new_channels[target][1] if target in new_channels else provenance_of(opened, target)
+    how = results[target][1] if target in results else provenance_of(opened, target)
     if how is None or how.transform != FUSE:
         return SceneOnPictures((), (), ())
     scene_cameras = []
@@ -202,7 +202,7 @@ def scene_on_pictures(
         return SceneOnPictures((), (), ())
     parts = {target: DETECTIONS, f"{target}/sightings": SIGHTINGS}
     frames = [
-        new_channels[topic][0] if topic in new_channels else opened.frame_columns(topic, schema)
+        results[topic][0] if topic in results else opened.frame_columns(topic, schema)
         for topic, schema in parts.items()
     ]
     return SceneOnPictures(frames[0], frames[1], scene_cameras)

@@ -180,7 +180,7 @@ def highest_values(prefix: str, frames_of: Callable[[str, Schema], Sequence[Fram
 def write(
     opened: log.Log,
     prefix: str,
-    new_channels: Mapping[str, Made],
+    results: Mapping[str, Made],
     planes: Planes,
     stamps: Mapping[str, Sequence[int]],
     output: Path | None,
@@ -195,11 +195,11 @@ def write(
     ``boxes`` are recorded boxes in space that this run has read, by topic; those that viewers don't draw get a view.
 
     ``path`` is how the camera moves, if its tracks are compensated for it: so are views, and ``planes`` with it.
-    ``new_channels`` and ``stamps``, the capture times in ns of pictures that stages have read, are by topic.
+    ``results`` and ``stamps``, the capture times in ns of pictures that stages have read, are by topic.
     """
     camera = camera_at(opened, prefix)
     video, picture_ns, stamp_ns = picture_clock(opened, prefix, stamps)
-    shown = _channels_to_draw(opened, camera, new_channels) | _boxes_to_draw(opened, boxes)
+    shown = _channels_to_draw(opened, camera, results) | _boxes_to_draw(opened, boxes)
     outdated = {topic + suffix for topic in shown for suffix in views.SUFFIXES}
     planes = moved_planes(planes, path)
     frame_id = _frame_id(opened, prefix, shown)
@@ -215,7 +215,7 @@ def write(
         if recorded_topic.startswith(f"{topic}{views.SUFFIX}/")
     }
     scene = scene_on_pictures(
-        opened, prefix, {topic: (channel.frames, channel.provenance) for topic, channel in new_channels.items()}
+        opened, prefix, {topic: (channel.frames, channel.provenance) for topic, channel in results.items()}
     )
     seen_on = (*cameras, *(camera_seen.pictures for camera_seen in scene.cameras))
     outdated |= {topic + views.SUFFIX + pictures for topic in shown for pictures in seen_on}
@@ -234,18 +234,16 @@ def write(
         _last_step(opened, prefix, shown_or_gone),
         _is_truth_known(opened, prefix, shown_or_gone),
     )
-    sources = recorded_sources(
-        opened, [*camera.topics, *(channel.provenance.input for channel in new_channels.values())]
-    )
+    sources = recorded_sources(opened, [*camera.topics, *(channel.provenance.input for channel in results.values())])
     follow = robot_frame(opened, sources, tree, frame_id) if tree and frame_id else ""
     by_viewers = recorded_drawings(opened, sources) if frame_id else {}
     floor_m = _floor_m(opened, prefix, shown_or_gone) if frame_id else 0.0
     highest = highest_values(prefix, lambda topic, schema: _frames(opened, shown_or_gone, topic, schema))
     # Write views of unchanged channels first, so that channels made again keep their place and the log its bytes.
-    first, last = ({t: c for t, c in shown.items() if (t in new_channels) is is_made} for is_made in (False, True))
+    first, last = ({t: c for t, c in shown.items() if (t in results) is is_made} for is_made in (False, True))
     drawn_first = [view for view in drawn.views(first, start_ns) if view.topic not in recorded]
     drawn_last = [view for view in drawn.views(last, start_ns) if view.topic not in recorded]
-    topics = {*opened.channels} - outdated | {*new_channels} | {view.topic for view in (*drawn_first, *drawn_last)}
+    topics = {*opened.channels} - outdated | {*results} | {view.topic for view in (*drawn_first, *drawn_last)}
     by_viewers |= {source + views.SCENE_SUFFIX: True for source in sources if source + views.SCENE_SUFFIX in topics}
     names = frozenset(topic.removeprefix(prefix + "/") for topic in topics if topic.startswith(prefix + "/"))
     frame_id = frame_id or views.ground.frame_of(prefix)
@@ -257,11 +255,11 @@ def write(
     new = {attachment_of(name): content for name, content in layout_files.items()}
     unchanged = {name for name, content in new.items() if opened.attachment(name) == content}
     replaced = [name for name in ATTACHMENTS if name not in unchanged]
-    new_topics = {*new_channels, *outdated, *(view.topic for view in (*drawn_first, *drawn_last))}
+    new_topics = {*results, *outdated, *(view.topic for view in (*drawn_first, *drawn_last))}
     log.refuse_to_replace_recorded(opened, new_topics, "write to another channel")
     encoding = encoding_for(opened)
-    check_topics({*new_channels, *(view.topic for view in (*drawn_first, *drawn_last))}, encoding)
-    with log.extend(opened, output, drop={*new_channels, *outdated}, drop_attachments=replaced) as writer:
+    check_topics({*results, *(view.topic for view in (*drawn_first, *drawn_last))}, encoding)
+    with log.extend(opened, output, drop={*results, *outdated}, drop_attachments=replaced) as writer:
         streams: list[Iterator[Numbered]] = []
 
         def add_views(some: Iterable[View]) -> None:
@@ -272,7 +270,7 @@ def write(
                 streams.append(_with_number(number, foxglove.messages_in(view.schema_name, view.messages, encoding)))
 
         add_views(drawn_first)
-        for topic, channel in new_channels.items():
+        for topic, channel in results.items():
             made_by = channel.provenance.transform  # outputs of a stage are dropped together: they share chunks
             record, metadata = channel.record_in(encoding), channel.provenance.to_metadata()
             number = writer.add_channel(topic, record, encoding, metadata, group=made_by)
@@ -285,16 +283,16 @@ def write(
     return layout_files
 
 
-def _channels_to_draw(opened: log.Log, camera: Camera, new_channels: Mapping[str, Made]) -> dict[str, ChannelToDraw]:
+def _channels_to_draw(opened: log.Log, camera: Camera, results: Mapping[str, Made]) -> dict[str, ChannelToDraw]:
     """Return the channels that get views, by topic: those of this run, and ingested ones without a current view."""
     shown = {
         topic: ChannelToDraw(
             channel.schema, channel.frames, how.digest, how.transform, class_names(how.to_metadata()), how.frame_id
         )
-        for topic, channel in new_channels.items()
+        for topic, channel in results.items()
         for how in (channel.provenance,)
     }
-    inputs = {topic: channel.provenance.input for topic, channel in new_channels.items()}
+    inputs = {topic: channel.provenance.input for topic, channel in results.items()}
     for topic, channel in sorted(opened.channels.items()):
         schema = SCHEMAS.get(channel.schema_name)
         provenance = Provenance.from_metadata(channel.metadata)

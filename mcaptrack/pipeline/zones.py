@@ -81,14 +81,14 @@ def outputs(topic: str) -> tuple[str, ...]:
 def make_zones(
     opened: log.Log,
     prefix: str,
-    new_channels: Mapping[str, Made],
+    results: Mapping[str, Made],
     planes: Planes,
     watch: ZoneWatch,
     stamps: Mapping[str, Sequence[int]] = {},
 ) -> dict[str, Made]:
     """Count the zones of channels of tracks that are not counted yet, or that have changed since.
 
-    ``new_channels`` and ``stamps`` are as for ``write``. Returns the channels that it makes by topic. Raises
+    ``results`` and ``stamps`` are as for ``write``. Returns the channels that it makes by topic. Raises
     McaptrackError for given topics that hold no tracks, and for zones that none of the tracks can be compared with.
     """
     before = _before(opened, prefix)
@@ -97,7 +97,7 @@ def make_zones(
         return {}
     options = watch.options or (before.options if before.options else ZoneOptions())
     zones = _of_camera(opened, prefix, zones, is_given=bool(watch.zones))
-    topics = watch.topics or _default_topics(opened, prefix, new_channels, before)
+    topics = watch.topics or _default_topics(opened, prefix, results, before)
     if not topics:
         if not watch.zones:
             return {}
@@ -105,11 +105,11 @@ def make_zones(
     out: dict[str, Made] = {}
     faults: list[McaptrackError] = []
     for topic in topics:
-        if not _has_tracks(opened, topic, new_channels):
+        if not _has_tracks(opened, topic, results):
             schema_name = opened.channel(topic).schema_name  # raises if there is no such channel
             raise McaptrackError(f"{opened.path}: {topic} holds {schema_name or 'no schema'}, not tracks")
         wanted = _parameters(zones, options, planes)
-        if not watch.force and not _is_due(opened, topic, new_channels, wanted):
+        if not watch.force and not _is_due(opened, topic, results, wanted):
             continue
         taken = [
             output
@@ -124,7 +124,7 @@ def make_zones(
             continue
         try:
             pictures = picture_clock(opened, prefix, stamps)
-            out |= _counted(opened, prefix, topic, new_channels, planes, zones, options, wanted, pictures)
+            out |= _counted(opened, prefix, topic, results, planes, zones, options, wanted, pictures)
         except McaptrackError as error:
             faults.append(error)
     if faults and (not out or watch.topics) and watch.zones:
@@ -138,7 +138,7 @@ def _counted(
     opened: log.Log,
     prefix: str,
     topic: str,
-    new_channels: Mapping[str, Made],
+    results: Mapping[str, Made],
     planes: Planes,
     zones: Sequence[Zone],
     options: ZoneOptions,
@@ -146,28 +146,22 @@ def _counted(
     pictures: PictureClock,
 ) -> dict[str, Made]:
     """Count the zones of one channel of tracks, and return the new channels by topic."""
-    source = new_channels[topic].provenance.digest if topic in new_channels else digest_of(opened, topic)
+    source = results[topic].provenance.digest if topic in results else digest_of(opened, topic)
     frames: Sequence[Frame]
     if topic == camera_at(opened, prefix).truth:
-        frames = ground_truth_with(opened, prefix, new_channels)
+        frames = ground_truth_with(opened, prefix, results)
     else:
-        frames = new_channels[topic].frames if topic in new_channels else opened.frame_columns(topic, TRACKS)
-    path, motion = path_with(opened, prefix, topic, new_channels)
+        frames = results[topic].frames if topic in results else opened.frame_columns(topic, TRACKS)
+    path, motion = path_with(opened, prefix, topic, results)
     still = scene_planes(planes, path)
     placed: list[PlacedZone] = [place_zone(zone, still) for zone in zones]
-    positions = positions_of(frames, still, path, _class_names(opened, topic, new_channels))
+    positions = positions_of(frames, still, path, _class_names(opened, topic, results))
     zone_events = find_zone_events(frames, positions, placed, options, topic)
     for note in zone_events.notes:
         warn(note, "not-compared")
     names = {str(zone.number): zone.name for zone in zones}
     provenance = Provenance(
-        STAGE,
-        parameters,
-        topic,
-        source,
-        references=motion,
-        zones=names,
-        frame_id=_frame_id(opened, topic, new_channels),
+        STAGE, parameters, topic, source, references=motion, zones=names, frame_id=_frame_id(opened, topic, results)
     )
     rows = (zone_events.visits, zone_events.crossings, zone_events.counts)
     out = {
@@ -272,11 +266,11 @@ def _of_camera(opened: log.Log, prefix: str, zones: tuple[Zone, ...], is_given: 
     return kept
 
 
-def _default_topics(opened: log.Log, prefix: str, new_channels: Mapping[str, Made], before: _Before) -> tuple[str, ...]:
+def _default_topics(opened: log.Log, prefix: str, results: Mapping[str, Made], before: _Before) -> tuple[str, ...]:
     full = f"{prefix}/retracks{FULL}"
-    retracked = full if _has_tracks(opened, full, new_channels) else f"{prefix}/retracks"
+    retracked = full if _has_tracks(opened, full, results) else f"{prefix}/retracks"
     usual = (f"{prefix}/tracks", retracked, camera_at(opened, prefix).truth)
-    return tuple(topic for topic in dict.fromkeys((*usual, *before.topics)) if _has_tracks(opened, topic, new_channels))
+    return tuple(topic for topic in dict.fromkeys((*usual, *before.topics)) if _has_tracks(opened, topic, results))
 
 
 def _parameters(zones: Sequence[Zone], options: ZoneOptions, planes: Planes) -> dict[str, Any]:
@@ -285,7 +279,7 @@ def _parameters(zones: Sequence[Zone], options: ZoneOptions, planes: Planes) -> 
     return values | ({"ground_planes": planes_to_json(planes)} if planes else {})
 
 
-def _is_due(opened: log.Log, topic: str, new_channels: Mapping[str, Made], wanted: Mapping[str, Any]) -> bool:
+def _is_due(opened: log.Log, topic: str, results: Mapping[str, Made], wanted: Mapping[str, Any]) -> bool:
     """Whether zones were not counted yet, were counted with other parameters, or are out of date."""
     names = outputs(topic)[: len(_SCHEMAS) + 1]
     if not all(name in opened.channels for name in names) or is_stale(opened, names[0]):
@@ -294,8 +288,7 @@ def _is_due(opened: log.Log, topic: str, new_channels: Mapping[str, Made], wante
     if provenance is None or not _is_same(provenance.parameters, wanted):
         return True
     return any(
-        name in new_channels and new_channels[name].provenance.digest != then
-        for name, then in provenance.made_from().items()
+        name in results and results[name].provenance.digest != then for name, then in provenance.made_from().items()
     )
 
 
@@ -306,22 +299,22 @@ def _is_same(before: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
     return zones_to_json(zones) == wanted["zones"] and rest[0] == rest[1]
 
 
-def _class_names(opened: log.Log, topic: str, new_channels: Mapping[str, Made]) -> dict[int, str]:
+def _class_names(opened: log.Log, topic: str, results: Mapping[str, Made]) -> dict[int, str]:
     """The names of the classes of tracks."""
-    if topic in new_channels:
-        return {int(number): name for number, name in new_channels[topic].provenance.classes.items()}
+    if topic in results:
+        return {int(number): name for number, name in results[topic].provenance.classes.items()}
     return class_names(opened.channel(topic).metadata)
 
 
-def _frame_id(opened: log.Log, topic: str, new_channels: Mapping[str, Made]) -> str:
+def _frame_id(opened: log.Log, topic: str, results: Mapping[str, Made]) -> str:
     """The frame of the metres of tracks."""
-    if topic in new_channels:
-        return new_channels[topic].provenance.frame_id
+    if topic in results:
+        return results[topic].provenance.frame_id
     return frame_id_of(opened.channel(topic).metadata)
 
 
-def _has_tracks(opened: log.Log, topic: str, new_channels: Mapping[str, Made]) -> bool:
-    return new_channels[topic].schema is TRACKS if topic in new_channels else _holds(opened, topic, TRACKS)
+def _has_tracks(opened: log.Log, topic: str, results: Mapping[str, Made]) -> bool:
+    return results[topic].schema is TRACKS if topic in results else _holds(opened, topic, TRACKS)
 
 
 def _holds(opened: log.Log, topic: str, schema: Schema) -> bool:
