@@ -93,12 +93,10 @@ def frames_of_columns(columns: dict[str, Any], schema: Schema | None) -> tuple[S
     if "t_ns" not in columns:
         raise McaptrackError(f"the table has no column t_ns (times in nanoseconds); it has {', '.join(columns)}")
     schema = schema or (TRACKS if "track_id" in columns else DETECTIONS)
-    column_names = {column.name for column in schema.columns}
-    strange = sorted(set(columns) - column_names - set(_BESIDE))
+    own = {column.name for column in schema.columns}
+    strange = sorted(set(columns) - own - set(_BESIDE))
     if strange:
-        raise McaptrackError(
-            f"{schema.name} has no column {', '.join(strange)}; it has {', '.join(sorted(column_names))}"
-        )
+        raise McaptrackError(f"{schema.name} has no column {', '.join(strange)}; it has {', '.join(sorted(own))}")
     for name in ("topic", "recording"):
         different = sorted({str(value) for value in columns.get(name, ())})
         if len(different) > 1:
@@ -109,9 +107,7 @@ def frames_of_columns(columns: dict[str, Any], schema: Schema | None) -> tuple[S
     t_ns = times_of(columns["t_ns"], "the column t_ns")
     if len(t_ns):
         time_of(t_ns.min())
-    rows = _rows(
-        schema, {name: values for name, values in columns.items() if name in column_names}, len(t_ns), "the table"
-    )
+    rows = _rows(schema, {name: values for name, values in columns.items() if name in own}, len(t_ns), "the table")
     numbers = _numbers(columns["frame"]) if "frame" in columns else np.full(len(t_ns), UNNUMBERED)
     order = np.lexsort((numbers, t_ns))
     begins = np.flatnonzero((np.diff(t_ns[order]) != 0) | (np.diff(numbers[order]) != 0)) + 1
@@ -119,11 +115,9 @@ def frames_of_columns(columns: dict[str, Any], schema: Schema | None) -> tuple[S
     return schema, [Frame(int(t_ns[part[0]]), int(numbers[part[0]]), rows[part]) for part in parts]
 
 
-def _rows(schema: Schema, values_by_name: Mapping[str, Any], count: int, where: str) -> Rows:
+def _rows(schema: Schema, inputs: Mapping[str, Any], count: int, where: str) -> Rows:
     """Return the rows of columns; columns with a default may be left out."""
-    columns = {
-        name: _whole(values) if schema.dtype[name].kind in "iu" else values for name, values in values_by_name.items()
-    }
+    columns = {name: _whole(values) if schema.dtype[name].kind in "iu" else values for name, values in inputs.items()}
     if schema is TRACKS:
         columns.setdefault("observed", np.ones(count, bool))
         columns.setdefault("source_id", np.full(count, -1))

@@ -185,9 +185,7 @@ def words_of(function: Callable[..., Any]) -> Words:
     for block in re.split(r"^(?=\S)", sections.get("Parameters", ""), flags=re.M):
         names, _, lines = block.partition("\n")
         for name in names.partition(" : ")[0].split(", "):
-            parameters[name.lstrip("*")] = [
-                " ".join(paragraph.split()) for paragraph in inspect.cleandoc(lines).split("\n\n")
-            ]
+            parameters[name.lstrip("*")] = [" ".join(part.split()) for part in inspect.cleandoc(lines).split("\n\n")]
     return Words(text.strip(), parameters, re.findall(r"^ +(mcaptrack .+)$", sections.get("Examples", ""), re.M))
 
 

@@ -290,12 +290,8 @@ def _of_frames(rows: Any, schema: Schema | None, names: dict[int, str]) -> tuple
         raise McaptrackError(f"rows are frames, an array, a table or supervision.Detections, not {kind_of(rows)}")
     frames = [_frame(item, schema, names) for item in (rows.items() if hasattr(rows, "items") else rows)]
     if schema is None:
-        column_names = {frame.rows.dtype.names for frame in [frame for frame in frames if len(frame.rows)] or frames}
-        fitting = [
-            candidate
-            for candidate in (DETECTIONS, TRACKS)
-            if column_names and all(map(candidate.has_columns, column_names))
-        ]
+        layouts = {frame.rows.dtype.names for frame in [frame for frame in frames if len(frame.rows)] or frames}
+        fitting = [kind for kind in (DETECTIONS, TRACKS) if layouts and all(map(kind.has_columns, layouts))]
         if not fitting:
             raise McaptrackError(
                 "it is not clear whether these are detections or tracks; all frames have to be of one kind, and "

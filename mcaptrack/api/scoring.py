@@ -420,15 +420,13 @@ def _smoothed(opened: logs.Log, prefix: str) -> Candidate:
     samples, forecasts = (f"{prefix}/{name}" for name in (stage.input_topic, stage.output_topic))
     if forecasts not in opened.channels or samples not in opened.channels:
         raise McaptrackError(f"{opened.path} has no {forecasts}; {call('run', opened.path)} makes them")
-    provenance = Provenance.from_metadata(opened.channel(forecasts).metadata)
-    transform = (
-        rebuild(stage, provenance, {}) if provenance is not None and provenance.transform == stage.name else None
-    )
-    if provenance is None or not isinstance(transform, Predict):
+    how = Provenance.from_metadata(opened.channel(forecasts).metadata)
+    transform = rebuild(stage, how, {}) if how is not None and how.transform == stage.name else None
+    if how is None or not isinstance(transform, Predict):
         raise McaptrackError(f"{forecasts} of {opened.path} is recorded: how it was predicted is not known")
     names = class_names(opened.channel(samples).metadata)
     class_of = tuple(names.items())
-    rate_hz = float(provenance.parameters.get("rate_hz", transform.rate_hz))
+    rate_hz = float(how.parameters.get("rate_hz", transform.rate_hz))
     frames = opened.frames(samples, TRACKS)
     predictions = list(smoothed_predictions(frames, replace(transform, rate_hz=rate_hz, class_names=class_of)))
     name = f"{samples}, smoothed"

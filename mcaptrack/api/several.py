@@ -192,7 +192,7 @@ class _Steps:
 def unfitting(
     opened: logs.Log, prefix: str, transforms: Mapping[str, Transform], say: Callable[[str], None]
 ) -> set[str]:
-    """Return the stages whose transform can't take the boxes of this camera or scene.
+    """Return the stages with a transform that can't take the boxes of this camera or scene.
 
     A tracker that is named is for the cameras, or for the scene: of boxes in pictures, or of positions in metres.
     """

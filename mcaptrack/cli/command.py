@@ -37,14 +37,12 @@ def usage_in_one_line(command: str = "") -> Iterator[None]:
         yield
     except _UsageError as error:
         error.message = _message(error)
-        message = " ".join(error.format_message().replace("Value error, ", "").rstrip(".").split())
+        text = " ".join(error.format_message().replace("Value error, ", "").rstrip(".").split())
         if hasattr(error, "possibilities"):
-            message = _unknown_option(error)
+            text = _unknown_option(error)
         page = " ".join(filter(None, ["mcaptrack", command, "--help"]))
-        end = "" if message.endswith("?") else ";"
-        refuse_usage(
-            f"{message[:1].lower()}{message[1:]}{end} `{page}` lists the {'options' if command else 'commands'}"
-        )
+        end = "" if text.endswith("?") else ";"
+        refuse_usage(f"{text[:1].lower()}{text[1:]}{end} `{page}` lists the {'options' if command else 'commands'}")
 
 
 def _message(error: Any) -> str:

@@ -90,12 +90,10 @@ def zones(
     if str(logs[0]) == _DRAW and len(logs) == 1 and not Path(_DRAW).exists():
         raise McaptrackError("`zones draw` needs a log: name it after draw")
     if str(logs[0]) == _DRAW and len(logs) > 1:
-        unused_options = {"--zones": zones, "--topic": topic, "--margin-m": margin_m, "--max-gap-s": max_gap_s}
-        unused_options |= {"--sidecar": sidecar}
-        if len(logs) > 2 or any(value is not None for value in unused_options.values()):
-            unused = next(
-                (name for name, value in unused_options.items() if value is not None), f"another log ({logs[-1]})"
-            )
+        extra = {"--zones": zones, "--topic": topic, "--margin-m": margin_m, "--max-gap-s": max_gap_s}
+        extra |= {"--sidecar": sidecar}
+        if len(logs) > 2 or any(value is not None for value in extra.values()):
+            unused = next((name for name, value in extra.items() if value is not None), f"another log ({logs[-1]})")
             raise McaptrackError(f"`zones draw` takes one log, --camera, --output and --force, not {unused}")
         page = mcaptrack.draw_zones(logs[1], camera=camera, output=output, force=force)
         if json:
@@ -167,23 +165,12 @@ def print_zones(result: RunResult) -> None:
             table.add_column(name, justify="left" if place < 2 else "right", overflow="fold")
         for name, _ in (pair for pair in names if pair[1] == is_line):
             for topic, totals in result.zones.items():
-                totals_of_zone = next(
-                    (total for total in totals if (total.zone, total.is_line) == (name, is_line)), None
-                )
-                if totals_of_zone is None:
+                counts = next((total for total in totals if (total.zone, total.is_line) == (name, is_line)), None)
+                if counts is None:
                     continue
-                stay = "" if totals_of_zone.mean_dwell_s is None else f"{totals_of_zone.mean_dwell_s:.1f} s"
-                of_zone = (
-                    totals_of_zone.visits,
-                    totals_of_zone.entered,
-                    totals_of_zone.left,
-                    stay,
-                    totals_of_zone.most_inside,
-                )
-                cells = (
-                    totals_of_zone.tracks,
-                    *((totals_of_zone.forward, totals_of_zone.backward) if is_line else of_zone),
-                )
+                stay = "" if counts.mean_dwell_s is None else f"{counts.mean_dwell_s:.1f} s"
+                of_zone = (counts.visits, counts.entered, counts.left, stay, counts.most_inside)
+                cells = (counts.tracks, *((counts.forward, counts.backward) if is_line else of_zone))
                 table.add_row(name, topic, *map(str, cells))
         if table.row_count:
             console().print(table)

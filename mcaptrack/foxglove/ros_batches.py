@@ -211,7 +211,7 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
 
 
 class Batches:
-    """Converts messages of one type, whose ``fields`` are lists of messages, and times."""
+    """Converts messages of a type that has only these ``fields``: lists of messages, and times."""
 
     @staticmethod
     def take(fields: Mapping[int, FieldType]) -> bool:

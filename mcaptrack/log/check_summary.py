@@ -181,20 +181,15 @@ class _Checker:
             self._find("chunk-not-listed", int(ours.offsets[missing].min()), text, times=int(missing.sum()))
 
     def _compare_statistics(self, reader: Reader, summary: Index, where: int) -> None:
-        data_index = self._found
-        loose = [
-            sum(data_index.counts.values()),
-            len(data_index.schemas),
-            len(data_index.channels),
-            len(data_index.attachments),
-        ]
-        actual = [*loose, len(data_index.metadata), len(data_index.chunks), data_index.start_ns, data_index.end_ns]
+        ours = self._found
+        loose = [sum(ours.counts.values()), len(ours.schemas), len(ours.channels), len(ours.attachments)]
+        actual = [*loose, len(ours.metadata), len(ours.chunks), ours.start_ns, ours.end_ns]
         for (name, size), number in zip(_STATISTICS.items(), actual, strict=True):
             value = reader.number(size)
             only_described = name in ("schemas", "channels") and value == len(getattr(summary, name))
             if value != number and not only_described:
                 self._find("statistics", where, f"the statistics say {value} for {name}; it is {number}")
-        if {n: count for n, count in summary.counts.items() if count} != data_index.counts:
+        if {n: count for n, count in summary.counts.items() if count} != ours.counts:
             self._find("statistics-counts", where, "the statistics have a wrong number of messages for a channel")
 
     def _compare_offsets(self, start: int, end: int, groups: Mapping[int, tuple[int, int, int]]) -> None:

@@ -294,19 +294,11 @@ def _scan_chunk(index: Index, buffer: Bytes, record: Record) -> None:
 
 def attachment_entry(buffer: Bytes, record: Record, offset: int) -> SummaryEntry:
     """The summary entry of an attachment at ``offset`` of a file."""
-    attachment = records.read_attachment(buffer, record)
-    numbers = (
-        offset,
-        record.end - record.start,
-        attachment.log_ns,
-        attachment.create_ns,
-        attachment.end - attachment.start,
-    )
+    head = records.read_attachment(buffer, record)
+    numbers = (offset, record.end - record.start, head.log_ns, head.create_ns, head.end - head.start)
     packed = b"".join(records.number(value, 8) for value in numbers)
-    index = records.pack(
-        Opcode.ATTACHMENT_INDEX, packed, records.text(attachment.name), records.text(attachment.media_type)
-    )
-    return SummaryEntry(attachment.name, offset, index)
+    index = records.pack(Opcode.ATTACHMENT_INDEX, packed, records.text(head.name), records.text(head.media_type))
+    return SummaryEntry(head.name, offset, index)
 
 
 def metadata_entry(buffer: Bytes, record: Record, offset: int) -> SummaryEntry:

@@ -336,11 +336,9 @@ class _Recovery:
             numbers = (first, last, head.uncompressed_size, head.uncompressed_crc)
             whole = records.pack_chunk(numbers, head.compression, bytes(self._buffer[head.start : head.end]))
         sizes = (head.compression, head.end - head.start, head.uncompressed_size)
-        chunk_index_record = ChunkIndexRecord(first, last, 0, len(whole), {}, 0, *sizes)
+        entry = ChunkIndexRecord(first, last, 0, len(whole), {}, 0, *sizes)
         self._saved.update({number: len(listed) for number, listed in entries.items()})
-        self._writer.copy_chunk(
-            whole, chunk_index_record, {number: listed.tobytes() for number, listed in entries.items()}
-        )
+        self._writer.copy_chunk(whole, entry, {number: listed.tobytes() for number, listed in entries.items()})
 
     def _describe(self, record: Record) -> None:
         if record.opcode == Opcode.SCHEMA:

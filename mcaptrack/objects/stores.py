@@ -47,7 +47,7 @@ def store_of(url: Url) -> Any:
 def _made_store(scheme: str, bucket: str, settings: tuple[tuple[str, str], ...]) -> Any:
     from obstore.store import AzureStore, GCSStore, S3Store
 
-    environment = dict(settings)
+    env = dict(settings)
     common: dict[str, Any] = {
         "client_options": {
             "connect_timeout": timedelta(seconds=_CONNECT_S),
@@ -64,16 +64,12 @@ def _made_store(scheme: str, bucket: str, settings: tuple[tuple[str, str], ...])
         return GCSStore(bucket, **common)
     if scheme == "az":
         return AzureStore(bucket, **common)
-    config: Any = _of_profile(environment)
-    if (
-        endpoint := environment.get("AWS_ENDPOINT_URL_S3")
-        or environment.get("AWS_ENDPOINT_URL")
-        or config.get("endpoint")
-    ):
+    config: Any = _of_profile(env)
+    if endpoint := env.get("AWS_ENDPOINT_URL_S3") or env.get("AWS_ENDPOINT_URL") or config.get("endpoint"):
         config["endpoint"] = endpoint
         common["client_options"]["allow_http"] = endpoint.startswith("http://")
-    if not environment.get("AWS_REGION") and environment.get("AWS_DEFAULT_REGION"):
-        config["region"] = environment["AWS_DEFAULT_REGION"]
+    if not env.get("AWS_REGION") and env.get("AWS_DEFAULT_REGION"):
+        config["region"] = env["AWS_DEFAULT_REGION"]
     return S3Store(bucket, config=config, **common)
 
 

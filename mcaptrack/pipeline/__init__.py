@@ -100,22 +100,18 @@ def choose_cameras(opened: log.Log, names: Sequence[str] = ()) -> ChosenCameras 
     McaptrackError if no camera has anything to begin with, and for names that the log doesn't have, or that can't be
     run.
     """
-    all_cameras, scenes = cameras(opened), scenes_of(opened)
+    every, scenes = cameras(opened), scenes_of(opened)
     if names:
-        by_name = {name.strip("/"): camera for camera in all_cameras for name in camera.names}
+        named = {name.strip("/"): camera for camera in every for name in camera.names}
         for name in names:
-            if name.strip("/") not in by_name:
-                raise McaptrackError(
-                    f"{opened.path} has no camera {name}; it has {', '.join(sorted(by_name)) or 'none'}"
-                )
-        wanted = list(dict.fromkeys(by_name[name.strip("/")] for name in names))
+            if name.strip("/") not in named:
+                raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(named)) or 'none'}")
+        wanted = list(dict.fromkeys(named[name.strip("/")] for name in names))
         wanted_scenes = tuple(camera.prefix for camera in wanted if camera.prefix in scenes)
         wanted = [camera for camera in wanted if camera.prefix not in scenes]
     else:
         wanted_scenes = ()
-        wanted = [
-            camera for camera in all_cameras if camera.prefix not in scenes and not _is_truth_of_scene(opened, camera)
-        ]
+        wanted = [camera for camera in every if camera.prefix not in scenes and not _is_truth_of_scene(opened, camera)]
         wanted = [camera for camera in wanted if not camera.in_space or has_own_channels(opened, camera)] or wanted
         if len(wanted) + len(scenes) < 2 or all(camera.in_space for camera in wanted):
             return None

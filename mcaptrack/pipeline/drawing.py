@@ -248,15 +248,11 @@ class ViewFactory:
                 seen = drawing.on_camera(camera, channel.bodies)
                 yield View(topic + views.SUFFIX + pictures, foxglove.ANNOTATIONS, made_from, group, seen)
             if self._scene is not None and channel.schema is not DETECTIONS:
-                for scene_camera in self._scene.cameras:
-                    rows, planes = self._scene.on_camera(
-                        scene_camera, channel.schema, frames, is_true=not channel.made_by
-                    )
+                for member in self._scene.cameras:
+                    rows, planes = self._scene.on_camera(member, channel.schema, frames, is_true=not channel.made_by)
                     on_picture = views.Drawing(topic, channel.schema, rows, planes, is_retracked, names)
-                    seen = on_picture.on_pictures(scene_camera.clock.t_ns, scene_camera.clock.stamp_ns)
-                    yield View(
-                        topic + views.SUFFIX + scene_camera.pictures, foxglove.ANNOTATIONS, made_from, group, seen
-                    )
+                    seen = on_picture.on_pictures(member.clock.t_ns, member.clock.stamp_ns)
+                    yield View(topic + views.SUFFIX + member.pictures, foxglove.ANNOTATIONS, made_from, group, seen)
             if channel.is_on_ground():
                 own_ns = frame_times(channel.frames)
                 t_ns = self._picture_ns if len(self._picture_ns) and not is_solid else own_ns

@@ -145,9 +145,7 @@ def _forecast_errors(
         warn(f"no errors of {topic}: they would replace {conflict}", "left-out")
         return {}
     forecasts, digest_of_forecasts = _rows(opened, topic, results, PREDICTIONS)
-    (history, of_tracks), (offline, of_later) = (
-        _rows(opened, topic_of_tracks, results) for topic_of_tracks in (tracks, later)
-    )
+    (history, of_tracks), (offline, of_later) = (_rows(opened, each, results) for each in (tracks, later))
     try:
         forecast_errors = find_forecast_errors(forecasts, history, truth().frames, offline, topic)
     except McaptrackError as error:

@@ -182,14 +182,12 @@ def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: st
 _STAGE: Final = "sample"
 
 
-def are_new(opened: log.Log, prefix: str, provenance: Provenance) -> bool:
+def are_new(opened: log.Log, prefix: str, how: Provenance) -> bool:
     """Whether samples were made before their tracks had corrections."""
     corrections = (
-        corrections_of(opened, camera_at(opened, prefix).prefix, provenance.input)
-        if provenance.transform == _STAGE
-        else None
+        corrections_of(opened, camera_at(opened, prefix).prefix, how.input) if how.transform == _STAGE else None
     )
-    return corrections is not None and corrections not in provenance.references
+    return corrections is not None and corrections not in how.references
 
 
 def corrected_input(
@@ -411,12 +409,10 @@ class _Planner:
         for job in self.jobs:
             if topic in job.outputs():
                 return job.transform
-        provenance = provenance_of(self._opened, topic)
-        if provenance and provenance.transform == FUSE:
-            return fuser_of(provenance)[0]
-        return (
-            self._before(provenance.transform, provenance)[0] if provenance and provenance.transform in STAGES else None
-        )
+        how = provenance_of(self._opened, topic)
+        if how and how.transform == FUSE:
+            return fuser_of(how)[0]
+        return self._before(how.transform, how)[0] if how and how.transform in STAGES else None
 
     def _is_made_by_another(self, topic: str) -> bool:
         """Return whether this run makes a channel by another class of transforms than before."""

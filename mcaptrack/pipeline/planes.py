@@ -94,7 +94,7 @@ class PlaneChoice(NamedTuple):
         return (bool(self.estimate) and is_untried) or self.settled(provenance) != AS_BEFORE.settled(provenance)
 
     def frames(self, provenance: Provenance | None) -> tuple[str, str]:
-        """Return the frames of the metres and of the ground, as chosen or else as in ``provenance``; "": the default."""
+        """Return the frames of the metres and of the ground, as chosen or as in ``provenance``; "": the default."""
         before = provenance.parameters if provenance and provenance.transform == _CALIBRATE else {}
         frame = before.get("frame", "") if self.frame is None else self.frame
         ground_frame = before.get("ground_frame", "") if self.ground_frame is None else self.ground_frame
@@ -165,18 +165,13 @@ def _is_calibrated(opened: log.Log) -> bool:
     return any(map(holds_calibrations, opened.channels.values()))
 
 
-def _is_recalibrated(opened: log.Log, prefix: str, plane_provenance: Provenance | None) -> bool:
+def _is_recalibrated(opened: log.Log, prefix: str, how: Provenance | None) -> bool:
     """Return whether a calibration was ingested for a camera after its planes were made from a calibration."""
     topic = f"{prefix}/calibration"
     provenance = provenance_of(opened, topic)
-    if (
-        plane_provenance is None
-        or plane_provenance.transform != _CALIBRATE
-        or provenance is None
-        or provenance.transform != INGEST
-    ):
+    if how is None or how.transform != _CALIBRATE or provenance is None or provenance.transform != INGEST:
         return False
-    return plane_provenance.input != topic or plane_provenance.input_digest != digest_of(opened, topic)
+    return how.input != topic or how.input_digest != digest_of(opened, topic)
 
 
 def calibrated_planes(
@@ -225,14 +220,7 @@ def make_plane(
     jobs. ``uncalibrated`` says why the plane doesn't follow from a calibration.
     Both results are None if no frame has boxes in pixels.
     """
-    names = next(
-        (
-            provenance.classes
-            for _, provenance in _chain(opened, source[0], results)
-            if provenance and provenance.classes
-        ),
-        {},
-    )
+    names = next((how.classes for _, how in _chain(opened, source[0], results) if how and how.classes), {})
     frames = thinned(frames, _MOST_BOXES)
     boxes, number, score, are_people = _boxes(frames, names)
     if not len(boxes):
@@ -435,11 +423,7 @@ def _boxes(frames: Sequence[Frame], names: Mapping[str, str]) -> tuple[Floats, I
     number = np.repeat(np.arange(len(frames)), [len(frame.rows) for frame in frames])
     kept = np.isfinite(columns_to_boxes(rows)).all(axis=1)
     rows, number = rows[kept], number[kept]
-    wanted = [
-        int(number_of_class)
-        for number_of_class, name in names.items()
-        if is_person(name) and number_of_class.isdecimal()
-    ] or [PERSON]
+    wanted = [int(kind) for kind, name in names.items() if is_person(name) and kind.isdecimal()] or [PERSON]
     are_people = np.isin(rows["class_id"], wanted)
     if not are_people.any():
         are_people = rows["class_id"] == UNKNOWN

@@ -208,16 +208,11 @@ def write(
     frames = new_frames(prefix, shown, tree.frames() if tree else ())
     solid_in = next((channel.frame_id for channel in shown.values() if channel.is_solid()), "")
     cameras = calibrated_cameras(opened, solid_in) if solid_in and tree else {}
-    outdated |= {
-        recorded_topic
-        for recorded_topic in opened.channels
-        for topic in shown
-        if recorded_topic.startswith(f"{topic}{views.SUFFIX}/")
-    }
+    outdated |= {view for view in opened.channels for topic in shown if view.startswith(f"{topic}{views.SUFFIX}/")}
     scene = scene_on_pictures(
         opened, prefix, {topic: (channel.frames, channel.provenance) for topic, channel in results.items()}
     )
-    seen_on = (*cameras, *(camera_seen.pictures for camera_seen in scene.cameras))
+    seen_on = (*cameras, *(seen.pictures for seen in scene.cameras))
     outdated |= {topic + views.SUFFIX + pictures for topic in shown for pictures in seen_on}
     drawn = ViewFactory(prefix, picture_ns, stamp_ns, planes, path, frames, cameras, scene)
     if frames:
@@ -228,17 +223,14 @@ def write(
         warn(f"no view at {topic}, which {describe_origin(opened, topic)}", "left-out")
     # Read everything before anything is written, because the log is changed in place.
     start_ns = _start_ns(opened, camera, shown, picture_ns)
-    shown_or_gone = shown | {topic: _nothing(opened, topic) for topic in gone}
-    eye = layouts.eye_on(_positions(opened, prefix, shown_or_gone), planes, start_ns)
-    last_step, is_truth_known = (
-        _last_step(opened, prefix, shown_or_gone),
-        _is_truth_known(opened, prefix, shown_or_gone),
-    )
+    current = shown | {topic: _nothing(opened, topic) for topic in gone}
+    eye = layouts.eye_on(_positions(opened, prefix, current), planes, start_ns)
+    last_step, is_truth_known = (_last_step(opened, prefix, current), _is_truth_known(opened, prefix, current))
     sources = recorded_sources(opened, [*camera.topics, *(channel.provenance.input for channel in results.values())])
     follow = robot_frame(opened, sources, tree, frame_id) if tree and frame_id else ""
     by_viewers = recorded_drawings(opened, sources) if frame_id else {}
-    floor_m = _floor_m(opened, prefix, shown_or_gone) if frame_id else 0.0
-    highest = highest_values(prefix, lambda topic, schema: _frames(opened, shown_or_gone, topic, schema))
+    floor_m = _floor_m(opened, prefix, current) if frame_id else 0.0
+    highest = highest_values(prefix, lambda topic, schema: _frames(opened, current, topic, schema))
     # Write views of unchanged channels first, so that channels made again keep their place and the log its bytes.
     first, last = ({t: c for t, c in shown.items() if (t in results) is is_made} for is_made in (False, True))
     drawn_first = [view for view in drawn.views(first, start_ns) if view.topic not in recorded]

@@ -107,13 +107,9 @@ def join(parts: Sequence[tuple[str, Any]], columns: Any = None) -> Any:
     loose = [with_recording(part, name) for name, part in parts if not isinstance(part, Path)]
     files = [(name, part) for name, part in parts if isinstance(part, Path)]
     try:
-        first_schemas = [columns] if columns is not None else []
+        first = [columns] if columns is not None else []
         schema = pa.unify_schemas(
-            [
-                *first_schemas,
-                *(table.schema.remove_metadata() for table in loose),
-                *(_columns(path) for _, path in files),
-            ],
+            [*first, *(table.schema.remove_metadata() for table in loose), *(_columns(path) for _, path in files)],
             promote_options="permissive",
         )
         at = schema.get_field_index(RECORDING.name)

@@ -167,9 +167,7 @@ def compare(
         for done, (t_ns, parts) in enumerate(shown, 1):
             if ground is None and scene in opened.channels:
                 ground = _Ground(opened, scene, span, max(16, round(parts[0].shape[1] * len(parts) * _GROUND)))
-            counters = [
-                _counter(panel, events_of_panel, t_ns) for panel, events_of_panel in zip(panels, happened, strict=True)
-            ]
+            counters = [_counter(panel, events, t_ns) for panel, events in zip(panels, happened, strict=True)]
             captions = _captions(panels, happened, t_ns)
             clock = _clock((t_ns - start_ns) / NS_PER_S)
             titles = [panel.title for panel in panels]
@@ -265,12 +263,10 @@ def _counter(panel: Panel, happened: _Happened, now_ns: int) -> str:
 def _captions(panels: Sequence[Panel], happened: Sequence[_Happened], now_ns: int) -> list[str]:
     """The events of the last seconds as texts, the newest first."""
     captions = []
-    for panel, events_of_panel in zip(panels, happened, strict=True):
-        low = int(np.searchsorted(events_of_panel.t_ns, now_ns - seconds_to_ns(_SHOWN_S), "right"))
-        high = int(np.searchsorted(events_of_panel.t_ns, now_ns, "right"))
-        captions += [
-            (int(events_of_panel.t_ns[n]), f"{panel.title}: {events_of_panel.words[n]}") for n in range(low, high)
-        ]
+    for panel, events in zip(panels, happened, strict=True):
+        low = int(np.searchsorted(events.t_ns, now_ns - seconds_to_ns(_SHOWN_S), "right"))
+        high = int(np.searchsorted(events.t_ns, now_ns, "right"))
+        captions += [(int(events.t_ns[n]), f"{panel.title}: {events.words[n]}") for n in range(low, high)]
     return [caption for _, caption in sorted(captions, key=lambda pair: -pair[0])]
 
 

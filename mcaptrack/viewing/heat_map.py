@@ -293,11 +293,7 @@ def _heat(opened: log.Log, topic: str, pictures: str | None, options: RenderOpti
     for _, _, joined in joined_parts(TRACKS, frames):
         rows, t_ns = joined.rows, joined.row_ns
         classes = rows["class_id"].astype(np.int64)
-        wanted = [
-            number
-            for number in np.unique(classes).tolist()
-            if number == UNKNOWN or is_person(class_name(number, names))
-        ]
+        wanted = [kind for kind in np.unique(classes).tolist() if kind == UNKNOWN or is_person(class_name(kind, names))]
         kept = np.isin(classes, wanted) & (t_ns >= first) & (t_ns <= (t_ns if last is None else last))
         parts.append((t_ns[kept], rows["track_id"][kept].astype(np.int64), rows["x_m"][kept], rows["y_m"][kept]))
     if not parts or not sum(len(part[0]) for part in parts):

@@ -206,10 +206,7 @@ def labels_of(number: Ints, class_id: Ints, names: Mapping[int, str] | None) -> 
     if not len(number) or names is None:
         return number
     pairs, which = np.unique(np.stack([number, class_id]), axis=1, return_inverse=True)
-    called = {
-        class_number: _shortened(class_name(class_number, names), _NAME_LENGTH)
-        for class_number in np.unique(class_id).tolist()
-    }
+    called = {kind: _shortened(class_name(kind, names), _NAME_LENGTH) for kind in np.unique(class_id).tolist()}
     return np.array([f"{person} {called[of]}" for person, of in pairs.T.tolist()])[which.reshape(-1)]
 
 

@@ -152,10 +152,8 @@ class _Job:
             self._at(frame.t_ns, frame.index)
             ids = rows["class_id"].astype(np.int64) if is_detections else rows["track_id"]
             texts = [
-                " ".join(
-                    ([] if is_detections else [str(number)]) + ([] if kind == PERSON else [class_name(kind, names)])
-                )
-                for number, kind in zip(ids.tolist(), rows["class_id"].tolist(), strict=True)
+                " ".join(([] if is_detections else [str(id_)]) + ([] if kind == PERSON else [class_name(kind, names)]))
+                for id_, kind in zip(ids.tolist(), rows["class_id"].tolist(), strict=True)
             ]
             boxes = columns_to_boxes(rows)
             here = np.isfinite(boxes).all(axis=1)

@@ -106,12 +106,8 @@ def best_tracks(camera: Camera, topics: Iterable[str]) -> str | None:
 def about_channels(opened: log.Log) -> dict[str, Any]:
     """The warnings that the channels of a log carry, and the versions that made them."""
     provenances = [Provenance.from_metadata(channel.metadata) for _, channel in sorted(opened.channels.items())]
-    warnings = list(
-        dict.fromkeys(
-            (code, message) for provenance in provenances if provenance for code, message in provenance.warnings
-        )
-    )
-    versions = sorted({provenance.version for provenance in provenances if provenance})
+    warnings = list(dict.fromkeys((code, message) for how in provenances if how for code, message in how.warnings))
+    versions = sorted({how.version for how in provenances if how})
     said = [{"code": code, "message": message} for code, message in warnings]
     return {
         "warnings": len(warnings),
@@ -211,14 +207,10 @@ class LogTables:
         while todo:
             topic = todo.pop()
             channel = self.opened.channels.get(topic)
-            provenance = Provenance.from_metadata(channel.metadata) if channel and topic not in out else None
-            if provenance and provenance.transform != "view":
-                out[topic] = {
-                    "transform": provenance.transform,
-                    "input": provenance.input,
-                    "parameters": provenance.parameters,
-                }
-                todo.append(provenance.input)
+            how = Provenance.from_metadata(channel.metadata) if channel and topic not in out else None
+            if how and how.transform != "view":
+                out[topic] = {"transform": how.transform, "input": how.input, "parameters": how.parameters}
+                todo.append(how.input)
         return json.dumps(out, sort_keys=True, separators=(",", ":"))
 
     # Foreign channels
@@ -263,12 +255,10 @@ class LogTables:
         topics = self.topics("frames")
         names = [*topics, *(file_name(part.path) for part in self.opened.parts)]
 
-        def tables_of_topics() -> Iterator[Any]:
+        def pieces() -> Iterator[Any]:
             return (tables.frames_table({topic: self._pointers(topic)}, names) for topic in topics)
 
-        return TablePieces(
-            TABLES["frames"].arrow, sum(self.opened.channel(topic).messages for topic in topics), tables_of_topics
-        )
+        return TablePieces(TABLES["frames"].arrow, sum(self.opened.channel(topic).messages for topic in topics), pieces)
 
     def _frames(self, topic: str) -> FrameColumns:
         if topic not in self._kept:
@@ -296,21 +286,17 @@ class LogTables:
 
     def _track_names(self, topic: str) -> TrackNames:
         """The names of the classes of the tracks, and of the ground truth, that the rows of a channel are about."""
-        provenance = provenance_of(self.opened, topic)
+        how = provenance_of(self.opened, topic)
         base = topic
         for beside in ("/events", "/errors", "/decisions", "/appearance"):
             base = base.removesuffix(beside)
-        if provenance and provenance.zones:
-            base = provenance.input
+        if how and how.zones:
+            base = how.input
         beside = base.removesuffix("/predictions")
         near = (base,) if base == beside else (f"{beside}/online", beside, input_of(self.opened.channel(base).metadata))
         track_topics = set(self.topics("tracks"))
         tracks = next((near_topic for near_topic in near if near_topic in track_topics), "")
-        truth = (
-            next((reference for reference in provenance.references if reference in track_topics), "")
-            if provenance
-            else ""
-        )
+        truth = next((reference for reference in how.references if reference in track_topics), "") if how else ""
 
         def names(of: str) -> dict[int, str]:
             return tables.names_by_track(self._frames(of), self._class_names.get(of, {})) if of else {}
@@ -319,10 +305,8 @@ class LogTables:
 
     def _zone_names(self, topic: str) -> dict[int, str]:
         """The names of the zones that the rows of a channel are about."""
-        provenance = provenance_of(self.opened, topic)
-        return (
-            {int(number): name for number, name in provenance.zones.items() if number.isdecimal()} if provenance else {}
-        )
+        how = provenance_of(self.opened, topic)
+        return {int(number): name for number, name in how.zones.items() if number.isdecimal()} if how else {}
 
     def _note(self, name: str, note: str) -> None:
         self.notes[name] = "; ".join([*filter(None, [self.notes.get(name)]), note])
@@ -429,20 +413,18 @@ def _order_of_scores(row: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def _channel(channel: log.Channel) -> dict[str, object]:
-    provenance = Provenance.from_metadata(channel.metadata)
+    how = Provenance.from_metadata(channel.metadata)
     out: dict[str, object] = {
         "topic": channel.topic,
         "schema": channel.schema_name or None,
         "messages": channel.messages,
         "encoding": channel.message_encoding or None,
     }
-    if provenance:
+    if how:
         names = ("transform", "input", "version", "digest", "input_digest", "weights_sha256", "frame_id")
-        out |= {name: getattr(provenance, name) or None for name in names}
-        out["parameters"] = json.dumps(provenance.parameters, sort_keys=True, separators=(",", ":"))
-        out["compared_with"] = (
-            json.dumps(dict(provenance.references), sort_keys=True) if provenance.references else None
-        )
+        out |= {name: getattr(how, name) or None for name in names}
+        out["parameters"] = json.dumps(how.parameters, sort_keys=True, separators=(",", ":"))
+        out["compared_with"] = json.dumps(dict(how.references), sort_keys=True) if how.references else None
     return out
 
 

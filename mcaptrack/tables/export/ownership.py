@@ -123,15 +123,13 @@ def _recorded(opened: log.Log) -> dict[str, str]:
     """Digests of what was recorded, by topic."""
     channels = []
     for channel in opened.channels.values():
-        provenance = Provenance.from_metadata(channel.metadata)
-        if channel.messages and (
-            provenance is None or (provenance.transform == INGEST and _REPLACEABLE not in provenance.parameters)
-        ):
-            channels.append((not foreign.holds_pictures(channel), -channel.messages, channel.topic, provenance))
+        how = Provenance.from_metadata(channel.metadata)
+        if channel.messages and (how is None or (how.transform == INGEST and _REPLACEABLE not in how.parameters)):
+            channels.append((not foreign.holds_pictures(channel), -channel.messages, channel.topic, how))
     channels.sort(key=lambda row: row[:3])
     return {
-        topic: ((provenance.digest if provenance else "") or opened.fingerprint(topic))[:32]
-        for _, _, topic, provenance in channels[:_MOST_CHANNELS]
+        topic: ((how.digest if how else "") or opened.fingerprint(topic))[:32]
+        for _, _, topic, how in channels[:_MOST_CHANNELS]
     }
 
 

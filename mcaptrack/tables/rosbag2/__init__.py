@@ -239,13 +239,7 @@ class _Job:
             for frame in frames:
                 ids = np.unique(frame.rows["track_id"]).astype(np.int64)
                 heights = base_heights(tracks, np.full(len(ids), frame.t_ns), ids)
-                out.append(
-                    {
-                        track_id: up
-                        for track_id, up in zip(ids.tolist(), heights.tolist(), strict=True)
-                        if np.isfinite(up)
-                    }
-                )
+                out.append({id_: up for id_, up in zip(ids.tolist(), heights.tolist(), strict=True) if np.isfinite(up)})
             return out
         return [{} for _ in frames]
 

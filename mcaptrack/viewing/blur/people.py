@@ -200,9 +200,7 @@ def shows_people(name: str) -> bool:
 def people_among(class_id: NDArray[Any], names: Mapping[int, str]) -> Bools:
     """Which rows (N,) are people, or of unknown class."""
     numbers = class_id.astype(np.int64)
-    wanted = [
-        number for number in np.unique(numbers).tolist() if number == UNKNOWN or shows_people(class_name(number, names))
-    ]
+    wanted = [kind for kind in np.unique(numbers).tolist() if kind == UNKNOWN or shows_people(class_name(kind, names))]
     return np.asarray(np.isin(numbers, wanted), np.bool_)
 
 

@@ -179,9 +179,7 @@ def _comparison(reports: Sequence[LogReport]) -> dict[str, Any]:
     """Scores by log, and of all logs together."""
     pairs = [(report, before_after(report, report.results) if report.results else None) for report in reports]
     sure = [intervals_of([report]) for report in reports]
-    rows = [
-        _comparison_row(report.file, scores, interval) for (report, scores), interval in zip(pairs, sure, strict=True)
-    ]
+    rows = [_comparison_row(report.file, scores, sides) for (report, scores), sides in zip(pairs, sure, strict=True)]
     together = combined_results(reports)
     if together:
         whole = before_after(next(report for report in reports if report.results), together)
@@ -199,9 +197,9 @@ def _comparison(reports: Sequence[LogReport]) -> dict[str, Any]:
             chart = pairs_chart(f"{label} by log", values, axis, ("tracked", "re-tracked"))  # type: ignore[arg-type]
             charts.append({"chart": chart, "title": label, "caption": ""})
     ranges = [
-        (report.name, interval.idf1)
-        for report, interval in zip(reports, sure, strict=True)
-        if interval and interval.idf1[1].is_known
+        (report.name, sides.idf1)
+        for report, sides in zip(reports, sure, strict=True)
+        if sides and sides.idf1[1].is_known
     ]
     if ranges:
         title = "IDF1 with 95 % intervals, by log"

@@ -151,23 +151,16 @@ def histogram_chart(title: str, rows: Sequence[Bars], edges: Floats, label: str)
         return left + min(max(value / x.most, 0), 1) * width
 
     drawn = []
-    for k, histogram in enumerate(rows, start=1):
+    for k, part in enumerate(rows, start=1):
         bars = []
-        for low, high, share in zip(edges[:-1].tolist(), edges[1:].tolist(), histogram.shares.tolist(), strict=True):
+        for low, high, share in zip(edges[:-1].tolist(), edges[1:].tolist(), part.shares.tolist(), strict=True):
             tall = share / top * (row - 14)
             if tall > 0:
                 place = (at(low), row * k - tall, max(at(high) - at(low) - 1, 0.5), tall)
                 bars.append((*map(_fixed, place), f"{low:g} to {high:g}: {100 * share:.1f} %"))
-        median = _fixed(at(histogram.median))
+        median = _fixed(at(part.median))
         drawn.append(
-            {
-                "bars": bars,
-                "floor": row * k,
-                "median": median,
-                "name": histogram.name,
-                "role": histogram.role,
-                "text": histogram.text,
-            }
+            {"bars": bars, "floor": row * k, "median": median, "name": part.name, "role": part.role, "text": part.text}
         )
     return {
         "kind": "histogram", "title": title, "width": WIDTH, "height": bottom + 34,

@@ -151,35 +151,29 @@ def zone_section(opened: log.Log, prefix: str, names: Mapping[str, str]) -> dict
     counted = pipeline.counted_zones(opened, prefix)
     if not counted:
         return {"columns": _OF_ZONES, "rows": [], "line_columns": _OF_LINES, "lines": [], "figures": [], "data": {}}
-    shown = [
-        (zones_counted, _ROLES.get(zones_counted.topic.removeprefix(prefix + "/"), "samples"))
-        for zones_counted in counted
-    ]
+    shown = [(channel, _ROLES.get(channel.topic.removeprefix(prefix + "/"), "samples")) for channel in counted]
     shown.sort(key=lambda pair: ([*_ROLES.values(), "samples"].index(pair[1]), pair[0].topic))
     called = {
-        zones_counted.topic: names.get(role, zones_counted.topic) if role != "samples" else zones_counted.topic
-        for zones_counted, role in shown
+        channel.topic: names.get(role, channel.topic) if role != "samples" else channel.topic for channel, role in shown
     }
-    zones = list({zone.name: zone for zones_counted in counted for zone in zones_counted.zones}.values())
+    zones = list({zone.name: zone for channel in counted for zone in channel.zones}.values())
     groups: dict[bool, list[dict[str, Any]]] = {False: [], True: []}
     for zone in zones:
         rows = [
-            {"name": called[zones_counted.topic], "role": role, "topic": zones_counted.topic, "cells": _cells(total)}
-            for zones_counted, role in shown
-            for total in zones_counted.totals
+            {"name": called[channel.topic], "role": role, "topic": channel.topic, "cells": _cells(total)}
+            for channel, role in shown
+            for total in channel.totals
             if (total.zone, total.is_line) == (zone.name, zone.is_line)
         ]
         groups[zone.is_line].append({"zone": zone.name, "rows": rows})
     some = [zone for zone in zones if not zone.is_line][:_CHARTS]
-    inside = {
-        zones_counted.topic: _inside(opened, zones_counted.topic, zones_counted.zones) for zones_counted in counted
-    }
+    inside = {channel.topic: _inside(opened, channel.topic, channel.zones) for channel in counted}
     figures = []
     for zone in some:
         lines = [
-            Line(short(called[zones_counted.topic]), role, *inside[zones_counted.topic][zone.name])
-            for zones_counted, role in shown
-            if zone.name in inside[zones_counted.topic]
+            Line(short(called[channel.topic]), role, *inside[channel.topic][zone.name])
+            for channel, role in shown
+            if zone.name in inside[channel.topic]
         ]
         figures.append(_chart(zone.name, lines))
     left = sum(not zone.is_line for zone in zones) - len(some)
@@ -190,7 +184,7 @@ def zone_section(opened: log.Log, prefix: str, names: Mapping[str, str]) -> dict
         "lines": groups[True],
         "figures": figures,
         "left_out": left,
-        "data": {zones_counted.topic: [total.to_json() for total in zones_counted.totals] for zones_counted in counted},
+        "data": {channel.topic: [total.to_json() for total in channel.totals] for channel in counted},
     }
 
 

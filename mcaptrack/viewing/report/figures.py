@@ -116,9 +116,7 @@ def _event(event: IdentityEvent, text: str, report: LogReport) -> dict[str, Any]
         "t_ns": event.t_ns,
         "clock": clock(seconds),
         "thumbnails": [
-            _thumbnail(thumbnail, when)
-            for thumbnail, when in ((event.before, "before"), (event.after, "after"))
-            if thumbnail
+            _thumbnail(image, when) for image, when in ((event.before, "before"), (event.after, "after")) if image
         ],
     }
 

@@ -68,8 +68,7 @@ def identity_timeline(report: LogReport) -> dict[str, Any]:
         "left_out": len(rows) - len(kept),
         "has_truth": bool(scored),
         "lanes": [
-            {"name": short(tracks.name), "role": tracks.role, "switches": _switches(people)}
-            for tracks, people in scored
+            {"name": short(side.name), "role": side.role, "switches": _switches(people)} for side, people in scored
         ],
         "rule": rule_text(*headline.rule) if headline else "",
         "span": clock(span_s),

@@ -99,10 +99,7 @@ def _score_text(key: str, value: float | None) -> str:
 
 
 def _track_rows(report: LogReport) -> list[dict[str, Any]]:
-    repairs = {
-        channel_event.topic: channel_event.counts["joined"] + channel_event.counts["parted"]
-        for channel_event in report.channel_events
-    }
+    repairs = {events.topic: events.counts["joined"] + events.counts["parted"] for events in report.channel_events}
     return [
         {
             "name": tracks["name"],
@@ -129,13 +126,11 @@ def forecasts(report: LogReport) -> dict[str, Any]:
             reason = f"the log holds none; {command('predict', Path(report.file))} makes them"
         return {"figures": [], "missing": [f"There are no forecasts that could be scored: {reason}."]}
     names = {track_set.topic: (track_set.name, track_set.role) for track_set in report.track_sets.values()}
-    members = [(candidate, *names.get(candidate["tracks"], (candidate["tracks"], "truth"))) for candidate in errors]
+    members = [(entry, *names.get(entry["tracks"], (entry["tracks"], "truth"))) for entry in errors]
     figures = [_by_recall(members)]
-    parts = [part for candidate in errors for part in (candidate["by_horizon"], candidate["constant_velocity"]) if part]
+    parts = [part for entry in errors for part in (entry["by_horizon"], entry["constant_velocity"]) if part]
     most = round_most(np.array(part[key], float) for part in parts for key in ("mean_m", "three_quarters_m"))
-    figures += [
-        _by_horizon(candidate, name, role, most) for candidate, name, role in members if candidate["by_horizon"]["n"]
-    ]
+    figures += [_by_horizon(entry, name, role, most) for entry, name, role in members if entry["by_horizon"]["n"]]
     with_covariance = [member for member in members if member[0]["calibration"]]
     if with_covariance:
         return {"figures": [*figures, _reliability(with_covariance)], "missing": []}
