@@ -528,8 +528,8 @@ def _run_job(
             entry = STAGES[job.stage].entry(type(transform))
             is_own = STAGES[job.stage].is_built_in(type(transform))
             stream = _Repeatable(lambda: _counting(job_input.stream, taken))
-            results = transform(stream) if is_own else guarded(entry, transform, stream)
-            for result in results:
+            batches = transform(stream) if is_own else guarded(entry, transform, stream)
+            for result in batches:
                 for frame, collector in zip(result, collectors, strict=True):
                     collector.append(frame)
             outputs: list[Sequence[Frame]] = [collector.done() for collector in collectors]
