@@ -7,6 +7,7 @@ import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
+from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
 from typing import ClassVar
@@ -16,7 +17,6 @@ import pytest
 
 from mcaptrack import log, notices, pipeline
 from mcaptrack.errors import McaptrackError
-from mcaptrack.pipeline import run
 from mcaptrack.pipeline.planes import make_plane
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.provenance import Provenance
@@ -25,6 +25,8 @@ from mcaptrack.transforms.protocol import option
 from tests.commands import call, done
 from tests.tiers import one_in
 from tests.worlds import assert_same_rows, boxes_at, ns, tracks_at, walk
+
+runner = import_module("mcaptrack.pipeline.run")  # the package has a function of its name
 
 
 @pytest.fixture
@@ -159,7 +161,7 @@ def test_a_missing_channel_is_reported_once(path):
 
 
 def test_run_warns_of_too_little_memory(path, monkeypatch):
-    monkeypatch.setattr(run, "free_memory", lambda: 1_000_000)
+    monkeypatch.setattr(runner, "free_memory", lambda: 1_000_000)
     said = json.loads(done("track", path, "--json", "-q").out)["warnings"]
     assert [one["code"] for one in said] == ["memory"]
 
@@ -169,9 +171,9 @@ def test_the_memory_warning_begins_at_the_estimated_need(monkeypatch):
     frames = [Frame(n * 100_000_000, n, DETECTIONS.empty(20)) for n in range(1_000)]
     needed = 400_000_000 + 2_000 * 3_000
     for free, is_little in ((needed, False), (needed - 1, True), (None, False)):
-        monkeypatch.setattr(run, "free_memory", lambda free=free: free)
+        monkeypatch.setattr(runner, "free_memory", lambda free=free: free)
         with notices.listening(lambda _: None), notices.collected() as said:
-            run.warn_memory(frames)
+            runner.warn_memory(frames)
         assert [one.code for one in said] == ["memory"] * is_little
 
 
@@ -182,10 +184,10 @@ def test_empty_results_are_explained_by_the_input_or_the_transform():
         ([none, some], "no samples of /camera/tracks: "),
     ):
         with notices.listening(lambda _: None), notices.collected() as said:
-            run.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), given, [none])
+            runner.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), given, [none])
         assert [one.message.startswith(words) for one in said] == [True]
     with notices.listening(lambda _: None), notices.collected() as said:
-        run.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), [none, some], [none, some])
+        runner.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), [none, some], [none, some])
     assert said == []
 
 

@@ -33,7 +33,12 @@ LIMITS = {
         "_MAX_CLASSES": 65_536,
         "_MAX_NAME": 256,
     },
-    f"{LABELS}.number_table": {"_MAX_ROWS": 10_000_000, "_MAX_LINE": 4096, "EXACT": 9_007_199_254_740_992},
+    f"{LABELS}.number_table": {
+        "_MAX_ROWS": 10_000_000,
+        "_MAX_LINE": 4096,
+        "EXACT": 9_007_199_254_740_992,
+        "_MOST_ZOOM": 4.0,
+    },
     f"{LABELS}.yolo": {
         "_MAX_FILES": 1_000_000,
         "_MAX_ROWS": 10_000_000,
@@ -50,7 +55,6 @@ LIMITS = {
         "_MAX_NAMES": 65_536,
         "KITTI_HEIGHT_PX": 25.0,
     },
-    f"{LABELS}.motions": {"_MOST_ZOOM": 4.0},
     "mcaptrack.sources.ingest.recording_job": {"_MAX_MESSAGE_BYTES": 240 * MIB},
     f"{LABELS}.cvat": {
         "_MAX_BYTES": 512 * MIB,
@@ -63,7 +67,7 @@ LIMITS = {
     f"{LABELS}.boxes_3d.rows": {"_LEAST_LENGTH_M": 0.05, "_MOST_LENGTH_M": 60.0},
     "mcaptrack.sources.ingest.calibration.content": {"_MAX_BYTES": MIB, "_MAX_DEPTH": 16, "_MAX_NODES": 20_000},
     f"{BAGS}.rosbag1": {"_MAX_HEADER_BYTES": MIB, "_MAX_DATA_BYTES": 256 * MIB},
-    f"{BAGS}.metadata_update": {"_MOST_TRIES": 5},
+    f"{BAGS}.metadata_yaml": {"_MOST_TRIES": 5},
     "mcaptrack.log.chunks": {
         "MAX_CHUNK_MIB": 256,
         "_MAX_PLAIN_BYTES": 64 * MIB,
@@ -130,9 +134,9 @@ SHOWN = {
     "mcaptrack.cli.text": {"_UNBROKEN": 100_000},
     "mcaptrack.tables": {"_DIGITS": 6},
     f"{LABELS}.box_rows": {"_SHOWN": 8},
-    f"{LABELS}.cvat_files": {"_SHOWN": 5},
+    f"{LABELS}.cvat": {"_SHOWN": 5},
     f"{LABELS}.number_table": {"_SHOWN": 60},
-    f"{LABELS}.wanted": {"_SHOWN": 10, "_MAX_LISTED": 20},
+    f"{LABELS}.content": {"_SHOWN": 10, "_MAX_LISTED": 20},
     f"{LABELS}.boxes_3d.nuscenes": {"_SHOWN": 10},
     f"{LABELS}.boxes_3d.rows": {"_SHOWN": 8},
     "mcaptrack.sources.ingest.boxes_3d_job": {"_LISTED": 8},
@@ -146,7 +150,7 @@ FORMATS = {
     "mcaptrack.log.writer": {"_MAX_ID": 65_535},
     "mcaptrack.log.journal": {"_NOT_LAST": 2**64 - 1, "_DIGEST_SIZE": 32, "_HEAD_SIZE": 164},
     f"{BAGS}.rosbag1": {"_MESSAGE": 2, "_BAG": 3, "_CHUNK": 5, "_CHUNK_INFO": 6, "_CONNECTION": 7},
-    f"{BAGS}.metadata_update": {"_QOS_TEXT": 4, "_QOS_LIST": 9, "_HASH": 7},
+    f"{BAGS}.metadata_yaml": {"_QOS_TEXT": 4, "_QOS_LIST": 9, "_HASH": 7},
     "mcaptrack.tables.rosbag2": {"_VERSION": 8, "_LAST_S": 2**31},
     "mcaptrack.tables.rosbag2.messages": {
         "_CUBE": 1, "_CYLINDER": 3, "_LINE_STRIP": 4, "_TEXT": 9, "_ADD": 0, "_DELETE_ALL": 3, "_MARKERS": 2**31,

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from importlib import import_module
 
 import numpy as np
 import pyarrow as pa
@@ -15,7 +16,6 @@ import pytest
 import mcaptrack
 from mcaptrack import environment, log, notices, tables
 from mcaptrack.errors import McaptrackError
-from mcaptrack.pipeline import run
 from mcaptrack.pipeline.pictures import Ahead, KeptPictures
 from mcaptrack.pipeline.plan import spaces_of_boxes
 from mcaptrack.pipeline.run import Stopwatch
@@ -28,6 +28,8 @@ from mcaptrack.transforms.retrack import identity_swaps, likelihood
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
 from tests.awaiting import until
 from tests.memory import held
+
+runner = import_module("mcaptrack.pipeline.run")  # the package has a function of its name
 
 PEOPLE = 12
 
@@ -235,7 +237,7 @@ def test_the_thread_ends_when_no_more_frames_are_wanted():
 
 def test_time_counts_for_the_innermost_part(monkeypatch):
     now = [0.0]
-    monkeypatch.setattr(run, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(runner, "perf_counter", lambda: now[0])
 
     def passes(seconds: float) -> None:
         now[0] += seconds

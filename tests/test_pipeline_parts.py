@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import pytest
 from mcaptrack import foxglove, log, notices, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
-from mcaptrack.pipeline import drawing, run
+from mcaptrack.pipeline import drawing
 from mcaptrack.pipeline import write as writing
 from mcaptrack.pipeline.checks import _lacks
 from mcaptrack.pipeline.plan import check_spaces
@@ -24,6 +25,8 @@ from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, INGEST, VIEW, Provenance, digest
 from mcaptrack.transforms import STAGES, KnnDetector, OcSort, Predict, Retrack, Sample, Sort, Transform
 from tests.worlds import boxes_at, ns, tracks_at, walk
+
+runner = import_module("mcaptrack.pipeline.run")  # the package has a function of its name
 
 PLANE = GroundPlane((0.1, 0, 0, 0, 0.1, 0, 0, 0, 1), 640, 480)
 Channels = Mapping[str, tuple[Schema, Provenance | None, Sequence[Frame]]]
@@ -434,7 +437,7 @@ def test_what_was_odd_when_a_channel_was_made_is_said_for_what_runs_and_what_it_
 
         def said(made: dict[str, Provenance], is_all: bool) -> list[tuple[str, str]]:
             with notices.listening(lambda _: None), notices.collected() as heard:
-                run.warn_findings(opened, "/camera", made, (), is_all)
+                runner.warn_findings(opened, "/camera", made, (), is_all)
             return [(one.message, one.code) for one in heard]
 
         now = Provenance("predict", {}, "/camera/samples", warnings=[("strange", "odd now")])
@@ -463,7 +466,7 @@ def test_a_guessed_scale_is_said_of_what_is_in_metres(tmp_path, stage, assumed, 
         notices.listening(lambda _: None),
         notices.collected() as said,
     ):
-        run.warn_findings(opened, "/camera", {"/camera/other": Provenance(stage, {})}, [(0, plane)], is_all=False)
+        runner.warn_findings(opened, "/camera", {"/camera/other": Provenance(stage, {})}, [(0, plane)], is_all=False)
     assert [(one.message, one.code) for one in said] == [(GUESSED, "assumed-ground-plane")] * is_said
 
 
@@ -484,14 +487,14 @@ def test_tracks_that_are_only_linked_or_passed_on_are_said(tmp_path, parameters,
         f"along the ground. To insist: `mcaptrack.retrack('{path}', side_view=True)`"
     )
     with log.read(path) as opened, notices.listening(lambda _: None), notices.collected() as said:
-        run.warn_findings(opened, "/camera", {"/camera/x": Provenance("retrack", parameters)}, (), is_all=False)
+        runner.warn_findings(opened, "/camera", {"/camera/x": Provenance("retrack", parameters)}, (), is_all=False)
     assert [(one.message, one.code) for one in said] == [(words, "held-back")] * bool(done)
 
 
 def test_little_memory_is_said_in_numbers(monkeypatch):
-    monkeypatch.setattr(run, "free_memory", lambda: 160_000_000)
+    monkeypatch.setattr(runner, "free_memory", lambda: 160_000_000)
     with notices.listening(lambda _: None), notices.collected() as said:
-        run.warn_memory([Frame(n * 40_000_000, n, DETECTIONS.empty(10)) for n in range(50_000)])
+        runner.warn_memory([Frame(n * 40_000_000, n, DETECTIONS.empty(10)) for n in range(50_000)])
     assert [(one.message, one.code) for one in said] == [
         (
             "500,000 boxes, of people who are seen for 6 hours together, take about 0.5 GB of memory, and 0.2 GB are "
@@ -518,8 +521,8 @@ def test_free_memory_is_the_least_that_linux_grants(monkeypatch, files, free):
             raise FileNotFoundError
         return files[path.name]
 
-    monkeypatch.setattr(run.Path, "read_text", read_text)
-    assert run.free_memory() == free
+    monkeypatch.setattr(runner.Path, "read_text", read_text)
+    assert runner.free_memory() == free
 
 
 # What is drawn

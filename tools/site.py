@@ -127,8 +127,7 @@ def metrics() -> str:
     from mcaptrack.evaluation import metrics
 
     parts = [_references(metrics, metrics.__all__)]
-    for name in ("clear", "identity", "hota", "displacement", "calibration"):
-        module = import_module(f"{metrics.__name__}.{name}")
+    for module in (metrics, *(import_module(f"{metrics.__name__}.{name}") for name in ("clear", "displacement"))):
         own = [each for each, found in vars(module).items() if getattr(found, "__module__", "") == module.__name__]
         parts.append(_references(module, [each for each in own if not each.startswith("_")], set(metrics.__all__)))
     return "\n\n".join(parts)

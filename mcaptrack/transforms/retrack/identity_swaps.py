@@ -72,7 +72,7 @@ _CHANGE_M_PER_S: Final = 0.4
 
 #: The most encounters that are decided at once, and nodes after which the solver gives up: unlike a time, both are the
 #: same on every machine.
-_COMPATIBLE_SWAPS_MOST, _NODES = 1_000, 10_000
+_MOST_TOGETHER, _NODES = 1_000, 10_000
 
 
 def compatible(pair: Ints, low: Ints, high: Ints, gain: Floats) -> Ints:
@@ -119,7 +119,7 @@ def _solved(limits: csr_array, gain: Floats) -> Bools:
     """Which encounters (C,) have the largest total gain, if one at most of each row of ``limits`` (Q, C) is chosen."""
     from scipy.optimize import Bounds, LinearConstraint, milp
 
-    if len(gain) <= _COMPATIBLE_SWAPS_MOST:
+    if len(gain) <= _MOST_TOGETHER:
         found = milp(
             -gain,
             integrality=np.ones(len(gain)),
