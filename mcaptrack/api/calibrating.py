@@ -9,8 +9,8 @@ from typing import Any
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import Notes, as_location, clock_offsets, split_names, warn_unused, warnings_about
+from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.api.running import Where, change, warn_stale
 from mcaptrack.location import Location

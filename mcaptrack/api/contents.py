@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import as_location, warnings_about
+from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.transform_series import TransformSeries

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import Notes, as_path
+from mcaptrack.api.declared import checked
 from mcaptrack.api.ingesting import ingest
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.api.scoring import Scores, evaluate

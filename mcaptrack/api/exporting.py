@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Literal, cast
 
 from mcaptrack import log as logs
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import log_location, names_of, optional_path, warn_unused, warnings_about
+from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, place_of

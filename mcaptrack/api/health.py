@@ -384,7 +384,10 @@ def doctor(store: str | None = None) -> DoctorResult:
         ]
         codecs = codec_faults()
         faults += [
-            f"{name}: {_codec_words(name)} ({why}); `pip install av` brings it" for name, why in codecs.items() if why
+            f"{name}: pictures can't be {'en' if name.endswith('encoder') else 'de'}coded ({why}); "
+            "`pip install av` brings it"
+            for name, why in codecs.items()
+            if why
         ]
         folder, why = temporary_folder()
         if why:
@@ -419,10 +422,6 @@ def doctor(store: str | None = None) -> DoctorResult:
             store=checked,
             warnings=tuple(warnings),
         )
-
-
-def _codec_words(name: str) -> str:
-    return "pictures can't be encoded" if name.endswith("encoder") else "pictures can't be decoded"
 
 
 def _packages() -> tuple[dict[str, str], dict[str, tuple[str, ...]], list[str]]:

@@ -10,8 +10,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from mcaptrack.api.checked import declared
-from mcaptrack.api.declared import OneOfMany, Option
+from mcaptrack.api.declared import OneOfMany, Option, declared
 from mcaptrack.api.options import FILES, LABELS, PathLike, Reports, Sidecar, no_progress, output
 from mcaptrack.choices import ImageFormat, InputRole, LabelFormat, LengthUnit, Point
 from mcaptrack.errors import McaptrackError, call

@@ -16,8 +16,8 @@ import numpy as np
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline, tables
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import as_path, warn_unused, warnings_about
+from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike, Progress
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish_bytes, refuse_overwrite

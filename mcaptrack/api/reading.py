@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from mcaptrack import log as logs
 from mcaptrack import tables
-from mcaptrack.api.checked import checked
 from mcaptrack.api.columns import times_of
 from mcaptrack.api.common import names_of
+from mcaptrack.api.declared import checked
 from mcaptrack.api.notebook import Choice, Player, show_log, show_tables
 from mcaptrack.api.options import Progress, no_progress
 from mcaptrack.api.rows import supervision_of

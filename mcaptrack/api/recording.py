@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from mcaptrack import log as logs
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import as_location, log_output
+from mcaptrack.api.declared import checked
 from mcaptrack.api.reading import LogReader
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_overwrite

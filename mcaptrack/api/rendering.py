@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
-from mcaptrack.api.checked import declared
-from mcaptrack.api.declared import Option
+from mcaptrack.api.declared import Option, declared
 from mcaptrack.api.options import Camera, EachLog, Force, PathLike, Reports, no_progress, output
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location

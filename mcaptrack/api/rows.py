@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mcaptrack import tables
-from mcaptrack.api.checked import checked
 from mcaptrack.api.class_names import checked_names, numbered_columns, numbers_of
 from mcaptrack.api.columns import (
     UNNUMBERED,
@@ -27,6 +26,7 @@ from mcaptrack.api.columns import (
     number_of,
     time_of,
 )
+from mcaptrack.api.declared import checked
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema

@@ -14,8 +14,8 @@ import numpy as np
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import Notes, as_path, detail, locations_of, names_of, optional_path, paths_of, warn_unused
+from mcaptrack.api.declared import checked
 from mcaptrack.api.ingesting import parse_fps
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.choices import Point

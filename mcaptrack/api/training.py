@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Final, Literal
 
 from mcaptrack import __version__
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import Notes, as_path, optional_path, paths_of
+from mcaptrack.api.declared import checked
 from mcaptrack.api.ingesting import parse_fps
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.choices import Point

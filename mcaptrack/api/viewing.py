@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Final, Self
 
 from mcaptrack import log as logs
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import Notes, as_path, log_file
+from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.clocks import NS_PER_S

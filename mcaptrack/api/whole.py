@@ -9,8 +9,8 @@ from typing import Any, Final
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import as_location, as_path, log_location, names_of, optional_path, split_names, warn_unused
+from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.api.running import Fusing, RunResult, Where, transform_of, transforms_of, work
 from mcaptrack.api.several import unfitting

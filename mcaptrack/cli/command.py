@@ -155,7 +155,7 @@ class Command(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the command line; whatever is wrong with it ends the command in one line."""
-        with log_format(_value_of(args, "--log-format"), self.name or ""):
+        with log_format(next(_values_of(args, "--log-format"), ""), self.name or ""):
             return self._parse(ctx, args)
 
     def _parse(self, ctx: Any, args: list[str]) -> list[str]:
@@ -203,11 +203,6 @@ def _refuse_several(args: Sequence[str], options: Sequence[str]) -> None:
     names = {value: None for option in options for value in _values_of(args, option)}
     if len(names) > 1:
         refuse_usage(f"{options[0]} is given as {' and as '.join(names)}; give one, and call the command once for each")
-
-
-def _value_of(args: Sequence[str], option: str) -> str:
-    """Return the value of an option on a command line that may be wrong; "" without one."""
-    return next(_values_of(args, option), "")
 
 
 def _values_of(args: Sequence[str], option: str) -> Iterator[str]:

@@ -29,7 +29,7 @@ from mcaptrack.cli.text import Level, is_json, say
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish_bytes, refuse_overwrite, refuse_special, refuse_url
 from mcaptrack.location import Location, is_remote, parse
-from mcaptrack.notices import Code, Notice
+from mcaptrack.notices import Notice
 from mcaptrack.ranges import limits
 from mcaptrack.streams import LostOutputError
 
@@ -167,10 +167,6 @@ class Talk:
         """Print a line that is for programs: with ``--log-format json`` only."""
         if is_json():
             self.say(line, "info", event, **about)
-
-    def warn(self, message: str, code: Code = "other") -> None:
-        """Print a warning, also with ``quiet``, and add it to the JSON; see ``mcaptrack.notices``."""
-        notices.warn(message, code)
 
     def _hear(self, notice: Notice) -> None:
         self._stop()

@@ -130,6 +130,7 @@ def option_of(field: Field[Any], switch: str, panel: str, tuning: Any = True, ot
     """
     about = field.metadata
     text = str(about.get("help", "") or otherwise)
+    default = field.default_factory() if field.default_factory is not MISSING else field.default
     return common.option(
         switch,
         panel=panel,
@@ -137,13 +138,8 @@ def option_of(field: Field[Any], switch: str, panel: str, tuning: Any = True, ot
         help=f"{text[:1].upper()}{text[1:]}.",
         least=about.get("least", -math.inf),
         most=about.get("most", math.inf),
-        show_default=shown_default(default_of(field)),
+        show_default=shown_default(default),
     )
-
-
-def default_of(field: Field[Any]) -> Any:
-    """Return the default of a field."""
-    return field.default_factory() if field.default_factory is not MISSING else field.default
 
 
 def shown_default(default: Any) -> str:

@@ -126,16 +126,11 @@ def zones_in_short(result: RunResult) -> str:
     return f"{zones} {named}, of {topics} channel{'' if topics == 1 else 's'} of tracks"
 
 
-def zones_as_json(result: RunResult) -> dict[str, Any]:
-    """The totals as values of JSON: by the topic of tracks, a list of zones."""
-    return {topic: [total.to_json() for total in totals] for topic, totals in result.zones.items()}
-
-
 def _as_json(result: RunResult) -> dict[str, Any]:
     return {
         "log": str(result.log),
         "stages": list(result.stages),
-        "zones": zones_as_json(result),
+        "zones": {topic: [total.to_json() for total in totals] for topic, totals in result.zones.items()},
         "written_to": str(result.written_to) if result.written_to else None,
         "seconds": result.seconds,
     }

@@ -14,9 +14,9 @@ from threading import Event, Lock, local
 from time import monotonic
 from typing import Any, TypeVar
 
-from mcaptrack.api.checked import checked
+from mcaptrack.api.declared import checked
 from mcaptrack.errors import McaptrackError
-from mcaptrack.fleet.child import Child, WorkerLimits, size_in_bytes
+from mcaptrack.fleet.child import Child, WorkerLimits, memory_in_bytes
 from mcaptrack.fleet.digests import digest_of_settings
 from mcaptrack.fleet.expansion import NamedLog, find_logs, outputs_in
 from mcaptrack.fleet.ledger import Ledger
@@ -137,9 +137,7 @@ def run(
         work.append(QueuedLog(number, named_log.path, location_of(named_log.path), own, place))
     for output in outputs:
         _make_folder(output.parent)
-    limits = WorkerLimits(
-        min(jobs or 1, len(named_logs)), os.getcwd(), timeout_s, size_in_bytes(memory_limit, "memory_limit")
-    )
+    limits = WorkerLimits(min(jobs or 1, len(named_logs)), os.getcwd(), timeout_s, memory_in_bytes(memory_limit))
 
     def hear(outcome: LogOutcome[T]) -> None:
         if on_outcome is not None:
@@ -152,7 +150,7 @@ def run(
             on_status(status)
 
     crew = _crew(scheduler, limits, jobs)
-    fleet = Fleet(function, keywords, work, crew, entries, tries, keep_going, hear, watch, on_note or _ignore)
+    fleet = Fleet(function, keywords, work, crew, entries, tries, keep_going, hear, watch, on_note or (lambda _: None))
     return fleet.run()
 
 
@@ -245,7 +243,3 @@ def _make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise McaptrackError(f"the folder {folder} can't be made: {error.strerror or error}") from error
-
-
-def _ignore(_: str) -> None:
-    pass

@@ -63,8 +63,8 @@ def environment_of_worker(workers: int) -> dict[str, str]:
     return dict.fromkeys(THREADS, share) | dict(os.environ)
 
 
-def size_in_bytes(size: str | float | None, name: str) -> int | None:
-    """Return a size such as "2GB", "1.5 GiB" or a number of bytes; None for None.
+def memory_in_bytes(size: str | float | None) -> int | None:
+    """Return a limit of memory such as "2GB", "1.5 GiB" or a number of bytes; None for None.
 
     Raises McaptrackError for text that is no size, and for less than a megabyte.
     """
@@ -72,11 +72,13 @@ def size_in_bytes(size: str | float | None, name: str) -> int | None:
         return None
     match = _SIZE.fullmatch(str(size).strip())
     if match is None:
-        raise McaptrackError(f"`{name}=` needs a size such as 2GB or 500MB, not {str(size)!r:.40}")
+        raise McaptrackError(f"`memory_limit=` needs a size such as 2GB or 500MB, not {str(size)!r:.40}")
     number, unit, binary = match.groups()
     amount = int(float(number) * (1024 if binary else 1000) ** (" kmgt".index(unit.lower() or " ")))
     if amount < 1_000_000:
-        raise McaptrackError(f"`{name}=` needs a size such as 2GB or 500MB, not {str(size)!r:.40}: that is too little")
+        raise McaptrackError(
+            f"`memory_limit=` needs a size such as 2GB or 500MB, not {str(size)!r:.40}: that is too little"
+        )
     return amount
 
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Final
 
 from mcaptrack import objects
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import as_location
+from mcaptrack.api.declared import checked
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import place_of, refuse_special, refuse_url
 from mcaptrack.location import Location, Url, sibling

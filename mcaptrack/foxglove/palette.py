@@ -25,7 +25,7 @@ _LIGHT: Final = 0.55
 
 
 @cache
-def colour(identity: int, alpha: float = 1.0) -> Rgba:
+def colour(identity: int) -> Rgba:
     """The colour of an identity as RGBA, each part between 0 and 1."""
     base, shade = _HUES[identity % len(_HUES)], _SHADES[identity // len(_HUES) % len(_SHADES)]
     red, green, blue = (int(base[at : at + 2], 16) / 255 for at in (0, 2, 4))
@@ -34,7 +34,7 @@ def colour(identity: int, alpha: float = 1.0) -> Rgba:
     red, green, blue = (
         round(part * 256) / 256 for part in colorsys.hls_to_rgb(hue, min(light * shade, 0.85), saturation)
     )
-    return red, green, blue, alpha
+    return red, green, blue, 1.0
 
 
 def colours(identities: NDArray[np.int64]) -> Floats:

@@ -442,7 +442,8 @@ class _Planner:
         wanted = self._with_choice(self._defaults.get(stage, suited or before)) if is_usual else before
         is_replaced = is_usual and (self._is_replaced(STAGES[stage], before, wanted) or suited is not None)
         is_replaced = is_replaced or self._frame_id not in ("", provenance.frame_id or self._frame_id)
-        is_projected = is_usual and STAGES[stage].needs_scale and self._is_plane_due(source)
+        is_projected = is_usual and STAGES[stage].needs_scale
+        is_projected = is_projected and is_plane_due(self._opened, self._prefix, source, self._plane)
         is_due = is_due or is_projected
         if wanted and not is_replaced and not self._force:
             self._warn_settings(main, differing(before, wanted) if before else str(why_not))
@@ -493,10 +494,6 @@ class _Planner:
         keep = tuple(suffix for suffix, is_kept in zip(transform.writes, kept, strict=True) if is_kept)
         self.add(Job(stage, transform, source, main, None if all(kept) else keep, frame_id=self._frame_id))
         return True
-
-    def _is_plane_due(self, source: str) -> bool:
-        """Return whether the ground plane is made again from these boxes, because it would be another now."""
-        return is_plane_due(self._opened, self._prefix, source, self._plane)
 
     def _is_replaced(self, stage: Stage, before: Transform | None, wanted: Transform | None) -> bool:
         """Return whether the user chose another class for a stage than the one that made its channel."""

@@ -190,7 +190,7 @@ def _read(path: Path, role: Role, topics: Sequence[str], wanted: WantedClasses) 
     if path.suffix.lower() in (".parquet", ".pq"):
         return _read_parquet(path, role, topics)
     if role == "tracks" and path.is_file() and _is_blank(path):
-        return _no_tracks("mot")
+        return _no_tracks()
     labels = read_labels(path, role=role, wanted=wanted)
     if labels.times_s is not None or labels.is_normalised:
         what = "times instead of frames" if labels.times_s is not None else "boxes in shares of the picture's size"
@@ -204,10 +204,10 @@ def _is_blank(path: Path) -> bool:
     return path.stat().st_size < _BLANK_BYTES and not path.read_bytes().strip()
 
 
-def _no_tracks(name: Any) -> Labels:
+def _no_tracks() -> Labels:
     """A file of tracks without rows: of a tracker that found no people."""
     none = np.empty(0, np.int64)
-    return Labels(name, 1, none, none, np.empty((0, 4)), None, np.empty(0), none, np.empty(0, np.uint32))
+    return Labels("mot", 1, none, none, np.empty((0, 4)), None, np.empty(0), none, np.empty(0, np.uint32))
 
 
 def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:

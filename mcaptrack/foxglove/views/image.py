@@ -67,9 +67,9 @@ class PictureTimes(NamedTuple):
         yield from zip(times, range(span.start, span.stop), drawn.messages(), strict=True)
 
 
-def fade(count: int, longest: int, strongest: float = 0.875, weakest: float = 0.125) -> Floats:
+def fade(count: int, longest: int, weakest: float = 0.125) -> Floats:
     """The opacities of the last ``count`` of ``longest`` lines; the last is the strongest."""
-    return np.linspace(weakest, strongest, longest)[longest - count :]
+    return np.linspace(weakest, 0.875, longest)[longest - count :]
 
 
 def detections(frames: Sequence[Frame], pictures: PictureTimes, planes: Planes) -> View:
