@@ -197,8 +197,8 @@ def drop(
     options = {"topics": topics, "in_place": in_place, "force": force}
     with common.Talk(quiet, verbose).open() as talk:
         work = LogWork(
-            "drop", mcaptrack.drop, options, lambda _, result: talk.say(f"{result.log}: {line(result)}"), data, line
+            "drop", mcaptrack.drop, options, lambda _, done: talk.say(f"{done.log}: {line(done)}"), data, line
         )
         results, totals = process(find_logs([path]), work, talk, output)
     if json:
-        common.print_json({"results": [data(result) for result in results], **totals})
+        common.print_json({"results": [data(done) for done in results], **totals})

@@ -124,10 +124,6 @@ class Template:
             target[last] = values
         return out
 
-    def one(self) -> bytes:
-        """The bytes of a message without slots."""
-        return self._data
-
 
 def _lay_out(descriptor: Any, content: Mapping[str, Any]) -> _Layout:
     layout = _Layout()

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-import heapq
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple, Self, TypeVar
@@ -265,16 +264,6 @@ class Log:
             if message.t_ns > MAX_NS:
                 self.times(topic)  # raises the error
             yield message
-
-    def merged(
-        self, topics: Iterable[str], start_ns: int | None = None, end_ns: int | None = None
-    ) -> Iterator[tuple[str, Message]]:
-        """The messages of several topics in time order, each with its topic; equal times in the order of ``topics``."""
-
-        def named(topic: str) -> Iterator[tuple[str, Message]]:
-            return ((topic, message) for message in self.messages(topic, start_ns, end_ns))
-
-        return heapq.merge(*map(named, topics), key=lambda pair: pair[1].t_ns)
 
     def rows(self, topic: str, schema: Schema) -> ChannelRows:
         """All rows of a channel as one array. Raises McaptrackError if the channel has another schema.

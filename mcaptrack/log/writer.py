@@ -305,10 +305,8 @@ class LogWriter:
 
             compression, data = "zstd", zstandard.ZstdCompressor(_ZSTD_LEVEL[chunk.kind]).compress(content)
         record = records.pack_chunk((first, last, len(content), zlib.crc32(content)), compression, data)
-        chunk_index_record = ChunkIndexRecord(first, last, 0, len(record), {}, 0, compression, len(data), len(content))
-        self.copy_chunk(
-            record, chunk_index_record, {channel: entries.tobytes() for channel, entries in indexes.items()}
-        )
+        entry = ChunkIndexRecord(first, last, 0, len(record), {}, 0, compression, len(data), len(content))
+        self.copy_chunk(record, entry, {channel: entries.tobytes() for channel, entries in indexes.items()})
 
 
 def _joined(entries: Iterable[bytes]) -> Iterator[bytes]:

@@ -246,9 +246,7 @@ def _with_counts(opened: log.Log, prefix: str) -> list[str]:
     ending = _BELOW + next(iter(_SCHEMAS))
     visits = (topic for topic in sorted(camera_at(opened, prefix).topics) if topic.endswith(ending))
     provenances = ((topic, provenance_of(opened, topic)) for topic in visits)
-    return [
-        topic.removesuffix(ending) for topic, provenance in provenances if provenance and provenance.transform == STAGE
-    ]
+    return [topic.removesuffix(ending) for topic, how in provenances if how and how.transform == STAGE]
 
 
 def _of_camera(opened: log.Log, prefix: str, zones: tuple[Zone, ...], is_given: bool) -> tuple[Zone, ...]:

@@ -87,8 +87,8 @@ def tracks(shown: PeopleInParts, t_ns: Ints, frame_id: str, style: TrackStyle, c
     instants = _Instants(t_ns, frame_id)
     for first, last, people in shown.parts(BATCH):
         has_body = people.has_body()
-        has_place = np.asarray(np.isfinite(people.at_m).all(axis=1), np.bool_)
-        lines = trails(people, has_place, t_ns)
+        placed = np.asarray(np.isfinite(people.at_m).all(axis=1), np.bool_)
+        lines = trails(people, placed, t_ns)
         longest = lines.row.shape[1] - 1
         rgb = np.broadcast_to(_WHITE, (len(people.number), 3)) if style.is_white else colours(people.number)
         body_rgb = rgb if style.is_white else class_colours(people.class_id, classes)
@@ -96,12 +96,10 @@ def tracks(shown: PeopleInParts, t_ns: Ints, frame_id: str, style: TrackStyle, c
         alpha, body_alpha = 0.875 * strength, 0.625 * strength
         places = np.column_stack([people.at_m, people.body.base_m()])
         apart_m = np.zeros(len(people.number))
-        apart_m[has_place] = label_places.heights(
-            t_ns, people.frame[has_place], people.number[has_place], people.at_m[has_place]
-        )
+        apart_m[placed] = label_places.heights(t_ns, people.frame[placed], people.number[placed], people.at_m[placed])
         for span, scene in instants.batches(first, last):
             rows = np.arange(*np.searchsorted(people.frame, [span.start, span.stop]))
-            rows = rows[has_place[rows]]
+            rows = rows[placed[rows]]
             for points, is_solid, these in _alike(lines.points, has_body, rows):
                 trail = places[lines.row[these, -points:], : 3 if is_solid else 2]
                 opacity = fade(points, longest + 1)

@@ -62,11 +62,6 @@ class BoxTable:
         return {number: class_name(number, self.names) for number in np.unique(self.class_id).tolist()}
 
     @property
-    def row_ns(self) -> Ints:
-        """The time of each row (N,)."""
-        return self.t_ns[np.searchsorted(self.frames, self.frame)]
-
-    @property
     def last_frame(self) -> int:
         """The number of the last frame."""
         return int(self.frames[-1])

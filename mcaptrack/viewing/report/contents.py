@@ -342,12 +342,10 @@ def _compare_people(opened: log.Log, out: LogReport) -> None:
     if headline is None:
         return
     for role in filter(None, headline.roles):
-        track_set = out.track_sets[role]
+        tracks = out.track_sets[role]
         rule = MatchRule(*headline.rule)  # type: ignore[arg-type]  # a similarity
-        classes = _classes(opened, out, track_set.topic)
-        scores = person_scores(
-            out.track_sets["truth"].frames, track_set.frames, rule, (out.name, track_set.topic), classes
-        )
+        classes = _classes(opened, out, tracks.topic)
+        scores = person_scores(out.track_sets["truth"].frames, tracks.frames, rule, (out.name, tracks.topic), classes)
         if scores is not None:
             out.people[role] = scores
 

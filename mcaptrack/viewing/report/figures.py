@@ -69,11 +69,10 @@ def heat(report: LogReport) -> dict[str, Any] | None:
     """The map of where people spent their time: re-tracked people, or tracks; None without positions in metres."""
     for role in ("offline", "online", "samples", "tracks"):
         tracks = report.track_sets.get(role)
-        heat_values = (
-            heat_map(tracks.frames) if tracks is not None and any(len(frame.rows) for frame in tracks.frames) else None
-        )
-        if tracks is not None and heat_values is not None:
-            return heat_values | {"name": short(tracks.name), "role": tracks.role, "note": report.metres_note}
+        if tracks is None or not any(len(frame.rows) for frame in tracks.frames):
+            continue
+        if (values := heat_map(tracks.frames)) is not None:
+            return values | {"name": short(tracks.name), "role": tracks.role, "note": report.metres_note}
     return None
 
 
