@@ -15,8 +15,6 @@ SCENE: Final = "foxglove.SceneUpdate"
 TRANSFORM: Final = "foxglove.FrameTransform"
 LOG: Final = "foxglove.Log"
 CALIBRATION: Final = "foxglove.CameraCalibration"
-#: Schemas of pictures.
-PICTURES: Final = (VIDEO, IMAGE)
 
 
 @cache
@@ -95,9 +93,3 @@ def unpack(schema_name: str, payload: bytes) -> Any:
     except DecodeError:
         raise McaptrackError(f"{len(payload)} bytes are no {schema_name} message") from None
     return message
-
-
-def unpack_picture(schema_name: str, payload: bytes) -> tuple[str, bytes]:
-    """Format and data of a CompressedVideo or CompressedImage message. Raises McaptrackError if it is none."""
-    message = unpack(schema_name, payload)
-    return message.format, message.data

@@ -43,7 +43,6 @@ from mcaptrack.tables.messages import messages_table
 from mcaptrack.tables.rows import TrackNames, names_by_track, rows_in_pieces, rows_table, summary_table
 
 __all__ = [
-    "ANSWERS",
     "FORMATS",
     "RECORDING",
     "TABLES",
@@ -171,8 +170,6 @@ def _parquet(path: Path) -> Any:
 # decimals.
 
 
-#: The formats of answers.
-ANSWERS: Final = ("csv", "json", "jsonl", "parquet", "arrow")
 _DIGITS: Final = 6
 
 

@@ -22,8 +22,6 @@ from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SIGHTINGS, TRACKS, VIDEO
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.protocol import Colour, Transform, check_options, traits_of
 
-Result = list[tuple[Frame, ...]]
-
 
 class LawError(AssertionError):
     """A transform or a predictor breaks a law; the message says which one, and where."""

@@ -51,11 +51,10 @@ _INK: Final = (235, 230, 225)
 
 
 class HeatMap(NamedTuple):
-    """A heat map: the topic of its tracks, the person-seconds of all cells, and the highest density in s/m2."""
+    """A heat map: the topic of its tracks, and the person-seconds of all cells."""
 
     topic: str
     person_s: float
-    most_s_per_m2: float
 
 
 def draw_heat_map(
@@ -103,7 +102,7 @@ def draw_heat_map(
     image = _with_legend(image, most, float(heat.person_s.sum()), topic)
     data = encode_image(image, "jpeg" if SUFFIXES[output.suffix.lower()] == "jpeg" else "png")
     publish_bytes(output, data)
-    return HeatMap(topic, float(heat.person_s.sum()), most)
+    return HeatMap(topic, float(heat.person_s.sum()))
 
 
 def _channel(opened: log.Log, prefix: str, topics: Sequence[str]) -> str:

@@ -31,10 +31,9 @@ from mcaptrack.sources.frames import transforms_of
 from mcaptrack.tables.rosbag2 import messages
 from mcaptrack.tables.rosbag2.messages import message, typestore
 
-__all__ = ["STORAGES", "Storage", "WrittenBag", "default_folder", "write_bag"]
+__all__ = ["Storage", "WrittenBag", "default_folder", "write_bag"]
 
 Storage = Literal["mcap", "sqlite3"]
-STORAGES: Final[tuple[Storage, ...]] = ("mcap", "sqlite3")
 #: The version of the format of metadata.yaml: readers accept earlier ones, not later ones.
 _VERSION: Final = 8
 _METADATA: Final = "metadata.yaml"
