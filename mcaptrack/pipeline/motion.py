@@ -47,14 +47,12 @@ def is_motion_new(opened: log.Log, prefix: str, provenance: Provenance) -> bool:
     return is_used and topic in opened.channels and topic not in provenance.references
 
 
-def is_motion_wanted(
-    opened: log.Log, prefix: str, transform: Transform, boxes: str, has_pictures: bool, jobs: Sequence[Job]
-) -> bool:
-    """Whether the motion of a camera is to be there before its boxes are tracked.
+def is_motion_wanted(opened: log.Log, transform: Transform, boxes: str, jobs: Sequence[Job]) -> bool:
+    """Whether the motion of a camera is needed before its boxes are tracked.
 
-    Not so where the boxes come from a detector that needs a still camera: it has looked already.
+    It isn't if the boxes come from a detector that needs a still camera, unless it is switched on.
     """
-    if not uses_motion(transform) or not has_pictures:
+    if not uses_motion(transform):
         return False
     return getattr(transform, "camera_motion", "") == "on" or not _needs_still_camera(opened, boxes, jobs)
 

@@ -535,7 +535,7 @@ class _Planner:
     def ensure_motion(self, transform: Transform, source: str) -> None:
         """Plan the motion of the camera if a stage that reads boxes at ``source`` is better with it."""
         pictures = self._given_pictures() or camera_at(self._opened, self._prefix).pictures
-        if motion.is_motion_wanted(self._opened, self._prefix, transform, source, bool(pictures), self.jobs):
+        if pictures and motion.is_motion_wanted(self._opened, transform, source, self.jobs):
             count = len(self.jobs)
             self.ensure(motion_topic(self._prefix))
             is_asked = getattr(transform, "camera_motion", "") == "on"
