@@ -89,17 +89,17 @@ def share_of_cores() -> float:
 
 def cpu_quotas(root: Path = CONTROL_GROUPS, own: str | None = None) -> list[float]:
     """The limits of processor time of this process's control group and those above it, in cores."""
-    found = []
+    quotas = []
     for folder in control_groups(root, own):
         with suppress(OSError, ValueError):
             quota, period = (folder / "cpu.max").read_text().split()
             if quota != "max":
-                found.append(int(quota) / int(period))
+                quotas.append(int(quota) / int(period))
     with suppress(OSError, ValueError):
         old = int((root / "cpu/cpu.cfs_quota_us").read_text()), int((root / "cpu/cpu.cfs_period_us").read_text())
         if old[0] > 0:
-            found.append(old[0] / old[1])
-    return [quota for quota in found if quota > 0]
+            quotas.append(old[0] / old[1])
+    return [quota for quota in quotas if quota > 0]
 
 
 def control_groups(root: Path = CONTROL_GROUPS, own: str | None = None) -> list[Path]:

@@ -32,9 +32,9 @@ def call(function: str, *values: str | Path, **parameters: Any) -> str:
     >>> call("ingest", "LABELS", into=Path("my log.mcap"))
     "`mcaptrack.ingest('LABELS', into='my log.mcap')`"
     """
-    words = [_literal(value) for value in values]
-    words += [f"{name}={_literal(value)}" for name, value in parameters.items()]
-    return f"`mcaptrack.{function}({', '.join(words)})`"
+    arguments = [_literal(value) for value in values]
+    arguments += [f"{name}={_literal(value)}" for name, value in parameters.items()]
+    return f"`mcaptrack.{function}({', '.join(arguments)})`"
 
 
 def list_names(names: Sequence[str], most: int = 30) -> str:
@@ -53,7 +53,7 @@ def _literal(value: Any) -> str:
     return repr(str(value) if isinstance(value, Path) else value).replace("`", "\\x60")
 
 
-def command(*words: str | Path) -> str:
+def command(*parts: str | Path) -> str:
     """A command to propose at a terminal or on a page, in backquotes and quoted for a shell.
 
     A path is never mistaken for an option, whatever its name. Placeholders for the user to fill in are in capitals.
@@ -63,7 +63,7 @@ def command(*words: str | Path) -> str:
     >>> command("run", Path("my log.mcap"), "--truth", "LABELS")
     "`mcaptrack run 'my log.mcap' --truth LABELS`"
     """
-    return f"`mcaptrack {' '.join(_quoted(word) for word in words)}`"
+    return f"`mcaptrack {' '.join(_quoted(word) for word in parts)}`"
 
 
 def _quoted(word: str | Path) -> str:

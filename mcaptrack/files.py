@@ -73,17 +73,17 @@ def keep_attributes(path: Path, new: Path) -> list[str]:
 
     Returns the names of those that could not be copied.
     """
-    there, here = path.stat(), new.stat()
+    old, here = path.stat(), new.stat()
     lost: list[str] = []
-    for name, wanted, given, owner in (
-        ("owner", there.st_uid, here.st_uid, (there.st_uid, -1)),
-        ("group", there.st_gid, here.st_gid, (-1, there.st_gid)),
+    for name, wanted, value, owner in (
+        ("owner", old.st_uid, here.st_uid, (old.st_uid, -1)),
+        ("group", old.st_gid, here.st_gid, (-1, old.st_gid)),
     ):
-        if wanted != given:
+        if wanted != value:
             with _noting(name, lost):
                 os.chown(new, *owner)
     with _noting("permissions", lost):
-        new.chmod(there.st_mode & (0o777 if lost else 0o7777))  # no set-user-id bit for another user
+        new.chmod(old.st_mode & (0o777 if lost else 0o7777))  # no set-user-id bit for another user
     with _noting("extended attributes", lost):
         _keep_extended(path, new)
     return lost
@@ -197,11 +197,11 @@ def place_of(location: Location) -> Location:
     return location if isinstance(location, Url) else follow_links(location)
 
 
-def is_same_file(one: Location, other: Location) -> bool:
+def is_same_file(path: Location, other: Location) -> bool:
     """Whether two paths lead to the same existing file."""
-    if isinstance(one, Url) or isinstance(other, Url):
-        return one == other
-    return one.exists() and other.exists() and one.samefile(other)
+    if isinstance(path, Url) or isinstance(other, Url):
+        return path == other
+    return path.exists() and other.exists() and path.samefile(other)
 
 
 def read_beginning(path: Path, count: int) -> bytes:
@@ -257,10 +257,10 @@ _URL: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/+([^\s]+)")
 
 def refuse_url(path: Path | str) -> None:
     """Raise McaptrackError for a URL, with the slashes that it had."""
-    found = _URL.fullmatch(str(path))
-    if found and not Path(path).exists():
-        url = hide_secrets(f"{found[1]}://{found[2]}")
-        if found[1].lower() in SCHEMES:
+    match = _URL.fullmatch(str(path))
+    if match and not Path(path).exists():
+        url = hide_secrets(f"{match[1]}://{match[2]}")
+        if match[1].lower() in SCHEMES:
             raise McaptrackError(f"{url} is in a store, from which only logs are read; give a file here")
         raise McaptrackError(
             f"{url} is a URL; only files, and logs at s3://, gs:// and az://, are read: copy it here first"

@@ -117,10 +117,10 @@ def parse(text: str | os.PathLike[str]) -> Location:
         return text
     if not os.fspath(text):
         raise McaptrackError("an empty name is no file or folder; give its name, or . for the working folder")
-    found = _URL.fullmatch(os.fspath(text))
-    if found is None or found[1].lower() not in SCHEMES:
+    match = _URL.fullmatch(os.fspath(text))
+    if match is None or match[1].lower() not in SCHEMES:
         return Path(text)
-    scheme, rest = found[1].lower(), found[2] or ""
+    scheme, rest = match[1].lower(), match[2] or ""
     url = Url(f"{scheme}://{rest}")
     if "@" in url.bucket or ":" in url.bucket:
         raise McaptrackError(
@@ -198,8 +198,8 @@ def distinct_names(names: Sequence[str], places: Sequence[Location]) -> list[str
         if not again:
             break
         distinct = [
-            "/".join([*place.parts[:-1][-depth:], name]) if known in again else known
-            for name, known, place in zip(names, distinct, places, strict=True)
+            "/".join([*place.parts[:-1][-depth:], name]) if current in again else current
+            for name, current, place in zip(names, distinct, places, strict=True)
         ]
     first: dict[str, Location] = {}
     for name, place in zip(distinct, places, strict=True):

@@ -145,8 +145,8 @@ def naming(name: str) -> Iterator[None]:
 
     def hear(notice: Notice) -> None:
         is_named = name in re.split(r"[^\w.-]+", notice.message)
-        words = notice.message if is_named else f"{name}: {notice.message}"
-        _pass_on(notice._replace(message=words), outside)
+        message = notice.message if is_named else f"{name}: {notice.message}"
+        _pass_on(notice._replace(message=message), outside)
 
     with listening(hear):
         yield
@@ -155,11 +155,11 @@ def naming(name: str) -> Iterator[None]:
 @contextmanager
 def collected() -> Iterator[list[Notice]]:
     """Collect the warnings of this block in a list, and pass them on to the outer listener."""
-    outside, found = _LISTENER.get(), list[Notice]()
+    outside, notices = _LISTENER.get(), list[Notice]()
 
     def hear(notice: Notice) -> None:
-        found.append(notice)
+        notices.append(notice)
         _pass_on(notice, outside)
 
     with listening(hear):
-        yield found
+        yield notices

@@ -114,8 +114,8 @@ class TestIngest:
         with log.read(out) as opened:
             video = list(opened.messages("/camera/video"))
             assert [m.t_ns for m in video] == [ns(100 + n / 10) for n in range(20)]
-            image_format, data = foxglove.unpack_picture(opened.channel("/camera/video").schema_name, video[3].payload)
-            assert (image_format, data[:3]) == ("h264", b"\x00\x00\x00"[:3])
+            picture = foxglove.unpack(opened.channel("/camera/video").schema_name, video[3].payload)
+            assert (picture.format, picture.data[:3]) == ("h264", b"\x00\x00\x00"[:3])
             frames = opened.frames("/camera/truth", TRACKS)
             assert [(f.t_ns, f.index) for f in frames] == [(ns(100 + n / 10), n) for n in range(20)]
             assert [ids(f) for f in frames[:3]] == [[3, 5], [3], []]  # frame 1 of the file is the first picture

@@ -56,9 +56,9 @@ def test_a_command_starts_without_the_warnings_of_the_one_before(boxes):
 def test_the_same_warning_is_shown_once(capsys):
     @common.one_line
     def command() -> None:
-        with common.Talk(quiet=True).open() as talk:
-            talk.warn("twice")
-            talk.warn("twice")
+        with common.Talk(quiet=True).open():
+            notices.warn("twice")
+            notices.warn("twice")
             notices.warn("the\nother", "lost")
         common.print_json({})
 

@@ -237,4 +237,4 @@ def test_a_log_of_ours_is_what_foxglove_names(made):
         schema = opened.channel(TOPIC).schema_name
         assert schema == (foxglove.IMAGE if name in ("jpeg", "png") else foxglove.VIDEO)
         payload = next(opened.messages(TOPIC)).payload
-        assert foxglove.unpack_picture(schema, payload)[0] == name
+        assert foxglove.unpack(schema, payload).format == name

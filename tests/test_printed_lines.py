@@ -613,10 +613,11 @@ OF_FUNCTIONS = ("demo", "drop", "evaluate", "events", "export", "ingest", "recov
 def test_every_option_arrives_under_its_name(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     known = inspect.signature(getattr(mcaptrack, command)).parameters
+    options = options_of(command)  # made before the function is replaced: options follow from its signature
     calls = asked_of(monkeypatch, command)
     first = {"drop": ["x.mcap", "/a"], "demo": []}.get(command, ["x.mcap"])
     tried = set()
-    for one in options_of(command):
+    for one in options:
         value = another(one, None)
         if one.parameter in OWN or one.parameter not in known:
             continue

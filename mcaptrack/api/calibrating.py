@@ -9,8 +9,8 @@ from typing import Any
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import Notes, as_location, clock_offsets, split_names, warn_unused, warnings_about
+from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.api.running import Where, change, warn_stale
 from mcaptrack.location import Location
@@ -182,14 +182,14 @@ def calibrate(
 
         return calibrate_cameras(opened, names, right, offsets, report)
 
-    found: list[Any] = []
+    outcome: list[Any] = []
 
     def act(opened: logs.Log, target: Path | None, notes: Notes, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
         refined, offset_s, planes = compare(opened)
         before = {topic for topic in opened.channels if pipeline.is_stale(opened, topic)}
         changes = changes_of(opened, refined, planes)
         is_new = write_changes(opened, changes, target)
-        found.extend((refined, offset_s, planes, changes, before))
+        outcome.extend((refined, offset_s, planes, changes, before))
         stages = [REFINE] if is_new or target is not None else []
         return "", pipeline.Report(stages=stages)
 
@@ -203,7 +203,7 @@ def calibrate(
                 changes = changes_of(opened, refined, planes)
             return _result(path, refined, offset_s, planes, changes, is_dry_run=True, warnings=warnings)
         done = change(Where(log, None, None, output, sidecar, force), act, progress, None)
-        refined, offset_s, planes, changes, before = found
+        refined, offset_s, planes, changes, before = outcome
         with logs.read(done.log) as opened:
             stale = sorted(
                 topic for topic in opened.channels if topic not in before and pipeline.is_stale(opened, topic)
@@ -230,25 +230,25 @@ def _result(
     seconds: float = 0.0,
     is_dry_run: bool = False,
 ) -> CalibrateResult:
-    def of(one: Refined) -> CameraCorrection:
-        before, after = one.before, one.after
+    def of(camera: Refined) -> CameraCorrection:
+        before, after = camera.before, camera.after
         return CameraCorrection(
-            correction=one.model,
-            moved_m=round(one.moved_m, 4),
+            correction=camera.model,
+            moved_m=round(camera.moved_m, 4),
             pairs=before.pairs if before else 0,
             median_before_m=before.median_m if before else None,
             p90_before_m=before.p90_m if before else None,
             median_after_m=after.median_m if after else None,
             p90_after_m=after.p90_m if after else None,
-            why=one.why,
-            limit=one.limit,
-            clock_offset_s=offset_s.get(one.name, 0.0),
-            homography=planes[one.name].homography if one.name in planes else None,
+            why=camera.why,
+            limit=camera.limit,
+            clock_offset_s=offset_s.get(camera.name, 0.0),
+            homography=planes[camera.name].homography if camera.name in planes else None,
         )
 
     return CalibrateResult(
         log=path,
-        cameras={one.name: of(one) for one in refined},
+        cameras={camera.name: of(camera) for camera in refined},
         corrected=dict(changes.topics),
         unchanged=changes.unchanged,
         dropped=changes.dropped,

@@ -9,7 +9,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from mcaptrack.api.checked import checked
+from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import publish_bytes, refuse_special
@@ -112,7 +112,7 @@ def get_model(name: str, *, source: PathLike | None = None) -> Path:
 
 
 def _read(model: Model, path: Path) -> bytes:
-    """The bytes of a file of the user, which is read once and no further than it may be long.
+    """Return the bytes of a file of the user; no more are read than the model has.
 
     Raises McaptrackError if it can't be read, or is not the model's.
     """
@@ -144,7 +144,7 @@ def _fetch(model: Model, url: str) -> Path:
         ) from None
 
     def download(address: str, output: Any, _: Any) -> None:
-        """Save what an address gives, as far as the file may be long."""
+        """Save what an address gives; refuse more bytes than the model has."""
         begin = monotonic()
         with requests.get(address, stream=True, timeout=_WAIT_S) as response, Path(output).open("wb") as file:
             response.raise_for_status()
@@ -161,9 +161,9 @@ def _fetch(model: Model, url: str) -> Path:
                 raise McaptrackError(f"{url} ends after {file.tell():,} of {model.size_bytes:,} bytes")
 
     pooch.get_logger().setLevel(logging.ERROR)
-    known = f"sha256:{model.sha256}"
+    digest = f"sha256:{model.sha256}"
     try:
-        return Path(pooch.retrieve(url, known, fname=model.path.name, path=model.path.parent, downloader=download))
+        return Path(pooch.retrieve(url, digest, fname=model.path.name, path=model.path.parent, downloader=download))
     except requests.RequestException as error:
         raise McaptrackError(f"{url}: {_reason(error)}") from None
     except ValueError:  # of pooch: another digest

@@ -17,12 +17,14 @@ _LONGEST: Final = 200
 _NUMBER, _NAME = "class_id", "class"
 
 
-def checked_names(given: Mapping[int, str] | None) -> dict[int, str]:
+def checked_names(classes: Mapping[int, str] | None) -> dict[int, str]:
     """Return the names of classes by number. Raises McaptrackError for what can't be a number or a name."""
     out = {}
-    if given is not None and not isinstance(given, Mapping):
-        raise McaptrackError(f"`classes=` is a mapping of numbers to names, as in {{2: 'bicycle'}}, not {given!r:.40}")
-    for number, name in (given or {}).items():
+    if classes is not None and not isinstance(classes, Mapping):
+        raise McaptrackError(
+            f"`classes=` is a mapping of numbers to names, as in {{2: 'bicycle'}}, not {classes!r:.40}"
+        )
+    for number, name in (classes or {}).items():
         try:
             whole = as_index(number)
         except TypeError:
@@ -43,19 +45,19 @@ def _checked_name(number: int, name: object) -> str:
     return str(name)
 
 
-def numbers_of(classes: Any, given: Mapping[int, str]) -> Any:
+def numbers_of(classes: Any, class_names: Mapping[int, str]) -> Any:
     """Classes (N,) given by name as numbers; other classes as they are. Raises McaptrackError for unknown names."""
-    names = checked_names(given)
+    names = checked_names(class_names)
     values = np.asarray(() if classes is None else classes)
     if values.dtype.kind not in "UO":
         return classes
-    known = {name: number for number, name in sorted(names.items(), reverse=True)}
+    number_of = {name: number for number, name in sorted(names.items(), reverse=True)}
     out = []
     for name in values.reshape(-1).tolist():
-        number = PERSON if isinstance(name, str) and is_person(name) else known.get(name)
+        number = PERSON if isinstance(name, str) and is_person(name) else number_of.get(name)
         if number is None:
-            there = ", ".join(list(known)[:8]) + (", ..." if len(known) > 8 else "")
-            raise McaptrackError(f"`class_names=` has no class {name!r:.60}; it has {there or 'none'}")
+            listed = ", ".join(list(number_of)[:8]) + (", ..." if len(number_of) > 8 else "")
+            raise McaptrackError(f"`class_names=` has no class {name!r:.60}; it has {listed or 'none'}")
         out.append(number)
     return np.array(out, np.int64).reshape(values.shape)
 
@@ -76,11 +78,11 @@ def numbered_columns(columns: Mapping[str, Any]) -> tuple[dict[str, Any], dict[i
         numbers = {name: number for number, name in enumerate(others, start=PERSON + 1)}
         ids = [numbers.get(name, PERSON if name else UNKNOWN) for name in names]
         out[_NUMBER] = np.array(ids, np.uint32)
-    found: dict[int, str] = {}
+    name_of: dict[int, str] = {}
     for number, name in sorted(set(zip(np.asarray(out[_NUMBER]).tolist(), names, strict=False)), key=repr):
-        is_other = name and number in found and found[number] != name
+        is_other = name and number in name_of and name_of[number] != name
         if is_other and not (number == PERSON and is_person(name)):
-            raise McaptrackError(f"class {number} has two names in the table, {found[number]!r:.60} and {name!r:.60}")
+            raise McaptrackError(f"class {number} has two names in the table, {name_of[number]!r:.60} and {name!r:.60}")
         if name:
-            found.setdefault(number, name)
-    return out, {number: _checked_name(number, name) for number, name in found.items()}
+            name_of.setdefault(number, name)
+    return out, {number: _checked_name(number, name) for number, name in name_of.items()}

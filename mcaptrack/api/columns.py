@@ -1,4 +1,4 @@
-"""Columns of a user as frames of rows: what is a time, a frame number, a box, a position, and what is none.
+"""Check columns that a user gives (times, frame numbers, boxes, positions), and make frames of rows from them.
 
 Letters: N rows.
 """
@@ -37,12 +37,12 @@ _IN_NS: Final = "whole nanoseconds, such as `round(seconds * 1e9)`"
 
 
 def frame_of(
-    schema: Schema, boxes: Floats | None, given: Mapping[str, Any], t_ns: int | np.datetime64, index: int
+    schema: Schema, boxes: Floats | None, named: Mapping[str, Any], t_ns: int | np.datetime64, index: int
 ) -> Frame:
-    """Return a frame of boxes (N, 4), or of positions in ``given``, with the other columns that are given."""
+    """Return a frame of boxes (N, 4), or of positions, with the columns in ``named``."""
     columns: dict[str, Any] = {} if boxes is None else dict(zip(BOX_PX, boxes.T, strict=True))
-    count = len(given["x_m"]) if boxes is None else len(boxes)
-    for name, values in given.items():
+    count = len(named["x_m"]) if boxes is None else len(boxes)
+    for name, values in named.items():
         if values is None:
             continue
         try:
@@ -56,20 +56,20 @@ def frame_of(
     try:
         rows = _rows(schema, columns, count, f"the frame at {time} ns")
     except McaptrackError as error:
-        words = str(error)
-        for name in given:
-            words = words.replace(f"{schema.name}.{name} ", f"{_named(name)} ")
-        raise McaptrackError(words) from None
+        text = str(error)
+        for name in named:
+            text = text.replace(f"{schema.name}.{name} ", f"{_named(name)} ")
+        raise McaptrackError(text) from None
     return Frame(time, number, rows)
 
 
-def columns_in_space(given: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
+def columns_in_space(arrays: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
     """Return columns by name, from arrays (N,) or (N, C) by the names of their columns; the last may be left out.
 
     Raises McaptrackError for other shapes, and for what is no number.
     """
     out: dict[str, Any] = {}
-    for names, values in given.items():
+    for names, values in arrays.items():
         if values is None:
             continue
         own = _IN_SPACE[names[0]]
@@ -93,10 +93,10 @@ def frames_of_columns(columns: dict[str, Any], schema: Schema | None) -> tuple[S
     if "t_ns" not in columns:
         raise McaptrackError(f"the table has no column t_ns (times in nanoseconds); it has {', '.join(columns)}")
     schema = schema or (TRACKS if "track_id" in columns else DETECTIONS)
-    known = {column.name for column in schema.columns}
-    strange = sorted(set(columns) - known - set(_BESIDE))
+    own = {column.name for column in schema.columns}
+    strange = sorted(set(columns) - own - set(_BESIDE))
     if strange:
-        raise McaptrackError(f"{schema.name} has no column {', '.join(strange)}; it has {', '.join(sorted(known))}")
+        raise McaptrackError(f"{schema.name} has no column {', '.join(strange)}; it has {', '.join(sorted(own))}")
     for name in ("topic", "recording"):
         different = sorted({str(value) for value in columns.get(name, ())})
         if len(different) > 1:
@@ -107,7 +107,7 @@ def frames_of_columns(columns: dict[str, Any], schema: Schema | None) -> tuple[S
     t_ns = times_of(columns["t_ns"], "the column t_ns")
     if len(t_ns):
         time_of(t_ns.min())
-    rows = _rows(schema, {name: values for name, values in columns.items() if name in known}, len(t_ns), "the table")
+    rows = _rows(schema, {name: values for name, values in columns.items() if name in own}, len(t_ns), "the table")
     numbers = _numbers(columns["frame"]) if "frame" in columns else np.full(len(t_ns), UNNUMBERED)
     order = np.lexsort((numbers, t_ns))
     begins = np.flatnonzero((np.diff(t_ns[order]) != 0) | (np.diff(numbers[order]) != 0)) + 1
@@ -115,9 +115,9 @@ def frames_of_columns(columns: dict[str, Any], schema: Schema | None) -> tuple[S
     return schema, [Frame(int(t_ns[part[0]]), int(numbers[part[0]]), rows[part]) for part in parts]
 
 
-def _rows(schema: Schema, given: Mapping[str, Any], count: int, where: str) -> Rows:
-    """Rows of columns; those that have usual values may be left out."""
-    columns = {name: _whole(values) if schema.dtype[name].kind in "iu" else values for name, values in given.items()}
+def _rows(schema: Schema, inputs: Mapping[str, Any], count: int, where: str) -> Rows:
+    """Return the rows of columns; columns with a default may be left out."""
+    columns = {name: _whole(values) if schema.dtype[name].kind in "iu" else values for name, values in inputs.items()}
     if schema is TRACKS:
         columns.setdefault("observed", np.ones(count, bool))
         columns.setdefault("source_id", np.full(count, -1))
@@ -133,10 +133,10 @@ def check_frames(schema: Schema, frames: Sequence[Frame]) -> None:
     """Raise McaptrackError for the first row that can't be; warn of scores that trackers can't use."""
     rows = schema.joined([frame.rows for frame in frames])
     of = np.repeat(np.arange(len(frames)), [len(frame.rows) for frame in frames])
-    if found := first_impossible(schema, rows, of):
-        at, words = found
+    if impossible := first_impossible(schema, rows, of):
+        at, reason = impossible
         number = at - int(np.searchsorted(of, of[at]))
-        raise McaptrackError(f"the frame at {frames[of[at]].t_ns} ns: in row {number} {words}")
+        raise McaptrackError(f"the frame at {frames[of[at]].t_ns} ns: in row {number} {reason}")
     odd = (rows["score"] < 0) | (rows["score"] > 1)
     if odd.any():
         low, high = np.nanmin(rows["score"]), np.nanmax(rows["score"])
@@ -145,9 +145,9 @@ def check_frames(schema: Schema, frames: Sequence[Frame]) -> None:
 
 def time_of(t_ns: Any) -> int:
     """Return a time in whole nanoseconds. Raises McaptrackError for anything else, such as seconds."""
-    found = t_ns.astype("datetime64[ns]").astype(np.int64) if isinstance(t_ns, np.datetime64) else t_ns
+    value = t_ns.astype("datetime64[ns]").astype(np.int64) if isinstance(t_ns, np.datetime64) else t_ns
     try:
-        whole = as_index(found)
+        whole = as_index(value)
     except TypeError:
         raise McaptrackError(f"`t_ns=` needs {_IN_NS}, not {kind_of(t_ns)}") from None
     if not 0 <= whole <= LAST_NS:

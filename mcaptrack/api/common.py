@@ -25,12 +25,12 @@ _MOST_OFFSET_S: Final = 86_400.0
 
 def as_path(path: PathLike) -> Path:
     """Return a path to a file or folder. Raises McaptrackError for a URL, a pipe, a device, and for "-"."""
-    found = Path(path)
-    refuse_url(found)
-    refuse_special(found)
+    checked = Path(path)
+    refuse_url(checked)
+    refuse_special(checked)
     if str(path) == "-":
         raise McaptrackError("- is not a file: pipes are neither read nor written; give the name of a file")
-    return found
+    return checked
 
 
 def optional_path(path: PathLike | None) -> Path | None:
@@ -40,25 +40,25 @@ def optional_path(path: PathLike | None) -> Path | None:
 
 def as_location(path: PathLike) -> Location:
     """Return the location of a log: an object in a store, or a path as ``as_path`` returns it."""
-    found = parse(path)
-    return found if isinstance(found, Url) and (is_remote(path) or not Path(path).exists()) else as_path(path)
+    location = parse(path)
+    return location if isinstance(location, Url) and (is_remote(path) or not Path(path).exists()) else as_path(path)
 
 
 def log_file(path: PathLike) -> Path:
     """Return the path of a log that stands. Raises McaptrackError as ``log_location``, and for an object in a store."""
-    found = log_location(path)
-    if isinstance(found, Url):
-        raise McaptrackError(f"{found} is in a store, and this works with files only; copy it here first")
-    return found
+    location = log_location(path)
+    if isinstance(location, Url):
+        raise McaptrackError(f"{location} is in a store, and this works with files only; copy it here first")
+    return location
 
 
 def log_location(path: PathLike) -> Location:
     """Return the location of a log that stands. Raises McaptrackError as ``as_path``, and for a folder."""
-    found = as_location(path)
-    if isinstance(found, Path) and found.is_dir():
-        logs.refuse_non_mcap(found)
-        raise McaptrackError(f"{found} is a folder, not an MCAP file; give the log in it")
-    return found
+    location = as_location(path)
+    if isinstance(location, Path) and location.is_dir():
+        logs.refuse_non_mcap(location)
+        raise McaptrackError(f"{location} is a folder, not an MCAP file; give the log in it")
+    return location
 
 
 def paths_of(paths: PathLike | Sequence[PathLike]) -> list[Path]:
@@ -81,27 +81,27 @@ def names_of(names: str | Sequence[str] | None) -> tuple[str, ...]:
     return () if names is None else (names,) if isinstance(names, str) else tuple(names)
 
 
-def split_names(parameter: str, given: str | Sequence[str] | None) -> tuple[str, ...]:
+def split_names(parameter: str, value: str | Sequence[str] | None) -> tuple[str, ...]:
     """Return names that were given as a sequence, or as text with commas between them.
 
     Raises McaptrackError for an empty name; ``parameter`` is what they were given as.
     """
-    if given is None:
+    if value is None:
         return ()
-    if not isinstance(given, str) and not all(isinstance(name, str) for name in given):
-        raise McaptrackError(f"`{parameter}=` has names, with commas between several, not {given!r:.40}")
-    names = tuple(name.strip() for name in (given.split(",") if isinstance(given, str) else given))
+    if not isinstance(value, str) and not all(isinstance(name, str) for name in value):
+        raise McaptrackError(f"`{parameter}=` has names, with commas between several, not {value!r:.40}")
+    names = tuple(name.strip() for name in (value.split(",") if isinstance(value, str) else value))
     if not names or not all(name.strip("/") for name in names):
-        raise McaptrackError(f"`{parameter}=` has an empty name, in {given!r:.40}")
+        raise McaptrackError(f"`{parameter}=` has an empty name, in {value!r:.40}")
     return names
 
 
-def clock_offsets(given: Mapping[str, float] | None) -> dict[str, float]:
+def clock_offsets(seconds_by_camera: Mapping[str, float] | None) -> dict[str, float]:
     """Return the offsets of clocks in seconds, by the bare names of cameras.
 
     Raises McaptrackError for more than a day, and for NaN.
     """
-    offsets = {name.strip("/"): float(value) for name, value in (given or {}).items()}
+    offsets = {name.strip("/"): float(value) for name, value in (seconds_by_camera or {}).items()}
     for name, value in offsets.items():
         if not abs(value) <= _MOST_OFFSET_S:
             raise McaptrackError(f"`clock_offset_s=` has {value:g} s for {name}; a clock is late by a day at most")
@@ -113,13 +113,13 @@ def log_output(path: PathLike, source: Location) -> Path:
 
     Raises McaptrackError for a name that does not end with .mcap. Callers check whether it is ``source`` itself.
     """
-    found = as_path(path)
-    if found.is_dir():
-        logs.refuse_non_mcap(found)
-        raise McaptrackError(f"{found} is a folder; give the name of a file")
-    if found.suffix.lower() != ".mcap" and not is_same_file(found, source):
-        raise McaptrackError(f"{found} is not a name for a log: logs are MCAP files; give a name that ends with .mcap")
-    return found
+    target = as_path(path)
+    if target.is_dir():
+        logs.refuse_non_mcap(target)
+        raise McaptrackError(f"{target} is a folder; give the name of a file")
+    if target.suffix.lower() != ".mcap" and not is_same_file(target, source):
+        raise McaptrackError(f"{target} is not a name for a log: logs are MCAP files; give a name that ends with .mcap")
+    return target
 
 
 @contextmanager
@@ -129,9 +129,9 @@ def warnings_about(log: object) -> Iterator[list[Notice]]:
         yield warnings
 
 
-def warn_unused(reason: str, **given: bool) -> None:
+def warn_unused(reason: str, **is_unused: bool) -> None:
     """Warn of parameters that have no effect in this call, as far as they were given; ``reason`` says why."""
-    for name, is_given in given.items():
+    for name, is_given in is_unused.items():
         if is_given:
             notices.warn(f"`{name}=` changes nothing here: {reason}", "option-not-used")
 

@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import as_location, warnings_about
+from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.transform_series import TransformSeries
@@ -214,7 +214,7 @@ def info(log: PathLike, *, frames: bool = False) -> LogInfo:
     with warnings_about(path) as warnings, logs.read(path) as opened:
         pipeline.warn_clock_jumps(opened)
         every = [(channel, part) for part in opened.parts for channel in part.recorded]
-        every.sort(key=lambda found: (found[0].topic, found[1] is opened, found[0].id))
+        every.sort(key=lambda pair: (pair[0].topic, pair[1] is opened, pair[0].id))
         names = names_by_topic(opened)
         channels = tuple(_channel(opened, part, channel, names.get(channel.topic)) for channel, part in every)
         return LogInfo(
@@ -232,7 +232,7 @@ def info(log: PathLike, *, frames: bool = False) -> LogInfo:
 
 
 def _channel(opened: logs.Log, part: logs.Log, channel: logs.Channel, camera: str | None) -> ChannelInfo:
-    made = Provenance.from_metadata(channel.metadata)
+    provenance = Provenance.from_metadata(channel.metadata)
     replaced = opened.part(channel.topic) is not part
     return ChannelInfo(
         topic=channel.topic,
@@ -243,12 +243,12 @@ def _channel(opened: logs.Log, part: logs.Log, channel: logs.Channel, camera: st
         encoding=channel.message_encoding,
         messages=channel.messages,
         rate_hz=_rate(opened, channel.messages),
-        transform=made.transform if made else None,
-        input=made.input or None if made else None,
-        version=made.version if made else None,
-        references=dict(made.references) if made else None,
-        plugins={part: plugin._asdict() for part, plugin in made.plugins.items()} if made else None,
-        parameters=dict(made.parameters) if made else None,
+        transform=provenance.transform if provenance else None,
+        input=provenance.input or None if provenance else None,
+        version=provenance.version if provenance else None,
+        references=dict(provenance.references) if provenance else None,
+        plugins={part: plugin._asdict() for part, plugin in provenance.plugins.items()} if provenance else None,
+        parameters=dict(provenance.parameters) if provenance else None,
         frame=frame_id_of(channel.metadata) or None,
         stale=not replaced and pipeline.is_stale(opened, channel.topic),
         camera=camera,
@@ -262,21 +262,21 @@ def _rate(opened: logs.Log, messages: int) -> float | None:
 
 
 def _frames(opened: logs.Log) -> tuple[FrameInfo, ...]:
-    """Return the frames of a log, each after its parent, and warn of what contradicts or lacks."""
+    """Return the frames of a log, each after its parent, and warn of transforms that contradict or are missing."""
     read = read_frames(opened)
-    for words in read.unread:
-        warn(f"{opened.path}: {words}", "lost")
+    for why in read.unread:
+        warn(f"{opened.path}: {why}", "lost")
     if read.tree is None:
         return ()
     for remark in read.tree.remarks:
         warn(f"{opened.path}: transforms: {remark.text}", "transforms")
     waiting = read.tree.roots()[::-1]
-    found: list[FrameInfo] = []
+    infos: list[FrameInfo] = []
     while waiting:
         frame = waiting.pop()
-        found.append(_frame(frame, read.tree.series.get(frame)))
+        infos.append(_frame(frame, read.tree.series.get(frame)))
         waiting += read.tree.children_of(frame)[::-1]
-    return tuple(found)
+    return tuple(infos)
 
 
 def _frame(frame: str, series: TransformSeries | None) -> FrameInfo:

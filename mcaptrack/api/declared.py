@@ -3,8 +3,8 @@
 The signature says what there is: names, types, defaults. The docstring says what it means: the first paragraph of a
 parameter is its help, and ``; by default X.`` at its end is the default that the help shows. ``Annotated`` adds what
 neither can say: the range of a number, the heading in the help, who may set it (``Option``). This module imports
-nothing heavy, so that ``--help`` stays quick; a declared function imports what it needs in its body. The decorator
-that checks arguments by all this is ``checked.declared``.
+nothing heavy, so that ``--help`` stays quick; a declared function imports what it needs in its body. By the same
+annotations the arguments of calls are checked (``checked``): names of files, choices, ranges of numbers, progress.
 """
 
 from __future__ import annotations
@@ -14,11 +14,30 @@ import math
 import os
 import re
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
-from functools import cache
+from difflib import get_close_matches
+from functools import cache, wraps
+from numbers import Integral, Real
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Final,
+    Literal,
+    NamedTuple,
+    ParamSpec,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+from mcaptrack.errors import McaptrackError
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -111,13 +130,13 @@ def bare(hint: Any) -> Any:
 
 def option_of(hint: Any) -> Option:
     """The facts about an option in an annotation."""
-    return next((one for one in _about(hint) if isinstance(one, Option)), Option())
+    return next((part for part in _about(hint) if isinstance(part, Option)), Option())
 
 
 def one_of_many(function: Callable[..., Any]) -> OneOfMany | None:
     """The facts about the parameter of which the command takes many; None without one."""
-    about = (one for hint in hints_of(function).values() for one in _about(hint))
-    return next((one for one in about if isinstance(one, OneOfMany)), None)
+    about = (part for hint in hints_of(function).values() for part in _about(hint))
+    return next((part for part in about if isinstance(part, OneOfMany)), None)
 
 
 def _about(hint: Any) -> tuple[Any, ...]:
@@ -126,22 +145,26 @@ def _about(hint: Any) -> tuple[Any, ...]:
 
 def options_of(function: Callable[..., Any]) -> list[Parameter]:
     """The parameters of a declared function that are options of its command, in order."""
-    words, hints = words_of(function), hints_of(function)
+    doc, hints = words_of(function), hints_of(function)
     flags = {name: f"--{(option_of(hint).flag or name).replace('_', '-')}" for name, hint in hints.items()}
     out = []
-    for name, one in inspect.signature(function).parameters.items():
+    for name, parameter in inspect.signature(function).parameters.items():
         about = _about(hints[name])
-        if one.kind is one.VAR_KEYWORD or PYTHON_ONLY in about or any(isinstance(each, OneOfMany) for each in about):
+        if (
+            parameter.kind is parameter.VAR_KEYWORD
+            or PYTHON_ONLY in about
+            or any(isinstance(each, OneOfMany) for each in about)
+        ):
             continue
         option, (kind, many) = option_of(hints[name]), on_command_line(bare(hints[name]))
-        text, shown = _split_default(words.parameters.get(name, [""])[0])
+        text, shown = _split_default(doc.parameters.get(name, [""])[0])
         flag, _, off = flags[name].partition("/")
-        if kind is bool and (off or one.default is not False):
+        if kind is bool and (off or parameter.default is not False):
             off = f"--{off or f'no-{flag[2:]}'}"
             text = text.replace("(True)", f"({flag})").replace("(False)", f"({off})")
         names = (f"{flag}/{off}" if off else flag, *([f"-{option.short}"] if option.short else []))
         default = shown if option.shown is None else option.shown
-        out.append(Parameter(name, kind, many, names, one.default, option, with_dashes(text, flags), default))
+        out.append(Parameter(name, kind, many, names, parameter.default, option, with_dashes(text, flags), default))
     return out
 
 
@@ -168,7 +191,7 @@ def on_command_line(hint: Any) -> tuple[Any, bool]:
 
 def _parts(hint: Any) -> list[Any]:
     if get_origin(hint) in (Union, types.UnionType):
-        return [part for one in get_args(hint) for part in _parts(one)]
+        return [part for inner in get_args(hint) for part in _parts(inner)]
     return [hint]
 
 
@@ -181,21 +204,127 @@ def words_of(function: Callable[..., Any]) -> Words:
     for block in re.split(r"^(?=\S)", sections.get("Parameters", ""), flags=re.M):
         names, _, lines = block.partition("\n")
         for name in names.partition(" : ")[0].split(", "):
-            parameters[name.lstrip("*")] = [" ".join(one.split()) for one in inspect.cleandoc(lines).split("\n\n")]
+            parameters[name.lstrip("*")] = [" ".join(part.split()) for part in inspect.cleandoc(lines).split("\n\n")]
     return Words(text.strip(), parameters, re.findall(r"^ +(mcaptrack .+)$", sections.get("Examples", ""), re.M))
 
 
 def _split_default(text: str) -> tuple[str, str | None]:
     """Split "Width; by default that of the video." into the help and the default that it shows."""
-    found = re.fullmatch(r"(.+?)(?:;|\.) [Bb]y default (.+?)\.", text)
-    return (f"{found[1]}.", found[2]) if found else (text, None)
+    match = re.fullmatch(r"(.+?)(?:;|\.) [Bb]y default (.+?)\.", text)
+    return (f"{match[1]}.", match[2]) if match else (text, None)
 
 
 def with_dashes(text: str, flags: dict[str, str]) -> str:
     """Return text of a docstring for the command line: ``max_fps`` and `max_fps=` become --max-fps."""
 
-    def option(found: re.Match[str]) -> str:
-        name = found[1] or found[2]
-        return flags[name].partition("/")[0] if name in flags else name if found[1] else found[0]
+    def option(match: re.Match[str]) -> str:
+        name = match[1] or match[2]
+        return flags[name].partition("/")[0] if name in flags else name if match[1] else match[0]
 
     return re.sub(r"``(\w+)``|`(\w+)=`", option, text).replace("``", "")
+
+
+def checked(**ranges: tuple[float, float]) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Check parameters before a function runs: paths, those of a ``Literal``, those with a range, and ``progress``.
+
+    Parameters
+    ----------
+    **ranges : tuple of two float
+        Smallest and largest value of a parameter that is a number, or several.
+
+    Returns
+    -------
+    callable
+        A decorator. The function raises McaptrackError, and does nothing, if a value is an empty name of a file, none
+        of the choices, or out of its range.
+
+    """
+
+    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        signature = inspect.signature(function)
+
+        @wraps(function)
+        def call(*args: P.args, **kwargs: P.kwargs) -> T:
+            for name, value in signature.bind(*args, **kwargs).arguments.items():
+                if value is signature.parameters[name].default:
+                    continue
+                kinds = _kinds(function).get(name, ())
+                choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
+                if "" in map(_name_of, _paths_in(value, kinds)):
+                    raise McaptrackError(f"`{name}=` is an empty name; give the name of a file or folder")
+                if choices:
+                    _check_choice(name, value, choices)
+                if kinds and set(kinds) <= {str, type(None)} and not isinstance(value, tuple(kinds)):
+                    raise McaptrackError(f"`{name}=` is text, not {value!r:.40}")
+                if ends := ranges.get(name) or _ranges(function).get(name):
+                    _check_range(name, value, ends, is_whole=float not in kinds)
+                if name == "progress" and not callable(value):
+                    raise McaptrackError(
+                        f"`progress=` is called as progress(stage, done, total), which {value!r:.40} is not"
+                    )
+            return function(*args, **kwargs)
+
+        return call
+
+    return decorate
+
+
+def declared(*, most_used: tuple[str, ...] = ()) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Declare a command: a function that is ``checked``. The options ``most_used`` come first in its help."""
+
+    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        call = checked()(function)
+        vars(call)["most_used"] = most_used
+        return call
+
+    return decorate
+
+
+@cache
+def _kinds(function: Callable[..., object]) -> dict[str, tuple[Any, ...]]:
+    """The types that each parameter may have. That of the result is left out: it may be known to type checkers only."""
+    return {name: tuple(_parts(bare(hint))) for name, hint in hints_of(function).items()}
+
+
+@cache
+def _ranges(function: Callable[..., object]) -> dict[str, tuple[float, float]]:
+    """The ranges that the annotations of a function declare."""
+    options = {name: option_of(hint) for name, hint in hints_of(function).items()}
+    return {name: (option.least, option.most) for name, option in options.items() if option.is_bounded}
+
+
+def _paths_in(value: Any, kinds: Iterable[Any]) -> Iterable[Any]:
+    """The paths among the value of a parameter of these types: itself, members of a sequence, values of a mapping."""
+    if isinstance(value, Mapping):
+        return value.values() if any(get_origin(kind) is Mapping and _holds_paths(kind) for kind in kinds) else ()
+    if not any(map(_holds_paths, kinds)):
+        return ()
+    return value if isinstance(value, Sequence) and not isinstance(value, str) else (value,)
+
+
+def _holds_paths(kind: Any) -> bool:
+    whole = get_origin(kind) or kind
+    return (isinstance(whole, type) and issubclass(whole, os.PathLike)) or any(map(_holds_paths, get_args(kind)))
+
+
+def _name_of(path: Any) -> Any:
+    return os.fspath(path) if isinstance(path, os.PathLike) else path
+
+
+def _check_choice(name: str, value: object, choices: list[Any]) -> None:
+    if not isinstance(value, str) or value not in choices:
+        close = get_close_matches(str(value), map(str, choices), 1)
+        meant = f"did you mean {close[0]}? " if close else ""
+        raise McaptrackError(f"`{name}=` can't be {value!r:.40}; {meant}there are {', '.join(map(str, choices))}")
+
+
+def _check_range(name: str, value: Any, ends: tuple[float, float], *, is_whole: bool) -> None:
+    kind: Any = Integral if is_whole else Real
+    least, most = ends
+    values = list(value) if isinstance(value, Iterable) and not isinstance(value, str | bytes) else [value]
+    for number in values:
+        if not isinstance(number, kind) or isinstance(number, bool) or not least <= number <= most:
+            text = "a whole number" if is_whole else "a number"
+            raise McaptrackError(f"`{name}=` is {text} from {least:.12g} to {most:.12g}, not {number!r:.40}")
+    if not values:
+        raise McaptrackError(f"`{name}=` needs at least one number")

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import Notes, as_path
+from mcaptrack.api.declared import checked
 from mcaptrack.api.ingesting import ingest
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.api.scoring import Scores, evaluate
@@ -111,7 +111,7 @@ def demo(
     with collected() as warnings:
         if scene in PLACES:
             footage, truth = _several(PLACES[scene](seed), folder, target, force, notes, progress)
-            made = run(target, progress=progress)
+            result = run(target, progress=progress)
             name = "world"
         else:
             drawn = SCENES[scene](seed)
@@ -125,7 +125,7 @@ def demo(
                 force=force,
                 progress=progress,
             )
-            made, name, truth = run(target, progress=progress), "camera", footage.ground_truth
+            result, name, truth = run(target, progress=progress), "camera", footage.ground_truth
         topics = (f"/{name}/samples", f"/{name}/retracks")
         scores = evaluate(target, similarity="metres", gate_m=GATE_M, topic=topics, camera=name)
     return DemoResult(
@@ -134,9 +134,9 @@ def demo(
         truth=truth,
         ground_plane=footage.ground_plane,
         tables=default_folder(target),
-        layouts=made.layouts,
+        layouts=result.layouts,
         scores=scores,
-        notes=(*notes, *made.notes),
+        notes=(*notes, *result.notes),
         warnings=tuple(dict.fromkeys(warnings)),
     )
 
@@ -148,8 +148,8 @@ def _several(
     seconds = next(iter(cameras.values())).seconds
     notes.say(f"drawing {seconds:g} seconds for each of the cameras {', '.join(cameras)} ...")
     footage, positions = drawing.draw_place(cameras, folder, progress)
-    for name, one in footage.items():
-        where = {"output": target, "force": force} if one is next(iter(footage.values())) else {"into": target}
-        ingest(one.video, ground_plane=one.ground_plane, camera=name, progress=progress, **where)
+    for name, drawn in footage.items():
+        where = {"output": target, "force": force} if drawn is next(iter(footage.values())) else {"into": target}
+        ingest(drawn.video, ground_plane=drawn.ground_plane, camera=name, progress=progress, **where)
     ingest(positions, into=target, role="truth", camera="world", frame="map")
     return next(iter(footage.values())), positions

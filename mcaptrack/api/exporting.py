@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Literal, cast
 
 from mcaptrack import log as logs
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import log_location, names_of, optional_path, warn_unused, warnings_about
+from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, place_of
@@ -135,8 +135,8 @@ def export(
             done = write_tables(
                 opened, folder, progress, form=cast("Format", form), topics=names_of(topic), blobs=blobs, force=force
             )
-        for words in done.notes:
-            warn(words, "left-out")
+        for note in done.notes:
+            warn(note, "left-out")
     owed = (main_file(path, folder, cast("Format", form)),)
     return ExportResult(path, folder, done.rows, tuple(done.written), tuple(dict.fromkeys(warnings)), owed)
 
@@ -156,8 +156,8 @@ def _export_bag(
         folder = output or default_bag(path)
         with logs.read(path) as opened:
             done = write_bag(opened, folder, progress, storage=storage, force=force)
-        for words in done.notes:
-            warn(words, "left-out")
+        for note in done.notes:
+            warn(note, "left-out")
     return ExportResult(
         path, folder, done.messages, tuple(done.messages), tuple(dict.fromkeys(warnings)), files=(folder,)
     )
@@ -182,8 +182,8 @@ def _export_file(
             if any(is_same_file(part.path, target) for part in opened.parts):
                 raise McaptrackError(f"{target} is a log; give the file another name with `output=`")
             done = write_boxes(opened, target, form, topics[0] if topics else None, progress, force=force)
-        for words in done.notes:
-            warn(words, "left-out")
+        for note in done.notes:
+            warn(note, "left-out")
     return ExportResult(
         path, target, {done.topic: done.rows}, (done.topic,), tuple(dict.fromkeys(warnings)), files=(target,)
     )

@@ -39,21 +39,21 @@ _NO_LIMIT: Final = 1 << 60
 
 def memory_bytes() -> int | None:
     """Return how much memory this process may use: that of the machine, or the limit of its control group."""
-    found = memory_limits()
+    limits = memory_limits()
     with suppress(ValueError, OSError, AttributeError):
-        found.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    return min(found, default=None)
+        limits.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    return min(limits, default=None)
 
 
 def memory_limits(root: Path = CONTROL_GROUPS, own: str | None = None) -> list[int]:
     """Return the limits of memory of this process's control group and those above it, in bytes."""
-    found = []
+    limits = []
     for folder in control_groups(root, own):
         with suppress(OSError, ValueError):
-            found.append(int((folder / "memory.max").read_text()))  # "max" is no number
+            limits.append(int((folder / "memory.max").read_text()))  # "max" is no number
     with suppress(OSError, ValueError):
-        found.append(int((root / "memory/memory.limit_in_bytes").read_text()))
-    return [limit for limit in found if 0 < limit < _NO_LIMIT]
+        limits.append(int((root / "memory/memory.limit_in_bytes").read_text()))
+    return [limit for limit in limits if 0 < limit < _NO_LIMIT]
 
 
 def temporary_folder() -> tuple[Path | None, str]:
@@ -121,7 +121,7 @@ class StoreCheck:
         for name, why in self.access.items():
             if why:
                 reasons.setdefault(why, []).append(_STORE_CHECK_TRIED[name])
-        return tuple(f"{self.url}: {' and '.join(words)}: {why}" for why, words in reasons.items())
+        return tuple(f"{self.url}: {' and '.join(tried)}: {why}" for why, tried in reasons.items())
 
 
 def url_of_store(store: str) -> Url:
@@ -150,17 +150,17 @@ def check_store(url: Url) -> StoreCheck:
 def _tries(url: Url) -> Iterator[tuple[str, str]]:
     """Yield each operation, and why it failed; "" if it didn't."""
     listed: list[Url] = []
-    yield "list", _why(lambda: listed.extend(found for found, _ in islice(objects.list_objects(url), 1)))
+    yield "list", _why(lambda: listed.extend(member for member, _ in islice(objects.list_objects(url), 1)))
     probe = url / f".mcaptrack-doctor-{uuid4().hex}"
     texts = [f"{number} {uuid4().hex}".encode() for number in range(4)]
-    made: list[Version | None] = []
-    why = _why(lambda: made.append(objects.put_if_unchanged(probe, texts[0], None)))
+    versions: list[Version | None] = []
+    why = _why(lambda: versions.append(objects.put_if_unchanged(probe, texts[0], None)))
     yield "write", why
-    if why or made[0] is None:
+    if why or versions[0] is None:
         if listed:
             yield "read", _why(lambda: objects.read_end(listed[0], 1))
         return
-    first = made[0]
+    first = versions[0]
     try:
         yield "read", _why(lambda: _compare(probe, first, texts[0]))
         yield "put-if-absent", _why(lambda: _refuse(objects.put_if_unchanged(probe, texts[1], None)))
@@ -171,7 +171,7 @@ def _tries(url: Url) -> Iterator[tuple[str, str]]:
 
 
 def _why(attempt: Callable[[], object]) -> str:
-    """Return why something can't be done; "" if it was."""
+    """Do something, and return why it failed; "" if it didn't."""
     try:
         attempt()
     except McaptrackError as error:
@@ -256,8 +256,8 @@ def free_bytes(folder: Path) -> int | None:
 
 def can_be_written(folder: Path) -> bool:
     """Whether files can be made in a folder, or the folder itself."""
-    there = next(place for place in (folder, *folder.parents) if place.exists())
-    return there.is_dir() and os.access(there, os.W_OK | os.X_OK)
+    existing = next(place for place in (folder, *folder.parents) if place.exists())
+    return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
 
 
 @dataclass(frozen=True)
@@ -336,10 +336,10 @@ class DoctorResult:
         ()
 
         """
-        found = asdict(self)
-        del found["warnings"]
+        data = asdict(self)
+        del data["warnings"]
         folder = self.temporary_folder
-        return found | {"temporary_folder": str(folder) if folder else None, "cache_folder": str(self.cache_folder)}
+        return data | {"temporary_folder": str(folder) if folder else None, "cache_folder": str(self.cache_folder)}
 
 
 def doctor(store: str | None = None) -> DoctorResult:
@@ -378,13 +378,16 @@ def doctor(store: str | None = None) -> DoctorResult:
         packages, extras, faults = _packages()
         broken = broken_packages()
         faults += [
-            f"{name}: {words}; install {name} again"
-            for name, words in broken.items()
+            f"{name}: {problem}; install {name} again"
+            for name, problem in broken.items()
             if packages.get(name, "?")  # that it is not installed is said already
         ]
         codecs = codec_faults()
         faults += [
-            f"{name}: {_codec_words(name)} ({why}); `pip install av` brings it" for name, why in codecs.items() if why
+            f"{name}: pictures can't be {'en' if name.endswith('encoder') else 'de'}coded ({why}); "
+            "`pip install av` brings it"
+            for name, why in codecs.items()
+            if why
         ]
         folder, why = temporary_folder()
         if why:
@@ -421,28 +424,24 @@ def doctor(store: str | None = None) -> DoctorResult:
         )
 
 
-def _codec_words(name: str) -> str:
-    return "pictures can't be encoded" if name.endswith("encoder") else "pictures can't be decoded"
-
-
 def _packages() -> tuple[dict[str, str], dict[str, tuple[str, ...]], list[str]]:
     """Return the versions of the packages that are needed, what each extra lacks, and faults."""
     packages: dict[str, str] = {}
     lacking: dict[str, list[str]] = {}
     faults = []
     for text in _requirements():
-        found = _REQUIREMENT.match(text)
-        if found is None:
+        match = _REQUIREMENT.match(text)
+        if match is None:
             continue
-        name, least, marker = found.groups(default="")
+        name, least, marker = match.groups(default="")
         extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", marker)
         have = _version_of(name)
         is_enough = bool(have) and _numbers(have) >= _numbers(least)
         if extra is None:
             packages[name] = have
             if not is_enough:
-                there = f"only version {have} is installed" if have else "it is not installed"
-                faults.append(f"{name}: {there}; `pip install '{name}>={least}'` installs what is needed")
+                lack = f"only version {have} is installed" if have else "it is not installed"
+                faults.append(f"{name}: {lack}; `pip install '{name}>={least}'` installs what is needed")
         elif extra[1] not in _NOT_SHOWN:
             lacking.setdefault(extra[1], []).extend([] if is_enough else [name])
     return packages, {name: tuple(names) for name, names in lacking.items()}, faults
@@ -465,35 +464,35 @@ def _version_of(name: str) -> str:
 
 def _numbers(version: str) -> tuple[int, ...]:
     """Return the numbers at the beginning of a version; zeros at their end say nothing."""
-    found = re.match(r"\d+(?:\.\d+)*", version)
-    numbers = [int(number) for number in found[0].split(".")] if found else []
+    match = re.match(r"\d+(?:\.\d+)*", version)
+    numbers = [int(number) for number in match[0].split(".")] if match else []
     while numbers and not numbers[-1]:
         numbers.pop()
     return tuple(numbers)
 
 
 def _threads(broken: Collection[str]) -> dict[str, str]:
-    found = {name: os.environ[name] for name in THREADS if name in os.environ}
+    settings = {name: os.environ[name] for name in THREADS if name in os.environ}
     if "opencv-python-headless" in broken:
-        return found
+        return settings
     import cv2
 
-    return {"OpenCV": str(cv2.getNumThreads())} | found
+    return {"OpenCV": str(cv2.getNumThreads())} | settings
 
 
 def _plugins() -> dict[str, str]:
     """Import the plug-ins of installed packages; return why each can't be imported, or "", and warn of it."""
     from mcaptrack.registry import BUILT_IN, KINDS, find, names
 
-    found = {}
+    reasons = {}
     for kind in KINDS:
         for name in names(kind):
             if name in BUILT_IN[kind]:
                 continue
-            found[f"{kind} {name}"] = ""
+            reasons[f"{kind} {name}"] = ""
             try:
                 find(kind, name)
             except McaptrackError as error:
-                found[f"{kind} {name}"] = str(error)
+                reasons[f"{kind} {name}"] = str(error)
                 warn(str(error), "other")
-    return found
+    return reasons

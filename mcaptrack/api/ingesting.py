@@ -10,8 +10,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from mcaptrack.api.checked import declared
-from mcaptrack.api.declared import OneOfMany, Option
+from mcaptrack.api.declared import OneOfMany, Option, declared
 from mcaptrack.api.options import FILES, LABELS, PathLike, Reports, Sidecar, no_progress, output
 from mcaptrack.choices import ImageFormat, InputRole, LabelFormat, LengthUnit, Point
 from mcaptrack.errors import McaptrackError, call
@@ -322,12 +321,12 @@ def _changes(path: Path, report: IngestReport) -> dict[str, Any] | None:
 
     (topic,) = (topic for topic in report.messages if topic.endswith(f"/{CORRECTED}"))
     with logs.read(path) as opened:
-        found = changes_in(opened, topic)
-    if found is None:
+        changes = changes_in(opened, topic)
+    if changes is None:
         report.remarks.append(f"{path} has no tracks to compare {topic} with")
         return None
-    report.remarks.append(f"{topic}: {found.words}; {call('run', path)} takes it over")
-    return found.to_json()
+    report.remarks.append(f"{topic}: {changes.words}; {call('run', path)} takes it over")
+    return changes.to_json()
 
 
 def default_log(source: Path) -> Path:
@@ -354,10 +353,10 @@ def parse_size(size: str | tuple[int, int] | None) -> tuple[int, int] | None:
 
     if size is None:
         return None
-    found = boxes.parse_size(size if isinstance(size, str) else "x".join(map(str, size)))
-    if found is None:
+    parsed = boxes.parse_size(size if isinstance(size, str) else "x".join(map(str, size)))
+    if parsed is None:
         raise McaptrackError(f"`size=` is the width and height of pictures in pixels, like 1920x1080, not {size!r:.40}")
-    return found
+    return parsed
 
 
 def parse_start_time(time: float | str | dt.datetime | None) -> int | None:

@@ -16,8 +16,8 @@ import numpy as np
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline, tables
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import as_path, warn_unused, warnings_about
+from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike, Progress
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish_bytes, refuse_overwrite
@@ -156,12 +156,12 @@ def show_tables() -> None:
     if shell is None:
         return
     html = shell.display_formatter.formatters["text/html"]
-    if _ARROW not in html.deferred_printers and not any(_name_of(one) == _ARROW for one in html.type_printers):
+    if _ARROW not in html.deferred_printers and not any(_name_of(printer) == _ARROW for printer in html.type_printers):
         html.for_type_by_name(*_ARROW, arrow_html)
 
 
-def _name_of(one: type) -> tuple[str, str]:
-    return one.__module__, one.__qualname__
+def _name_of(cls: type) -> tuple[str, str]:
+    return cls.__module__, cls.__qualname__
 
 
 def arrow_html(table: pa.Table) -> str | None:
@@ -174,7 +174,7 @@ def arrow_html(table: pa.Table) -> str | None:
     True
     """
     about = [{key.decode(): text.decode() for key, text in (field.metadata or {}).items()} for field in table.schema]
-    if not any("unit" in one and "description" in one for one in about):
+    if not any("unit" in metadata and "description" in metadata for metadata in about):
         return None
     rows = table.num_rows
     is_whole = rows <= FIRST + LAST
@@ -182,9 +182,9 @@ def arrow_html(table: pa.Table) -> str | None:
     texts += [] if is_whole else tables.cells(table.slice(rows - LAST), LAST)[1]
     columns = [
         ShownColumn(
-            name, found.get("unit", ""), found.get("description", ""), is_number, [line[place] for line in texts]
+            name, metadata.get("unit", ""), metadata.get("description", ""), is_number, [line[place] for line in texts]
         )
-        for place, (name, found, is_number) in enumerate(zip(table.column_names, about, numbers, strict=True))
+        for place, (name, metadata, is_number) in enumerate(zip(table.column_names, about, numbers, strict=True))
     ]
     return table_html(columns, rows)
 
@@ -203,23 +203,23 @@ def show_log(
     with warnings_about(opened.path) as warnings:
         source = PictureSource(opened, pipeline.find_camera(opened, camera), topics)
         if at_s is None:
-            made = _player(opened, source, choice, max_mb, progress)
+            shown = _player(opened, source, choice, max_mb, progress)
         else:
-            given = {"start_s": choice.start_s > 0, "end_s": choice.end_s is not None, "every": bool(choice.every)}
-            warn_unused("a still is one picture", **given)
-            made = _still(opened, source, source.number_at(at_s), choice.width_px)
-    return replace(made, warnings=tuple(dict.fromkeys(warnings)))
+            unused = {"start_s": choice.start_s > 0, "end_s": choice.end_s is not None, "every": bool(choice.every)}
+            warn_unused("a still is one picture", **unused)
+            shown = _still(opened, source, source.number_at(at_s), choice.width_px)
+    return replace(shown, warnings=tuple(dict.fromkeys(warnings)))
 
 
 def _still(opened: logs.Log, source: PictureSource, number: int, width_px: int | None) -> Player:
     seconds = source.seconds(int(source.t_ns[number]))
     image = source.still(number, width_px)
     jpeg = still_jpeg(image)
-    made = Player(
+    player = Player(
         opened.path, source.topic, source.is_above, source.views, 1, 1, 1, seconds, seconds, html="", still=jpeg
     )
-    title = f"{opened.path.name}: {made.caption}"
-    return replace(made, html=still_html(jpeg, image.shape[1], title))
+    title = f"{opened.path.name}: {player.caption}"
+    return replace(player, html=still_html(jpeg, image.shape[1], title))
 
 
 def _player(opened: logs.Log, source: PictureSource, choice: Choice, max_mb: float, progress: Progress) -> Player:
@@ -227,9 +227,9 @@ def _player(opened: logs.Log, source: PictureSource, choice: Choice, max_mb: flo
     moments = find_moments(opened)
     at_ns, _ = opening_moment(opened, moments)
     events = [
-        (source.seconds(one.t_ns), one.text)
-        for one in moments
-        if any(f"{view}/".startswith(f"{one.topic}/") for view in source.views)
+        (source.seconds(moment.t_ns), moment.text)
+        for moment in moments
+        if any(f"{view}/".startswith(f"{moment.topic}/") for view in source.views)
     ]
     every = choice.every or source.step(numbers, _PLANNED * max_mb * _MB, choice.width_px)
     taken = source.take(numbers[::every], choice.width_px, progress)
@@ -239,14 +239,14 @@ def _player(opened: logs.Log, source: PictureSource, choice: Choice, max_mb: flo
         image = source.still(taken.numbers[opens_at], choice.width_px or min(PLAYER_PX, taken.sizes[0][0]))
         still = Still(still_jpeg(image), image.shape[1])
         span = seconds[0], seconds[-1]
-        made = Player(
+        player = Player(
             opened.path, source.topic, source.is_above, source.views,
             len(seconds), len(numbers), every, *span, html="", still=still.jpeg,
         )  # fmt: skip
         inside = [(at, text) for at, text in events if span[0] <= at <= span[1]]
-        html = player_html(taken, seconds, inside, opens_at, still, f"{opened.path.name}: {made.caption}")
+        html = player_html(taken, seconds, inside, opens_at, still, f"{opened.path.name}: {player.caption}")
         if len(html) <= max_mb * _MB or len(seconds) == 1:
-            return replace(made, html=html)
+            return replace(player, html=html)
         if choice.every is not None:
             raise McaptrackError(
                 f"{opened.path}: {len(seconds)} {source.noun} make a player of {len(html) / _MB:.1f} MB, and "

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from mcaptrack import log as logs
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import detail, locations_of, log_location, optional_path, warn_unused
+from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, place_of, publish_bytes, refuse_overwrite

@@ -1,4 +1,4 @@
-"""The files that a run owes beside a log, all of them made from the log as it stands.
+"""The files beside a log (layouts, tables), all of them made from the content of the log.
 
 A log is written as a whole, with its views and its layouts; what stands beside it is written afterwards, so a run that
 is killed may leave the log without. ``write_products`` is what every command calls after it has written, or found
@@ -69,8 +69,8 @@ def write_products(
             exported = export(opened, default_folder(log), progress, force=force, boxes=boxes)
             done.owed.append(main_file(log, default_folder(log)))
             done.rows, done.tables = exported.rows, exported.written
-            for words in exported.notes:
-                warn(words, "left-out")
+            for note in exported.notes:
+                warn(note, "left-out")
     return done
 
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import as_path, detail, locations_of
+from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike
 from mcaptrack.tables import RECORDING, TABLES
 

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from mcaptrack import log as logs
 from mcaptrack import tables
-from mcaptrack.api.checked import checked
 from mcaptrack.api.columns import times_of
 from mcaptrack.api.common import names_of
+from mcaptrack.api.declared import checked
 from mcaptrack.api.notebook import Choice, Player, show_log, show_tables
 from mcaptrack.api.options import Progress, no_progress
 from mcaptrack.api.rows import supervision_of
@@ -93,7 +93,7 @@ def _whole(value: Any) -> int | None:
 
 
 def shown_pictures(opened: Log, topic: str, times: Sequence[int] | NDArray[Any]) -> dict[int, int]:
-    """The numbers of the pictures that are shown at these times, and how often each is asked for."""
+    """Return the numbers of the pictures that are shown at these times, and how often each occurs."""
     wanted = times_of(times, "`times=`")
     at = np.searchsorted(opened.times(topic), wanted, "right") - 1
     if len(at) and at.min() < 0:
@@ -189,19 +189,19 @@ class LogReader:
         with self._reading:
             channels = self._log.channels
             if str(name) in tables.TABLES:
-                made = self._contents.table(name)
+                whole = self._contents.table(name)
             elif str(name) in channels:
-                made = self._contents.messages(name)[0]
+                whole = self._contents.messages(name)[0]
             else:
                 raise McaptrackError(
                     f"{self.path} has no table {name}; there are {', '.join(self.tables)}, and its channels"
                 )
         if topic is not None:
             self._log.channel(topic)
-            if "topic" not in made.schema.names:
+            if "topic" not in whole.schema.names:
                 raise McaptrackError(f"the rows of the table {name} are not by channel; leave `topic=` out")
-            made = tables.rows_of_topic(made, topic)
-        return tables.with_recording(made, self.name)
+            whole = tables.rows_of_topic(whole, topic)
+        return tables.with_recording(whole, self.name)
 
     def array(self, name: str, topic: str | None = None) -> NDArray[Any]:
         """Return a table as a structured NumPy array.
@@ -401,20 +401,20 @@ class LogReader:
         4
 
         """
-        there = {c.topic: SCHEMAS.get(c.schema_name) for c in self._log.channels.values()}
-        boxes = {name: schema for name, schema in there.items() if schema in (DETECTIONS, TRACKS)}
+        schemas = {c.topic: SCHEMAS.get(c.schema_name) for c in self._log.channels.values()}
+        boxes = {name: schema for name, schema in schemas.items() if schema in (DETECTIONS, TRACKS)}
         end = "/" + topic.strip("/")
-        found = [name for name in boxes if name == topic] or [name for name in boxes if name.endswith(end)]
-        if len(found) != 1:
+        topics = [name for name in boxes if name == topic] or [name for name in boxes if name.endswith(end)]
+        if len(topics) != 1:
             raise McaptrackError(
-                f"{self.path} has {len(found) or 'no'} channels {topic} of boxes; it has {', '.join(sorted(boxes))}"
+                f"{self.path} has {len(topics) or 'no'} channels {topic} of boxes; it has {', '.join(sorted(boxes))}"
             )
-        schema = boxes[found[0]]
-        names = class_names(self._log.channel(found[0]).metadata)
-        return supervision_of(self._log.frames(found[0], schema or TRACKS), names)
+        schema = boxes[topics[0]]
+        names = class_names(self._log.channel(topics[0]).metadata)
+        return supervision_of(self._log.frames(topics[0], schema or TRACKS), names)
 
     def _decoded(self, topic: str, wanted: Mapping[int, int] | None, colour: Colour) -> Iterator[Frame]:
         pixels = decode_gray if colour == "grey" else decode_bgr
-        found = Pictures(self._log, topic)
-        for frame in found.frames(range(len(found.t_ns)) if wanted is None else wanted, pixels):
+        pictures = Pictures(self._log, topic)
+        for frame in pictures.frames(range(len(pictures.t_ns)) if wanted is None else wanted, pixels):
             yield frame._replace(rows=frame.rows[..., ::-1]) if colour == "rgb" else frame

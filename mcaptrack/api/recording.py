@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from mcaptrack import log as logs
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import as_location, log_output
+from mcaptrack.api.declared import checked
 from mcaptrack.api.reading import LogReader
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_overwrite
@@ -130,10 +130,10 @@ def open(path: str | Path, *, create: bool = False) -> Recording:  # noqa: A001 
     True
     """
     if create:
-        made = log_output(path, Path(path))
-        if made.exists():
-            raise McaptrackError(f"{made} exists; open it without `create=True`, or give a new log another name")
-        refuse_overwrite(made, force=False)
-        with logs.create(made):
+        target = log_output(path, Path(path))
+        if target.exists():
+            raise McaptrackError(f"{target} exists; open it without `create=True`, or give a new log another name")
+        refuse_overwrite(target, force=False)
+        with logs.create(target):
             pass
     return Recording(as_location(path))

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
-from mcaptrack.api.checked import declared
-from mcaptrack.api.declared import Option
+from mcaptrack.api.declared import Option, declared
 from mcaptrack.api.options import Camera, EachLog, Force, PathLike, Reports, no_progress, output
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
@@ -178,16 +177,16 @@ def render(
             warn_unused("the whole log is written", **{name: bool(value) for name, value in of_video.items()})
             only = None if camera is None else pipeline.find_camera(opened, camera)
             done = write_blurred_log(opened, blurrable(opened, only), target, progress)
-            found = tuple(dict.fromkeys(warnings))
-            return RenderResult(path, target, sum(done.pictures.values()), (), found, tuple(done.pictures))
+            notices = tuple(dict.fromkeys(warnings))
+            return RenderResult(path, target, sum(done.pictures.values()), (), notices, tuple(done.pictures))
         if blur is not None:
             hidden = blurrable(opened, None if camera is None else pipeline.find_camera(opened, camera))
             pictures = _one_of(opened, list(hidden), camera)
             prefix = pipeline.find_camera(opened, camera) if topic else ""
             views = list(pipeline.find_views(opened, prefix, names_of(topic)).views) if topic else []
             count = draw_video(opened, pictures, views, target, options, progress, hidden[pictures])
-            found = tuple(dict.fromkeys(warnings))
-            return RenderResult(path, target, count, tuple(views), found, (pictures,))
+            notices = tuple(dict.fromkeys(warnings))
+            return RenderResult(path, target, count, tuple(views), notices, (pictures,))
         prefix = pipeline.find_camera(opened, camera)
         if heatmap:
             warn_unused("a heat map is one picture", max_fps=max_fps is not None, gif=gif and output is None)
@@ -226,9 +225,9 @@ def _one_of(opened: logs.Log, pictures: Sequence[str], camera: str | None) -> st
     )
 
 
-def refuse_both(**given: bool) -> None:
+def refuse_both(**flags: bool) -> None:
     """Raise McaptrackError if more than one of some parameters is given."""
-    chosen = [f"`{name}=`" for name, is_given in given.items() if is_given]
+    chosen = [f"`{name}=`" for name, is_given in flags.items() if is_given]
     if len(chosen) > 1:
         raise McaptrackError(f"{' and '.join(chosen)} make different files; give one of them")
 

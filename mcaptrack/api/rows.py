@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mcaptrack import tables
-from mcaptrack.api.checked import checked
 from mcaptrack.api.class_names import checked_names, numbered_columns, numbers_of
 from mcaptrack.api.columns import (
     UNNUMBERED,
@@ -27,6 +26,7 @@ from mcaptrack.api.columns import (
     number_of,
     time_of,
 )
+from mcaptrack.api.declared import checked
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
@@ -44,82 +44,82 @@ _NAMES: Final = "class_name"
 _OTHERS: Final = 2
 
 
-def is_supervision(given: Any) -> bool:
+def is_supervision(rows: Any) -> bool:
     """Whether an object is a ``supervision.Detections``, by its attributes: the package need not be installed.
 
     Raises McaptrackError for boxes of another package that look alike.
     """
-    if not hasattr(given, "xyxy"):
+    if not hasattr(rows, "xyxy"):
         return False
-    lacks = [name for name in _SUPERVISION if not hasattr(given, name)]
+    lacks = [name for name in _SUPERVISION if not hasattr(rows, name)]
     if lacks:
-        kind = f"{type(given).__module__}.{type(given).__qualname__}"
+        kind = f"{type(rows).__module__}.{type(rows).__qualname__}"
         raise McaptrackError(f"{kind} has no {lacks[0]}, unlike supervision.Detections; give its boxes as an array")
     return True
 
 
 def frame_of_supervision(
-    found: Any, t_ns: int | np.datetime64, index: int = UNNUMBERED, schema: Schema | None = None
+    detections_: Any, t_ns: int | np.datetime64, index: int = UNNUMBERED, schema: Schema | None = None
 ) -> Frame:
     """Return ``supervision.Detections`` as a frame: of tracks where they have tracker ids, otherwise of detections.
 
     Trackers give -1 to boxes of tracks that are not confirmed yet: a frame of tracks leaves these out. A frame without
     boxes needs no tracker ids.
     """
-    boxes = boxes_of(found.xyxy, "xyxy")
-    ids = None if found.tracker_id is None else np.asarray(found.tracker_id, np.int64)
+    boxes = boxes_of(detections_.xyxy, "xyxy")
+    ids = None if detections_.tracker_id is None else np.asarray(detections_.tracker_id, np.int64)
     schema = schema or (DETECTIONS if ids is None else TRACKS)
-    if found.mask is not None and len(boxes):
+    if detections_.mask is not None and len(boxes):
         warn("rows hold boxes: masks of supervision.Detections are left out", "left-out")
     if schema is DETECTIONS:
-        columns = {"score": found.confidence, "class_id": _classes_of(found)}
+        columns = {"score": detections_.confidence, "class_id": _classes_of(detections_)}
         return frame_of(DETECTIONS, boxes, columns, t_ns, index)
     if ids is None and len(boxes):
         raise McaptrackError(f"the detections at {t_ns} ns have no tracker ids; tracks need them")
     ids = np.empty(0, np.int64) if ids is None else ids
-    columns = {"score": found.confidence, "track_id": ids, "class_id": _classes_of(found)}
+    columns = {"score": detections_.confidence, "track_id": ids, "class_id": _classes_of(detections_)}
     frame = frame_of(TRACKS, boxes, columns, t_ns, index)
     if (ids < 0).any():
         warn("boxes without a tracker id (-1: the track is not confirmed yet) are left out", "left-out")
     return frame._replace(rows=frame.rows[ids >= 0])
 
 
-def _classes_of(found: Any) -> Any:
+def _classes_of(detections_: Any) -> Any:
     """Return class ids (N,) as the schema of detections has them: 0 unknown, 1 a person.
 
     Detectors count from 0 or from 1, and person may be any number, so names decide where there are some.
     """
-    count, names = len(found.xyxy), found.data.get(_NAMES)
-    ids = np.zeros(count, np.uint32) if found.class_id is None else np.asarray(found.class_id)
+    count, names = len(detections_.xyxy), detections_.data.get(_NAMES)
+    ids = np.zeros(count, np.uint32) if detections_.class_id is None else np.asarray(detections_.class_id)
     if names is None or not count:
         return ids
     raised = f"other numbers are {_OTHERS} higher than the detector's"
-    out = _ids_of(found)
+    out = _ids_of(detections_)
     if (out != ids).any() and (out != PERSON).any():
         warn(f"supervision.Detections name their classes: in class_id 1 is a person, {raised}", "classes")
     return out
 
 
-def _ids_of(found: Any) -> Any:
+def _ids_of(detections_: Any) -> Any:
     """Class ids (N,) of detections that name their classes: 1 is a person, others are raised by ``_OTHERS``.
 
     0 stays what it is if its name says that it is unknown, as in what ``supervision_of`` gives.
     """
-    names = np.array([str(name).lower() for name in found.data[_NAMES]])
+    names = np.array([str(name).lower() for name in detections_.data[_NAMES]])
     are_people = np.array([is_person(name) for name in names], bool)
-    if found.class_id is None:
+    if detections_.class_id is None:
         return np.where(are_people, PERSON, 0)
-    ids = np.asarray(found.class_id)
+    ids = np.asarray(detections_.class_id)
     is_unknown = (ids == UNKNOWN) & (names == class_name(UNKNOWN, {}))
     return np.where(are_people, PERSON, np.where(is_unknown, UNKNOWN, ids + _OTHERS))
 
 
-def names_of_supervision(found: Any) -> dict[int, str]:
+def names_of_supervision(detections_: Any) -> dict[int, str]:
     """Return the names of the classes by the ids that ``frame_of_supervision`` gives them."""
-    names = found.data.get(_NAMES)
-    if names is None or not len(found.xyxy):
+    names = detections_.data.get(_NAMES)
+    if names is None or not len(detections_.xyxy):
         return {}
-    out = dict(zip(np.asarray(_ids_of(found)).tolist(), (str(name) for name in names), strict=True))
+    out = dict(zip(np.asarray(_ids_of(detections_)).tolist(), (str(name) for name in names), strict=True))
     return checked_names({number: name for number, name in out.items() if number != UNKNOWN})
 
 
@@ -232,7 +232,7 @@ def detections(
         if any(values is not None for values in in_space.values()):
             raise McaptrackError("supervision.Detections are boxes in pixels; give positions without them")
         return frame_of_supervision(boxes, t_ns, index, DETECTIONS)
-    given = columns_in_space(in_space)
+    columns = columns_in_space(in_space)
     if boxes is None and positions_m is None:
         raise McaptrackError("detections need boxes in pixels (`boxes=`), or positions in metres (`positions_m=`)")
     if boxes is None and box_format is not None:
@@ -240,9 +240,9 @@ def detections(
     if boxes is not None and box_format not in ("xyxy", "xywh"):
         raise McaptrackError("say what the columns of boxes are with `box_format='xyxy'` or `box_format='xywh'`")
     classes = classes if class_names is None else numbers_of(classes, class_names)
-    given |= {"score": scores, "class_id": classes}
+    columns |= {"score": scores, "class_id": classes}
     pixels = None if boxes is None or box_format is None else boxes_of(boxes, box_format)
-    return frame_of(DETECTIONS, pixels, given, t_ns, index)
+    return frame_of(DETECTIONS, pixels, columns, t_ns, index)
 
 
 def frames_of(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame], dict[int, str]]:
@@ -288,10 +288,10 @@ def _of_frames(rows: Any, schema: Schema | None, names: dict[int, str]) -> tuple
         )
     if not isinstance(rows, Iterable) or isinstance(rows, str | bytes):
         raise McaptrackError(f"rows are frames, an array, a table or supervision.Detections, not {kind_of(rows)}")
-    frames = [_frame(one, schema, names) for one in (rows.items() if hasattr(rows, "items") else rows)]
+    frames = [_frame(item, schema, names) for item in (rows.items() if hasattr(rows, "items") else rows)]
     if schema is None:
-        found = {frame.rows.dtype.names for frame in [frame for frame in frames if len(frame.rows)] or frames}
-        fitting = [one for one in (DETECTIONS, TRACKS) if found and all(map(one.has_columns, found))]
+        layouts = {frame.rows.dtype.names for frame in [frame for frame in frames if len(frame.rows)] or frames}
+        fitting = [kind for kind in (DETECTIONS, TRACKS) if layouts and all(map(kind.has_columns, layouts))]
         if not fitting:
             raise McaptrackError(
                 "it is not clear whether these are detections or tracks; all frames have to be of one kind, and "
@@ -309,19 +309,19 @@ def _checked(schema: Schema, frame: Frame) -> Frame:
         raise McaptrackError(f"the frame at {frame.t_ns} ns: {error}") from None
 
 
-def _frame(one: Any, schema: Schema | None, names: dict[int, str]) -> Frame:
-    if isinstance(one, Frame):
-        if not isinstance(one.rows, np.ndarray):
-            raise McaptrackError(f"the rows of a frame are a structured array, not {kind_of(one.rows)}")
-        if any(np.ma.getmaskarray(one.rows).tobytes()):
+def _frame(item: Any, schema: Schema | None, names: dict[int, str]) -> Frame:
+    if isinstance(item, Frame):
+        if not isinstance(item.rows, np.ndarray):
+            raise McaptrackError(f"the rows of a frame are a structured array, not {kind_of(item.rows)}")
+        if any(np.ma.getmaskarray(item.rows).tobytes()):
             raise McaptrackError(
                 "the rows of a frame are masked; give frames without a mask, with NaN for missing numbers"
             )
-        return Frame(time_of(one.t_ns), number_of(one.index), one.rows)
-    if isinstance(one, Sequence) and len(one) == 2 and is_supervision(one[1]):
-        names |= names_of_supervision(one[1]) | names
-        return frame_of_supervision(one[1], one[0], schema=schema)
-    kind = "a mapping of columns" if isinstance(one, tuple) and one and isinstance(one[0], str) else kind_of(one)
+        return Frame(time_of(item.t_ns), number_of(item.index), item.rows)
+    if isinstance(item, Sequence) and len(item) == 2 and is_supervision(item[1]):
+        names |= names_of_supervision(item[1]) | names
+        return frame_of_supervision(item[1], item[0], schema=schema)
+    kind = "a mapping of columns" if isinstance(item, tuple) and item and isinstance(item[0], str) else kind_of(item)
     raise McaptrackError(
         f"each frame is one of `mcaptrack.detections`, or a time in nanoseconds with supervision.Detections, not "
         f"{kind}; columns are given as a structured array, or a table of pandas, Polars or Arrow"

@@ -112,9 +112,9 @@ class RunResult:
     written_tables: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        did, found = ", ".join(self.stages) or "up to date", self.summary
-        counts = "" if found is None or found.tracks is None else f"; {found.tracks} tracks"
-        counts += f", {found.repair.tracks} after re-tracking" if counts and found and found.repair else ""
+        did, summary = ", ".join(self.stages) or "up to date", self.summary
+        counts = "" if summary is None or summary.tracks is None else f"; {summary.tracks} tracks"
+        counts += f", {summary.repair.tracks} after re-tracking" if counts and summary and summary.repair else ""
         return f"RunResult({str(self.log)!r}: {did}{counts}; {self.seconds:.1f} s, {len(self.warnings)} warnings)"
 
     @property
@@ -192,8 +192,8 @@ def work(
                 before = pipeline.Before(earlier, opened, at)
                 report = run(plan(opened, at, notes.say, fused, before.renewed(opened)), before=before)
             continued.append(before.result)
-            for words in before.result.words():
-                notes.say(words)
+            for line in before.result.words():
+                notes.say(line)
             return at, report
 
         return act
@@ -239,11 +239,11 @@ def change(
             has_several = each is not None and each.chooses(opened, notes)
             done = [] if has_several else [Done("", *act(opened, output, notes, boxes))]
             written_to = output or opened.parts[-1].path
-            report = together([one.report for one in done])
+            report = together([camera.report for camera in done])
             named = {topic: pipeline.camera_to_name(opened, topic) for topic in report.stale}
         if each is not None and has_several:
             done = each.run(path, output, place, notes, progress)
-            report = together([one.report for one in done])
+            report = together([camera.report for camera in done])
             with logs.read(target) as opened:
                 report.stale = [topic for topic in report.stale if pipeline.is_stale(opened, topic)]
                 named = {topic: pipeline.camera_to_name(opened, topic) for topic in report.stale}
@@ -266,15 +266,17 @@ def change(
         counted = {}
         if report.has_zones:
             with logs.read(target) as opened:
-                found = [one for camera in done for one in pipeline.counted_zones(opened, camera.prefix)]
-                counted = {one.topic: one.totals for one in found}
+                zones_counted = [
+                    counted_zone for camera in done for counted_zone in pipeline.counted_zones(opened, camera.prefix)
+                ]
+                counted = {channel.topic: channel.totals for channel in zones_counted}
         summaries: dict[str, Summary] = {}
         if tables is not None:
             with report.watch.part("summary"), logs.read(target) as opened:
-                for one in done:
-                    with notices.naming(one.name) if has_several else nullcontext():
-                        summaries[one.name] = pipeline.summarise(opened, one.prefix, boxes)
-    scene = next((one.name for one in reversed(done) if one.is_scene), None) if has_several else ""
+                for camera in done:
+                    with notices.naming(camera.name) if has_several else nullcontext():
+                        summaries[camera.name] = pipeline.summarise(opened, camera.prefix, boxes)
+    scene = next((camera.name for camera in reversed(done) if camera.is_scene), None) if has_several else ""
     return RunResult(
         log=target,
         stages=tuple(report.stages),
@@ -293,7 +295,9 @@ def change(
         notes=tuple(notes),
         seconds=round(monotonic() - began, 3),
         seconds_by_part={name: round(seconds, 3) for name, seconds in report.watch.seconds.items()},
-        cameras={one.name: CameraResult.of(one, summaries[one.name]) for one in done} if has_several else {},
+        cameras={camera.name: CameraResult.of(camera, summaries[camera.name]) for camera in done}
+        if has_several
+        else {},
         left_out=dict(each.left_out) if each is not None else {},
         not_fused=each.not_fused if each is not None else "",
         files=tuple(products.owed),
@@ -337,13 +341,13 @@ def _with_options(base: Transform, options: Mapping[str, Option]) -> Transform:
         raise McaptrackError(
             f"{base!r:.80} is no transform: it is no dataclass; give a name, or an object of a transform"
         )
-    known = [f.name for f in fields(base) if not f.metadata.get("context")]
+    own_names = [f.name for f in fields(base) if not f.metadata.get("context")]
     for name in options:
-        if name not in known:
-            close = get_close_matches(name, known, 1)
+        if name not in own_names:
+            close = get_close_matches(name, own_names, 1)
             meant = f"did you mean {close[0]}? " if close else ""
             raise McaptrackError(
-                f"{type(base).__name__} has no parameter {name}; {meant}there are {', '.join(known) or 'none'}"
+                f"{type(base).__name__} has no parameter {name}; {meant}there are {', '.join(own_names) or 'none'}"
             )
     return replace(base, **options)
 

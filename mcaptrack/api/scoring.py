@@ -14,8 +14,8 @@ import numpy as np
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import Notes, as_path, detail, locations_of, names_of, optional_path, paths_of, warn_unused
+from mcaptrack.api.declared import checked
 from mcaptrack.api.ingesting import parse_fps
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.choices import Point
@@ -158,10 +158,10 @@ class Scores:
         whole = [row for row in rows if row["tracks"] == tracks or row["tracks"].endswith(f"/{tracks}")]
         rows = whole or rows
         if len(rows) != 1:
-            there = ", ".join(f"{row['tracks']} {row['similarity']} {row['gate']:g}" for row in rows or final)
+            choices = ", ".join(f"{row['tracks']} {row['similarity']} {row['gate']:g}" for row in rows or final)
             raise McaptrackError(
                 f"{len(rows) or 'no'} results fit `tracks={tracks!r}`, `similarity={similarity!r}` and `gate={gate}`; "
-                f"choose one of: {there}"
+                f"choose one of: {choices}"
             )
         _check_name(name, rows[0])
         return float(rows[0][name])
@@ -194,8 +194,8 @@ class Scores:
         """
         rows = [row for row in self.rows() if row["class"] == of_class]
         if not rows and of_class is not None:
-            there = ", ".join(dict.fromkeys(one.of_class for one in self.results if one.of_class is not None))
-            raise McaptrackError(f"no class {of_class!r:.60} was scored by itself; there are {there or 'none'}")
+            scored = ", ".join(dict.fromkeys(result.of_class for result in self.results if result.of_class is not None))
+            raise McaptrackError(f"no class {of_class!r:.60} was scored by itself; there are {scored or 'none'}")
         return [row for row in rows if row["sequence"] == COMBINED] or rows
 
     @checked()
@@ -229,14 +229,14 @@ class Scores:
         """
         from mcaptrack.viewing.report.formatting import curves_svg
 
-        whole = [one for one in self.results if one.of_class is None and one.displacement is not None]
-        whole = [one for one in whole if one.sequence == COMBINED] or whole
-        found = {one.tracks: one.displacement for one in whole if one.displacement is not None}
-        if not found:
+        whole = [result for result in self.results if result.of_class is None and result.displacement is not None]
+        whole = [result for result in whole if result.sequence == COMBINED] or whole
+        displacements = {result.tracks: result.displacement for result in whole if result.displacement is not None}
+        if not displacements:
             raise McaptrackError("no predictions were scored; there are no curves to draw")
         path = as_path(output)
         refuse_overwrite(path, force)
-        publish_bytes(path, curves_svg(found).encode())
+        publish_bytes(path, curves_svg(displacements).encode())
         return path
 
     def below(self, limits: Mapping[str, float]) -> list[str]:
@@ -369,8 +369,8 @@ def evaluate(
 
         outcome = score_sequences(sequences, options, tell)
         progress("evaluate", total, total)
-        for words in outcome.notes:
-            warn(words, "not-compared")
+        for note in outcome.notes:
+            warn(note, "not-compared")
         has_point, has_plane = point != "foot", ground_plane is not None
         if truth is None:
             reason = "it is about label files; logs have theirs inside"
@@ -420,13 +420,13 @@ def _smoothed(opened: logs.Log, prefix: str) -> Candidate:
     samples, forecasts = (f"{prefix}/{name}" for name in (stage.input_topic, stage.output_topic))
     if forecasts not in opened.channels or samples not in opened.channels:
         raise McaptrackError(f"{opened.path} has no {forecasts}; {call('run', opened.path)} makes them")
-    made = Provenance.from_metadata(opened.channel(forecasts).metadata)
-    transform = rebuild(stage, made, {}) if made is not None and made.transform == stage.name else None
-    if made is None or not isinstance(transform, Predict):
+    how = Provenance.from_metadata(opened.channel(forecasts).metadata)
+    transform = rebuild(stage, how, {}) if how is not None and how.transform == stage.name else None
+    if how is None or not isinstance(transform, Predict):
         raise McaptrackError(f"{forecasts} of {opened.path} is recorded: how it was predicted is not known")
     names = class_names(opened.channel(samples).metadata)
     class_of = tuple(names.items())
-    rate_hz = float(made.parameters.get("rate_hz", transform.rate_hz))
+    rate_hz = float(how.parameters.get("rate_hz", transform.rate_hz))
     frames = opened.frames(samples, TRACKS)
     predictions = list(smoothed_predictions(frames, replace(transform, rate_hz=rate_hz, class_names=class_of)))
     name = f"{samples}, smoothed"
@@ -443,9 +443,9 @@ def _from_files(
     classes: str | None,
     notes: Notes,
 ) -> list[EvaluationInput]:
-    pairs, words = pair_files(tracks, truths)
-    if words:
-        notes.say(words)
+    pairs, note_on_pairs = pair_files(tracks, truths)
+    if note_on_pairs:
+        notes.say(note_on_pairs)
     sequences = []
     for name, path, labels in pairs:
         both = compare_files(path, labels, fps, ground_plane, point, topics, classes)

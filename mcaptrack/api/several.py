@@ -86,7 +86,7 @@ class EveryCamera:
     scenes: tuple[str, ...] = ()
 
     def chooses(self, opened: logs.Log, notes: Notes) -> bool:
-        """Return whether the log has several cameras, or several are named; says which are run, and which are not."""
+        """Return whether the log has several cameras, or several are named; note which are run."""
         chosen = pipeline.choose_cameras(opened, self.names)
         if chosen is None:
             return False
@@ -98,8 +98,8 @@ class EveryCamera:
             listed = ", ".join(prefix[1:] for prefix in self.prefixes)
             notes.say(f"running {len(self.prefixes)} cameras, {listed}; `camera=` names those to run")
         for prefix in self.prefixes:
-            if words := pipeline.begins_with(opened, prefix):
-                notes.say(words)
+            if reason := pipeline.begins_with(opened, prefix):
+                notes.say(reason)
         return True
 
     def run(
@@ -122,8 +122,8 @@ class EveryCamera:
             scenes = self.scenes or (pipeline.scenes_of(opened) if self.is_fused else ())
             joined: list[str] = []
             if self.is_fused and not scenes:
-                given = [prefix[1:] for prefix in self.prefixes]
-                joined, why = pipeline.fusable(opened, given)
+                names = [prefix[1:] for prefix in self.prefixes]
+                joined, why = pipeline.fusable(opened, names)
                 self.not_fused = "" if joined else why
                 if joined and why:
                     steps.notes.say(f"not in the scene: {why}")
@@ -160,7 +160,7 @@ class _Steps:
     @property
     def failed(self) -> list[str]:
         """The names of the cameras that failed."""
-        return [one.name for one in self.done if one.failure]
+        return [camera.name for camera in self.done if camera.failure]
 
     def opened(self) -> logs.Log:
         """The log as it is now."""
@@ -178,10 +178,10 @@ class _Steps:
                 prefix, report = act(opened, output, self.notes, BoxesRead())
             except McaptrackError as error:
                 why = str(error).replace(str(self.part), str(self.output))
-                self.done = [one for one in self.done if one.name != name]
+                self.done = [step for step in self.done if step.name != name]
                 self.done.append(Done(name, f"/{name}", Report(), is_scene, why))
                 return False
-        before = next((one for one in self.done if one.name == name), None)
+        before = next((step for step in self.done if step.name == name), None)
         if before is None:
             self.done.append(Done(name, prefix, report, is_scene))
         else:
@@ -192,42 +192,42 @@ class _Steps:
 def unfitting(
     opened: logs.Log, prefix: str, transforms: Mapping[str, Transform], say: Callable[[str], None]
 ) -> set[str]:
-    """Return the stages with a transform that can't take the boxes of one of several cameras, or of a scene.
+    """Return the stages with a transform that can't take the boxes of this camera or scene.
 
     A tracker that is named is for the cameras, or for the scene: of boxes in pictures, or of positions in metres.
     """
     space = "ground" if pipeline.camera_at(opened, prefix).in_space else "picture"
-    found = set()
-    for stage, one in transforms.items():
-        if one.reads is DETECTIONS and one.writes[""] is TRACKS and traits_of(one).space != space:
-            say(f"{prefix[1:]} is not tracked by {STAGES[stage].choice(one)}, which is for other boxes")
-            found.add(stage)
-    return found
+    stages = set()
+    for stage, transform in transforms.items():
+        if transform.reads is DETECTIONS and transform.writes[""] is TRACKS and traits_of(transform).space != space:
+            say(f"{prefix[1:]} is not tracked by {STAGES[stage].choice(transform)}, which is for other boxes")
+            stages.add(stage)
+    return stages
 
 
 def together(reports: Sequence[Report]) -> Report:
     """Return the reports on several cameras as one."""
     out = Report()
-    for one in reports:
-        out.stages += one.stages
-        out.frames |= one.frames
-        out.rows |= one.rows
-        out.tracks |= one.tracks
-        out.events |= one.events
-        out.is_written |= one.is_written
-        out.stale = [*dict.fromkeys([*out.stale, *one.stale])]
-        out.warnings += one.warnings
-        out.has_zones |= one.has_zones
-        for name, seconds in one.watch.seconds.items():
+    for report in reports:
+        out.stages += report.stages
+        out.frames |= report.frames
+        out.rows |= report.rows
+        out.tracks |= report.tracks
+        out.events |= report.events
+        out.is_written |= report.is_written
+        out.stale = [*dict.fromkeys([*out.stale, *report.stale])]
+        out.warnings += report.warnings
+        out.has_zones |= report.has_zones
+        for name, seconds in report.watch.seconds.items():
             out.watch.seconds[name] = out.watch.seconds.get(name, 0.0) + seconds
     return out
 
 
 def refuse_failed(log: Location, done: Sequence[Done]) -> None:
     """Raise McaptrackError if any camera failed, with its reason."""
-    failed = [one for one in done if one.failure]
+    failed = [camera for camera in done if camera.failure]
     if failed:
-        why = "; ".join(f"{one.name}: {one.failure}" for one in failed)
-        good = ", ".join(one.name for one in done if not one.failure)
+        why = "; ".join(f"{camera.name}: {camera.failure}" for camera in failed)
+        good = ", ".join(camera.name for camera in done if not camera.failure)
         rest = f". What was made of {good} is written; `camera=` names cameras to run" if good else ""
         raise McaptrackError(f"{log}: {len(failed)} of {len(done)} cameras failed: {why}{rest}")

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.checked import checked, declared
 from mcaptrack.api.common import Notes, clock_offsets, split_names
-from mcaptrack.api.declared import PYTHON_ONLY, Option
+from mcaptrack.api.declared import PYTHON_ONLY, Option, checked, declared
 from mcaptrack.api.options import (
     Camera,
     EachLog,

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Final, Literal
 
 from mcaptrack import __version__
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import Notes, as_path, optional_path, paths_of
+from mcaptrack.api.declared import checked
 from mcaptrack.api.ingesting import parse_fps
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.choices import Point
@@ -194,16 +194,16 @@ def train(
             training, validation = split(training, _VALIDATION_SHARE, chosen.seed)
         notes.say(f"training on {len(training)} windows, validating on {len(validation)}")
         folder.mkdir(parents=True, exist_ok=True)
-        made = fit(chosen, training, validation, folder, card, where, threads, resume, progress, notes.say)
+        trained = fit(chosen, training, validation, folder, card, where, threads, resume, progress, notes.say)
     return TrainResult(
-        weights=made.weights,
-        predictor=f"{chosen.network}:{made.weights}",
-        epochs=made.epochs,
-        kept_epoch=made.kept_epoch,
-        windows=made.windows,
-        validation_windows=made.validation_windows,
-        scores=made.scores,
-        seconds=made.seconds,
+        weights=trained.weights,
+        predictor=f"{chosen.network}:{trained.weights}",
+        epochs=trained.epochs,
+        kept_epoch=trained.kept_epoch,
+        windows=trained.windows,
+        validation_windows=trained.validation_windows,
+        scores=trained.scores,
+        seconds=trained.seconds,
         notes=tuple(notes),
         warnings=tuple(dict.fromkeys(warnings)),
     )
@@ -224,19 +224,19 @@ def _windows(
     recipe: Recipe, sources: PathLike | Sequence[PathLike], walks: int, options: SourceOptions, notes: Notes
 ) -> tuple[Windows, dict[str, str]]:
     """Return the windows of all sources, and what the model card says of them."""
-    given = [sources] if isinstance(sources, str | os.PathLike) else list(sources)
-    paths = paths_of([source for source in given if source != SYNTHETIC])
-    parts, words = [], []
-    if len(paths) < len(given):
+    given_sources = [sources] if isinstance(sources, str | os.PathLike) else list(sources)
+    paths = paths_of([source for source in given_sources if source != SYNTHETIC])
+    parts, descriptions = [], []
+    if len(paths) < len(given_sources):
         notes.say(f"simulating {walks} walks ...")
         parts.append(synthetic(recipe, walks, recipe.seed))
-        words.append(f"{walks} synthetic walks of mcaptrack {__version__}, seed {recipe.seed}")
+        descriptions.append(f"{walks} synthetic walks of mcaptrack {__version__}, seed {recipe.seed}")
     if paths:
         scenes = read_scenes(paths, options, recipe.step_s)
         first = 0 if not parts else int(parts[0].scene.max()) + 1
-        found = windows_of(scenes, recipe)
-        parts.append(Windows(found.past, found.known, found.future, found.scene + first))
-        words.append(f"{len(scenes)} scenes: {', '.join(scene.name for scene in scenes)[:500]}")
+        windows = windows_of(scenes, recipe)
+        parts.append(Windows(windows.past, windows.known, windows.future, windows.scene + first))
+        descriptions.append(f"{len(scenes)} scenes: {', '.join(scene.name for scene in scenes)[:500]}")
     licence = _LICENCE if paths else "Apache-2.0"
-    card = {"data": "; ".join(words), "licence": licence, "made_by": f"mcaptrack {__version__}"}
+    card = {"data": "; ".join(descriptions), "licence": licence, "made_by": f"mcaptrack {__version__}"}
     return Windows.join(parts), card

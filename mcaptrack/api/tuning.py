@@ -11,8 +11,8 @@ from typing import Final, Literal
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import Notes, detail, optional_path, paths_of
+from mcaptrack.api.declared import checked
 from mcaptrack.api.ingesting import parse_fps
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.api.running import Option, transform_of
@@ -182,9 +182,9 @@ def tune(
         elif not has_tracker:
             raise McaptrackError(f"files of detections are for `stage='track'`; to tune {stage} give logs")
         else:
-            pairs, words = pair_files(paths_of(inputs), paths_of(truth))
-            if words:
-                notes.say(words)
+            pairs, note_on_pairs = pair_files(paths_of(inputs), paths_of(truth))
+            if note_on_pairs:
+                notes.say(note_on_pairs)
             tasks = _tasks_of_files(pairs, parse_fps(fps), optional_path(ground_plane), point)
         if force and trials_file is not None:
             trials_file.unlink(missing_ok=True)
@@ -233,8 +233,8 @@ def _ranges(kind: type[Transform], search: Search | None) -> dict[str, Range]:
     out = {}
     for name, span in asked.items():
         if name not in declared:
-            known = ", ".join(declared) or "none"
-            raise McaptrackError(f"`search=` has {name}, which can't be searched; there are {known}")
+            text = ", ".join(declared) or "none"
+            raise McaptrackError(f"`search=` has {name}, which can't be searched; there are {text}")
         out[name] = declared[name]
         if span is not None:
             low, high = span
@@ -252,8 +252,8 @@ def _tasks_of_files(
 ) -> list[Task]:
     tasks = []
     for name, path, labels in pairs:
-        found = detections_and_ground_truth(path, labels, fps, ground_plane, point)
-        tasks.append(Task(name, found.detections, found.ground_truth, {"ground_planes": found.planes}))
+        detected = detections_and_ground_truth(path, labels, fps, ground_plane, point)
+        tasks.append(Task(name, detected.detections, detected.ground_truth, {"ground_planes": detected.planes}))
     return tasks
 
 

@@ -8,8 +8,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from mcaptrack import log as logs
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import log_file, log_location, log_output, names_of, warnings_about
+from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_overwrite
@@ -50,7 +50,7 @@ class LogCheck:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Errors, and warnings about what could be better."""
-        return tuple(found for file in self.files for found in file.findings)
+        return tuple(finding for file in self.files for finding in file.findings)
 
 
 @checked()
@@ -276,24 +276,24 @@ def _chosen(opened: logs.Log, patterns: Sequence[str]) -> set[str]:
     """
     chosen: set[str] = set()
     for pattern in patterns:
-        found = {pattern} & opened.channels.keys()
+        fitting = {pattern} & opened.channels.keys()
         if any(letter in pattern for letter in "*?["):  # most are names, and there may be thousands
-            found |= {topic for topic in opened.channels if fnmatchcase(topic, pattern)}
-        if not found:
+            fitting |= {topic for topic in opened.channels if fnmatchcase(topic, pattern)}
+        if not fitting:
             opened.channel(pattern)  # raises, with the channels that there are
-        chosen |= found
-    made = {topic: Provenance.from_metadata(channel.metadata) for topic, channel in opened.channels.items()}
+        chosen |= fitting
+    provenances = {topic: Provenance.from_metadata(channel.metadata) for topic, channel in opened.channels.items()}
     # The outline of a corrected plane is drawn as the view of the plane that was given.
     outlines = {
         provenance.input + SCENE_SUFFIX
         for topic in chosen
-        if (provenance := made[topic]) and provenance.transform == REFINE
+        if (provenance := provenances[topic]) and provenance.transform == REFINE
     }
-    chosen |= outlines & made.keys()
+    chosen |= outlines & provenances.keys()
     for transform in ("events", "view"):  # in this order: events have views
         chosen |= {
             topic
-            for topic, provenance in made.items()
+            for topic, provenance in provenances.items()
             if provenance and provenance.transform == transform and provenance.input in chosen
         }
     return chosen

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Final, Self
 
 from mcaptrack import log as logs
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import Notes, as_path, log_file
+from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.clocks import NS_PER_S
@@ -94,8 +94,8 @@ class LogServer:
         }
         self.links = links_to(first, contents.at_ns)
         self.events = tuple(
-            one._replace(link=links_to(first, links.before(one.t_ns, contents.start_ns))["Lichtblick"])
-            for one in contents.events
+            event._replace(link=links_to(first, links.before(event.t_ns, contents.start_ns))["Lichtblick"])
+            for event in contents.events
         )
         self.report = None
         if contents.report is not None:
@@ -231,8 +231,8 @@ def _opening(opened: logs.Log, events: Sequence[LinkedEvent], at_s: float | None
         return opened.start_ns + round(at_s * NS_PER_S), "as asked"
     if event is not None:
         if event > len(events):
-            there = f"the events 1 to {len(events)}" if events else "no identity switches and repairs"
-            raise McaptrackError(f"{opened.path} has {there}, so viewers can't open at event {event}")
+            what_there_is = f"the events 1 to {len(events)}" if events else "no identity switches and repairs"
+            raise McaptrackError(f"{opened.path} has {what_there_is}, so viewers can't open at event {event}")
         chosen = events[event - 1]
         return links.before(chosen.t_ns, opened.start_ns), f"a second before event {event} ({chosen.text})"
     return links.opening_moment(opened, events)
@@ -261,14 +261,14 @@ def _say_trouble(opened: logs.Log, notes: Notes) -> None:
         topics.setdefault(codec, []).append(topic)
     again = call("ingest", Path("VIDEO"), image_format="jpeg")
     for codec, those in topics.items():
-        there = f"pictures in {', '.join(those)} are {_CODECS.get(codec, codec)}"
+        trouble = f"pictures in {', '.join(those)} are {_CODECS.get(codec, codec)}"
         if codec == "h264":
             notes.say(
-                f"{there}: on a slow machine Lichtblick may show none while it is paused, and late ones during play. "
+                f"{trouble}: on a slow machine Lichtblick may show none while it is paused, and late ones during play. "
                 f"A log made by {again} doesn't have this, and is larger"
             )
         else:
-            notes.say(f"{there}, which Lichtblick doesn't play; a log made by {again} can be seen everywhere")
+            notes.say(f"{trouble}, which Lichtblick doesn't play; a log made by {again} can be seen everywhere")
 
 
 def _chosen_layouts(
@@ -284,13 +284,13 @@ def _chosen_layouts(
         except (ValueError, RecursionError):
             raise McaptrackError(f"{file} is no layout: it is not JSON") from None
         return {file.stem.removesuffix(".layout"): (f"{file.stem}.json", file)}
-    found = _layouts(path, opened, notes)
-    if chosen is not None and str(chosen) not in found:
-        there = ", ".join(found) or "none"
-        raise McaptrackError(f"{path} has no layout {chosen}; it has {there}. A file of a layout ends with .json")
+    layouts = _layouts(path, opened, notes)
+    if chosen is not None and str(chosen) not in layouts:
+        text = ", ".join(layouts) or "none"
+        raise McaptrackError(f"{path} has no layout {chosen}; it has {text}. A file of a layout ends with .json")
     return {
         name: (layout_path(path, name).name, content)
-        for name, content in found.items()
+        for name, content in layouts.items()
         if chosen is None or name == str(chosen)
     }
 
@@ -302,7 +302,7 @@ def _is_file_name(chosen: PathLike) -> bool:
 
 def _layouts(path: Path, opened: logs.Log, notes: Notes) -> dict[str, Path | bytes]:
     """Return the layouts of a log: files beside it, otherwise what it keeps. Notes tell of files that were edited."""
-    found: dict[str, Path | bytes] = {}
+    layouts: dict[str, Path | bytes] = {}
     for name in LAYOUTS:
         kept, file = opened.attachment(attachment_of(name)), layout_path(path, name)
         try:
@@ -314,9 +314,9 @@ def _layouts(path: Path, opened: logs.Log, notes: Notes) -> dict[str, Path | byt
             why = error.strerror if isinstance(error, OSError) else "it is not JSON"
             warn(f"{file} can't be served ({why}); the log's own layout is used", "left-out")
         if content is not None:
-            found[name] = file
+            layouts[name] = file
         elif kept is not None:
-            found[name] = kept
+            layouts[name] = kept
         if content is not None and kept is not None and content != kept:
             notes.say(f"{file} differs from the layout in the log; the file is served")
-    return found
+    return layouts

@@ -9,8 +9,8 @@ from typing import Any, Final
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import as_location, as_path, log_location, names_of, optional_path, split_names, warn_unused
+from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.api.running import Fusing, RunResult, Where, transform_of, transforms_of, work
 from mcaptrack.api.several import unfitting
@@ -36,16 +36,16 @@ _PAGE: Final = ".zones.html"
 ZonesLike = PathLike | Mapping[str, Any]
 
 
-def zones_of(given: ZonesLike | None) -> tuple[Zone, ...]:
+def zones_of(source: ZonesLike | None) -> tuple[Zone, ...]:
     """Return the zones of a file, or of GeoJSON; none of None. Raises McaptrackError if they can't be read."""
-    if given is None:
+    if source is None:
         return ()
-    if isinstance(given, Mapping):
+    if isinstance(source, Mapping):
         try:
-            return parse_zones(dict(given))
+            return parse_zones(dict(source))
         except McaptrackError as error:
             raise McaptrackError(f"`zones=`: {error}") from None
-    return read_zones(as_path(given))
+    return read_zones(as_path(source))
 
 
 @checked(margin_m=(0, 100), max_gap_s=(0, 1e6))
@@ -111,20 +111,22 @@ def zones(
     ['zone 1']
 
     """
-    found, usual = zones_of(zones), ZoneOptions()
+    wanted, usual = zones_of(zones), ZoneOptions()
     options = None
     if margin_m is not None or max_gap_s is not None:
-        given = {"margin_m": margin_m, "max_gap_s": max_gap_s}
-        options = ZoneOptions(**{name: getattr(usual, name) if one is None else one for name, one in given.items()})
+        changed = {"margin_m": margin_m, "max_gap_s": max_gap_s}
+        options = ZoneOptions(
+            **{name: getattr(usual, name) if value is None else value for name, value in changed.items()}
+        )
     elif zones is not None:
         options = usual
 
     def plan(opened: logs.Log, prefix: str, *_: object) -> list[Job]:
-        if not found and not pipeline.counted_zones(opened, prefix):
+        if not wanted and not pipeline.counted_zones(opened, prefix):
             raise McaptrackError(f"{opened.path} was not counted yet; give a file of GeoJSON with `zones=`")
         return []
 
-    watch = ZoneWatch(found, names_of(topic), options, force)
+    watch = ZoneWatch(wanted, names_of(topic), options, force)
     return work(Where(log, camera, None, output, sidecar, force), plan, None, progress, None, zones=watch)
 
 
@@ -300,15 +302,15 @@ def run(
     if len(names) > 1 and topic is not None:
         raise McaptrackError(f"`topic={topic!r}` is of one camera, and `camera=` names {len(names)}; leave one out")
     named = {"detector": detector, "tracker": tracker, "retracker": retracker, "predictor": predictor}
-    chosen = {kind: one for kind, one in named.items() if one is not None}
+    chosen = {kind: choice for kind, choice in named.items() if choice is not None}
     transforms = transforms_of(stages)
     transforms |= {s.name: transform_of(s.name, chosen[s.option], {}) for s in STAGES.values() if s.option in chosen}
 
     joins = None if fuser is None else transform_of(FUSION.name, fuser, {})
 
     plane = PlaneChoice(fit_plane, person_height_m, frame, ground_frame)
-    given = {"camera_motion": camera_motion, "across_classes": across_classes, "class_limits": class_limits}
-    shared = {name: value for name, value in given.items() if value is not None}
+    settings = {"camera_motion": camera_motion, "across_classes": across_classes, "class_limits": class_limits}
+    shared = {name: value for name, value in settings.items() if value is not None}
 
     def plan(
         opened: logs.Log,
@@ -318,7 +320,7 @@ def run(
         renewed: Collection[str],
     ) -> list[Job]:
         others = unfitting(opened, prefix, transforms, say) if len(names) != 1 and topic is None else set()
-        kept = {stage: one for stage, one in transforms.items() if stage not in others}
+        kept = {stage: transform for stage, transform in transforms.items() if stage not in others}
         options = chosen.keys() - {STAGES[stage].option for stage in others}
         return pipeline.plan_all(
             opened, prefix, say, topic, kept, force, options, shared, plane, frame or "", changed, renewed
@@ -336,16 +338,16 @@ def run(
 def _log_before(log: Location, follows: PathLike | Sequence[PathLike] | None) -> Location | None:
     """Return the log that a log follows; of several the one before it, None if it is the first."""
     if follows is None or isinstance(follows, str | os.PathLike):
-        found = None if follows is None else as_location(follows)
+        before = None if follows is None else as_location(follows)
     else:
-        order = [as_location(one) for one in follows]
+        order = [as_location(log_before) for log_before in follows]
         if log not in order:
             raise McaptrackError(f"{log} is not one of the logs of `follows=`; their order says which one it follows")
         at = order.index(log)
-        found = order[at - 1] if at else None
-    if found is not None and found == log:
+        before = order[at - 1] if at else None
+    if before is not None and before == log:
         raise McaptrackError(f"{log} can't follow itself; `follows=` is the log before it")
-    return found
+    return before
 
 
 @checked(gate_m=(0.001, 1e6), min_iou=(0.001, 1))

@@ -1,4 +1,4 @@
-"""Rows of a user into a log, as a channel like any other."""
+"""Write rows of a user into a log, as a channel like any other."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ def write_rows(
     sidecar: bool | None,
 ) -> int:
     """Write rows as a channel of the log; returns the number of frames. See ``Recording.write``."""
-    place, given = SidecarChoice(sidecar), checked_names(classes)
+    place, names_by_number = SidecarChoice(sidecar), checked_names(classes)
     with warnings_about(path), logs.read(path, sidecar=place) as opened:
         opened.lock()
         name = _topic(opened, topic)
         prefix, _, last = name.rpartition("/")
-        schema, frames, found = frames_of(rows, _HOLDS.get(last))
-        names = {str(number): one for number, one in sorted((found | given).items())}
+        schema, frames, names_in_rows = frames_of(rows, _HOLDS.get(last))
+        names = {str(number): class_name for number, class_name in sorted((names_in_rows | names_by_number).items())}
         _refuse_to_replace(opened, name, schema, replace)
         planes = pipeline.read_planes(opened, prefix) or ()
         frames = _numbered(
@@ -62,10 +62,10 @@ def write_rows(
         )
         own_frame = frame_id or (_FRAME if schema is DETECTIONS and _in_space(frames) else "")
         how = Provenance(INGEST, {"written_with": "mcaptrack.open"}, classes=names, frame_id=own_frame)
-        made = Made.of(schema, frames, how)
+        channel = Made.of(schema, frames, how)
         path_of_camera, _ = path_of(opened, prefix, tracks_topic(prefix))
-        write(opened, prefix, {name: made}, planes, {}, None, path_of_camera)
-        stale = pipeline.outdated_by(opened, {name: made.provenance.digest})
+        write(opened, prefix, {name: channel}, planes, {}, None, path_of_camera)
+        stale = pipeline.outdated_by(opened, {name: channel.provenance.digest})
         for topic_of_stage in stale:
             warn_stale(topic_of_stage, path, {topic_of_stage: pipeline.camera_to_name(opened, topic_of_stage)})
     write_products(path, is_new=True, progress=no_progress)
@@ -95,12 +95,12 @@ def _topic(opened: logs.Log, topic: str) -> str:
 
 def _refuse_to_replace(opened: logs.Log, name: str, schema: Schema, replace: bool) -> None:
     """Raise McaptrackError if there is a channel of this name that has to stay."""
-    there = opened.channels.get(name)
-    if there is None:
+    channel = opened.channels.get(name)
+    if channel is None:
         return
-    if there.schema_name != schema.name:
+    if channel.schema_name != schema.name:
         raise McaptrackError(
-            f"{opened.path} has {name}, which holds {there.schema_name or 'no schema'} and is not replaced by "
+            f"{opened.path} has {name}, which holds {channel.schema_name or 'no schema'} and is not replaced by "
             f"{schema.name}; write to another channel, such as {_SUCH}"
         )
     if not replace:

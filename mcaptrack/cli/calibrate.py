@@ -99,34 +99,34 @@ def _in_short(result: CalibrateResult) -> str:
 def _print(result: CalibrateResult, talk: common.Talk) -> None:
     took = f" in {result.seconds:.1f} s" if result.seconds else ""
     talk.say(f"{result.log}: {_in_short(result)}{took}")
-    lines = [(name, _words(one, name in result.unchanged)) for name, one in result.cameras.items()]
+    lines = [(name, _words(camera, name in result.unchanged)) for name, camera in result.cameras.items()]
     dropped = "would be dropped" if result.is_dry_run else "dropped"
     lines += [(dropped, f"{topic}: the camera agrees without it") for topic in result.dropped]
     if result.written_because and result.written_to:
         lines.append(("written", f"the planes are in {result.written_to}: {result.written_because}"))
     width = max(len(name) for name, _ in lines)
-    for name, words in lines:
-        talk.say(f"  {name:<{width}}  {words}")
+    for name, description in lines:
+        talk.say(f"  {name:<{width}}  {description}")
 
 
-def _words(one: CameraCorrection, is_unchanged: bool) -> str:
+def _words(camera: CameraCorrection, is_unchanged: bool) -> str:
     """Describe what was found about a camera."""
-    before = _distances(one.median_before_m, one.p90_before_m)
-    if not one.correction:
-        compared = f"; feet are {before} from those of the others ({one.pairs:,} compared)" if one.pairs else ""
-        words = f"as it was: {with_flags(one.why)}{compared}"
+    before = _distances(camera.median_before_m, camera.p90_before_m)
+    if not camera.correction:
+        compared = f"; feet are {before} from those of the others ({camera.pairs:,} compared)" if camera.pairs else ""
+        text = f"as it was: {with_flags(camera.why)}{compared}"
     else:
-        after = _distances(one.median_after_m, one.p90_after_m)
+        after = _distances(camera.median_after_m, camera.p90_after_m)
         corrected = "corrected already by" if is_unchanged else "corrected by"
-        words = (
-            f"{corrected} {_IN_WORDS[one.correction]}, which moves feet by {one.moved_m:.2f} m: they are {after} from "
-            f"those of the others, and were {before} ({one.pairs:,} compared)"
+        text = (
+            f"{corrected} {_IN_WORDS[camera.correction]}, which moves feet by {camera.moved_m:.2f} m: they are {after} "
+            f"from those of the others, and were {before} ({camera.pairs:,} compared)"
         )
-        words += f"; {one.limit}" if one.limit else ""
-    if one.clock_offset_s:
-        late = "late" if one.clock_offset_s > 0 else "early"
-        words += f"; its times are {abs(one.clock_offset_s):.2f} s {late}"
-    return words
+        text += f"; {camera.limit}" if camera.limit else ""
+    if camera.clock_offset_s:
+        late = "late" if camera.clock_offset_s > 0 else "early"
+        text += f"; its times are {abs(camera.clock_offset_s):.2f} s {late}"
+    return text
 
 
 def _distances(median_m: float | None, p90_m: float | None) -> str:
@@ -139,7 +139,7 @@ def _as_json(result: CalibrateResult) -> dict[str, Any]:
     """Return the result as values of JSON."""
     return {
         "log": str(result.log),
-        "cameras": {name: _camera_as_json(one) for name, one in result.cameras.items()},
+        "cameras": {name: _camera_as_json(camera) for name, camera in result.cameras.items()},
         "corrected": dict(result.corrected),
         "unchanged": list(result.unchanged),
         "dropped": list(result.dropped),
@@ -151,17 +151,17 @@ def _as_json(result: CalibrateResult) -> dict[str, Any]:
     }
 
 
-def _camera_as_json(one: CameraCorrection) -> dict[str, Any]:
+def _camera_as_json(camera: CameraCorrection) -> dict[str, Any]:
     return {
-        "correction": one.correction or None,
-        "moved_m": one.moved_m,
-        "pairs": one.pairs,
-        "median_before_m": one.median_before_m,
-        "p90_before_m": one.p90_before_m,
-        "median_after_m": one.median_after_m,
-        "p90_after_m": one.p90_after_m,
-        "why": with_flags(one.why) or None,
-        "limit": one.limit or None,
-        "clock_offset_s": one.clock_offset_s,
-        "homography": list(one.homography) if one.homography else None,
+        "correction": camera.correction or None,
+        "moved_m": camera.moved_m,
+        "pairs": camera.pairs,
+        "median_before_m": camera.median_before_m,
+        "p90_before_m": camera.p90_before_m,
+        "median_after_m": camera.median_after_m,
+        "p90_after_m": camera.p90_after_m,
+        "why": with_flags(camera.why) or None,
+        "limit": camera.limit or None,
+        "clock_offset_s": camera.clock_offset_s,
+        "homography": list(camera.homography) if camera.homography else None,
     }

@@ -89,15 +89,15 @@ def _read_member(value: str, kind: Any) -> Any:
     return kind(value) if kind in (int, float) else value
 
 
-def is_open(stage: Stage, given: Mapping[str, Any]) -> bool:
+def is_open(stage: Stage, values: Mapping[str, Any]) -> bool:
     """Return whether the boxes of a log decide which tracker runs, because the user named none."""
     is_tracker = stage.default.reads is DETECTIONS
-    return is_tracker and given["tracker"] == stage.entry(stage.default).name and not is_on_command_line("tracker")
+    return is_tracker and values["tracker"] == stage.entry(stage.default).name and not is_on_command_line("tracker")
 
 
 def make_transform(
     stage: Stage,
-    given: Mapping[str, Any],
+    options: Mapping[str, Any],
     wanted: Mapping[str, Any],
     owners: Mapping[str, list[str]] = MappingProxyType({}),
     typed: Collection[str] = (),
@@ -108,7 +108,7 @@ def make_transform(
     command line is refused if the chosen transform lacks it; one from a file or the environment is ignored, since it
     may be meant for another transform.
     """
-    name = _chosen(stage, given, wanted)
+    name = _chosen(stage, options, wanted)
     cls = stage.with_part(stage.find(name).cls if name else stage.default, wanted.get(stage.parameter))
     own = options_of(cls)
     for option in wanted:
@@ -126,7 +126,7 @@ def make_transform(
         for option, value in wanted.items()
         if option in own
     }
-    if stage.profiles and (profile := given.get("profile")):
+    if stage.profiles and (profile := options.get("profile")):
         return replace(stage.profiles[profile], **values)
     return stage.make(name, **values)
 
@@ -151,36 +151,36 @@ class Maker:
 
     @classmethod
     def of(
-        cls, stage: Stage, given: Mapping[str, Any], wanted: Mapping[str, Any], owners: Mapping[str, list[str]]
+        cls, stage: Stage, options: Mapping[str, Any], wanted: Mapping[str, Any], owners: Mapping[str, list[str]]
     ) -> Maker:
         """Return a maker for the running command."""
-        chosen = {name: given[name] for name in (stage.kind, "profile") if name and name in given}
-        typed = [name for name in wanted if is_on_command_line(name if name in given else "set")]
+        chosen = {name: options[name] for name in (stage.kind, "profile") if name and name in options}
+        typed = [name for name in wanted if is_on_command_line(name if name in options else "set")]
         return cls(stage.name, chosen, wanted, owners, tuple(typed))
 
     def __call__(self, name: str) -> Transform:
         """Make the transform of this name; for "" the one that the user chose, or the default one."""
         stage, context = STAGES[self.stage], RUNNING.get()
-        given = {**self.given, "quiet": context is None or context.params.get("quiet")}
+        options = {**self.given, "quiet": context is None or context.params.get("quiet")}
         if name and stage.kind:
-            given[stage.kind] = name
-        return make_transform(stage, given, self.wanted, self.owners, self.typed)
+            options[stage.kind] = name
+        return make_transform(stage, options, self.wanted, self.owners, self.typed)
 
 
-def _chosen(stage: Stage, given: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
+def _chosen(stage: Stage, options: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
     """Return the name of the chosen transform: from its option, the profile, or an option that implies it; else "".
 
     Raises McaptrackError if the profile is of another transform.
     """
-    name = (given.get(stage.kind) if stage.kind else "") or ""
-    if stage.profiles and (profile := given.get("profile")):
+    name = (options.get(stage.kind) if stage.kind else "") or ""
+    if stage.profiles and (profile := options.get("profile")):
         meant = stage.choice(stage.profiles[profile])
         if name not in ("", meant):
             raise McaptrackError(f"the profile {profile} is of the {stage.kind} {meant}, not of {name}")
         return meant
     for option, implied in stage.implied.items():
         if not name and option in wanted:
-            if not given.get("quiet"):
+            if not options.get("quiet"):
                 say(f"{option} belongs to --{stage.kind} {implied}, which is used; the next release requires that")
             return implied
     return name

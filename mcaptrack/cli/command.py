@@ -37,39 +37,39 @@ def usage_in_one_line(command: str = "") -> Iterator[None]:
         yield
     except _UsageError as error:
         error.message = _message(error)
-        words = " ".join(error.format_message().replace("Value error, ", "").rstrip(".").split())
+        text = " ".join(error.format_message().replace("Value error, ", "").rstrip(".").split())
         if hasattr(error, "possibilities"):
-            words = _unknown_option(error)
+            text = _unknown_option(error)
         page = " ".join(filter(None, ["mcaptrack", command, "--help"]))
-        end = "" if words.endswith("?") else ";"
-        refuse_usage(f"{words[:1].lower()}{words[1:]}{end} `{page}` lists the {'options' if command else 'commands'}")
+        end = "" if text.endswith("?") else ";"
+        refuse_usage(f"{text[:1].lower()}{text[1:]}{end} `{page}` lists the {'options' if command else 'commands'}")
 
 
 def _message(error: Any) -> str:
     """Return the message of an error; for errors of pydantic a shorter one."""
-    for found in error.__cause__.errors() if hasattr(error.__cause__, "errors") else ():
-        if found["type"] in _NOT:
-            return f"{found['input']!r} is not {_NOT[found['type']]}"
+    for fault in error.__cause__.errors() if hasattr(error.__cause__, "errors") else ():
+        if fault["type"] in _NOT:
+            return f"{fault['input']!r} is not {_NOT[fault['type']]}"
     return re.sub(r"Got unexpected extra argument(?:s|\(s\))? \((.*)\)", r"too many arguments: \1", str(error.message))
 
 
 def _unknown_option(error: Any) -> str:
     """Return the message about an unknown option: which commands have it, and which options have similar names."""
     name, context = error.option_name, error.ctx
-    words = f"no such option: {name}"
+    text = f"no such option: {name}"
     if context is None or context.parent is None:
-        return words
-    theirs = {command: _options_of(found) for command, found in context.parent.command.commands.items()}
+        return text
+    theirs = {command: _options_of(command_class) for command, command_class in context.parent.command.commands.items()}
     if having := [command for command, options in theirs.items() if name in options]:
-        words += f" ({', '.join(having)} {'has' if len(having) == 1 else 'have'} it)"
+        text += f" ({', '.join(having)} {'has' if len(having) == 1 else 'have'} it)"
     parameter = name.removeprefix("--").removeprefix("no-").replace("-", "_")
     if parameter in getattr(context.command, "settable", ()):
-        return f"{words}; did you mean --set {parameter}=VALUE?"
-    known = theirs.get(context.info_name, [])
+        return f"{text}; did you mean --set {parameter}=VALUE?"
+    own_options = theirs.get(context.info_name, [])
     stem = name.replace("_", "-")
-    alike = [option for option in known if option == stem or option.startswith(f"{stem}-")]
-    alike = alike or difflib.get_close_matches(name, known, 1, 0.75)
-    return f"{words}; did you mean {' or '.join(alike)}?" if alike else words
+    alike = [option for option in own_options if option == stem or option.startswith(f"{stem}-")]
+    alike = alike or difflib.get_close_matches(name, own_options, 1, 0.75)
+    return f"{text}; did you mean {' or '.join(alike)}?" if alike else text
 
 
 def _options_of(command: Any) -> list[str]:
@@ -106,21 +106,21 @@ _THOSE: Final = re.compile(r"\((.+)\)$|^Options of (.+)$")
 
 def arrange(first: Sequence[str], parameters: list[Any]) -> None:
     """Put the parameters of a command into the order of its help, below its headings; ``first`` come first."""
-    for one in parameters:
-        if one.param_type_name != "option":
+    for parameter in parameters:
+        if parameter.param_type_name != "option":
             continue
-        if one.name in first:
-            those = _THOSE.search(one.rich_help_panel or "")
+        if parameter.name in first:
+            those = _THOSE.search(parameter.rich_help_panel or "")
             if those:
-                one.help = f"{one.help.rstrip('.')} ({those[1] or those[2]})."
-            one.rich_help_panel = FIRST_PANEL
-        elif first and not one.rich_help_panel:
-            one.rich_help_panel = MORE_PANEL
+                parameter.help = f"{parameter.help.rstrip('.')} ({those[1] or those[2]})."
+            parameter.rich_help_panel = FIRST_PANEL
+        elif first and not parameter.rich_help_panel:
+            parameter.rich_help_panel = MORE_PANEL
 
-    def place(one: Any) -> tuple[int, int]:
-        panel = getattr(one, "rich_help_panel", None)
+    def place(parameter: Any) -> tuple[int, int]:
+        panel = getattr(parameter, "rich_help_panel", None)
         if panel == FIRST_PANEL:
-            return -1, first.index(one.name)
+            return -1, first.index(parameter.name)
         return (1 + LAST_PANELS.index(panel), 0) if panel in LAST_PANELS else (0, 0)
 
     parameters.sort(key=place)
@@ -134,12 +134,12 @@ class Command(TyperCommand):
 
     reads: ClassVar = False
 
-    def __init__(self, name: str, **given: Any) -> None:
-        super().__init__(name, **given)
-        self.settings = declared_settings(name, given["callback"], self.params)
-        self.most_used: tuple[str, ...] = getattr(given["callback"], "most_used", ()) or MOST_USED.get(name, ())
+    def __init__(self, name: str, **arguments: Any) -> None:
+        super().__init__(name, **arguments)
+        self.settings = declared_settings(name, arguments["callback"], self.params)
+        self.most_used: tuple[str, ...] = getattr(arguments["callback"], "most_used", ()) or MOST_USED.get(name, ())
         arrange(self.most_used, self.params)
-        self.settable: tuple[str, ...] = getattr(given["callback"], "settable", ())
+        self.settable: tuple[str, ...] = getattr(arguments["callback"], "settable", ())
         parameters: dict[str, Any] = {parameter.name or "": parameter for parameter in self.params}
         for parameter in parameters.values():
             parameter.process_value = _refusing_empty(parameter.process_value)
@@ -155,16 +155,16 @@ class Command(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the command line; whatever is wrong with it ends the command in one line."""
-        with log_format(_value_of(args, "--log-format"), self.name or ""):
+        with log_format(next(_values_of(args, "--log-format"), ""), self.name or ""):
             return self._parse(ctx, args)
 
     def _parse(self, ctx: Any, args: list[str]) -> list[str]:
-        given = list(args)  # parsing may take words away
+        args_before = list(args)  # parsing may take words away
         with usage_in_one_line(self.name or ""):
             left = super().parse_args(ctx, args)
         for option in self.params:
             if option.name == "topic" and not option.multiple:
-                _refuse_several(given, option.opts)
+                _refuse_several(args_before, option.opts)
         return left
 
     def invoke(self, ctx: Any) -> Any:
@@ -176,14 +176,14 @@ class Command(TyperCommand):
             return super().invoke(ctx)
 
     def _options_in_use(self, ctx: Any) -> str:
-        found = found_of(self.name or "")
+        set_values = found_of(self.name or "")
         parts = []
         for setting in self.settings.values():
-            rank, where = _rank(ctx, setting.parameter, found)
+            rank, where = _rank(ctx, setting.parameter, set_values)
             if rank != _DEFAULT and setting.parameter in ctx.params:
                 value = ctx.params[setting.parameter]
-                words = " ".join(map(str, value)) if setting.many else str(value)
-                parts.append(f"{setting.name}={words} ({where or 'command line'})")
+                text = " ".join(map(str, value)) if setting.many else str(value)
+                parts.append(f"{setting.name}={text} ({where or 'command line'})")
         return f"options: {', '.join(parts)}"
 
 
@@ -198,25 +198,20 @@ def _refusing_empty(process: Callable[[Any, Any], Any]) -> Callable[[Any, Any], 
     return processed
 
 
-def _refuse_several(words: Sequence[str], options: Sequence[str]) -> None:
+def _refuse_several(args: Sequence[str], options: Sequence[str]) -> None:
     """Refuse several values of an option that takes one: the last would count, and the others be ignored."""
-    names = {value: None for option in options for value in _values_of(words, option)}
+    names = {value: None for option in options for value in _values_of(args, option)}
     if len(names) > 1:
         refuse_usage(f"{options[0]} is given as {' and as '.join(names)}; give one, and call the command once for each")
 
 
-def _value_of(words: Sequence[str], option: str) -> str:
-    """Return the value of an option on a command line that may be wrong; "" without one."""
-    return next(_values_of(words, option), "")
-
-
-def _values_of(words: Sequence[str], option: str) -> Iterator[str]:
+def _values_of(args: Sequence[str], option: str) -> Iterator[str]:
     """Yield the values of an option on a command line that may be wrong."""
-    for number, word in enumerate(words):
+    for number, word in enumerate(args):
         if word == "--":
             return
         if word == option:
-            yield "".join(words[number + 1 : number + 2])
+            yield "".join(args[number + 1 : number + 2])
         elif word.startswith(f"{option}="):
             yield word.partition("=")[2]
 
@@ -230,13 +225,13 @@ class Reading(Command):
 _DEFAULT: Final = 3
 
 
-def _rank(ctx: Any, parameter: str, found: Mapping[str, tuple[Setting, Given]]) -> tuple[int, str]:
+def _rank(ctx: Any, parameter: str, set_values: Mapping[str, tuple[Setting, Given]]) -> tuple[int, str]:
     """Return the rank of the source of a value (0, the command line, is the strongest), and its description."""
     source = ctx.get_parameter_source(parameter)
     if source is None or source.name == "DEFAULT":
         return _DEFAULT, ""
     if source.name == "DEFAULT_MAP":
-        return found[parameter][1].rank, found[parameter][1].where
+        return set_values[parameter][1].rank, set_values[parameter][1].where
     return (1, "the environment") if source.name == "ENVIRONMENT" else (0, "")
 
 
@@ -261,21 +256,21 @@ def converted(context: Any, command: str) -> dict[str, Any]:
     """
     parameters = {parameter.name: parameter for parameter in context.parent.command.commands[command].params}
     out = {}
-    for name, (_, given) in found_of(command).items():
+    for name, (_, set_value) in found_of(command).items():
         try:
-            out[name] = parameters[name].process_value(context, given.value)
+            out[name] = parameters[name].process_value(context, set_value.value)
         except typer.BadParameter as error:
-            refuse_usage(f"{given.where}: {_message(error)}")
+            refuse_usage(f"{set_value.where}: {_message(error)}")
     return out
 
 
 def settings_of(command: str) -> dict[str, Any]:
     """Return the values that environment and files set for another command (a stage that the running one runs)."""
     context: Any = RUNNING.get()
-    values, found = converted(context, command), found_of(command)
+    values, set_values = converted(context, command), found_of(command)
     other: Command = context.parent.command.commands[command]
     for setting in other.settings.values():
-        place = found[setting.parameter][1].where if setting.parameter in found else ""
+        place = set_values[setting.parameter][1].where if setting.parameter in set_values else ""
         setting.check(values.get(setting.parameter), place)
     return values
 
@@ -285,9 +280,9 @@ def check_ranges(values: Mapping[str, Any]) -> None:
     context: Any = RUNNING.get()
     if context is None:  # the function was called without a command line
         return
-    found = found_of(context.info_name)
+    set_values = found_of(context.info_name)
     for setting in context.command.settings.values():
-        setting.check(values.get(setting.parameter), _rank(context, setting.parameter, found)[1])
+        setting.check(values.get(setting.parameter), _rank(context, setting.parameter, set_values)[1])
 
 
 def is_on_command_line(parameter: str) -> bool:

@@ -29,7 +29,7 @@ from mcaptrack.cli.text import Level, is_json, say
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish_bytes, refuse_overwrite, refuse_special, refuse_url
 from mcaptrack.location import Location, is_remote, parse
-from mcaptrack.notices import Code, Notice
+from mcaptrack.notices import Notice
 from mcaptrack.ranges import limits
 from mcaptrack.streams import LostOutputError
 
@@ -73,28 +73,28 @@ def option(
     tuning: bool | str = False,
     least: float = -math.inf,
     most: float = math.inf,
-    **given: Any,
+    **settings: Any,
 ) -> Any:
     """Return a Typer option below the heading ``panel``; ``Declared`` explains the other parameters.
 
     The help names the range. Options of ``COMMON`` and of ``FILES`` show no defaults, and none shows its environment
     variable.
     """
-    if words := limits(least, most):
-        given["help"] += f" {words[0].upper()}{words[1:]}."
+    if range_text := limits(least, most):
+        settings["help"] += f" {range_text[0].upper()}{range_text[1:]}."
     if panel:
-        given["rich_help_panel"] = panel
+        settings["rich_help_panel"] = panel
     if panel in (COMMON, FILES):
-        given.setdefault("show_default", False)
-    made: Any = typer.Option(*names, show_envvar=False, **given)
-    made.declared = Declared(tuning, least, most)
-    return made
+        settings.setdefault("show_default", False)
+    info: Any = typer.Option(*names, show_envvar=False, **settings)
+    info.declared = Declared(tuning, least, most)
+    return info
 
 
 def output(shown: str | bool = False) -> Any:
     """Return the option --output; ``shown`` is its default in the help."""
-    words = "Write to this file; the input stays unchanged."
-    return option("--output", "-o", panel=FILES, help=words, show_default=shown)
+    text = "Write to this file; the input stays unchanged."
+    return option("--output", "-o", panel=FILES, help=text, show_default=shown)
 
 
 Output = Annotated[Path | None, output()]
@@ -152,25 +152,21 @@ class Talk:
         self._tasks: dict[str, Any] = {}
         self._shown = 0.0
 
-    def say(self, words: str, level: Level = "info", event: str = "", **about: Any) -> None:
+    def say(self, line: str, level: Level = "info", event: str = "", **about: Any) -> None:
         """Print a line to stderr; see ``text.say``."""
         if not self.quiet:
             self._stop()
-            say(words, level, event, **about)
+            say(line, level, event, **about)
 
-    def detail(self, words: str) -> None:
+    def detail(self, line: str) -> None:
         """Print a line to stderr with --verbose."""
         if self.verbose:
-            self.say(words, "debug")
+            self.say(line, "debug")
 
-    def event(self, words: str, event: str, **about: Any) -> None:
+    def event(self, line: str, event: str, **about: Any) -> None:
         """Print a line that is for programs: with ``--log-format json`` only."""
         if is_json():
-            self.say(words, "info", event, **about)
-
-    def warn(self, words: str, code: Code = "other") -> None:
-        """Print a warning, also with ``quiet``, and add it to the JSON; see ``mcaptrack.notices``."""
-        notices.warn(words, code)
+            self.say(line, "info", event, **about)
 
     def _hear(self, notice: Notice) -> None:
         self._stop()
@@ -182,8 +178,8 @@ class Talk:
         if is_json():
             if now - self._shown >= PROGRESS_S:
                 self._shown = now
-                words = f"{stage}: {done:g}" + (f" of {total:g}" if total is not None else "")
-                self.event(words, "progress", stage=stage, done=done, total=total)
+                text = f"{stage}: {done:g}" + (f" of {total:g}" if total is not None else "")
+                self.event(text, "progress", stage=stage, done=done, total=total)
             return
         if total is None or self.quiet or not sys.stderr.isatty():
             return
@@ -251,12 +247,12 @@ def _printing_notes(talk: Talk) -> Iterator[None]:
 _LOGS: Final = ("logs", "path", "inputs")
 
 
-def check_paths(given: Mapping[str, Any]) -> None:
+def check_paths(values: Mapping[str, Any]) -> None:
     """Raise McaptrackError if a path among the values of a command's options is a URL, a pipe or a device.
 
     Logs may be URLs of objects in a store.
     """
-    for name, value in given.items():
+    for name, value in values.items():
         for path in value if isinstance(value, list | tuple) else [value]:
             if isinstance(path, Path):
                 if name not in _LOGS or not is_remote(parse(path)):
@@ -268,7 +264,7 @@ def expand(paths: Sequence[Path], *, each: bool = False, folders: bool = False) 
     """Return the inputs that arguments name; see ``fleet.expansion.find_inputs``."""
     from mcaptrack.fleet.expansion import find_inputs
 
-    return [one.path for one in find_inputs(paths, each=each, folders=folders)]
+    return [found_log.path for found_log in find_inputs(paths, each=each, folders=folders)]
 
 
 def only_one_output(paths: Sequence[Location], output: Path | None) -> None:
@@ -309,13 +305,15 @@ def one_line(command: Callable[P, None]) -> Callable[P, None]:
             say(f"a fault of the program: {last}", "error", traceback=traceback.format_exc())
             raise typer.Exit(REFUSED) from None
         if batch.failed:
-            names = ", ".join(one.input for one in batch.failed)
+            names = ", ".join(failure.input for failure in batch.failed)
             say(f"{len(batch.failed)} of {batch.tried} failed: {names}", "error", failed=len(batch.failed))
         if batch.failed or batch.is_early:
             raise typer.Exit(LOST)
 
     hints = hints_of(command)
-    own = [one.replace(annotation=hints[name]) for name, one in inspect.signature(command).parameters.items()]
+    own = [
+        parameter.replace(annotation=hints[name]) for name, parameter in inspect.signature(command).parameters.items()
+    ]
     added = inspect.Parameter("log_format", inspect.Parameter.KEYWORD_ONLY, default="text", annotation=LogFormat)
     guarded.__signature__ = inspect.Signature([*own, added])  # type: ignore[attr-defined]
     guarded.__annotations__ = {**hints, added.name: LogFormat}
@@ -329,7 +327,7 @@ def hints_of(command: Callable[..., Any]) -> dict[str, Any]:
 
 
 def tried(inputs: int) -> None:
-    """Count inputs that the running command has tried."""
+    """Add to the number of inputs that the running command has tried."""
     _BATCH.get().tried += inputs
 
 
@@ -344,10 +342,10 @@ def record_failure(path: Location, error: str, state: str = "failed", **about: A
 
     ``about`` is what else ``--log-format json`` prints.
     """
-    words = error.strip()
-    words = words if str(path) in words else f"{path}: {words}"
-    say(words, "error", "log", **({"log": str(path), "state": state} | about))
-    _BATCH.get().failed.append(Failed(str(path), with_flags(words), state))
+    message = error.strip()
+    message = message if str(path) in message else f"{path}: {message}"
+    say(message, "error", "log", **({"log": str(path), "state": state} | about))
+    _BATCH.get().failed.append(Failed(str(path), with_flags(message), state))
 
 
 def with_progress(function: Callable[..., Any], progress: Any) -> Callable[..., Any]:
@@ -387,8 +385,8 @@ def print_json(data: dict[str, Any]) -> None:
     The output is flushed, so that other programs get it while this one continues, as ``view`` does.
     """
     added = {
-        "failed": [one._asdict() for one in _BATCH.get().failed],
-        "warnings": [one._asdict() for one in _WARNED.get()],
+        "failed": [failure._asdict() for failure in _BATCH.get().failed],
+        "warnings": [warning._asdict() for warning in _WARNED.get()],
     }
     whole = {"schema_version": SCHEMA_VERSION} | data | added
     print(json.dumps(whole, indent=2, allow_nan=False), flush=True)

@@ -51,15 +51,15 @@ def read_files(named: Path | None) -> list[ConfigFile]:
             refuse_usage(f"--config {named}: there is no such file")
         return [ConfigFile(named, tables, trusted=True)]
     own = user_file()
-    found = [(Path(NAME), _is_same(Path(NAME), own)), (own, True)]
-    if found[0][1]:
-        del found[0]
-    return [ConfigFile(path, tables, trusted) for path, trusted in found if (tables := _read(path)) is not None]
+    candidates = [(Path(NAME), _is_same(Path(NAME), own)), (own, True)]
+    if candidates[0][1]:
+        del candidates[0]
+    return [ConfigFile(path, tables, trusted) for path, trusted in candidates if (tables := _read(path)) is not None]
 
 
-def _is_same(one: Path, other: Path) -> bool:
+def _is_same(path: Path, other: Path) -> bool:
     try:
-        return one.samefile(other)
+        return path.samefile(other)
     except OSError:
         return False
 
@@ -132,10 +132,10 @@ def edited(path: Path, text: str, command: str, settings: Mapping[str, Any]) -> 
     bom = _BOM if text.startswith(_BOM) else ""
     text = text.removeprefix(_BOM)
     tables = tomllib.loads(text)
-    found = tables.get(command, {})
-    if not isinstance(found, dict):
+    settings_before = tables.get(command, {})
+    if not isinstance(settings_before, dict):
         raise McaptrackError(f"{path}: {command} is a command; write its options below [{command}]")
-    wanted = dict(found)
+    wanted = dict(settings_before)
     try:
         document: Any = tomlkit.parse(text)
         if command not in document:

@@ -25,23 +25,23 @@ _OF_ALL: dict[str, Any] = {"json": common.Json, "quiet": common.Quiet, "verbose"
 class EachLog(Generic[T]):
     """A command that calls its function with each log: how it prints what this returns.
 
-    ``given`` has the options of the call. Subclasses say what is not the usual way.
+    ``given`` has the options of the call. Subclasses override what differs.
     """
 
     #: As in ``LogWork``.
     names_output = False
 
-    def __init__(self, given: Mapping[str, Any]) -> None:
-        self.given = given
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self.given = values
 
     @classmethod
     def function_of(cls, name: str) -> Callable[..., None]:
         """Return the function of the command: with its options as Typer takes them."""
         declared = getattr(mcaptrack, name)
-        names = [one.name for one in options_of(declared) if one.name != "output"]
+        names = [option.name for option in options_of(declared) if option.name != "output"]
 
-        def run(given: Mapping[str, Any]) -> None:
-            cls(given)._run(name, names)
+        def run(values: Mapping[str, Any]) -> None:
+            cls(values)._run(name, names)
 
         return command(name, declared, run)
 
@@ -76,8 +76,8 @@ class EachLog(Generic[T]):
         return common.DONE
 
     def _run(self, name: str, names: Sequence[str]) -> None:
-        given = self.given
-        with common.Talk(given["quiet"], given["verbose"]).open() as talk:
+        values = self.given
+        with common.Talk(values["quiet"], values["verbose"]).open() as talk:
             logs, arguments = self.logs(), self.arguments(names)
             work: LogWork[T] = LogWork(
                 name,
@@ -89,9 +89,9 @@ class EachLog(Generic[T]):
                 suffix=self.suffix(),
                 names_output=self.names_output,
             )
-            results, totals = process(logs, work, talk, given["output"])
-        if given["json"]:
-            common.print_json({"results": [self.data(one) for one in results], **totals})
+            results, totals = process(logs, work, talk, values["output"])
+        if values["json"]:
+            common.print_json({"results": [self.data(result) for result in results], **totals})
         if code := self.code(results):
             raise typer.Exit(code)
 
@@ -108,49 +108,49 @@ def command(
     """
     annotations: dict[str, tuple[Any, Any]] = {}
     if each := one_of_many(declared):
-        words = typer.Argument(metavar=each.metavar, help=each.help, show_default=False)
-        annotations[each.name] = Annotated[list[Path], words], inspect.Parameter.empty
-    annotations |= {one.name: (annotation_of(one), one.default) for one in options_of(declared)}
+        argument = typer.Argument(metavar=each.metavar, help=each.help, show_default=False)
+        annotations[each.name] = Annotated[list[Path], argument], inspect.Parameter.empty
+    annotations |= {parameter.name: (annotation_of(parameter), parameter.default) for parameter in options_of(declared)}
     annotations |= dict(more or {})
     annotations |= {option: (hint, False) for option, hint in _OF_ALL.items()} | {"config": (common.Config, None)}
 
-    def call(**given: Any) -> None:
-        run(given)
+    def call(**values: Any) -> None:
+        run(values)
 
     keyword = inspect.Parameter.KEYWORD_ONLY
     call.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [inspect.Parameter(n, keyword, default=default, annotation=hint) for n, (hint, default) in annotations.items()]
     )
     call.__name__, call.__annotations__ = name, {n: hint for n, (hint, _) in annotations.items()}
-    made: Any = common.one_line(takes_many()(call) if each else call)
-    made.settable = ()
-    made.help, made.most_used = help_of(declared), getattr(declared, "most_used", ())
-    return made  # type: ignore[no-any-return]
+    function: Any = common.one_line(takes_many()(call) if each else call)
+    function.settable = ()
+    function.help, function.most_used = help_of(declared), getattr(declared, "most_used", ())
+    return function  # type: ignore[no-any-return]
 
 
-def annotation_of(one: Parameter) -> Any:
+def annotation_of(parameter: Parameter) -> Any:
     """Return the annotation of an option, as Typer takes it."""
-    about = one.option
-    given: dict[str, Any] = {"help": one.help, "metavar": about.metavar}
-    if one.shown is not None:
-        given["show_default"] = one.shown
+    about = parameter.option
+    settings: dict[str, Any] = {"help": parameter.help, "metavar": about.metavar}
+    if parameter.shown is not None:
+        settings["show_default"] = parameter.shown
     if about.names is not None:
-        given["autocompletion"] = about.names
+        settings["autocompletion"] = about.names
     info = common.option(
-        *one.flags,
+        *parameter.flags,
         panel=about.panel,
         tuning=about.tuning,
         least=about.least,
         most=about.most,
-        **given,
+        **settings,
     )
-    kind: Any = list[one.kind] if one.many else one.kind  # type: ignore[name-defined]
-    return Annotated[kind | None if one.default is None else kind, info]
+    kind: Any = list[parameter.kind] if parameter.many else parameter.kind  # type: ignore[name-defined]
+    return Annotated[kind | None if parameter.default is None else kind, info]
 
 
 def help_of(declared: Callable[..., Any]) -> str:
     """Return the help of a command: the docstring of its function, with options as the command line writes them."""
-    words = words_of(declared)
-    flags = {one.name: one.flags[0] for one in options_of(declared)}
-    examples = [f"Example: {line}" for line in words.examples]
-    return "\n\n".join([with_dashes(words.text, flags), *examples])
+    doc = words_of(declared)
+    flags = {option.name: option.flags[0] for option in options_of(declared)}
+    examples = [f"Example: {line}" for line in doc.examples]
+    return "\n\n".join([with_dashes(doc.text, flags), *examples])

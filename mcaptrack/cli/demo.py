@@ -49,24 +49,24 @@ def demo(
     import mcaptrack
 
     with common.Talk(quiet, verbose).open() as talk:
-        made = mcaptrack.demo(output, scene=scene, seed=seed, force=force, progress=talk.progress)
-    sort, retracked = made.scores.rows()
+        result = mcaptrack.demo(output, scene=scene, seed=seed, force=force, progress=talk.progress)
+    sort, retracked = result.scores.rows()
     if json:
         common.print_json({"scene": scene, "seed": seed, "results": [sort, retracked]})
         return
     show(
-        *_side_by_side(sort, retracked, "tracker" if made.truth.suffix == ".csv" else "SORT"),
+        *_side_by_side(sort, retracked, "tracker" if result.truth.suffix == ".csv" else "SORT"),
         "",
         *_over_seeds(scene, seed),
         "",
-        f"video    {made.video}",
-        f"log      {made.log}",
-        f"layouts  {'  '.join(str(path) for path in made.layouts)}",
-        f"tables   {made.tables}",
+        f"video    {result.video}",
+        f"log      {result.log}",
+        f"layouts  {'  '.join(str(path) for path in result.layouts)}",
+        f"tables   {result.tables}",
         "",
         f"Open the log in Foxglove, or in Lichtblick (https://{_LICHTBLICK}): open local file, then import a layout.",
         "See more:",
-        *(f"  {line}" for line in _next_commands(made.log)),
+        *(f"  {line}" for line in _next_commands(result.log)),
     )
 
 
@@ -82,10 +82,10 @@ def _next_commands(target: Path) -> list[str]:
 def _program() -> str:
     """Return how a shell finds the running program: by its name, otherwise by its path."""
     program = Path(sys.argv[0])
-    found = which(program.name)
+    on_path = which(program.name)
     if program.name.endswith(".py") or not program.is_file():  # python -m mcaptrack
         return f"{_from_here(Path(sys.executable))} -m mcaptrack"
-    return program.name if found and Path(found).samefile(program) else _from_here(program)
+    return program.name if on_path and Path(on_path).samefile(program) else _from_here(program)
 
 
 def _from_here(path: Path) -> str:
@@ -96,7 +96,7 @@ def _from_here(path: Path) -> str:
 
 def _side_by_side(sort: dict[str, float], retracked: dict[str, float], tracker: str) -> list[str]:
     """Return the scores of SORT, or another tracker, and of re-tracking side by side."""
-    words = {
+    meanings = {
         "IDF1": "identity kept (IDF1)",
         "MOTA": "accuracy (MOTA)",
         "IDSW": "identity switches",
@@ -105,7 +105,7 @@ def _side_by_side(sort: dict[str, float], retracked: dict[str, float], tracker: 
         "Frag": "fragments",
     }
     lines = [f"{'within 1 m, 2.5 Hz':<36}{tracker:>10}{'re-tracked':>14}"]
-    for name, meaning in words.items():
+    for name, meaning in meanings.items():
         values = [
             f"{100 * part[name]:.1f} %" if name in ("IDF1", "MOTA") else str(part[name]) for part in (sort, retracked)
         ]

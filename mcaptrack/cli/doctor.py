@@ -36,48 +36,48 @@ def doctor(
     Example: mcaptrack doctor s3://robots/night
     """
     with stdout_to_stderr():
-        found = mcaptrack.doctor(store)
+        result = mcaptrack.doctor(store)
     if json:
-        common.print_json(found.to_json())
+        common.print_json(result.to_json())
     elif not quiet:
-        lines = list(_lines(found, verbose))
+        lines = list(_lines(result, verbose))
         width = max(len(name) for name, _ in lines)
-        show(*(f"{name:<{width}}  {words}" for name, words in lines))
-    for fault in found.faults:
+        show(*(f"{name:<{width}}  {value}" for name, value in lines))
+    for fault in result.faults:
         say(fault, "error")
-    if found.faults:
+    if result.faults:
         raise typer.Exit(common.REFUSED)
 
 
-def _lines(found: mcaptrack.DoctorResult, verbose: bool) -> Iterator[tuple[str, str]]:
+def _lines(result: mcaptrack.DoctorResult, verbose: bool) -> Iterator[tuple[str, str]]:
     """Yield the lines of the page: their names and their texts."""
-    yield "mcaptrack", found.version
-    yield "Python", f"{found.python}, {found.system}"
-    missing = [name for name, version in found.packages.items() if not version]
-    yield "packages", f"{len(found.packages) - len(missing)} of {len(found.packages)} that are needed"
+    yield "mcaptrack", result.version
+    yield "Python", f"{result.python}, {result.system}"
+    missing = [name for name, version in result.packages.items() if not version]
+    yield "packages", f"{len(result.packages) - len(missing)} of {len(result.packages)} that are needed"
     if verbose:
-        yield from ((f"  {name}", version or "missing") for name, version in found.packages.items())
-    for extra, lacking in found.extras.items():
+        yield from ((f"  {name}", version or "missing") for name, version in result.packages.items())
+    for extra, lacking in result.extras.items():
         install = f"lacks {', '.join(lacking)}; `pip install 'mcaptrack[{extra}]'` installs what it needs"
         yield f"extra {extra}", install if lacking else "installed"
-    for codec, why in found.codecs.items():
+    for codec, why in result.codecs.items():
         yield f"codec {codec}", why or "works"
-    yield "ONNX Runtime", ", ".join(found.onnx_providers) or "not installed"
-    yield "cores", f"{found.cores:g}"
-    yield "memory", "unknown" if found.memory_bytes is None else f"{found.memory_bytes / 1e9:.1f} GB"
-    yield "threads", ", ".join(f"{name} {number}" for name, number in found.threads.items())
-    free = "" if found.temporary_bytes_free is None else f", {found.temporary_bytes_free / 1e9:.1f} GB free"
-    yield "temporary files", f"{found.temporary_folder or 'no folder can be written'}{free}"
-    can = "" if found.cache_can_be_written else ", which can't be written"
-    yield "fetched weights", f"{found.cache_folder}{can}"
-    for name, why in found.plugins.items():
+    yield "ONNX Runtime", ", ".join(result.onnx_providers) or "not installed"
+    yield "cores", f"{result.cores:g}"
+    yield "memory", "unknown" if result.memory_bytes is None else f"{result.memory_bytes / 1e9:.1f} GB"
+    yield "threads", ", ".join(f"{name} {number}" for name, number in result.threads.items())
+    free = "" if result.temporary_bytes_free is None else f", {result.temporary_bytes_free / 1e9:.1f} GB free"
+    yield "temporary files", f"{result.temporary_folder or 'no folder can be written'}{free}"
+    can = "" if result.cache_can_be_written else ", which can't be written"
+    yield "fetched weights", f"{result.cache_folder}{can}"
+    for name, why in result.plugins.items():
         yield name, why or "can be imported"
-    if found.store is not None:
-        yield "store", found.store.url
+    if result.store is not None:
+        yield "store", result.store.url
         yield (
             "  server",
-            f"{found.store.server}, region {found.store.region}" if found.store.region else found.store.server,
+            f"{result.store.server}, region {result.store.region}" if result.store.region else result.store.server,
         )
-        yield "  credentials", found.store.credentials
-        yield from ((f"  {name}", why or "works") for name, why in found.store.access.items())
-    yield "faults", f"{len(found.faults)}, see below" if found.faults else "none"
+        yield "  credentials", result.store.credentials
+        yield from ((f"  {name}", why or "works") for name, why in result.store.access.items())
+    yield "faults", f"{len(result.faults)}, see below" if result.faults else "none"

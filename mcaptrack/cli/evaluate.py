@@ -164,8 +164,8 @@ def evaluate(
         else:
             print_results(scores)
     missed = scores.below(limits)
-    for words in missed:
-        say(words)
+    for line in missed:
+        say(line)
     if missed:
         raise typer.Exit(common.GATE_MISSED)
 
@@ -241,8 +241,8 @@ def _print_forecasts(out: Console, forecasts: Mapping[_Key, Displacement], sever
     table, first = _table_of_forecasts("forecasts of", forecasts, several)
     for name in _FORECAST_COLUMNS.values():
         table.add_column(name, justify="right", no_wrap=True)
-    for key, found in forecasts.items():
-        values = found.summary()
+    for key, forecast in forecasts.items():
+        values = forecast.summary()
         numbers = ["-" if values[name] is None else f"{values[name]:.3f}" for name in _FORECAST_COLUMNS]
         table.add_row(*first(key), *numbers)
     out.print()
@@ -251,7 +251,7 @@ def _print_forecasts(out: Console, forecasts: Mapping[_Key, Displacement], sever
 
 def _print_reliability(out: Console, forecasts: Mapping[_Key, Displacement], several: bool) -> None:
     """The share of true positions in the ellipses of each probability; nothing if no forecast has ellipses."""
-    held = {key: found.reliability() for key, found in forecasts.items()}
+    held = {key: displacement.reliability() for key, displacement in forecasts.items()}
     levels = [f"in {100 * part['level']:g} %" for part in next((parts for parts in held.values() if parts), [])]
     if not levels:
         return

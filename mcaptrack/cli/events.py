@@ -51,6 +51,6 @@ def events(
     """
     import mcaptrack
 
-    given = {"logs": logs, "camera": camera, "output": output, "sidecar": sidecar, "force": force}
+    shared = {"logs": logs, "camera": camera, "output": output, "sidecar": sidecar, "force": force}
     options = {"topic": topic, "similarity": similarity, "gate_m": gate_m, "min_iou": min_iou}
-    run_on_logs(given | {"json": json, "quiet": quiet, "verbose": verbose}, "events", mcaptrack.events, options)
+    run_on_logs(shared | {"json": json, "quiet": quiet, "verbose": verbose}, "events", mcaptrack.events, options)

@@ -47,20 +47,20 @@ def check(
         mcaptrack.check,
         {},
         show=lambda *_: None,
-        data=lambda one: {"files": [_as_json(file) for file in one.files]},
+        data=lambda log_check: {"files": [_as_json(file) for file in log_check.files]},
         line=_verdict,
         writes=False,
     )
     with common.Talk(quiet, verbose).open() as talk:
-        found, totals = process(find_logs(logs), work, talk)
-    checked = [file for one in found for file in one.files]
+        checks, totals = process(find_logs(logs), work, talk)
+    checked = [file for log_check in checks for file in log_check.files]
     with common.printed_to(output, force):
         if json:
-            common.print_json({"results": [_as_json(one) for one in checked], **totals})
+            common.print_json({"results": [_as_json(file) for file in checked], **totals})
         elif not many_options().json_lines:
-            for one in checked:
-                _print_check(one, quiet)
-    if not all(one.is_sound for one in checked):
+            for file in checked:
+                _print_check(file, quiet)
+    if not all(file.is_sound for file in checked):
         raise typer.Exit(common.REFUSED)
 
 
@@ -68,7 +68,7 @@ def _verdict(checked: LogCheck) -> str:
     """Return the result of one of many logs in one line; the findings are printed at the end."""
     if checked.is_sound:
         return "sound"
-    return f"damaged, {sum(found.level == 'error' for found in checked.findings)} errors"
+    return f"damaged, {sum(finding.level == 'error' for finding in checked.findings)} errors"
 
 
 def _as_json(checked: CheckResult) -> dict[str, object]:
@@ -91,15 +91,15 @@ def _print_check(checked: CheckResult, quiet: bool) -> None:
     if not quiet:
         verdict = "sound" if checked.is_sound else "damaged"
         show(f"{checked.path}: {verdict}; {checked.messages} messages in {checked.chunks} chunks")
-    findings = [found for found in checked.findings if not quiet or found.level == "error"]
+    findings = [finding for finding in checked.findings if not quiet or finding.level == "error"]
     if not findings:
         return
     table = Table(box=None, pad_edge=False)
     for name, justify in (("", "left"), ("byte", "right"), ("times", "right"), ("kind", "left"), ("", "left")):
         table.add_column(name, justify=justify, overflow="fold")  # type: ignore[arg-type]
-    for found in findings:
-        style = "red" if found.level == "error" else "yellow"
-        table.add_row(Text(found.level, style), str(found.where), str(found.times), found.kind, found.words)
+    for finding in findings:
+        style = "red" if finding.level == "error" else "yellow"
+        table.add_row(Text(finding.level, style), str(finding.where), str(finding.times), finding.kind, finding.words)
     console().print(table)
 
 
@@ -126,8 +126,8 @@ def recover(
 
     def show(_: Location, report: LogRecovery) -> None:
         talk.say(f"{report.output}: {report.messages} messages in {report.chunks} chunks are saved")
-        for words in report.lost if verbose else report.lost[:_SHOWN]:
-            talk.say(f"lost: {words}")
+        for loss in report.lost if verbose else report.lost[:_SHOWN]:
+            talk.say(f"lost: {loss}")
         if len(report.lost) > _SHOWN and not verbose:
             talk.say(f"lost: {len(report.lost) - _SHOWN} more; -v shows them")
         if not report.lost:
@@ -141,10 +141,10 @@ def recover(
         saved = {"log": str(report.log), "output": str(report.output), "messages": report.messages}
         return saved | {"chunks": report.chunks, "lost": list(report.lost)}
 
-    found = find_logs(logs, each=True, leave_out=_RECOVERED)
+    logs_found = find_logs(logs, each=True, leave_out=_RECOVERED)
     with common.Talk(quiet, verbose).open() as talk:
         work = LogWork("recover", mcaptrack.recover, {"force": force}, show, data, line, _RECOVERED)
-        reports, totals = process(found, work, talk, output)
+        reports, totals = process(logs_found, work, talk, output)
     if json:
         common.print_json({"results": [data(report) for report in reports], **totals})
     if any(report.lost for report in reports):
@@ -196,7 +196,9 @@ def drop(
 
     options = {"topics": topics, "in_place": in_place, "force": force}
     with common.Talk(quiet, verbose).open() as talk:
-        work = LogWork("drop", mcaptrack.drop, options, lambda _, one: talk.say(f"{one.log}: {line(one)}"), data, line)
+        work = LogWork(
+            "drop", mcaptrack.drop, options, lambda _, done: talk.say(f"{done.log}: {line(done)}"), data, line
+        )
         results, totals = process(find_logs([path]), work, talk, output)
     if json:
-        common.print_json({"results": [data(one) for one in results], **totals})
+        common.print_json({"results": [data(done) for done in results], **totals})

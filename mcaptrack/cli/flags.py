@@ -26,31 +26,31 @@ def with_flags(message: str) -> str:
     return _PARAMETER.sub(_option, _CALL.sub(_command, message))
 
 
-def _command(found: re.Match[str]) -> str:
-    name, arguments = found.groups()
+def _command(match: re.Match[str]) -> str:
+    name, arguments = match.groups()
     try:
         call = ast.parse(f"call({arguments})", mode="eval").body
         assert isinstance(call, ast.Call)
         values = [ast.literal_eval(value) for value in call.args]
-        options = {one.arg or "": ast.literal_eval(one.value) for one in call.keywords}
+        options = {keyword.arg or "": ast.literal_eval(keyword.value) for keyword in call.keywords}
     except (SyntaxError, ValueError, AssertionError):
-        return found[0]
-    words: list[str | Path] = [Path(value) if value.startswith("-") else value for value in values]
+        return match[0]
+    arguments_: list[str | Path] = [Path(value) if value.startswith("-") else value for value in values]
     for parameter, value in options.items():
         flag = flag_of(parameter, value, _ACTIONS.get(name, (name,))[0])
-        words += [flag] if isinstance(value, bool) else [flag, str(value)]
+        arguments_ += [flag] if isinstance(value, bool) else [flag, str(value)]
     name, *more = _WITH_OPTION.get(name, (name,))
-    return command(*_ACTIONS.get(name, (name,)), *words, *more)
+    return command(*_ACTIONS.get(name, (name,)), *arguments_, *more)
 
 
-def _option(found: re.Match[str]) -> str:
-    parameter, text = found.groups()
+def _option(match: re.Match[str]) -> str:
+    parameter, text = match.groups()
     if not text:
         return flag_of(parameter)
     try:
         value = ast.literal_eval(text)
     except (SyntaxError, ValueError):
-        return found[0]
+        return match[0]
     flag = flag_of(parameter, value)
     return flag if isinstance(value, bool) else f"{flag} {value}"
 

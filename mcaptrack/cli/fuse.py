@@ -73,7 +73,7 @@ def fuse(
     """
     import mcaptrack
 
-    given = {"logs": logs, "output": output, "sidecar": sidecar, "force": force}
+    shared = {"logs": logs, "output": output, "sidecar": sidecar, "force": force}
     options = {
         "cameras": cameras,
         "to": to,
@@ -85,13 +85,13 @@ def fuse(
         "noise": noise,
         "noise_m": noise_m,
     }
-    run_on_logs(given | {"json": json, "quiet": quiet, "verbose": verbose}, "fuse", mcaptrack.fuse, options)
+    run_on_logs(shared | {"json": json, "quiet": quiet, "verbose": verbose}, "fuse", mcaptrack.fuse, options)
 
 
-def offsets_of(given: Any) -> dict[str, float]:
+def offsets_of(texts: Any) -> dict[str, float]:
     """Return the offsets of clocks by camera. Raises McaptrackError for others than CAMERA=SECONDS."""
     out: dict[str, float] = {}
-    for text in given:
+    for text in texts:
         name, equals, value = text.partition("=")
         try:
             seconds = float(value)

@@ -158,14 +158,14 @@ ENTRIES: Final = (
     ),
 )
 #: Commands with options of plug-ins.
-_WITH_PLUGINS: Final = ("run", *(one.name for one in ENTRIES if one.place == "stages:StageCommand"))
+_WITH_PLUGINS: Final = ("run", *(entry.name for entry in ENTRIES if entry.place == "stages:StageCommand"))
 
 
 def make(entry: Listed, function: Any = None) -> Any:
     """Make a command of Typer of an entry; ``function`` is its function, if it is not the usual one."""
     module, _, name = entry.place.partition(":")
-    found = function or getattr(import_module(f"mcaptrack.cli.{module}"), name)
-    function = found.function_of(entry.name) if hasattr(found, "function_of") else found
+    target = function or getattr(import_module(f"mcaptrack.cli.{module}"), name)
+    function = target.function_of(entry.name) if hasattr(target, "function_of") else target
     app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
     app.command(
         entry.name,
@@ -180,9 +180,9 @@ def make(entry: Listed, function: Any = None) -> Any:
 class Commands(MutableMapping[str, Any]):
     """The commands by name; each is made when it is looked up."""
 
-    def __init__(self, changed: Mapping[str, Any] | None = None, made: dict[str, Any] | None = None) -> None:
-        self._entries = {one.name: one for one in ENTRIES}
-        self._made: dict[str, Any] = {} if made is None else made
+    def __init__(self, changed: Mapping[str, Any] | None = None, commands_made: dict[str, Any] | None = None) -> None:
+        self._entries = {entry.name: entry for entry in ENTRIES}
+        self._made: dict[str, Any] = {} if commands_made is None else commands_made
         self._changed = changed or {}
 
     def __getitem__(self, name: str) -> Any:
@@ -208,7 +208,7 @@ class Commands(MutableMapping[str, Any]):
         return name in self._entries
 
     def changed(self, functions: Mapping[str, Any]) -> Commands:
-        """The same commands, but for those of other functions."""
+        """Return a copy of the table, with other functions for some commands."""
         changed = {name: make(self._entries[name], function) for name, function in functions.items()}
         return Commands(changed, self._made)
 
@@ -216,8 +216,8 @@ class Commands(MutableMapping[str, Any]):
 class Group(TyperGroup):
     """The group of all commands."""
 
-    def __init__(self, **given: Any) -> None:
-        super().__init__(**given | {"commands": {}})
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes | {"commands": {}})
         self.commands = self._own = Commands()
         self._lists = False
 
@@ -229,7 +229,7 @@ class Group(TyperGroup):
         """Return a command; one that shows no more than its line, while the commands are listed."""
         if not self._lists or cmd_name not in self.commands:
             return super().get_command(ctx, cmd_name) if cmd_name in self.commands else None
-        entry = next(one for one in ENTRIES if one.name == cmd_name)
+        entry = next(candidate for candidate in ENTRIES if candidate.name == cmd_name)
         line: Any = typer.core.TyperCommand(entry.name, help=entry.summary, rich_help_panel=entry.panel)
         return line
 
@@ -263,10 +263,10 @@ class Group(TyperGroup):
             return super().resolve_command(ctx, args)
 
 
-def _with_plugins(commands: Commands, words: list[str]) -> dict[str, Any]:
+def _with_plugins(commands: Commands, arguments: list[str]) -> dict[str, Any]:
     """The functions of commands with options of plug-ins in this call. Where there can be none, nothing is loaded."""
-    if not set(words) & set(_WITH_PLUGINS) and not may_be_set(words):
+    if not set(arguments) & set(_WITH_PLUGINS) and not may_be_set(arguments):
         return {}
     from mcaptrack.cli.plugins import commands_with_plugins
 
-    return commands_with_plugins(commands, words)
+    return commands_with_plugins(commands, arguments)

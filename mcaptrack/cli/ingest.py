@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 class Ingest(EachLog["IngestResult"]):
     """Make logs of videos, images, recordings and label files."""
 
-    def __init__(self, given: dict[str, Any]) -> None:
-        super().__init__(given)
-        self.names_output = not given["into"]
+    def __init__(self, values: dict[str, Any]) -> None:
+        super().__init__(values)
+        self.names_output = not values["into"]
 
     def logs(self) -> Sequence[NamedLog]:
         """Return the inputs, each once, with the names of their logs."""
@@ -39,10 +39,10 @@ class Ingest(EachLog["IngestResult"]):
 
     def show(self, log: Location, done: IngestResult, talk: common.Talk) -> None:
         """Print what was written."""
-        for words in done.notes:
-            talk.say(words)
-        for words in done.details:
-            talk.detail(words)
+        for line in done.notes:
+            talk.say(line)
+        for line in done.details:
+            talk.detail(line)
         talk.say(f"{done.log}: {_counts(done)}")
 
     def line(self, done: IngestResult) -> str:
@@ -54,8 +54,8 @@ class Ingest(EachLog["IngestResult"]):
         return {
             "log": str(done.log),
             "messages": done.messages,
-            "notes": [with_flags(words) for words in (*done.notes, *done.details)],
-            "lost": [with_flags(words) for words in done.lost],
+            "notes": [with_flags(note) for note in (*done.notes, *done.details)],
+            "lost": [with_flags(loss) for loss in done.lost],
             **({"changes": done.changes} if done.changes is not None else {}),
         }
 

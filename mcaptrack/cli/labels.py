@@ -39,21 +39,21 @@ LabelFps = Annotated[
 
 def similarity(shown: str) -> Any:
     """Return the option --similarity; ``shown`` is its default in the help."""
-    words = (
+    text = (
         "How ground truth and tracks are matched: by overlap of boxes in pictures (iou), distance on the ground "
         "(metres), or overlap of 3D boxes, seen from above (bev-iou) or in space (3d-iou)."
     )
-    return common.option("--similarity", panel=SCORES, tuning=True, help=words, show_default=shown)
+    return common.option("--similarity", panel=SCORES, tuning=True, help=text, show_default=shown)
 
 
 def gate_m(shown: str | bool = True, tuning: str | bool = True) -> Any:
     """Return the option --gate-m."""
-    words = "Gate: largest distance in metres at which ground truth and a track match."
+    text = "Gate: largest distance in metres at which ground truth and a track match."
     ends: dict[str, Any] = {} if isinstance(tuning, str) else {"least": 0.001, "most": 1e6}  # text is several numbers
-    return common.option("--gate-m", panel=SCORES, tuning=tuning, help=words, show_default=shown, **ends)
+    return common.option("--gate-m", panel=SCORES, tuning=tuning, help=text, show_default=shown, **ends)
 
 
 def min_iou() -> Any:
     """Return the option --min-iou."""
-    words = "Least overlap (IoU) at which ground truth and a track match."
-    return common.option("--min-iou", panel=SCORES, tuning=True, help=words, show_default="0.5", least=0.001, most=1)
+    text = "Least overlap (IoU) at which ground truth and a track match."
+    return common.option("--min-iou", panel=SCORES, tuning=True, help=text, show_default="0.5", least=0.001, most=1)

@@ -124,7 +124,7 @@ class ManyOptions:
 
     @property
     def concern_one(self) -> bool:
-        """Whether any of them matters for a single log, so that it is processed as many are."""
+        """Whether an option is set for which a single log, too, has to be processed by workers."""
         return any((self.scheduler, self.output_dir, self.ledger, self.timeout, self.memory_limit, self.json_lines))
 
     def for_fleet(self) -> dict[str, Any]:
@@ -142,7 +142,7 @@ class ManyOptions:
 
 #: The options of the running command.
 _OPTIONS: Final[ContextVar[ManyOptions]] = ContextVar("many")
-NAMES: Final = tuple(one.name for one in fields(ManyOptions))
+NAMES: Final = tuple(field.name for field in fields(ManyOptions))
 
 
 def many_options() -> ManyOptions:
@@ -171,13 +171,13 @@ def takes_many(*, outputs: bool = True) -> Callable[[Callable[..., None]], Calla
             for name in names
         ]
 
-        def with_options(**given: Any) -> None:
-            _OPTIONS.set(ManyOptions(**{name: given.pop(name) for name in names}))
-            command(**given)
+        def with_options(**values: Any) -> None:
+            _OPTIONS.set(ManyOptions(**{name: values.pop(name) for name in names}))
+            command(**values)
 
         with_options.__name__, with_options.__doc__ = command.__name__, command.__doc__
         with_options.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        with_options.__annotations__ = {one.name: one.annotation for one in parameters}
+        with_options.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
         return with_options
 
     return decorate
@@ -264,17 +264,17 @@ def table_of(status: FleetStatus) -> Any:
     table.add_column("log", overflow="ellipsis", no_wrap=True, ratio=1)
     for name in ("stage", "done", "seconds", "MB"):
         table.add_column(name, justify="left" if name == "stage" else "right", no_wrap=True)
-    for one in sorted(status.running, key=lambda running: -running.seconds):
-        done = f"{one.done / one.total:.0%}" if one.total else ""
-        cells = (printable(one.stage), done, f"{one.seconds:.0f}", f"{one.resident_bytes / 1e6:,.0f}")
-        table.add_row(Text(printable(str(one.log))), *cells)
+    for log in sorted(status.running, key=lambda running: -running.seconds):
+        done = f"{log.done / log.total:.0%}" if log.total else ""
+        cells = (printable(log.stage), done, f"{log.seconds:.0f}", f"{log.resident_bytes / 1e6:,.0f}")
+        table.add_row(Text(printable(str(log.log))), *cells)
     return table
 
 
 def process(
     logs: Sequence[NamedLog], work: LogWork[T], talk: common.Talk, output: Path | None = None
 ) -> tuple[list[T], dict[str, Any]]:
-    """Process logs: one as ever, several in workers. Returns the results, and totals for the JSON of several.
+    """Process one log here, or several in workers. Returns the results, and totals for the JSON of several.
 
     ``output`` is that of a single log. An error in one of several logs is printed and does not stop the others; the
     command ends with exit code 3 then.
@@ -292,7 +292,7 @@ def process(
     if work.shares_output and folder is not None:
         options, folder = {**options, "output": folder}, None
     elif not work.shares_output:
-        only_one_output([one.path for one in logs], output)
+        only_one_output([log.path for log in logs], output)
     if len(logs) == 1 and not many.concern_one:
         path = logs[0].path
         with notices.about(output or path):
@@ -304,7 +304,7 @@ def process(
         return [result], {}
     from mcaptrack.fleet import run as run_fleet
 
-    listener: _Printer[T] = _Printer(work, talk, [one.path for one in logs])
+    listener: _Printer[T] = _Printer(work, talk, [log.path for log in logs])
     try:
         is_hidden = talk.quiet or work.line is None or many.json_lines or is_json()
         with LiveTable.on_terminal(is_hidden) as table:
@@ -328,7 +328,7 @@ def process(
             )
         raise
     _summarise(done, talk)
-    return [done.results[one.path] for one in logs if one.path in done.results], {"fleet": done.to_json()}
+    return [done.results[log.path] for log in logs if log.path in done.results], {"fleet": done.to_json()}
 
 
 class _Printer(Generic[T]):
@@ -364,8 +364,8 @@ class _Printer(Generic[T]):
         elif outcome.result is not None and self._talk.verbose:
             self._work.show(outcome.log, outcome.result)
         elif outcome.result is not None:
-            words = self._work.line(outcome.result)
-            self._talk.say(f"{outcome.log}: {words}", "info", "log", **_about(outcome))
+            summary = self._work.line(outcome.result)
+            self._talk.say(f"{outcome.log}: {summary}", "info", "log", **_about(outcome))
 
     def watch(self, status: FleetStatus, table: LiveTable) -> None:
         """Show how far the logs are: in a table, or now and then in a line for programs."""
@@ -374,9 +374,9 @@ class _Printer(Generic[T]):
             return
         self._shown = monotonic()
         ended = status.logs - status.left
-        running = [{**asdict(one), "log": str(one.log), "seconds": round(one.seconds, 1)} for one in status.running]
-        words = f"{ended} of {status.logs} logs"
-        self._talk.event(words, "progress", done=ended, total=status.logs, states=dict(status.ended), running=running)
+        running = [{**asdict(log), "log": str(log.log), "seconds": round(log.seconds, 1)} for log in status.running]
+        text = f"{ended} of {status.logs} logs"
+        self._talk.event(text, "progress", done=ended, total=status.logs, states=dict(status.ended), running=running)
 
     def _print_line(self, outcome: LogOutcome[T]) -> None:
         """Print the outcome as a line of JSON to stdout."""
@@ -385,7 +385,9 @@ class _Printer(Generic[T]):
             "schema_version": SCHEMA_VERSION,
             **_about(outcome),
             "error": with_flags(outcome.error) or None,
-            "warnings": [{"code": one.code, "message": with_flags(one.message)} for one in outcome.warnings],
+            "warnings": [
+                {"code": warning.code, "message": with_flags(warning.message)} for warning in outcome.warnings
+            ],
             "result": result,
         }
         print_line_of_json(line, sys.stdout)
@@ -414,17 +416,17 @@ def _about(outcome: LogOutcome[Any]) -> dict[str, Any]:
 def _summarise(done: FleetResult[Any], talk: common.Talk) -> None:
     """Print the totals, and with many logs once more why some failed."""
     common.tried(len(done.outcomes))
-    words = [f"{count} {state}" for state, count in done.counts.items()]
+    counts = [f"{count} {state}" for state, count in done.counts.items()]
     rate = len(done.outcomes) / max(done.seconds, 1e-3)
-    line = f"{len(done.outcomes)} logs in {done.seconds:.1f} s ({rate:.1f} a second): {', '.join(words)}"
+    line = f"{len(done.outcomes)} logs in {done.seconds:.1f} s ({rate:.1f} a second): {', '.join(counts)}"
     if done.peak_bytes:
-        ran = [one for one in done.outcomes if one.tries]
+        ran = [outcome for outcome in done.outcomes if outcome.tries]
         used = done.cpu_seconds / max(1, len(ran))
         line += f"; at most {done.peak_bytes / 1e6:,.0f} MB of memory, {used:.2f} s of processor time a log"
     talk.say(line, "info", "summary", **done.to_json())
     if len(done.outcomes) >= _REPEATED:
-        for one in done.failed:
-            say(f"  {one.state}: {one.error}", "info", "log", **_about(one))
+        for outcome in done.failed:
+            say(f"  {outcome.state}: {outcome.error}", "info", "log", **_about(outcome))
     if done.stopped:
         left = done.counts.get("not-tried", 0)
         common.end_early(f"{done.stopped}; {left} of {len(done.outcomes)} logs are left, and the same command goes on")
@@ -434,7 +436,7 @@ def _seconds(text: str | None) -> float | None:
     """Return a time such as 90s, 10m or 2h in seconds; None for None."""
     if text is None:
         return None
-    found = _TIME.fullmatch(text.strip().lower())
-    if found is None or not float(found[1]):
+    match = _TIME.fullmatch(text.strip().lower())
+    if match is None or not float(match[1]):
         raise McaptrackError(f"--timeout needs a time such as 90s, 10m or 2h, not {text!r:.40}")
-    return float(found[1]) * _SECONDS[found[2]]
+    return float(match[1]) * _SECONDS[match[2]]

@@ -43,9 +43,9 @@ def models(
         _list(json, verbose)
         return
     if action != "get" or name is None:
-        words = " ".join(filter(None, (action, name)))
+        text = " ".join(filter(None, (action, name)))
         raise McaptrackError(
-            f"models takes nothing, or get and a name, not {words}; {command('models')} lists the names"
+            f"models takes nothing, or get and a name, not {text}; {command('models')} lists the names"
         )
     path = mcaptrack.get_model(name, source=source)
     if json:
@@ -55,19 +55,20 @@ def models(
 
 
 def _list(json: bool, verbose: bool) -> None:
-    found: list[dict[str, Any]] = [
+    models: list[dict[str, Any]] = [
         {**asdict(model), "path": str(model.path) if model.path.is_file() else None} for model in mcaptrack.models()
     ]
     if json:
-        common.print_json({"models": found})
+        common.print_json({"models": models})
         return
-    for one in found:
-        where = one["path"] or f"not fetched; {command('models', 'get', one['name'])} fetches it"
+    for model in models:
+        where = model["path"] or f"not fetched; {command('models', 'get', model['name'])} fetches it"
+        size = f"{model['size_bytes'] / 1e6:.1f} MB"
         lines = [
-            f"{one['name']}  {one['size_bytes'] / 1e6:.1f} MB, {one['licence']}, trained on {one['trained_on']}",
-            f"  good for  {one['good_for']}",
-            f"  source    {one['source']}",
+            f"{model['name']}  {size}, {model['licence']}, trained on {model['trained_on']}",
+            f"  good for  {model['good_for']}",
+            f"  source    {model['source']}",
             f"  file      {where}",
         ]
-        lines += [f"  sha256    {one['sha256']}", *(f"  url       {url}" for url in one["urls"])] if verbose else []
+        lines += [f"  sha256    {model['sha256']}", *(f"  url       {url}" for url in model["urls"])] if verbose else []
         show(*lines)

@@ -29,45 +29,45 @@ from mcaptrack.transforms import STAGES, Stage, Transform
 _HELP: Final = ("--help", "-h")
 
 
-def commands_with_plugins(commands: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
+def commands_with_plugins(commands: Mapping[str, Any], arguments: Sequence[str]) -> dict[str, Any]:
     """Return the commands of stages that have options of plug-ins which this call chooses for them.
 
     A plug-in on the command line that can't be loaded ends the command with exit code 1.
     """
-    called = next((word for word in words if not word.startswith("-")), "")
+    called = next((word for word in arguments if not word.startswith("-")), "")
     if called not in commands:
         return {}
-    files = [] if set(words) & set(_HELP) else _files(called, words)
-    found: dict[str, Any] = {}
+    files = [] if set(arguments) & set(_HELP) else _files(called, arguments)
+    functions: dict[str, Any] = {}
     for stage in STAGES.values():
         if not stage.option:
             continue
         try:
             with stdout_to_stderr(), listening(lambda notice: say(notice.message, "warning")):
-                plugins = dict(_of_words(stage, words)) if called in (stage.name, "run") else {}
+                plugins = dict(_of_words(stage, arguments)) if called in (stage.name, "run") else {}
                 plugins |= _of_settings(stage, files, commands)
             plugins = {name: cls for name, cls in plugins.items() if cls is not stage.default}
             if plugins:
-                found[stage.name] = stage_command(stage, plugins)
+                functions[stage.name] = stage_command(stage, plugins)
         except McaptrackError as error:
             say(str(error), "error")
             raise typer.Exit(common.REFUSED) from None
-    return found
+    return functions
 
 
-def _files(called: str, words: Sequence[str]) -> list[ConfigFile]:
-    given = [*_values(words, "config"), os.environ.get(f"{PREFIX}{called.upper()}_CONFIG", "")]
-    return read_files(Path(given[0]) if given[0] else None)
+def _files(called: str, arguments: Sequence[str]) -> list[ConfigFile]:
+    paths = [*_values(arguments, "config"), os.environ.get(f"{PREFIX}{called.upper()}_CONFIG", "")]
+    return read_files(Path(paths[0]) if paths[0] else None)
 
 
-def _values(words: Sequence[str], option: str) -> list[str]:
+def _values(arguments: Sequence[str], option: str) -> list[str]:
     """Return the values of an option among the words of a command line."""
-    after = [value for word, value in pairwise(words) if word == f"--{option}"]
-    return after + [word.partition("=")[2] for word in words if word.startswith(f"--{option}=")]
+    after = [value for word, value in pairwise(arguments) if word == f"--{option}"]
+    return after + [word.partition("=")[2] for word in arguments if word.startswith(f"--{option}=")]
 
 
-def _of_words(stage: Stage, words: Sequence[str]) -> Iterator[tuple[str, type[Transform]]]:
-    for name in filter(None, _values(words, stage.option)):  # the parser refuses an empty one
+def _of_words(stage: Stage, arguments: Sequence[str]) -> Iterator[tuple[str, type[Transform]]]:
+    for name in filter(None, _values(arguments, stage.option)):  # the parser refuses an empty one
         if stage.split(name)[0] in BUILT_IN[stage.option]:
             continue
         with nullcontext() if stage.kind else suppress(McaptrackError):  # a predictor: the command reports the error
@@ -83,25 +83,27 @@ def _of_settings(stage: Stage, files: Sequence[ConfigFile], commands: Mapping[st
     return out
 
 
-def _names_of_settings(stage: Stage, files: Sequence[ConfigFile], known: Callable[[], Collection[str]]) -> list[str]:
+def _names_of_settings(
+    stage: Stage, files: Sequence[ConfigFile], own_options: Callable[[], Collection[str]]
+) -> list[str]:
     """Return the names of plug-ins that environment and files give for a stage.
 
     A file in the working folder can't name modules.
     """
     kind = stage.option
     assert kind
-    found = [os.environ.get(f"{PREFIX}{command}_{kind}".upper(), "") for command in (stage.name, "run")]
+    plugin_names = [os.environ.get(f"{PREFIX}{command}_{kind}".upper(), "") for command in (stage.name, "run")]
     options: set[str] = set()
     for file in files:
         for command in (stage.name, "run"):
             table = file.tables.get(command)
             name = table.get(kind) if isinstance(table, dict) else None
             if isinstance(name, str) and (file.trusted or ":" not in name):
-                found.append(name)
+                plugin_names.append(name)
         table = file.tables.get(stage.name)
         options |= {key.replace("_", "-") for key in table} if isinstance(table, dict) else set()
     start = f"{PREFIX}{stage.name}_".upper()
     options |= {name.removeprefix(start).lower().replace("_", "-") for name in os.environ if name.startswith(start)}
-    if options and options - set(known()):
-        found += names(kind)
-    return [name for name in dict.fromkeys(found) if name and stage.split(name)[0] not in BUILT_IN[kind]]
+    if options and options - set(own_options()):
+        plugin_names += names(kind)
+    return [name for name in dict.fromkeys(plugin_names) if name and stage.split(name)[0] not in BUILT_IN[kind]]

@@ -134,11 +134,11 @@ def query(
             _write(answer, chosen, output, json)
 
 
-def _asked(words: Sequence[str], file: Path | None, tables: bool) -> tuple[list[Path], str]:
+def _asked(arguments: Sequence[str], file: Path | None, tables: bool) -> tuple[list[Path], str]:
     """Return the logs and the query that the words of the command line give."""
     from_file = file is not None or tables
-    names = list(words) if from_file else list(words[:-1])
-    for word in words:
+    names = list(arguments) if from_file else list(arguments[:-1])
+    for word in arguments:
         if not is_remote(parse(word)):
             refuse_url(word)
     stray = next((name for name in names if name.lower() in _KEYWORDS and not Path(name).exists()), None)
@@ -148,12 +148,12 @@ def _asked(words: Sequence[str], file: Path | None, tables: bool) -> tuple[list[
         if file is not None:
             raise McaptrackError("--tables needs no query; leave -f out")
         return [Path(name) for name in names], ""
-    if not words or (not from_file and _exists(words[-1])):
+    if not arguments or (not from_file and _exists(arguments[-1])):
         raise McaptrackError("there is no query; give it last, in quotes, or with -f FILE (--tables lists the tables)")
     if not names:
         raise McaptrackError("there is no log; give logs or folders of tables before the query")
-    if file is None and words[-1] != "-":
-        sql = words[-1]
+    if file is None and arguments[-1] != "-":
+        sql = arguments[-1]
     elif file is None or str(file) == "-":
         sql = sys.stdin.read()
     else:
@@ -180,8 +180,8 @@ def _form(form: Form | None, output: Path | None, json: bool) -> Form:
     if json and form not in (None, "json"):
         raise McaptrackError(f"--json and --format {form} are two formats; give one")
     end = output.suffix.removeprefix(".").lower() if output is not None else ""
-    known: dict[str, Form] = {name: name for name in ("csv", "json", "jsonl", "parquet", "arrow")}
-    chosen: Form = "json" if json else form or known.get(end, "table")
+    by_ending: dict[str, Form] = {name: name for name in ("csv", "json", "jsonl", "parquet", "arrow")}
+    chosen: Form = "json" if json else form or by_ending.get(end, "table")
     if chosen in ("parquet", "arrow") and output is None:
         raise McaptrackError(f"--format {chosen} is not text; name a file with -o")
     return chosen
@@ -189,10 +189,10 @@ def _form(form: Form | None, output: Path | None, json: bool) -> Form:
 
 def _named(files: Sequence[str]) -> dict[str, Path]:
     out = {}
-    for words in files:
-        name, equals, path = words.partition("=")
+    for file in files:
+        name, equals, path = file.partition("=")
         if not equals or not path:
-            raise McaptrackError(f"--with {words}: give a name and a file, such as --with zones=zones.csv")
+            raise McaptrackError(f"--with {file}: give a name and a file, such as --with zones=zones.csv")
         out[name] = Path(path)
     return out
 
@@ -211,8 +211,8 @@ def _write(answer: Any, form: Form, output: Path | None, json: bool) -> None:
         tables.write_answer(output, answer, form)
     else:
         for piece in tables.pieces(answer, form):  # type: ignore[arg-type]
-            words = piece.decode("utf-8")
-            sys.stdout.write("\n".join(map(printable, words.split("\n"))) if sys.stdout.isatty() else words)
+            text = piece.decode("utf-8")
+            sys.stdout.write("\n".join(map(printable, text.split("\n"))) if sys.stdout.isatty() else text)
 
 
 def _print_answer(answer: Any, limit: int) -> str:
@@ -271,25 +271,25 @@ def _fitting(names: Sequence[str], rows: Sequence[Sequence[str | None]], width: 
 
 
 def _print_tables(listed: TableList, json: bool) -> None:
-    found = {"recordings": listed.recordings, "channels": listed.channels} if listed.recordings else {}
+    other_names = {"recordings": listed.recordings, "channels": listed.channels} if listed.recordings else {}
     if json:
         results = [
             {"table": table.name, "meaning": table.meaning, "columns": [asdict(column) for column in table.columns]}
             for table in listed.tables
         ]
-        common.print_json({"results": results} | {what: list(names) for what, names in found.items()})
+        common.print_json({"results": results} | {what: list(names) for what, names in other_names.items()})
         return
     from rich.table import Table
     from rich.text import Text
 
     out = console()
-    for one in listed.tables:
-        out.print(Text(one.name, "bold"))
-        out.print(Text(one.meaning, "dim"))
+    for table in listed.tables:
+        out.print(Text(table.name, "bold"))
+        out.print(Text(table.meaning, "dim"))
         shown = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
-        for column in one.columns:
+        for column in table.columns:
             shown.add_row(f"  {column.name}", column.type, column.unit, column.meaning)
         out.print(shown)
         out.print()
-    for what, names in found.items():
+    for what, names in other_names.items():
         out.print(f"{what}: {', '.join(names)}")

@@ -20,8 +20,8 @@ class Render(EachLog["RenderResult"]):
 
     def arguments(self, names: Sequence[str]) -> dict[str, Any]:
         """Return the arguments; in ``--output-dir`` the name of the output says what is written."""
-        given = super().arguments(names)
-        return given | {"gif": given["gif"] and many_options().output_dir is None}
+        arguments = super().arguments(names)
+        return arguments | {"gif": arguments["gif"] and many_options().output_dir is None}
 
     def suffix(self) -> str:
         """Return the end of the names of outputs."""

@@ -85,13 +85,13 @@ def run(
     quiet: common.Quiet = False,
     verbose: common.Verbose = False,
     config: common.Config = None,
-    fuser: Annotated[str | None, chooser("fuser", words=_AGAIN, panel=_SEVERAL, shown="as before, or feet")] = None,
-    detector: Annotated[str | None, chooser("detector", words=_AGAIN, shown="as before, or median")] = None,
+    fuser: Annotated[str | None, chooser("fuser", intro=_AGAIN, panel=_SEVERAL, shown="as before, or feet")] = None,
+    detector: Annotated[str | None, chooser("detector", intro=_AGAIN, shown="as before, or median")] = None,
     tracker: Annotated[
-        str | None, chooser("tracker", words=_AGAIN, shown="as before, or one that suits the detections")
+        str | None, chooser("tracker", intro=_AGAIN, shown="as before, or one that suits the detections")
     ] = None,
-    retracker: Annotated[str | None, chooser("retracker", words=_AGAIN, shown="as before, or likelihood")] = None,
-    predictor: Annotated[str | None, chooser("predictor", words=_AGAIN, shown="as before, or red")] = None,
+    retracker: Annotated[str | None, chooser("retracker", intro=_AGAIN, shown="as before, or likelihood")] = None,
+    predictor: Annotated[str | None, chooser("predictor", intro=_AGAIN, shown="as before, or red")] = None,
     camera_motion: Annotated[
         Literal["auto", "on", "off"] | None,
         common.option(
@@ -165,8 +165,8 @@ def run(
 
     Example: mcaptrack run log.mcap
     """
-    given = {"logs": logs, "output": output, "sidecar": sidecar, "force": force}
-    given |= {"json": json, "quiet": quiet, "verbose": verbose}
+    shared = {"logs": logs, "output": output, "sidecar": sidecar, "force": force}
+    shared |= {"json": json, "quiet": quiet, "verbose": verbose}
     named = {"detector": detector, "tracker": tracker, "retracker": retracker, "predictor": predictor}
     chosen = {kind: name for kind, name in named.items() if name}
     import mcaptrack
@@ -192,4 +192,4 @@ def run(
         options["follows"] = in_order(logs, output)
     watched = EventOptions(*(settings.get(name) for name in ("similarity", "gate_m", "min_iou")))
     options |= {"events": watched if events else False, "stages": stages}
-    run_on_logs(given, "run", mcaptrack.run, options)
+    run_on_logs(shared, "run", mcaptrack.run, options)

@@ -27,13 +27,13 @@ _UP_TO_DATE = "nothing to do, everything is up to date"
 _SLOW_SHARE = 0.05
 
 
-def run_on_logs(given: Mapping[str, Any], name: str, function: Run, options: Mapping[str, Any]) -> None:
+def run_on_logs(values: Mapping[str, Any], name: str, function: Run, options: Mapping[str, Any]) -> None:
     """Run stages on each log, and print the results. ``function`` takes a log and ``options``."""
     from mcaptrack.fleet import find_logs
 
-    where = {name: given[name] for name in ("camera", "sidecar", "force") if name in given}
+    where = {name: values[name] for name in ("camera", "sidecar", "force") if name in values}
     shows_events = name == "events"
-    with common.Talk(given["quiet"], given["verbose"]).open() as talk:
+    with common.Talk(values["quiet"], values["verbose"]).open() as talk:
         work: LogWork[RunResult] = LogWork(
             name,
             function,
@@ -42,8 +42,8 @@ def run_on_logs(given: Mapping[str, Any], name: str, function: Run, options: Map
             data=_as_json,
             line=lambda result: _line_of(result, shows_events),
         )
-        results, totals = process(find_logs(given["logs"]), work, talk, given["output"])
-    if given["json"]:
+        results, totals = process(find_logs(values["logs"]), work, talk, values["output"])
+    if values["json"]:
         common.print_json({"results": [_as_json(result) for result in results], **totals})
 
 
@@ -54,21 +54,21 @@ def in_order(logs: Sequence[Path], output: Path | None) -> list[Location]:
     """
     from mcaptrack.fleet import find_logs
 
-    many, found = many_options(), [one.path for one in find_logs(logs)]
+    many, ordered = many_options(), [log.path for log in find_logs(logs)]
     order, place = "one log is done after the other", "ids go on in the logs themselves"
-    given: dict[str, tuple[object, str]] = {
+    refused: dict[str, tuple[object, str]] = {
         "--jobs": ((many.jobs or 1) > 1, order),
         "--scheduler": (many.scheduler, order),
         "--ledger": (many.ledger, "it judges each log by itself, and a second run does only what is missing, anyway"),
         "--output-dir": (many.output_dir, place),
         "--output": (output, place),
     }
-    for name, (is_given, why) in given.items():
+    for name, (is_given, why) in refused.items():
         if is_given:
             raise McaptrackError(f"--continue doesn't go with {name}: {why}; leave {name} out")
-    if len(found) < 2:
+    if len(ordered) < 2:
         raise McaptrackError("--continue needs several logs, in the order of their times; name the one before, too")
-    return found
+    return ordered
 
 
 def _as_json(result: RunResult) -> dict[str, Any]:
@@ -79,7 +79,7 @@ def _as_json(result: RunResult) -> dict[str, Any]:
         "frames": result.frames,
         "events": result.events,
         **(
-            {"zones": {topic: [one.to_json() for one in some] for topic, some in result.zones.items()}}
+            {"zones": {topic: [total.to_json() for total in some] for topic, some in result.zones.items()}}
             if result.zones
             else {}
         ),
@@ -90,7 +90,7 @@ def _as_json(result: RunResult) -> dict[str, Any]:
         data |= {
             "tables": result.tables,
             "summary": None if result.summary is None else result.summary.to_json(),
-            "cameras": {name: _camera_as_json(one) for name, one in result.cameras.items()},
+            "cameras": {name: _camera_as_json(camera) for name, camera in result.cameras.items()},
         }
     elif result.summary is not None:
         data |= {"tables": result.tables, "summary": result.summary.to_json()}
@@ -130,8 +130,8 @@ def _print(result: RunResult, shows_events: bool, talk: common.Talk) -> None:
     for topic, count in result.frames.items():
         talk.detail(f"{result.log}: {topic} {count} frames")
     for topic, kinds in result.events.items():
-        words = ", ".join(f"{kind} {count}" for kind, count in kinds.items() if count) or "nothing happened"
-        (talk.say if shows_events else talk.detail)(f"{topic}: {words}")
+        text = ", ".join(f"{kind} {count}" for kind, count in kinds.items() if count) or "nothing happened"
+        (talk.say if shows_events else talk.detail)(f"{topic}: {text}")
     if result.tables:
         talk.detail(f"{result.log}: {', '.join(f'{name} {rows}' for name, rows in result.tables.items())}")
     talk.say(f"{result.log}: {_did(result)}")
@@ -143,8 +143,8 @@ def _print(result: RunResult, shows_events: bool, talk: common.Talk) -> None:
         lines.append(("written", f"results are in {result.written_to}: {result.written_because}"))
     lines.append(("next", "    ".join(_next(result))))
     width = max(len(name) for name, _ in lines)
-    for name, words in lines:
-        talk.say(f"  {name:<{width}}  {words}")
+    for name, text in lines:
+        talk.say(f"  {name:<{width}}  {text}")
 
 
 def _did(result: RunResult) -> str:
@@ -165,20 +165,20 @@ def _slow_parts(result: RunResult) -> str:
 
 def _line_of(result: RunResult, shows_events: bool) -> str:
     """Return the result for one of many logs in one line."""
-    words = [_did(result)]
+    parts = [_did(result)]
     if result.cameras:
-        words.append(f"{sum(not one.is_scene for one in result.cameras.values())} cameras")
+        parts.append(f"{sum(not camera.is_scene for camera in result.cameras.values())} cameras")
     if shows_events:
         counts = Counter({kind: n for kinds in result.events.values() for kind, n in kinds.items() if n})
-        words.append(", ".join(f"{kind} {count}" for kind, count in counts.items()) or "nothing happened")
+        parts.append(", ".join(f"{kind} {count}" for kind, count in counts.items()) or "nothing happened")
     summary = result.summary
     if summary is not None and summary.tracks is not None:
-        words.append(f"{summary.tracks:,} {'track' if summary.tracks == 1 else 'tracks'}")
+        parts.append(f"{summary.tracks:,} {'track' if summary.tracks == 1 else 'tracks'}")
     if result.continued is not None:
-        words.append(result.continued.words()[-1])
+        parts.append(result.continued.words()[-1])
     if codes := dict.fromkeys(notice.code for notice in result.warnings):
-        words.append(f"warnings: {', '.join(codes)}")
-    return "; ".join(words)
+        parts.append(f"warnings: {', '.join(codes)}")
+    return "; ".join(parts)
 
 
 def _lines_of_run(result: RunResult) -> Iterator[tuple[str, str]]:
@@ -204,22 +204,22 @@ def _lines_of_run(result: RunResult) -> Iterator[tuple[str, str]]:
 
 def _line_of_camera(camera: CameraResult) -> str:
     """Return what was made of one of several cameras, in one line."""
-    summary, words = camera.summary, []
+    summary, parts = camera.summary, []
     if summary.pictures is not None:
-        words.append(f"{summary.pictures:,} pictures")
+        parts.append(f"{summary.pictures:,} pictures")
     if summary.boxes is not None:
-        words.append(f"{summary.boxes:,} boxes")
+        parts.append(f"{summary.boxes:,} boxes")
     if summary.tracks is not None:
-        words.append(f"{summary.tracks:,} {'track' if summary.tracks == 1 else 'tracks'}")
+        parts.append(f"{summary.tracks:,} {'track' if summary.tracks == 1 else 'tracks'}")
     if summary.repair is not None:
-        words.append(f"{summary.repair.tracks:,} after re-tracking")
+        parts.append(f"{summary.repair.tracks:,} after re-tracking")
     if summary.appearance is not None:
-        words.append(f"colours {'' if summary.appearance.used else 'not '}compared")
+        parts.append(f"colours {'' if summary.appearance.used else 'not '}compared")
     if summary.scores is not None:
-        words.append(f"IDF1 {summary.scores.idf1[1]:.1%}")
+        parts.append(f"IDF1 {summary.scores.idf1[1]:.1%}")
     if summary.ground_plane is not None:
-        words.append(f"ground plane {summary.ground_plane}")
-    return ", ".join(words)
+        parts.append(f"ground plane {summary.ground_plane}")
+    return ", ".join(parts)
 
 
 def _lines_of_summary(summary: Summary) -> Iterator[tuple[str, str]]:
@@ -235,21 +235,21 @@ def _lines_of_summary(summary: Summary) -> Iterator[tuple[str, str]]:
         yield "corrected", f"{count:,} boxes of {tracks:,} tracks by people, in {pictures:,} pictures"
     if summary.repair is not None:
         done = (("joined", "gaps closed"), ("parted", "split"), ("left_out", "left out"))
-        words = ", ".join(f"{getattr(summary.repair, name):,} {word}" for name, word in done)
+        text = ", ".join(f"{getattr(summary.repair, name):,} {word}" for name, word in done)
         count = summary.repair.tracks
-        yield "re-tracked", f"{count:,} {'track' if count == 1 else 'tracks'}: {words}"
+        yield "re-tracked", f"{count:,} {'track' if count == 1 else 'tracks'}: {text}"
     if summary.appearance is not None and summary.appearance.separation is None:
         yield "colours", "not compared: too few people were seen well before and after gaps"
     elif summary.appearance is not None:
         looks, share = summary.appearance, f"{summary.appearance.separation:.0%}"
         over = f"{looks.tracks:,} {'track' if looks.tracks == 1 else 'tracks'}"
-        words = f"compared: two people differ more than one does in {share} of cases ({over})"
+        text = f"compared: two people differ more than one does in {share} of cases ({over})"
         no = f"not compared: two people differ more than one does in only {share} of cases ({over})"
-        yield "colours", words if looks.used else no
+        yield "colours", text if looks.used else no
     if summary.scores is not None:
         (was, now), (before, after) = summary.scores.idf1, summary.scores.switches
-        words = f"IDF1 {was:.1%} before re-tracking, {now:.1%} after; identity switches {before:,}, then {after:,}"
-        yield "ground truth", f"{words} (matched {summary.scores.by})"
+        text = f"IDF1 {was:.1%} before re-tracking, {now:.1%} after; identity switches {before:,}, then {after:,}"
+        yield "ground truth", f"{text} (matched {summary.scores.by})"
     if summary.forecasts is not None:
         ahead = "" if summary.horizon_s is None else f", {summary.horizon_s:g} s ahead"
         yield "forecasts", f"{summary.forecasts:,}{ahead}"

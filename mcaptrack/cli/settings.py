@@ -113,10 +113,10 @@ class Setting:
     def check(self, value: Any, where: str) -> None:
         """Raise McaptrackError for a number out of range. ``where`` is what set it; "" is the command line."""
         least, most = self.declared.least, self.declared.most
-        for one in (value or ()) if self.many else (value,):
-            if self.kind in (int, float) and one is not None and not least <= one <= most:
-                words = limits(least, most) or "a number"
-                raise McaptrackError(f"{where or f'--{self.name}'} has to be {words}, not {one}")
+        for number in (value or ()) if self.many else (value,):
+            if self.kind in (int, float) and number is not None and not least <= number <= most:
+                range_text = limits(least, most) or "a number"
+                raise McaptrackError(f"{where or f'--{self.name}'} has to be {range_text}, not {number}")
 
     def may_tune(self, value: Any) -> bool:
         """Whether a file in the working folder may set this value."""
@@ -147,7 +147,7 @@ def declared_settings(command: str, function: Any, parameters: Iterable[Any]) ->
         if parameter.param_type_name != "option":
             continue
         annotation, *about = get_args(hints[parameter.name])
-        declared = next((found for one in about if (found := getattr(one, "declared", None))), Declared())
+        declared = next((declaration for part in about if (declaration := getattr(part, "declared", None))), Declared())
         members = [part for part in get_args(annotation) if part is not type(None)]
         kind = annotation if get_origin(annotation) is Literal or not members else members[0]
         many = get_origin(kind) is list
@@ -157,9 +157,9 @@ def declared_settings(command: str, function: Any, parameters: Iterable[Any]) ->
     return out
 
 
-def may_be_set(words: Sequence[str]) -> bool:
+def may_be_set(arguments: Sequence[str]) -> bool:
     """Whether the environment or a file may set options in a call with these words; quick, and never wrongly False."""
-    is_named = any(word.startswith("--config") for word in words)
+    is_named = any(word.startswith("--config") for word in arguments)
     return (
         is_named or any(name.startswith(PREFIX) for name in os.environ) or Path(NAME).exists() or user_file().exists()
     )
@@ -170,14 +170,14 @@ def gather(commands: Commands, config: Path | None) -> dict[str, dict[str, Given
 
     An unknown name, a value of the wrong type, and an option that a file may not set end the command with exit code 2.
     """
-    found: dict[str, dict[str, Given]] = defaultdict(dict)
-    for command, setting, given in _from_environment(commands):
-        found[command][setting.name] = given
+    values_set: dict[str, dict[str, Given]] = defaultdict(dict)
+    for command, setting, set_value in _from_environment(commands):
+        values_set[command][setting.name] = set_value
     for file in read_files(config):
-        for command, setting, given in _from_file(commands, file):
-            found[command].setdefault(setting.name, given)
-    _KNOWN.set((commands, found))
-    return found
+        for command, setting, set_value in _from_file(commands, file):
+            values_set[command].setdefault(setting.name, set_value)
+    _KNOWN.set((commands, values_set))
+    return values_set
 
 
 def _from_environment(commands: Commands) -> Iterable[tuple[str, Setting, Given]]:
@@ -186,10 +186,10 @@ def _from_environment(commands: Commands) -> Iterable[tuple[str, Setting, Given]
             continue
         command = name.removeprefix(PREFIX).partition("_")[0].lower()
         own = commands[command].settings.values() if command in commands else ()
-        setting = next((one for one in own if one.variable == name), None)
+        setting = next((candidate for candidate in own if candidate.variable == name), None)
         if setting is None:
-            known = [one.variable for command in commands for one in commands[command].settings.values()]
-            refuse_usage(f"the environment variable {name} names no option{_nearest(name, [*known, *VARIABLES])}")
+            variables = [each.variable for command in commands for each in commands[command].settings.values()]
+            refuse_usage(f"the environment variable {name} names no option{_nearest(name, [*variables, *VARIABLES])}")
         if not text or setting.name in CALL_ONLY:
             continue
         try:
@@ -205,35 +205,35 @@ def _from_file(commands: Commands, file: ConfigFile) -> Iterable[tuple[str, Sett
             refuse_usage(f"{file.path}: there is no command {command}{_nearest(command, commands)}")
         if not isinstance(values, dict):
             refuse_usage(f"{file.path}: {command} is a command; write its options below [{command}]")
-        known = {name: setting for name, setting in commands[command].settings.items() if name not in CALL_ONLY}
+        own = {name: setting for name, setting in commands[command].settings.items() if name not in CALL_ONLY}
         for key, value in values.items():
             name = key.replace("_", "-")
-            if name not in known:
+            if name not in own:
                 settable = key.replace("-", "_") in getattr(commands[command], "settable", ())
-                hint = f'; write set = ["{key}={value}"]' if settable else _nearest(name, known)
+                hint = f'; write set = ["{key}={value}"]' if settable else _nearest(name, own)
                 refuse_usage(f"{file.path}: {command} has no option {key}{hint}")
             where = f"{file.path}: [{command}] {key}"
             try:
-                taken = known[name].from_toml(value)
+                taken = own[name].from_toml(value)
             except ValueError as error:
                 refuse_usage(f"{where} {error}")
-            if not file.trusted and not known[name].may_tune(taken):
+            if not file.trusted and not own[name].may_tune(taken):
                 refuse_usage(
                     f"{where} = {reprlib.repr(value)}: a {NAME} in the working folder may tune and nothing else; give "
-                    f"--{name} or {known[name].variable}, or put it into {user_file()} or a file for --config"
+                    f"--{name} or {own[name].variable}, or put it into {user_file()} or a file for --config"
                 )
-            yield command, known[name], Given(taken, where, 2)
+            yield command, own[name], Given(taken, where, 2)
 
 
 def found_of(command: str) -> dict[str, tuple[Setting, Given]]:
     """Return the options of a command that environment and files set, with their values, by parameter."""
-    commands, found = _KNOWN.get()
-    if not found.get(command):
+    commands, values_set = _KNOWN.get()
+    if not values_set.get(command):
         return {}
     settings = commands[command].settings
-    return {settings[name].parameter: (settings[name], one) for name, one in found[command].items()}
+    return {settings[name].parameter: (settings[name], set_value) for name, set_value in values_set[command].items()}
 
 
-def _nearest(name: str, known: Iterable[str]) -> str:
-    close = difflib.get_close_matches(name, list(known), 1)
+def _nearest(name: str, names: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, list(names), 1)
     return f"; did you mean {close[0]}?" if close else ""

@@ -48,17 +48,17 @@ def info(
     import mcaptrack
     from mcaptrack.fleet import find_logs
 
-    def show(_: Location, found: LogInfo) -> None:
+    def show(_: Location, log_info: LogInfo) -> None:
         if not json:
-            _print(found.to_json(), verbose)
+            _print(log_info.to_json(), verbose)
 
     work: LogWork[LogInfo] = LogWork(
-        "info", mcaptrack.info, {"frames": frames}, show, lambda one: one.to_json(), writes=False
+        "info", mcaptrack.info, {"frames": frames}, show, lambda log_info: log_info.to_json(), writes=False
     )
     with common.Talk(quiet, verbose).open() as talk, common.printed_to(output, force):
-        found, totals = process(find_logs(logs), work, talk)
+        infos, totals = process(find_logs(logs), work, talk)
         if json:
-            common.print_json({"results": [one.to_json() for one in found], **totals})
+            common.print_json({"results": [log_info.to_json() for log_info in infos], **totals})
 
 
 def _print(data: dict[str, Any], verbose: bool) -> None:
@@ -138,16 +138,16 @@ def _lineage(channels: list[dict[str, Any]], verbose: bool) -> Tree:
         label.append(f"  {printable(channel['transform'])}" if channel["transform"] else "", "dim")
         for plugin in (channel["plugins"] or {}).values():
             package = f"{plugin['distribution']} {plugin['version']}".strip()
-            words = f"  {plugin['name']}" + (f" ({package})" if package else "")
-            label.append(printable(words), "dim")
+            text = f"  {plugin['name']}" + (f" ({package})" if package else "")
+            label.append(printable(text), "dim")
         corrections = [topic for topic in channel.get("references") or () if topic.endswith("/corrected")]
         label.append(f"  with {printable(corrections[0])}" if corrections else "", "dim")
         label.append(f"  in {printable(channel['frame'])}" if channel["frame"] else "", "dim")
         label.append("  out of date" if channel["stale"] else "", "red")
         node = parent.add(label)
         if verbose and channel["parameters"]:
-            words = ", ".join(f"{key}={value}" for key, value in sorted(channel["parameters"].items()))
-            node.add(Text(printable(words), "dim"))
+            text = ", ".join(f"{key}={value}" for key, value in sorted(channel["parameters"].items()))
+            node.add(Text(printable(text), "dim"))
         below = node if depth < _DEEPEST else parent
         waiting += [(below, other, depth + 1) for other in reversed(made_from.get(channel["topic"], []))]
     return root
@@ -175,10 +175,10 @@ def _frames(frames: list[dict[str, Any]], start_ns: int) -> Tree:
             f"{seconds(jump['t_ns'])} s ({jump['distance_m']:.2g} m, {jump['angle_deg']:.0f} degrees)"
             for jump in frame["jumps"]
         ]
-        for word, found in (("gap", gaps), ("jump", jumps)):
-            if found:
-                more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
-                label.append(f"  {word}{'s' * (len(found) > 1)}: {', '.join(found[:_SHOWN])}{more}", "red")
+        for word, faults in (("gap", gaps), ("jump", jumps)):
+            if faults:
+                more = f" and {len(faults) - _SHOWN} more" if len(faults) > _SHOWN else ""
+                label.append(f"  {word}{'s' * (len(faults) > 1)}: {', '.join(faults[:_SHOWN])}{more}", "red")
         above, depth = nodes[frame["parent"]]
         node = above.add(label)
         nodes[frame["frame"]] = (node, depth + 1) if depth < _DEEPEST else (above, depth)
@@ -271,10 +271,10 @@ def export(
     from mcaptrack.tables.catalogue import refresh
     from mcaptrack.tables.exchange import ends_with
 
-    found, is_table = find_logs(logs), form in TABLES
+    logs_found, is_table = find_logs(logs), form in TABLES
     folder = output or many_options().output_dir
     if is_table:
-        refuse_same_tables([one.path for one in found], folder)
+        refuse_same_tables([log.path for log in logs_found], folder)
 
     def rows(done: ExportResult) -> str:
         return ", ".join(f"{name} {count}" for name, count in done.rows.items())
@@ -298,8 +298,8 @@ def export(
             ".rosbag2" if form.startswith("rosbag2") else ends_with(form),
             shares_output=is_table,
         )
-        results, totals = process(found, work, talk, output)
-        if folder is not None and form == "parquet" and len(found) > 1:
+        results, totals = process(logs_found, work, talk, output)
+        if folder is not None and form == "parquet" and len(logs_found) > 1:
             refresh(folder)
     if json:
-        common.print_json({"results": [data(one) for one in results], **totals})
+        common.print_json({"results": [data(result) for result in results], **totals})

@@ -47,7 +47,7 @@ Set = Annotated[
 _NAME: Final = r"[A-Za-z0-9_-]+"
 
 
-def chooser(kind: Kind, words: str = "The {kind} to use", panel: str = "", shown: str | bool = True) -> Any:
+def chooser(kind: Kind, intro: str = "The {kind} to use", panel: str = "", shown: str | bool = True) -> Any:
     """Return the option that chooses a detector, tracker or so on of the registry by name."""
     built_in = ", ".join(BUILT_IN[kind])
     return common.option(
@@ -55,7 +55,7 @@ def chooser(kind: Kind, words: str = "The {kind} to use", panel: str = "", shown
         tuning=_NAME,
         panel=panel,
         metavar="NAME",
-        help=f"{words.format(kind=kind)}: {built_in}, one of an installed package, or module:Class.",
+        help=f"{intro.format(kind=kind)}: {built_in}, one of an installed package, or module:Class.",
         autocompletion=lambda: names(kind),
         show_default=shown,
     )
@@ -86,11 +86,11 @@ class StageCommand:
 def stage_help(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> str:
     """Return the help of the command of a stage; the docstrings of plug-ins come first."""
     where = f"From /camera/{stage.input_topic} to /camera/{stage.output_topic}. Inputs that are missing are made first."
-    others = [f"{name}: {text}" for name, one in plugins.items() if (text := _own_doc(one))]
-    docs = [*others, *(inspect.cleandoc(one.__doc__ or "") for one in stage.built_in().values())]
-    words = [re.split(r"\n\n\w+\n---", doc)[0] for doc in docs]  # without the sections on use from Python
+    others = [f"{name}: {text}" for name, plugin in plugins.items() if (text := _own_doc(plugin))]
+    docs = [*others, *(inspect.cleandoc(cls.__doc__ or "") for cls in stage.built_in().values())]
+    intros = [re.split(r"\n\n\w+\n---", doc)[0] for doc in docs]  # without the sections on use from Python
     return "\n\n".join(
-        [*words, where, *(f"Example: {line}" for line in words_of(getattr(mcaptrack, stage.name)).examples)]
+        [*intros, where, *(f"Example: {line}" for line in words_of(getattr(mcaptrack, stage.name)).examples)]
     )
 
 
@@ -117,8 +117,8 @@ def _option(field: Field[Any], annotation: Any, of: Sequence[str] = ()) -> Any:
     flag = "--" + field.name.replace("_", "-")
     switch = f"{flag}/--no-{flag[2:]}" if kind is bool and not is_tuple else flag
     tuning = _NAME if about.get("kind") else about.get("pattern") or bool(choices(kind)) or kind is not str
-    words = f"parameter {field.name} of {' and '.join(of)}"
-    info = option_of(field, switch, _panel(about.get("theme", ""), of), tuning, words)
+    text = f"parameter {field.name} of {' and '.join(of)}"
+    info = option_of(field, switch, _panel(about.get("theme", ""), of), tuning, text)
     values: Any = list[kind] if is_tuple else kind  # type: ignore[valid-type]
     return Annotated[values | None, info]
 
@@ -129,21 +129,17 @@ def option_of(field: Field[Any], switch: str, panel: str, tuning: Any = True, ot
     ``otherwise`` is the help of a parameter without any.
     """
     about = field.metadata
-    words = str(about.get("help", "") or otherwise)
+    text = str(about.get("help", "") or otherwise)
+    default = field.default_factory() if field.default_factory is not MISSING else field.default
     return common.option(
         switch,
         panel=panel,
         tuning=tuning,
-        help=f"{words[:1].upper()}{words[1:]}.",
+        help=f"{text[:1].upper()}{text[1:]}.",
         least=about.get("least", -math.inf),
         most=about.get("most", math.inf),
-        show_default=shown_default(default_of(field)),
+        show_default=shown_default(default),
     )
-
-
-def default_of(field: Field[Any]) -> Any:
-    """Return the default of a field."""
-    return field.default_factory() if field.default_factory is not MISSING else field.default
 
 
 def shown_default(default: Any) -> str:
@@ -160,8 +156,8 @@ def _flags(parameter: str, annotation: Any) -> set[str]:
     about = get_args(annotation)[1]
     # Typer takes the first name for a default until it reads the annotation.
     names = (about.default, *(about.param_decls or ()))
-    given = [part for name in names if isinstance(name, str) for part in name.split("/")]
-    return {name.removeprefix("--") for name in (*given, parameter.replace("_", "-")) if name}
+    names_given = [part for name in names if isinstance(name, str) for part in name.split("/")]
+    return {name.removeprefix("--") for name in (*names_given, parameter.replace("_", "-")) if name}
 
 
 def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> Callable[..., None]:
@@ -173,8 +169,8 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
     kinds = {**plugins, **stage.built_in()}
     own = {name: options_of(kind) for name, kind in kinds.items()}
     owners: dict[str, list[str]] = {}
-    for name, found in own.items():
-        for option in found:
+    for name, options_there in own.items():
+        for option in options_there:
             owners.setdefault(option, []).append(name)
     built_in = set(stage.built_in())
     more: dict[str, tuple[Any, Any]] = {}
@@ -185,7 +181,7 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
         more[option] = _option(own[having[0]][option], hint, () if built_in <= set(having) else having), None
     if len(more) < len(owners):
         more["set"] = Set, None
-    taken = {one.name: annotation_of(one) for one in options_of_function(declared)}
+    taken = {option.name: annotation_of(option) for option in options_of_function(declared)}
     if stage.kind:
         usual = stage.entry(stage.default).name
         which = chooser(stage.kind, shown=usual if stage.profiles else True)
@@ -194,28 +190,28 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
     pairs = [*taken.items(), *((option, hint) for option, (hint, _) in more.items())]
     flags = Counter(flag for option, hint in pairs for flag in _flags(option, hint)) + Counter(RESERVED)
     if twice := {flag.replace("-", "_") for flag, count in flags.items() if count > 1}:
-        words = f"{' and '.join(plugins)} can't have a parameter {' or '.join(sorted(twice))}"
-        raise McaptrackError(f"{words}: that is the name of an option of {stage.name}")
+        text = f"{' and '.join(plugins)} can't have a parameter {' or '.join(sorted(twice))}"
+        raise McaptrackError(f"{text}: that is the name of an option of {stage.name}")
     if stage.kind:
         more[stage.kind] = taken[stage.kind], None if stage.profiles else usual
 
-    def run(given: Mapping[str, Any]) -> None:
-        wanted = {option: given[option] for option in owners if given.get(option) is not None}
-        for option, value in values_set(given.get("set"), kinds).items():
+    def run(values: Mapping[str, Any]) -> None:
+        wanted = {option: values[option] for option in owners if values.get(option) is not None}
+        for option, value in values_set(values.get("set"), kinds).items():
             if option in wanted and is_on_command_line(option):
                 raise McaptrackError(f"--set {option} and the option of this name are both given; give one of them")
             wanted[option] = value
 
         from mcaptrack.api.running import run_stage
 
-        make = Maker.of(stage, given, wanted, owners)
-        options: dict[str, Any] = {"topic": given["topic"], "to": given["to"], "frame": given.get("frame")}
+        make = Maker.of(stage, values, wanted, owners)
+        options: dict[str, Any] = {"topic": values["topic"], "to": values["to"], "frame": values.get("frame")}
         with stdout_to_stderr():
-            transform = None if is_open(stage, given) else make("")
-            options |= {"stages": configured(), "mode": given["mode"] if stage.modes else None, "make": make}
-        run_on_logs(given, stage.name, partial(run_stage, stage.name, transform), options)
+            transform = None if is_open(stage, values) else make("")
+            options |= {"stages": configured(), "mode": values["mode"] if stage.modes else None, "make": make}
+        run_on_logs(values, stage.name, partial(run_stage, stage.name, transform), options)
 
-    made: Any = command(stage.name, declared, run, more)
-    made.help = stage_help(stage, plugins)
-    made.settable = tuple(option for option in owners if option not in more)
-    return made  # type: ignore[no-any-return]
+    function: Any = command(stage.name, declared, run, more)
+    function.help = stage_help(stage, plugins)
+    function.settable = tuple(option for option in owners if option not in more)
+    return function  # type: ignore[no-any-return]

@@ -56,13 +56,13 @@ def say(line: str, level: Level = "info", event: str = "", **about: Any) -> None
     ``event`` says what kind of line it is (by default "note", or the level), and ``about`` what it is about: values of
     JSON, which are not printed as text.
     """
-    words = with_flags(line)
+    text = with_flags(line)
     if _JSON.get() is None:
-        print(printable(_BEGINNINGS.get(level, "") + words), file=sys.stderr)
+        print(printable(_BEGINNINGS.get(level, "") + text), file=sys.stderr)
         return
     time = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
     kind = event or (level if level in _BEGINNINGS else "note")
-    whole = {"time": time, "level": level, "event": kind, "command": _JSON.get(), "message": words.strip(), **about}
+    whole = {"time": time, "level": level, "event": kind, "command": _JSON.get(), "message": text.strip(), **about}
     print_line_of_json(whole, sys.stderr)
 
 
@@ -117,8 +117,8 @@ def console() -> Console:
     from rich.console import Console
 
     class Plain(Console):
-        def render_str(self, text: str, **given: Any) -> Any:
-            return super().render_str(printable(text), **given)
+        def render_str(self, text: str, **options: Any) -> Any:
+            return super().render_str(printable(text), **options)
 
     width = None if sys.stdout.isatty() else _UNBROKEN
     return Plain(file=sys.stdout, width=width, markup=False, emoji=False, highlight=False)

@@ -278,11 +278,11 @@ def _print(trained: TrainResult) -> None:
     table.add_column("predictor", no_wrap=True)
     for name in _COLUMNS.values():
         table.add_column(name, justify="right", no_wrap=True)
-    words = {"clean": "as they are", "noisy": "with 0.2 m of noise"}
+    meaning = {"clean": "as they are", "noisy": "with 0.2 m of noise"}
     for kind, scores in trained.scores.items():
         for number, (predictor, values) in enumerate(scores.items()):
             numbers = [f"{values[name]:.3f}" for name in _COLUMNS]
-            table.add_row(words[kind] if number == 0 else "", predictor, *numbers)
+            table.add_row(meaning[kind] if number == 0 else "", predictor, *numbers)
     console().print(table)
     minutes, seconds = divmod(round(trained.seconds), 60)
     show("", f"{trained.weights}: epoch {trained.kept_epoch} of {trained.epochs}, {minutes} min {seconds} s")

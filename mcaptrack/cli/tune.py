@@ -45,7 +45,7 @@ def tune(
         Literal["track", "sample", "retrack"],
         common.option("--stage", panel=_SEARCH, tuning=True, help="The stage to tune."),
     ] = "track",
-    tracker: Annotated[str, chooser("tracker", words="The {kind} to tune", panel=_SEARCH)] = "sort",
+    tracker: Annotated[str, chooser("tracker", intro="The {kind} to tune", panel=_SEARCH)] = "sort",
     metric: Annotated[
         Literal["IDF1", "MOTA", "HOTA", "IDP", "IDR", "DetA", "AssA"],
         common.option("--metric", panel=labels.SCORES, tuning=True, help="Score to maximise.", case_sensitive=False),
@@ -191,8 +191,8 @@ def _print(done: TuneResult) -> None:
     table.add_column("")
     for name in _SHOWN:
         table.add_column(name, justify="right")
-    for words, scores in (("defaults", done.default_scores), ("best", done.scores)):
+    for name_of_scores, scores in (("defaults", done.default_scores), ("best", done.scores)):
         values = [scores[name] for name in _SHOWN]
-        table.add_row(words, *(f"{100 * v:.1f}" if isinstance(v, float) else str(v) for v in values))
+        table.add_row(name_of_scores, *(f"{100 * v:.1f}" if isinstance(v, float) else str(v) for v in values))
     console().print(table)
     show("", *(f"{name.replace('_', '-')} = {value}" for name, value in done.settings.items()))

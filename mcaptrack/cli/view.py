@@ -118,7 +118,7 @@ def _as_json(server: LogServer) -> dict[str, Any]:
         "lichtblick": server.lichtblick,
         "report": server.report,
         "at_s": server.at_s,
-        "events": [one._asdict() for one in server.events],
+        "events": [event._asdict() for event in server.events],
         "notes": list(server.notes),
     }
 
@@ -132,9 +132,9 @@ def _print(server: LogServer, path: Path, most: int) -> None:
     lines += [] if server.layouts else [("layout", f"none yet: {command('run', path)} makes one")]
     width = max(len(name) for name, _ in lines) + 2
     show(*(f"{name:<{width}}{what}" for name, what in lines))
-    for one in server.events[:most]:
-        show("", f"event {one.event}, {one.topic}: {one.text}", f"  {one.link}")
+    for event in server.events[:most]:
+        show("", f"event {event.event}, {event.topic}: {event.text}", f"  {event.link}")
     rest = len(server.events) - min(most, len(server.events))
     if rest:
-        words = f"and {rest} more" if most else f"{rest} events"
-        show("", f"{words}: --links {len(server.events)} prints their links, --event N opens one, --json has all")
+        text = f"and {rest} more" if most else f"{rest} events"
+        show("", f"{text}: --links {len(server.events)} prints their links, --event N opens one, --json has all")

@@ -90,10 +90,10 @@ def zones(
     if str(logs[0]) == _DRAW and len(logs) == 1 and not Path(_DRAW).exists():
         raise McaptrackError("`zones draw` needs a log: name it after draw")
     if str(logs[0]) == _DRAW and len(logs) > 1:
-        given = {"--zones": zones, "--topic": topic, "--margin-m": margin_m, "--max-gap-s": max_gap_s}
-        given |= {"--sidecar": sidecar}
-        if len(logs) > 2 or any(one is not None for one in given.values()):
-            unused = next((name for name, one in given.items() if one is not None), f"another log ({logs[-1]})")
+        extra = {"--zones": zones, "--topic": topic, "--margin-m": margin_m, "--max-gap-s": max_gap_s}
+        extra |= {"--sidecar": sidecar}
+        if len(logs) > 2 or any(value is not None for value in extra.values()):
+            unused = next((name for name, value in extra.items() if value is not None), f"another log ({logs[-1]})")
             raise McaptrackError(f"`zones draw` takes one log, --camera, --output and --force, not {unused}")
         page = mcaptrack.draw_zones(logs[1], camera=camera, output=output, force=force)
         if json:
@@ -120,22 +120,17 @@ def zones(
 
 def zones_in_short(result: RunResult) -> str:
     """The number of zones and lines that were counted, and of channels of tracks, in words."""
-    zones = len({one.zone for totals in result.zones.values() for one in totals})
+    zones = len({total.zone for totals in result.zones.values() for total in totals})
     topics = len(result.zones)
     named = "zone or line" if zones == 1 else "zones and lines"
     return f"{zones} {named}, of {topics} channel{'' if topics == 1 else 's'} of tracks"
-
-
-def zones_as_json(result: RunResult) -> dict[str, Any]:
-    """The totals as values of JSON: by the topic of tracks, a list of zones."""
-    return {topic: [one.to_json() for one in totals] for topic, totals in result.zones.items()}
 
 
 def _as_json(result: RunResult) -> dict[str, Any]:
     return {
         "log": str(result.log),
         "stages": list(result.stages),
-        "zones": zones_as_json(result),
+        "zones": {topic: [total.to_json() for total in totals] for topic, totals in result.zones.items()},
         "written_to": str(result.written_to) if result.written_to else None,
         "seconds": result.seconds,
     }
@@ -158,19 +153,19 @@ def print_zones(result: RunResult) -> None:
         False: ("zone", "tracks of", "tracks", "visits", "entered", "left", "mean stay", "most inside"),
         True: ("line", "tracks of", "tracks", "forward", "backward"),
     }
-    names = dict.fromkeys((one.zone, one.is_line) for totals in result.zones.values() for one in totals)
+    names = dict.fromkeys((total.zone, total.is_line) for totals in result.zones.values() for total in totals)
     for is_line, head in heads.items():
         table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
         for place, name in enumerate(head):
             table.add_column(name, justify="left" if place < 2 else "right", overflow="fold")
         for name, _ in (pair for pair in names if pair[1] == is_line):
             for topic, totals in result.zones.items():
-                one = next((found for found in totals if (found.zone, found.is_line) == (name, is_line)), None)
-                if one is None:
+                counts = next((total for total in totals if (total.zone, total.is_line) == (name, is_line)), None)
+                if counts is None:
                     continue
-                stay = "" if one.mean_dwell_s is None else f"{one.mean_dwell_s:.1f} s"
-                of_zone = (one.visits, one.entered, one.left, stay, one.most_inside)
-                cells = (one.tracks, *((one.forward, one.backward) if is_line else of_zone))
+                stay = "" if counts.mean_dwell_s is None else f"{counts.mean_dwell_s:.1f} s"
+                of_zone = (counts.visits, counts.entered, counts.left, stay, counts.most_inside)
+                cells = (counts.tracks, *((counts.forward, counts.backward) if is_line else of_zone))
                 table.add_row(name, topic, *map(str, cells))
         if table.row_count:
             console().print(table)

@@ -14,9 +14,9 @@ from threading import Event, Lock, local
 from time import monotonic
 from typing import Any, TypeVar
 
-from mcaptrack.api.checked import checked
+from mcaptrack.api.declared import checked
 from mcaptrack.errors import McaptrackError
-from mcaptrack.fleet.child import Child, WorkerLimits, size_in_bytes
+from mcaptrack.fleet.child import Child, WorkerLimits, memory_in_bytes
 from mcaptrack.fleet.digests import digest_of_settings
 from mcaptrack.fleet.expansion import NamedLog, find_logs, outputs_in
 from mcaptrack.fleet.ledger import Ledger
@@ -121,25 +121,23 @@ def run(
     for what, value, least in (("jobs", jobs, 1), ("tries", tries, 1), ("timeout_s", timeout_s, 0.001)):
         if value is not None and not least <= value < float("inf"):
             raise McaptrackError(f"`{what}=` has to be at least {least}, not {value}")
-    found = _named(logs)
-    if not found:
+    named_logs = _named(logs)
+    if not named_logs:
         raise McaptrackError("there are no logs to process")
-    given, command = dict(options or {}), name or _name_of(function)
+    keywords, command = dict(options or {}), name or _name_of(function)
     folder = None if output_dir is None else Path(output_dir)
-    settings = digest_of_settings(function, given, str(folder.absolute()) if folder else None)
+    settings = digest_of_settings(function, keywords, str(folder.absolute()) if folder else None)
     entries = None if ledger is None else Ledger(Path(ledger), command, settings)
     claims_in = folder or (None if ledger is None else Path(ledger).absolute().parent)
     work = []
-    outputs = outputs_in(folder, found, suffix) if folder is not None else []
-    for number, one in enumerate(found):
+    outputs = outputs_in(folder, named_logs, suffix) if folder is not None else []
+    for number, named_log in enumerate(named_logs):
         own = {"output": outputs[number]} if outputs else {}
-        place = _claimed_in(one.path, claims_in) if writes and folder is None else claims_in
-        work.append(QueuedLog(number, one.path, location_of(one.path), own, place))
+        place = _claimed_in(named_log.path, claims_in) if writes and folder is None else claims_in
+        work.append(QueuedLog(number, named_log.path, location_of(named_log.path), own, place))
     for output in outputs:
         _make_folder(output.parent)
-    limits = WorkerLimits(
-        min(jobs or 1, len(found)), os.getcwd(), timeout_s, size_in_bytes(memory_limit, "memory_limit")
-    )
+    limits = WorkerLimits(min(jobs or 1, len(named_logs)), os.getcwd(), timeout_s, memory_in_bytes(memory_limit))
 
     def hear(outcome: LogOutcome[T]) -> None:
         if on_outcome is not None:
@@ -152,7 +150,7 @@ def run(
             on_status(status)
 
     crew = _crew(scheduler, limits, jobs)
-    fleet = Fleet(function, given, work, crew, entries, tries, keep_going, hear, watch, on_note or _ignore)
+    fleet = Fleet(function, keywords, work, crew, entries, tries, keep_going, hear, watch, on_note or (lambda _: None))
     return fleet.run()
 
 
@@ -186,8 +184,8 @@ class Processes:
             try:
                 self._own.child = Child(self._limits)
             except OSError as error:  # no folder for temporary files, or no room there
-                words = f"{request.log}: no worker process can be started ({error.strerror or error})"
-                return Reply("failed", error=words)
+                text = f"{request.log}: no worker process can be started ({error.strerror or error})"
+                return Reply("failed", error=text)
             with self._lock:
                 self._children.append(self._own.child)
         child: Child = self._own.child
@@ -232,7 +230,7 @@ def _named(logs: Any) -> list[NamedLog]:
     if isinstance(logs, str | os.PathLike):
         return find_logs([logs])
     several = list(logs)
-    return several if all(isinstance(one, NamedLog) for one in several) else find_logs(several)
+    return several if all(isinstance(log, NamedLog) for log in several) else find_logs(several)
 
 
 def _name_of(function: Any) -> str:
@@ -245,7 +243,3 @@ def _make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise McaptrackError(f"the folder {folder} can't be made: {error.strerror or error}") from error
-
-
-def _ignore(_: str) -> None:
-    pass

@@ -63,20 +63,22 @@ def environment_of_worker(workers: int) -> dict[str, str]:
     return dict.fromkeys(THREADS, share) | dict(os.environ)
 
 
-def size_in_bytes(size: str | float | None, name: str) -> int | None:
-    """Return a size such as "2GB", "1.5 GiB" or a number of bytes; None for None.
+def memory_in_bytes(size: str | float | None) -> int | None:
+    """Return a limit of memory such as "2GB", "1.5 GiB" or a number of bytes; None for None.
 
     Raises McaptrackError for text that is no size, and for less than a megabyte.
     """
     if size is None:
         return None
-    found = _SIZE.fullmatch(str(size).strip())
-    if found is None:
-        raise McaptrackError(f"`{name}=` needs a size such as 2GB or 500MB, not {str(size)!r:.40}")
-    number, unit, binary = found.groups()
+    match = _SIZE.fullmatch(str(size).strip())
+    if match is None:
+        raise McaptrackError(f"`memory_limit=` needs a size such as 2GB or 500MB, not {str(size)!r:.40}")
+    number, unit, binary = match.groups()
     amount = int(float(number) * (1024 if binary else 1000) ** (" kmgt".index(unit.lower() or " ")))
     if amount < 1_000_000:
-        raise McaptrackError(f"`{name}=` needs a size such as 2GB or 500MB, not {str(size)!r:.40}: that is too little")
+        raise McaptrackError(
+            f"`memory_limit=` needs a size such as 2GB or 500MB, not {str(size)!r:.40}: that is too little"
+        )
     return amount
 
 
@@ -95,7 +97,7 @@ class Child:
         self.resident = 0
 
     def do(self, request: Request, is_stopping: Callable[[], bool]) -> Reply:
-        """Let the worker process a log. Whatever that does to the worker becomes a reply.
+        """Let the worker process a log. If the worker dies or exceeds a limit, the reply says so.
 
         Raises StoppedError when ``is_stopping`` returns true; the worker is ended then.
         """
@@ -109,8 +111,8 @@ class Child:
             try:
                 self._start()
             except OSError as error:
-                words = f"{request.log}: no worker process can be started in {self._limits.folder or '.'}"
-                return Reply("failed", error=f"{words} ({error.strerror or error})")
+                reason = f"{request.log}: no worker process can be started in {self._limits.folder or '.'}"
+                return Reply("failed", error=f"{reason} ({error.strerror or error})")
             deadline = began + _START_S
         else:
             deadline = self._deadline()
@@ -133,13 +135,13 @@ class Child:
             self.resident = resident_bytes_with_children(self._process.pid)
             peak = max(peak, self.resident)
             if over := self._over(deadline, peak):
-                state, words = over
+                state, reason = over
                 if not is_started and state == "timed-out":
-                    words = f"its worker process did not start within {_START_S:g} s (the machine may be too busy)"
+                    reason = f"its worker process did not start within {_START_S:g} s (the machine may be too busy)"
                 self.end(grace_s=_GRACE_S if state == "timed-out" else 0.0)
                 seconds = round(monotonic() - began, 3)
-                words = f"{request.log}: {words}, and was ended"
-                return Reply(state, error=words, seconds=seconds, peak_bytes=peak, detail=self._printed())
+                reason = f"{request.log}: {reason}, and was ended"
+                return Reply(state, error=reason, seconds=seconds, peak_bytes=peak, detail=self._printed())
             if self._process.poll() is not None and not self._connection.poll(0):
                 return replace(self._died(request), seconds=monotonic() - began, peak_bytes=peak)
 

@@ -38,8 +38,8 @@ class Cluster:
         except ImportError:
             raise McaptrackError("`scheduler=` needs Dask: `pip install 'mcaptrack[fleet]'` installs it") from None
         self._address, self._most = address, most
-        known = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] in _LOGGERS]
-        self._levels = {name: logging.getLogger(name).level for name in (*_LOGGERS, *known)}
+        loggers = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] in _LOGGERS]
+        self._levels = {name: logging.getLogger(name).level for name in (*_LOGGERS, *loggers)}
         for name in self._levels:  # Dask sets the levels of some of them, so that those above don't count
             logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
@@ -47,8 +47,8 @@ class Cluster:
             self._client = make(address, timeout=_ANSWER_S, set_as_default=False)
         except (OSError, ValueError, TypeError, RuntimeError) as error:
             self._restore_logging()
-            words = " ".join(str(error).split()) or type(error).__name__
-            raise McaptrackError(f"no Dask scheduler answers at {address}: {words:.200}") from error
+            text = " ".join(str(error).split()) or type(error).__name__
+            raise McaptrackError(f"no Dask scheduler answers at {address}: {text:.200}") from error
         self._futures: dict[Location, tuple[Any, float]] = {}
         self._places, self._looked = 0, 0.0
         self._limits = limits
@@ -70,12 +70,12 @@ class Cluster:
         try:
             theirs = self._client.run(versions)
         except Exception as error:
-            words = " ".join(str(error).split())
+            text = " ".join(str(error).split())
             raise McaptrackError(
-                f"workers of {self._address} can't use this version of mcaptrack: {words:.200}"
+                f"workers of {self._address} can't use this version of mcaptrack: {text:.200}"
             ) from error
         for name, version in own.items():
-            others = sorted({found[name] for found in theirs.values()} - {version})
+            others = sorted({worker_versions[name] for worker_versions in theirs.values()} - {version})
             if others:
                 warn(f"workers of {self._address} have {name} {', '.join(others)}, not {version}", "other-version")
 
@@ -109,13 +109,13 @@ class Cluster:
         try:
             out.set_result(task.result(timeout=_ANSWER_S))
         except KilledWorker as error:
-            words = f"{request.log}: workers of the cluster died while they processed it"
-            out.set_result(Reply("killed", error=words, detail=str(error)))
+            text = f"{request.log}: workers of the cluster died while they processed it"
+            out.set_result(Reply("killed", error=text, detail=str(error)))
         except CancelledError:
             out.cancel()
         except Exception as error:
-            words = " ".join(str(error).split()) or type(error).__name__
-            out.set_result(Reply("failed", error=f"{request.log}: {words:.500}"))
+            text = " ".join(str(error).split()) or type(error).__name__
+            out.set_result(Reply("failed", error=f"{request.log}: {text:.500}"))
         self._futures.pop(request.log, None)
         return out
 

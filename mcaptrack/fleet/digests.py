@@ -32,23 +32,23 @@ def digest_of_log(path: Location) -> str:
     """
     if isinstance(path, Url):
         return _digest_in_store(path)
-    found = hashlib.sha256()
+    total = hashlib.sha256()
     try:
         results = results_path(path)
         for part in dict.fromkeys((path, results)):
             if part is results and part != path and not part.exists():
                 continue
             if part.is_dir():
-                found.update(_about_folder(part))
+                total.update(_about_folder(part))
                 continue
             with part.open("rb") as stream:
                 about = os.fstat(stream.fileno())
                 stream.seek(max(0, about.st_size - _TAIL))
-                found.update(f"{about.st_size} {about.st_mtime_ns} ".encode())
-                found.update(stream.read(_TAIL))
+                total.update(f"{about.st_size} {about.st_mtime_ns} ".encode())
+                total.update(stream.read(_TAIL))
     except OSError:
         return ""
-    return found.hexdigest()[:32]
+    return total.hexdigest()[:32]
 
 
 def _about_folder(folder: Path) -> bytes:
@@ -69,7 +69,7 @@ def _digest_in_store(url: Url) -> str:
 
 def digest_of_settings(*settings: object) -> str:
     """Return a digest of a function and its options; it is the same in every process."""
-    text = json.dumps([_plain(one) for one in settings], sort_keys=True)
+    text = json.dumps([_plain(setting) for setting in settings], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
@@ -84,13 +84,13 @@ def _plain(value: Any) -> Any:
     if isinstance(value, partial):
         return [_plain(value.func), _plain(value.args), _plain(value.keywords)]
     if is_dataclass(value) and not isinstance(value, type):
-        return [_name(type(value)), {one.name: _plain(getattr(value, one.name)) for one in fields(value)}]
+        return [_name(type(value)), {field.name: _plain(getattr(value, field.name)) for field in fields(value)}]
     if isinstance(value, Mapping):
-        return {str(key): _plain(one) for key, one in value.items()}
+        return {str(key): _plain(member) for key, member in value.items()}
     if isinstance(value, AbstractSet):
-        return sorted((_plain(one) for one in value), key=repr)
+        return sorted((_plain(member) for member in value), key=repr)
     if isinstance(value, Sequence) and not isinstance(value, bytes):
-        return [_plain(one) for one in value]
+        return [_plain(member) for member in value]
     if callable(value) and hasattr(value, "__qualname__"):
         return _name(value)
     return [_name(type(value)), hashlib.sha256(pickle.dumps(value, protocol=5)).hexdigest()]

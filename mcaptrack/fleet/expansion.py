@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Final
 
 from mcaptrack import objects
-from mcaptrack.api.checked import checked
 from mcaptrack.api.common import as_location
+from mcaptrack.api.declared import checked
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import place_of, refuse_special, refuse_url
 from mcaptrack.location import Location, Url, sibling
@@ -38,16 +38,16 @@ def logs_in_store(url: Url, leave_out: str) -> Iterator[tuple[Url, Path]]:
     several. Raises McaptrackError if nothing fits, or if the store can't be read.
     """
     if glob.has_magic(url.key):
-        found = [*_in_store_matching(url, leave_out)]
-        if not found:
+        members = [*_in_store_matching(url, leave_out)]
+        if not members:
             raise McaptrackError(f"no object matches {url}")
-        yield from found
+        yield from members
         return
     is_log = url.suffix.lower() == _IN_STORE_SUFFIX and not url.endswith("/")
-    found = [] if is_log else [*_below(url, leave_out)]
-    if not found and (url.endswith("/") or not url.key):
+    members = [] if is_log else [*_below(url, leave_out)]
+    if not members and (url.endswith("/") or not url.key):
         raise McaptrackError(f"{url} has no log: no object below it ends with {_IN_STORE_SUFFIX}")
-    yield from found or [(url, Path(url.name))]
+    yield from members or [(url, Path(url.name))]
 
 
 def _below(prefix: Url, leave_out: str) -> Iterator[tuple[Url, Path]]:
@@ -127,12 +127,12 @@ def find_logs(
         If a folder has no log, if a pattern matches no file, or for another URL, a pipe or a device.
 
     """
-    found: list[NamedLog] = []
+    named_logs: list[NamedLog] = []
     for argument in arguments:
-        found += _logs_of(argument, leave_out, read_list or _standard_input)
+        named_logs += _logs_of(argument, leave_out, read_list or _standard_input)
     once: dict[object, NamedLog] = {}
-    for one in found if each else _without_results(found):
-        once.setdefault(_identity(one.path), one)
+    for log in named_logs if each else _without_results(named_logs):
+        once.setdefault(_identity(log.path), log)
     return list(once.values())
 
 
@@ -144,28 +144,28 @@ def find_inputs(
     With ``folders``, a folder or prefix stands for the logs in it, if there are any. LOG.results.mcap is left out if
     LOG is there, because it is a part of LOG; with ``each`` it is kept. Raises McaptrackError as ``find_logs`` does.
     """
-    found: list[NamedLog] = []
+    inputs: list[NamedLog] = []
     for argument in arguments:
         if str(argument) == LIST:
-            found += _listed(_standard_input(), has_folders=not folders)
+            inputs += _listed(_standard_input(), has_folders=not folders)
             continue
         location = as_location(argument)
         if folders and (isinstance(location, Url) or (location.is_dir() and _has_logs(location))):
-            found += _logs_of(argument, "", _standard_input)
+            inputs += _logs_of(argument, "", _standard_input)
         elif isinstance(location, Url) or _is_no_pattern(location):
             if isinstance(location, Path):
                 refuse_url(location)
-            found.append(NamedLog(location, Path(location.name)))
+            inputs.append(NamedLog(location, Path(location.name)))
         else:
             refuse_url(location)
-            found += _matching(location, None)
-    return found if each else _without_results(found)
+            inputs += _matching(location, None)
+    return inputs if each else _without_results(inputs)
 
 
-def _without_results(found: Sequence[NamedLog]) -> list[NamedLog]:
+def _without_results(named_logs: Sequence[NamedLog]) -> list[NamedLog]:
     """Leave out LOG.results.mcap where LOG is there."""
-    results = {results_path(place_of(one.path)) for one in found}
-    return [one for one in found if place_of(one.path) not in results]
+    results = {results_path(place_of(log.path)) for log in named_logs}
+    return [log for log in named_logs if place_of(log.path) not in results]
 
 
 def _has_logs(folder: Path) -> bool:
@@ -182,13 +182,13 @@ def outputs_in(folder: Path, logs: Sequence[NamedLog], suffix: str) -> list[Path
     Raises McaptrackError if two logs have the same name.
     """
     names: dict[Path, Location] = {}
-    for one in logs:
-        stem = one.below.name.removesuffix(one.below.suffix) if one.below.suffix.lower() == _SUFFIX else one.below.name
-        name = folder / sibling(one.below, suffix, of=stem)
-        other = names.setdefault(name, one.path)
-        if other != one.path:
+    for log in logs:
+        stem = log.below.name.removesuffix(log.below.suffix) if log.below.suffix.lower() == _SUFFIX else log.below.name
+        name = folder / sibling(log.below, suffix, of=stem)
+        other = names.setdefault(name, log.path)
+        if other != log.path:
             raise McaptrackError(
-                f"the results of {other} and {one.path} would both be {name}; give the folder that holds both logs, "
+                f"the results of {other} and {log.path} would both be {name}; give the folder that holds both logs, "
                 "which keeps the folders below it apart, or process them one by one"
             )
     return list(names)
@@ -205,12 +205,12 @@ def _logs_of(named: str | os.PathLike[str], leave_out: str, read_list: Callable[
     refuse_url(argument)
     refuse_special(argument)
     if argument.is_dir():
-        found = list(_logs_in(argument, leave_out))
-        if not found or (argument / "metadata.yaml").is_file():
+        members = list(_logs_in(argument, leave_out))
+        if not members or (argument / "metadata.yaml").is_file():
             refuse_non_mcap(argument)  # a bag is one recording, whatever number of files it has
-        if not found:
+        if not members:
             raise McaptrackError(f"the folder {argument} has no log: no file in it ends with {_SUFFIX}")
-        yield from found
+        yield from members
     elif _is_no_pattern(argument):
         yield NamedLog(argument, Path(argument.name))
     else:
@@ -236,7 +236,7 @@ def _logs_in(folder: Path, leave_out: str) -> Iterator[NamedLog]:
 
 
 def _matching(pattern: Path, leave_out: str | None) -> Iterator[NamedLog]:
-    """Yield the files that a pattern matches, and the logs in folders that it matches; the folders for None."""
+    """Yield the files that a pattern matches, and the logs in folders (the folders if ``leave_out`` is None)."""
     names = sorted(glob.glob(str(pattern), recursive=True))
     if not names:
         raise McaptrackError(f"no file matches {pattern}")
@@ -248,7 +248,7 @@ def _matching(pattern: Path, leave_out: str | None) -> Iterator[NamedLog]:
     for name in names:
         path = Path(name)
         if leave_out is not None and path.is_dir():
-            yield from (replace(one, below=path.relative_to(fixed) / one.below) for one in _logs_in(path, leave_out))
+            yield from (replace(log, below=path.relative_to(fixed) / log.below) for log in _logs_in(path, leave_out))
         else:
             yield NamedLog(path, path.relative_to(fixed))
 

@@ -89,8 +89,8 @@ class Ledger:
         line = self._last.get(location)
         if line is None or line["state"] not in ("done", "up-to-date") or line["settings"] != self._settings:
             return False
-        there = all(os.path.exists(output) for output in line["outputs"] or ())
-        return there and bool(digest) and line["digest"] == digest
+        has_outputs = all(os.path.exists(output) for output in line["outputs"] or ())
+        return has_outputs and bool(digest) and line["digest"] == digest
 
     def append(self, **values: Any) -> None:
         """Add a line, in one write. Warns once if it can't be written."""

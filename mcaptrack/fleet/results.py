@@ -91,27 +91,27 @@ class FleetResult(Generic[T]):
     @property
     def results(self) -> dict[Location, T]:
         """The results of the function, for logs that were done now."""
-        return {one.log: one.result for one in self.outcomes if one.result is not None}
+        return {outcome.log: outcome.result for outcome in self.outcomes if outcome.result is not None}
 
     @property
     def failed(self) -> tuple[LogOutcome[T], ...]:
         """The logs that were tried, and are not done."""
-        return tuple(one for one in self.outcomes if not one.is_good and one.state != "not-tried")
+        return tuple(outcome for outcome in self.outcomes if not outcome.is_good and outcome.state != "not-tried")
 
     @property
     def counts(self) -> dict[str, int]:
         """Number of logs by state."""
-        return dict(Counter(one.state for one in self.outcomes))
+        return dict(Counter(outcome.state for outcome in self.outcomes))
 
     @property
     def peak_bytes(self) -> int:
         """Largest resident memory of a worker."""
-        return max((one.peak_bytes for one in self.outcomes), default=0)
+        return max((outcome.peak_bytes for outcome in self.outcomes), default=0)
 
     @property
     def cpu_seconds(self) -> float:
         """Processor time of all last tries."""
-        return sum(one.cpu_seconds for one in self.outcomes)
+        return sum(outcome.cpu_seconds for outcome in self.outcomes)
 
     def to_json(self) -> dict[str, Any]:
         """Return the totals as values of JSON."""

@@ -193,7 +193,7 @@ class Fleet(Generic[T]):
                 seconds=reply.seconds,
                 cpu_seconds=reply.cpu_seconds,
                 peak_bytes=reply.peak_bytes,
-                warnings=[{"code": one.code, "message": one.message} for one in reply.warnings],
+                warnings=[{"code": warning.code, "message": warning.message} for warning in reply.warnings],
                 error=reply.error or None,
                 detail=reply.detail or None,
                 outputs=[*([os.path.abspath(work.own["output"])] if "output" in work.own else []), *reply.files],
@@ -232,7 +232,7 @@ class Fleet(Generic[T]):
         self._hear(outcome)
 
     def _status(self) -> FleetStatus:
-        ended = Counter(one.state for one in self._outcomes.values())
+        ended = Counter(outcome.state for outcome in self._outcomes.values())
         return FleetStatus(len(self._logs), ended, self._crew.running(), monotonic() - self._began)
 
 

@@ -79,11 +79,11 @@ def do(request: Request, progress: Callable[[str, float, float | None], None]) -
         reply = Reply("out-of-memory", error=f"{request.log}: the memory of this machine is not enough")
     except Exception as error:
         last = " ".join(traceback.format_exception_only(error)[-1].split())
-        words = f"{request.log}: {last}; this is a fault of the program, the ledger and -v have its traceback"
-        reply = Reply("failed", error=words, detail=traceback.format_exc())
+        text = f"{request.log}: {last}; this is a fault of the program, the ledger and -v have its traceback"
+        reply = Reply("failed", error=text, detail=traceback.format_exc())
     seconds, cpu = round(monotonic() - began, 3), round(_cpu_seconds() - used, 3)
-    found = tuple(dict.fromkeys(warnings))
-    return replace(reply, seconds=seconds, cpu_seconds=cpu, peak_bytes=_peak_bytes(), warnings=found)
+    unique_warnings = tuple(dict.fromkeys(warnings))
+    return replace(reply, seconds=seconds, cpu_seconds=cpu, peak_bytes=_peak_bytes(), warnings=unique_warnings)
 
 
 def _files_of(result: object) -> tuple[str, ...]:
@@ -144,7 +144,7 @@ def _end(number: int, _: FrameType | None) -> NoReturn:
 def _cpu_seconds() -> float:
     """Return the processor time of this process and of those that it waited for."""
     used = [resource.getrusage(which) for which in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(one.ru_utime + one.ru_stime for one in used)
+    return sum(usage.ru_utime + usage.ru_stime for usage in used)
 
 
 def _reset_peak() -> None:

@@ -6,7 +6,6 @@ from mcaptrack.foxglove.messages import (
     CALIBRATION,
     IMAGE,
     LOG,
-    PICTURES,
     SCENE,
     TRANSFORM,
     VIDEO,
@@ -17,7 +16,6 @@ from mcaptrack.foxglove.messages import (
     pack_transform,
     schema_record,
     unpack,
-    unpack_picture,
 )
 from mcaptrack.foxglove.palette import class_colour, colour, colours
 from mcaptrack.foxglove.ros import messages_in, record_in
@@ -28,7 +26,6 @@ __all__ = [
     "CALIBRATION",
     "IMAGE",
     "LOG",
-    "PICTURES",
     "SCENE",
     "TRANSFORM",
     "VIDEO",
@@ -49,5 +46,4 @@ __all__ = [
     "record_in",
     "schema_record",
     "unpack",
-    "unpack_picture",
 ]

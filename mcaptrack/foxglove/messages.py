@@ -15,8 +15,6 @@ SCENE: Final = "foxglove.SceneUpdate"
 TRANSFORM: Final = "foxglove.FrameTransform"
 LOG: Final = "foxglove.Log"
 CALIBRATION: Final = "foxglove.CameraCalibration"
-#: Schemas of pictures.
-PICTURES: Final = (VIDEO, IMAGE)
 
 
 @cache
@@ -76,10 +74,10 @@ def pack_stamped(message: Any, t_ns: int) -> bytes:
     return payload
 
 
-def pack_log(t_ns: int, level: str, name: str, words: str) -> bytes:
+def pack_log(t_ns: int, level: str, name: str, text: str) -> bytes:
     """A Log message; ``level`` is "DEBUG", "INFO", "WARNING" or "ERROR", ``name`` is that of the source."""
     kind = message_class(LOG)
-    message = kind(level=kind.Level.Value(level), name=name, message=words)
+    message = kind(level=kind.Level.Value(level), name=name, message=text)
     _stamp(message, t_ns)
     payload: bytes = message.SerializeToString(deterministic=True)
     return payload
@@ -95,9 +93,3 @@ def unpack(schema_name: str, payload: bytes) -> Any:
     except DecodeError:
         raise McaptrackError(f"{len(payload)} bytes are no {schema_name} message") from None
     return message
-
-
-def unpack_picture(schema_name: str, payload: bytes) -> tuple[str, bytes]:
-    """Format and data of a CompressedVideo or CompressedImage message. Raises McaptrackError if it is none."""
-    message = unpack(schema_name, payload)
-    return message.format, message.data

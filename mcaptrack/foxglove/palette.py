@@ -25,7 +25,7 @@ _LIGHT: Final = 0.55
 
 
 @cache
-def colour(identity: int, alpha: float = 1.0) -> Rgba:
+def colour(identity: int) -> Rgba:
     """The colour of an identity as RGBA, each part between 0 and 1."""
     base, shade = _HUES[identity % len(_HUES)], _SHADES[identity // len(_HUES) % len(_SHADES)]
     red, green, blue = (int(base[at : at + 2], 16) / 255 for at in (0, 2, 4))
@@ -34,7 +34,7 @@ def colour(identity: int, alpha: float = 1.0) -> Rgba:
     red, green, blue = (
         round(part * 256) / 256 for part in colorsys.hls_to_rgb(hue, min(light * shade, 0.85), saturation)
     )
-    return red, green, blue, alpha
+    return red, green, blue, 1.0
 
 
 def colours(identities: NDArray[np.int64]) -> Floats:
@@ -54,11 +54,11 @@ _UNKNOWN: Final = (0.75, 0.75, 0.75)
 
 def class_colour(class_id: int, name: str = "") -> tuple[float, float, float]:
     """The colour of a class: by its name, so that cars have one colour in all logs, else by its number; 0 is grey."""
-    words = re.split(r"[\W_]+", name.casefold())
-    found = next((_CLASSES[word] for word in words if word in _CLASSES), None)
-    if found is None and not class_id:
+    parts = re.split(r"[\W_]+", name.casefold())
+    index = next((_CLASSES[word] for word in parts if word in _CLASSES), None)
+    if index is None and not class_id:
         return _UNKNOWN
-    red, green, blue, _ = colour(class_id + len(_HUES) if found is None else found)
+    red, green, blue, _ = colour(class_id + len(_HUES) if index is None else index)
     return red, green, blue
 
 

@@ -82,10 +82,10 @@ def record_in(schema_name: str, encoding: Encoding) -> tuple[str, str, bytes]:
         inner = [field.message_type for field in current.fields if field.message_type]
         if name == "geometry_msgs/Pose":  # its position is another type there
             inner = [message_class("foxglove.Point3").DESCRIPTOR, message_class("foxglove.Quaternion").DESCRIPTOR]
-        for one in inner:
-            if one.full_name not in done:
-                done.add(one.full_name)
-                waiting.append(one)
+        for member in inner:
+            if member.full_name not in done:
+                done.add(member.full_name)
+                waiting.append(member)
     return _ros_type(descriptor).replace("/", "/msg/"), ROS2MSG, ("\n".join(sections) + "\n").encode()
 
 
@@ -99,8 +99,8 @@ def messages_in(
     if encoding != CDR:
         yield from messages
         return
-    made, append = message_class(schema_name), _appender(message_class(schema_name).DESCRIPTOR)
-    fields = _field_types(made.DESCRIPTOR)
+    cls, append = message_class(schema_name), _appender(message_class(schema_name).DESCRIPTOR)
+    fields = _field_types(cls.DESCRIPTOR)
     batches = Batches(fields, _check_seconds) if Batches.take(fields) else None
     coming = iter(messages)
     while block := list(islice(coming, _BLOCK if batches else 1)):
@@ -111,7 +111,7 @@ def messages_in(
         for place, (t_ns, number, payload) in enumerate(block):
             out = bytearray(converted[place] if converted else b"")
             if not converted:
-                append(made.FromString(payload), out)
+                append(cls.FromString(payload), out)
             yield t_ns, number, _LITTLE_ENDIAN + out
 
 
@@ -251,30 +251,30 @@ def _append_list(field: Any, get: Callable[[Any], Any]) -> _Append:
     if numbers:
         values = _getter(numbers)
 
-        def content(found: Any, out: bytearray) -> None:
+        def content(members: Any, out: bytearray) -> None:
             _align(out, 8)
-            out += np.fromiter(chain.from_iterable(map(values, found)), "<f8").tobytes()
+            out += np.fromiter(chain.from_iterable(map(values, members)), "<f8").tobytes()
 
     elif field.message_type:
         inner = _appender(field.message_type)
 
-        def content(found: Any, out: bytearray) -> None:
-            for one in found:
-                inner(one, out)
+        def content(members: Any, out: bytearray) -> None:
+            for member in members:
+                inner(member, out)
 
     else:
         form = np.dtype(_SCALARS[_kind(field)][1])
 
-        def content(found: Any, out: bytearray) -> None:
+        def content(members: Any, out: bytearray) -> None:
             _align(out, form.itemsize)
-            out += np.array(found, form).tobytes()
+            out += np.array(members, form).tobytes()
 
     def append(message: Any, out: bytearray) -> None:
         _align(out, _U4.size)
-        found = get(message)
-        if found:
-            out += _U4.pack(len(found))
-            content(found, out)
+        members = get(message)
+        if members:
+            out += _U4.pack(len(members))
+            content(members, out)
         else:
             out += _NO_MEMBERS
 

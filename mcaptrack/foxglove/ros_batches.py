@@ -78,8 +78,8 @@ class _Shape:
 
     def __init__(self, field: FieldType, part: bytes) -> None:
         mask = np.full(len(part), 0xFF, np.uint8)
-        one = field._replace(is_list=False)
-        self._steps = list(_field_steps(one, part, 0, len(part), mask))
+        single = field._replace(is_list=False)
+        self._steps = list(_field_steps(single, part, 0, len(part), mask))
         self._places = np.flatnonzero(mask)
         self._mask = mask[self._places]
         self._tags = np.frombuffer(part, np.uint8)[self._places] & self._mask
@@ -102,16 +102,16 @@ class _Shape:
                     copies[_ALIGN if align == _ALIGN else 1].append((start, len(base), length))
                 base += constant or bytes(_U4.size if is_number else length)
             whole = np.frombuffer(bytes(base), np.uint8)
-            there = np.flatnonzero(whole)
+            nonzero = np.flatnonzero(whole)
             source, places = _places(copies[_ALIGN], _ALIGN)
-            words = source, (places + phase) // _ALIGN
+            eights = source, (places + phase) // _ALIGN
             letters = _places(copies[1], 1)
-            self._layouts[phase] = _Layout(len(base), (whole[there], there), words, letters, tuple(numbers))
+            self._layouts[phase] = _Layout(len(base), (whole[nonzero], nonzero), eights, letters, tuple(numbers))
         return self._layouts[phase]
 
 
 def _places(copies: Sequence[tuple[int, int, int]], width: int) -> tuple[Ints, Ints]:
-    """Where each item of this width in copies (from, to, length) is from, and where it goes."""
+    """Return source and target of each item of this width in ``copies`` (from, to, length)."""
     table = np.array(copies, np.int64).reshape(-1, 3)
     counts = table[:, 2] // width
     steps = ragged_range(0, counts) * width
@@ -120,31 +120,31 @@ def _places(copies: Sequence[tuple[int, int, int]], width: int) -> tuple[Ints, I
 
 def _steps(fields: Mapping[int, FieldType], data: bytes, low: int, high: int, mask: Bytes) -> Iterator[_Step]:
     """Convert the bytes of a message from ``low`` to ``high``; those that are copied are taken out of ``mask``."""
-    found: dict[int, list[tuple[int, int, int]]] = {}
+    by_number: dict[int, list[tuple[int, int, int]]] = {}
     for number, wire, start, end in _wire(data, low, high):
-        found.setdefault(number, []).append((wire, start, end))
-    if found.keys() - fields.keys():
+        by_number.setdefault(number, []).append((wire, start, end))
+    if by_number.keys() - fields.keys():
         raise UnusualMessage
     for number, field in fields.items():
-        there = found.get(number, [])
+        values = by_number.get(number, [])
         if field.is_list:
-            yield from _list_steps(field, data, there, mask)
-        elif len(there) > 1:
+            yield from _list_steps(field, data, values, mask)
+        elif len(values) > 1:
             raise UnusualMessage
         else:
-            yield from _field_steps(field, data, *(there[0][1:] if there else (0, 0)), mask)
+            yield from _field_steps(field, data, *(values[0][1:] if values else (0, 0)), mask)
 
 
-def _list_steps(field: FieldType, data: bytes, there: Sequence[tuple[int, int, int]], mask: Bytes) -> Iterator[_Step]:
+def _list_steps(field: FieldType, data: bytes, values: Sequence[tuple[int, int, int]], mask: Bytes) -> Iterator[_Step]:
     if field.kind == "MESSAGE":
-        yield _Step(4, _U4.pack(len(there)))
-        for _, start, end in there:
+        yield _Step(4, _U4.pack(len(values)))
+        for _, start, end in values:
             yield from _steps(field.fields, data, start, end, mask)
         return
     width = _FIXED.get(field.kind, 0)
-    if not width or len(there) > 1 or any(wire != 2 for wire, *_ in there):
+    if not width or len(values) > 1 or any(wire != 2 for wire, *_ in values):
         raise UnusualMessage
-    start, end = there[0][1:] if there else (0, 0)
+    start, end = values[0][1:] if values else (0, 0)
     yield _Step(4, _U4.pack((end - start) // width))
     if end > start:
         mask[start:end] = 0
@@ -153,9 +153,9 @@ def _list_steps(field: FieldType, data: bytes, there: Sequence[tuple[int, int, i
 
 def _field_steps(field: FieldType, data: bytes, start: int, end: int, mask: Bytes) -> Iterator[_Step]:
     if field.is_time:
-        there = {number: place for number, _, *place in _wire(data, start, end)}
+        places = {number: place for number, _, *place in _wire(data, start, end)}
         for number in (1, 2):
-            first, last = there.get(number, (0, 0))
+            first, last = places.get(number, (0, 0))
             if last - first > _LONGEST_VARINT:
                 raise UnusualMessage
             mask[first:last] = 0x80
@@ -211,11 +211,11 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
 
 
 class Batches:
-    """Messages of one type, which consists of lists of messages, and of times: ``fields`` are these."""
+    """Converts messages of a type that has only these ``fields``: lists of messages, and times."""
 
     @staticmethod
     def take(fields: Mapping[int, FieldType]) -> bool:
-        """Whether messages with these fields are of such a type."""
+        """Whether messages with these fields can be converted here."""
         return all(field.fields and (field.is_list or field.is_time) for field in fields.values())
 
     def __init__(self, fields: Mapping[int, FieldType], check_seconds: Callable[[int], None]) -> None:
@@ -237,7 +237,7 @@ class Batches:
             mine = [(number, start, end) for number, _, start, end in _wire(data, low, high)]
             if any(number not in self._fields for number, *_ in mine):
                 raise UnusualMessage
-            mine.sort(key=lambda one: self._order[one[0]])
+            mine.sort(key=lambda item: self._order[item[0]])
             bounds.append((len(parts), len(parts) + len(mine)))
             parts += mine
             low = high
@@ -250,16 +250,16 @@ class Batches:
             groups.setdefault((number, end - start), []).append(index)
         out: list[Any] = [None] * len(parts)
         for (number, length), indices in groups.items():
-            known = self._shapes.setdefault((number, length), [])
+            shapes = self._shapes.setdefault((number, length), [])
             left, starts, tried = np.array(indices), np.array([parts[index][1] for index in indices]), 0
             while len(left):
-                if tried == len(known):
+                if tried == len(shapes):
                     _, start, end = parts[int(left[0])]
-                    known.append(_Shape(self._fields[number], data[start:end]))
+                    shapes.append(_Shape(self._fields[number], data[start:end]))
                     self._count += 1
-                fits = known[tried].fits(raw, starts)
+                fits = shapes[tried].fits(raw, starts)
                 for index in left[fits].tolist():
-                    out[index] = known[tried]
+                    out[index] = shapes[tried]
                 left, starts = left[~fits], starts[~fits]
                 tried += 1
         return out
@@ -319,9 +319,9 @@ class Batches:
             out.view("<u8")[(targets // _ALIGN)[:, None] + places] = at_any_byte[starts[:, None] + source]
         for number, (start, length, place) in enumerate(layout.numbers):
             digits = raw[starts[:, None] + np.arange(start, start + length)].astype(np.int64) & 0x7F
-            found = (digits << (7 * np.arange(length))).sum(axis=1)
-            if number % 2 == 0 and len(found):  # seconds come before nanoseconds
-                self._check_seconds(int(found.max()))
+            numbers = (digits << (7 * np.arange(length))).sum(axis=1)
+            if number % 2 == 0 and len(numbers):  # seconds come before nanoseconds
+                self._check_seconds(int(numbers.max()))
             out[targets[:, None] + np.arange(place, place + _U4.size)] = (
-                found.astype("<u4").view(np.uint8).reshape(-1, _U4.size)
+                numbers.astype("<u4").view(np.uint8).reshape(-1, _U4.size)
             )

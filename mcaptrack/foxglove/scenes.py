@@ -98,10 +98,10 @@ class SceneMessages:
         """
         xy, trail = _short(xy_m), _short(trail_m)
         text_z = marker.number_m + np.sign(marker.number_m) * _short(apart_m)
-        for length, chosen, words in by_length(labels):
+        for length, chosen, texts in by_length(labels):
             template = _person(self._frame_id, self._lifetime_ns, length, marker, trail.shape[1])
             self._add(
-                frame[chosen], template, entity_id=words, label=words, x=xy[chosen, 0], y=xy[chosen, 1],
+                frame[chosen], template, entity_id=texts, label=texts, x=xy[chosen, 0], y=xy[chosen, 1],
                 text_x=xy[chosen, 0], text_y=xy[chosen, 1], text_z=text_z[chosen], a=alpha[chosen],
                 **_shades("", rgb[chosen]), **_shades("text_", rgb[chosen]), **_line(trail[chosen], rgb[chosen], fade),
             )  # fmt: skip
@@ -122,14 +122,14 @@ class SceneMessages:
         heading = np.stack([np.cos(boxes.heading_rad), np.sin(boxes.heading_rad)], axis=-1)
         ahead[:, 1, :2] += _AHEAD * length_m[:, None] * heading
         trail, ahead = _short(trail_m), _short(ahead)
-        for length, chosen, words in by_length(labels):
+        for length, chosen, texts in by_length(labels):
             template = _box(self._frame_id, self._lifetime_ns, length, line, trail.shape[1])
             place = {name: middle[chosen, axis] for axis, name in enumerate("xyz")}
             above = {"text_x": place["x"], "text_y": place["y"], "text_z": _short((base + over)[chosen])}
             extent = {name: size[chosen, axis] for axis, name in enumerate(("long", "wide", "high"))}
             front = {f"ahead__{name}": ahead[chosen, :, axis] for axis, name in enumerate("xyz")}
             self._add(
-                frame[chosen], template, entity_id=words, label=words, a=alpha[chosen], **place, **above, **extent,
+                frame[chosen], template, entity_id=texts, label=texts, a=alpha[chosen], **place, **above, **extent,
                 **front, **_turned(boxes.heading_rad[chosen]), **_shades("", rgb[chosen]),
                 **_shades("ahead_", rgb[chosen]), **_shades("text_", label_rgb[chosen]),
                 **_line(trail[chosen], label_rgb[chosen], fade),
@@ -146,7 +146,7 @@ class SceneMessages:
         """
         path = _short(path_m)
         is_high = path.shape[2] > 2
-        for length, chosen, words in by_length(numbers):
+        for length, chosen, texts in by_length(numbers):
             template = _forecast(
                 self._frame_id, self._lifetime_ns, length, path.shape[1], thickness_px, bool(ellipses), is_high
             )
@@ -158,7 +158,7 @@ class SceneMessages:
                 more |= _turned(turn)
                 more |= {"z": _short(at[:, 2] + _DISC_M)} if is_high else {}
             line = _line(path[chosen], rgb[chosen], fade)
-            self._add(frame[chosen], template, entity_id=words, **more, **line)
+            self._add(frame[chosen], template, entity_id=texts, **more, **line)
 
     def outline(self, frame: int, name: str, xy_m: Floats, rgba: tuple[float, float, float, float]) -> None:
         """Draw a closed line through points (P, 2) on the ground."""
@@ -173,11 +173,11 @@ class SceneMessages:
         """Draw the rings (P, 2) of a zone, or a line, at each of N instants, with labels (N,) at a point (2,)."""
         height_m = round(height_m * PER_M) / PER_M
         points = tuple(tuple(map(tuple, _short(ring).tolist())) for ring in rings)
-        for length, chosen, words in by_length(np.array(labels, object)):
+        for length, chosen, texts in by_length(np.array(labels, object)):
             template = _zone(self._frame_id, self._lifetime_ns, name, points, is_closed, length, rgba, height_m)
             at = {f"text_{axis}": np.full(len(chosen), _short(label_m)[place]) for place, axis in enumerate("xy")}
             shades = _shades("text_", np.broadcast_to(rgba[:3], (len(chosen), 3)))
-            self._add(frame[chosen], template, label=words, **at, **shades)
+            self._add(frame[chosen], template, label=texts, **at, **shades)
 
     def messages(self) -> Iterator[bytes]:
         """The message of each instant, in order."""

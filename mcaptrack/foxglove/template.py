@@ -124,10 +124,6 @@ class Template:
             target[last] = values
         return out
 
-    def one(self) -> bytes:
-        """The bytes of a message without slots."""
-        return self._data
-
 
 def _lay_out(descriptor: Any, content: Mapping[str, Any]) -> _Layout:
     layout = _Layout()
@@ -146,9 +142,9 @@ def _put(layout: _Layout, field: Any, value: Any) -> None:
     tag = varint(field.number << 3 | wire_type)
     match value:
         case Each(name, times, content):
-            one = _Layout()
-            one.nest(tag, _lay_out(field.message_type, content))
-            layout.put(b"", bytes(one.data) * times, (name, (one.dtype(), (times,))))
+            member = _Layout()
+            member.nest(tag, _lay_out(field.message_type, content))
+            layout.put(b"", bytes(member.data) * times, (name, (member.dtype(), (times,))))
         case Slot(name):
             layout.put(tag, bytes(8), (name, "<f8"))
         case TextSlot(name, length):

@@ -123,16 +123,16 @@ def _attach_remote(log: Log, results: Url, sidecar: bool | None) -> None:
     if sidecar is False:
         return
     try:
-        found = Log(results)
+        existing = Log(results)
     except AbsentError:
         if not sidecar:
             return
-        made = temporary_folder()
-        with create(Path(made.name, results.name)):
+        folder = temporary_folder()
+        with create(Path(folder.name, results.name)):
             pass
-        log.attach_results(Log(results, made), is_new=True)
+        log.attach_results(Log(results, folder), is_new=True)
     else:
-        log.attach_results(found, is_new=False)
+        log.attach_results(existing, is_new=False)
 
 
 # All records of a log in file order, to copy them to another log.

@@ -55,8 +55,8 @@ class Signature(NamedTuple):
     @classmethod
     def of(cls, handle: int) -> Signature:
         """The current signature of an open file."""
-        found = os.fstat(handle)
-        return cls(found.st_size, found.st_mtime_ns, found.st_ctime_ns)
+        status = os.fstat(handle)
+        return cls(status.st_size, status.st_mtime_ns, status.st_ctime_ns)
 
     @property
     def is_certain(self) -> bool:

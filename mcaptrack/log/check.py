@@ -88,22 +88,22 @@ def check(path: Location, progress: Progress = lambda *_: None) -> CheckResult:
     """
     with open_bytes(path) as (source, file):
         signature = file.signature()
-        found = find_journal(path, file)
-        if found and found.is_busy:
+        state = find_journal(path, file)
+        if state and state.is_busy:
             raise McaptrackError(f"{path} is being written to by another process; try again when it is done")
-        half = found.journal if found else None
-        if found and not half:
-            notices.warn(found.message, "journal")
+        half = state.journal if state else None
+        if state and not half:
+            notices.warn(state.message, "journal")
         look = _Checker((half.old_content() if half else source).sequential(), progress)
-        if found and half:
-            look.findings.add("half-written", half.start, found.message)
+        if state and half:
+            look.findings.add("half-written", half.start, state.message)
         try:
             look.check_all()
         except Damaged as error:  # an unreadable file; damaged content is a finding
             raise McaptrackError(f"{path} can't be read to its end: {error}") from None
         if file.signature() != signature:
             raise changed(path)
-    findings = sorted(look.findings, key=lambda found: (found.level, found.where))
+    findings = sorted(look.findings, key=lambda finding: (finding.level, finding.where))
     return CheckResult(path, sum(look.found.counts.values()), len(look.found.chunks), findings)
 
 
@@ -122,12 +122,12 @@ def content_to_recover(path: Location, source: ByteSource, file: ReadFile) -> By
 
     The log itself is not written to, so a journal is good enough that doesn't prove that it belongs to this file.
     """
-    found = find_journal(path, file)
-    if found is None or isinstance(path, Url) or not isinstance(file, OpenFile):
+    journal = find_journal(path, file)
+    if journal is None or isinstance(path, Url) or not isinstance(file, OpenFile):
         return source
-    before = found.journal.old_content() if found.journal else load_old_content(follow_links(path), file)
-    if before is None or (not found.journal and is_sound(source)) or not is_sound(before):
-        notices.warn(found.message, "journal")
+    before = journal.journal.old_content() if journal.journal else load_old_content(follow_links(path), file)
+    if before is None or (not journal.journal and is_sound(source)) or not is_sound(before):
+        notices.warn(journal.message, "journal")
         return source
     notices.warn(
         f"{path} was left half written by an interrupted change; its state before that is recovered with the help "
@@ -181,10 +181,10 @@ def spans_of(span: Span, entries: Mapping[int, Entries]) -> list[Span]:
     return list(zip(t_ns[[0, *(cuts + 1)]].tolist(), t_ns[[*cuts, -1]].tolist(), strict=True))
 
 
-def joined(one: Span, two: Span) -> Span | None:
+def joined(first: Span, two: Span) -> Span | None:
     """The span of both; None if there is a jump between them."""
-    both = min(one[0], two[0]), max(one[1], two[1])
-    return both if max(one[0], two[0]) - min(one[1], two[1]) <= _JUMP_NS else None
+    both = min(first[0], two[0]), max(first[1], two[1])
+    return both if max(first[0], two[0]) - min(first[1], two[1]) <= _JUMP_NS else None
 
 
 def jumps_between(spans: Iterable[Span], messages: int) -> list[ClockJump]:
@@ -211,10 +211,10 @@ def jumps_text(jumps: list[ClockJump], start_ns: int) -> str:
         return ""
     longest = max(jumps, key=lambda jump: jump.after_ns - jump.before_ns)
     after_s = (longest.before_ns - start_ns) / NS_PER_S
-    words = f"there is no message for {_long((longest.after_ns - longest.before_ns) / NS_PER_S)} after {after_s:.3f} s"
+    text = f"there is no message for {_long((longest.after_ns - longest.before_ns) / NS_PER_S)} after {after_s:.3f} s"
     if len(jumps) > 1:
-        words += f", the longest of {len(jumps)} gaps of more than {JUMP_S:g} s"
-    return words
+        text += f", the longest of {len(jumps)} gaps of more than {JUMP_S:g} s"
+    return text
 
 
 def _long(seconds: float) -> str:
@@ -300,7 +300,7 @@ class _Checker:
         self._find("no-data-end", end, "the data section has no end: records are missing")
 
     def _at_record(self, record: Record) -> None:
-        buffer, found = self._buffer, self.found
+        buffer, index = self._buffer, self.found
         if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             self._describe(buffer, record, record.start)
         elif record.opcode == Opcode.CHUNK:
@@ -320,9 +320,9 @@ class _Checker:
         elif record.opcode == Opcode.ATTACHMENT:
             if not attachment_is_whole(buffer, record):
                 self._find("attachment-checksum", record.start, "the checksum of an attachment is wrong")
-            found.attachments.append(attachment_entry(buffer, record, record.start))
+            index.attachments.append(attachment_entry(buffer, record, record.start))
         elif record.opcode == Opcode.METADATA:
-            found.metadata.append(metadata_entry(buffer, record, record.start))
+            index.metadata.append(metadata_entry(buffer, record, record.start))
         elif record.opcode == Opcode.HEADER:
             records.read_header(buffer, record)
         elif record.opcode == 0 or record.opcode in (Opcode.FOOTER, Opcode.STATISTICS, Opcode.CHUNK_INDEX):
@@ -365,24 +365,24 @@ class _Checker:
         if not indexes:
             self._describe_all(content, record.start)
             if entries:
-                words = "a chunk without message indexes: finding a message takes a scan"
-                self._find("no-message-index", record.start, words, "warning")
+                text = "a chunk without message indexes: finding a message takes a scan"
+                self._find("no-message-index", record.start, text, "warning")
         self._count(entries, record.start)
         times = [int(edge) for e in entries.values() if len(e) for edge in (e[:, 0].min(), e[:, 0].max())]
         span = (min(times), max(times)) if times else (0, 0)
         if (head.start_ns, head.end_ns) != span:
-            words = (
+            text = (
                 f"a chunk declares times from {head.start_ns} to {head.end_ns} ns; its messages are from "
                 f"{span[0]} to {span[1]}"
             )
-            self._find("chunk-times", record.start, words)
+            self._find("chunk-times", record.start, text)
         last = max((records.record_at(buffer, at).end for at in indexes.values()), default=record.end)
         sizes = (head.compression, head.end - head.start, head.uncompressed_size)
         place = (record.start, record.end - record.start, dict(indexes), last - record.end)
         self.found.chunks.append(ChunkIndexRecord(head.start_ns, head.end_ns, *place, *sizes))
 
     def _add_spans(self, entries: Mapping[int, Entries], where: int) -> None:
-        """Note when there are messages; those of one record, by channel."""
+        """Keep the spans of time of messages: those of one record, by channel."""
         edges = [int(edge) for listed in entries.values() for edge in (listed[:, 0].min(), listed[:, 0].max())]
         for span in spans_of((min(edges), max(edges)), entries) if edges else ():
             if self._spans and (both := joined(self._spans[-1], span)):
@@ -444,16 +444,16 @@ class _Checker:
                 self._find("no-channel", where, f"messages of channel {channel}, which was not described before")
             t_ns = listed[:, 0]
             latest = self._latest.get(channel, 0)
-            known = self.found.channels.get(channel)
-            topic = known.topic if known else f"channel {channel}"
+            described = self.found.channels.get(channel)
+            topic = described.topic if described else f"channel {channel}"
             behind = t_ns < np.maximum(np.maximum.accumulate(t_ns), np.uint64(latest))
             if behind.any():
-                words = f"messages of {topic} that follow later ones"
-                self._find("order", where, words, "warning", int(behind.sum()))
+                text = f"messages of {topic} that follow later ones"
+                self._find("order", where, text, "warning", int(behind.sum()))
             late = t_ns > np.uint64(MAX_NS)
             if late.any():
-                words = f"messages of {topic} later than the year 2262, which are kept, but nothing is computed with"
-                self._find("late", where, words, "warning", int(late.sum()))
+                text = f"messages of {topic} later than the year 2262, which are kept, but nothing is computed with"
+                self._find("late", where, text, "warning", int(late.sum()))
             self._latest[channel] = max(latest, int(t_ns.max()))
             if not self.found.counts:
                 self.found.start_ns = int(t_ns.min())

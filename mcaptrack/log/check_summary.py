@@ -45,12 +45,12 @@ class Findings:
         self._times: Counter[tuple[Level, str]] = Counter()
 
     def __iter__(self) -> Iterator[Finding]:
-        for (level, kind), (where, words) in self._first.items():
-            yield Finding(level, kind, where, words, self._times[level, kind])
+        for (level, kind), (where, message) in self._first.items():
+            yield Finding(level, kind, where, message, self._times[level, kind])
 
-    def add(self, kind: str, where: int, words: str, level: Level = "error", times: int = 1) -> None:
+    def add(self, kind: str, where: int, message: str, level: Level = "error", times: int = 1) -> None:
         """Add a finding, or count it if there is one of its kind."""
-        self._first.setdefault((level, kind), (where, words))
+        self._first.setdefault((level, kind), (where, message))
         self._times[level, kind] += times
 
 
@@ -62,40 +62,40 @@ def record_name(opcode: int) -> str:
         return f"{opcode:#04x}"
 
 
-def check_summary(buffer: Bytes, found: Index, findings: Findings) -> None:
-    """Check summary and footer of a log; ``found`` is the index of its data section."""
+def check_summary(buffer: Bytes, data_index: Index, findings: Findings) -> None:
+    """Check summary and footer of a log; ``data_index`` is the index of its data section."""
     try:
-        _Checker(buffer, found, findings).check()
+        _Checker(buffer, data_index, findings).check()
     except Damaged as error:
-        findings.add("summary-structure", found.data_end, f"the summary can't be read: {error}")
+        findings.add("summary-structure", data_index.data_end, f"the summary can't be read: {error}")
 
 
 class _Checker:
-    def __init__(self, buffer: Bytes, found: Index, findings: Findings) -> None:
-        self._buffer, self._found, self._find = buffer, found, findings.add
+    def __init__(self, buffer: Bytes, data_index: Index, findings: Findings) -> None:
+        self._buffer, self._found, self._find = buffer, data_index, findings.add
 
     def check(self) -> None:
-        buffer, found = self._buffer, self._found
+        buffer, data_index = self._buffer, self._found
         footer = read_footer(buffer)
         if footer is None:
             self._find("no-footer", max(len(buffer) - FOOTER_SIZE, 0), "there is no footer at the end of the file")
             return
         at, start, offsets_start, crc = footer
-        behind = found.data_end + DATA_END_SIZE
+        behind = data_index.data_end + DATA_END_SIZE
         length = Reader(buffer, at + 1, len(buffer)).number(8)
         if length != FOOTER_BODY.size:  # readers that read the footer as a record take its length from here
             self._find("footer", at, f"the footer declares a length of {length} bytes; it has {FOOTER_BODY.size}")
         if start == 0:
-            words = "there is no summary: opening the log takes a scan"
-            self._find("no-summary", at, words, "warning")
+            text = "there is no summary: opening the log takes a scan"
+            self._find("no-summary", at, text, "warning")
             if offsets_start:
-                words = f"the footer places summary offsets at byte {offsets_start}, but there is no summary"
-                self._find("footer", at, words, "warning")
+                text = f"the footer places summary offsets at byte {offsets_start}, but there is no summary"
+                self._find("footer", at, text, "warning")
             self._compare_checksum(at, crc)
-            if behind != at and found.data_end:
+            if behind != at and data_index.data_end:
                 self._find("footer", at, "there are records after the data section, and the footer names no summary")
             return
-        if not len(MAGIC) <= start <= at or (found.data_end and start != behind):
+        if not len(MAGIC) <= start <= at or (data_index.data_end and start != behind):
             self._find(
                 "footer", at, f"the footer places the summary at byte {start}; the data section ends at {behind}"
             )
@@ -129,10 +129,10 @@ class _Checker:
             self._find("summary-checksum", start, "the checksum of the summary is wrong")
 
     def _compare(self, summary: Index, where: int) -> None:
-        found = self._found
+        data_index = self._found
         for name, theirs, ours in (
-            ("schema", summary.schemas, found.schemas),
-            ("channel", summary.channels, found.channels),
+            ("schema", summary.schemas, data_index.schemas),
+            ("channel", summary.channels, data_index.channels),
         ):
             for number, record in theirs.items():
                 if ours.get(number, record) != record:
@@ -143,23 +143,23 @@ class _Checker:
                     )
             missing = ours.keys() - theirs.keys()
             if missing and theirs:
-                words = f"{name} {min(missing)} is missing in the summary"
-                self._find(f"summary-no-{name}", where, words, "error" if name == "channel" else "warning")
+                text = f"{name} {min(missing)} is missing in the summary"
+                self._find(f"summary-no-{name}", where, text, "error" if name == "channel" else "warning")
         self._compare_chunks(summary, where)
-        for name, listed, there in (
-            ("attachment", summary.attachments, found.attachments),
-            ("metadata", summary.metadata, found.metadata),
+        for name, listed, in_data in (
+            ("attachment", summary.attachments, data_index.attachments),
+            ("metadata", summary.metadata, data_index.metadata),
         ):
-            if listed and sorted(part.entry for part in listed) != sorted(part.entry for part in there):
+            if listed and sorted(part.entry for part in listed) != sorted(part.entry for part in in_data):
                 self._find(f"{name}-index", where, f"the {name} index differs from the {name} records in the log")
-            if there and not listed:
-                self._find(f"no-{name}-index", where, f"the summary does not list {len(there)} {name}", "warning")
+            if in_data and not listed:
+                self._find(f"no-{name}-index", where, f"the summary does not list {len(in_data)} {name}", "warning")
 
     def _compare_chunks(self, summary: Index, where: int) -> None:
         ours = self._found.chunks
         if len(ours) and not len(summary.chunks):
-            words = "the summary lists no chunks: finding a message takes a scan"
-            self._find("no-chunk-index", where, words, "warning")
+            text = "the summary lists no chunks: finding a message takes a scan"
+            self._find("no-chunk-index", where, text, "warning")
             return
         missing = np.ones(len(ours), bool)
         for chunk in summary.chunks:
@@ -172,24 +172,24 @@ class _Checker:
                 )
                 continue
             missing[row] = False
-            names = [name for name, one, two in zip(chunk._fields, chunk, ours[row], strict=True) if one != two]
+            names = [name for name, listed, two in zip(chunk._fields, chunk, ours[row], strict=True) if listed != two]
             if names:
-                words = f"the chunk index differs from the chunk at byte {chunk.offset}: {', '.join(names)}"
-                self._find("chunk-index", where, words)
+                text = f"the chunk index differs from the chunk at byte {chunk.offset}: {', '.join(names)}"
+                self._find("chunk-index", where, text)
         if missing.any():
-            words = "a chunk that the summary does not list"
-            self._find("chunk-not-listed", int(ours.offsets[missing].min()), words, times=int(missing.sum()))
+            text = "a chunk that the summary does not list"
+            self._find("chunk-not-listed", int(ours.offsets[missing].min()), text, times=int(missing.sum()))
 
     def _compare_statistics(self, reader: Reader, summary: Index, where: int) -> None:
-        found = self._found
-        loose = [sum(found.counts.values()), len(found.schemas), len(found.channels), len(found.attachments)]
-        there = [*loose, len(found.metadata), len(found.chunks), found.start_ns, found.end_ns]
-        for (name, size), number in zip(_STATISTICS.items(), there, strict=True):
+        ours = self._found
+        loose = [sum(ours.counts.values()), len(ours.schemas), len(ours.channels), len(ours.attachments)]
+        actual = [*loose, len(ours.metadata), len(ours.chunks), ours.start_ns, ours.end_ns]
+        for (name, size), number in zip(_STATISTICS.items(), actual, strict=True):
             value = reader.number(size)
             only_described = name in ("schemas", "channels") and value == len(getattr(summary, name))
             if value != number and not only_described:
                 self._find("statistics", where, f"the statistics say {value} for {name}; it is {number}")
-        if {n: count for n, count in summary.counts.items() if count} != found.counts:
+        if {n: count for n, count in summary.counts.items() if count} != ours.counts:
             self._find("statistics-counts", where, "the statistics have a wrong number of messages for a channel")
 
     def _compare_offsets(self, start: int, end: int, groups: Mapping[int, tuple[int, int, int]]) -> None:
@@ -202,15 +202,15 @@ class _Checker:
             opcode, low, size = reader.number(1), reader.number(8), reader.number(8)
             listed.add(opcode)
             if size == 0:
-                words = (
+                text = (
                     f"a summary offset of an empty group of {record_name(opcode)} records; some readers report "
                     "it as damage"
                 )
-                self._find("empty-group", record.start, words, "warning")
+                self._find("empty-group", record.start, text, "warning")
             elif groups.get(opcode) != (low, low + size, size):
-                words = f"the {record_name(opcode)} records are not at their summary offset"
-                self._find("summary-offset", record.start, words)
+                text = f"the {record_name(opcode)} records are not at their summary offset"
+                self._find("summary-offset", record.start, text)
         missing = groups.keys() - listed
         if missing:
-            words = f"the {record_name(min(missing))} records have no summary offset"
-            self._find("no-summary-offset", start, words, "warning")
+            text = f"the {record_name(min(missing))} records have no summary offset"
+            self._find("no-summary-offset", start, text, "warning")

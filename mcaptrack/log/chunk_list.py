@@ -102,7 +102,7 @@ class ChunkList:
         """Whether the same entries follow in the same order."""
         if not isinstance(other, ChunkList):
             return NotImplemented
-        return self._numbers == other._numbers and all(one == two for one, two in zip(self, other, strict=True))
+        return self._numbers == other._numbers and all(mine == two for mine, two in zip(self, other, strict=True))
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -125,7 +125,7 @@ class ChunkList:
         return np.unique(rows[ragged_range(low, high - low)])
 
     def first_rows(self, channels: Collection[int]) -> dict[int, list[int]]:
-        """The channels of these that have messages, by the number of the first entry of a chunk that holds them."""
+        """Return the numbers of the first entries with messages of these channels, and for each its channels."""
         order, rows = self._rows_by_channel()
         out: dict[int, list[int]] = {}
         for channel in channels:

@@ -189,12 +189,12 @@ def read_index_entries(buffer: Bytes, at: int, channel_id: int) -> Entries:
 
 def scan_entries(content: Bytes) -> dict[int, Entries]:
     """The entries that the message indexes of a chunk must have: for each channel log time and offset, (M, 2)."""
-    found: dict[int, list[tuple[int, int]]] = {}
+    entries_of: dict[int, list[tuple[int, int]]] = {}
     for record in walk(content, 0, len(content)):
         if record.opcode == Opcode.MESSAGE:
             channel, _, t_ns, _ = message_head(content, record)
-            found.setdefault(channel, []).append((t_ns, record.start))
-    return {channel: np.array(entries, "<u8") for channel, entries in found.items()}
+            entries_of.setdefault(channel, []).append((t_ns, record.start))
+    return {channel: np.array(entries, "<u8") for channel, entries in entries_of.items()}
 
 
 def message_heads_at(content: Bytes, channel_id: int, t_ns: Times, offset: Ints) -> MessageHeads:

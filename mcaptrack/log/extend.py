@@ -256,10 +256,10 @@ class _Rewrite:
         lost = _Descriptions(writer.chunks.channels)
         for record in walk(buffer, self.cut - base, len(buffer)):
             if record.opcode == Opcode.CHUNK:
-                known = self.index.chunks.at(base + record.start)
-                if known is None:
+                listed = self.index.chunks.at(base + record.start)
+                if listed is None:
                     raise Damaged("a chunk is missing in the index", record.start)
-                self._copy_kept_chunk(writer, buffer, base, record, known, lost)
+                self._copy_kept_chunk(writer, buffer, base, record, listed, lost)
             elif record.opcode == Opcode.MESSAGE:
                 channel, _, t_ns, _ = message_head(buffer, record)
                 if channel not in self.dropped:
@@ -292,10 +292,10 @@ class _Rewrite:
         buffer: Bytes,
         base: int,
         record: Record,
-        known: ChunkIndexRecord,
+        listed: ChunkIndexRecord,
         lost: _Descriptions,
     ) -> None:
-        holds = set(known.message_index_offsets)
+        holds = set(listed.message_index_offsets)
         content = None
         undescribed = lost.of(writer.channels[channel] for channel in sorted(holds) if channel in writer.channels)
         if self.open_all or not holds.isdisjoint(self.dropped) or undescribed:
@@ -306,7 +306,7 @@ class _Rewrite:
                 lost.schemas |= schemas
                 return
             if not self.dropped.isdisjoint(holds | channels):
-                kind = "rows" if known.compression else "media"
+                kind = "rows" if listed.compression else "media"
                 writer.write_kept_records(kind, self._kept_records(content))  # type: ignore[arg-type]
                 return
             schemas.add(0)  # none
@@ -316,17 +316,17 @@ class _Rewrite:
         lost.described |= holds
         indexes: dict[int, bytes] = {}
         if self.index.regular:
-            for offset in known.message_index_offsets.values():
+            for offset in listed.message_index_offsets.values():
                 index = records.record_at(buffer, offset - base)
                 channel, entries = records.read_message_entries(buffer, index)
                 indexes[channel] = bytes(entries)
         else:
-            found = self.index.entries[known.offset]
-            indexes = {channel: entries.tobytes() for channel, entries in found.items()}
-            low = min((int(entries[:, 0].min()) for entries in found.values()), default=0)
-            high = max((int(entries[:, 0].max()) for entries in found.values()), default=0)
-            known = known._replace(start_ns=low, end_ns=high)
-        writer.copy_chunk(bytes(buffer[record.start : record.end]), known, indexes)
+            entries_of = self.index.entries[listed.offset]
+            indexes = {channel: entries.tobytes() for channel, entries in entries_of.items()}
+            low = min((int(entries[:, 0].min()) for entries in entries_of.values()), default=0)
+            high = max((int(entries[:, 0].max()) for entries in entries_of.values()), default=0)
+            listed = listed._replace(start_ns=low, end_ns=high)
+        writer.copy_chunk(bytes(buffer[record.start : record.end]), listed, indexes)
 
     def _kept_records(self, content: Bytes) -> Iterator[tuple[int, int, memoryview]]:
         """The kept records of a chunk: channel (-1 if it is not a message), log time, and the record."""
@@ -342,7 +342,7 @@ class _Rewrite:
 
 @dataclass
 class _Descriptions:
-    """Channels that kept chunks hold and so ``described``; and what chunks described that were dropped."""
+    """The channels that kept chunks have ``described``, and the channels and schemas that dropped chunks described."""
 
     described: set[int]
     channels: set[int] = field(default_factory=set)
@@ -351,9 +351,9 @@ class _Descriptions:
     def of(self, channels: Iterable[ChannelRecord]) -> list[int]:
         """The ids of kept channels that need a new description: no kept chunk holds one so far."""
         return [
-            one.id
-            for one in channels
-            if (one.id in self.channels or one.schema_id in self.schemas) and one.id not in self.described
+            channel.id
+            for channel in channels
+            if (channel.id in self.channels or channel.schema_id in self.schemas) and channel.id not in self.described
         ]
 
 

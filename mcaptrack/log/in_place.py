@@ -56,14 +56,14 @@ def resolve_journal(path: Path, handle: int, file: OpenFile) -> None:
     Raises McaptrackError if the journal's path holds something else.
     """
     try:
-        found = journal.find(path, file)
-        if found is None:
+        left_behind = journal.find(path, file)
+        if left_behind is None:
             return
-        state = found.state()
+        state = left_behind.state()
         if state == "busy":
             raise _busy_error(path)
         if state == "between":
-            found.restore(handle)
+            left_behind.restore(handle)
     except UnusableJournal as why:
         raise McaptrackError(
             f"{journal_of(path)} {why}; changing {path} needs that name for its journal. "
@@ -165,17 +165,17 @@ def _roll_back(path: Path, handle: int, written: Journal, why: BaseException) ->
 
 def _write_journal(path: Path, handle: int, start: int, log: OpenFile) -> tuple[Journal, bytes]:
     """Write a journal with the old tail beside a log and sync it to disk; it stays open and locked."""
-    there = os.fstat(handle)
+    status = os.fstat(handle)
     head = journal.pack_head(handle, start)
     with publish(journal_of(path)) as part:
         file = OpenFile(os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o600))
         fcntl.flock(file.handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if keep_attributes(path, part):  # users who may not read the log may not read its tail either
-            part.chmod(there.st_mode & 0o700)
+            part.chmod(status.st_mode & 0o700)
         _append(file.handle, head)
-        for at in range(start, there.st_size, _BLOCK):
-            _append(file.handle, os.pread(handle, min(_BLOCK, there.st_size - at), at))
-    return Journal(file, log, start, there.st_size, written_to=start), journal.digest_of(head)
+        for at in range(start, status.st_size, _BLOCK):
+            _append(file.handle, os.pread(handle, min(_BLOCK, status.st_size - at), at))
+    return Journal(file, log, start, status.st_size, written_to=start), journal.digest_of(head)
 
 
 def _append(handle: int, data: bytes) -> None:

@@ -99,8 +99,8 @@ class Index:
         )
 
 
-def _equal(one: Entries | None, other: Entries | None) -> bool:
-    return one is other or (one is not None and other is not None and np.array_equal(one, other))
+def _equal(entries: Entries | None, other: Entries | None) -> bool:
+    return entries is other or (entries is not None and other is not None and np.array_equal(entries, other))
 
 
 def read_index(source: ByteSource) -> Index:
@@ -187,7 +187,7 @@ def _is_consistent(index: Index, statistics: Reader) -> bool:
     """Whether the summary describes all channels and lists all messages, and no chunks overlap."""
     statistics.skip(8)
     declared = [statistics.number(size) for size in (2, 4, 4, 4, 4)]
-    found = [len(part) for part in (index.schemas, index.channels, index.attachments, index.metadata, index.chunks)]
+    listed = [len(part) for part in (index.schemas, index.channels, index.attachments, index.metadata, index.chunks)]
     schemas = {0, *index.schemas}
     described = index.chunks.channels <= set(index.channels)
     described = described and all(c.schema_id in schemas for c in index.channels.values())
@@ -195,7 +195,7 @@ def _is_consistent(index: Index, statistics: Reader) -> bool:
     # messages, some are outside of chunks or were never indexed.
     indexed = index.chunks.are_all_indexed and index.chunks.listed == 16 * sum(index.counts.values())
     apart = index.chunks.are_apart(len(MAGIC), index.data_end)
-    return declared == found and described and indexed and apart
+    return declared == listed and described and indexed and apart
 
 
 def add_summary_record(index: Index, buffer: Bytes, record: Record) -> None:
@@ -257,9 +257,9 @@ def _scan(buffer: ByteSource) -> Index:
     return index
 
 
-def _count(index: Index, found: Mapping[int, Entries]) -> None:
+def _count(index: Index, entries_of: Mapping[int, Entries]) -> None:
     """Add messages to the counts by channel and to the time span."""
-    for channel, entries in found.items():
+    for channel, entries in entries_of.items():
         first_ns, last_ns = int(entries[:, 0].min()), int(entries[:, 0].max())
         if not index.counts:
             index.start_ns, index.end_ns = first_ns, last_ns
@@ -294,11 +294,11 @@ def _scan_chunk(index: Index, buffer: Bytes, record: Record) -> None:
 
 def attachment_entry(buffer: Bytes, record: Record, offset: int) -> SummaryEntry:
     """The summary entry of an attachment at ``offset`` of a file."""
-    found = records.read_attachment(buffer, record)
-    numbers = (offset, record.end - record.start, found.log_ns, found.create_ns, found.end - found.start)
+    head = records.read_attachment(buffer, record)
+    numbers = (offset, record.end - record.start, head.log_ns, head.create_ns, head.end - head.start)
     packed = b"".join(records.number(value, 8) for value in numbers)
-    index = records.pack(Opcode.ATTACHMENT_INDEX, packed, records.text(found.name), records.text(found.media_type))
-    return SummaryEntry(found.name, offset, index)
+    index = records.pack(Opcode.ATTACHMENT_INDEX, packed, records.text(head.name), records.text(head.media_type))
+    return SummaryEntry(head.name, offset, index)
 
 
 def metadata_entry(buffer: Bytes, record: Record, offset: int) -> SummaryEntry:

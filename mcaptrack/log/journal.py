@@ -59,7 +59,7 @@ _MAX_TORN_ROWS: Final = 2
 
 
 class UnusableJournal(Exception):
-    """Why the file at LOG.journal can't be used, in words that follow its name."""
+    """The file at LOG.journal can't be used; the message goes on after its name."""
 
 
 def journal_of(path: Path) -> Path:
@@ -142,11 +142,11 @@ class _Comparison:
         is_old, is_new, torn = now == journal.size, now == journal.final, 0
         for low in range(self._first * ROW, now, _BLOCK):
             high = min(low + _BLOCK, now)
-            there, before = _rows(self._now, low, high, high), _rows(old, low, min(high, len(old)), high)
-            differs = (there != before).any(axis=1)
+            now_rows, before = _rows(self._now, low, high, high), _rows(old, low, min(high, len(old)), high)
+            differs = (now_rows != before).any(axis=1)
             is_old &= not differs.any()
-            for row in range(len(there)) if is_new else np.flatnonzero(differs).tolist():
-                at, pair = low + row * ROW, (there[row], before[row])
+            for row in range(len(now_rows)) if is_new else np.flatnonzero(differs).tolist():
+                at, pair = low + row * ROW, (now_rows[row], before[row])
                 if not self._is_new(at, *pair):
                     is_new = False
                     torn += bool(differs[row]) and not self._is_old_then_zero(at, *pair)
@@ -156,22 +156,22 @@ class _Comparison:
             raise UnusableJournal(_CHANGED)
         return "old" if is_old else "new" if is_new else "between"
 
-    def _is_new(self, at: int, there: NDArray[np.uint8], before: NDArray[np.uint8]) -> bool:
+    def _is_new(self, at: int, row_now: NDArray[np.uint8], before: NDArray[np.uint8]) -> bool:
         """Whether the row at offset ``at`` holds what was going to be written."""
         journal = self._journal
         number = at // ROW - self._first
         if number >= len(journal.rows):
             return False
         low, high = max(journal.start - at, 0), min(journal.written_to - at, ROW)
-        rest = there[high:]
+        rest = row_now[high:]
         is_rest_known = not rest.any() or bool((rest == before[high:]).all())
-        return is_rest_known and zlib.crc32(there[low:high].tobytes()) == journal.rows[number]
+        return is_rest_known and zlib.crc32(row_now[low:high].tobytes()) == journal.rows[number]
 
-    def _is_old_then_zero(self, at: int, there: NDArray[np.uint8], before: NDArray[np.uint8]) -> bool:
+    def _is_old_then_zero(self, at: int, row_now: NDArray[np.uint8], before: NDArray[np.uint8]) -> bool:
         if at + ROW <= self._zeros_from:
             return False
         low = max(self._zeros_from - at, 0)
-        return bool((there[:low] == before[:low]).all() and not there[low:].any())
+        return bool((row_now[:low] == before[:low]).all() and not row_now[low:].any())
 
     def _is_sound(self) -> bool:
         """Whether the file is a log with a readable end: then its change was finished and must not be rolled back."""
@@ -203,13 +203,13 @@ def row_checksums(data: bytes, at: int) -> list[int]:
 
 def pack_head(handle: int, start: int) -> bytes:
     """The part of a journal before the old tail, for a log that is going to be rewritten from ``start`` on."""
-    there = os.fstat(handle)
+    status = os.fstat(handle)
     old = hashlib.sha256()
-    for at in range(start, there.st_size, _BLOCK):
-        old.update(read_exactly(handle, at, min(_BLOCK, there.st_size - at)))
-    length = _HEAD_SIZE + there.st_size - start
-    place = (there.st_dev, os.fstatvfs(handle).f_fsid % 2**64, there.st_ino)
-    head = _MAGIC + _HEAD.pack(length, *place, there.st_size, start, _identity(handle, start), old.digest())
+    for at in range(start, status.st_size, _BLOCK):
+        old.update(read_exactly(handle, at, min(_BLOCK, status.st_size - at)))
+    length = _HEAD_SIZE + status.st_size - start
+    place = (status.st_dev, os.fstatvfs(handle).f_fsid % 2**64, status.st_ino)
+    head = _MAGIC + _HEAD.pack(length, *place, status.st_size, start, _identity(handle, start), old.digest())
     return head + hashlib.sha256(head).digest()
 
 
@@ -259,8 +259,8 @@ def find(path: Path, log: OpenFile) -> Journal | None:
 def is_left_behind(path: Path) -> bool:
     """Whether an interrupted change of the file at ``path`` has left its journal behind."""
     try:
-        found = None if path.is_symlink() or not path.is_file() else find(path, OpenFile.at(path))
-        return found is not None and found.state() != "busy"
+        state = None if path.is_symlink() or not path.is_file() else find(path, OpenFile.at(path))
+        return state is not None and state.state() != "busy"
     except (UnusableJournal, McaptrackError):
         return False
 
@@ -291,10 +291,10 @@ def _open(path: Path, log: OpenFile) -> OpenFile | None:
         return None
     except OSError as error:
         raise UnusableJournal(f"can't be opened: {error.strerror}") from None
-    found = os.fstat(file.handle)
-    if not stat.S_ISREG(found.st_mode):
-        raise UnusableJournal(f"is {file_type(found.st_mode)}")
-    if found.st_uid not in (os.fstat(log.handle).st_uid, os.geteuid(), 0):
+    status = os.fstat(file.handle)
+    if not stat.S_ISREG(status.st_mode):
+        raise UnusableJournal(f"is {file_type(status.st_mode)}")
+    if status.st_uid not in (os.fstat(log.handle).st_uid, os.geteuid(), 0):
         raise UnusableJournal("belongs to another user than the log")
     return file
 
@@ -309,25 +309,25 @@ def _read(file: OpenFile, log: OpenFile) -> tuple[Journal, bool]:
     digest = digest_of(head)
     if len(head) < _HEAD_SIZE or hashlib.sha256(head[:-_DIGEST_SIZE]).digest() != digest:
         raise incomplete
-    length, device, file_system, inode, size, start, known, old = _HEAD.unpack_from(head, len(_MAGIC))
+    length, device, file_system, inode, size, start, identity, old = _HEAD.unpack_from(head, len(_MAGIC))
     if not len(MAGIC) <= start <= size or length != _HEAD_SIZE + size - start or length > len(source):
         raise incomplete
-    found = hashlib.sha256()
+    content = hashlib.sha256()
     for at in range(_HEAD_SIZE, length, _BLOCK):
-        found.update(source[at : min(at + _BLOCK, length)])
-    if found.digest() != old:
+        content.update(source[at : min(at + _BLOCK, length)])
+    if content.digest() != old:
         raise incomplete
     try:
-        is_known = _identity(log.handle, start) == known
+        is_known = _identity(log.handle, start) == identity
     except Damaged:  # the log is shorter than that
         is_known = False
     if not is_known:
         raise UnusableJournal("belongs to a log with another beginning")
     journal = Journal(file, log, start, size, written_to=start)
     _read_pieces(journal, source, length, digest)
-    there = os.fstat(log.handle)
-    is_there = device == there.st_dev or file_system == os.fstatvfs(log.handle).f_fsid % 2**64
-    return journal, is_there and inode == there.st_ino
+    status = os.fstat(log.handle)
+    is_there = device == status.st_dev or file_system == os.fstatvfs(log.handle).f_fsid % 2**64
+    return journal, is_there and inode == status.st_ino
 
 
 def _read_pieces(journal: Journal, source: ByteSource, at: int, digest: bytes) -> None:

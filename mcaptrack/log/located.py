@@ -171,12 +171,12 @@ class MessageBatches:
             first_ns[order].tolist(), last_ns[order].tolist(), numbers[order].tolist(), strict=True
         ):
             if group and (first, number) > last:
-                yield [self[one] for one in sorted(group)]
+                yield [self[member] for member in sorted(group)]
                 group = []
             group.append(number)
             last = max(last, (until, max(group)))
         if group:
-            yield [self[one] for one in sorted(group)]
+            yield [self[member] for member in sorted(group)]
 
 
 def to_int64(t_ns: Times) -> Ints:

@@ -100,10 +100,10 @@ class Checksums:
         """The checksum of a chunk, which is read once."""
         if not len(self._numbers):
             self._numbers = np.full(len(index.chunks), -1)
-        found = int(self._numbers[row])
-        if found > 0:
-            return found
-        if found < 0:
+        checksum = int(self._numbers[row])
+        if checksum > 0:
+            return checksum
+        if checksum < 0:
             chunk = index.chunks[row]
             head = records.read_chunk(buffer, chunk_record(buffer, chunk))
             self._numbers[row] = head.uncompressed_crc
@@ -124,8 +124,8 @@ def fingerprint(buffer: Bytes, index: Index, channel_id: int | None = None, chec
     checksums = checksums or Checksums()
     total = hashlib.sha256()
 
-    def say(*words: object) -> None:
-        total.update(repr(words).encode())
+    def say(*values: object) -> None:
+        total.update(repr(values).encode())
 
     for number in sorted(index.channels) if channel_id is None else [channel_id]:
         channel = index.channels[number]
@@ -244,13 +244,13 @@ class Messages:
         rows, done, taken = schema.empty(), 0, 0
         for batch in batches:
             content, offset = self._open(batch)
-            found = message_heads_at(content, batch.channel, batch.t_ns, offset)
-            decoded = reader.decode_at(np.frombuffer(content, np.uint8), found.start, found.end)
+            message_heads = message_heads_at(content, batch.channel, batch.t_ns, offset)
+            decoded = reader.decode_at(np.frombuffer(content, np.uint8), message_heads.start, message_heads.end)
             if decoded is None:
                 return None
             part, counts_of = decoded
             until = done + len(batch.t_ns)
-            sequence[done:until], counts[done:until] = found.head["sequence"], counts_of
+            sequence[done:until], counts[done:until] = message_heads.head["sequence"], counts_of
             if taken + len(part) > len(rows):  # room for the rest, if it has as many rows a message as so far
                 share = (len(t_ns) - done) / max(until - done, 1)
                 rows = schema.codec.longer(rows, taken, taken + int(len(part) * share * 1.02) + 1)
@@ -270,14 +270,14 @@ class Messages:
             rows, sequence, counts = [], [], []
             for batch in group:
                 content, offset = self._open(batch)
-                found = message_heads_at(content, batch.channel, batch.t_ns, offset)
-                decoded = reader.decode_at(np.frombuffer(content, np.uint8), found.start, found.end)
+                message_heads = message_heads_at(content, batch.channel, batch.t_ns, offset)
+                decoded = reader.decode_at(np.frombuffer(content, np.uint8), message_heads.start, message_heads.end)
                 if decoded is None:
                     yield None
                     return
                 rows.append(decoded[0])
                 counts.append(decoded[1])
-                sequence.append(found.head["sequence"].astype(np.int64))
+                sequence.append(message_heads.head["sequence"].astype(np.int64))
             members, numbers, sizes = schema.joined(rows), np.concatenate(sequence), np.concatenate(counts)
             order = np.argsort(t_ns, kind="stable")
             if (np.diff(order) != 1).any():
@@ -383,10 +383,10 @@ class Messages:
     def _read(self, batch: MessageBatch, skip: int) -> Iterator[Message]:
         """The messages of a batch except the first ``skip``."""
         content, offset = self._open(batch)
-        found = message_heads_at(content, batch.channel, batch.t_ns[skip:], offset[skip:])
+        message_heads = message_heads_at(content, batch.channel, batch.t_ns[skip:], offset[skip:])
         whole = content.obj
         data = whole if isinstance(whole, bytes) and len(whole) == len(content) else content
-        spans = zip(found.start.tolist(), found.end.tolist(), strict=True)
+        spans = zip(message_heads.start.tolist(), message_heads.end.tolist(), strict=True)
         payloads = (bytes(data[start:end]) for start, end in spans)
-        head = found.head
+        head = message_heads.head
         return map(Message, head["t_ns"].tolist(), head["sequence"].tolist(), head["publish_ns"].tolist(), payloads)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-import heapq
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple, Self, TypeVar
@@ -59,10 +58,10 @@ class Log:
     new channels are written to the sidecar.
     """
 
-    def __init__(self, path: Location, made: TemporaryDirectory[str] | None = None) -> None:
+    def __init__(self, path: Location, folder: TemporaryDirectory[str] | None = None) -> None:
         self.path = path
-        self._made = made  # holds the content of a new log in a store, until it is written there
-        place = path if made is None else Path(made.name, path.name)
+        self._made = folder  # holds the content of a new log in a store, until it is written there
+        place = path if folder is None else Path(folder.name, path.name)
         self.real_path = place_of(place)
         self._lock: int | None = None
         self.snapshot = open_snapshot(place)
@@ -176,9 +175,9 @@ class Log:
     def channel(self, topic: str) -> Channel:
         """The channel of a topic. Raises McaptrackError, with the topics that exist, if there is none."""
         if topic not in self.channels:
-            there = [name for name in sorted(self.channels) if "/view/" not in name]
+            topics = [name for name in sorted(self.channels) if "/view/" not in name]
             more = call("info", self.path)
-            raise McaptrackError(f"{self.path} has no channel {topic}; it has {list_names(there)}. {more} shows more")
+            raise McaptrackError(f"{self.path} has no channel {topic}; it has {list_names(topics)}. {more} shows more")
         return self.channels[topic]
 
     def _channel(self, record: ChannelRecord) -> Channel:
@@ -224,22 +223,22 @@ class Log:
         """The last metadata record of that name."""
         if self.results is not None and (of_results := self.results.metadata(name)) is not None:
             return of_results
-        found = [listed.offset for listed in self.index.metadata if listed.name == name]
-        if not found:
+        offsets = [listed.offset for listed in self.index.metadata if listed.name == name]
+        if not offsets:
             return None
         with self.snapshot.reporting_damage():
-            whole = self.snapshot.record(found[-1])
+            whole = self.snapshot.record(offsets[-1])
             return records.read_metadata(whole, records.record_at(whole, 0))[1]
 
     def attachment(self, name: str) -> bytes | None:
         """The data of the last attachment of that name."""
         if self.results is not None and (of_results := self.results.attachment(name)) is not None:
             return of_results
-        found = [listed.offset for listed in self.index.attachments if listed.name == name]
-        if not found:
+        offsets = [listed.offset for listed in self.index.attachments if listed.name == name]
+        if not offsets:
             return None
         with self.snapshot.reporting_damage():
-            whole = self.snapshot.record(found[-1])
+            whole = self.snapshot.record(offsets[-1])
             attachment = records.read_attachment(whole, records.record_at(whole, 0))
             return bytes(whole[attachment.start : attachment.end])
 
@@ -266,16 +265,6 @@ class Log:
                 self.times(topic)  # raises the error
             yield message
 
-    def merged(
-        self, topics: Iterable[str], start_ns: int | None = None, end_ns: int | None = None
-    ) -> Iterator[tuple[str, Message]]:
-        """The messages of several topics in time order, each with its topic; equal times in the order of ``topics``."""
-
-        def named(topic: str) -> Iterator[tuple[str, Message]]:
-            return ((topic, message) for message in self.messages(topic, start_ns, end_ns))
-
-        return heapq.merge(*map(named, topics), key=lambda found: found[1].t_ns)
-
     def rows(self, topic: str, schema: Schema) -> ChannelRows:
         """All rows of a channel as one array. Raises McaptrackError if the channel has another schema.
 
@@ -284,8 +273,8 @@ class Log:
         if (part := self.part(topic)) is not self:
             return part.rows(topic, schema)
         channel = self._row_channel(topic, schema)
-        found = self._rows(topic, schema)
-        return found._replace(rows=with_only_class(schema, found.rows, channel.metadata))
+        columns = self._rows(topic, schema)
+        return columns._replace(rows=with_only_class(schema, columns.rows, channel.metadata))
 
     def _row_channel(self, topic: str, schema: Schema) -> Channel:
         """The channel of a topic. Raises McaptrackError if it has another schema."""
@@ -299,10 +288,10 @@ class Log:
         channels = self._ids(topic)
         reader = self._reader(topic, schema)
         with self.snapshot.reporting_bad_times(topic):
-            found = self._messages.columns(channels, schema, reader)
+            columns = self._messages.columns(channels, schema, reader)
             self.snapshot.confirm_unchanged(channels)
-            if found is not None:
-                return found
+            if columns is not None:
+                return columns
             messages = list(self.messages(topic))
             try:
                 rows, counts = reader.decode_all([message.payload for message in messages])
@@ -322,8 +311,8 @@ class Log:
 
     def frames(self, topic: str, schema: Schema) -> list[Frame]:
         """All rows of a channel, one frame for each message."""
-        found = self.rows(topic, schema)
-        return split_rows(found.t_ns.tolist(), found.sequence.tolist(), found.rows, np.cumsum(found.counts))
+        columns = self.rows(topic, schema)
+        return split_rows(columns.t_ns.tolist(), columns.sequence.tolist(), columns.rows, np.cumsum(columns.counts))
 
     def frame_columns(self, topic: str, schema: Schema) -> FrameColumns:
         """All rows of a channel as ``frames`` gives them, in blocks, most of which are not in memory."""
@@ -332,14 +321,14 @@ class Log:
         metadata = self._row_channel(topic, schema).metadata
         channels, reader, out = self._ids(topic), self._reader(topic, schema), FrameCollector(schema)
         with self.snapshot.reporting_bad_times(topic):
-            for found in self._messages.parts(channels, schema, reader):
-                if found is None:
+            for columns in self._messages.parts(channels, schema, reader):
+                if columns is None:
                     whole = self.rows(topic, schema)
                     out = FrameCollector(schema)
                     out.extend(whole.t_ns, whole.sequence, np.append(0, np.cumsum(whole.counts)), whole.rows)
                     break
-                rows = with_only_class(schema, found.rows, metadata)
-                out.extend(found.t_ns, found.sequence, np.append(0, np.cumsum(found.counts)), rows)
+                rows = with_only_class(schema, columns.rows, metadata)
+                out.extend(columns.t_ns, columns.sequence, np.append(0, np.cumsum(columns.counts)), rows)
             self.snapshot.confirm_unchanged(channels)
         return out.done()
 
@@ -381,7 +370,7 @@ class Log:
         with self.snapshot.reporting_damage():
             if topic is not None:
                 self.channel(topic)
-                those = [self._fingerprint(one.id) for one in self._by_topic[topic]]
+                those = [self._fingerprint(recorded.id) for recorded in self._by_topic[topic]]
                 return those[0] if len(those) == 1 else hashlib.sha256("".join(those).encode()).hexdigest()
             whole = [part._fingerprint() for part in self.parts]
             return whole[0] if len(whole) == 1 else hashlib.sha256("".join(whole).encode()).hexdigest()
@@ -390,5 +379,5 @@ class Log:
         return self.snapshot.consistent(lambda messages: messages.fingerprint(channel_id), str.__eq__)
 
 
-def _are_equal(one: MessageLocations, other: MessageLocations) -> bool:
-    return all(map(np.array_equal, one, other))
+def _are_equal(locations: MessageLocations, other: MessageLocations) -> bool:
+    return all(map(np.array_equal, locations, other))

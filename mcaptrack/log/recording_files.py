@@ -59,9 +59,9 @@ def split_files_in(folder: Path) -> list[Path]:
     """
     names = [entry.name for entry in folder.iterdir() if entry.name.endswith(_PARTS)]
     names = [name for name in names if not name.endswith(RESULTS_SUFFIX)]
-    found = [match for match in map(_SPLIT.fullmatch, names) if match]
-    if len(found) == len(names) and len({(match[1], match[3]) for match in found}) == 1:
-        return [folder / match[0] for match in sorted(found, key=lambda match: int(match[2]))]
+    matches = [match for match in map(_SPLIT.fullmatch, names) if match]
+    if len(matches) == len(names) and len({(match[1], match[3]) for match in matches}) == 1:
+        return [folder / match[0] for match in sorted(matches, key=lambda match: int(match[2]))]
     return [folder / names[0]] if len(names) == 1 else []
 
 

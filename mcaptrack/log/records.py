@@ -133,9 +133,9 @@ class ChunkIndexRecord(NamedTuple):
 class Damaged(McaptrackError):
     """Bytes that violate the MCAP format, and their offset if it is known."""
 
-    def __init__(self, words: str, at: int | None = None) -> None:
-        super().__init__(words if at is None else f"byte {at}: {words}")
-        self._words, self._at = words, at
+    def __init__(self, message: str, at: int | None = None) -> None:
+        super().__init__(message if at is None else f"byte {at}: {message}")
+        self._words, self._at = message, at
 
     def moved(self, base: int) -> Damaged:
         """The same error with its offset moved by ``base``, where the part of the file begins."""

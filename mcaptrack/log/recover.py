@@ -96,8 +96,8 @@ def recover(path: Location, output: Path, progress: Progress = lambda *_: None) 
         If no message can be recovered; then nothing is written.
     """
     report = RecoverResult(path, output)
-    with open_bytes(path) as (there, file), ExitStack() as stack:
-        source = content_to_recover(path, there, file)
+    with open_bytes(path) as (damaged, file), ExitStack() as stack:
+        source = content_to_recover(path, damaged, file)
         writer = stack.enter_context(create(output, header=_header(source)))
         try:
             report.messages = _Recovery(source.sequential(), writer, report, progress).all()
@@ -188,8 +188,8 @@ class _Recovery:
             self._pending, at = None, uncertain_from
         self._copy_pending()
         is_half = following == len(self._buffer) and not self._known_offsets and self._buffer[at] in DATA_OPCODES
-        words = f"an incomplete {record_name(self._buffer[at])} record" if is_half else "no record can be read here"
-        self._report_lost(at, following, self._words(at, words))
+        text = f"an incomplete {record_name(self._buffer[at])} record" if is_half else "no record can be read here"
+        self._report_lost(at, following, self._words(at, text))
         return following
 
     def _next(self, start: int) -> int:
@@ -201,11 +201,11 @@ class _Recovery:
         low, step, size = start, _FIRST_STEP, len(self._buffer)
         while low < size:
             block = self._buffer[low : min(low + step + _LONGEST, size)]  # a match may end in the next step
-            found = pattern.search(block)
-            while found and found.start() < step:
-                if is_one(low + found.start()):
-                    return low + found.start()
-                found = pattern.search(block, found.start() + 1)
+            match = pattern.search(block)
+            while match and match.start() < step:
+                if is_one(low + match.start()):
+                    return low + match.start()
+                match = pattern.search(block, match.start() + 1)
             low, step = low + step, min(2 * step, BLOCK)
         return size
 
@@ -336,9 +336,9 @@ class _Recovery:
             numbers = (first, last, head.uncompressed_size, head.uncompressed_crc)
             whole = records.pack_chunk(numbers, head.compression, bytes(self._buffer[head.start : head.end]))
         sizes = (head.compression, head.end - head.start, head.uncompressed_size)
-        known = ChunkIndexRecord(first, last, 0, len(whole), {}, 0, *sizes)
+        entry = ChunkIndexRecord(first, last, 0, len(whole), {}, 0, *sizes)
         self._saved.update({number: len(listed) for number, listed in entries.items()})
-        self._writer.copy_chunk(whole, known, {number: listed.tobytes() for number, listed in entries.items()})
+        self._writer.copy_chunk(whole, entry, {number: listed.tobytes() for number, listed in entries.items()})
 
     def _describe(self, record: Record) -> None:
         if record.opcode == Opcode.SCHEMA:
@@ -367,19 +367,19 @@ class _Recovery:
 
     def _words(self, at: int, why: str) -> str:
         """Why something is lost, and what it held, if the summary lists a chunk there."""
-        known = self._summary_index.chunks.at(at)
-        if known is None or not self._known_offsets:
+        listed = self._summary_index.chunks.at(at)
+        if listed is None or not self._known_offsets:
             return why
         topics = [
             self._summary_index.channels[n].topic
-            for n in known.message_index_offsets
+            for n in listed.message_index_offsets
             if n in self._summary_index.channels
         ]
-        span = f"{known.start_ns / 1e9:.3f} to {known.end_ns / 1e9:.3f} s"
+        span = f"{listed.start_ns / 1e9:.3f} to {listed.end_ns / 1e9:.3f} s"
         return f"{why}; it held messages of {', '.join(sorted(topics)) or 'no topic'} from {span}"
 
-    def _report_lost(self, start: int, end: int, words: str) -> None:
-        self._report.lost.append(f"byte {start} to {end}: {words.removeprefix(f'byte {start}: ')}")
+    def _report_lost(self, start: int, end: int, reason: str) -> None:
+        self._report.lost.append(f"byte {start} to {end}: {reason.removeprefix(f'byte {start}: ')}")
 
     def _compare(self) -> None:
         """Compare the recovered messages with the statistics."""
@@ -398,7 +398,7 @@ def _has_schema(channel: ChannelRecord, schemas: Mapping[int, SchemaRecord]) -> 
     return not channel.schema_id or channel.schema_id in schemas
 
 
-def _register(known: MutableMapping[int, Described], record: Described) -> None:
+def _register(registered: MutableMapping[int, Described], record: Described) -> None:
     """Register a schema or channel. Raises Damaged if its id belongs to a different one."""
-    if known.setdefault(record.id, record) != record:
+    if registered.setdefault(record.id, record) != record:
         raise Damaged(f"schema or channel {record.id} differs from another record with the same id")

@@ -96,12 +96,12 @@ class RemoteFile:
             raise Damaged(f"the object ends before byte {at + size}")
         parts, end = [], at + size
         while at < end:
-            found = self._find(at)
-            if found is None:
+            piece = self._find(at)
+            if piece is None:
                 self._fetch(at, end)
-                found = self._find(at)
-            assert found is not None
-            parts.append(found[: end - at])
+                piece = self._find(at)
+            assert piece is not None
+            parts.append(piece[: end - at])
             at += len(parts[-1])
         return bytes(parts[0]) if len(parts) == 1 else b"".join(parts)
 
@@ -140,20 +140,20 @@ class RemoteFile:
 
     def _announced(self, at: int, end: int) -> list[Range]:
         """The announced ranges from ``at`` on, up to a limit; none if this part was not announced."""
-        number = bisect_right(self._expected, at, key=lambda found: found[0]) - 1
+        number = bisect_right(self._expected, at, key=lambda span: span[0]) - 1
         if number < 0 or self._expected[number][1] <= at:
             return []
         low = max(self._expected[number][0], self._end_before(at))
         low = low if end - low <= _MAX_AHEAD else at  # what comes before is wanted, too
         high = min(max(self._expected[number][1], end), max(low + _MAX_AHEAD, end))
-        found, total = [(low, high)], high - low
+        ranges, total = [(low, high)], high - low
         for start, stop in self._expected[number + 1 :]:
             total += stop - start
             if total > _MAX_AHEAD:
                 break
             if start >= high:
-                found.append((start, stop))
-        return found
+                ranges.append((start, stop))
+        return ranges
 
     def _end_before(self, at: int) -> int:
         """The end of the kept bytes that begin before ``at``."""

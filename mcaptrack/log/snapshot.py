@@ -50,7 +50,7 @@ class Snapshot:
             if fresh is None:
                 return
             if all(
-                self.index.has_same_channel(fresh.index, one) for one in channels
+                self.index.has_same_channel(fresh.index, channel) for channel in channels
             ) and self.messages.are_unchanged_in(fresh.source):
                 return
         except Damaged:
@@ -64,17 +64,17 @@ class Snapshot:
 
     def consistent(self, look: Callable[[Messages], T], are_equal: Callable[[T, T], bool]) -> T:
         """The result of ``look``; if the file was changed meanwhile, a second look must give an equal result."""
-        found, fresh = look(self.messages), self._now()
-        if fresh is not None and not are_equal(found, look(fresh)):
+        result, fresh = look(self.messages), self._now()
+        if fresh is not None and not are_equal(result, look(fresh)):
             raise changed(self.path)
-        return found
+        return result
 
     def record(self, offset: int) -> memoryview:
         """The record at an offset of the file."""
 
         def whole(messages: Messages) -> memoryview:
-            found = records.record_at(messages.source, offset)
-            return messages.source[found.start : found.end]
+            record = records.record_at(messages.source, offset)
+            return messages.source[record.start : record.end]
 
         return self.consistent(whole, memoryview.__eq__)
 
@@ -109,10 +109,10 @@ class Snapshot:
         """Whether the log is read through a journal, as it was before an unfinished change."""
         return len(self.source.pieces) > 1
 
-    def is_on_disk(self, there: os.stat_result) -> bool:
+    def is_on_disk(self, status: os.stat_result) -> bool:
         """Whether a file is the one that was opened, with the same content on the disk."""
         try:
-            if not isinstance(self.file, OpenFile) or not os.path.samestat(there, os.fstat(self.file.handle)):
+            if not isinstance(self.file, OpenFile) or not os.path.samestat(status, os.fstat(self.file.handle)):
                 return False
             if self.file.signature() == self._signature and self._is_certain:
                 return not self.is_through_journal
@@ -151,15 +151,15 @@ def open_snapshot(path: Location) -> Snapshot:
     while True:
         file = open_file(path)
         try:
-            found = _look(path, file)
+            outcome = _look(path, file)
         except BaseException:
             file.close()
             raise
-        if isinstance(found, Snapshot):
-            return found
+        if isinstance(outcome, Snapshot):
+            return outcome
         file.close()
         if time.monotonic() > until:
-            raise found
+            raise outcome
         time.sleep(_PAUSE_S)
 
 
@@ -168,23 +168,23 @@ def _look(path: Location, file: ReadFile) -> Snapshot | McaptrackError:
     signature = file.signature()
     is_certain = signature.is_certain
     try:
-        found = find_journal(path, file)
-        source = found.journal.old_content() if found and found.journal else ByteSource.of(file)
+        journal = find_journal(path, file)
+        source = journal.journal.old_content() if journal and journal.journal else ByteSource.of(file)
         if not len(source):
             raise Damaged("it is empty")
         index = read_index(source)
     except Damaged as error:
         hint = f"; {recover_hint(path)}" if _looks_like_mcap(file, signature.size) else ""
-        words = McaptrackError(f"{path} can't be read as an MCAP file: {error}{hint}")
+        refusal = McaptrackError(f"{path} can't be read as an MCAP file: {error}{hint}")
         if not _is_unchanged(path, file, signature):
-            return words
-        if found:
-            notices.warn(found.message, "journal")
-        raise words from None
-    if file.signature() != signature and not (found and found.is_busy):
+            return refusal
+        if journal:
+            notices.warn(journal.message, "journal")
+        raise refusal from None
+    if file.signature() != signature and not (journal and journal.is_busy):
         return McaptrackError(f"{path} is being changed by another process; try again when it is done")
-    if found:
-        notices.warn(found.message, "journal")
+    if journal:
+        notices.warn(journal.message, "journal")
     return Snapshot(path, file, source, index, signature, is_certain)
 
 

@@ -191,7 +191,7 @@ class LogWriter:
         self._attachments.append(attachment_entry(buffer, records.record_at(buffer, 0), self.offset))
         self.write(record)
 
-    def copy_chunk(self, record: bytes, known: ChunkIndexRecord, indexes: Mapping[int, bytes]) -> None:
+    def copy_chunk(self, record: bytes, listed: ChunkIndexRecord, indexes: Mapping[int, bytes]) -> None:
         """Copy a chunk, and write its message indexes from their entries (time and offset, 8 bytes each)."""
         start = self.offset
         self.write(record)
@@ -201,11 +201,11 @@ class LogWriter:
             self.write(records.pack_message_index(channel_id, entries))
             self.counts[channel_id] = self.counts.get(channel_id, 0) + len(entries) // 16
         self.chunks.append(
-            known._replace(offset=start, message_index_offsets=offsets, message_index_length=self.offset - index_start)
+            listed._replace(offset=start, message_index_offsets=offsets, message_index_length=self.offset - index_start)
         )
         if indexes:
-            low, high = self._times or (known.start_ns, known.end_ns)
-            self._times = (min(low, known.start_ns), max(high, known.end_ns))
+            low, high = self._times or (listed.start_ns, listed.end_ns)
+            self._times = (min(low, listed.start_ns), max(high, listed.end_ns))
 
     def write_kept_records(self, kind: ChunkKind, parts: Iterable[tuple[int, int, memoryview]]) -> None:
         """Write kept records as a new chunk: each with its channel (-1 if it is not a message) and log time."""
@@ -281,9 +281,9 @@ class LogWriter:
 
     def _describe(self, chunk: _OpenChunk, channel_id: int) -> array[int]:
         """Write the schema and channel records of a channel into a chunk, before its first message there."""
-        words = self._description(channel_id)
-        chunk.parts.append(words)
-        chunk.size += len(words)
+        description = self._description(channel_id)
+        chunk.parts.append(description)
+        chunk.size += len(description)
         return chunk.entries.setdefault(channel_id, array("Q"))
 
     def _description(self, channel_id: int) -> bytes:
@@ -305,8 +305,8 @@ class LogWriter:
 
             compression, data = "zstd", zstandard.ZstdCompressor(_ZSTD_LEVEL[chunk.kind]).compress(content)
         record = records.pack_chunk((first, last, len(content), zlib.crc32(content)), compression, data)
-        known = ChunkIndexRecord(first, last, 0, len(record), {}, 0, compression, len(data), len(content))
-        self.copy_chunk(record, known, {channel: entries.tobytes() for channel, entries in indexes.items()})
+        entry = ChunkIndexRecord(first, last, 0, len(record), {}, 0, compression, len(data), len(content))
+        self.copy_chunk(record, entry, {channel: entries.tobytes() for channel, entries in indexes.items()})
 
 
 def _joined(entries: Iterable[bytes]) -> Iterator[bytes]:
@@ -332,10 +332,10 @@ def _append(chunk: _OpenChunk, channel_id: int, t_ns: int, record: memoryview) -
 def _free_id(taken: Mapping[int, object], last: int, what: str) -> int:
     """The first free id after ``last``, else the lowest free one."""
     free = (number for number in chain(range(last + 1, _MAX_ID + 1), range(1, last + 1)) if number not in taken)
-    found = next(free, None)
-    if found is None:
+    free_id = next(free, None)
+    if free_id is None:
         raise McaptrackError(f"there are {len(taken)} {what} already; a log holds no more")
-    return found
+    return free_id
 
 
 def refuse_earlier_results(path: Path) -> None:

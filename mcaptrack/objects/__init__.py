@@ -70,12 +70,12 @@ def read_end(url: Url, size: int) -> tuple[Version, bytes]:
             return _get(obstore, url, {"range": {"suffix": size}})
         except obstore.exceptions.BaseError as error:
             # Azure knows no ranges of this kind, and an empty object has none.
-            is_range = any(words in str(error) for words in ("416", "non-partial"))
+            is_range = any(fault in str(error) for fault in ("416", "non-partial"))
             if not is_range and not isinstance(error, obstore.exceptions.NotSupportedError):
                 raise
-            there = _version(obstore.head(store_of(url), url.key))
-    start = max(there.size - size, 0)
-    return there, read_ranges(url, there, [(start, there.size)])[0] if there.size else b""
+            version = _version(obstore.head(store_of(url), url.key))
+    start = max(version.size - size, 0)
+    return version, read_ranges(url, version, [(start, version.size)])[0] if version.size else b""
 
 
 def read_ranges(url: Url, version: Version, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
@@ -85,11 +85,11 @@ def read_ranges(url: Url, version: Version, ranges: Sequence[tuple[int, int]]) -
     """
     pieces = [(at, min(at + _MAX_BYTES, end)) for start, end in ranges for at in range(start, end, _MAX_BYTES)]
     if len(pieces) <= 1:
-        found = [_read(url, version, *piece) for piece in pieces]
+        parts = [_read(url, version, *piece) for piece in pieces]
     else:
         with ThreadPoolExecutor(min(_AT_ONCE, len(pieces))) as threads:
-            found = list(threads.map(lambda piece: _read(url, version, *piece), pieces))
-    waiting = iter(found)
+            parts = list(threads.map(lambda piece: _read(url, version, *piece), pieces))
+    waiting = iter(parts)
     return [b"".join(next(waiting) for _ in range(start, end, _MAX_BYTES)) for start, end in ranges]
 
 
@@ -97,8 +97,8 @@ def _read(url: Url, version: Version, start: int, end: int) -> bytes:
     obstore = library(url)
     options: dict[str, Any] = {"range": (start, end)} | ({"if_match": version.etag} if version.etag else {})
     with reporting_faults(url):
-        found, data = _get(obstore, url, options)
-    if found != version:
+        present, data = _get(obstore, url, options)
+    if present != version:
         raise replaced(url)
     if len(data) != end - start:
         raise McaptrackError(f"{url} can't be read: the store gives {len(data)} bytes of {end - start}")
@@ -109,8 +109,8 @@ def _get(obstore: Any, url: Url, options: Mapping[str, Any]) -> tuple[Version, b
     """The version of an object, and a part of it. An answer that breaks off is asked for again."""
     for left in reversed(range(_TRIES)):
         try:
-            found = obstore.get(store_of(url), url.key, options=options)
-            return _version(found.meta), bytes(found.bytes())
+            response = obstore.get(store_of(url), url.key, options=options)
+            return _version(response.meta), bytes(response.bytes())
         except obstore.exceptions.GenericError as error:
             if not left or not breaks_off(error):
                 raise
@@ -152,17 +152,17 @@ def replace(url: Url, file: Path, before: Version | None) -> Version:
         try:
             if size <= _PART_BYTES:
                 mode: Any = {"e_tag": before.etag} if before else "create"
-                made = obstore.put(store_of(url), url.key, file.read_bytes(), mode=mode, use_multipart=False)
+                answer = obstore.put(store_of(url), url.key, file.read_bytes(), mode=mode, use_multipart=False)
             else:
                 if find(url) != before:
                     raise overtaken(url)
-                made = obstore.put(store_of(url), url.key, file, chunk_size=_PART_BYTES, max_concurrency=4)
-            version = Version(size, made["e_tag"])
+                answer = obstore.put(store_of(url), url.key, file, chunk_size=_PART_BYTES, max_concurrency=4)
+            version = Version(size, answer["e_tag"])
         except (obstore.exceptions.PreconditionError, obstore.exceptions.AlreadyExistsError):
-            there = find(url)  # it may be this one, if the answer to the first attempt was lost
-            if there is None or there.size != size or not _holds(url, there, file):
+            present = find(url)  # it may be this one, if the answer to the first attempt was lost
+            if present is None or present.size != size or not _holds(url, present, file):
                 raise overtaken(url) from None
-            return there
+            return present
     if not _holds(url, version, file):
         raise McaptrackError(f"{url} does not hold what was written to it; the results are not safe there")
     return version
@@ -189,8 +189,8 @@ def put_if_unchanged(url: Url, data: bytes, before: Version | None) -> Version |
     mode: Any = {"e_tag": before.etag} if before else "create"
     with reporting_faults(url, "written"):
         try:
-            made = obstore.put(store_of(url), url.key, data, mode=mode, use_multipart=False)
-            return Version(len(data), made["e_tag"])
+            answer = obstore.put(store_of(url), url.key, data, mode=mode, use_multipart=False)
+            return Version(len(data), answer["e_tag"])
         except (
             obstore.exceptions.AlreadyExistsError,
             obstore.exceptions.PreconditionError,
@@ -199,10 +199,10 @@ def put_if_unchanged(url: Url, data: bytes, before: Version | None) -> Version |
             if isinstance(error, FileNotFoundError) and meaning_of(url, error):
                 raise
     try:
-        there, found = read_end(url, max(len(data), 1) + 1)
+        present, content = read_end(url, max(len(data), 1) + 1)
     except AbsentError:
         return None
-    return there if found == data else None
+    return present if content == data else None
 
 
 def delete(url: Url) -> None:
@@ -225,7 +225,7 @@ def list_objects(prefix: Url) -> Iterator[tuple[Url, Version]]:
     with reporting_faults(prefix):
         root = Url(f"{prefix.scheme}://{prefix.bucket}")
         for page in obstore.list(store_of(prefix), prefix=prefix.key.strip("/") or None):
-            yield from ((root / found["path"], _version(found)) for found in page)
+            yield from ((root / listed["path"], _version(listed)) for listed in page)
 
 
 def _version(meta: Any) -> Version:

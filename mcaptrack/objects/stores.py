@@ -47,7 +47,7 @@ def store_of(url: Url) -> Any:
 def _made_store(scheme: str, bucket: str, settings: tuple[tuple[str, str], ...]) -> Any:
     from obstore.store import AzureStore, GCSStore, S3Store
 
-    given = dict(settings)
+    env = dict(settings)
     common: dict[str, Any] = {
         "client_options": {
             "connect_timeout": timedelta(seconds=_CONNECT_S),
@@ -64,48 +64,48 @@ def _made_store(scheme: str, bucket: str, settings: tuple[tuple[str, str], ...])
         return GCSStore(bucket, **common)
     if scheme == "az":
         return AzureStore(bucket, **common)
-    config: Any = _of_profile(given)
-    if endpoint := given.get("AWS_ENDPOINT_URL_S3") or given.get("AWS_ENDPOINT_URL") or config.get("endpoint"):
+    config: Any = _of_profile(env)
+    if endpoint := env.get("AWS_ENDPOINT_URL_S3") or env.get("AWS_ENDPOINT_URL") or config.get("endpoint"):
         config["endpoint"] = endpoint
         common["client_options"]["allow_http"] = endpoint.startswith("http://")
-    if not given.get("AWS_REGION") and given.get("AWS_DEFAULT_REGION"):
-        config["region"] = given["AWS_DEFAULT_REGION"]
+    if not env.get("AWS_REGION") and env.get("AWS_DEFAULT_REGION"):
+        config["region"] = env["AWS_DEFAULT_REGION"]
     return S3Store(bucket, config=config, **common)
 
 
-def _of_profile(given: Mapping[str, str]) -> dict[str, str]:
+def _of_profile(environment: Mapping[str, str]) -> dict[str, str]:
     """The settings in the profile of AWS that the environment does not have.
 
     Raises McaptrackError if AWS_PROFILE names a profile that has no keys.
     """
     home = Path.home() / ".aws"
-    name = _profile(given)
+    name = _profile(environment)
     files = (
-        (given.get("AWS_CONFIG_FILE") or home / "config", name if name == "default" else f"profile {name}"),
-        (given.get("AWS_SHARED_CREDENTIALS_FILE") or home / "credentials", name),
+        (environment.get("AWS_CONFIG_FILE") or home / "config", name if name == "default" else f"profile {name}"),
+        (environment.get("AWS_SHARED_CREDENTIALS_FILE") or home / "credentials", name),
     )
-    found: dict[str, str] = {}
+    profile: dict[str, str] = {}
     for path, section in files:
         reader = configparser.RawConfigParser()
         try:
             reader.read(path, encoding="utf-8")
         except (configparser.Error, UnicodeDecodeError, OSError):
             raise McaptrackError(f"{path} can't be read as settings of AWS") from None
-        found |= dict(reader[section]) if section in reader else {}
-    has_keys = {"aws_access_key_id", "aws_secret_access_key"} <= found.keys()
-    if given.get("AWS_PROFILE") and not has_keys and "AWS_ACCESS_KEY_ID" not in given:
+        profile |= dict(reader[section]) if section in reader else {}
+    has_keys = {"aws_access_key_id", "aws_secret_access_key"} <= profile.keys()
+    if environment.get("AWS_PROFILE") and not has_keys and "AWS_ACCESS_KEY_ID" not in environment:
         raise McaptrackError(
             f"the profile {name} of AWS (AWS_PROFILE) has no aws_access_key_id and aws_secret_access_key; "
             "`aws configure export-credentials` prints those of a profile of another kind, for the environment"
         )
-    settings = {"region": found.get("region"), "endpoint": found.get("endpoint_url")}
-    if "AWS_ACCESS_KEY_ID" not in given and has_keys:
+    settings = {"region": profile.get("region"), "endpoint": profile.get("endpoint_url")}
+    if "AWS_ACCESS_KEY_ID" not in environment and has_keys:
         settings |= {
-            "access_key_id": found["aws_access_key_id"],
-            "secret_access_key": found["aws_secret_access_key"],
-            "session_token": found.get("aws_session_token"),
+            "access_key_id": profile["aws_access_key_id"],
+            "secret_access_key": profile["aws_secret_access_key"],
+            "session_token": profile.get("aws_session_token"),
         }
-    return {name: value for name, value in settings.items() if value and f"AWS_{name.upper()}" not in given}
+    return {name: value for name, value in settings.items() if value and f"AWS_{name.upper()}" not in environment}
 
 
 def described(url: Url) -> tuple[str, str, str]:
@@ -113,33 +113,33 @@ def described(url: Url) -> tuple[str, str, str]:
 
     Raises McaptrackError if the settings of AWS can't be read.
     """
-    given, service = os.environ, SCHEMES[url.scheme]
+    environment, service = os.environ, SCHEMES[url.scheme]
     if url.scheme == "gs":
-        file = given.get("GOOGLE_APPLICATION_CREDENTIALS") or given.get("GOOGLE_SERVICE_ACCOUNT")
+        file = environment.get("GOOGLE_APPLICATION_CREDENTIALS") or environment.get("GOOGLE_SERVICE_ACCOUNT")
         return service, "", f"the file {file}" if file else "the login of gcloud, or the account of this machine"
     if url.scheme == "az":
-        name = given.get("AZURE_STORAGE_ACCOUNT_NAME")
+        name = environment.get("AZURE_STORAGE_ACCOUNT_NAME")
         has_key = any(
-            f"AZURE_STORAGE_{kind}" in given for kind in ("ACCOUNT_KEY", "ACCESS_KEY", "SAS_KEY", "SAS_TOKEN")
+            f"AZURE_STORAGE_{kind}" in environment for kind in ("ACCOUNT_KEY", "ACCESS_KEY", "SAS_KEY", "SAS_TOKEN")
         )
         server = f"{service}, account {name}" if name else f"{service}, no account (AZURE_STORAGE_ACCOUNT_NAME)"
         return server, "", "the environment" if has_key else "the identity of this machine"
-    config = _of_profile(given)
+    config = _of_profile(environment)
     server = endpoint() or config.get("endpoint", "")
-    named = given.get("AWS_REGION") or given.get("AWS_DEFAULT_REGION") or config.get("region")
-    if given.get("AWS_SKIP_SIGNATURE", "").lower() in ("true", "1"):
+    named = environment.get("AWS_REGION") or environment.get("AWS_DEFAULT_REGION") or config.get("region")
+    if environment.get("AWS_SKIP_SIGNATURE", "").lower() in ("true", "1"):
         keys = "none (AWS_SKIP_SIGNATURE)"
-    elif "AWS_ACCESS_KEY_ID" in given:
+    elif "AWS_ACCESS_KEY_ID" in environment:
         keys = "the environment"
     elif "access_key_id" in config:
-        keys = f"the profile {_profile(given)} of AWS"
+        keys = f"the profile {_profile(environment)} of AWS"
     else:
         keys = "the role of this machine or container"
     return hide_secrets(server) if server else service, named or "us-east-1 (assumed; AWS_REGION names another)", keys
 
 
-def _profile(given: Mapping[str, str]) -> str:
-    return given.get("AWS_PROFILE") or given.get("AWS_DEFAULT_PROFILE") or "default"
+def _profile(environment: Mapping[str, str]) -> str:
+    return environment.get("AWS_PROFILE") or environment.get("AWS_DEFAULT_PROFILE") or "default"
 
 
 def endpoint() -> str:
@@ -208,15 +208,15 @@ def reporting_faults(url: Url, done: str = "read") -> Iterator[None]:
         raise McaptrackError(f"{url} can't be {done}: {reason(url, error)}") from None
 
 
-def plain(words: str) -> str:
+def plain(message: str) -> str:
     """A message of a library without the colours and arrows that some print even where no terminal is."""
-    return _COLOUR.sub("", _ARROW.sub(":", words))
+    return _COLOUR.sub("", _ARROW.sub(":", message))
 
 
 def meaning_of(url: Url, error: Exception) -> str:
     """The meaning of a store's answer; "" if it is not known."""
     said = _text_of(url, error)
-    return next((meaning for words, meaning in _MEANINGS if any(word in said for word in words)), "")
+    return next((meaning for phrases, meaning in _MEANINGS if any(word in said for word in phrases)), "")
 
 
 def _text_of(url: Url, error: Exception) -> str:
@@ -232,14 +232,14 @@ def reason(url: Url, error: Exception) -> str:
         return f"no credentials are found{_credentials_hint(url)}"
     if meaning := meaning_of(url, error):
         return meaning
-    if any(words in said for words in ("dns error", "error trying to connect", "Connect", "sending request")):
+    if any(phrase in said for phrase in ("dns error", "error trying to connect", "Connect", "sending request")):
         where = hide_secrets(endpoint()) if url.scheme == "s3" and endpoint() else ""
         return f"the store can't be reached{f' at {where}' if where else ''}"
     if breaks_off(error):
         return "the answer of the store breaks off"
     if "status code: 403" in said:
         return f"{FORBIDDEN}{_absent_hint(url)}"
-    if any(words in said for words in ("timed out", "TimedOut", "timeout")):
+    if any(phrase in said for phrase in ("timed out", "TimedOut", "timeout")):
         return "the store does not answer in time"
     status = re.search(r"status code: (\d\d\d [A-Za-z ]+)", said)
     if status and status[1].startswith("400"):  # to a request for the head of an object, S3 can't say why

@@ -100,18 +100,18 @@ def choose_cameras(opened: log.Log, names: Sequence[str] = ()) -> ChosenCameras 
     McaptrackError if no camera has anything to begin with, and for names that the log doesn't have, or that can't be
     run.
     """
-    known, scenes = cameras(opened), scenes_of(opened)
+    every, scenes = cameras(opened), scenes_of(opened)
     if names:
-        found = {name.strip("/"): camera for camera in known for name in camera.names}
+        named = {name.strip("/"): camera for camera in every for name in camera.names}
         for name in names:
-            if name.strip("/") not in found:
-                raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(found)) or 'none'}")
-        wanted = list(dict.fromkeys(found[name.strip("/")] for name in names))
+            if name.strip("/") not in named:
+                raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(named)) or 'none'}")
+        wanted = list(dict.fromkeys(named[name.strip("/")] for name in names))
         wanted_scenes = tuple(camera.prefix for camera in wanted if camera.prefix in scenes)
         wanted = [camera for camera in wanted if camera.prefix not in scenes]
     else:
         wanted_scenes = ()
-        wanted = [camera for camera in known if camera.prefix not in scenes and not _is_truth_of_scene(opened, camera)]
+        wanted = [camera for camera in every if camera.prefix not in scenes and not _is_truth_of_scene(opened, camera)]
         wanted = [camera for camera in wanted if not camera.in_space or has_own_channels(opened, camera)] or wanted
         if len(wanted) + len(scenes) < 2 or all(camera.in_space for camera in wanted):
             return None
@@ -139,9 +139,9 @@ def _lack(opened: log.Log, camera: Camera) -> str:
     if camera.boxes or not _is_bare(opened, camera):
         return ""
     if camera.pictures is None:
-        there = sorted(one for one in camera.topics if foreign.holds_pictures(opened.channels[one]))
-        if there:
-            return f"has pictures in {list_names(there)}; `topic=` runs it on one of them"
+        with_pictures = sorted(topic for topic in camera.topics if foreign.holds_pictures(opened.channels[topic]))
+        if with_pictures:
+            return f"has pictures in {list_names(with_pictures)}; `topic=` runs it on one of them"
         has = sorted(topic for topic in camera.topics if "/view/" not in topic)
         return f"has neither pictures nor boxes, but {list_names(has, 5)}"
     if not opened.channels[camera.pictures].messages:
@@ -157,8 +157,8 @@ def _lack(opened: log.Log, camera: Camera) -> str:
 def begins_with(opened: log.Log, prefix: str) -> str:
     """Describe the input of the run of one of several cameras; "" for the usual one, pictures alone."""
     camera, detections = camera_at(opened, prefix), f"{prefix}/{STAGES['detect'].output_topic}"
-    made = provenance_of(opened, detections)
-    if detections in opened.channels and (made is None or made.transform not in STAGES):
+    provenance = provenance_of(opened, detections)
+    if detections in opened.channels and (provenance is None or provenance.transform not in STAGES):
         return f"{prefix[1:]} has detections in {detections} already: it is tracked from these, nothing is detected"
     if camera.pictures is None and camera.boxes:
         return f"{prefix[1:]} has no pictures: it is tracked from the boxes in {camera.boxes}"

@@ -70,19 +70,19 @@ def calibrate_cameras(
     McaptrackError
         If there are fewer than two cameras to compare, or if two are and none is a reference.
     """
-    found, names_of = _compared(opened, names)
+    compared, names_of = _compared(opened, names)
     reference = [names_of.get(name.strip("/"), name.strip("/")) for name in reference]
-    chosen = [camera.prefix[1:] for camera in found]
+    chosen = [camera.prefix[1:] for camera in compared]
     for name in reference:
         if name not in chosen:
             raise McaptrackError(f"`reference=` has {name}, which is not compared; {', '.join(chosen)} are")
     for name in clock_offset_s:
         if name not in chosen:
             raise McaptrackError(f"`clock_offset_s=` has {name}, which is not compared; {', '.join(chosen)} are")
-    sources, _, _, _ = read_sources(opened, found, clock_offset_s)
-    cameras = {camera.prefix[1:]: camera for camera in found}
+    sources, _, _, _ = read_sources(opened, compared, clock_offset_s)
+    cameras = {camera.prefix[1:]: camera for camera in compared}
     sources = [_given(opened, source, cameras[source.view.name], reference) for source in sources]
-    chosen = [one.view.name for one in sources]  # without those that have no messages, which was said
+    chosen = [source.view.name for source in sources]  # without those that have no messages, which was said
     if len(chosen) < 2:
         raise McaptrackError(f"{opened.path}: only {chosen[0]} has boxes; two cameras are compared at least")
     if lacking := sorted(set(reference) - set(chosen)):
@@ -92,15 +92,21 @@ def calibrate_cameras(
             f"{opened.path}: of two cameras, {' and '.join(chosen)}, the log doesn't say which is right; name that one "
             "with `reference=`"
         )
-    held = {one.view.name: _why_held(opened, cameras[one.view.name], one.view.planes, reference) for one in sources}
+    held = {
+        source.view.name: _why_held(opened, cameras[source.view.name], source.view.planes, reference)
+        for source in sources
+    }
     return _in_turns(sources, held, frozenset(reference), clock_offset_s, progress)
 
 
 def _compared(opened: log.Log, names: Sequence[str]) -> tuple[list[Camera], dict[str, str]]:
-    """The cameras to compare, and the names in the results of all cameras by each of their names."""
+    """Return the cameras to compare, and for each name of a camera the one that results use."""
     scenes = scenes_of(opened)
     names_of = {
-        name.strip("/"): one.prefix[1:] for one in cameras_of(opened) if one.prefix not in scenes for name in one.names
+        name.strip("/"): camera.prefix[1:]
+        for camera in cameras_of(opened)
+        if camera.prefix not in scenes
+        for name in camera.names
     }
     for name in names:
         if name.strip("/") not in names_of:
@@ -138,8 +144,8 @@ def _why_held(opened: log.Log, camera: Camera, planes: Planes, reference: Sequen
     """The reason why a plane stays as it is; "" if it may be corrected."""
     if camera.prefix[1:] in reference:
         return REFERENCE
-    made = provenance_of(opened, given_plane(camera))
-    if made is not None and made.transform not in ("ingest",):
+    provenance = provenance_of(opened, given_plane(camera))
+    if provenance is not None and provenance.transform not in ("ingest",):
         return "its plane follows from the transforms of the recording, which stay as they are"
     if len(planes) > 1:
         return "its ground plane changes over time"
@@ -150,14 +156,14 @@ def _in_turns(
     sources: list[Source],
     held: Mapping[str, str],
     reference: frozenset[str],
-    given: Mapping[str, float],
+    given_offset_s: Mapping[str, float],
     progress: Callable[[int, int], None],
 ) -> tuple[list[Refined], dict[str, float], dict[str, GroundPlane]]:
     """Correct planes, estimate the offsets of clocks with them, and correct them again at the right times."""
     fuser = FootFuser()
-    offset_s = {one.view.name: given.get(one.view.name, 0.0) for one in sources}
+    offset_s = {source.view.name: given_offset_s.get(source.view.name, 0.0) for source in sources}
     refined: list[Refined] = []
-    planes = {one.view.name: one.view.planes[0][1] for one in sources}
+    planes = {source.view.name: source.view.planes[0][1] for source in sources}
     for turn in range(_TURNS):
         gathered = Gathered(sources, fuser)
 
@@ -165,31 +171,33 @@ def _in_turns(
             progress(turn * total + done, _TURNS * total)
 
         refined = _refiner(gathered, sources, held, reference, fuser, report).refine()
-        planes = {one.name: corrected(one, sources) for one in refined}
+        planes = {camera.name: corrected(camera, sources) for camera in refined}
         right = [
-            one._replace(view=replace(one.view, planes=((one.view.planes[0][0], planes[one.view.name]),)))
-            if len(one.view.planes) == 1
-            else one
-            for one in sources
+            source._replace(view=replace(source.view, planes=((source.view.planes[0][0], planes[source.view.name]),)))
+            if len(source.view.planes) == 1
+            else source
+            for source in sources
         ]
         if turn == _TURNS - 1:
             break
-        _, _, _, late_s, _ = compared_cameras(right, fuser, given)
-        late = {name: seconds for name, seconds in late_s.items() if name not in given and seconds}
+        _, _, _, late_s, _ = compared_cameras(right, fuser, given_offset_s)
+        late = {name: seconds for name, seconds in late_s.items() if name not in given_offset_s and seconds}
         if not late:
             progress(1, 1)
             break
         offset_s |= late
-        sources = [one._replace(t_ns=one.t_ns - round(late.get(one.view.name, 0.0) * NS_PER_S)) for one in sources]
-    return refined, offset_s, {one.name: planes[one.name] for one in refined if one.model}
+        sources = [
+            source._replace(t_ns=source.t_ns - round(late.get(source.view.name, 0.0) * NS_PER_S)) for source in sources
+        ]
+    return refined, offset_s, {camera.name: planes[camera.name] for camera in refined if camera.model}
 
 
-def corrected(one: Refined, sources: Sequence[Source]) -> GroundPlane:
+def corrected(camera: Refined, sources: Sequence[Source]) -> GroundPlane:
     """The plane of a camera with its correction."""
-    plane = next(source.view.planes[0][1] for source in sources if source.view.name == one.name)
-    if not one.model:
+    plane = next(source.view.planes[0][1] for source in sources if source.view.name == camera.name)
+    if not camera.model:
         return plane
-    matrix = one.matrix @ plane.matrix
+    matrix = camera.matrix @ plane.matrix
     if plane.lens is None:
         # Any scale is the same plane; that of the one before is kept, so that numbers stay comparable.
         matrix *= np.linalg.norm(plane.matrix) / np.linalg.norm(matrix)
@@ -204,7 +212,7 @@ def _refiner(
     fuser: FootFuser,
     progress: Callable[[int, int], None],
 ) -> Refiner:
-    """The feet that each camera sees at the times of the slowest one, ready to be compared."""
+    """Gather the feet that each camera sees at the times of the slowest one, for a ``Refiner``."""
     every = -(-len(gathered) // _COMPARED)
     frames = [frame for number, frame in enumerate(gathered) if number % every == 0]
     size = [len(frame.rows) for frame in frames]
@@ -247,38 +255,38 @@ class CorrectedPlanes:
 
 
 def changes_of(opened: log.Log, refined: Sequence[Refined], planes: Mapping[str, GroundPlane]) -> CorrectedPlanes:
-    """Return what is to be written and dropped.
+    """Return the corrected planes to write, and those to drop.
 
     Raises McaptrackError if other software recorded a channel with the name of a corrected plane.
     """
-    cameras = {one.name: camera_at(opened, f"/{one.name}") for one in refined}
-    topics = {one.name: refined_plane(cameras[one.name]) for one in refined if one.model}
+    cameras = {camera.name: camera_at(opened, f"/{camera.name}") for camera in refined}
+    topics = {camera.name: refined_plane(cameras[camera.name]) for camera in refined if camera.model}
     for topic in topics.values():
         if not may_replace(opened, topic, REFINE):
             raise McaptrackError(f"{opened.path}: {topic} {describe_origin(opened, topic)}, and is not replaced")
-    made: dict[str, Made] = {}
-    compared = sorted(one.name for one in refined if one.before is not None)
-    for one in refined:
-        if not one.model:
+    results: dict[str, Made] = {}
+    compared = sorted(camera.name for camera in refined if camera.before is not None)
+    for camera in refined:
+        if not camera.model:
             continue
-        base, topic = given_plane(cameras[one.name]), topics[one.name]
+        base, topic = given_plane(cameras[camera.name]), topics[camera.name]
         before = opened.frames(base, GROUND_PLANE)[0]
-        parameters = {**as_json(one), "compared_with": [name for name in compared if name != one.name]}
+        parameters = {**as_json(camera), "compared_with": [name for name in compared if name != camera.name]}
         frame_id = frame_id_of(opened.channels[base].metadata)
         how = Provenance(REFINE, parameters, base, digest_of(opened, base), frame_id=frame_id)
-        frame = Frame(before.t_ns, before.index, plane_to_rows(planes[one.name]))
-        made[topic] = Made.of(GROUND_PLANE, [frame], how)
+        frame = Frame(before.t_ns, before.index, plane_to_rows(planes[camera.name]))
+        results[topic] = Made.of(GROUND_PLANE, [frame], how)
     dropped = [
         topic
-        for one in refined
-        if not one.model
-        and one.before is not None
-        and one.why != REFERENCE
-        and (topic := refined_plane(cameras[one.name])) in opened.channels
+        for camera in refined
+        if not camera.model
+        and camera.before is not None
+        and camera.why != REFERENCE
+        and (topic := refined_plane(cameras[camera.name])) in opened.channels
         and may_replace(opened, topic, REFINE)
     ]
-    unchanged = tuple(name for name, topic in topics.items() if _is_there(opened, topic, made[topic]))
-    new = {topic: made[topic] for name, topic in topics.items() if name not in unchanged}
+    unchanged = tuple(name for name, topic in topics.items() if _is_there(opened, topic, results[topic]))
+    new = {topic: results[topic] for name, topic in topics.items() if name not in unchanged}
     return CorrectedPlanes(topics, new, unchanged, tuple(dropped))
 
 
@@ -287,7 +295,7 @@ def write_changes(opened: log.Log, changes: CorrectedPlanes, output: Path | None
     is_changed = bool(changes.new or changes.dropped)
     if is_changed or output is not None:
         outlines = {plane.provenance.input + views.SCENE_SUFFIX for plane in changes.new.values()}
-        drop = {*changes.new, *changes.dropped, *(one for one in outlines if one in opened.channels)}
+        drop = {*changes.new, *changes.dropped, *(outline for outline in outlines if outline in opened.channels)}
         encoding = encoding_for(opened)
         check_topics({*changes.new}, encoding)
         with log.extend(opened, output, drop=drop) as writer:
@@ -298,24 +306,24 @@ def write_changes(opened: log.Log, changes: CorrectedPlanes, output: Path | None
     return is_changed
 
 
-def _is_there(opened: log.Log, topic: str, made: Made) -> bool:
-    known = provenance_of(opened, topic)
-    return known is not None and known.to_metadata() == made.provenance.to_metadata()
+def _is_there(opened: log.Log, topic: str, channel: Made) -> bool:
+    provenance = provenance_of(opened, topic)
+    return provenance is not None and provenance.to_metadata() == channel.provenance.to_metadata()
 
 
-def as_json(one: Refined) -> dict[str, Any]:
-    """The findings about a camera, as values of JSON."""
+def as_json(camera: Refined) -> dict[str, Any]:
+    """Return what was found about a camera as values of JSON."""
 
-    def residual(found: Any) -> dict[str, Any] | None:
-        if found is None:
+    def residual(distances: Any) -> dict[str, Any] | None:
+        if distances is None:
             return None
-        median, p90 = (None if np.isnan(value) else round(value, 4) for value in found[:2])
-        return {"median_m": median, "p90_m": p90, "pairs": found.pairs}
+        median, p90 = (None if np.isnan(value) else round(value, 4) for value in distances[:2])
+        return {"median_m": median, "p90_m": p90, "pairs": distances.pairs}
 
     return {
-        "correction": one.model or None,
-        "matrix": [round(value, 12) for value in one.matrix.ravel().tolist()] if one.model else None,
-        "moved_m": round(one.moved_m, 4),
-        "before": residual(one.before),
-        "after": residual(one.after),
+        "correction": camera.model or None,
+        "matrix": [round(value, 12) for value in camera.matrix.ravel().tolist()] if camera.model else None,
+        "moved_m": round(camera.moved_m, 4),
+        "before": residual(camera.before),
+        "after": residual(camera.after),
     }

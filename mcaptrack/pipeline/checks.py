@@ -50,7 +50,7 @@ class Job(NamedTuple):
 
 
 def superseded(opened: log.Log, job: Job) -> list[str]:
-    """Return results that the job's stage made before, beside those of now, and that its transform doesn't make."""
+    """Return channels below the job's target that its stage made before, and that its transform doesn't make."""
     now, stage = {*job.outputs(), job.target + FULL}, job.stage
     before = (topic for topic in opened.channels if topic not in now and topic.startswith(job.target + "/"))
     own = (topic for topic in before if may_replace(opened, topic, stage))
@@ -59,9 +59,9 @@ def superseded(opened: log.Log, job: Job) -> list[str]:
 
 def main_topic(opened: log.Log, stage: str, topic: str) -> str:
     """Return the main output topic of the stage that makes ``topic``: itself, or the topic above its last part."""
-    made = provenance_of(opened, topic)
-    if made and made.output:
-        return topic.removesuffix("/" + made.output)
+    provenance = provenance_of(opened, topic)
+    if provenance and provenance.output:
+        return topic.removesuffix("/" + provenance.output)
     above = topic.rpartition("/")[0]
     has_outputs = any(below in opened.channels for below in STAGES[stage].outputs(topic)[1:])
     return above if topic in STAGES[stage].outputs(above)[1:] and not has_outputs else topic
@@ -120,8 +120,8 @@ def read_named_frames(
     """
     channel = opened.channel(topic)
     if schema is DETECTIONS and channel.schema_name != DETECTIONS.name:
-        found = (BoxesRead() if boxes is None else boxes).read(opened, topic, frame_id)
-        return found._replace(frames=collect(DETECTIONS, found.frames))
+        boxes_read = (BoxesRead() if boxes is None else boxes).read(opened, topic, frame_id)
+        return boxes_read._replace(frames=collect(DETECTIONS, boxes_read.frames))
     return foreign.NamedFrames(
         opened.frame_columns(topic, schema), class_names(channel.metadata), frame_id_of(channel.metadata)
     )
@@ -129,10 +129,10 @@ def read_named_frames(
 
 def _lacks(opened: log.Log, prefix: str, job: Job) -> str:
     """Return the message for a missing input: what is missing, what the log has, and what to do."""
-    there = [topic for topic in sorted(opened.channels) if "/view/" not in topic]
-    has, hint = f"it has {list_names(there)}", f"{call('info', opened.path)} shows more"
+    topics = [topic for topic in sorted(opened.channels) if "/view/" not in topic]
+    has, hint = f"it has {list_names(topics)}", f"{call('info', opened.path)} shows more"
     if job.transform.reads is VIDEO and job.source == f"{prefix}/{STAGES[job.stage].input_topic}":
-        pictures = [topic for topic in there if foreign.holds_pictures(opened.channels[topic])]
+        pictures = [topic for topic in topics if foreign.holds_pictures(opened.channels[topic])]
         if pictures:
             has, hint = f"it has pictures in {list_names(pictures)}", "choose one with `topic=`"
         else:
@@ -168,15 +168,15 @@ def _check_outputs(opened: log.Log, prefix: str, job: Job) -> None:
 
 def may_replace(opened: log.Log, topic: str, transform: str) -> bool:
     """Return whether a topic is free, or holds only channels that the same transform made."""
-    return all(made is not None and made.transform == transform for made, _ in _making(opened, topic))
+    return all(provenance is not None and provenance.transform == transform for provenance, _ in _making(opened, topic))
 
 
 def describe_origin(opened: log.Log, topic: str) -> str:
     """Describe the origin of a channel as text; if several channels share the topic, a recorded one goes first."""
-    made, schema_name = min(_making(opened, topic), key=lambda found: found[0] is not None)
-    if made is None:
+    provenance, schema_name = min(_making(opened, topic), key=lambda pair: pair[0] is not None)
+    if provenance is None:
         return f"was recorded by others ({schema_name or 'no schema'})"
-    return "was ingested" if made.transform == INGEST else f"was made by {made.transform}"
+    return "was ingested" if provenance.transform == INGEST else f"was made by {provenance.transform}"
 
 
 def _making(opened: log.Log, topic: str) -> list[tuple[Provenance | None, str]]:

@@ -59,37 +59,37 @@ def find_views(opened: log.Log, prefix: str, topics: Sequence[str] = ()) -> Show
         return _given(opened, prefix, topics, pictures)
     if pictures is not None:
         for scene in scenes_of(opened):
-            if found := _best(opened, scene, views.SUFFIX + pictures):
-                words = f"drawing the tracks of {scene} on {pictures}; `topic=` names those of {prefix}"
-                warn(words, "chosen-camera")
-                return Shown(found, pictures)
-        if found := _best(opened, prefix, views.SUFFIX):
-            return Shown(found, pictures)
+            if best := _best(opened, scene, views.SUFFIX + pictures):
+                text = f"drawing the tracks of {scene} on {pictures}; `topic=` names those of {prefix}"
+                warn(text, "chosen-camera")
+                return Shown(best, pictures)
+        if best := _best(opened, prefix, views.SUFFIX):
+            return Shown(best, pictures)
         raise McaptrackError(f"{opened.path} has no views of {prefix} yet; {call('run', opened.path)} makes them")
     drawn_on = _calibrated(opened, prefix)
-    for one in drawn_on:
+    for pictures_topic in drawn_on:
         if len(drawn_on) > 1:
             others = ", ".join(drawn_on[1:])
-            warn(f"tracks are drawn on {one}; `topic=` names views on {others} or scenes", "chosen-camera")
-        return Shown(_best(opened, prefix, views.SUFFIX + one), one)
-    if found := _best(opened, prefix, views.SCENE_SUFFIX):
-        return Shown(found, "")
-    there = f"{opened.path} has no pictures of {prefix} to draw on, and no scenes"
-    raise McaptrackError(f"{there}; {call('info', opened.path)} shows what it has")
+            warn(f"tracks are drawn on {pictures_topic}; `topic=` names views on {others} or scenes", "chosen-camera")
+        return Shown(_best(opened, prefix, views.SUFFIX + pictures_topic), pictures_topic)
+    if best := _best(opened, prefix, views.SCENE_SUFFIX):
+        return Shown(best, "")
+    lack = f"{opened.path} has no pictures of {prefix} to draw on, and no scenes"
+    raise McaptrackError(f"{lack}; {call('info', opened.path)} shows what it has")
 
 
 def _given(opened: log.Log, prefix: str, topics: Sequence[str], pictures: str | None) -> Shown:
     """Return the views of given channels, or these themselves if they are views."""
     if pictures is None:
-        suffix = next((views.SUFFIX + one for one in _calibrated(opened, prefix)), views.SCENE_SUFFIX)
+        suffix = next((views.SUFFIX + topic for topic in _calibrated(opened, prefix)), views.SCENE_SUFFIX)
     else:
         suffix = views.SUFFIX
-    found = [opened.channel(_view_of(opened, topic, suffix)).topic for topic in topics]
-    places = {_place_of(topic, pictures) for topic in found}
+    view_topics = [opened.channel(_view_of(opened, topic, suffix)).topic for topic in topics]
+    places = {_place_of(topic, pictures) for topic in view_topics}
     if len(places) > 1:
-        words = ", ".join(sorted(place or "scenes" for place in places))
-        raise McaptrackError(f"{opened.path}: views on {words} can't be drawn in one video; name those of one")
-    return Shown(found, places.pop())
+        text = ", ".join(sorted(place or "scenes" for place in places))
+        raise McaptrackError(f"{opened.path}: views on {text} can't be drawn in one video; name those of one")
+    return Shown(view_topics, places.pop())
 
 
 def _place_of(view: str, pictures: str | None) -> str:
@@ -108,8 +108,8 @@ def _best(opened: log.Log, prefix: str, suffix: str) -> list[str]:
 
 def _calibrated(opened: log.Log, prefix: str) -> list[str]:
     """Return the pictures of calibrated cameras that tracks are drawn on, by topic."""
-    found = (topic.partition(views.SUFFIX)[2] for topic in opened.channels if topic.startswith(prefix + "/"))
-    return sorted({pictures for pictures in found if pictures and _best(opened, prefix, views.SUFFIX + pictures)})
+    drawn_on = (topic.partition(views.SUFFIX)[2] for topic in opened.channels if topic.startswith(prefix + "/"))
+    return sorted({pictures for pictures in drawn_on if pictures and _best(opened, prefix, views.SUFFIX + pictures)})
 
 
 def _view_of(opened: log.Log, topic: str, suffix: str) -> str:
@@ -143,7 +143,7 @@ def robot_path(opened: log.Log, prefix: str, view: str, t_ns: Ints) -> RobotPath
 def _frame_of(opened: log.Log, view: str) -> str:
     """Return the frame of the scenes of a view; "" if the first ones are empty."""
     decode = message_decoder(opened, view)
-    scenes = (decode(one.payload) for one in islice(opened.messages(view), _SHOWN_MOST_READ))
+    scenes = (decode(message.payload) for message in islice(opened.messages(view), _SHOWN_MOST_READ))
     return next((str(entity.frame_id) for scene in scenes for entity in scene.entities), "")
 
 
@@ -248,11 +248,11 @@ class ViewFactory:
                 seen = drawing.on_camera(camera, channel.bodies)
                 yield View(topic + views.SUFFIX + pictures, foxglove.ANNOTATIONS, made_from, group, seen)
             if self._scene is not None and channel.schema is not DETECTIONS:
-                for one in self._scene.cameras:
-                    rows, planes = self._scene.on_camera(one, channel.schema, frames, is_true=not channel.made_by)
+                for member in self._scene.cameras:
+                    rows, planes = self._scene.on_camera(member, channel.schema, frames, is_true=not channel.made_by)
                     on_picture = views.Drawing(topic, channel.schema, rows, planes, is_retracked, names)
-                    seen = on_picture.on_pictures(one.clock.t_ns, one.clock.stamp_ns)
-                    yield View(topic + views.SUFFIX + one.pictures, foxglove.ANNOTATIONS, made_from, group, seen)
+                    seen = on_picture.on_pictures(member.clock.t_ns, member.clock.stamp_ns)
+                    yield View(topic + views.SUFFIX + member.pictures, foxglove.ANNOTATIONS, made_from, group, seen)
             if channel.is_on_ground():
                 own_ns = frame_times(channel.frames)
                 t_ns = self._picture_ns if len(self._picture_ns) and not is_solid else own_ns
@@ -280,10 +280,10 @@ def frame_of(prefix: str, channel: ChannelToDraw) -> str:
     return channel.frame_id or views.ground.frame_of(prefix)
 
 
-def new_frames(prefix: str, shown: Mapping[str, ChannelToDraw], known: Collection[str]) -> list[str]:
-    """Return the coordinate frames of drawings that are not ``known``, in order."""
+def new_frames(prefix: str, shown: Mapping[str, ChannelToDraw], existing: Collection[str]) -> list[str]:
+    """Return the coordinate frames of drawings that are not among the ``existing`` ones, in order."""
     wanted = [frame_of(prefix, channel) for channel in shown.values() if channel.is_on_ground()]
-    return [frame_id for frame_id in dict.fromkeys(wanted) if frame_id not in known]
+    return [frame_id for frame_id in dict.fromkeys(wanted) if frame_id not in existing]
 
 
 def robot_frame(opened: log.Log, sources: Collection[str], tree: TransformTree, fixed: str) -> str:
@@ -306,21 +306,21 @@ def calibrated_cameras(opened: log.Log, frame_id: str) -> dict[str, views.Moving
     """
     if not any(map(holds_calibrations, opened.channels.values())):
         return {}
-    found = {}
+    cameras = {}
     for topic, channel in sorted(opened.channels.items()):
         if foreign.holds_pictures(channel) and channel.messages:
             try:
-                found[topic] = moving_camera(opened, topic, frame_id)
+                cameras[topic] = moving_camera(opened, topic, frame_id)
             except McaptrackError as error:
                 warn(f"{opened.path}: tracks are not drawn on {topic}: {error}", "left-out")
-    return found
+    return cameras
 
 
 def recorded_drawings(opened: log.Log, sources: Collection[str]) -> dict[str, bool]:
     """Return the recorded topics that viewers draw in 3D, and whether they are among ``sources``."""
     return {
         channel.topic: channel.topic in sources
-        for channel in sorted(opened.channels.values(), key=lambda one: one.topic)
+        for channel in sorted(opened.channels.values(), key=lambda channel: channel.topic)
         if is_drawn_by_viewers(channel)
     }
 
@@ -332,8 +332,8 @@ def is_drawn_by_viewers(channel: log.Channel) -> bool:
 
 def recorded_sources(opened: log.Log, topics: Iterable[str]) -> list[str]:
     """Return the recorded topics that these were made from."""
-    found = {topic for one in topics for topic in chain_of(opened, one)[-1:]} & set(opened.channels)
-    return sorted(topic for topic in found if Provenance.from_metadata(opened.channels[topic].metadata) is None)
+    origins = {topic for made_topic in topics for topic in chain_of(opened, made_topic)[-1:]} & set(opened.channels)
+    return sorted(topic for topic in origins if Provenance.from_metadata(opened.channels[topic].metadata) is None)
 
 
 def _frame_of_messages(opened: log.Log, topic: str) -> str:
@@ -347,8 +347,8 @@ def _frame_of_messages(opened: log.Log, topic: str) -> str:
 
 def _frame_named(message: Any) -> str:
     parts = (getattr(message, name, ()) for name in ("entities", "markers", "boxes", "objects", "detections"))
-    for one in (message, *(part for some in parts for part in some)):
-        for holder in (one, getattr(one, "header", None)):
+    for holder_of_name in (message, *(part for some in parts for part in some)):
+        for holder in (holder_of_name, getattr(holder_of_name, "header", None)):
             name = getattr(holder, "frame_id", "")
             if name:
                 return str(name)

@@ -72,25 +72,26 @@ def outputs(topic: str) -> tuple[str, ...]:
     return topic + _EVENTS, topic + _EVENTS + SUFFIX, topic + _COUNTS
 
 
-def make_events(opened: log.Log, prefix: str, made: Mapping[str, Made], watch: Watch) -> dict[str, Made]:
+def make_events(opened: log.Log, prefix: str, results: Mapping[str, Made], watch: Watch) -> dict[str, Made]:
     """Find the events of tracks and the errors of forecasts that are missing or out of date.
 
-    ``made`` are the channels of this run, by topic. Returns the new channels by topic. A channel that can't be compared
-    with the ground truth is left out, with a warning. Raises McaptrackError for given topics that hold no tracks.
+    ``results`` are those of this run, by topic. Returns the channels that it makes by topic. A channel that can't
+    be compared with the ground truth is left out, with a warning. Raises McaptrackError for given topics that hold no
+    tracks.
     """
     out: dict[str, Made] = {}
-    topics = watch.topics or _default_topics(opened, prefix, made)
+    topics = watch.topics or _default_topics(opened, prefix, results)
     if watch.again and not topics:
         raise McaptrackError(f"{opened.path} has no tracks of {prefix}; {call('run', opened.path)} makes them")
 
     @cache
     def truth() -> _GroundTruth:
-        return _read_truth(opened, prefix, made)
+        return _read_truth(opened, prefix, results)
 
     for topic in topics:
         options = watch.options if watch.again else _options_for(opened, topic, watch.options)
         has_same_options = _options_for(opened, topic, EventOptions()) == options
-        is_up_to_date = has_same_options and not _is_outdated(opened, outputs(topic), made)
+        is_up_to_date = has_same_options and not _is_outdated(opened, outputs(topic), results)
         if is_up_to_date and not (watch.again or watch.force):
             continue
         conflict = _find_conflict(opened, outputs(topic))
@@ -99,25 +100,27 @@ def make_events(opened: log.Log, prefix: str, made: Mapping[str, Made], watch: W
                 raise McaptrackError(f"{opened.path}: events would replace {conflict}")
             warn(f"no events of {topic}: they would replace {conflict}", "left-out")
             continue
-        frames, tracks_digest = _rows(opened, topic, made)
-        names = class_names(made[topic].provenance.to_metadata() if topic in made else opened.channel(topic).metadata)
+        frames, tracks_digest = _rows(opened, topic, results)
+        names = class_names(
+            results[topic].provenance.to_metadata() if topic in results else opened.channel(topic).metadata
+        )
         classes = (truth().classes, names)
-        origin = made[topic].provenance if topic in made else provenance_of(opened, topic)
+        origin = results[topic].provenance if topic in results else provenance_of(opened, topic)
         frames = repaired_tracks(frames, origin)
-        found = find_events(frames, truth().frames, options, opened.path.stem, topic, classes)
-        for note in found.notes:
+        track_events = find_events(frames, truth().frames, options, opened.path.stem, topic, classes)
+        for note in track_events.notes:
             warn(note, "not-compared")
-        parameters = found.parameters(options)
+        parameters = track_events.parameters(options)
         provenance = Provenance(STAGE, parameters, topic, tracks_digest, references=truth().digests)
-        out[topic + _EVENTS] = events = Made.of(EVENTS, found.events, provenance)
+        out[topic + _EVENTS] = events = Made.of(EVENTS, track_events.events, provenance)
         nouns = nouns_of(truth().frames or (), frames, classes)
-        text = list(log_messages(found.events, topic, opened.start_ns, found.frame_interval_s, nouns))
+        text = list(log_messages(track_events.events, topic, opened.start_ns, track_events.frame_interval_s, nouns))
         view = Provenance(VIEW, {}, topic + _EVENTS, events.provenance.digest)
         out[topic + _EVENTS + SUFFIX] = Made(EVENTS, [], view, text, foxglove.LOG)
-        out[topic + _COUNTS] = Made.of(COUNTS, found.counts, provenance)
+        out[topic + _COUNTS] = Made.of(COUNTS, track_events.counts, provenance)
     if not watch.topics:
         for name in FORECAST_INPUTS:
-            out |= _forecast_errors(opened, prefix, name, made, watch.again or watch.force, truth)
+            out |= _forecast_errors(opened, prefix, name, results, watch.again or watch.force, truth)
     return out
 
 
@@ -125,41 +128,41 @@ def _forecast_errors(
     opened: log.Log,
     prefix: str,
     name: str,
-    made: Mapping[str, Made],
+    results: Mapping[str, Made],
     again: bool,
     truth: Callable[[], _GroundTruth],
 ) -> dict[str, Made]:
     """Find the errors of the forecasts in one channel, if the channel exists and its errors are missing or outdated."""
-    topic, tracks, later = (f"{prefix}/{one}" for one in (name, FORECAST_INPUTS[name], _OFFLINE))
-    if not _has_rows(opened, topic, made, PREDICTIONS) or not _has_rows(opened, tracks, made):
+    topic, tracks, later = (f"{prefix}/{part}" for part in (name, FORECAST_INPUTS[name], _OFFLINE))
+    if not _has_rows(opened, topic, results, PREDICTIONS) or not _has_rows(opened, tracks, results):
         return {}
-    later = later if _has_rows(opened, later, made) else tracks
+    later = later if _has_rows(opened, later, results) else tracks
     topics = (topic + _ERRORS, topic + _SCORES)
-    if not again and not _is_outdated(opened, topics, made) and later in _input_digests(opened, topics[0]):
+    if not again and not _is_outdated(opened, topics, results) and later in _input_digests(opened, topics[0]):
         return {}
     conflict = _find_conflict(opened, topics)
     if conflict:
         warn(f"no errors of {topic}: they would replace {conflict}", "left-out")
         return {}
-    forecasts, digest_of_forecasts = _rows(opened, topic, made, PREDICTIONS)
-    (history, of_tracks), (offline, of_later) = (_rows(opened, one, made) for one in (tracks, later))
+    forecasts, digest_of_forecasts = _rows(opened, topic, results, PREDICTIONS)
+    (history, of_tracks), (offline, of_later) = (_rows(opened, each, results) for each in (tracks, later))
     try:
-        found = find_forecast_errors(forecasts, history, truth().frames, offline, topic)
+        forecast_errors = find_forecast_errors(forecasts, history, truth().frames, offline, topic)
     except McaptrackError as error:
         warn(f"no errors of forecasts: {error}", "not-compared")
         return {}
     references = truth().digests | {tracks: of_tracks, later: of_later}
     provenance = Provenance(STAGE, {}, topic, digest_of_forecasts, references=references)
     return {
-        topics[0]: Made.of(FORECAST_ERRORS, found.errors, provenance),
-        topics[1]: Made.of(FORECAST_SCORES, found.scores, provenance),
+        topics[0]: Made.of(FORECAST_ERRORS, forecast_errors.errors, provenance),
+        topics[1]: Made.of(FORECAST_SCORES, forecast_errors.scores, provenance),
     }
 
 
-def tally(made: Mapping[str, Made]) -> dict[str, dict[str, int]]:
+def tally(results: Mapping[str, Made]) -> dict[str, dict[str, int]]:
     """Count the events of each kind for each channel of tracks: count by name of the kind, by topic of the tracks."""
     out = {}
-    for topic, channel in made.items():
+    for topic, channel in results.items():
         if channel.schema is EVENTS and not channel.drawn:
             kinds = join_frames(EVENTS, channel.frames).rows["kind"]
             counts = np.bincount(kinds, minlength=max(EVENT_KINDS) + 1).tolist()
@@ -179,7 +182,7 @@ class _GroundTruth(NamedTuple):
     classes: Mapping[int, str] = {}
 
 
-def _read_truth(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> _GroundTruth:
+def _read_truth(opened: log.Log, prefix: str, results: Mapping[str, Made]) -> _GroundTruth:
     topic = camera_at(opened, prefix).truth
     if topic not in opened.channels:
         return _GroundTruth(None, {topic: ""})
@@ -187,13 +190,13 @@ def _read_truth(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> _Grou
         return _GroundTruth(None, {})
     try:
         names = class_names(opened.channel(topic).metadata)
-        return _GroundTruth(ground_truth_with(opened, prefix, made), {topic: digest_of(opened, topic)}, names)
+        return _GroundTruth(ground_truth_with(opened, prefix, results), {topic: digest_of(opened, topic)}, names)
     except McaptrackError as error:
         warn(f"no misses, false tracks and switches: {error}", "not-compared")
         return _GroundTruth(None, {})
 
 
-def _default_topics(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> list[str]:
+def _default_topics(opened: log.Log, prefix: str, results: Mapping[str, Made]) -> list[str]:
     """Return the default channels of tracks, and those of the camera that have events already."""
     topics = [f"{prefix}/{name}" for name in WATCHED]
     topics += [
@@ -201,15 +204,15 @@ def _default_topics(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> l
         for topic in sorted(camera_at(opened, prefix).topics)
         if topic.endswith(_EVENTS) and may_replace(opened, topic, STAGE)
     ]
-    return [topic for topic in dict.fromkeys(topics) if _has_rows(opened, topic, made)]
+    return [topic for topic in dict.fromkeys(topics) if _has_rows(opened, topic, results)]
 
 
-def _options_for(opened: log.Log, topic: str, given: EventOptions) -> EventOptions:
+def _options_for(opened: log.Log, topic: str, requested: EventOptions) -> EventOptions:
     """Return the given options if they differ from the defaults, else those that the log's events were found with."""
-    known = provenance_of(opened, topic + _EVENTS)
-    asked: Any = known.parameters.get("asked") if known and known.transform == STAGE else None
-    if given != EventOptions() or not isinstance(asked, dict):
-        return given
+    provenance = provenance_of(opened, topic + _EVENTS)
+    asked: Any = provenance.parameters.get("asked") if provenance and provenance.transform == STAGE else None
+    if requested != EventOptions() or not isinstance(asked, dict):
+        return requested
     similarity = asked.get("similarity")
     if similarity not in get_args(Similarity):
         similarity = None
@@ -221,18 +224,20 @@ def _is_gate(value: Any) -> bool:
     return isinstance(value, float | int) and not isinstance(value, bool) and value > 0
 
 
-def _is_outdated(opened: log.Log, topics: Sequence[str], made: Mapping[str, Made]) -> bool:
+def _is_outdated(opened: log.Log, topics: Sequence[str], results: Mapping[str, Made]) -> bool:
     """Return whether one of these topics is missing, or an input of the first one has changed since."""
     if not all(topic in opened.channels for topic in topics) or is_stale(opened, topics[0]):
         return True
     then = _input_digests(opened, topics[0])
-    return not then or any(name in made and made[name].provenance.digest != digest for name, digest in then.items())
+    return not then or any(
+        name in results and results[name].provenance.digest != digest for name, digest in then.items()
+    )
 
 
 def _input_digests(opened: log.Log, topic: str) -> dict[str, str]:
     """Return the digests of a channel's inputs when it was made, by topic."""
-    known = Provenance.from_metadata(opened.channel(topic).metadata)
-    return known.made_from() if known else {}
+    provenance = Provenance.from_metadata(opened.channel(topic).metadata)
+    return provenance.made_from() if provenance else {}
 
 
 def _find_conflict(opened: log.Log, topics: Sequence[str]) -> str:
@@ -242,18 +247,18 @@ def _find_conflict(opened: log.Log, topics: Sequence[str]) -> str:
     return f"{taken[0]}, which {describe_origin(opened, taken[0])}" if taken else ""
 
 
-def _has_rows(opened: log.Log, topic: str, made: Mapping[str, Made] = {}, schema: Schema = TRACKS) -> bool:
+def _has_rows(opened: log.Log, topic: str, results: Mapping[str, Made] = {}, schema: Schema = TRACKS) -> bool:
     """Return whether a channel of the log or of this run has the given schema."""
-    if topic in made:
-        return made[topic].schema is schema
+    if topic in results:
+        return results[topic].schema is schema
     channel = opened.channels.get(topic)
     return channel is not None and channel.holds(schema)
 
 
 def _rows(
-    opened: log.Log, topic: str, made: Mapping[str, Made], schema: Schema = TRACKS
+    opened: log.Log, topic: str, results: Mapping[str, Made], schema: Schema = TRACKS
 ) -> tuple[Sequence[Frame], str]:
     """Return the frames of a channel, and the digest of its messages."""
-    if topic in made:
-        return made[topic].frames, made[topic].provenance.digest
+    if topic in results:
+        return results[topic].frames, results[topic].provenance.digest
     return opened.frame_columns(topic, schema), digest_of(opened, topic)

@@ -64,10 +64,10 @@ class Continued:
     @classmethod
     def joined(cls, each: Sequence[Continued]) -> Continued:
         """Return the outcomes of several cameras as one, with the longest of their gaps."""
-        out = cls(each[0].log, max(one.gap_s for one in each))
-        for one in each:
-            out.at_cut |= one.at_cut
-            out.kept |= one.kept
+        out = cls(each[0].log, max(camera.gap_s for camera in each))
+        for camera in each:
+            out.at_cut |= camera.at_cut
+            out.kept |= camera.kept
         return out
 
     def to_json(self) -> dict[str, Any]:
@@ -84,9 +84,9 @@ class Continued:
 
 
 def begins_here(before: log.Log, opened: log.Log, prefix: str) -> str:
-    """Return why the ids of one of several cameras go on from none, where the log before has others of them; or ""."""
-    there, here = ({one.prefix for one in cameras(each)} for each in (before, opened))
-    if prefix in there or not there & here:
+    """Return why a camera continues no ids, if the log before has other cameras of this log but not this one; or ""."""
+    before_cameras, here = ({camera.prefix for camera in cameras(each)} for each in (before, opened))
+    if prefix in before_cameras or not before_cameras & here:
         return ""
     return f"{before.path} has no camera {prefix[1:]}: its ids begin with {opened.path}"
 
@@ -118,14 +118,14 @@ class Before:
 
     def _check_camera(self, opened: log.Log) -> None:
         before, prefix = self._log, self._prefix
-        there = [one.prefix[1:] for one in cameras(before)]
-        if prefix[1:] not in there:
+        names = [camera.prefix[1:] for camera in cameras(before)]
+        if prefix[1:] not in names:
             raise McaptrackError(
                 f"{opened.path} is of the camera {prefix[1:]}, and {before.path} is of "
-                f"{', '.join(sorted(there)) or 'none'}; ids go on from one recording of a camera to the next"
+                f"{', '.join(sorted(names)) or 'none'}; ids go on from one recording of a camera to the next"
             )
-        made, again = provenance_of(before, self.tracks), call("run", before.path)
-        if made is None or not _is_tracker(made) or not before.channels[self.tracks].messages:
+        provenance, again = provenance_of(before, self.tracks), call("run", before.path)
+        if provenance is None or not _is_tracker(provenance) or not before.channels[self.tracks].messages:
             raise McaptrackError(f"{before.path} has no tracks that ids could go on from; {again} makes them")
         if is_stale(before, self.tracks):
             raise McaptrackError(f"{before.path}: {self.tracks} is out of date; {again} brings it up to date")
@@ -134,11 +134,11 @@ class Before:
             raise McaptrackError(
                 f"{opened.path}: {self.tracks} wasn't made by `track`, so that its ids stay as they are"
             )
-        sizes = [picture_size(one, camera_at(one, prefix).pictures) for one in (before, opened)]
+        sizes = [picture_size(each, camera_at(each, prefix).pictures) for each in (before, opened)]
         if None not in sizes and sizes[0] != sizes[1]:
-            words = " and ".join("{} x {}".format(*size) for size in sizes if size)
+            text = " and ".join("{} x {}".format(*size) for size in sizes if size)
             raise McaptrackError(
-                f"{before.path} and {opened.path} have pictures of {words} pixels; they are not of one camera"
+                f"{before.path} and {opened.path} have pictures of {text} pixels; they are not of one camera"
             )
 
     def _check_times(self, opened: log.Log, first_ns: int) -> None:
@@ -170,9 +170,9 @@ class Before:
         return channel is not None and channel.schema_name == schema.name and channel.messages > 0
 
     def renewed(self, opened: log.Log) -> set[str]:
-        """The channels of ids that were not made as the continuation of this log, and have to be made again."""
-        made = provenance_of(opened, self.tracks)
-        is_new = made is not None and made.continued.get(AFTER) != digest_of(self._log, self.tracks)
+        """Return the channels with ids that don't continue those of the log before, and have to be made again."""
+        provenance = provenance_of(opened, self.tracks)
+        is_new = provenance is not None and provenance.continued.get(AFTER) != digest_of(self._log, self.tracks)
         return {self.tracks} if is_new else set()
 
     def lead(self, job: Job, numbers: Ints, planes: Planes) -> list[Frame]:
@@ -180,32 +180,32 @@ class Before:
 
         Their numbers are those before ``numbers`` (N,), which are of the frames of this log.
         """
-        made = provenance_of(self._log, job.target)
-        source = made.input if made and made.transform == job.stage else job.source
+        provenance = provenance_of(self._log, job.target)
+        source = provenance.input if provenance and provenance.transform == job.stage else job.source
         if not _is_led(job) or not self.is_bridged or source not in self._log.channels:
             return []
-        found = read_named_frames(self._log, source, job.transform.reads, job.frame_id).frames
-        low = int(np.searchsorted(frame_times(found), self._lead_ns))
-        frames = found[low:]
+        input_frames = read_named_frames(self._log, source, job.transform.reads, job.frame_id).frames
+        low = int(np.searchsorted(frame_times(input_frames), self._lead_ns))
+        frames = input_frames[low:]
         if job.transform.reads is TRACKS and _differ(read_planes(self._log, self._prefix), planes):
-            frames = [one._replace(rows=_in_planes(one, planes)) for one in frames]
+            frames = [frame._replace(rows=_in_planes(frame, planes)) for frame in frames]
         missing = round(self.result.gap_s * NS_PER_S / self._period_ns) if self._period_ns else 1
         first = int(numbers[0]) if len(numbers) else 0
         shift = first - max(missing, 1) - (frames[-1].index if frames else 0)
-        return [one._replace(index=one.index + shift) for one in frames]
+        return [frame._replace(index=frame.index + shift) for frame in frames]
 
     def in_context(self, transform: Transform) -> Transform:
         """The transform with the clock of the log before, if it samples."""
-        is_clocked = self.is_bridged and "start_ns" in {one.name for one in fields(transform)}
+        is_clocked = self.is_bridged and "start_ns" in {field.name for field in fields(transform)}
         return replace(transform, start_ns=self._lead_ns) if is_clocked else transform
 
     def own(self, job: Job, outputs: Sequence[Sequence[Frame]]) -> tuple[list[Sequence[Frame]], dict[str, str]]:
-        """The outputs of a job without the lead, under ids that go on; and how they go on, for the provenance."""
+        """Return the outputs of a job without the lead, with continued ids, and facts about that for the provenance."""
         if not _is_led(job):
             return [*outputs], {}
         schemas, topics = list(job.transform.writes.values()), list(job.outputs())
         if not _gives_ids(job) or not self._has(job.target, TRACKS):
-            return [self._kept(schema, one, None) for schema, one in zip(schemas, outputs, strict=True)], {}
+            return [self._kept(schema, output, None) for schema, output in zip(schemas, outputs, strict=True)], {}
         last_id = self._last_id(job)
         maps: dict[str, dict[int, int]] = {}
         for topic, schema, frames in zip(topics, schemas, outputs, strict=True):
@@ -227,10 +227,10 @@ class Before:
         return out, {AFTER: digest_of(self._log, job.target), LAST_ID: str(largest)}
 
     def _last_id(self, job: Job) -> int:
-        """The largest id up to the end of the log before, also in those before it."""
-        made = provenance_of(self._log, job.target)
-        known = made.continued.get(LAST_ID, "") if made else ""
-        largest = int(known) if known.isascii() and known.isdigit() and len(known) < 19 else 0
+        """Return the largest id in the log before, and in all logs that it continues."""
+        provenance = provenance_of(self._log, job.target)
+        last_id = provenance.continued.get(LAST_ID, "") if provenance else ""
+        largest = int(last_id) if last_id.isascii() and last_id.isdigit() and len(last_id) < 19 else 0
         for topic, schema in job.outputs().items():
             if schema is TRACKS and self._has(topic, TRACKS):
                 ids = unique_values(TRACKS, self._log.frame_columns(topic, TRACKS), "track_id")
@@ -238,7 +238,7 @@ class Before:
         return largest
 
     def _same(self, topic: str, frames: Sequence[Frame]) -> dict[int, int]:
-        """The ids of a channel in the log before, by those of the same tracks in this one."""
+        """Return the ids of tracks in the log before, by the ids of the same tracks in this log."""
         if not self.is_bridged or not self._has(topic, TRACKS):
             return {}
         before = self._log.frame_columns(topic, TRACKS)
@@ -255,22 +255,24 @@ class Before:
             if frame.t_ns >= self.start_ns + round(_AT_CUT_S * NS_PER_S):
                 break
             if frame.t_ns >= self.start_ns:
-                for source, one in zip(frame.rows["source_id"].tolist(), frame.rows["track_id"].tolist(), strict=True):
-                    if source >= 0 and source in last and one not in begun:
-                        votes[one, last[source]] += _OF_SOURCE
-                    begun.add(one)
+                for source, track_id in zip(
+                    frame.rows["source_id"].tolist(), frame.rows["track_id"].tolist(), strict=True
+                ):
+                    if source >= 0 and source in last and track_id not in begun:
+                        votes[track_id, last[source]] += _OF_SOURCE
+                    begun.add(track_id)
             elif frame.t_ns in at:
                 weight = 0.5 ** ((self.start_ns - frame.t_ns) / NS_PER_S / _HALF_S)
                 for pair in _pairs(frame.rows, before[at[frame.t_ns]].rows):
                     votes[pair] += weight
         out: dict[int, int] = {}
-        for (mine, theirs), _ in sorted(votes.items(), key=lambda one: (-one[1], one[0])):
+        for (mine, theirs), _ in sorted(votes.items(), key=lambda vote: (-vote[1], vote[0])):
             if mine not in out and theirs not in out.values():
                 out[mine] = theirs
         return out
 
     def _kept(self, schema: Schema, frames: Sequence[Frame], number: Callable[[Ints], Ints] | None) -> Sequence[Frame]:
-        """Frames of this log, without those of the lead; ``number`` gives the ids of rows."""
+        """Return the frames of this log without those of the lead; ``number`` returns the new ids of rows."""
         collector = FrameCollector(schema)
         for frame in frames:
             if frame.t_ns < self.start_ns:
@@ -286,9 +288,9 @@ class Before:
         """Count the ids at the cut, and those of them that go on."""
         before = self._log.frame_columns(topic, TRACKS)
         low = int(np.searchsorted(frame_times(before), self._end_ns - round(_AT_CUT_S * NS_PER_S)))
-        there = set(np.unique(before.rows(low)["track_id"]).tolist())
-        self.result.at_cut[topic] = len(there)
-        self.result.kept[topic] = len(there & set(unique_values(TRACKS, frames, "track_id").tolist()))
+        ids_at_cut = set(np.unique(before.rows(low)["track_id"]).tolist())
+        self.result.at_cut[topic] = len(ids_at_cut)
+        self.result.kept[topic] = len(ids_at_cut & set(unique_values(TRACKS, frames, "track_id").tolist()))
 
 
 def _is_led(job: Job) -> bool:
@@ -301,9 +303,9 @@ def _gives_ids(job: Job) -> bool:
     return job.transform.reads is DETECTIONS or STAGES[job.stage].repairs_tracks
 
 
-def _is_tracker(made: Provenance) -> bool:
+def _is_tracker(provenance: Provenance) -> bool:
     """Return whether a stage made tracks of detections."""
-    return made.transform in STAGES and STAGES[made.transform].default.reads is DETECTIONS
+    return provenance.transform in STAGES and STAGES[provenance.transform].default.reads is DETECTIONS
 
 
 def _start_ns(opened: log.Log, prefix: str) -> int:
@@ -316,9 +318,9 @@ def _start_ns(opened: log.Log, prefix: str) -> int:
 
 
 def warn_unfollowed(opened: log.Log, job: Job) -> None:
-    """Warn of ids that went on from another log, and begin at 1 again, since no log before is named."""
-    made = provenance_of(opened, job.target)
-    if _gives_ids(job) and made is not None and made.continued:
+    """Warn that ids which continued those of another log begin at 1 again, because this run names no log before."""
+    provenance = provenance_of(opened, job.target)
+    if _gives_ids(job) and provenance is not None and provenance.continued:
         warn(
             f"{job.target} went on from another log, and its ids are made without it now; name both, in order, with "
             "`follows=` to go on again",
@@ -327,7 +329,7 @@ def warn_unfollowed(opened: log.Log, job: Job) -> None:
 
 
 def led(lead: Sequence[Frame], frames: Sequence[Frame], schema: Schema) -> Sequence[Frame]:
-    """Frames after those of a lead."""
+    """Return the frames of a lead, followed by ``frames``."""
     collector = FrameCollector(schema)
     for frame in chain(lead, frames):
         collector.append(frame)
@@ -335,7 +337,7 @@ def led(lead: Sequence[Frame], frames: Sequence[Frame], schema: Schema) -> Seque
 
 
 def numbers_of(frames: Sequence[Frame]) -> Ints:
-    """The number of the first frame, (1,), or none."""
+    """Return the number of the first frame, (1,); (0,) without frames."""
     return frame_numbers(frames[:1])
 
 
@@ -359,12 +361,12 @@ def _pairs(mine: Rows, theirs: Rows) -> list[tuple[int, int]]:
 
 
 def _distances(mine: Rows, theirs: Rows) -> Floats:
-    """Distances (T, U) of rows, as shares of those at which they are of one person."""
+    """Distances (T, U) between rows, divided by the largest at which two rows can be of one person."""
     boxes, others = columns_to_boxes(mine), columns_to_boxes(theirs)
-    middle, other = (one[:, :2] + one[:, 2:] / 2 for one in (boxes, others))
+    middle, other = (box[:, :2] + box[:, 2:] / 2 for box in (boxes, others))
     apart = np.hypot(*(middle[:, None] - other).transpose(2, 0, 1))
     away = apart / np.maximum(_NEAR_HEIGHTS * others[:, 3], 1e-9)
-    on_ground = [np.stack([one["x_m"], one["y_m"]], axis=-1) for one in (mine, theirs)]
+    on_ground = [np.stack([rows["x_m"], rows["y_m"]], axis=-1) for rows in (mine, theirs)]
     metres = np.hypot(*(on_ground[0][:, None] - on_ground[1]).transpose(2, 0, 1)) / _NEAR_M
     out: Floats = np.nan_to_num(np.where(np.isfinite(away), away, metres), nan=np.inf)
     return out
@@ -375,7 +377,7 @@ def _differ(before: Planes | None, planes: Planes) -> bool:
 
 
 def _in_planes(frame: Frame, planes: Planes) -> Rows:
-    """Rows with positions by these planes, where they have boxes."""
+    """Return the rows of a frame; those with boxes get their positions by ``planes``."""
     plane, boxes = plane_at(planes, frame.t_ns), columns_to_boxes(frame.rows)
     at = np.flatnonzero(np.isfinite(boxes).all(axis=1))
     if plane is None or not len(at):

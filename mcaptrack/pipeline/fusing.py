@@ -110,29 +110,29 @@ def fuse_again(
     made it is not installed.
     """
     target = next(iter(_topics(prefix)))
-    made = provenance_of(opened, target)
-    if made is None or made.transform != FUSE:
+    provenance = provenance_of(opened, target)
+    if provenance is None or provenance.transform != FUSE:
         return {}
-    names = [str(name) for name in made.parameters["cameras"]]
-    is_open = adds and not made.parameters.get("cameras_given")
+    names = [str(name) for name in provenance.parameters["cameras"]]
+    is_open = adds and not provenance.parameters.get("cameras_given")
     more = [name for name in fusable(opened, (), prefix)[0] if name not in names] if is_open else []
-    before, why_not = fuser_of(made, fuser)
+    before, why_not = fuser_of(provenance, fuser)
     is_other = fuser is not None and (before is None or FUSION.choice(before) != FUSION.choice(fuser))
     if not (force or more or is_other or is_stale(opened, target)):
         return {}
     wanted = fuser if fuser is not None and (is_other or force) else before
     if wanted is None:
         raise McaptrackError(f"{opened.path}: {target} can't be made again: {why_not}")
-    offset_s = dict(zip(names, made.parameters["clock_offset_s"], strict=True))
-    given = {name: float(offset_s[name]) for name in made.parameters.get("clock_offsets_given", ())}
+    offset_s = dict(zip(names, provenance.parameters["clock_offset_s"], strict=True))
+    given_offset_s = {name: float(offset_s[name]) for name in provenance.parameters.get("clock_offsets_given", ())}
     why = f"was made by the {FUSION.entry(type(before))}" if is_other and before else "was made by another fuser"
     if not is_other:
         why = f"was made without {', '.join(more)}" if more else "was made from earlier detections or ground planes"
     names = sorted((*names, *more)) if more else names
     how = f"by the {FUSION.entry(type(wanted))}" if is_other else "as before"
     say(f"{target} {why}: fusing {', '.join(names)} again, {how}")
-    is_chosen = bool(made.parameters.get("cameras_given"))
-    return _fuse(opened, names, prefix, wanted, given, progress, is_asked=is_chosen, is_again=True)
+    is_chosen = bool(provenance.parameters.get("cameras_given"))
+    return _fuse(opened, names, prefix, wanted, given_offset_s, progress, is_asked=is_chosen, is_again=True)
 
 
 def fusable(opened: log.Log, names: Sequence[str] = (), scene: str = "/world") -> tuple[list[str], str]:
@@ -141,17 +141,19 @@ def fusable(opened: log.Log, names: Sequence[str] = (), scene: str = "/world") -
     They can if two cameras have detections and a measured ground plane, in the same frame.
     """
     scenes = {scene, *scenes_of(opened)}
-    ours = [one for one in cameras(opened) if one.prefix not in scenes and (not names or _has_name(one, names))]
-    lacks = {one: _lack(opened, one) for one in ours}
-    able = [one for one, why in lacks.items() if not why]
-    listed = [one.prefix[1:] for one in able]
-    frames = {name: frame_of_plane(opened, one) for name, one in zip(listed, able, strict=True)}
+    ours = [
+        camera for camera in cameras(opened) if camera.prefix not in scenes and (not names or _has_name(camera, names))
+    ]
+    lacks = {our: _lack(opened, our) for our in ours}
+    able = [camera for camera, why in lacks.items() if not why]
+    listed = [camera.prefix[1:] for camera in able]
+    frames = {name: frame_of_plane(opened, camera) for name, camera in zip(listed, able, strict=True)}
     if len(able) < 2:
-        why = "; ".join(f"{one.prefix[1:]} {reason}" for one, reason in lacks.items() if reason)
+        why = "; ".join(f"{camera.prefix[1:]} {reason}" for camera, reason in lacks.items() if reason)
         return [], f"only {listed[0]} can be fused, since {why}" if able else why
     if len(set(frames.values())) > 1:
         return [], f"their ground planes are in different frames, {frames_in_words(frames)}"
-    return listed, "; ".join(f"{one.prefix[1:]} {why}" for one, why in lacks.items() if why)
+    return listed, "; ".join(f"{camera.prefix[1:]} {why}" for camera, why in lacks.items() if why)
 
 
 def _has_name(camera: Camera, names: Sequence[str]) -> bool:
@@ -190,9 +192,9 @@ def _fuse(
             results = feet.fused(gathered.joined(feet))
         else:
             results = guarded(FUSION.entry(type(fuser)), fuser, gathered)
-        for count, made in enumerate(results, start=1):
+        for count, result in enumerate(results, start=1):
             progress(FUSE, count, len(gathered))
-            by_suffix = dict(zip(fuser.writes, made, strict=True))
+            by_suffix = dict(zip(fuser.writes, result, strict=True))
             for suffix, collector in zip(("", "sightings"), collectors, strict=True):
                 collector.append(by_suffix[suffix])
         if shared.are_strangers:
@@ -206,7 +208,7 @@ def _fuse(
             )
     for notice in warnings:
         warn(notice.message, notice.code)
-    own = {one.name: getattr(fuser, one.name) for one in fields(fuser) if not one.metadata.get("context")}
+    own = {field.name: getattr(fuser, field.name) for field in fields(fuser) if not field.metadata.get("context")}
     parameters = {
         **own,
         "fuser": FUSION.entry(type(fuser)).name,
@@ -235,7 +237,7 @@ def _fuse(
 
 
 def _feet_of(fuser: Transform) -> FootFuser:
-    """The fuser by which cameras are compared: the same one, or for another one the usual one, with its noise."""
+    """Return the fuser by which cameras are compared: a ``FootFuser`` itself, else the usual one with its noise."""
     if isinstance(fuser, FootFuser):
         return fuser
     return FootFuser(**{name: getattr(fuser, name) for name in ("noise", "noise_m") if hasattr(fuser, name)})
@@ -245,17 +247,17 @@ def _with_views(fuser: Transform, feet: FootFuser) -> Transform:
     """A fuser with the views of the cameras, if it has a field for them."""
     if isinstance(fuser, FootFuser):
         return feet
-    names = {one.name for one in fields(fuser) if one.metadata.get("context")}
+    names = {field.name for field in fields(fuser) if field.metadata.get("context")}
     return replace(fuser, views=feet.views) if "views" in names else fuser
 
 
 def _chosen(opened: log.Log, names: Sequence[str], scene: str) -> list[Camera]:
     """The cameras to fuse. Raises McaptrackError if one is not there, or lacks something."""
-    known = {name.strip("/"): camera for camera in cameras(opened) for name in camera.names if camera.prefix != scene}
+    by_name = {name.strip("/"): camera for camera in cameras(opened) for name in camera.names if camera.prefix != scene}
     for name in names:
-        if name.strip("/") not in known:
-            raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(known)) or 'none'}")
-    wanted = [known[name.strip("/")] for name in names] if names else list(dict.fromkeys(known.values()))
+        if name.strip("/") not in by_name:
+            raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(by_name)) or 'none'}")
+    wanted = [by_name[name.strip("/")] for name in names] if names else list(dict.fromkeys(by_name.values()))
     lacks = {camera.prefix[1:]: why for camera in wanted if (why := _lack(opened, camera))}
     if names and lacks:
         raise McaptrackError(f"{opened.path}: {next(iter(lacks))} {next(iter(lacks.values()))}")

@@ -62,7 +62,7 @@ class Gathered:
 
     def __init__(self, sources: Sequence[Source], fuser: FootFuser) -> None:
         self._sources, self._noise, self._noise_m = sources, fuser.noise, fuser.noise_m
-        self.at = min(sources, key=lambda one: len(one.frames) / max(float(np.ptp(one.t_ns)), 1.0))
+        self.at = min(sources, key=lambda source: len(source.frames) / max(float(np.ptp(source.t_ns)), 1.0))
         step_s = float(np.median(np.diff(self.at.t_ns))) / NS_PER_S if len(self.at.t_ns) > 1 else _MOST_WITHIN_S
         self._within_ns = round(min(_WITHIN * step_s, _MOST_WITHIN_S) * NS_PER_S)
         #: Frames before time 0, where the clock of the slowest camera is late by more than the beginning of the log.
@@ -87,7 +87,7 @@ class Gathered:
             yield block
 
     def _from(self, begin: int) -> Iterator[Frame]:
-        nearest = [_nearest(one.t_ns, self.at.t_ns) for one in self._sources]
+        nearest = [_nearest(source.t_ns, self.at.t_ns) for source in self._sources]
         for first in range(begin, len(self.at.t_ns), _TOGETHER):
             yield from self._frames(range(first, min(first + _TOGETHER, len(self.at.t_ns))), nearest)
 
@@ -99,7 +99,7 @@ class Gathered:
             index = nearest[camera][numbers.start : numbers.stop]
             away_ns = source.t_ns[index] - times
             near = np.abs(away_ns) <= self._within_ns
-            frames = [source.frames[one] for one in index[near].tolist()]
+            frames = [source.frames[number] for number in index[near].tolist()]
             rows, frame = self._seen(camera, source, frames, away_ns[near] / NS_PER_S)
             parts.append(rows)
             counts.append(np.flatnonzero(near)[frame])
@@ -113,9 +113,9 @@ class Gathered:
         if not frames:
             return SIGHTINGS.empty(), np.empty(0, np.int64)
         counts = [len(frame.rows) for frame in frames]
-        frame, rows = group_index(counts), DETECTIONS.joined([one.rows for one in frames])
+        frame, rows = group_index(counts), DETECTIONS.joined([frame.rows for frame in frames])
         noise_m, xywh = np.hypot(self._noise_m, _PACE_M_PER_S * away_s)[frame], columns_to_boxes(rows)
-        times, ends = np.array([one.t_ns for one in frames]), np.cumsum(counts).tolist()
+        times, ends = np.array([frame.t_ns for frame in frames]), np.cumsum(counts).tolist()
         places = [
             source.view.places(xywh[part], int(times[low]), self._noise, noise_m[part])
             for low, high in runs_of_planes(source.view.planes, times.tolist())
@@ -165,12 +165,12 @@ def read_sources(
     for camera in chosen:
         name, topic = camera.prefix[1:], detections_of(opened, camera)
         assert topic is not None
-        found = read_named_frames(opened, topic, DETECTIONS)
-        if not len(found.frames):
+        named_frames = read_named_frames(opened, topic, DETECTIONS)
+        if not len(named_frames.frames):
             warn(f"{name} is left out: {topic} has no messages", "left-out")
             continue
         references |= {topic: digest_of(opened, topic), camera.ground_plane: digest_of(opened, camera.ground_plane)}
-        for number, word in found.classes.items():
+        for number, word in named_frames.classes.items():
             if classes.setdefault(str(number), word) != word:
                 raise McaptrackError(
                     f"{opened.path}: class {number} is {classes[str(number)]} in one camera and {word} in {topic}; "
@@ -178,10 +178,10 @@ def read_sources(
                 )
         frames_of[name] = frame_of_plane(opened, camera)
         view = CameraView(name=name, planes=tuple(read_planes(opened, camera.prefix) or ()))
-        view = view.with_heights_in(found.frames)
-        t_ns = frame_times(found.frames)
+        view = view.with_heights_in(named_frames.frames)
+        t_ns = frame_times(named_frames.frames)
         offset_ns = round(clock_offset_s.get(name, 0.0) * NS_PER_S)
-        sources.append(Source(topic, found.frames, t_ns - offset_ns, view))
+        sources.append(Source(topic, named_frames.frames, t_ns - offset_ns, view))
     if not sources:
         raise McaptrackError(f"{opened.path} has no detections to fuse: all channels are empty")
     if len(set(frames_of.values())) > 1:
@@ -190,17 +190,17 @@ def read_sources(
 
 
 def compared_cameras(
-    sources: list[Source], fuser: FootFuser, given: Mapping[str, float]
+    sources: list[Source], fuser: FootFuser, given_offset_s: Mapping[str, float]
 ) -> tuple[Gathered, FootFuser, tuple[Offset, ...], dict[str, float], Shared]:
     """Estimate how well the cameras agree, and the offsets of clocks that are not given."""
-    offset_s = {one.view.name: given.get(one.view.name, 0.0) for one in sources}
+    offset_s = {source.view.name: given_offset_s.get(source.view.name, 0.0) for source in sources}
     for _ in range(3):
         gathered = Gathered(sources, fuser)
-        fuser = replace(fuser, views=tuple(one.view for one in sources))
+        fuser = replace(fuser, views=tuple(source.view for source in sources))
         every = max(len(gathered) // _COMPARED, 1)
         part = (frame for number, frame in enumerate(gathered) if number // 2 % every == 0)
         blocks = gathered.joined(fuser, keeps=True) if every == 1 else fuser.joined(part)
-        taken_ns = [round(offset_s[one.view.name] * NS_PER_S) for one in sources]
+        taken_ns = [round(offset_s[source.view.name] * NS_PER_S) for source in sources]
         views, offsets, shared = compare(blocks, fuser.views, taken_ns)
         late = {
             view.name: round(offset.late_s, 3)
@@ -208,12 +208,14 @@ def compared_cameras(
             if np.isfinite(offset.late_s)
         }
         worst = max(late, key=lambda name: abs(late[name]), default="")
-        if not worst or worst in given or abs(late[worst]) < _LATE_S:
+        if not worst or worst in given_offset_s or abs(late[worst]) < _LATE_S:
             break
         # One camera at a time, the worst first, because those that are right look late beside it.
         offset_s[worst] = round(offset_s[worst] + late[worst], 3)
         shift_ns = round(late[worst] * NS_PER_S)
-        sources = [one._replace(t_ns=one.t_ns - shift_ns) if one.view.name == worst else one for one in sources]
+        sources = [
+            source._replace(t_ns=source.t_ns - shift_ns) if source.view.name == worst else source for source in sources
+        ]
     return gathered, replace(fuser, views=views), offsets, offset_s, shared
 
 
@@ -222,7 +224,7 @@ def warn_disagreeing(
     views: Sequence[CameraView],
     offsets: Sequence[Offset],
     offset_s: Mapping[str, float],
-    given: Mapping[str, float],
+    given_offset_s: Mapping[str, float],
 ) -> None:
     """Warn of cameras that disagree with the others; ``path`` is that of the log."""
     correct = call("calibrate", path)
@@ -235,7 +237,7 @@ def warn_disagreeing(
                 f"{offset.compared}); its ground plane, or theirs, is not right; {correct} corrects it",
                 "cameras-disagree",
             )
-        if taken_s and name not in given:
+        if taken_s and name not in given_offset_s:
             warn(
                 f"{name}: its times are {abs(taken_s):.2f} s {'late' if taken_s > 0 else 'early'}, as people who walk "
                 f"show; this is taken off (`clock_offset_s=` sets it, with 0 for none)",

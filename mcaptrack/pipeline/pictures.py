@@ -75,12 +75,12 @@ class KeptPictures:
                 rows = frame.rows.copy()  # a transform may draw into its pictures
                 difference = rows - before if rows.shape == before.shape else rows
                 try:
-                    there = file.put(np.ascontiguousarray(difference).data)
+                    place = file.put(np.ascontiguousarray(difference).data)
                 except McaptrackError:  # there is no room
                     left = 0
                 else:
-                    before, left = rows, left - there.stored
-                    kept.append(_Kept(frame.t_ns, frame.index, rows.shape, there))
+                    before, left = rows, left - place.stored
+                    kept.append(_Kept(frame.t_ns, frame.index, rows.shape, place))
                 if left <= 0:
                     kept, file = [], SpillFile()
             yield frame
@@ -88,8 +88,8 @@ class KeptPictures:
 
     def _again(self) -> Iterator[Frame]:
         before: Image = np.zeros(0, np.uint8)
-        for t_ns, index, shape, there in self._kept:
-            difference = np.frombuffer(self._file.get(there), np.uint8).reshape(shape)
+        for t_ns, index, shape, place in self._kept:
+            difference = np.frombuffer(self._file.get(place), np.uint8).reshape(shape)
             before = before + difference if before.shape == shape else difference
             yield Frame(t_ns, index, before.copy())
 
@@ -119,12 +119,12 @@ class Ahead:
         self._frames = frames
 
     def __iter__(self) -> Iterator[Frame]:
-        made: Queue[Frame | BaseException | None] = Queue(_WAITING)
+        queue: Queue[Frame | BaseException | None] = Queue(_WAITING)
         is_over = Event()
-        thread = Thread(target=copy_context().run, args=(_make, self._frames, made, is_over), daemon=True)
+        thread = Thread(target=copy_context().run, args=(_make, self._frames, queue, is_over), daemon=True)
         thread.start()
         try:
-            while isinstance(frame := made.get(), Frame):
+            while isinstance(frame := queue.get(), Frame):
                 yield frame
             if frame is not None:
                 raise frame
@@ -133,22 +133,22 @@ class Ahead:
             thread.join()
 
 
-def _make(frames: Iterable[Frame], made: Queue[Frame | BaseException | None], is_over: Event) -> None:
+def _make(frames: Iterable[Frame], queue: Queue[Frame | BaseException | None], is_over: Event) -> None:
     """Put frames into the queue until they are all made or no more are wanted; then None, or what went wrong."""
     last: BaseException | None = None
     try:
         for frame in frames:
-            if not _put(frame, made, is_over):
+            if not _put(frame, queue, is_over):
                 break
     except BaseException as error:  # it is raised where frames are read
         last = error
-    _put(last, made, is_over)
+    _put(last, queue, is_over)
 
 
-def _put(one: Frame | BaseException | None, made: Queue[Frame | BaseException | None], is_over: Event) -> bool:
+def _put(item: Frame | BaseException | None, queue: Queue[Frame | BaseException | None], is_over: Event) -> bool:
     while not is_over.is_set():
         try:
-            made.put(one, timeout=_PAUSE_S)
+            queue.put(item, timeout=_PAUSE_S)
         except Full:
             continue
         return True
@@ -217,20 +217,20 @@ def with_descriptors(
     compares, stores = getattr(transform, "appearance", False), getattr(transform, "store_appearance", False)
     if compares is False and not stores:
         return transform
-    topic, found = camera_at(opened, prefix).pictures, None
+    topic, descriptors = camera_at(opened, prefix).pictures, None
     why = _why_not(transform, frames, keep) if topic else f"the log has no pictures of {prefix}"
     if topic and not why:
-        found, why = _descriptors(opened, topic, frames, progress)
+        descriptors, why = _descriptors(opened, topic, frames, progress)
     if compares and why:
         warn(f"`appearance=` changes nothing here: {why}", "option-not-used")
     if stores and why:
         warn(f"`store_appearance=` finds nothing to write: {why}", "option-not-used")
-    return transform if found is None else replace(transform, descriptors=found)
+    return transform if descriptors is None else replace(transform, descriptors=descriptors)
 
 
 def _why_not(transform: Transform, frames: Sequence[Frame], keep: Collection[str] | None) -> str:
-    """Return why pictures are of no use; "" if they are."""
-    if keep is not None and all(transform.latency_s.get(one) != float("inf") for one in keep):
+    """Return why pictures can't be used; "" if they can."""
+    if keep is not None and all(transform.latency_s.get(output) != float("inf") for output in keep):
         return "tracks that use the past alone (online) don't look at pictures"
     if getattr(transform, "leaves_unchanged", False) and not getattr(transform, "links_in_picture", False):
         return "tracks are left as they are"
@@ -242,7 +242,7 @@ def _why_not(transform: Transform, frames: Sequence[Frame], keep: Collection[str
 def _descriptors(
     opened: log.Log, topic: str, frames: Sequence[Frame], progress: Callable[[str, int, int], None]
 ) -> tuple[Descriptors | None, str]:
-    """Return what is seen of ``frames`` in the pictures of a channel; or None, and why not."""
+    """Return the descriptors of ``frames`` in the pictures of a channel; or None, and the reason."""
     damaged: list[McaptrackError] = []
     try:
         pictures = Pictures(opened, topic)
@@ -280,7 +280,7 @@ def _described(
     progress: Callable[[int, int], None],
     damaged: list[McaptrackError],
 ) -> Iterator[Descriptors]:
-    """For each frame with a picture what is seen in its samples; pictures that can't be decoded add to ``damaged``."""
+    """Yield the descriptors of each frame with a picture; errors of pictures are added to ``damaged``."""
     shown = np.flatnonzero(nearest >= 0)  # in order of time, as pictures are
     wanted, of_picture = np.unique(nearest[shown], return_index=True)
     decoded = _decodable(pictures, wanted.tolist(), damaged)
@@ -303,7 +303,7 @@ def _described(
 
 
 def _decodable(pictures: Pictures, wanted: list[int], damaged: list[McaptrackError]) -> Iterator[Frame]:
-    """Those of the ``wanted`` pictures that can be decoded; the errors of the others are added to ``damaged``.
+    """Yield the ``wanted`` pictures that can be decoded; the errors of others are added to ``damaged``.
 
     Raises McaptrackError if many in a row can't be.
     """

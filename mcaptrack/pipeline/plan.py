@@ -123,13 +123,13 @@ def spaces_of_boxes(opened: log.Log, topic: str) -> frozenset[Space]:
         return frozenset({"picture"})
     if not frame_id_of(channel.metadata) and is_made_by_stage(channel):
         return frozenset({"picture"})
-    there: dict[Space, str] = {"picture": "x_px", "ground": "x_m"}
-    found = set[Space]()
+    columns: dict[Space, str] = {"picture": "x_px", "ground": "x_m"}
+    spaces_seen = set[Space]()
     for _, _, part in joined_parts(DETECTIONS, opened.frame_columns(topic, DETECTIONS)):
-        found |= {space for space, column in there.items() if np.isfinite(part.rows[column]).any()}
-        if len(found) == len(there):
+        spaces_seen |= {space for space, column in columns.items() if np.isfinite(part.rows[column]).any()}
+        if len(spaces_seen) == len(columns):
             break
-    return frozenset(found)
+    return frozenset(spaces_seen)
 
 
 def tracker_of(space: str) -> str:
@@ -159,7 +159,7 @@ def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: st
     """
     sources = {job.source for job in jobs if job.source in opened.channels}
     is_calibrated = any(map(holds_calibrations, opened.channels.values()))
-    has_boxes = camera_at(opened, prefix).in_space or any(holds_boxes_3d(opened, one) for one in sources)
+    has_boxes = camera_at(opened, prefix).in_space or any(holds_boxes_3d(opened, source) for source in sources)
     if frame_id and not has_boxes and not is_calibrated:
         warn("`frame=` has no effect: only recorded 3D boxes are brought to a frame", "option-not-used")
     for job in jobs:
@@ -167,15 +167,12 @@ def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: st
             continue
         spaces, space = spaces_of_boxes(opened, job.source), traits_of(job.transform).space
         if spaces and space not in spaces:
-            there = " and ".join(_BOXES[one] for one in sorted(spaces))
+            has = " and ".join(_BOXES[name_of_space] for name_of_space in sorted(spaces))
             name, others = STAGES["track"].choice(job.transform), _trackers_of(next(iter(sorted(spaces))))
             other = f"`tracker={others[0]!r}` takes these" if others else "no built-in one takes these"
             raise McaptrackError(
-                f"{opened.path}: {job.source} has {there}, and the tracker {name} takes {_BOXES[space]}; " + other
+                f"{opened.path}: {job.source} has {has}, and the tracker {name} takes {_BOXES[space]}; " + other
             )
-
-
-# Whether a channel is out of date.
 
 
 # Corrections by people in the pipeline: samples are of corrected tracks, and re-tracking keeps these as they are.
@@ -185,16 +182,18 @@ def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: st
 _STAGE: Final = "sample"
 
 
-def are_new(opened: log.Log, prefix: str, made: Provenance) -> bool:
-    """Whether samples were made before their tracks were corrected."""
-    found = corrections_of(opened, camera_at(opened, prefix).prefix, made.input) if made.transform == _STAGE else None
-    return found is not None and found not in made.references
+def are_new(opened: log.Log, prefix: str, how: Provenance) -> bool:
+    """Whether samples were made before their tracks had corrections."""
+    corrections = (
+        corrections_of(opened, camera_at(opened, prefix).prefix, how.input) if how.transform == _STAGE else None
+    )
+    return corrections is not None and corrections not in how.references
 
 
 def corrected_input(
     opened: log.Log, prefix: str, job: Job, frames: Sequence[Frame]
 ) -> tuple[Sequence[Frame], Mapping[str, str]]:
-    """The frames that a job samples, with corrections, and the digests of these by topic; all others as they are."""
+    """Return the input of a job, corrected if it is sampled, and the digests of the corrections by topic."""
     topic = corrections_of(opened, prefix, job.source) if job.stage == _STAGE else None
     if topic is None:
         return frames, {}
@@ -208,57 +207,57 @@ def corrected_tracks(opened: log.Log, prefix: str, source: str, tracks: Sequence
 
 
 def without_filled_in(opened: log.Log, prefix: str, source: str, frames: Sequence[Frame]) -> Sequence[Frame]:
-    """Re-tracked tracks at the rate of those at ``source``, without boxes that corrections of these don't have."""
+    """Leave out boxes that re-tracking filled in where corrections of the tracks at ``source`` have none."""
     topic = corrections_of(opened, prefix, source)
     return frames if topic is None else without_filled(frames, opened.frame_columns(topic, TRACKS))
 
 
-def is_of_corrections(opened: log.Log, prefix: str, made: Provenance) -> bool:
+def is_of_corrections(opened: log.Log, prefix: str, provenance: Provenance) -> bool:
     """Whether samples are out of date because corrections of their tracks are new, changed or gone."""
-    if made.transform != _STAGE:
+    if provenance.transform != _STAGE:
         return False
     ending = f"/{CORRECTED}"
-    then = {topic: digest for topic, digest in made.references.items() if topic.endswith(ending)}
-    found = corrections_of(opened, camera_at(opened, prefix).prefix, made.input)
-    return then != ({} if found is None else {found: digest_of(opened, found)})
+    then = {topic: digest for topic, digest in provenance.references.items() if topic.endswith(ending)}
+    corrections = corrections_of(opened, camera_at(opened, prefix).prefix, provenance.input)
+    return then != ({} if corrections is None else {corrections: digest_of(opened, corrections)})
 
 
-def fixed_in(opened: log.Log, prefix: str, source: str, made: Mapping[str, Made]) -> tuple[int, ...]:
+def fixed_in(opened: log.Log, prefix: str, source: str, results: Mapping[str, Made]) -> tuple[int, ...]:
     """The ids of corrected tracks in the samples at ``source``; () if they were made without corrections."""
-    how = made[source].provenance if source in made else provenance_of(opened, source)
+    how = results[source].provenance if source in results else provenance_of(opened, source)
     topic = corrections_of(opened, prefix, how.input) if how and how.transform == _STAGE else None
     if how is None or topic is None or topic not in how.references:
         return ()
-    tracks = made[how.input].frames if how.input in made else opened.frame_columns(how.input, TRACKS)
+    tracks = results[how.input].frames if how.input in results else opened.frame_columns(how.input, TRACKS)
     return fixed_ids(tracks, opened.frame_columns(topic, TRACKS))
 
 
 def is_stale(opened: log.Log, topic: str) -> bool:
     """Return whether an input or reference of ``topic``, or its ground plane, has changed since it was made."""
-    made = Provenance.from_metadata(opened.channel(topic).metadata)
-    if made is None:
+    provenance = Provenance.from_metadata(opened.channel(topic).metadata)
+    if provenance is None:
         return False
     prefix = name_above(chain_of(opened, topic)[-1])
-    if "ground_planes" in made.parameters:
+    if "ground_planes" in provenance.parameters:
         planes = read_planes(opened, prefix)
-        if planes_to_json(planes or ()) != made.parameters["ground_planes"]:
+        if planes_to_json(planes or ()) != provenance.parameters["ground_planes"]:
             return True
-    if motion.is_motion_new(opened, prefix, made) or are_new(opened, prefix, made):
+    if motion.is_motion_new(opened, prefix, provenance) or are_new(opened, prefix, provenance):
         return True
-    if _has_other_planes(opened, made):
+    if _has_other_planes(opened, provenance):
         return True
-    if any((name in opened.channels) != bool(then) for name, then in made.references.items()):
+    if any((name in opened.channels) != bool(then) for name, then in provenance.references.items()):
         return True
-    for name, then in made.made_from().items():
+    for name, then in provenance.made_from().items():
         now = provenance_of(opened, name)
         if now and now.digest and now.digest != then:
             return True
     return False
 
 
-def _has_other_planes(opened: log.Log, made: Provenance) -> bool:
+def _has_other_planes(opened: log.Log, provenance: Provenance) -> bool:
     """Return whether a camera of a scene has a corrected ground plane, or has none any more."""
-    planes = [name for name in made.references if made.transform == FUSE and is_plane(name)]
+    planes = [name for name in provenance.references if provenance.transform == FUSE and is_plane(name)]
     return any(camera_at(opened, name_above(name)).ground_plane != name for name in planes)
 
 
@@ -305,8 +304,8 @@ class _Planner:
             raise McaptrackError(self._refusal())
         check_inputs(self._opened, self._prefix, self.jobs)
         check_spaces(self._opened, self._prefix, self.jobs, self._frame_id)
-        for words in self._notes:
-            say(words)
+        for note in self._notes:
+            say(note)
         return self.jobs
 
     def source_of(self, stage: str) -> str:
@@ -343,31 +342,31 @@ class _Planner:
 
     def _plan(self, topic: str) -> bool:
         usual = USUAL.get(topic.removeprefix(self._prefix + "/"), "") if topic.startswith(self._prefix + "/") else ""
-        made = provenance_of(self._opened, topic)
+        provenance = provenance_of(self._opened, topic)
         if topic not in self._opened.channels:
             sibling = self._sibling(usual, topic)
             return self._make_again(sibling, usual, topic) if sibling else bool(usual) and self._make(usual, topic)
-        if made is None or made.transform not in STAGES:
+        if provenance is None or provenance.transform not in STAGES:
             if usual in self._sources and topic != self._sources[usual]:
                 raise McaptrackError(self._not_made(usual, topic))
             return False  # no stage makes recorded and ingested channels
-        return self._make_again(made, made.transform, topic)
+        return self._make_again(provenance, provenance.transform, topic)
 
     def _sibling(self, stage: str, topic: str) -> Provenance | None:
         """Return the provenance of another output of the stage that makes ``topic``; None if there is none."""
         topics = STAGES[stage].outputs(main_topic(self._opened, stage, topic)) if stage else ()
-        found = (provenance_of(self._opened, one) for one in topics)
-        return next((made for made in found if made and made.transform == stage), None)
+        provenances = (provenance_of(self._opened, output) for output in topics)
+        return next((provenance for provenance in provenances if provenance and provenance.transform == stage), None)
 
-    def _replace_older(self, made: Provenance, stage: str, topic: str) -> bool:
+    def _replace_older(self, provenance: Provenance, stage: str, topic: str) -> bool:
         """With ``force`` plan the stage of a channel of an older version by its defaults; or else say that it stays."""
         if self._force:
-            return self._make(stage, topic, f"was made by version {made.version}")
+            return self._make(stage, topic, f"was made by version {provenance.version}")
         if not self._is_of_older_version:
             self._is_of_older_version = True
             force = call("run", self._opened.path, force=True)
-            words = f"made by an older version ({made.version}), and left as it is; {force} makes all again"
-            warn(f"{topic} was {words}", "out-of-date")
+            text = f"made by an older version ({provenance.version}), and left as it is; {force} makes all again"
+            warn(f"{topic} was {text}", "out-of-date")
         return False
 
     def _make(self, stage: str, topic: str, why: str = "is missing") -> bool:
@@ -384,24 +383,24 @@ class _Planner:
     def _suited(self, stage: str, source: str) -> Transform | None:
         """Create the transform that the maker of a stage's input recommends for the stage; None if it names none."""
         option, maker = STAGES[stage].option, self._maker_of(source)
-        found = traits_of(maker).suited(option)
-        if maker is None or found is None:
+        suited = traits_of(maker).suited(option)
+        if maker is None or suited is None:
             name = self.suited_tracker(stage, source)
             return STAGES[stage].make(name) if name else None
-        made_by = next(one for one in STAGES.values() if f"{self._prefix}/{one.output_topic}" == source)
+        made_by = next(producer for producer in STAGES.values() if f"{self._prefix}/{producer.output_topic}" == source)
         made_by = FUSION if maker.reads is SIGHTINGS else made_by
         named = f"{made_by.option} {made_by.choice(maker)}"
-        parameters, planes = dict(found.parameters), read_planes(self._opened, self._prefix)
+        parameters, planes = dict(suited.parameters), read_planes(self._opened, self._prefix)
         if planes and not is_assumed(planes):
-            parameters |= found.on_ground
+            parameters |= suited.on_ground
         try:
-            transform = STAGES[stage].make(found.name, **parameters)
+            transform = STAGES[stage].make(suited.name, **parameters)
         except McaptrackError as error:
             raise McaptrackError(
-                f"{made_by.entry(type(maker))} suits {found.name}, but {error}; `{option}=` chooses another"
+                f"{made_by.entry(type(maker))} suits {suited.name}, but {error}; `{option}=` chooses another"
             ) from None
         values = ", ".join(f"{key} {value}" for key, value in parameters.items())
-        by = found.name + (f" ({values})" if values else "")
+        by = suited.name + (f" ({values})" if values else "")
         self._notes.append(f"{stage} by {by}, which suits the {named}; `{option}=` chooses")
         return transform
 
@@ -410,31 +409,31 @@ class _Planner:
         for job in self.jobs:
             if topic in job.outputs():
                 return job.transform
-        made = provenance_of(self._opened, topic)
-        if made and made.transform == FUSE:
-            return fuser_of(made)[0]
-        return self._before(made.transform, made)[0] if made and made.transform in STAGES else None
+        how = provenance_of(self._opened, topic)
+        if how and how.transform == FUSE:
+            return fuser_of(how)[0]
+        return self._before(how.transform, how)[0] if how and how.transform in STAGES else None
 
     def _is_made_by_another(self, topic: str) -> bool:
         """Return whether this run makes a channel by another class of transforms than before."""
-        made = provenance_of(self._opened, topic)
+        provenance = provenance_of(self._opened, topic)
         jobs = [job for job in self.jobs if topic in job.outputs()]
-        if not jobs or made is None or made.transform not in STAGES:
+        if not jobs or provenance is None or provenance.transform not in STAGES:
             return False
-        stage, before = STAGES[made.transform], self._before(made.transform, made)[0]
+        stage, before = STAGES[provenance.transform], self._before(provenance.transform, provenance)[0]
         return before is None or stage.choice(before) != stage.choice(jobs[0].transform)
 
-    def _make_again(self, made: Provenance, stage: str, topic: str) -> bool:
+    def _make_again(self, provenance: Provenance, stage: str, topic: str) -> bool:
         """Plan the stage of a channel again if the channel is missing, out of date, or gets another input now."""
         is_missing = topic not in self._opened.channels
-        had = made.input or self.source_of(stage)
+        had = provenance.input or self.source_of(stage)
         source = self._sources.get(stage, had)
-        is_changed = [self.ensure(one) for one in (source, *made.references)]
+        is_changed = [self.ensure(used) for used in (source, *provenance.references)]
         is_due = any(is_changed) or is_missing or is_stale(self._opened, topic) or source != had
         is_due = is_due or topic in self._renewed
-        before, why_not = self._before(stage, made)
+        before, why_not = self._before(stage, provenance)
         if isinstance(why_not, OlderVersionError):
-            return self._replace_older(made, stage, topic)
+            return self._replace_older(provenance, stage, topic)
         main = main_topic(self._opened, stage, topic)
         # A result at another topic keeps the parameters that it was requested with.
         is_usual = main == f"{self._prefix}/{STAGES[stage].output_topic}"
@@ -442,8 +441,9 @@ class _Planner:
         suited = self._suited(stage, source) if is_open else None
         wanted = self._with_choice(self._defaults.get(stage, suited or before)) if is_usual else before
         is_replaced = is_usual and (self._is_replaced(STAGES[stage], before, wanted) or suited is not None)
-        is_replaced = is_replaced or self._frame_id not in ("", made.frame_id or self._frame_id)
-        is_projected = is_usual and STAGES[stage].needs_scale and self._is_plane_due(source)
+        is_replaced = is_replaced or self._frame_id not in ("", provenance.frame_id or self._frame_id)
+        is_projected = is_usual and STAGES[stage].needs_scale
+        is_projected = is_projected and is_plane_due(self._opened, self._prefix, source, self._plane)
         is_due = is_due or is_projected
         if wanted and not is_replaced and not self._force:
             self._warn_settings(main, differing(before, wanted) if before else str(why_not))
@@ -479,12 +479,12 @@ class _Planner:
         elif topic in self._renewed:
             self._notes.append(f"{topic} goes on from another log: running {stage} again")
         elif is_due and not self._force:
-            is_corrected = is_of_corrections(self._opened, self._prefix, made)
+            is_corrected = is_of_corrections(self._opened, self._prefix, provenance)
             why = f"{topic} was made from an earlier {source}"
             why = f"corrections of {source} have changed" if is_corrected else why
             self._notes.append(f"{why}: running {stage} again, as before")
-        there = [f"{main}/{suffix}".rstrip("/") for suffix in transform.writes]
-        kept = [one == topic or one in self._opened.channels for one in there]
+        all_outputs = [f"{main}/{suffix}".rstrip("/") for suffix in transform.writes]
+        kept = [output == topic or output in self._opened.channels for output in all_outputs]
         beside = STAGES[stage].beside if topic == main or main in self._opened.channels else ()
         possible = before.writes if before else (*transform.writes,)[:1]  # what the former class didn't make is new
         kept = [
@@ -495,10 +495,6 @@ class _Planner:
         self.add(Job(stage, transform, source, main, None if all(kept) else keep, frame_id=self._frame_id))
         return True
 
-    def _is_plane_due(self, source: str) -> bool:
-        """Return whether the ground plane is made again from these boxes, because it would be another now."""
-        return is_plane_due(self._opened, self._prefix, source, self._plane)
-
     def _is_replaced(self, stage: Stage, before: Transform | None, wanted: Transform | None) -> bool:
         """Return whether the user chose another class for a stage than the one that made its channel."""
         if any(hasattr(wanted, name) and getattr(before, name, None) != now for name, now in self._shared.items()):
@@ -507,10 +503,10 @@ class _Planner:
             return False
         return before is None or stage.choice(before) != stage.choice(wanted)
 
-    def _before(self, stage: str, made: Provenance) -> tuple[Transform | None, McaptrackError | None]:
+    def _before(self, stage: str, provenance: Provenance) -> tuple[Transform | None, McaptrackError | None]:
         """Return the transform that made a channel, with the same parameters; or None, and the reason why not."""
         try:
-            return rebuild(STAGES[stage], made, self._defaults), None
+            return rebuild(STAGES[stage], provenance, self._defaults), None
         except McaptrackError as error:
             return None, error
 
@@ -520,11 +516,11 @@ class _Planner:
         for name, transform in self._defaults.items():
             if (option := STAGES[name].option) and option in self._chosen:
                 options[option] = STAGES[name].choice(transform)
-        found: dict[str, str] = {}  # by what has to be named, the first channel that it made
+        topic_by_fault: dict[str, str] = {}  # by what has to be named, the first channel that it made
         for topic, error in self._unnamed.items():
-            found.setdefault(str(error), topic)
+            topic_by_fault.setdefault(str(error), topic)
             options |= error.options
-        why = "; ".join(f"{topic} can't be made again: {error}" for error, topic in found.items())
+        why = "; ".join(f"{topic} can't be made again: {error}" for error, topic in topic_by_fault.items())
         again = call("run", self._opened.path, **options)
         return f"{self._opened.path}: {why}, as in {again}; another name replaces what it made"
 
@@ -539,7 +535,7 @@ class _Planner:
     def ensure_motion(self, transform: Transform, source: str) -> None:
         """Plan the motion of the camera if a stage that reads boxes at ``source`` is better with it."""
         pictures = self._given_pictures() or camera_at(self._opened, self._prefix).pictures
-        if motion.is_motion_wanted(self._opened, self._prefix, transform, source, bool(pictures), self.jobs):
+        if pictures and motion.is_motion_wanted(self._opened, transform, source, self.jobs):
             count = len(self.jobs)
             self.ensure(motion_topic(self._prefix))
             is_asked = getattr(transform, "camera_motion", "") == "on"
@@ -550,7 +546,7 @@ class _Planner:
         return next((topic for name, topic in self._sources.items() if STAGES[name].default.reads is VIDEO), "")
 
     def _with_choice(self, transform: Any) -> Any:
-        """A transform with the shared options that it has."""
+        """Return a transform with those of the shared options that it has."""
         chosen = {name: value for name, value in self._shared.items() if hasattr(transform, name)}
         return replace(transform, **chosen) if chosen else transform
 

@@ -76,26 +76,26 @@ class PlaneChoice(NamedTuple):
     frame: str | None = None
     ground_frame: str | None = None
 
-    def settled(self, made: Provenance | None) -> tuple[bool, float]:
-        """The choice where a plane was made before, or not."""
-        before = made.parameters if made and made.transform in (_ASSUME, _ESTIMATE) else {}
+    def settled(self, provenance: Provenance | None) -> tuple[bool, float]:
+        """Return the choice, with what is left open as in ``provenance``, or else the default."""
+        before = provenance.parameters if provenance and provenance.transform in (_ASSUME, _ESTIMATE) else {}
         height_m = before.get("person_height_m")
         height_m = float(height_m) if isinstance(height_m, int | float) and height_m > 0 else PERSON_HEIGHT_M
         estimate = before.get("fit_plane") is not False if self.estimate is None else self.estimate
         return estimate, float(self.person_height_m or height_m)
 
-    def is_another(self, made: Provenance | None) -> bool:
+    def is_another(self, provenance: Provenance | None) -> bool:
         """Whether a plane that was made before would be made in another way now."""
-        if made is not None and made.transform == _CALIBRATE:
-            return self.frames(made) != AS_BEFORE.frames(made)
-        if made is None or made.transform not in (_ASSUME, _ESTIMATE):
+        if provenance is not None and provenance.transform == _CALIBRATE:
+            return self.frames(provenance) != AS_BEFORE.frames(provenance)
+        if provenance is None or provenance.transform not in (_ASSUME, _ESTIMATE):
             return False
-        is_untried = made.transform == _ASSUME and not {"refused", "fit_plane"} & made.parameters.keys()
-        return (bool(self.estimate) and is_untried) or self.settled(made) != AS_BEFORE.settled(made)
+        is_untried = provenance.transform == _ASSUME and not {"refused", "fit_plane"} & provenance.parameters.keys()
+        return (bool(self.estimate) and is_untried) or self.settled(provenance) != AS_BEFORE.settled(provenance)
 
-    def frames(self, made: Provenance | None) -> tuple[str, str]:
-        """The frame of the metres and the frame of the ground, "" for the default, where planes were made before."""
-        before = made.parameters if made and made.transform == _CALIBRATE else {}
+    def frames(self, provenance: Provenance | None) -> tuple[str, str]:
+        """Return the frames of the metres and of the ground, as chosen or as in ``provenance``; "": the default."""
+        before = provenance.parameters if provenance and provenance.transform == _CALIBRATE else {}
         frame = before.get("frame", "") if self.frame is None else self.frame
         ground_frame = before.get("ground_frame", "") if self.ground_frame is None else self.ground_frame
         return str(frame), str(ground_frame)
@@ -111,15 +111,17 @@ _READ: Final[WeakKeyDictionary[log.Log, dict[str, Planes | None]]] = WeakKeyDict
 def read_planes(opened: log.Log, prefix: str) -> Planes | None:
     """Return the ground planes of a camera, each with its start time in ns; None if the log has none."""
     topic = camera_at(opened, prefix).ground_plane
-    known = _READ.setdefault(opened, {})
-    if topic not in known:
-        known[topic] = (planes_in(opened, topic) if topic in opened.channels else []) or None
-    return known[topic]
+    planes_by_topic = _READ.setdefault(opened, {})
+    if topic not in planes_by_topic:
+        planes_by_topic[topic] = (planes_in(opened, topic) if topic in opened.channels else []) or None
+    return planes_by_topic[topic]
 
 
 def planes_to_json(planes: Planes) -> list[Any]:
     """Convert ground planes to the JSON values that the parameters of a channel contain: their digest, if many."""
-    values = [(t_ns, {name: one for name, one in asdict(plane).items() if one is not None}) for t_ns, plane in planes]
+    values = [
+        (t_ns, {name: value for name, value in asdict(plane).items() if value is not None}) for t_ns, plane in planes
+    ]
     text = json.dumps(values)
     kept: list[Any] = json.loads(text)
     return kept if len(kept) <= _MOST_RECORDED else [len(kept), hashlib.sha256(text.encode()).hexdigest()]
@@ -127,20 +129,20 @@ def planes_to_json(planes: Planes) -> list[Any]:
 
 def is_plane_due(opened: log.Log, prefix: str, source: str, choice: PlaneChoice) -> bool:
     """Return whether the camera's plane was made from these boxes, or calibrated, and would be made otherwise now."""
-    made = provenance_of(opened, camera_at(opened, prefix).ground_plane)
-    if made is None or (made.input != source and made.transform != _CALIBRATE):
+    provenance = provenance_of(opened, camera_at(opened, prefix).ground_plane)
+    if provenance is None or (provenance.input != source and provenance.transform != _CALIBRATE):
         return False
-    is_untried = _UNCALIBRATED not in made.parameters or any(choice.frames(made))
-    is_new = made.transform in (_ASSUME, _ESTIMATE) and is_untried and _is_calibrated(opened)
-    is_new = is_new or _is_recalibrated(opened, prefix, made)
-    return choice.is_another(made) or is_new
+    is_untried = _UNCALIBRATED not in provenance.parameters or any(choice.frames(provenance))
+    is_new = provenance.transform in (_ASSUME, _ESTIMATE) and is_untried and _is_calibrated(opened)
+    is_new = is_new or _is_recalibrated(opened, prefix, provenance)
+    return choice.is_another(provenance) or is_new
 
 
 def warn_unused(opened: log.Log, prefix: str, choice: PlaneChoice) -> None:
     """Warn of choices that change nothing, because the plane is given, or the camera isn't calibrated."""
     topic = camera_at(opened, prefix).ground_plane
-    made = provenance_of(opened, topic)
-    is_given = topic in opened.channels and (made is None or made.transform not in _MADE)
+    provenance = provenance_of(opened, topic)
+    is_given = topic in opened.channels and (provenance is None or provenance.transform not in _MADE)
     if choice.estimate and is_given:
         warn("a ground plane is given, so that none is estimated", "option-not-used")
     if choice.ground_frame and (is_given or not _is_calibrated(opened)):
@@ -148,10 +150,10 @@ def warn_unused(opened: log.Log, prefix: str, choice: PlaneChoice) -> None:
         warn(f"`ground_frame=` changes nothing here: {why}", "option-not-used")
 
 
-def frame_of_planes(opened: log.Log, prefix: str, made: Mapping[str, Made]) -> str:
+def frame_of_planes(opened: log.Log, prefix: str, results: Mapping[str, Made]) -> str:
     """Return the frame of the metres of a camera's ground planes; "" if it has none, or they name no frame."""
     topic = camera_at(opened, prefix).ground_plane
-    how = made[topic].provenance if topic in made else provenance_of(opened, topic)
+    how = results[topic].provenance if topic in results else provenance_of(opened, topic)
     return how.frame_id if how else ""
 
 
@@ -163,13 +165,13 @@ def _is_calibrated(opened: log.Log) -> bool:
     return any(map(holds_calibrations, opened.channels.values()))
 
 
-def _is_recalibrated(opened: log.Log, prefix: str, made: Provenance | None) -> bool:
+def _is_recalibrated(opened: log.Log, prefix: str, how: Provenance | None) -> bool:
     """Return whether a calibration was ingested for a camera after its planes were made from a calibration."""
     topic = f"{prefix}/calibration"
-    given = provenance_of(opened, topic)
-    if made is None or made.transform != _CALIBRATE or given is None or given.transform != INGEST:
+    provenance = provenance_of(opened, topic)
+    if how is None or how.transform != _CALIBRATE or provenance is None or provenance.transform != INGEST:
         return False
-    return made.input != topic or made.input_digest != digest_of(opened, topic)
+    return how.input != topic or how.input_digest != digest_of(opened, topic)
 
 
 def calibrated_planes(
@@ -208,17 +210,17 @@ def make_plane(
     prefix: str,
     frames: Sequence[Frame],
     source: tuple[str, str],
-    made: Mapping[str, Made],
+    results: Mapping[str, Made],
     choice: PlaneChoice = AS_BEFORE,
     uncalibrated: str = "",
 ) -> tuple[Planes | None, Made | None]:
     """Make a ground plane from boxes, and its channel: an estimated plane, or a scale if boxes don't give one.
 
-    ``source`` is the topic of the boxes and the digest of its messages, ``made`` the channels that jobs before made.
-    ``uncalibrated`` says why the plane doesn't follow from a calibration.
+    ``source`` is the topic of the boxes and the digest of its messages, ``results`` are the channels of earlier
+    jobs. ``uncalibrated`` says why the plane doesn't follow from a calibration.
     Both results are None if no frame has boxes in pixels.
     """
-    names = next((one.classes for _, one in _chain(opened, source[0], made) if one and one.classes), {})
+    names = next((how.classes for _, how in _chain(opened, source[0], results) if how and how.classes), {})
     frames = thinned(frames, _MOST_BOXES)
     boxes, number, score, are_people = _boxes(frames, names)
     if not len(boxes):
@@ -229,11 +231,11 @@ def make_plane(
     plane: GroundPlane | None = None
     if not estimate:
         parameters["fit_plane"] = False
-    elif why_not := _why_not(opened, prefix, source[0], made):
+    elif why_not := _why_not(opened, prefix, source[0], results):
         if why_not != _BY_MOTION or choice.estimate:
             parameters["refused"] = why_not
     else:
-        size = _picture_size(opened, prefix, source[0], made) or (width, height)
+        size = _picture_size(opened, prefix, source[0], results) or (width, height)
         try:
             if not are_people.any():
                 raise McaptrackError("none of them is of a person")
@@ -256,7 +258,7 @@ def planes_for(
     job: Job,
     frames: Sequence[Frame],
     source: tuple[str, str],
-    made: Mapping[str, Made],
+    results: Mapping[str, Made],
     planes: Planes | None,
     choice: PlaneChoice,
 ) -> tuple[Planes | None, dict[str, Made], str]:
@@ -268,15 +270,15 @@ def planes_for(
     topic, stage, uncalibrated = camera_at(opened, prefix).ground_plane, STAGES[job.stage], ""
     channel: Made | None = None
     uses_planes = "ground_planes" in {f.name for f in fields(job.transform)}
-    if uses_planes and topic not in made and _has_pixels(frames):
-        found, channel, uncalibrated = calibrated_planes(opened, prefix, choice)
-        planes = found or planes
+    if uses_planes and topic not in results and _has_pixels(frames):
+        calibrated, channel, uncalibrated = calibrated_planes(opened, prefix, choice)
+        planes = calibrated or planes
     is_usual = job.target == f"{prefix}/{stage.output_topic}"
     is_new = job.transform.reads is DETECTIONS or is_plane_due(opened, prefix, job.source, choice)
     if (is_assumed(planes) and is_usual and is_new) or (planes is None and stage.needs_scale):
-        planes, channel = make_plane(opened, prefix, frames, source, made, choice, uncalibrated)
+        planes, channel = make_plane(opened, prefix, frames, source, results, choice, uncalibrated)
     new = {topic: channel} if channel else {}
-    frame = frame_of_planes(opened, prefix, {**made, **new}) if uses_planes and _has_pixels(frames) else ""
+    frame = frame_of_planes(opened, prefix, {**results, **new}) if uses_planes and _has_pixels(frames) else ""
     return planes, new, frame
 
 
@@ -294,23 +296,22 @@ def recorded_planes(transform: Transform) -> dict[str, Any]:
 _BY_MOTION: Final = "boxes of a motion detector have shadows, and several people in one"
 
 
-def _why_not(opened: log.Log, prefix: str, source: str, made: Mapping[str, Made]) -> str:
+def _why_not(opened: log.Log, prefix: str, source: str, results: Mapping[str, Made]) -> str:
     """Return why no plane can be estimated from these boxes, as a clause; "" if it can be tried."""
-    if any(motion.detects_motion(one) for _, one in _chain(opened, source, made)):
+    if any(motion.detects_motion(provenance) for _, provenance in _chain(opened, source, results)):
         return _BY_MOTION
-    return "the camera moves" if motion.moves(opened, prefix, made) else ""
+    return "the camera moves" if motion.moves(opened, prefix, results) else ""
 
 
-def _chain(opened: log.Log, topic: str, made: Mapping[str, Made]) -> list[tuple[str, Provenance | None]]:
+def _chain(opened: log.Log, topic: str, results: Mapping[str, Made]) -> list[tuple[str, Provenance | None]]:
     """Return a channel, its input, the input of that and so on, each with its provenance, also of this run."""
-    return list(lineage(opened, topic, {name: one.provenance for name, one in made.items()}))
+    return list(lineage(opened, topic, {name: channel.provenance for name, channel in results.items()}))
 
 
-# Leave out rows of people who are outside of the picture: interpolated and coasting boxes that the camera can't
-# see.
+# Leave out interpolated and coasting rows of people who are outside of the picture.
 #
-# A track goes on while its person is occluded, and its row then stands where the person is expected. Outside of the
-# picture, where people come and go unseen, such a row is no statement about that picture.
+# A track goes on while its person is occluded; its rows are then where the person is expected. Outside of the picture
+# people come and go unseen, so such rows would be guesses.
 
 
 #: Width and height of pictures in pixels; None where they aren't known.
@@ -341,10 +342,10 @@ def without_unseen(channels: Channels, picture_size: Callable[[], PictureSize]) 
     """
     out = dict(channels)
     for topic, (schema, frames) in channels.items():
-        found = _find_unseen(frames, picture_size) if schema is TRACKS else None
-        if found is None:
+        unseen = _find_unseen(frames, picture_size) if schema is TRACKS else None
+        if unseen is None:
             continue
-        is_unseen, count = found
+        is_unseen, count = unseen
         rows = "row is" if count == 1 else "rows are"
         warn(f"{topic}: {count:,} {rows} left out, outside of the picture and without a detection", "left-out")
         stem, _, name = topic.rpartition("/")
@@ -353,8 +354,8 @@ def without_unseen(channels: Channels, picture_size: Callable[[], PictureSize]) 
             gone: set[tuple[int, int]] = set()
             for low, _, joined in joined_parts(schema, frames):
                 gone.update(_keys(joined, low, is_unseen(joined.rows)))
-            made = channels[predictions][1]
-            out[predictions] = PREDICTIONS, _without(made, gone)
+            forecasts = channels[predictions][1]
+            out[predictions] = PREDICTIONS, _without(forecasts, gone)
         out[topic] = schema, _seen(frames, is_unseen)
     return out
 
@@ -366,7 +367,7 @@ def _seen(frames: Sequence[Frame], is_unseen: Callable[[Rows], Bools]) -> Sequen
 def _find_unseen(
     frames: Sequence[Frame], picture_size: Callable[[], PictureSize]
 ) -> tuple[Callable[[Rows], Bools], int] | None:
-    """Return what masks the rows that are not observed and lie outside of the picture, and their number.
+    """Return a function that masks the rows that are not observed and lie outside of the picture, and their number.
 
     None if there are none.
     """
@@ -382,9 +383,9 @@ def _find_unseen(
 
     outside = observed = unseen = 0
     for _, _, joined in joined_parts(TRACKS, frames):
-        outer, there = is_outside(joined.rows), joined.rows["observed"]
-        outside, observed = outside + int((outer & there).sum()), observed + int(there.sum())
-        unseen += int((outer & ~there).sum())
+        outer, seen = is_outside(joined.rows), joined.rows["observed"]
+        outside, observed = outside + int((outer & seen).sum()), observed + int(seen.sum())
+        unseen += int((outer & ~seen).sum())
     if not unseen or outside > _MOST_OUTSIDE * observed:
         return None
     return lambda rows: np.asarray(is_outside(rows) & ~rows["observed"]), unseen
@@ -405,9 +406,9 @@ def _without(frames: Sequence[Frame], gone: Collection[tuple[int, int]]) -> Sequ
     return out.done()
 
 
-def _picture_size(opened: log.Log, prefix: str, source: str, made: Mapping[str, Made]) -> tuple[int, int] | None:
+def _picture_size(opened: log.Log, prefix: str, source: str, results: Mapping[str, Made]) -> tuple[int, int] | None:
     """Return width and height of the pictures that boxes were found in, or of their camera; None if there are none."""
-    first = _chain(opened, source, made)[-1][0]
+    first = _chain(opened, source, results)[-1][0]
     channel = opened.channels.get(first)
     topic = first if channel and foreign.holds_pictures(channel) else camera_at(opened, prefix).pictures
     return picture_size(opened, topic)
@@ -422,28 +423,28 @@ def _boxes(frames: Sequence[Frame], names: Mapping[str, str]) -> tuple[Floats, I
     number = np.repeat(np.arange(len(frames)), [len(frame.rows) for frame in frames])
     kept = np.isfinite(columns_to_boxes(rows)).all(axis=1)
     rows, number = rows[kept], number[kept]
-    wanted = [int(one) for one, name in names.items() if is_person(name) and one.isdecimal()] or [PERSON]
+    wanted = [int(kind) for kind, name in names.items() if is_person(name) and kind.isdecimal()] or [PERSON]
     are_people = np.isin(rows["class_id"], wanted)
     if not are_people.any():
         are_people = rows["class_id"] == UNKNOWN
     return columns_to_boxes(rows), number, rows["score"].astype(np.float64), are_people
 
 
-def fit_of(made: Provenance | None) -> dict[str, float] | None:
+def fit_of(provenance: Provenance | None) -> dict[str, float] | None:
     """Return how well an estimated plane fits (``PlaneFit.to_json``), from its provenance; None for other planes."""
-    fit = made.parameters.get("fit") if made and made.transform == _ESTIMATE else None
+    fit = provenance.parameters.get("fit") if provenance and provenance.transform == _ESTIMATE else None
     return fit if isinstance(fit, dict) else None
 
 
-def plane_in_words(planes: Planes, made: Provenance | None) -> str:
+def plane_in_words(planes: Planes, provenance: Provenance | None) -> str:
     """Return what a plane that was made from boxes is, for a warning: where it is from, and how good it is."""
     give = f"Give one with {call('ingest', 'INPUT', ground_plane='HOMOGRAPHY')}"
-    _, person_m = AS_BEFORE.settled(made)
-    if fit := fit_of(made):
-        words = f"one was estimated from {fit_in_words(fit)}, with people {person_m:g} m high"
-        return f"no ground plane is known: {words}. {give}"
+    _, person_m = AS_BEFORE.settled(provenance)
+    if fit := fit_of(provenance):
+        text = f"one was estimated from {fit_in_words(fit)}, with people {person_m:g} m high"
+        return f"no ground plane is known: {text}. {give}"
     metres = 1 / planes[0][1].homography[0]
-    refused = made.parameters.get("refused", "") if made else ""
+    refused = provenance.parameters.get("refused", "") if provenance else ""
     why = f", and boxes don't tell it ({refused})" if refused else ""
     return (
         f"no ground plane is known{why}: taking {metres:.3g} px for a metre, since people are {person_m:g} m high; "

@@ -44,38 +44,38 @@ class OlderVersionError(McaptrackError):
 def plugins_of(stage: Stage, transform: Transform) -> dict[str, Plugin]:
     """Return the classes of other packages in a transform: "transform" for itself, "predictor" for its predictor."""
     cls = type(transform)
-    found = {} if stage.is_built_in(cls) else {"transform": _plugin(stage.entry(cls))}
+    plugins = {} if stage.is_built_in(cls) else {"transform": _plugin(stage.entry(cls))}
     predictor = getattr(transform, "predictor", None)
     if isinstance(predictor, str):
         entry, _ = predictor_entry(predictor)
         if not entry.is_built_in:
-            found["predictor"] = _plugin(entry)
-    return found
+            plugins["predictor"] = _plugin(entry)
+    return plugins
 
 
-def rebuild(stage: Stage, made: Provenance, known: Mapping[str, Transform]) -> Transform:
+def rebuild(stage: Stage, provenance: Provenance, named_by_user: Mapping[str, Transform]) -> Transform:
     """Return the transform that made a channel, with the same parameters.
 
-    ``known`` are the transforms that the user named, by stage; their classes may be used in addition to installed ones.
+    ``named_by_user`` are transforms by stage; their classes may be used in addition to installed ones.
     Raises OlderVersionError if an older version made it, MissingPluginError if a class of another package is not
     available, and McaptrackError for parameters that no longer exist.
     """
-    if made.is_of_older_version:
-        raise OlderVersionError(f"it was made by an older version ({made.version}); `force=True` makes it again")
-    parameters = dict(made.parameters)
-    cls = _class_of(stage, made, parameters, known)
-    plugin, name = made.plugins.get("predictor"), parameters.get("predictor")
+    if provenance.is_of_older_version:
+        raise OlderVersionError(f"it was made by an older version ({provenance.version}); `force=True` makes it again")
+    parameters = dict(provenance.parameters)
+    cls = _class_of(stage, provenance, parameters, named_by_user)
+    plugin, name = provenance.plugins.get("predictor"), parameters.get("predictor")
     if plugin is None and isinstance(name, str) and _is_of_a_module(name):
         plugin = Plugin(name, name, "", "")
     if plugin:
-        named = {name for other in known.values() if isinstance(name := getattr(other, "predictor", None), str)}
+        named = {name for other in named_by_user.values() if isinstance(name := getattr(other, "predictor", None), str)}
         if plugin.name not in named:
             _installed("predictor", plugin, find)
     cls = stage.with_part(cls, parameters.get(stage.parameter))
     types = {f.name: f for f in fields(cls)}
     unknown = sorted(set(parameters) - set(types))
     if unknown:
-        name = stage.entry(cls) if "transform" in made.plugins else cls.__name__
+        name = stage.entry(cls) if "transform" in provenance.plugins else cls.__name__
         raise McaptrackError(f"it was made with {', '.join(unknown)}, which {name} does not have")
     hints = get_type_hints(cls)
     values = {
@@ -85,23 +85,25 @@ def rebuild(stage: Stage, made: Provenance, known: Mapping[str, Transform]) -> T
     }
     transform: Transform = cls(**values)
     predictor = getattr(transform, "predictor", "")
-    if made.weights_sha256 and ":" in predictor and weights_sha256(predictor) != made.weights_sha256:
+    if provenance.weights_sha256 and ":" in predictor and weights_sha256(predictor) != provenance.weights_sha256:
         raise McaptrackError(f"{predictor} holds other weights than those it was made with")
-    own = transform.weights_sha256() if made.weights_sha256 and hasattr(transform, "weights_sha256") else None
-    if own not in (None, made.weights_sha256):
+    own = transform.weights_sha256() if provenance.weights_sha256 and hasattr(transform, "weights_sha256") else None
+    if own not in (None, provenance.weights_sha256):
         raise McaptrackError(f"{stage.choice(transform)} holds other weights than those it was made with")
     return transform
 
 
-def fuser_of(made: Provenance, known: Transform | None = None) -> tuple[Transform | None, McaptrackError | None]:
+def fuser_of(
+    provenance: Provenance, named_by_user: Transform | None = None
+) -> tuple[Transform | None, McaptrackError | None]:
     """Return the fuser that made a scene, with the same parameters; or None, and the reason why not.
 
-    ``known`` is the one that the user names, if any.
+    ``named_by_user`` is the one that the user names, if any.
     """
-    parameters = {name: value for name, value in made.parameters.items() if name not in _FINDINGS}
-    named = {} if known is None else {FUSION.name: known}
+    parameters = {name: value for name, value in provenance.parameters.items() if name not in _FINDINGS}
+    named = {} if named_by_user is None else {FUSION.name: named_by_user}
     try:
-        return rebuild(FUSION, replace(made, parameters=parameters), named), None
+        return rebuild(FUSION, replace(provenance, parameters=parameters), named), None
     except McaptrackError as error:
         return None, error
 
@@ -113,20 +115,20 @@ def _is_of_a_module(predictor: str) -> bool:
 
 
 def _class_of(
-    stage: Stage, made: Provenance, parameters: dict[str, Any], known: Mapping[str, Transform]
+    stage: Stage, provenance: Provenance, parameters: dict[str, Any], named_by_user: Mapping[str, Transform]
 ) -> type[Transform]:
     """Return the class of the transform; removes the parameter that names it from ``parameters``."""
     name = str(parameters.pop(stage.kind, "")) if stage.kind else ""
-    plugin = made.plugins.get("transform")
+    plugin = provenance.plugins.get("transform")
     if plugin is None:
         built_in = stage.built_in()
         if name and name not in built_in:
             raise McaptrackError(f"{stage.kind} {name} made it, which this version does not have")
         return built_in[name] if name else stage.default
-    given = known.get(stage.name)
-    if given is not None and stage.entry(type(given)).implementation == plugin.implementation:
-        _compare_versions(stage.entry(type(given)), plugin)
-        return type(given)
+    users = named_by_user.get(stage.name)
+    if users is not None and stage.entry(type(users)).implementation == plugin.implementation:
+        _compare_versions(stage.entry(type(users)), plugin)
+        return type(users)
     if stage.kind is None:
         raise MissingPluginError(
             f"{_name_with_package(stage.name, plugin)} made it; run it again from Python, with that class"
@@ -195,5 +197,5 @@ def differing(before: Transform, wanted: Transform) -> str:
         return f"{type(wanted).__name__}, not {type(before).__name__}"
     names = [f.name for f in fields(before) if not f.metadata.get("context")]
     pairs = [(name, getattr(before, name), getattr(wanted, name)) for name in names]
-    words = [f"{name} {now}, not {then}" for name, then, now in pairs if then != now]
-    return "; ".join(words[:_NAMED]) + (f"; and {len(words) - _NAMED} more" if len(words) > _NAMED else "")
+    changes = [f"{name} {now}, not {then}" for name, then, now in pairs if then != now]
+    return "; ".join(changes[:_NAMED]) + (f"; and {len(changes) - _NAMED} more" if len(changes) > _NAMED else "")

@@ -119,65 +119,65 @@ class Refiner:
 
     def refine(self) -> list[Refined]:
         """Return what was found about each camera, in order."""
-        self.maps = {one.name: np.eye(3) for one in self.cameras}
-        found: dict[str, _Found | str] = {}
+        self.maps = {camera.name: np.eye(3) for camera in self.cameras}
+        verdicts: dict[str, _Found | str] = {}
         if self.trusted:
-            self._outwards(found)
+            self._outwards(verdicts)
         else:
-            self._worst_first(found)
-        return [self._result(one, found.get(one.name, "")) for one in self.cameras]
+            self._worst_first(verdicts)
+        return [self._result(camera, verdicts.get(camera.name, "")) for camera in self.cameras]
 
-    def _outwards(self, found: dict[str, _Found | str]) -> None:
-        """Compare cameras with those that are right, and then count them to these, the one with most pairs first."""
-        settled, left = set(self.trusted), [one for one in self.cameras if one.name not in self.trusted]
+    def _outwards(self, verdicts: dict[str, _Found | str]) -> None:
+        """Judge the camera with the most pairs against those that are right, count it among them, and so on."""
+        settled, left = set(self.trusted), [camera for camera in self.cameras if camera.name not in self.trusted]
         while left:
             places = self._places("", settled, 1)
-            seen = [self._suspect(one, places) for one in left]
-            best = int(np.argmax([one[2] for one in seen]))
-            one = left.pop(best)
-            self._take(one, self._judge(one, places, seen[best][1]), found)
-            settled.add(one.name)
+            seen = [self._suspect(camera, places) for camera in left]
+            best = int(np.argmax([suspect[2] for suspect in seen]))
+            camera = left.pop(best)
+            self._take(camera, self._judge(camera, places, seen[best][1]), verdicts)
+            settled.add(camera.name)
             self.progress(len(settled), len(self.cameras))
 
-    def _worst_first(self, found: dict[str, _Found | str]) -> None:
+    def _worst_first(self, verdicts: dict[str, _Found | str]) -> None:
         """Correct the camera with the most to gain until none gains; later corrections may change earlier ones."""
-        names = {one.name for one in self.cameras}
+        names = {camera.name for camera in self.cameras}
         least = min(len(names) - 1, 2)
         settled: set[str] = set()
         seen: dict[str, tuple[Feet, float, list[Floats], int]] = {}
         turns, most = dict.fromkeys(names, 0), 4 * len(names)
         for number in range(most):
-            left = [one for one in self.cameras if one.name not in settled and turns[one.name] < 3]
+            left = [camera for camera in self.cameras if camera.name not in settled and turns[camera.name] < 3]
             if not left:
                 break
-            for one in left:
-                if one.name not in seen:
-                    places = self._places(one.name, names, least)
-                    seen[one.name] = places, *self._suspect(one, places)
-            one = max(left, key=lambda one: seen[one.name][1])
-            before = self.maps[one.name]
-            self._take(one, self._judge(one, seen[one.name][0], seen[one.name][2]), found)
-            turns[one.name] += 1
-            if _moves(one, before, self.maps[one.name]) > _SAME_M:
+            for camera in left:
+                if camera.name not in seen:
+                    places = self._places(camera.name, names, least)
+                    seen[camera.name] = places, *self._suspect(camera, places)
+            camera = max(left, key=lambda name_of: seen[name_of.name][1])
+            before = self.maps[camera.name]
+            self._take(camera, self._judge(camera, seen[camera.name][0], seen[camera.name][2]), verdicts)
+            turns[camera.name] += 1
+            if _moves(camera, before, self.maps[camera.name]) > _SAME_M:
                 settled, seen = set(), {}
-            settled.add(one.name)
+            settled.add(camera.name)
             self.progress(min(number + 1, most - 1), most)
         self.progress(most, most)
 
-    def _take(self, one: Watched, judged: _Found | str, found: dict[str, _Found | str]) -> None:
-        found[one.name] = judged
-        self.maps[one.name] = np.eye(3) if isinstance(judged, str) or one.why_held else judged.matrix
+    def _take(self, camera: Watched, judged: _Found | str, verdicts: dict[str, _Found | str]) -> None:
+        verdicts[camera.name] = judged
+        self.maps[camera.name] = np.eye(3) if isinstance(judged, str) or camera.why_held else judged.matrix
 
     def _places(self, but: str, among: set[str] | frozenset[str], least: int) -> Feet:
-        """Where at least so many of these cameras see people, without one of them."""
+        """Return the places where ``least`` of the cameras ``among`` see a person, leaving out ``but``."""
         parts, cameras, classes = [], [], []
-        for number, one in enumerate(self.cameras):
-            if one.name == but or one.name not in among:
+        for number, watched in enumerate(self.cameras):
+            if watched.name == but or watched.name not in among:
                 continue
-            feet, kept = moved_feet(self.maps[one.name], one.feet)
+            feet, kept = moved_feet(self.maps[watched.name], watched.feet)
             parts.append(feet)
             cameras.append(np.full(len(kept), number))
-            classes.append(one.classes[kept])
+            classes.append(watched.classes[kept])
         if not parts:
             return Feet(np.empty((0, 2)), np.empty((0, 3)), np.empty(0, np.int64))
         feet = Feet(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
@@ -196,76 +196,76 @@ class Refiner:
             out.append(Feet(centre.xy_m[seen], centre.cov[seen], np.full(int(seen.sum()), feet.frame[begin])))
         return Feet(*(np.concatenate(columns) for columns in zip(*out, strict=True)))
 
-    def _suspect(self, one: Watched, places: Feet) -> tuple[float, list[Floats], int]:
-        """The gain of a camera by a correction, maps from which one is searched, and the number of pairs."""
-        if not len(one.feet.frame) or not len(places.frame):
+    def _suspect(self, camera: Watched, places: Feet) -> tuple[float, list[Floats], int]:
+        """Return how much a correction gains, maps to start its search from, and the number of pairs."""
+        if not len(camera.feet.frame) or not len(places.frame):
             return 0.0, [np.eye(3)], 0
-        starts = [np.eye(3), vote(one.feet, places, round(10 * self.rate_hz))]
-        if not np.array_equal(self.maps[one.name], np.eye(3)):
-            starts.append(self.maps[one.name])
-        model = Corrector.around("rigid", one.feet.xy_m)
-        fits = [model.fit(one.feet, places, start) for start in starts]
-        costs = [self._cost(one.feet, places, fit) for fit in fits]
-        now = self._cost(one.feet, places, self.maps[one.name])
-        pairs = max(len(pair(moved_feet(fit, one.feet)[0], places, _PAIRED_M, GATE).feet) for fit in fits)
+        starts = [np.eye(3), vote(camera.feet, places, round(10 * self.rate_hz))]
+        if not np.array_equal(self.maps[camera.name], np.eye(3)):
+            starts.append(self.maps[camera.name])
+        model = Corrector.around("rigid", camera.feet.xy_m)
+        fits = [model.fit(camera.feet, places, start) for start in starts]
+        costs = [self._cost(camera.feet, places, fit) for fit in fits]
+        now = self._cost(camera.feet, places, self.maps[camera.name])
+        pairs = max(len(pair(moved_feet(fit, camera.feet)[0], places, _PAIRED_M, GATE).feet) for fit in fits)
         order = np.argsort(costs, kind="stable")
-        return (now - min(costs)) * len(one.feet.frame), [fits[order[0]]], pairs
+        return (now - min(costs)) * len(camera.feet.frame), [fits[order[0]]], pairs
 
     def _cost(self, feet: Feet, places: Feet, matrix: Floats) -> float:
         return float(np.nanmean(loss(moved_feet(matrix, feet)[0], places, self.frames)))
 
-    def _judge(self, one: Watched, places: Feet, starts: Sequence[Floats]) -> _Found | str:
-        """Return the best correction of a camera, of which those at other times are the judge; or why there is none."""
-        found = pair(moved_feet(starts[0], one.feet)[0], places, _PAIRED_M, GATE)
-        frames = len(np.unique(places.frame[found.places]))
-        if len(found.feet) < LEAST_PAIRS or frames < LEAST_FRAMES:
+    def _judge(self, camera: Watched, places: Feet, starts: Sequence[Floats]) -> _Found | str:
+        """Return the correction that fits best at times it was not fitted to; or why there is none."""
+        pairs = pair(moved_feet(starts[0], camera.feet)[0], places, _PAIRED_M, GATE)
+        frames = len(np.unique(places.frame[pairs.places]))
+        if len(pairs.feet) < LEAST_PAIRS or frames < LEAST_FRAMES:
             return (
-                f"it can't be compared: {len(found.feet)} of its boxes in {frames} frames are near people seen by the "
+                f"it can't be compared: {len(pairs.feet)} of its boxes in {frames} frames are near people seen by the "
                 f"others, and {LEAST_PAIRS} in {LEAST_FRAMES} are needed"
             )
-        models, limit = self._determined(one, places.xy_m[found.places])
+        models, limit = self._determined(camera, places.xy_m[pairs.places])
         block = np.arange(self.frames) * _BLOCKS // self.frames
         fits: dict[str, list[Floats]] = {"": [np.eye(3)] * 2}
         for model in models:
-            corrector = Corrector.around(model, one.feet.xy_m, one.plane.homography, one.plane.lens)
+            corrector = Corrector.around(model, camera.feet.xy_m, camera.plane.homography, camera.plane.lens)
             fits[model] = []
             for fold in range(2):
-                feet = one.feet.at(block[one.feet.frame] % 2 != fold)
+                feet = camera.feet.at(block[camera.feet.frame] % 2 != fold)
                 tried = [corrector.fit(feet, places, start) for start in starts]
                 costs = [self._cost(feet, places, fit) for fit in tried]
                 fits[model].append(tried[int(np.argmin(costs))])
-        costs_of = {model: self._held_out(one, places, pair_, block) for model, pair_ in fits.items()}
+        costs_of = {model: self._held_out(camera, places, pair_, block) for model, pair_ in fits.items()}
         best = min(costs_of, key=lambda model: float(np.nanmean(costs_of[model])))
         chosen = next(model for model in costs_of if _is_as_good(costs_of[model], costs_of[best]))
         if not chosen:
             chosen = best  # it is said how little there is to gain
         matrix = np.eye(3)
         if chosen:
-            corrector = Corrector.around(chosen, one.feet.xy_m, one.plane.homography, one.plane.lens)
-            tried = [corrector.fit(one.feet, places, start) for start in fits[chosen]]
-            matrix = tried[int(np.argmin([self._cost(one.feet, places, fit) for fit in tried]))]
-        moves = _moves(one, np.eye(3), matrix)
+            corrector = Corrector.around(chosen, camera.feet.xy_m, camera.plane.homography, camera.plane.lens)
+            tried = [corrector.fit(camera.feet, places, start) for start in fits[chosen]]
+            matrix = tried[int(np.argmin([self._cost(camera.feet, places, fit) for fit in tried]))]
+        moves = _moves(camera, np.eye(3), matrix)
         gain = costs_of[""] - costs_of[chosen]
         if chosen and (not _is_sure(gain) or moves < LEAST_MOVED_M):
             chosen, matrix, moves = "", np.eye(3), 0.0
-        return _Found(chosen, matrix, moves, *self._residuals(one, places, fits[chosen], block), limit)
+        return _Found(chosen, matrix, moves, *self._residuals(camera, places, fits[chosen], block), limit)
 
-    def _determined(self, one: Watched, xy_m: Floats) -> tuple[tuple[str, ...], str]:
-        """The corrections that people at these places determine, and what they don't."""
+    def _determined(self, camera: Watched, xy_m: Floats) -> tuple[tuple[str, ...], str]:
+        """Return the kinds of correction that people at these places determine, and a remark on what they don't."""
         x, y = (xy_m - xy_m.mean(axis=0)).T
         cov = np.array([[(x * x).mean(), (x * y).mean()], [(x * y).mean(), (y * y).mean()]])
         small, large = np.sqrt(np.maximum(np.linalg.eigvalsh(cov), 0.0)).tolist()
         if large < _SPOT_M:
-            return one.models[:1], "people are seen in one spot: only a shift is determined"
+            return camera.models[:1], "people are seen in one spot: only a shift is determined"
         if small < max(_NARROW_M, _NARROW * large):
-            return one.models[:2], "people walk on one line: only a shift and a rotation are determined"
-        return one.models, ""
+            return camera.models[:2], "people walk on one line: only a shift and a rotation are determined"
+        return camera.models, ""
 
-    def _held_out(self, one: Watched, places: Feet, fits: Sequence[Floats], block: Ints) -> Floats:
+    def _held_out(self, camera: Watched, places: Feet, fits: Sequence[Floats], block: Ints) -> Floats:
         """The loss of each block (B,) under the map that was fitted to the other ones."""
         out = np.full(_BLOCKS, np.nan)
         for fold, fit in enumerate(fits):
-            feet = one.feet.at(block[one.feet.frame] % 2 == fold)
+            feet = camera.feet.at(block[camera.feet.frame] % 2 == fold)
             cost = loss(moved_feet(fit, feet)[0], places, self.frames)
             for number in range(fold, _BLOCKS, 2):
                 part = cost[block == number]
@@ -273,27 +273,31 @@ class Refiner:
                     out[number] = np.nanmean(part)
         return out
 
-    def _residuals(self, one: Watched, places: Feet, fits: Sequence[Floats], block: Ints) -> tuple[Residual, Residual]:
+    def _residuals(
+        self, camera: Watched, places: Feet, fits: Sequence[Floats], block: Ints
+    ) -> tuple[Residual, Residual]:
         """Distances before and after, of the same pairs, at the times that were not fitted."""
         before, after = [], []
         for fold, fit in enumerate(fits):
-            feet = one.feet.at(block[one.feet.frame] % 2 == fold)
+            feet = camera.feet.at(block[camera.feet.frame] % 2 == fold)
             now, which = moved_feet(fit, feet)
-            found = pair(now, places, _PAIRED_M)
-            apart = feet.xy_m[which[found.feet]] - places.xy_m[found.places]
+            pairs = pair(now, places, _PAIRED_M)
+            apart = feet.xy_m[which[pairs.feet]] - places.xy_m[pairs.places]
             before.append(np.hypot(*apart.T))
-            after.append(found.distance_m)
+            after.append(pairs.distance_m)
         return _residual(np.concatenate(before)), _residual(np.concatenate(after))
 
-    def _result(self, one: Watched, judged: _Found | str) -> Refined:
+    def _result(self, camera: Watched, judged: _Found | str) -> Refined:
         none = np.eye(3)
         if isinstance(judged, str):
-            return Refined(one.name, "", none, 0.0, None, None, judged or one.why_held)
-        if one.why_held:
-            return Refined(one.name, "", none, 0.0, judged.before, judged.before, one.why_held)
+            return Refined(camera.name, "", none, 0.0, None, None, judged or camera.why_held)
+        if camera.why_held:
+            return Refined(camera.name, "", none, 0.0, judged.before, judged.before, camera.why_held)
         why = "" if judged.model else "it agrees with the others"
         limit = judged.limit if judged.model else ""
-        return Refined(one.name, judged.model, judged.matrix, judged.moved_m, judged.before, judged.after, why, limit)
+        return Refined(
+            camera.name, judged.model, judged.matrix, judged.moved_m, judged.before, judged.after, why, limit
+        )
 
 
 def _residual(distance_m: Floats) -> Residual:
@@ -302,9 +306,9 @@ def _residual(distance_m: Floats) -> Residual:
     return Residual(float(np.median(distance_m)), float(np.quantile(distance_m, 0.9)), len(distance_m))
 
 
-def _moves(one: Watched, before: Floats, after: Floats) -> float:
+def _moves(camera: Watched, before: Floats, after: Floats) -> float:
     """The distance between where two maps put the feet of a camera, as the root of its mean square in metres."""
-    apart = moved(after, one.feet.xy_m) - moved(before, one.feet.xy_m)
+    apart = moved(after, camera.feet.xy_m) - moved(before, camera.feet.xy_m)
     squared = (apart**2).sum(axis=1)
     squared = squared[np.isfinite(squared)]
     return float(np.sqrt(squared.mean())) if len(squared) else 0.0
@@ -317,6 +321,6 @@ def _is_as_good(cost: Floats, best: Floats) -> bool:
 
 
 def _is_sure(gain: Floats) -> bool:
-    """Whether blocks (B,) gain, by more than chance."""
+    """Whether the mean gain of blocks (B,) is more than chance."""
     gain = gain[np.isfinite(gain)]
     return len(gain) > 2 and float(gain.mean()) > _SURE * float(gain.std(ddof=1) / np.sqrt(len(gain)))

@@ -137,11 +137,11 @@ class Report:
     has_zones: bool = False
     watch: Stopwatch = field(default_factory=Stopwatch)
 
-    def count(self, topic: str, made: Made) -> None:
+    def count(self, topic: str, channel: Made) -> None:
         """Count the frames, rows and tracks of a new channel."""
-        self.frames[topic], self.rows[topic] = len(made.frames), int(row_ends(made.frames)[-1])
-        if made.schema is TRACKS:
-            self.tracks[topic] = len(unique_values(TRACKS, made.frames, "track_id"))
+        self.frames[topic], self.rows[topic] = len(channel.frames), int(row_ends(channel.frames)[-1])
+        if channel.schema is TRACKS:
+            self.tracks[topic] = len(unique_values(TRACKS, channel.frames, "track_id"))
 
 
 # Warn about results that are empty or unreliable, and about memory that runs out.
@@ -154,25 +154,27 @@ _IN_METRES: Final = {name for name, stage in STAGES.items() if stage.default.rea
 _BASE, _A_PERSON_SECOND = 400_000_000, 3_000
 
 
-def warn_no_rows(stage: str, source: str, transform: Transform, given: Sequence[Frame], made: Sequence[Frame]) -> None:
+def warn_no_rows(
+    stage: str, source: str, transform: Transform, read: Sequence[Frame], made_rows: Sequence[Frame]
+) -> None:
     """Warn if a stage made no rows, with the likely reason.
 
-    ``given`` are the frames that the stage read, ``made`` those of its first output.
+    ``read`` are the frames that the stage read, ``made_rows`` those of its first output.
     """
-    if row_ends(made)[-1]:
+    if row_ends(made_rows)[-1]:
         return
-    if transform.reads is not VIDEO and not row_ends(given)[-1]:
+    if transform.reads is not VIDEO and not row_ends(read)[-1]:
         warn(f"{source} holds nothing, so nothing was made of it", "nothing-found")
         return
-    reason = transform.why_empty(given, made) if hasattr(transform, "why_empty") else "the transform gave none"
+    reason = transform.why_empty(read, made_rows) if hasattr(transform, "why_empty") else "the transform gave none"
     warn(f"no {STAGES[stage].rows} of {source}: {reason}", "nothing-found")
 
 
 def warn_clock_jumps(opened: log.Log) -> None:
     """Warn if the clock of a log jumps, or if nothing was recorded for long."""
-    if words := log.jumps_text(log.clock_jumps(opened), opened.start_ns):
+    if jumps := log.jumps_text(log.clock_jumps(opened), opened.start_ns):
         warn(
-            f"{opened.path}: {words}: the clock jumps, or the recording paused; tracks and forecasts end there",
+            f"{opened.path}: {jumps}: the clock jumps, or the recording paused; tracks and forecasts end there",
             "clock-jump",
         )
 
@@ -192,44 +194,45 @@ def warn_memory(frames: Sequence[Frame]) -> None:
 
 def free_memory() -> int | None:
     """Return the free memory for this process in bytes, as Linux reports it; None if it isn't known."""
-    found = []
+    limits = []
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
-        found += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+        limits += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
         most, now = (Path(f"/sys/fs/cgroup/memory.{name}").read_text().strip() for name in ("max", "current"))
-        found += [int(most) - int(now)] if most != "max" else []
+        limits += [int(most) - int(now)] if most != "max" else []
     except (OSError, ValueError):
         pass  # not Linux, or no memory limit for this process's control group
-    return min(found, default=None)
+    return min(limits, default=None)
 
 
-def warn_findings(opened: log.Log, prefix: str, made: Mapping[str, Provenance], planes: Planes, is_all: bool) -> None:
+def warn_findings(
+    opened: log.Log, prefix: str, results: Mapping[str, Provenance], planes: Planes, is_all: bool
+) -> None:
     """Repeat the warnings that channels carry in their provenance, and warn about an estimated scale.
 
-    This covers the channels in ``made``, by topic, and the channels that they were made from; with ``is_all`` it covers
-    all channels of the camera.
+    This covers ``results`` and the channels that they were made from; with ``is_all`` all channels of the camera.
     """
-    known = dict(made)
+    provenances = dict(results)
     for topic in sorted(camera_at(opened, prefix).topics):
         provenance = Provenance.from_metadata(opened.channels[topic].metadata)
         if provenance is not None:
-            known.setdefault(topic, provenance)
-    topics = list(known) if is_all else list(made)
+            provenances.setdefault(topic, provenance)
+    topics = list(provenances) if is_all else list(results)
     for topic in topics:
-        if known[topic].input in known and known[topic].input not in topics:
-            topics.append(known[topic].input)
-    stages = {known[topic].transform for topic in topics}
+        if provenances[topic].input in provenances and provenances[topic].input not in topics:
+            topics.append(provenances[topic].input)
+    stages = {provenances[topic].transform for topic in topics}
     for topic in topics:
-        for code, message in known[topic].warnings:
+        for code, message in provenances[topic].warnings:
             warn(message, known_code(code))
     if is_assumed(planes) and stages & _IN_METRES:
-        words = plane_in_words(planes, known.get(camera_at(opened, prefix).ground_plane))
-        warn(words, "estimated-ground-plane" if is_estimated(planes) else "assumed-ground-plane")
-    given = [known[topic].parameters for topic in topics]
-    held_back = [one for one in given if one.get("poor_scale") and not one.get("side_view")]
+        plane = plane_in_words(planes, provenances.get(camera_at(opened, prefix).ground_plane))
+        warn(plane, "estimated-ground-plane" if is_estimated(planes) else "assumed-ground-plane")
+    parameters = [provenances[topic].parameters for topic in topics]
+    held_back = [values for values in parameters if values.get("poor_scale") and not values.get("side_view")]
     if held_back:
-        by_likelihood = [one for one in held_back if one.get("retracker", "likelihood") == "likelihood"]
-        is_linked = any(one.get("link_s") != 0 for one in by_likelihood)
+        by_likelihood = [values for values in held_back if values.get("retracker", "likelihood") == "likelihood"]
+        is_linked = any(values.get("link_s") != 0 for values in by_likelihood)
         done = "only linked over gaps, by their boxes in the picture" if is_linked else "not re-tracked but passed on"
         warn(
             f"tracks were {done}: without a measured ground plane, more needs a camera that looks down, and this one "
@@ -281,7 +284,7 @@ def _run(
     fused: Mapping[str, Made],
     before: Before | None,
 ) -> Report:
-    made: dict[str, Made] = dict(fused)
+    results: dict[str, Made] = dict(fused)
     stamps: dict[str, list[int]] = {}
     report = Report(stages=[FUSE] if fused else [])
     for topic, channel in fused.items():
@@ -289,81 +292,83 @@ def _run(
     planes, part = read_planes(opened, prefix), report.watch.part
     for job in jobs:
         with part("read"):
-            given = _input(opened, job, made, stamps, progress, boxes, report.watch)
-            source = (job.source, given.digest())
+            job_input = _input(opened, job, results, stamps, progress, boxes, report.watch)
+            source = (job.source, job_input.digest())
         with part(job.stage):
-            planes, ground, frame_id = planes_for(opened, prefix, job, given.frames, source, made, planes, choice)
-        made |= ground
-        given = given._replace(frame_id=given.frame_id or frame_id)
+            planes, ground, frame_id = planes_for(
+                opened, prefix, job, job_input.frames, source, results, planes, choice
+            )
+        results |= ground
+        job_input = job_input._replace(frame_id=job_input.frame_id or frame_id)
         if job.transform.reads is DETECTIONS:
-            warn_memory(given.frames)
+            warn_memory(job_input.frames)
         try:
             with part(job.stage):
-                made |= _run_job(opened, prefix, job, given, made, planes or (), before, progress)
+                results |= _run_job(opened, prefix, job, job_input, results, planes or (), before, progress)
         except McaptrackError as error:
             if not job.is_optional:
                 raise
             warn(f"{job.target} is left out: {error}", "left-out")
             continue
-        for topic in (topic for topic in job.outputs() if topic in made):
-            report.count(topic, made[topic])
+        for topic in (topic for topic in job.outputs() if topic in results):
+            report.count(topic, results[topic])
         report.stages.append(job.stage)
-        del given
+        del job_input
         release_memory()
     if watch is not None:
         with part(EVENTS_STAGE):
-            events = make_events(opened, prefix, made, watch)
-        made |= events
+            events = make_events(opened, prefix, results, watch)
+        results |= events
         report.frames |= {topic: channel.size() for topic, channel in events.items()}
         report.events = tally(events)
         report.stages += [EVENTS_STAGE] if events else []
     if zones is not None:
         with part(ZONES_STAGE):
-            counted = make_zones(opened, prefix, made, planes or (), zones, stamps)
-        made |= counted
+            counted = make_zones(opened, prefix, results, planes or (), zones, stamps)
+        results |= counted
         report.frames |= {topic: channel.size() for topic, channel in counted.items()}
         report.stages += [ZONES_STAGE] if counted else []
         report.has_zones = True
-    gone = _gone(opened, jobs, made)
-    if made or output is not None:
+    gone = _gone(opened, jobs, results)
+    if results or output is not None:
         with part("write"):
-            path, _ = path_with(opened, prefix, tracks_topic(prefix), made)
-            write(opened, prefix, made, planes or (), stamps, output, path, boxes.in_space(), gone)
+            path, _ = path_with(opened, prefix, tracks_topic(prefix), results)
+            write(opened, prefix, results, planes or (), stamps, output, path, boxes.in_space(), gone)
             report.is_written = True
-    provenances = {topic: channel.provenance for topic, channel in made.items()}
+    provenances = {topic: channel.provenance for topic, channel in results.items()}
     warn_findings(opened, prefix, provenances, planes or (), is_all=watch is not None or not jobs)
-    late = outdated_by(opened, {topic: channel.provenance.digest for topic, channel in made.items()})
+    late = outdated_by(opened, {topic: channel.provenance.digest for topic, channel in results.items()})
     report.stale = [topic for topic in late if topic not in gone]
     return report
 
 
-def _gone(opened: log.Log, jobs: Sequence[Job], made: Mapping[str, Made]) -> set[str]:
-    """Return earlier results of jobs that have run which these don't make now, and what was made of them."""
+def _gone(opened: log.Log, jobs: Sequence[Job], results: Mapping[str, Made]) -> set[str]:
+    """Return channels that these jobs made earlier and don't make now, and the channels made from those."""
     gone: set[str] = set()
     for job in jobs:
-        if job.kept() & {*made}:
+        if job.kept() & {*results}:
             empty = [
                 topic for topic in job.kept() if topic in opened.channels
             ]  # no rows, no tracks at the video's rate
             gone.update(superseded(opened, job))
             gone.update(topic for topic in empty if may_replace(opened, topic, job.stage))
-    gone -= {*made}
+    gone -= {*results}
     for topic in sorted(opened.channels, key=len):  # what is made of a channel has a longer topic
-        known = Provenance.from_metadata(opened.channels[topic].metadata)
-        if known and known.transform in (EVENTS_STAGE, ZONES_STAGE, VIEW) and known.input in gone:
+        provenance = Provenance.from_metadata(opened.channels[topic].metadata)
+        if provenance and provenance.transform in (EVENTS_STAGE, ZONES_STAGE, VIEW) and provenance.input in gone:
             gone.add(topic)
-    return gone - {*made}
+    return gone - {*results}
 
 
 def outdated_by(opened: log.Log, digests: Mapping[str, str]) -> list[str]:
     """Return the other channels that stages made from earlier contents of these topics, or compared with them."""
-    found = []
-    for topic, there in sorted(opened.channels.items()):
-        known = Provenance.from_metadata(there.metadata)
-        if topic not in digests and known and known.transform in {*STAGES, EVENTS_STAGE, ZONES_STAGE, FUSE}:
-            is_late = any(digests.get(name, then) != then for name, then in known.made_from().items())
-            found += [topic] if is_late else []
-    return found
+    outdated = []
+    for topic, channel in sorted(opened.channels.items()):
+        provenance = Provenance.from_metadata(channel.metadata)
+        if topic not in digests and provenance and provenance.transform in {*STAGES, EVENTS_STAGE, ZONES_STAGE, FUSE}:
+            is_late = any(digests.get(name, then) != then for name, then in provenance.made_from().items())
+            outdated += [topic] if is_late else []
+    return outdated
 
 
 class _Repeatable:
@@ -408,7 +413,7 @@ def at_video_rate(
     opened: log.Log,
     prefix: str,
     job: Job,
-    made: Mapping[str, Made],
+    results: Mapping[str, Made],
     retracked: Sequence[Frame],
     planes: Planes,
     path: CameraPath | None,
@@ -419,13 +424,13 @@ def at_video_rate(
     ``carry`` gives these tracks the re-tracked ids. Where the camera moves by ``path``, ``planes`` and the boxes of
     ``retracked`` are those of reference pictures.
     """
-    samples = made[job.source].provenance if job.source in made else provenance_of(opened, job.source)
+    samples = results[job.source].provenance if job.source in results else provenance_of(opened, job.source)
     source = samples.input if samples else ""
-    if source in made:
-        tracks = made[source].frames if made[source].schema is TRACKS else ()
+    if source in results:
+        tracks = results[source].frames if results[source].schema is TRACKS else ()
     else:
-        there = source in opened.channels and opened.channels[source].schema_name == TRACKS.name
-        tracks = opened.frame_columns(source, TRACKS) if there else ()
+        holds_tracks = source in opened.channels and opened.channels[source].schema_name == TRACKS.name
+        tracks = opened.frame_columns(source, TRACKS) if holds_tracks else ()
     tracks = corrected_tracks(opened, prefix, source, tracks) if len(tracks) else tracks
     carried = without_filled_in(opened, prefix, source, carry(to_scene(tracks, path), retracked, planes))
     return to_pictures(carried, path)
@@ -447,36 +452,36 @@ def in_context(
     They are the ground planes, the start of the clock in ns, the rate in Hz, and the names of classes by number.
     """
     names = {f.name for f in fields(job.transform) if f.metadata.get("context")}
-    known: dict[str, Any] = {}
+    context: dict[str, Any] = {}
     if "ground_planes" in names:
-        known["ground_planes"] = tuple(planes)
+        context["ground_planes"] = tuple(planes)
     if "class_names" in names:
-        known["class_names"] = tuple((int(number), name) for number, name in classes.items())
-        _warn_of_limits(str(getattr(job.transform, "class_limits", "")), known["class_names"])
+        context["class_names"] = tuple((int(number), name) for number, name in classes.items())
+        _warn_of_limits(str(getattr(job.transform, "class_limits", "")), context["class_names"])
     if "start_ns" in names:
-        known["start_ns"] = _clock_start(opened, prefix)
+        context["start_ns"] = _clock_start(opened, prefix)
     if "rate_hz" in names:
         steps = np.diff(frame_times(frames))
         if (steps > 0).any():  # frames may share a time
-            known["rate_hz"] = round(NS_PER_S / float(np.median(steps[steps > 0])), 6)
+            context["rate_hz"] = round(NS_PER_S / float(np.median(steps[steps > 0])), 6)
             usual = f"{prefix}/{STAGES[job.stage].input_topic}"
-            if job.source != usual and known["rate_hz"] > 2 * Sample().rate_hz:
+            if job.source != usual and context["rate_hz"] > 2 * Sample().rate_hz:
                 warn(
-                    f"{job.source} has {known['rate_hz']:g} frames a second, and {job.stage} takes steps at that rate; "
-                    f"{usual} has {Sample().rate_hz:g} unless it was made otherwise",
+                    f"{job.source} has {context['rate_hz']:g} frames a second, and {job.stage} takes steps at that "
+                    f"rate; {usual} has {Sample().rate_hz:g} unless it was made otherwise",
                     "clock",
                 )
     if "poor_scale" in names and is_assumed(planes):
-        known["poor_scale"] = is_poor(frames)
-    return replace(job.transform, **known)
+        context["poor_scale"] = is_poor(frames)
+    return replace(job.transform, **context)
 
 
 def _warn_of_limits(class_limits: str, names: ClassNames) -> None:
-    """Warn of limits of classes that there are not."""
+    """Warn of limits for classes that don't exist."""
     if unknown := unknown_limits(class_limits, names):
-        there = ", ".join(sorted({name for _, name in names if name})) or "none with a name"
-        words = f"`class_limits=` names {', '.join(unknown)}: no such class is in the table of limits or in the boxes"
-        warn(f"{words} (classes of these are: {there})", "option-not-used")
+        classes = ", ".join(sorted({name for _, name in names if name})) or "none with a name"
+        text = f"`class_limits=` names {', '.join(unknown)}: no such class is in the table of limits or in the boxes"
+        warn(f"{text} (classes of these are: {classes})", "option-not-used")
 
 
 def _clock_start(opened: log.Log, prefix: str) -> int | None:
@@ -492,28 +497,28 @@ def _run_job(
     opened: log.Log,
     prefix: str,
     job: Job,
-    given: _Input,
-    made: Mapping[str, Made],
+    job_input: _Input,
+    results: Mapping[str, Made],
     planes: Planes,
     before: Before | None,
     progress: Progress,
 ) -> dict[str, Made]:
-    """Run a job, and return its channels by topic. ``made`` are the channels of earlier jobs."""
-    known = side_inputs(opened, prefix, job, made)
-    given, corrections = given.corrected(opened, prefix, job)
-    shown = given.frames
-    path, motion = path_with(opened, prefix, job.source, made) if job.transform.reads is TRACKS else (None, {})
+    """Run a job, and return its channels by topic. ``results`` are the channels of earlier jobs."""
+    side = side_inputs(opened, prefix, job, results)
+    job_input, corrections = job_input.corrected(opened, prefix, job)
+    shown = job_input.frames
+    path, motion = path_with(opened, prefix, job.source, results) if job.transform.reads is TRACKS else (None, {})
     if path is not None:  # boxes of pictures that the camera moved between can't be joined as they are
-        given, planes = given.in_scene(path), scene_planes(planes, path)
+        job_input, planes = job_input.in_scene(path), scene_planes(planes, path)
     if before is None:
         warn_unfollowed(opened, job)
-    lead = before.lead(job, numbers_of(given.frames), planes) if before and path is None else ()
+    lead = before.lead(job, numbers_of(job_input.frames), planes) if before and path is None else ()
     if lead:
-        frames = led(lead, given.frames, job.transform.reads)
-        given = given._replace(stream=frames, frames=frames)
-    context = in_context(opened, prefix, job, given.frames, planes, given.classes)
-    fixed = fixed_in(opened, prefix, job.source, made) if hasattr(context, "fixed_ids") else ()
-    transform = replace(context, **known.values, **({"fixed_ids": fixed} if fixed else {}))
+        frames = led(lead, job_input.frames, job.transform.reads)
+        job_input = job_input._replace(stream=frames, frames=frames)
+    context = in_context(opened, prefix, job, job_input.frames, planes, job_input.classes)
+    fixed = fixed_in(opened, prefix, job.source, results) if hasattr(context, "fixed_ids") else ()
+    transform = replace(context, **side.values, **({"fixed_ids": fixed} if fixed else {}))
     transform = before.in_context(transform) if before and lead else transform
     transform = with_descriptors(transform, opened, prefix, shown, progress, job.keep)
     collectors = [FrameCollector(schema) for schema in transform.writes.values()]
@@ -522,9 +527,9 @@ def _run_job(
         with collected() as warnings:
             entry = STAGES[job.stage].entry(type(transform))
             is_own = STAGES[job.stage].is_built_in(type(transform))
-            stream = _Repeatable(lambda: _counting(given.stream, taken))
-            results = transform(stream) if is_own else guarded(entry, transform, stream)
-            for result in results:
+            stream = _Repeatable(lambda: _counting(job_input.stream, taken))
+            batches = transform(stream) if is_own else guarded(entry, transform, stream)
+            for result in batches:
                 for frame, collector in zip(result, collectors, strict=True):
                     collector.append(frame)
             outputs: list[Sequence[Frame]] = [collector.done() for collector in collectors]
@@ -532,25 +537,25 @@ def _run_job(
                 outputs[0] = settle_classes(outputs[0])
             outputs, continued = before.own(job, outputs) if before else (outputs, {})
             if not warnings:  # otherwise a warning has given the reason
-                warn_no_rows(job.stage, job.source, transform, given.frames, outputs[0])
+                warn_no_rows(job.stage, job.source, transform, job_input.frames, outputs[0])
     except McaptrackError as error:
         where = "" if str(opened.path) in str(error) else f"{opened.path}: {job.source}: "
         raise type(error)(f"{where}{error}") from None
-    left_out = given.messages() - max(taken)
+    left_out = job_input.messages() - max(taken)
     if transform.reads is VIDEO and left_out > 0:
         warn(
-            f"{job.source}: {left_out} of {given.messages()} messages were left out: a video has to begin with a key "
-            "picture that has its parameter sets",
+            f"{job.source}: {left_out} of {job_input.messages()} messages were left out: a video has to begin with a "
+            "key picture that has its parameter sets",
             "left-out",
         )
-    if given.damaged:
+    if job_input.damaged:
         warn(
-            f"{job.source}: {len(given.damaged)} of {given.messages()} pictures are damaged, number {given.damaged[0]} "
-            "first; what can't be decoded there is taken from others, so that detections may be wrong up to the next "
-            "key picture",
+            f"{job.source}: {len(job_input.damaged)} of {job_input.messages()} pictures are damaged, number "
+            f"{job_input.damaged[0]} first; what can't be decoded there is taken from others, so that detections may "
+            "be wrong up to the next key picture",
             "lost",
         )
-    provenance = _provenance_of(job, transform, given, warnings, {**known.references, **motion, **corrections})
+    provenance = _provenance_of(job, transform, job_input, warnings, {**side.references, **motion, **corrections})
     provenance = replace(provenance, continued=continued)
     channels: dict[str, tuple[Schema, Sequence[Frame]]] = {
         topic: (schema, to_pictures(channel, path) if schema is TRACKS else channel)
@@ -558,7 +563,7 @@ def _run_job(
     }
     if job.target + FULL in job.kept():
         carry = linked_tracks if traits_of(transform).leaves_unchanged else to_video_rate
-        frames = at_video_rate(opened, prefix, job, made, outputs[0], planes, path, carry)
+        frames = at_video_rate(opened, prefix, job, results, outputs[0], planes, path, carry)
         channels |= {job.target + FULL: (TRACKS, frames)} if frames else {}
     seen: Channels = channels
     if not traits_of(transform).keeps_unseen:
@@ -574,7 +579,7 @@ def _run_job(
 
 
 def _provenance_of(
-    job: Job, transform: Transform, given: _Input, warnings: Sequence[Notice], references: Mapping[str, str]
+    job: Job, transform: Transform, job_input: _Input, warnings: Sequence[Notice], references: Mapping[str, str]
 ) -> Provenance:
     """Return the provenance of a job's channels. Classes are named by the transform, or else by its input.
 
@@ -598,12 +603,12 @@ def _provenance_of(
         job.stage,
         parameters,
         job.source,
-        given.digest(),
+        job_input.digest(),
         weights_sha256=weights_sha256(predictor) if isinstance(predictor, str) else card.weights_sha256,
         references=references,
         plugins=plugins_of(stage, transform),
-        classes={str(number): name for number, name in card.classes.items()} or given.classes,
-        frame_id=given.frame_id,
+        classes={str(number): name for number, name in card.classes.items()} or job_input.classes,
+        frame_id=job_input.frame_id,
         model=card.facts,
         warnings=[(notice.code, notice.message) for notice in warnings],
     )
@@ -612,14 +617,14 @@ def _provenance_of(
 def _input(
     opened: log.Log,
     job: Job,
-    made: Mapping[str, Made],
+    results: Mapping[str, Made],
     stamps: dict[str, list[int]],
     progress: Progress,
     boxes: BoxesRead,
     watch: Stopwatch,
 ) -> _Input:
     """Return the input of a job; the capture times of pictures in ns are appended to ``stamps``, by topic."""
-    if job.source not in made and job.transform.reads is VIDEO:
+    if job.source not in results and job.transform.reads is VIDEO:
         seen = stamps.setdefault(job.source, [])
         damaged: list[int] = []
         digest, pictures = pictures_of(opened, job, seen, damaged)
@@ -627,8 +632,8 @@ def _input(
         numbers = count(1)
         each = _Repeatable(lambda: _counted(watch.each("decode", pictures), numbers, steps, job.stage, progress))
         return _Input(each, [], digest, lambda: len(seen), damaged=damaged)
-    if job.source in made:
-        frames, how = made[job.source].frames, made[job.source].provenance
+    if job.source in results:
+        frames, how = results[job.source].frames, results[job.source].provenance
         of_rows, names, frame_id = how.digest, class_names(how.to_metadata()), how.frame_id
     else:
         frames, names, frame_id = read_named_frames(opened, job.source, job.transform.reads, job.frame_id, boxes)
@@ -667,6 +672,6 @@ def input_of(
     check_inputs(opened, prefix, [job])
     frames, names, _ = read_named_frames(opened, topic, transform.reads)
     classes = {str(number): name for number, name in names.items()}
-    known = in_context(opened, prefix, job, frames, read_planes(opened, prefix) or (), classes)
-    known = with_descriptors(replace(known, **side_inputs(opened, prefix, job, {}).values), opened, prefix, frames)
-    return frames, {f.name: getattr(known, f.name) for f in fields(known) if f.metadata.get("context")}
+    filled = in_context(opened, prefix, job, frames, read_planes(opened, prefix) or (), classes)
+    filled = with_descriptors(replace(filled, **side_inputs(opened, prefix, job, {}).values), opened, prefix, frames)
+    return frames, {f.name: getattr(filled, f.name) for f in fields(filled) if f.metadata.get("context")}

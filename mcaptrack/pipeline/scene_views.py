@@ -57,15 +57,15 @@ def picture_clock(opened: log.Log, prefix: str, stamps: Mapping[str, Sequence[in
     return PictureClock(video, picture_ns, stamp_ns)
 
 
-def _stamps(opened: log.Log, topic: str, known: Sequence[int]) -> Ints:
+def _stamps(opened: log.Log, topic: str, read_before: Sequence[int]) -> Ints:
     """Return the capture times of a channel's pictures in ns, (M,) for M pictures.
 
-    ``known`` are times that were read before. Pictures that were ingested have their capture time as log time; in other
-    recordings the messages contain it.
+    ``read_before`` are the times if they were read before. Pictures that were ingested have their capture time as log
+    time; in other recordings the messages contain it.
     """
     if Provenance.from_metadata(opened.channel(topic).metadata):
         return opened.times(topic)
-    return np.array(known, np.int64) if known else foreign.stamps(opened, topic)
+    return np.array(read_before, np.int64) if read_before else foreign.stamps(opened, topic)
 
 
 @dataclass(frozen=True)
@@ -93,16 +93,16 @@ class SceneOnPictures:
     def on_camera(
         self, camera: SceneCamera, schema: Schema, frames: Sequence[Frame], is_true: bool
     ) -> tuple[Sequence[Frame], Planes]:
-        """Tracks or forecasts, at the times of the pictures of a camera, tracks with boxes in them; and its planes.
+        """Return tracks (with boxes) or forecasts at the times of a camera's pictures, and the camera's planes.
 
-        Tracks that are ground truth have no boxes of detections.
+        The boxes of ground truth are not taken from detections.
         """
         if schema is TRACKS:
             return self._boxes(frames, camera, is_true), camera.view.planes
         return [frame._replace(t_ns=frame.t_ns + camera.late_ns) for frame in frames], camera.view.planes
 
     def _boxes(self, tracks: Sequence[Frame], camera: SceneCamera, is_true: bool) -> FrameColumns:
-        """Tracks with boxes in the pictures of a camera, at the times of these; ground truth has none of detections."""
+        """Return tracks with boxes in a camera's pictures; those of ground truth are not taken from detections."""
         out, numbers, last_ns = FrameCollector(TRACKS), frame_numbers(tracks), -1
         for low, high, joined in joined_parts(TRACKS, tracks):
             rows, box = joined.rows.copy(), np.full((len(joined.rows), 4), np.nan)
@@ -124,12 +124,12 @@ class SceneOnPictures:
         return out.done()
 
     def _detected(self, joined: JoinedFrames, camera: SceneCamera, usual_ns: Ints) -> tuple[Floats, Ints]:
-        """The boxes (N, 4) that a camera has of tracks, NaN where none; and the times (F,) of its pictures."""
+        """Return the camera's detected boxes of tracks (N, 4), NaN without one, and the times of its pictures (F,)."""
         box, t_ns = np.full((len(joined.rows), 4), np.nan), usual_ns.copy()
-        there, box_ns = frame_times(self._detections), frame_times(camera.boxes)
+        detected_ns, box_ns = frame_times(self._detections), frame_times(camera.boxes)
         for number, now_ns in enumerate(joined.t_ns.tolist()):
-            at = int(np.searchsorted(there, now_ns))
-            if at == len(there) or there[at] != now_ns:
+            at = int(np.searchsorted(detected_ns, now_ns))
+            if at == len(detected_ns) or detected_ns[at] != now_ns:
                 continue
             seen = self._sightings[at].rows
             seen = seen[seen["camera"] == camera.number]
@@ -150,9 +150,9 @@ class SceneOnPictures:
 
 
 def _matched(tracks: np.ndarray, detections: np.ndarray) -> tuple[Ints, Ints]:
-    """The rows of tracks, and those of the detections that they are at."""
-    here, there = (np.stack([rows["x_m"], rows["y_m"]], axis=-1) for rows in (tracks, detections))
-    apart = here[:, None] - there
+    """Match tracks with detections at the same place, and return the rows of both."""
+    here, places = (np.stack([rows["x_m"], rows["y_m"]], axis=-1) for rows in (tracks, detections))
+    apart = here[:, None] - places
     cost = np.where(tracks["observed"][:, None], np.hypot(apart[..., 0], apart[..., 1]), np.inf)
     cost[tracks["class_id"][:, None] != detections["class_id"]] = np.inf
     return assign(cost, _AT_M)
@@ -166,27 +166,27 @@ def _standing(view: CameraView, xy_m: Floats, t_ns: Ints) -> Floats:
     for plane, held in by_plane(view.planes, t_ns):
         foot = plane.metres_to_pixels(xy_m[held])
         high = view.heights_at(plane, foot)
-        found = plane.standing_boxes(xy_m[held], np.stack([view.width * high, high], axis=-1))
+        boxes = plane.standing_boxes(xy_m[held], np.stack([view.width * high, high], axis=-1))
         size = np.array([plane.width_px, plane.height_px], float)
-        low, up = found[:, :2], found[:, :2] + found[:, 2:]
+        low, up = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
         inside = np.minimum(up, size) - np.maximum(low, 0)
-        is_seen: Bools = (high > 1) & (inside > _INSIDE * found[:, 2:]).all(axis=1)
-        box[held] = np.where(is_seen[:, None], found, np.nan)
+        is_seen: Bools = (high > 1) & (inside > _INSIDE * boxes[:, 2:]).all(axis=1)
+        box[held] = np.where(is_seen[:, None], boxes, np.nan)
     return box
 
 
 def scene_on_pictures(
-    opened: log.Log, prefix: str, made: Mapping[str, tuple[Sequence[Frame], Provenance]]
+    opened: log.Log, prefix: str, results: Mapping[str, tuple[Sequence[Frame], Provenance]]
 ) -> SceneOnPictures:
     """The scene below ``prefix`` and its cameras with pictures; no cameras if it is no scene.
 
-    ``made`` are the frames and the provenance of channels that are not written yet, by topic.
+    ``results`` are the frames and the provenance of channels that are not written yet, by topic.
     """
     target = f"{prefix}/{STAGES['detect'].output_topic}"
-    how = made[target][1] if target in made else provenance_of(opened, target)
+    how = results[target][1] if target in results else provenance_of(opened, target)
     if how is None or how.transform != FUSE:
         return SceneOnPictures((), (), ())
-    found = []
+    scene_cameras = []
     offsets = dict(zip(how.parameters["cameras"], how.parameters["clock_offset_s"], strict=True))
     for number, (name, late_s) in enumerate(offsets.items()):
         camera = camera_at(opened, f"/{name}")
@@ -197,9 +197,12 @@ def scene_on_pictures(
         planes = planes_in(opened, camera.ground_plane)
         boxes = read_frames(opened, topic, DETECTIONS)
         view = CameraView(name=name, planes=tuple(planes)).with_heights_in(boxes)
-        found.append(SceneCamera(number, clock, view, boxes, seconds_to_ns(late_s)))
-    if not found:
+        scene_cameras.append(SceneCamera(number, clock, view, boxes, seconds_to_ns(late_s)))
+    if not scene_cameras:
         return SceneOnPictures((), (), ())
     parts = {target: DETECTIONS, f"{target}/sightings": SIGHTINGS}
-    frames = [made[one][0] if one in made else opened.frame_columns(one, schema) for one, schema in parts.items()]
-    return SceneOnPictures(frames[0], frames[1], found)
+    frames = [
+        results[topic][0] if topic in results else opened.frame_columns(topic, schema)
+        for topic, schema in parts.items()
+    ]
+    return SceneOnPictures(frames[0], frames[1], scene_cameras)

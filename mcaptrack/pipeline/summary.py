@@ -114,9 +114,9 @@ def summarise(opened: log.Log, prefix: str, boxes_read: BoxesRead | None = None)
     motion = _rows(opened, motion_topic(prefix), CAMERA_MOTION)
     tracked, repaired = _sources(opened, tracks), _sources(opened, retracks)
     corrected = _corrected(opened, prefix, tracks, samples)
-    given = tracked
+    compared = tracked
     if corrected:
-        given = _pairs(corrected_tracks(opened, prefix, tracks, opened.frame_columns(tracks, TRACKS)))
+        compared = _pairs(corrected_tracks(opened, prefix, tracks, opened.frame_columns(tracks, TRACKS)))
     forecasts = _forecasts(opened, f"{retracks}/predictions") or _forecasts(opened, predictions)
     planes = read_planes(opened, prefix)
     scores = _scores(opened, prefix, camera.truth, (samples, retracks))
@@ -130,7 +130,7 @@ def summarise(opened: log.Log, prefix: str, boxes_read: BoxesRead | None = None)
         pictures=opened.channels[camera.pictures].messages if camera.pictures else None,
         boxes=_count_boxes(opened, tracks, boxes, boxes_read or BoxesRead()),
         tracks=None if tracked is None else len(np.unique(tracked[0])),
-        repair=None if given is None or repaired is None else _repair(given, repaired),
+        repair=None if compared is None or repaired is None else _repair(compared, repaired),
         forecasts=None if forecasts is None else forecasts[0],
         horizon_s=None if forecasts is None else forecasts[1],
         scores=scores,
@@ -143,9 +143,9 @@ def summarise(opened: log.Log, prefix: str, boxes_read: BoxesRead | None = None)
     )
 
 
-def _appearance(made: Provenance | None) -> Looks | None:
+def _appearance(provenance: Provenance | None) -> Looks | None:
     """Return what re-tracking found of the appearance of people; None if it didn't look."""
-    facts = made.model if made else {}
+    facts = provenance.model if provenance else {}
     separation = facts.get("separation")
     try:
         was = None if separation is None else float(separation)
@@ -164,8 +164,8 @@ def _frame_id(opened: log.Log, tracks: str) -> str | None:
 
 def _corrected(opened: log.Log, prefix: str, tracks: str, samples: str) -> Corrected | None:
     """Count the corrections that the samples were made with; None if there are none."""
-    topic, made = corrections_of(opened, prefix, tracks), provenance_of(opened, samples)
-    if topic is None or made is None or topic not in made.references:
+    topic, provenance = corrections_of(opened, prefix, tracks), provenance_of(opened, samples)
+    if topic is None or provenance is None or topic not in provenance.references:
         return None
     frames = opened.frame_columns(topic, TRACKS)
     return Corrected(int(row_ends(frames)[-1]), len(unique_values(TRACKS, frames, "track_id")), len(frames))
@@ -211,8 +211,8 @@ def _forecasts(opened: log.Log, topic: str) -> tuple[int, float | None] | None:
 
 def _count_boxes(opened: log.Log, tracks: str, usual: str, boxes_read: BoxesRead) -> int | None:
     """Return the number of boxes that tracks were made from."""
-    made = provenance_of(opened, tracks)
-    source = opened.channels.get(made.input if made else usual) or opened.channels.get(usual)
+    provenance = provenance_of(opened, tracks)
+    source = opened.channels.get(provenance.input if provenance else usual) or opened.channels.get(usual)
     if source is None:
         return None
     if holds_boxes(opened, source.topic):
@@ -235,13 +235,13 @@ def _repair(tracked: Ints, repaired: Ints) -> Repair:
 
 def _scores(opened: log.Log, prefix: str, truth: str, topics: tuple[str, str]) -> SummaryScores | None:
     """Score tracks before and after re-tracking, at their common sample times; None if they can't be compared."""
-    there = [opened.channels.get(topic) for topic in (truth, *topics)]
-    if not all(channel and channel.schema_name == TRACKS.name for channel in there):
+    channels = [opened.channels.get(topic) for topic in (truth, *topics)]
+    if not all(channel and channel.schema_name == TRACKS.name for channel in channels):
         return None
     names = {topic: class_names(opened.channel(topic).metadata) for topic in (truth, *topics)}
     candidates = [Candidate(topic, None, opened.frames(topic, TRACKS), classes=names[topic]) for topic in topics]
     sequence = EvaluationInput(opened.path.stem, read_ground_truth(opened, prefix), candidates, names[truth])
-    is_3d = all(are_3d(sequence.ground_truth, one.frames) for one in candidates)
+    is_3d = all(are_3d(sequence.ground_truth, candidate.frames) for candidate in candidates)
     gate_m = GATE_3D_M if is_3d else GATE_M
     rules = {
         f"within {gate_m:g} m": EvaluateOptions(similarities=("metres",), gates_m=(gate_m,)),
@@ -249,10 +249,10 @@ def _scores(opened: log.Log, prefix: str, truth: str, topics: tuple[str, str]) -
     }
     for by, options in rules.items():
         try:
-            found = evaluate([sequence], options).results
+            results = evaluate([sequence], options).results
         except McaptrackError:
             continue  # one of them has no positions in this unit
-        rows = [result.to_json() for result in found if result.of_class is None]
+        rows = [result.to_json() for result in results if result.of_class is None]
         idf1, switches = (tuple(row[name] for row in rows) for name in ("IDF1", "IDSW"))
         return SummaryScores((idf1[0], idf1[1]), (switches[0], switches[1]), by)
     return None

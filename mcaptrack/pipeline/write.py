@@ -90,9 +90,9 @@ class Made(NamedTuple):
         names = provenance.classes if has_classes(schema) else {}
         only = only_class(schema, frames)
         provenance = replace(provenance, classes=names, class_id=str(only) if only else "")
-        made = cls(schema, frames, provenance)
+        channel = cls(schema, frames, provenance)
         beside = classes_beside_rows(provenance.class_id, names)
-        return made._replace(provenance=replace(provenance, digest=digest(made.messages(), beside)))
+        return channel._replace(provenance=replace(provenance, digest=digest(channel.messages(), beside)))
 
     def messages(self) -> Iterator[tuple[int, int, bytes]]:
         """Yield time in ns, sequence number and payload of each message, one by one: all of them take much memory."""
@@ -131,14 +131,14 @@ class DrawnMessages(Collection[tuple[int, int, bytes]]):
         return self._draw()
 
     def __contains__(self, message: object) -> bool:
-        return any(message == one for one in self)
+        return any(message == own for own in self)
 
 
 def digest_of(opened: log.Log, topic: str) -> str:
     """Return the digest of a channel's messages: from its provenance if possible, else computed."""
-    known = Provenance.from_metadata(opened.channel(topic).metadata)
-    if known and known.digest:
-        return known.digest
+    provenance = Provenance.from_metadata(opened.channel(topic).metadata)
+    if provenance and provenance.digest:
+        return provenance.digest
     return digest((message.t_ns, message.sequence, message.payload) for message in opened.messages(topic))
 
 
@@ -171,16 +171,16 @@ def highest_values(prefix: str, frames_of: Callable[[str, Schema], Sequence[Fram
             for _, _, joined in joined_parts(schema, frames_of(f"{prefix}/{name}", schema)):
                 for column in columns:
                     values = np.asarray(joined.rows[column], np.float64)
-                    known = values[np.isfinite(values)]
-                    if len(known):
-                        out[plot] = max(out.get(plot, 0.0), float(known.max()))
+                    finite = values[np.isfinite(values)]
+                    if len(finite):
+                        out[plot] = max(out.get(plot, 0.0), float(finite.max()))
     return out
 
 
 def write(
     opened: log.Log,
     prefix: str,
-    made: Mapping[str, Made],
+    results: Mapping[str, Made],
     planes: Planes,
     stamps: Mapping[str, Sequence[int]],
     output: Path | None,
@@ -195,22 +195,24 @@ def write(
     ``boxes`` are recorded boxes in space that this run has read, by topic; those that viewers don't draw get a view.
 
     ``path`` is how the camera moves, if its tracks are compensated for it: so are views, and ``planes`` with it.
-    ``made`` are the channels by topic; ``stamps`` the capture times in ns of pictures that stages have read, by topic.
+    ``results`` and ``stamps``, the capture times in ns of pictures that stages have read, are by topic.
     """
     camera = camera_at(opened, prefix)
     video, picture_ns, stamp_ns = picture_clock(opened, prefix, stamps)
-    shown = _channels_to_draw(opened, camera, made) | _boxes_to_draw(opened, boxes)
+    shown = _channels_to_draw(opened, camera, results) | _boxes_to_draw(opened, boxes)
     outdated = {topic + suffix for topic in shown for suffix in views.SUFFIXES}
     planes = moved_planes(planes, path)
     frame_id = _frame_id(opened, prefix, shown)
-    is_framed = bool(frame_id) or any(one.frame_id for one in shown.values())
+    is_framed = bool(frame_id) or any(channel.frame_id for channel in shown.values())
     tree = transforms_of(opened) if is_framed else None
     frames = new_frames(prefix, shown, tree.frames() if tree else ())
-    solid_in = next((one.frame_id for one in shown.values() if one.is_solid()), "")
+    solid_in = next((channel.frame_id for channel in shown.values() if channel.is_solid()), "")
     cameras = calibrated_cameras(opened, solid_in) if solid_in and tree else {}
-    outdated |= {one for one in opened.channels for topic in shown if one.startswith(f"{topic}{views.SUFFIX}/")}
-    scene = scene_on_pictures(opened, prefix, {topic: (one.frames, one.provenance) for topic, one in made.items()})
-    seen_on = (*cameras, *(one.pictures for one in scene.cameras))
+    outdated |= {view for view in opened.channels for topic in shown if view.startswith(f"{topic}{views.SUFFIX}/")}
+    scene = scene_on_pictures(
+        opened, prefix, {topic: (channel.frames, channel.provenance) for topic, channel in results.items()}
+    )
+    seen_on = (*cameras, *(seen.pictures for seen in scene.cameras))
     outdated |= {topic + views.SUFFIX + pictures for topic in shown for pictures in seen_on}
     drawn = ViewFactory(prefix, picture_ns, stamp_ns, planes, path, frames, cameras, scene)
     if frames:
@@ -221,20 +223,20 @@ def write(
         warn(f"no view at {topic}, which {describe_origin(opened, topic)}", "left-out")
     # Read everything before anything is written, because the log is changed in place.
     start_ns = _start_ns(opened, camera, shown, picture_ns)
-    known = shown | {topic: _nothing(opened, topic) for topic in gone}
-    eye = layouts.eye_on(_positions(opened, prefix, known), planes, start_ns)
-    last_step, is_truth_known = _last_step(opened, prefix, known), _is_truth_known(opened, prefix, known)
-    sources = recorded_sources(opened, [*camera.topics, *(one.provenance.input for one in made.values())])
+    current = shown | {topic: _nothing(opened, topic) for topic in gone}
+    eye = layouts.eye_on(_positions(opened, prefix, current), planes, start_ns)
+    last_step, is_truth_known = (_last_step(opened, prefix, current), _is_truth_known(opened, prefix, current))
+    sources = recorded_sources(opened, [*camera.topics, *(channel.provenance.input for channel in results.values())])
     follow = robot_frame(opened, sources, tree, frame_id) if tree and frame_id else ""
     by_viewers = recorded_drawings(opened, sources) if frame_id else {}
-    floor_m = _floor_m(opened, prefix, known) if frame_id else 0.0
-    highest = highest_values(prefix, lambda topic, schema: _frames(opened, known, topic, schema))
+    floor_m = _floor_m(opened, prefix, current) if frame_id else 0.0
+    highest = highest_values(prefix, lambda topic, schema: _frames(opened, current, topic, schema))
     # Write views of unchanged channels first, so that channels made again keep their place and the log its bytes.
-    first, last = ({t: c for t, c in shown.items() if (t in made) is is_made} for is_made in (False, True))
+    first, last = ({t: c for t, c in shown.items() if (t in results) is is_made} for is_made in (False, True))
     drawn_first = [view for view in drawn.views(first, start_ns) if view.topic not in recorded]
     drawn_last = [view for view in drawn.views(last, start_ns) if view.topic not in recorded]
-    topics = {*opened.channels} - outdated | {*made} | {view.topic for view in (*drawn_first, *drawn_last)}
-    by_viewers |= {one + views.SCENE_SUFFIX: True for one in sources if one + views.SCENE_SUFFIX in topics}
+    topics = {*opened.channels} - outdated | {*results} | {view.topic for view in (*drawn_first, *drawn_last)}
+    by_viewers |= {source + views.SCENE_SUFFIX: True for source in sources if source + views.SCENE_SUFFIX in topics}
     names = frozenset(topic.removeprefix(prefix + "/") for topic in topics if topic.startswith(prefix + "/"))
     frame_id = frame_id or views.ground.frame_of(prefix)
     channels = layouts.CameraChannels(
@@ -245,11 +247,11 @@ def write(
     new = {attachment_of(name): content for name, content in layout_files.items()}
     unchanged = {name for name, content in new.items() if opened.attachment(name) == content}
     replaced = [name for name in ATTACHMENTS if name not in unchanged]
-    new_topics = {*made, *outdated, *(view.topic for view in (*drawn_first, *drawn_last))}
+    new_topics = {*results, *outdated, *(view.topic for view in (*drawn_first, *drawn_last))}
     log.refuse_to_replace_recorded(opened, new_topics, "write to another channel")
     encoding = encoding_for(opened)
-    check_topics({*made, *(view.topic for view in (*drawn_first, *drawn_last))}, encoding)
-    with log.extend(opened, output, drop={*made, *outdated}, drop_attachments=replaced) as writer:
+    check_topics({*results, *(view.topic for view in (*drawn_first, *drawn_last))}, encoding)
+    with log.extend(opened, output, drop={*results, *outdated}, drop_attachments=replaced) as writer:
         streams: list[Iterator[Numbered]] = []
 
         def add_views(some: Iterable[View]) -> None:
@@ -260,7 +262,7 @@ def write(
                 streams.append(_with_number(number, foxglove.messages_in(view.schema_name, view.messages, encoding)))
 
         add_views(drawn_first)
-        for topic, channel in made.items():
+        for topic, channel in results.items():
             made_by = channel.provenance.transform  # outputs of a stage are dropped together: they share chunks
             record, metadata = channel.record_in(encoding), channel.provenance.to_metadata()
             number = writer.add_channel(topic, record, encoding, metadata, group=made_by)
@@ -273,31 +275,33 @@ def write(
     return layout_files
 
 
-def _channels_to_draw(opened: log.Log, camera: Camera, made: Mapping[str, Made]) -> dict[str, ChannelToDraw]:
+def _channels_to_draw(opened: log.Log, camera: Camera, results: Mapping[str, Made]) -> dict[str, ChannelToDraw]:
     """Return the channels that get views, by topic: those of this run, and ingested ones without a current view."""
     shown = {
         topic: ChannelToDraw(
             channel.schema, channel.frames, how.digest, how.transform, class_names(how.to_metadata()), how.frame_id
         )
-        for topic, channel in made.items()
+        for topic, channel in results.items()
         for how in (channel.provenance,)
     }
-    inputs = {topic: channel.provenance.input for topic, channel in made.items()}
+    inputs = {topic: channel.provenance.input for topic, channel in results.items()}
     for topic, channel in sorted(opened.channels.items()):
         schema = SCHEMAS.get(channel.schema_name)
-        known = Provenance.from_metadata(channel.metadata)
-        if topic in shown or topic not in camera.topics or not known or known.transform != INGEST:
+        provenance = Provenance.from_metadata(channel.metadata)
+        if topic in shown or topic not in camera.topics or not provenance or provenance.transform != INGEST:
             continue
         drawn = opened.channels.get(topic + (views.SUFFIX if schema is DETECTIONS else views.SCENE_SUFFIX))
         drawn_from = Provenance.from_metadata(drawn.metadata) if drawn else None
-        is_new = drawn_from is None or drawn_from.input_digest != known.digest
+        is_new = drawn_from is None or drawn_from.input_digest != provenance.digest
         if schema in (*views.DRAWN, GROUND_PLANE) and is_new:
-            names, frame_id = class_names(channel.metadata), known.frame_id
-            shown[topic] = ChannelToDraw(schema, opened.frame_columns(topic, schema), known.digest, "", names, frame_id)
-            inputs[topic] = known.input
-    for topic, one in shown.items():
-        if one.schema is PREDICTIONS:
-            shown[topic] = one._replace(bodies=_bodies(opened, shown, topic, inputs[topic]))
+            names, frame_id = class_names(channel.metadata), provenance.frame_id
+            shown[topic] = ChannelToDraw(
+                schema, opened.frame_columns(topic, schema), provenance.digest, "", names, frame_id
+            )
+            inputs[topic] = provenance.input
+    for topic, drawing in shown.items():
+        if drawing.schema is PREDICTIONS:
+            shown[topic] = drawing._replace(bodies=_bodies(opened, shown, topic, inputs[topic]))
     return shown
 
 
@@ -309,9 +313,9 @@ def _nothing(opened: log.Log, topic: str) -> ChannelToDraw:
 def _boxes_to_draw(opened: log.Log, boxes: Mapping[str, foreign.NamedFrames]) -> dict[str, ChannelToDraw]:
     """Return the recorded boxes that viewers can't draw, by topic."""
     return {
-        topic: ChannelToDraw(DETECTIONS, one.frames, digest_of(opened, topic), "", one.classes, one.frame_id)
-        for topic, one in boxes.items()
-        if not is_drawn_by_viewers(opened.channel(topic)) and has_bodies(DETECTIONS, one.frames)
+        topic: ChannelToDraw(DETECTIONS, box.frames, digest_of(opened, topic), "", box.classes, box.frame_id)
+        for topic, box in boxes.items()
+        if not is_drawn_by_viewers(opened.channel(topic)) and has_bodies(DETECTIONS, box.frames)
     }
 
 
@@ -327,8 +331,8 @@ def _bodies(opened: log.Log, shown: Mapping[str, ChannelToDraw], topic: str, sou
 
 def _start_ns(opened: log.Log, camera: Camera, shown: Mapping[str, ChannelToDraw], picture_ns: Ints) -> int:
     """Return the time of a camera's first picture or row in ns; 0 if there is none."""
-    known = [channel.topic for channel in opened.channels.values() if channel.schema_name in SCHEMAS]
-    times = [picture_ns, *(opened.times(topic) for topic in known if topic in camera.topics)]
+    row_topics = [channel.topic for channel in opened.channels.values() if channel.schema_name in SCHEMAS]
+    times = [picture_ns, *(opened.times(topic) for topic in row_topics if topic in camera.topics)]
     times += [np.array([channel.frames[0].t_ns], np.int64) for channel in shown.values() if len(channel.frames)]
     return min((int(some[0]) for some in times if len(some)), default=0)
 

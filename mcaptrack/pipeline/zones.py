@@ -81,16 +81,15 @@ def outputs(topic: str) -> tuple[str, ...]:
 def make_zones(
     opened: log.Log,
     prefix: str,
-    made: Mapping[str, Made],
+    results: Mapping[str, Made],
     planes: Planes,
     watch: ZoneWatch,
     stamps: Mapping[str, Sequence[int]] = {},
 ) -> dict[str, Made]:
     """Count the zones of channels of tracks that are not counted yet, or that have changed since.
 
-    ``made`` are the channels of this run, by topic, ``stamps`` the capture times of pictures, as for ``write``. Returns
-    the new channels by topic. Raises McaptrackError for given topics that hold no tracks, and for zones that none of
-    the tracks can be compared with.
+    ``results`` and ``stamps`` are as for ``write``. Returns the channels that it makes by topic. Raises
+    McaptrackError for given topics that hold no tracks, and for zones that none of the tracks can be compared with.
     """
     before = _before(opened, prefix)
     zones = watch.zones or before.zones
@@ -98,7 +97,7 @@ def make_zones(
         return {}
     options = watch.options or (before.options if before.options else ZoneOptions())
     zones = _of_camera(opened, prefix, zones, is_given=bool(watch.zones))
-    topics = watch.topics or _default_topics(opened, prefix, made, before)
+    topics = watch.topics or _default_topics(opened, prefix, results, before)
     if not topics:
         if not watch.zones:
             return {}
@@ -106,22 +105,26 @@ def make_zones(
     out: dict[str, Made] = {}
     faults: list[McaptrackError] = []
     for topic in topics:
-        if not _has_tracks(opened, topic, made):
-            there = opened.channel(topic).schema_name  # raises if there is no such channel
-            raise McaptrackError(f"{opened.path}: {topic} holds {there or 'no schema'}, not tracks")
+        if not _has_tracks(opened, topic, results):
+            schema_name = opened.channel(topic).schema_name  # raises if there is no such channel
+            raise McaptrackError(f"{opened.path}: {topic} holds {schema_name or 'no schema'}, not tracks")
         wanted = _parameters(zones, options, planes)
-        if not watch.force and not _is_due(opened, topic, made, wanted):
+        if not watch.force and not _is_due(opened, topic, results, wanted):
             continue
-        taken = [one for one in outputs(topic) if not may_replace(opened, one, VIEW if "/view/" in one else STAGE)]
+        taken = [
+            output
+            for output in outputs(topic)
+            if not may_replace(opened, output, VIEW if "/view/" in output else STAGE)
+        ]
         if taken:
-            words = f"no zones of {topic}: they would replace {taken[0]}, which {describe_origin(opened, taken[0])}"
+            text = f"no zones of {topic}: they would replace {taken[0]}, which {describe_origin(opened, taken[0])}"
             if watch.topics:
-                raise McaptrackError(f"{opened.path}: {words}")
-            warn(words, "left-out")
+                raise McaptrackError(f"{opened.path}: {text}")
+            warn(text, "left-out")
             continue
         try:
             pictures = picture_clock(opened, prefix, stamps)
-            out |= _counted(opened, prefix, topic, made, planes, zones, options, wanted, pictures)
+            out |= _counted(opened, prefix, topic, results, planes, zones, options, wanted, pictures)
         except McaptrackError as error:
             faults.append(error)
     if faults and (not out or watch.topics) and watch.zones:
@@ -135,54 +138,54 @@ def _counted(
     opened: log.Log,
     prefix: str,
     topic: str,
-    made: Mapping[str, Made],
+    results: Mapping[str, Made],
     planes: Planes,
     zones: Sequence[Zone],
     options: ZoneOptions,
     parameters: Mapping[str, Any],
     pictures: PictureClock,
 ) -> dict[str, Made]:
-    """The channels of one channel of tracks."""
-    source = made[topic].provenance.digest if topic in made else digest_of(opened, topic)
+    """Count the zones of one channel of tracks, and return the new channels by topic."""
+    source = results[topic].provenance.digest if topic in results else digest_of(opened, topic)
     frames: Sequence[Frame]
     if topic == camera_at(opened, prefix).truth:
-        frames = ground_truth_with(opened, prefix, made)
+        frames = ground_truth_with(opened, prefix, results)
     else:
-        frames = made[topic].frames if topic in made else opened.frame_columns(topic, TRACKS)
-    path, motion = path_with(opened, prefix, topic, made)
+        frames = results[topic].frames if topic in results else opened.frame_columns(topic, TRACKS)
+    path, motion = path_with(opened, prefix, topic, results)
     still = scene_planes(planes, path)
     placed: list[PlacedZone] = [place_zone(zone, still) for zone in zones]
-    positions = positions_of(frames, still, path, _class_names(opened, topic, made))
-    found = find_zone_events(frames, positions, placed, options, topic)
-    for note in found.notes:
+    positions = positions_of(frames, still, path, _class_names(opened, topic, results))
+    zone_events = find_zone_events(frames, positions, placed, options, topic)
+    for note in zone_events.notes:
         warn(note, "not-compared")
     names = {str(zone.number): zone.name for zone in zones}
     provenance = Provenance(
-        STAGE, parameters, topic, source, references=motion, zones=names, frame_id=_frame_id(opened, topic, made)
+        STAGE, parameters, topic, source, references=motion, zones=names, frame_id=_frame_id(opened, topic, results)
     )
-    rows = (found.visits, found.crossings, found.counts)
+    rows = (zone_events.visits, zone_events.crossings, zone_events.counts)
     out = {
         topic + _BELOW + name: Made.of(schema, some, provenance)
         for (name, schema), some in zip(_SCHEMAS.items(), rows, strict=True)
     }
     visited, crossed = (topic + _BELOW + name for name in list(_SCHEMAS)[:2])
-    text = list(zone_messages(found.visits, found.crossings, zones, topic, opened.start_ns))
+    text = list(zone_messages(zone_events.visits, zone_events.crossings, zones, topic, opened.start_ns))
     crossings = {crossed: out[crossed].provenance.digest}
     view = Provenance(VIEW, {}, visited, out[visited].provenance.digest, references=crossings)
     out[topic + _BELOW + SUFFIX] = Made(ZONE_VISITS, [], view, text, foxglove.LOG)
     shapes = [
         drawn_zones.ZoneShape(
-            one.zone,
-            one.zone.shape(),
-            one.shape if one.units == "metres" else None,
-            one.forward,
-            ground_height_m(positions, one.shape) if one.units == "metres" else 0.0,
+            zone.zone,
+            zone.zone.shape(),
+            zone.shape if zone.units == "metres" else None,
+            zone.forward,
+            ground_height_m(positions, zone.shape) if zone.units == "metres" else 0.0,
         )
-        for one in placed
+        for zone in placed
     ]
     view = replace(view, input=(counts := topic + _BELOW + "/counts"), input_digest=out[counts].provenance.digest)
     view = replace(view, references={})
-    captions = drawn_zones.ZoneCaptions.of(zones, found.counts)
+    captions = drawn_zones.ZoneCaptions.of(zones, zone_events.counts)
     moving, frame_id = moved_planes(planes, path), provenance.frame_id or views.ground.frame_of(prefix)
     if len(pictures.t_ns):
         clock = PictureTimes(pictures.t_ns, pictures.stamp_ns)
@@ -193,7 +196,7 @@ def _counted(
                 shapes, captions, clock, moving, path, height_px)),
             foxglove.ANNOTATIONS,
         )  # fmt: skip
-    if any(one.ground for one in shapes):
+    if any(shape.ground for shape in shapes):
         scenes = DrawnMessages(len(captions.t_ns), lambda: drawn_zones.on_ground(shapes, captions, frame_id))
         out[topic + _BELOW + views.SCENE_SUFFIX] = Made(ZONE_COUNTS, [], view, scenes, foxglove.SCENE)
     return out
@@ -207,8 +210,8 @@ def counted_zones(opened: log.Log, prefix: str) -> list[CountedZones]:
         schemas = _SCHEMAS.values()
         if not all(_holds(opened, name, schema) for name, schema in zip(names, schemas, strict=True)):
             continue
-        known = provenance_of(opened, names[0])
-        zones = zones_from_json(known.parameters.get("zones")) if known else ()
+        provenance = provenance_of(opened, names[0])
+        zones = zones_from_json(provenance.parameters.get("zones")) if provenance else ()
         rows = [opened.frame_columns(name, schema) for name, schema in zip(names, schemas, strict=True)]
         out.append(CountedZones(topic, zones, zone_totals(zones, *rows)))
     return out
@@ -225,10 +228,10 @@ class _Before(NamedTuple):
 def _before(opened: log.Log, prefix: str) -> _Before:
     topics = tuple(_with_counts(opened, prefix))
     for topic in topics:
-        known = provenance_of(opened, topic + _BELOW + next(iter(_SCHEMAS)))
-        zones = zones_from_json(known.parameters.get("zones")) if known else ()
-        if known and zones:
-            values = {one.name: known.parameters.get(one.name) for one in fields(ZoneOptions)}
+        provenance = provenance_of(opened, topic + _BELOW + next(iter(_SCHEMAS)))
+        zones = zones_from_json(provenance.parameters.get("zones")) if provenance else ()
+        if provenance and zones:
+            values = {field.name: provenance.parameters.get(field.name) for field in fields(ZoneOptions)}
             numbers = {
                 name: float(value)
                 for name, value in values.items()
@@ -241,9 +244,9 @@ def _before(opened: log.Log, prefix: str) -> _Before:
 def _with_counts(opened: log.Log, prefix: str) -> list[str]:
     """The channels of a camera's tracks with visits that this stage counted."""
     ending = _BELOW + next(iter(_SCHEMAS))
-    found = (topic for topic in sorted(camera_at(opened, prefix).topics) if topic.endswith(ending))
-    made = ((topic, provenance_of(opened, topic)) for topic in found)
-    return [topic.removesuffix(ending) for topic, known in made if known and known.transform == STAGE]
+    visits = (topic for topic in sorted(camera_at(opened, prefix).topics) if topic.endswith(ending))
+    provenances = ((topic, provenance_of(opened, topic)) for topic in visits)
+    return [topic.removesuffix(ending) for topic, how in provenances if how and how.transform == STAGE]
 
 
 def _of_camera(opened: log.Log, prefix: str, zones: tuple[Zone, ...], is_given: bool) -> tuple[Zone, ...]:
@@ -261,11 +264,11 @@ def _of_camera(opened: log.Log, prefix: str, zones: tuple[Zone, ...], is_given: 
     return kept
 
 
-def _default_topics(opened: log.Log, prefix: str, made: Mapping[str, Made], before: _Before) -> tuple[str, ...]:
+def _default_topics(opened: log.Log, prefix: str, results: Mapping[str, Made], before: _Before) -> tuple[str, ...]:
     full = f"{prefix}/retracks{FULL}"
-    retracked = full if _has_tracks(opened, full, made) else f"{prefix}/retracks"
+    retracked = full if _has_tracks(opened, full, results) else f"{prefix}/retracks"
     usual = (f"{prefix}/tracks", retracked, camera_at(opened, prefix).truth)
-    return tuple(topic for topic in dict.fromkeys((*usual, *before.topics)) if _has_tracks(opened, topic, made))
+    return tuple(topic for topic in dict.fromkeys((*usual, *before.topics)) if _has_tracks(opened, topic, results))
 
 
 def _parameters(zones: Sequence[Zone], options: ZoneOptions, planes: Planes) -> dict[str, Any]:
@@ -274,40 +277,42 @@ def _parameters(zones: Sequence[Zone], options: ZoneOptions, planes: Planes) -> 
     return values | ({"ground_planes": planes_to_json(planes)} if planes else {})
 
 
-def _is_due(opened: log.Log, topic: str, made: Mapping[str, Made], wanted: Mapping[str, Any]) -> bool:
-    """Whether the zones of a channel were never counted, in another way, or of what has changed since."""
+def _is_due(opened: log.Log, topic: str, results: Mapping[str, Made], wanted: Mapping[str, Any]) -> bool:
+    """Whether zones were not counted yet, were counted with other parameters, or are out of date."""
     names = outputs(topic)[: len(_SCHEMAS) + 1]
     if not all(name in opened.channels for name in names) or is_stale(opened, names[0]):
         return True
-    known = provenance_of(opened, names[0])
-    if known is None or not _is_same(known.parameters, wanted):
+    provenance = provenance_of(opened, names[0])
+    if provenance is None or not _is_same(provenance.parameters, wanted):
         return True
-    return any(name in made and made[name].provenance.digest != then for name, then in known.made_from().items())
+    return any(
+        name in results and results[name].provenance.digest != then for name, then in provenance.made_from().items()
+    )
 
 
 def _is_same(before: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
-    """Whether parameters are the same, as JSON has them."""
-    known = zones_from_json(before.get("zones"))
-    rest = [{key: value for key, value in one.items() if key != "zones"} for one in (before, wanted)]
-    return zones_to_json(known) == wanted["zones"] and rest[0] == rest[1]
+    """Whether two sets of parameters are the same in JSON."""
+    zones = zones_from_json(before.get("zones"))
+    rest = [{key: value for key, value in parameters.items() if key != "zones"} for parameters in (before, wanted)]
+    return zones_to_json(zones) == wanted["zones"] and rest[0] == rest[1]
 
 
-def _class_names(opened: log.Log, topic: str, made: Mapping[str, Made]) -> dict[int, str]:
+def _class_names(opened: log.Log, topic: str, results: Mapping[str, Made]) -> dict[int, str]:
     """The names of the classes of tracks."""
-    if topic in made:
-        return {int(number): name for number, name in made[topic].provenance.classes.items()}
+    if topic in results:
+        return {int(number): name for number, name in results[topic].provenance.classes.items()}
     return class_names(opened.channel(topic).metadata)
 
 
-def _frame_id(opened: log.Log, topic: str, made: Mapping[str, Made]) -> str:
+def _frame_id(opened: log.Log, topic: str, results: Mapping[str, Made]) -> str:
     """The frame of the metres of tracks."""
-    if topic in made:
-        return made[topic].provenance.frame_id
+    if topic in results:
+        return results[topic].provenance.frame_id
     return frame_id_of(opened.channel(topic).metadata)
 
 
-def _has_tracks(opened: log.Log, topic: str, made: Mapping[str, Made]) -> bool:
-    return made[topic].schema is TRACKS if topic in made else _holds(opened, topic, TRACKS)
+def _has_tracks(opened: log.Log, topic: str, results: Mapping[str, Made]) -> bool:
+    return results[topic].schema is TRACKS if topic in results else _holds(opened, topic, TRACKS)
 
 
 def _holds(opened: log.Log, topic: str, schema: Schema) -> bool:

@@ -144,10 +144,10 @@ def entry_points(group: str, unreadable: list[str] | None = None) -> list[EntryP
 
     Packages with entry points that can't be read are left out; their names are added to ``unreadable``.
     """
-    found, failed = _declared(_places(), group)
+    points, failed = _declared(_places(), group)
     if unreadable is not None:
         unreadable += failed
-    return [point for point in found if ":" not in point.name]
+    return [point for point in points if ":" not in point.name]
 
 
 def package_of(point: EntryPoint) -> tuple[str, str]:
@@ -183,14 +183,14 @@ def _declared(_places: tuple[tuple[str, int], ...], group: str) -> tuple[list[En
     try:
         return list(metadata.entry_points(group=group)), []
     except Exception:  # those of one package can't be read; the others count all the same
-        found: list[EntryPoint] = []
+        points: list[EntryPoint] = []
         failed: list[str] = []
     for distribution in metadata.distributions():
         try:
-            found += [point for point in distribution.entry_points if point.group == group]
+            points += [point for point in distribution.entry_points if point.group == group]
         except Exception:
             failed.append(_name_and_version(distribution)[0])
-    return found, failed
+    return points, failed
 
 
 def _name_and_version(distribution: Distribution | None) -> tuple[str, str]:
@@ -236,12 +236,12 @@ def find(kind: Kind, name: str, distribution: str = "") -> Entry:
     'mcaptrack.transforms.sort.ocsort:OcSort'
     """
     if name in BUILT_IN[kind]:
-        found = _load(f"{kind} {name}", BUILT_IN[kind][name])
-        return Entry(name, kind, found, found.__module__, _OWN, __version__)
+        implementation = _load(f"{kind} {name}", BUILT_IN[kind][name])
+        return Entry(name, kind, implementation, implementation.__module__, _OWN, __version__)
     if ":" in name:
         with _working_folder():
-            found = _load(f"{kind} {name}", name)
-        return Entry(name, kind, found, found.__module__, *distribution_of(found.__module__))
+            implementation = _load(f"{kind} {name}", name)
+        return Entry(name, kind, implementation, implementation.__module__, *distribution_of(implementation.__module__))
     points = [point for point in entry_points(_group(kind)) if point.name == name]
     if not points:
         raise McaptrackError(_unknown(kind, name))
@@ -250,8 +250,8 @@ def find(kind: Kind, name: str, distribution: str = "") -> Entry:
         values = " and ".join(sorted(f"{point.value} ({' '.join(package_of(point))})" for point in points))
         raise McaptrackError(f"several installed packages have a {kind} {name}: {values}; name one as module:Class")
     package = package_of(points[0])
-    found = _load(f"{kind} {name} ({' '.join(package)})", points[0].value)
-    return Entry(name, kind, found, found.__module__, *package)
+    implementation = _load(f"{kind} {name} ({' '.join(package)})", points[0].value)
+    return Entry(name, kind, implementation, implementation.__module__, *package)
 
 
 def entry_of(kind: str, cls: type) -> Entry:
@@ -335,18 +335,18 @@ def _load(what: str, reference: str) -> Any:
         raise McaptrackError(f"{what}: {reference} is not of the form module:Class")
     try:
         with nullcontext() if module.startswith(f"{_OWN}.") else contained_import(what):
-            found: Any = import_module(module.strip())
+            member: Any = import_module(module.strip())
     except BaseException as error:  # code of other packages may raise anything
         if is_interruption(error):
             raise
         raise McaptrackError(f"{what} can't be imported: {_words(error)}") from error
     for part in parts:
-        found = getattr(found, part, None)
-    if found is None:
+        member = getattr(member, part, None)
+    if member is None:
         raise McaptrackError(f"{what}: {module} has no class {path}")
-    if not callable(found) or not hasattr(found, "__qualname__"):
-        raise McaptrackError(f"{what}: {path} in {module} is no class but of type {type(found).__name__}")
-    return found
+    if not callable(member) or not hasattr(member, "__qualname__"):
+        raise McaptrackError(f"{what}: {path} in {module} is no class but of type {type(member).__name__}")
+    return member
 
 
 @contextmanager
@@ -362,13 +362,13 @@ def _working_folder() -> Iterator[None]:
 
 
 def _unknown(kind: Kind, name: str) -> str:
-    known, unreadable = names(kind), list[str]()
+    all_names, unreadable = names(kind), list[str]()
     entry_points(_group(kind), unreadable)
-    close = difflib.get_close_matches(name, known, 1)
+    close = difflib.get_close_matches(name, all_names, 1)
     meant = f"did you mean {close[0]}? " if close else ""
-    there = f"there are {', '.join(known)}" if known else f"no {kind} is built in or installed"
+    choices = f"there are {', '.join(all_names)}" if all_names else f"no {kind} is built in or installed"
     return (
-        f"no {kind} is called {name}; {meant}{there}; an installed package gives more by its entry points in "
+        f"no {kind} is called {name}; {meant}{choices}; an installed package gives more by its entry points in "
         f"{_OWN}.{kind}s, and module:Class names any class"
         + (f". The entry points of {', '.join(unreadable)} can't be read" if unreadable else "")
     )

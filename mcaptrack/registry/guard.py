@@ -214,8 +214,8 @@ def contained(what: str) -> Iterator[None]:
 @contextmanager
 def contained_import(what: str) -> Iterator[None]:
     """Import code of another package. One that doesn't end can't be ended from here, but a warning names it."""
-    words = f"the import of {what} has taken {_LONG_S:g} s and goes on; Ctrl-C ends it"
-    waiting = threading.Timer(_LONG_S, copy_context().run, (warn, words))
+    text = f"the import of {what} has taken {_LONG_S:g} s and goes on; Ctrl-C ends it"
+    waiting = threading.Timer(_LONG_S, copy_context().run, (warn, text))
     waiting.daemon = True
     waiting.start()
     try:

@@ -43,7 +43,6 @@ from mcaptrack.tables.messages import messages_table
 from mcaptrack.tables.rows import TrackNames, names_by_track, rows_in_pieces, rows_table, summary_table
 
 __all__ = [
-    "ANSWERS",
     "FORMATS",
     "RECORDING",
     "TABLES",
@@ -147,9 +146,9 @@ def read_tracks(path: Path) -> dict[str, list[Frame]]:
     for name in np.unique(topic).tolist():
         mine = np.flatnonzero((topic == name) & np.isfinite(x_m) & np.isfinite(y_m))
         mine = mine[np.lexsort((track_id[mine], t_ns[mine]))]
-        given = {"track_id": track_id, "x_m": x_m, "y_m": y_m, "observed": observed, "source_id": np.full(count, -1)}
-        given |= dict.fromkeys(("x_px", "y_px", "w_px", "h_px", "score"), nowhere)
-        rows = TRACKS.rows(**{column: values[mine] for column, values in given.items()})
+        columns = {"track_id": track_id, "x_m": x_m, "y_m": y_m, "observed": observed, "source_id": np.full(count, -1)}
+        columns |= dict.fromkeys(("x_px", "y_px", "w_px", "h_px", "score"), nowhere)
+        rows = TRACKS.rows(**{column: values[mine] for column, values in columns.items()})
         times, first = np.unique(t_ns[mine], return_index=True)
         out[name] = split_rows(times, range(len(times)), rows, np.append(first[1:], len(mine)))
     return out
@@ -171,8 +170,6 @@ def _parquet(path: Path) -> Any:
 # decimals.
 
 
-#: The formats of answers.
-ANSWERS: Final = ("csv", "json", "jsonl", "parquet", "arrow")
 _DIGITS: Final = 6
 
 
@@ -235,8 +232,8 @@ def write_answer(path: Path, table: Any, form: str) -> None:
                 for piece in pieces(table, form):  # type: ignore[arg-type]
                     stream.write(piece)
     except (OSError, pa.ArrowException) as error:
-        words = getattr(error, "strerror", None) or str(error).splitlines()[0]
-        raise McaptrackError(f"{path} can't be written: {words}") from error
+        reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
+        raise McaptrackError(f"{path} can't be written: {reason}") from error
 
 
 def cells(table: Any, limit: int) -> tuple[list[bool], list[list[str | None]]]:
@@ -288,13 +285,13 @@ def _interval(value: Any) -> str | None:
     """An interval as DuckDB prints it: 1 month 2 days 00:00:01.5."""
     if value is None:
         return None
-    words = [f"{count} {name}{'s' * (abs(count) != 1)}" for count, name in _calendar(value) if count]
+    parts = [f"{count} {name}{'s' * (abs(count) != 1)}" for count, name in _calendar(value) if count]
     sign, rest = "-" * (value.nanoseconds < 0), abs(value.nanoseconds)
-    if rest or not words:
+    if rest or not parts:
         seconds, nanos = divmod(rest, 10**9)
         fraction = f".{nanos:09d}".rstrip("0") if nanos else ""
-        words.append(f"{sign}{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}{fraction}")
-    return " ".join(words)
+        parts.append(f"{sign}{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}{fraction}")
+    return " ".join(parts)
 
 
 def _calendar(value: Any) -> Sequence[tuple[int, str]]:

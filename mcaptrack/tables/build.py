@@ -101,8 +101,8 @@ def table_to_array(table: Any) -> NDArray[Any]:
     for field in table.schema:
         column = table.column(field.name)
         if pa.types.is_dictionary(field.type) or pa.types.is_string(field.type):
-            words = column.cast(pa.string())
-            arrays[field.name] = np.array(words.fill_null("").to_pylist(), np.str_).reshape(-1)
+            strings = column.cast(pa.string())
+            arrays[field.name] = np.array(strings.fill_null("").to_pylist(), np.str_).reshape(-1)
         elif pa.types.is_timestamp(field.type):
             arrays[field.name] = column.cast(pa.int64()).to_numpy().astype("datetime64[ns]")
         elif pa.types.is_floating(field.type) and column.null_count:
@@ -201,7 +201,7 @@ class TablePieces:
         for table in self._make():
             waiting.append(table)
             count += table.num_rows
-            if self._most_bytes is not None and sum(one.nbytes for one in waiting) >= self._most_bytes:
+            if self._most_bytes is not None and sum(piece.nbytes for piece in waiting) >= self._most_bytes:
                 yield pa.concat_tables(waiting)
                 waiting, count, is_first = [self.schema.empty_table()], 0, False
             if count < PIECE_ROWS:

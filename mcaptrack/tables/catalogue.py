@@ -59,7 +59,7 @@ def refresh(folder: Path) -> bool:
 
 def _members(folder: Path) -> dict[str, list[int]]:
     """The logs of a folder by name: when their rows were written, and how many bytes that took."""
-    found = {}
+    members = {}
     try:
         with os.scandir(folder / _TABLE) as entries:
             for entry in entries:
@@ -68,10 +68,10 @@ def _members(folder: Path) -> dict[str, list[int]]:
                         about = os.stat(os.path.join(entry.path, "part-0.parquet"))
                     except OSError:
                         continue
-                    found[entry.name.removeprefix(_PREFIX)] = [about.st_mtime_ns, about.st_size]
+                    members[entry.name.removeprefix(_PREFIX)] = [about.st_mtime_ns, about.st_size]
     except OSError:
         return {}
-    return dict(sorted(found.items()))
+    return dict(sorted(members.items()))
 
 
 def _known(folder: Path) -> tuple[dict[str, list[int]], Any]:
@@ -107,9 +107,9 @@ def join(parts: Sequence[tuple[str, Any]], columns: Any = None) -> Any:
     loose = [with_recording(part, name) for name, part in parts if not isinstance(part, Path)]
     files = [(name, part) for name, part in parts if isinstance(part, Path)]
     try:
-        known = [columns] if columns is not None else []
+        first = [columns] if columns is not None else []
         schema = pa.unify_schemas(
-            [*known, *(table.schema.remove_metadata() for table in loose), *(_columns(path) for _, path in files)],
+            [*first, *(table.schema.remove_metadata() for table in loose), *(_columns(path) for _, path in files)],
             promote_options="permissive",
         )
         at = schema.get_field_index(RECORDING.name)
@@ -178,12 +178,12 @@ def _opened(path: Path, local: Any) -> tuple[Any, ...]:
 
 
 def _table(folder: Path, members: Mapping[str, list[int]]) -> Any:
-    """The rows of all logs: those of the file that still hold, and those of logs that changed."""
+    """The rows of all logs: those in the file that are still valid, and those of logs that changed."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    known, table = _known(folder)
-    kept = [name for name, state in members.items() if known.get(name) == state]
+    states, table = _known(folder)
+    kept = [name for name, state in members.items() if states.get(name) == state]
     new = [(name, folder / _TABLE / f"{_PREFIX}{name}" / "part-0.parquet") for name in members if name not in kept]
     parts = [join(new, TABLES[_TABLE].arrow).to_table()] if new else []
     if kept and table is not None:

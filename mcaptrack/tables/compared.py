@@ -83,11 +83,11 @@ def pair_files(tracks: Sequence[Path], ground_truths: Sequence[Path]) -> tuple[l
     if len(tracks) == 1:
         return [(tracks[0].stem, tracks[0], ground_truths[0])], ""
     if set(track_names) == set(ground_truth_names):
-        found = dict(zip(ground_truth_names, ground_truths, strict=True))
-        return [(name, path, found[name]) for name, path in zip(track_names, tracks, strict=True)], ""
+        truth_by_name = dict(zip(ground_truth_names, ground_truths, strict=True))
+        return [(name, path, truth_by_name[name]) for name, path in zip(track_names, tracks, strict=True)], ""
     pairs = list(zip(track_names, tracks, ground_truths, strict=True))
-    words = ", ".join(f"{path} with {other}" for _, path, other in pairs)
-    return pairs, f"names of tracks and ground truth differ: taken in the order given, {words}"
+    text = ", ".join(f"{path} with {other}" for _, path, other in pairs)
+    return pairs, f"names of tracks and ground truth differ: taken in the order given, {text}"
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
@@ -117,8 +117,8 @@ def compare_files(
     if all(have_3d):
         return _boxes_3d(tracks, ground_truth, fps, ground_plane, classes)
     if any(have_3d):
-        words = f"{tracks if have_3d[0] else ground_truth} holds 3D boxes, and {tracks if have_3d[1] else ground_truth}"
-        raise McaptrackError(f"{words} does not; they can't be compared")
+        text = f"{tracks if have_3d[0] else ground_truth} holds 3D boxes, and {tracks if have_3d[1] else ground_truth}"
+        raise McaptrackError(f"{text} does not; they can't be compared")
     both: dict[Role, tuple[Path, Labels]] = {
         "truth": (ground_truth, _read(ground_truth, "truth", topics, WantedClasses(classes or ONLY_PEOPLE.text))),
         "tracks": (tracks, _read(tracks, "tracks", topics, WantedClasses(classes or ONLY_PEOPLE.text, may_lack=True))),
@@ -190,7 +190,7 @@ def _read(path: Path, role: Role, topics: Sequence[str], wanted: WantedClasses) 
     if path.suffix.lower() in (".parquet", ".pq"):
         return _read_parquet(path, role, topics)
     if role == "tracks" and path.is_file() and _is_blank(path):
-        return _no_tracks("mot")
+        return _no_tracks()
     labels = read_labels(path, role=role, wanted=wanted)
     if labels.times_s is not None or labels.is_normalised:
         what = "times instead of frames" if labels.times_s is not None else "boxes in shares of the picture's size"
@@ -204,25 +204,25 @@ def _is_blank(path: Path) -> bool:
     return path.stat().st_size < _BLANK_BYTES and not path.read_bytes().strip()
 
 
-def _no_tracks(name: Any) -> Labels:
+def _no_tracks() -> Labels:
     """A file of tracks without rows: of a tracker that found no people."""
     none = np.empty(0, np.int64)
-    return Labels(name, 1, none, none, np.empty((0, 4)), None, np.empty(0), none, np.empty(0, np.uint32))
+    return Labels("mot", 1, none, none, np.empty((0, 4)), None, np.empty(0), none, np.empty(0, np.uint32))
 
 
 def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
     """A table of tracks in the format of ``mcaptrack export``: the rows of one topic."""
     columns = ("topic", "frame", "track_id", "x_px", "y_px", "w_px", "h_px", "x_m", "y_m", "score")
     table = tables.read_columns(path, columns)
-    there = sorted(set(table["topic"].tolist()))
-    wanted = [topic for topic in topics if topic in there] or [
-        t for t in there if t.endswith("/truth") == (role == "truth")
+    file_topics = sorted(set(table["topic"].tolist()))
+    wanted = [topic for topic in topics if topic in file_topics] or [
+        t for t in file_topics if t.endswith("/truth") == (role == "truth")
     ]
-    if role == "truth" and not wanted and len(there) == 1:
-        wanted = there
+    if role == "truth" and not wanted and len(file_topics) == 1:
+        wanted = file_topics
     if len(wanted) != 1:
         raise McaptrackError(
-            f"{path} holds {', '.join(there) or 'no rows'}; "
+            f"{path} holds {', '.join(file_topics) or 'no rows'}; "
             + ("choose one with `topic=`" if wanted else f"none of them is {role}")
         )
     mine = table["topic"] == wanted[0]
@@ -241,22 +241,22 @@ def _by_number(
     """The frames with rows in either file, by their numbers, both counted from 0."""
     ground_truth, tracks = both["truth"][1], both["tracks"][1]
     plane = _plane(ground_plane, point, ground_truth, tracks)
-    there = {role: labels.frame - labels.first_frame for role, (_, labels) in both.items()}
+    numbers_of = {role: labels.frame - labels.first_frame for role, (_, labels) in both.items()}
     if ground_truth.first_frame != tracks.first_frame and len(tracks.frame):
         first = {role: f"{path} counts frames from {labels.first_frame}" for role, (path, labels) in both.items()}
         notes.append(f"{first['tracks']}, {first['truth']}: their first frames are taken as the same")
     if len(tracks.frame):
-        spans = {role: (int(numbers.min()), int(numbers.max())) for role, numbers in there.items()}
+        spans = {role: (int(numbers.min()), int(numbers.max())) for role, numbers in numbers_of.items()}
         (a, b), (c, d) = spans["truth"], spans["tracks"]
         if b < c or d < a:
-            words = [f"{both[role][0]} ({low} to {high})" for role, (low, high) in spans.items()]
-            raise McaptrackError(f"the frames of {' and '.join(words)} never overlap, counted from 0")
+            spans_as_text = [f"{both[role][0]} ({low} to {high})" for role, (low, high) in spans.items()]
+            raise McaptrackError(f"the frames of {' and '.join(spans_as_text)} never overlap, counted from 0")
     step = max(ground_truth.step, tracks.step) if len(tracks.frame) else ground_truth.step
     sparse = ground_truth if ground_truth.step >= tracks.step or not len(tracks.frame) else tracks
     start = int(sparse.labelled[0] - sparse.first_frame) % step
-    numbers = np.unique(np.concatenate([*there.values()]))  # frames without rows do not change any score
+    numbers = np.unique(np.concatenate([*numbers_of.values()]))  # frames without rows do not change any score
     numbers = numbers[numbers % step == start]
-    frames = {role: _frames(labels, numbers, there[role], plane, role) for role, (_, labels) in both.items()}
+    frames = {role: _frames(labels, numbers, numbers_of[role], plane, role) for role, (_, labels) in both.items()}
     if ground_truth.ignored is not None and ground_truth.boxes_px is not None:
         frames["tracks"], gone = _without_ignored(frames["truth"], frames["tracks"], ground_truth)
         if gone:
@@ -278,12 +278,12 @@ def _plane(path: Path | None, point: Point, ground_truth: Labels, tracks: Labels
 
 
 def _frames(
-    labels: Labels, numbers: NDArray[np.int64], there: NDArray[np.int64], plane: GroundPlane | None, role: Role
+    labels: Labels, numbers: NDArray[np.int64], row_frames: NDArray[np.int64], plane: GroundPlane | None, role: Role
 ) -> list[Frame]:
-    """The rows of labels in the frames ``numbers``; ``there`` are the frame numbers of all rows, rising."""
+    """The rows of labels in the frames ``numbers``; ``row_frames`` are the frame numbers of all rows, rising."""
     rows = label_rows(labels, role, plane)
-    kept = np.isin(there, numbers)
-    return split_rows(numbers * NS_PER_S, numbers, rows[kept], np.searchsorted(there[kept], numbers, "right"))
+    kept = np.isin(row_frames, numbers)
+    return split_rows(numbers * NS_PER_S, numbers, rows[kept], np.searchsorted(row_frames[kept], numbers, "right"))
 
 
 def _without_ignored(ground_truth: Sequence[Frame], tracks: Sequence[Frame], labels: Labels) -> tuple[list[Frame], int]:
@@ -294,11 +294,11 @@ def _without_ignored(ground_truth: Sequence[Frame], tracks: Sequence[Frame], lab
     ignored = _rows(ignored, order)
     at = ignored.frame - labels.first_frame
     out, gone = [], 0
-    for true, found in zip(ground_truth, tracks, strict=True):
+    for true, track in zip(ground_truth, tracks, strict=True):
         low, high = np.searchsorted(at, [true.index, true.index + 1])
-        kept = ~_is_ignored(_boxes(true), _boxes(found), _rows(ignored, slice(low, high)), labels.format == "kitti")
+        kept = ~_is_ignored(_boxes(true), _boxes(track), _rows(ignored, slice(low, high)), labels.format == "kitti")
         gone += int((~kept).sum())
-        out.append(found if kept.all() else found._replace(rows=found.rows[kept]))
+        out.append(track if kept.all() else track._replace(rows=track.rows[kept]))
     return out, gone
 
 
@@ -310,13 +310,13 @@ def _boxes(frame: Frame) -> Floats:
     return np.stack([frame.rows[name] for name in ("x_px", "y_px", "w_px", "h_px")], axis=-1)
 
 
-def _is_ignored(true: Floats, found: Floats, ignored: IgnoredBoxes, kitti: bool) -> Bools:
+def _is_ignored(true: Floats, tracked: Floats, ignored: IgnoredBoxes, kitti: bool) -> Bools:
     """Mark the boxes of tracks (K,) to ignore, given true boxes (N, 4) and labels that don't count."""
-    forgiven = np.zeros(len(found), bool)
-    if not len(found):
+    forgiven = np.zeros(len(tracked), bool)
+    if not len(tracked):
         return forgiven
     other = ~ignored.region
-    alike = iou(np.concatenate([true, ignored.boxes_px[other]]), found)
+    alike = iou(np.concatenate([true, ignored.boxes_px[other]]), tracked)
     alike[alike < _ALIKE - _EPS] = 0
     matched = forgiven.copy()
     if alike.size:
@@ -327,12 +327,12 @@ def _is_ignored(true: Floats, found: Floats, ignored: IgnoredBoxes, kitti: bool)
         of_aside = rows >= len(true)
         forgiven[columns[of_aside]] = ignored.forgiven[other][rows[of_aside] - len(true)]
     if kitti:
-        forgiven |= ~matched & (found[:, 3] <= KITTI_HEIGHT_PX + _EPS)
+        forgiven |= ~matched & (tracked[:, 3] <= KITTI_HEIGHT_PX + _EPS)
         for region in ignored.boxes_px[ignored.region]:
             low, high = (
-                np.maximum(found[:, :2], region[:2]),
-                np.minimum(found[:, :2] + found[:, 2:], region[:2] + region[2:]),
+                np.maximum(tracked[:, :2], region[:2]),
+                np.minimum(tracked[:, :2] + tracked[:, 2:], region[:2] + region[2:]),
             )
-            inside = np.clip(high - low, 0, None).prod(axis=1) > _ALIKE * found[:, 2:].prod(axis=1)
+            inside = np.clip(high - low, 0, None).prod(axis=1) > _ALIKE * tracked[:, 2:].prod(axis=1)
             forgiven |= ~matched & inside
     return forgiven

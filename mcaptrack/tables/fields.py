@@ -49,8 +49,8 @@ class Field:
             _FLAG: pa.bool_(),
         }
         unit = self.unit or (_NONE if self.kind in (_INT, _FLOAT) else "")
-        words = {"unit": unit, "description": self.description}
-        return pa.field(self.name, kinds[self.kind], nullable=self.nullable, metadata=words)
+        metadata = {"unit": unit, "description": self.description}
+        return pa.field(self.name, kinds[self.kind], nullable=self.nullable, metadata=metadata)
 
 
 @dataclass(frozen=True)
@@ -94,9 +94,9 @@ def _with_unit(field: Any) -> Any:
     """A field of a row schema, with a unit if it has none."""
     import pyarrow as pa
 
-    known = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+    metadata = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
     unit = "" if pa.types.is_boolean(field.type) else _NONE
-    return field.with_metadata({"unit": unit} | known)
+    return field.with_metadata({"unit": unit} | metadata)
 
 
 _TOPIC: Final = Field("topic", _NAME, "channel of the log that the row comes from")
@@ -323,8 +323,8 @@ _BY_TRACK: Final = ("tracks", "predictions", "forecast_errors")
 
 def _plural(schema: Schema) -> str:
     """GroundPlane -> ground_planes, Tracks -> tracks."""
-    words = "".join(f"_{c.lower()}" if c.isupper() else c for c in schema.name.rpartition(".")[2]).lstrip("_")
-    return words if words.endswith("s") else words + "s"
+    name = "".join(f"_{c.lower()}" if c.isupper() else c for c in schema.name.rpartition(".")[2]).lstrip("_")
+    return name if name.endswith("s") else name + "s"
 
 
 def _of_rows(schema: Schema) -> Table:

@@ -51,19 +51,19 @@ def write(
     metadata, ``order`` names the columns by which rows are sorted. A file with the same content and metadata is left as
     it is, unless ``force``. Raises McaptrackError if the file can't be written.
     """
-    words = {"table_version": TABLE_VERSION} | dict(provenance)
+    metadata = {"table_version": TABLE_VERSION} | dict(provenance)
     if form in _DESCRIBED and not force:
-        known = file_metadata(path, form)
-        may_stay = known is not None and _describes(known, words)
-        if may_stay and digest(table.schema, pieces_of(table)) == (known or {}).get("digest"):
+        old_metadata = file_metadata(path, form)
+        may_stay = old_metadata is not None and _describes(old_metadata, metadata)
+        if may_stay and digest(table.schema, pieces_of(table)) == (old_metadata or {}).get("digest"):
             return False
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with publish(path) as part:
             if form == "parquet":
-                _write_parquet(part, table, words, order)
+                _write_parquet(part, table, metadata, order)
             elif form == "arrow":
-                _write_arrow(part, table, words | {"digest": digest(table.schema, pieces_of(table))})
+                _write_arrow(part, table, metadata | {"digest": digest(table.schema, pieces_of(table))})
             else:
                 from mcaptrack.tables import text
 
@@ -72,10 +72,10 @@ def write(
             if is_large:
                 _release()
             try:
-                found = verify(part, form) if form in _DESCRIBED else table.num_rows
+                rows_read = verify(part, form) if form in _DESCRIBED else table.num_rows
             except McaptrackError:
-                found = -1
-            if found != table.num_rows:
+                rows_read = -1
+            if rows_read != table.num_rows:
                 raise McaptrackError(
                     f"{path} can't be written: what was written does not read back the same; the disk or the "
                     "memory of this machine may be at fault"
@@ -95,18 +95,18 @@ def _release() -> None:
     release_memory()
 
 
-def _describes(known: Mapping[str, str], words: Mapping[str, str]) -> bool:
-    """Whether metadata are those, apart from the source, which may change while the content does not."""
+def _describes(old: Mapping[str, str], new: Mapping[str, str]) -> bool:
+    """Whether metadata are equal apart from source and digest: the source may change while the content does not."""
     apart = {"source": "", "digest": ""}
-    return {**known, **apart} == {**words, **apart}
+    return {**old, **apart} == {**new, **apart}
 
 
-def _write_parquet(part: Path, table: Any, words: Mapping[str, str], order: Sequence[str]) -> None:
+def _write_parquet(part: Path, table: Any, texts: Mapping[str, str], order: Sequence[str]) -> None:
     import pyarrow.parquet as pq
 
     content = _TableDigest(table.schema)
 
-    metadata = {_PREFIX + key: value for key, value in words.items()}
+    metadata = {_PREFIX + key: value for key, value in texts.items()}
     ways = [(name, "ascending") for name in order]
     with part.open("xb") as stream:
         writer = pq.ParquetWriter(
@@ -153,10 +153,10 @@ def _encodings(schema: Any) -> dict[str, Any]:
     return {"use_dictionary": dictionaries, "column_encoding": encodings}
 
 
-def _write_arrow(part: Path, table: Any, words: Mapping[str, str]) -> None:
+def _write_arrow(part: Path, table: Any, texts: Mapping[str, str]) -> None:
     import pyarrow as pa
 
-    schema = table.schema.with_metadata({_PREFIX + key: value for key, value in words.items()})
+    schema = table.schema.with_metadata({_PREFIX + key: value for key, value in texts.items()})
     options = pa.ipc.IpcWriteOptions(compression="zstd", unify_dictionaries=True)
     with part.open("xb") as stream, pa.ipc.new_file(stream, schema, options=options) as writer:
         for piece in pieces_of(table):
@@ -173,10 +173,10 @@ def file_metadata(path: Path, form: Format) -> dict[str, str] | None:
             return None
         with path.open("rb") as stream:  # Arrow opens no file with a name that is not UTF-8
             file_metadata = pq.read_metadata(stream) if form == "parquet" else pa.ipc.open_file(stream).schema
-            found = file_metadata.metadata or {}
+            raw = file_metadata.metadata or {}
     except (OSError, pa.ArrowException):
         return None
-    pairs = ((key.decode("utf-8", "replace"), value.decode("utf-8", "replace")) for key, value in found.items())
+    pairs = ((key.decode("utf-8", "replace"), value.decode("utf-8", "replace")) for key, value in raw.items())
     return {key.removeprefix(_PREFIX): value for key, value in pairs if key.startswith(_PREFIX)}
 
 
@@ -208,16 +208,16 @@ def verify(path: Path, form: Format = "parquet") -> int:
                     for group in groups
                     for batch in file.iter_batches(rows_read, row_groups=[group])
                 )
-                found = digest(file.schema_arrow, counted(batches))
+                content = digest(file.schema_arrow, counted(batches))
         else:
             with path.open("rb") as stream:
                 reader = pa.ipc.open_file(stream)
                 batches = (reader.get_batch(number) for number in range(reader.num_record_batches))
                 tables = (pa.Table.from_batches([batch]) for batch in batches)
-                found = digest(reader.schema, counted(tables))
+                content = digest(reader.schema, counted(tables))
     except (OSError, pa.ArrowException) as error:
         raise McaptrackError(f"{path} can't be read back: {str(error).splitlines()[0]}") from None
-    if found != stored:
+    if content != stored:
         raise McaptrackError(f"{path} does not hold what was written to it; export it again")
     return rows[0]
 
@@ -304,9 +304,9 @@ class _ColumnDigest:
     def _add_dictionary(self, array: Any) -> None:
         names = array.dictionary.to_pylist()
         short = [hashlib.sha256(str(name).encode("utf-8", "surrogatepass")).digest()[:8] for name in names]
-        known = np.frombuffer(b"".join([*short, bytes(8)]), "<u8")
+        hashes = np.frombuffer(b"".join([*short, bytes(8)]), "<u8")
         at = array.indices.fill_null(len(names)).to_numpy()
-        self._values.update(known[at].tobytes())
+        self._values.update(hashes[at].tobytes())
 
     def digest(self) -> str:
         """The digest of all added values."""

@@ -51,22 +51,24 @@ def messages_table(
         name = _free_name("_".join(path), names)
         makers[path] = facts.maker()
         unit = "ns" if path[-1].endswith("_ns") else ""
-        words = {"unit": unit, "description": f"field {'.'.join(path)} of {schema_name or 'the message'}"}
-        fields.append(pa.field(name, makers[path].type, metadata=words | {"path": ".".join(path)}))
+        metadata = {"unit": unit, "description": f"field {'.'.join(path)} of {schema_name or 'the message'}"}
+        fields.append(pa.field(name, makers[path].type, metadata=metadata | {"path": ".".join(path)}))
     schema = pa.schema(fields)
 
-    def made() -> Iterator[Any]:
+    def pieces() -> Iterator[Any]:
         low = 0
         for count, values in kept.parts():
             empty = [None] * count
             arrays = [
-                pa.array([None if one is None else maker.make(one) for one in values.get(path, empty)], maker.type)
+                pa.array(
+                    [None if value is None else maker.make(value) for value in values.get(path, empty)], maker.type
+                )
                 for path, maker in makers.items()
             ]
             yield pa.table([*head.slice(low, count).columns, *arrays], schema=schema)
             low += count
 
-    return TablePieces(schema, head.num_rows, made, _PIECE_BYTES), left_out
+    return TablePieces(schema, head.num_rows, pieces, _PIECE_BYTES), left_out
 
 
 class _KeptMessages:
@@ -136,12 +138,12 @@ class _Facts:
 
     def add(self, values: Sequence[Any]) -> None:
         """Add values, or None for messages without the field."""
-        there = [value for value in values if value is not None]
-        lists = [value for value in there if isinstance(value, list)]
-        self.has_bytes |= any(isinstance(value, bytes) for value in there)
+        present = [value for value in values if value is not None]
+        lists = [value for value in present if isinstance(value, list)]
+        self.has_bytes |= any(isinstance(value, bytes) for value in present)
         self.has_lists |= bool(lists)
-        self.has_others |= len(lists) < len(there)
-        members = [member for value in lists for member in value] if lists else there
+        self.has_others |= len(lists) < len(present)
+        members = [member for value in lists for member in value] if lists else present
         self.types |= set(map(type, members))
         whole = [member for member in members if isinstance(member, int)]
         self.low, self.high = min([self.low, *whole]), max([self.high, *whole])
@@ -172,7 +174,7 @@ class _Facts:
 def _free_name(wanted: str, names: dict[str, Any]) -> str:
     """The name, with a number if it is taken; case is ignored, as in SQL."""
     name, number = wanted, 1
-    taken = {known.lower() for known in names}
+    taken = {name_taken.lower() for name_taken in names}
     while name.lower() in taken:
         number += 1
         name = f"{wanted}_{number}"

@@ -121,15 +121,15 @@ def _divided(schema: Schema, frames: FrameColumns) -> Iterator[OrderedRows]:
         members = np.empty(len(order), layout)
         members["place"] = frames.ends[low] + order
         members["row"] = joined.rows.view(np.uint8).reshape(len(order), -1)[order]
-        found, starts = np.unique(group[order], return_index=True)
-        for one, some in zip(found.tolist(), np.split(members, starts[1:]), strict=True):
-            waiting[one].append(some.copy())  # a part of ``members`` would keep all of it
-            if sum(part.nbytes for part in waiting[one]) >= _BUFFER_BYTES:
-                put(one)
-    for one in range(len(last_of_group)):
-        if waiting[one]:
-            put(one)
-        members = np.frombuffer(b"".join(file.get(piece) for piece in stored[one]), layout)
+        groups, starts = np.unique(group[order], return_index=True)
+        for number, some in zip(groups.tolist(), np.split(members, starts[1:]), strict=True):
+            waiting[number].append(some.copy())  # a part of ``members`` would keep all of it
+            if sum(part.nbytes for part in waiting[number]) >= _BUFFER_BYTES:
+                put(number)
+    for number in range(len(last_of_group)):
+        if waiting[number]:
+            put(number)
+        members = np.frombuffer(b"".join(file.get(piece) for piece in stored[number]), layout)
         rows = np.ascontiguousarray(members["row"]).view(schema.dtype)[:, 0]
         yield _by_track(frames, rows, members["place"])
 
@@ -172,24 +172,26 @@ def rows_in_pieces(
     named = {topic: _Names.of(table, names.get(topic, {}), of_tracks.get(topic)) for topic in members}
     named_zones = {topic: _Names(ZONE.name, (("zone_id", zones.get(topic, {})),)) for topic in members}
     columns_of = {topic: [named[topic], *([named_zones[topic]] if table.is_of_zones() else [])] for topic in members}
-    words: dict[str, int] = {}
+    places: dict[str, int] = {}
     for topic, frames in members.items():
-        for one in columns_of[topic]:
-            one.collect(schema, frames, words)
-    known = pa.array(list(words), pa.string())
+        for column_names in columns_of[topic]:
+            column_names.collect(schema, frames, places)
+    dictionary = pa.array(list(places), pa.string())
 
-    def made() -> Iterator[Any]:
+    def pieces() -> Iterator[Any]:
         for topic, frames in members.items():
             for part in ordered_rows(schema, frames, "track_id" in table.order):
                 columns = _columns(schema, frames, part)
                 columns["topic"] = repeated([topic], [len(part.rows)], list(members))
-                for one in columns_of[topic]:
-                    if one.column:
-                        codes = one.codes(part.rows, words)
-                        columns[one.column] = pa.DictionaryArray.from_arrays(pa.array(codes, mask=codes < 0), known)
+                for column_names in columns_of[topic]:
+                    if column_names.column:
+                        codes = column_names.codes(part.rows, places)
+                        columns[column_names.column] = pa.DictionaryArray.from_arrays(
+                            pa.array(codes, mask=codes < 0), dictionary
+                        )
                 yield pa.table([columns[field.name] for field in table.arrow], schema=table.arrow)
 
-    return TablePieces(table.arrow, sum(int(frames.ends[-1]) for frames in members.values()), made)
+    return TablePieces(table.arrow, sum(int(frames.ends[-1]) for frames in members.values()), pieces)
 
 
 def _columns(schema: Schema, frames: FrameColumns, part: OrderedRows) -> dict[str, Any]:
@@ -226,27 +228,27 @@ class _Names(NamedTuple):
             return cls(CLASS.name, (("class_id", {PERSON: _PERSON, **classes}),))
         return cls("", ())
 
-    def collect(self, schema: Schema, frames: FrameColumns, words: dict[str, int]) -> None:
-        """Add the names that occur to ``words``."""
+    def collect(self, schema: Schema, frames: FrameColumns, places: dict[str, int]) -> None:
+        """Add the names that occur to ``places``."""
         for column, names in self.by:
             if names:
                 for number in unique_values(schema, frames, column).tolist():
                     if number in names:
-                        words.setdefault(names[number], len(words))
+                        places.setdefault(names[number], len(places))
 
-    def codes(self, rows: NDArray[np.void], words: Mapping[str, int]) -> NDArray[np.int32]:
-        """The places in ``words`` of the names of rows (N,); -1 for those without a name."""
+    def codes(self, rows: NDArray[np.void], places: Mapping[str, int]) -> NDArray[np.int32]:
+        """The places in ``places`` of the names of rows (N,); -1 for those without a name."""
         (column, names), *others = self.by
-        out = _codes(rows[column], names, words)
+        out = _codes(rows[column], names, places)
         for other, of_other in others:
-            out = np.where(rows[column] >= 0, out, _codes(rows[other], of_other, words))
+            out = np.where(rows[column] >= 0, out, _codes(rows[other], of_other, places))
         return out
 
 
-def _codes(numbers: NDArray[Any], names: Mapping[int, str], words: Mapping[str, int]) -> NDArray[np.int32]:
-    """The places of names in ``words``; -1 for numbers without a name."""
-    there, which = np.unique(numbers, return_inverse=True)
-    return np.array([words.get(names.get(number, ""), -1) for number in there.tolist()], np.int32)[which]
+def _codes(numbers: NDArray[Any], names: Mapping[int, str], places: Mapping[str, int]) -> NDArray[np.int32]:
+    """The places of names in ``places``; -1 for numbers without a name."""
+    unique, which = np.unique(numbers, return_inverse=True)
+    return np.array([places.get(names.get(number, ""), -1) for number in unique.tolist()], np.int32)[which]
 
 
 class _Pairs(NamedTuple):
@@ -273,17 +275,17 @@ def names_by_track(frames: FrameColumns, names: Mapping[int, str]) -> dict[int, 
 
     A track has the class of most of its rows; of several, the one that comes first.
     """
-    found = _Pairs(*(np.empty(0, np.int64) for _ in _Pairs._fields))
+    pairs = _Pairs(*(np.empty(0, np.int64) for _ in _Pairs._fields))
     for low, _, joined in joined_parts(frames.schema, frames):
         track, of_class = (joined.rows[name].astype(np.int64) for name in ("track_id", "class_id"))
         place = np.arange(len(track)) + frames.ends[low]
         here = _Pairs(track, of_class, place, np.ones(len(track), np.int64)).joined()
-        found = _Pairs(*(np.concatenate(both) for both in zip(found, here, strict=True))).joined()
-    order = np.lexsort((found.first, -found.rows, found.track))
-    ids, begin = np.unique(found.track[order], return_index=True)
-    classes = found.of_class[order][begin].tolist()
-    known = {PERSON: _PERSON, **names}
-    return {one: known[of] for one, of in zip(ids.tolist(), classes, strict=True) if of in known}
+        pairs = _Pairs(*(np.concatenate(both) for both in zip(pairs, here, strict=True))).joined()
+    order = np.lexsort((pairs.first, -pairs.rows, pairs.track))
+    ids, begin = np.unique(pairs.track[order], return_index=True)
+    classes = pairs.of_class[order][begin].tolist()
+    all_names = {PERSON: _PERSON, **names}
+    return {track_id: all_names[of] for track_id, of in zip(ids.tolist(), classes, strict=True) if of in all_names}
 
 
 def summary_table(channels: Mapping[str, FrameColumns], names: Mapping[str, Mapping[int, str]] = {}) -> Any:
@@ -304,8 +306,8 @@ def summary_table(channels: Mapping[str, FrameColumns], names: Mapping[str, Mapp
         missing = np.isnan(values) if field.nullable else None
         columns[field.name] = pa.array(values, table.arrow.field(field.name).type, mask=missing)
     columns["topic"] = repeated([topic for topic, _ in parts], [len(part["rows"]) for _, part in parts])
-    known = {topic: {PERSON: _PERSON, **names.get(topic, {})} for topic in channels}
-    called = [known[topic].get(number) for topic, part in parts for number in part["class_id"].tolist()]
+    all_names = {topic: {PERSON: _PERSON, **names.get(topic, {})} for topic in channels}
+    called = [all_names[topic].get(number) for topic, part in parts for number in part["class_id"].tolist()]
     columns[CLASS.name] = pa.array(called, pa.string()).dictionary_encode()
     return pa.table([columns[name] for name in table.arrow.names], schema=table.arrow)
 
@@ -330,15 +332,15 @@ def _summary(frames: FrameColumns, part: OrderedRows) -> dict[str, NDArray[Any]]
         ends = _ends(np.isfinite(rows[f"x_{unit}"]) & np.isfinite(rows[f"y_{unit}"]), first, last)
         for name, at in zip(("first", "last"), ends, strict=True):
             for axis in "xy":
-                found = rows[f"{axis}_{unit}"][at] if len(rows) else np.empty(0)
-                out[f"{name}_{axis}_{unit}"] = np.where(at < 0, np.nan, found)
+                values = rows[f"{axis}_{unit}"][at] if len(rows) else np.empty(0)
+                out[f"{name}_{axis}_{unit}"] = np.where(at < 0, np.nan, values)
     return out
 
 
 def _motion(place: Floats, t_ns: Ints, track: Ints, tracks: int) -> dict[str, Floats]:
     """Path and speeds of tracks over their known positions; NaN for a track without any."""
-    known = np.isfinite(place).all(axis=1)
-    place, t_ns, track = place[known], t_ns[known], track[known]
+    has_place = np.isfinite(place).all(axis=1)
+    place, t_ns, track = place[has_place], t_ns[has_place], track[has_place]
     same = track[1:] == track[:-1]
     step_m = np.hypot(*(place[1:] - place[:-1]).T)[same]
     step_s, of = (t_ns[1:] - t_ns[:-1])[same] / 1e9, track[1:][same]
@@ -352,9 +354,9 @@ def _motion(place: Floats, t_ns: Ints, track: Ints, tracks: int) -> dict[str, Fl
     return {"path_m": path, "mean_speed_m_s": mean, "max_speed_m_s": np.where(fastest < 0, np.nan, fastest)}
 
 
-def _ends(known: NDArray[np.bool_], first: Ints, last: Ints) -> tuple[Ints, Ints]:
+def _ends(has_place: NDArray[np.bool_], first: Ints, last: Ints) -> tuple[Ints, Ints]:
     """The first and last known position between ``first`` and ``last`` of each track; -1 if there is none."""
-    at = np.flatnonzero(known)
+    at = np.flatnonzero(has_place)
     if len(at) == 0:
         return np.full(len(first), -1), np.full(len(first), -1)
     low = np.searchsorted(at, first)

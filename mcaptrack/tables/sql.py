@@ -98,8 +98,8 @@ class _FolderTables:
 
     def channels(self) -> list[str]:
         paths = sorted((self.folder / TOPICS).glob(f"*/{self._member.parent.name}/{self._member.name}"))
-        known = (tables.file_metadata(path, "parquet") or {} for path in paths)
-        return [words["topic"] for words in known if "topic" in words]
+        metadata = (tables.file_metadata(path, "parquet") or {} for path in paths)
+        return [texts["topic"] for texts in metadata if "topic" in texts]
 
 
 class Database:
@@ -179,8 +179,8 @@ class Database:
         _refuse_writing([statement.type.name for statement in statements])
         answer = None
         for statement in statements:
-            found = self._run(statement)
-            answer = found if statement.type.name in _ANSWERING else answer
+            result = self._run(statement)
+            answer = result if statement.type.name in _ANSWERING else answer
         return answer
 
     def _run(self, statement: Any) -> Any:
@@ -233,8 +233,8 @@ class Database:
         if not parts and columns is None:
             return False
         for recording, part in parts:
-            words = f"from {part}" if isinstance(part, Path) else "read from the log; exported tables would be quicker"
-            self.notes.append(f"{recording}: {name} {words}")
+            text = f"from {part}" if isinstance(part, Path) else "read from the log; exported tables would be quicker"
+            self.notes.append(f"{recording}: {name} {text}")
         self._connection.register(name, tables.join(parts, columns))
         self._loaded.add(name)
         return True
@@ -247,16 +247,16 @@ class Database:
             source = _LogTables(path)
             opening.enter_context(source.opened)
             return [source]
-        found = {member.name.partition("=")[2] for name in TABLES for member in (path / name).glob("recording=*")}
-        readers = [_FolderTables(path, name) for name in sorted(found)]
-        there = [reader for reader in readers if any(reader.part(table) for table in TABLES)]
-        if not there:
+        recordings = {member.name.partition("=")[2] for name in TABLES for member in (path / name).glob("recording=*")}
+        readers = [_FolderTables(path, name) for name in sorted(recordings)]
+        usable = [reader for reader in readers if any(reader.part(table) for table in TABLES)]
+        if not usable:
             log.refuse_non_mcap(path)
-            other = " (those in other formats are not read)" if found else ""
+            other = " (those in other formats are not read)" if recordings else ""
             raise McaptrackError(
                 f"{path} is a folder without tables in Parquet{other}; give a log, or a folder that one was exported to"
             )
-        return [*there]
+        return [*usable]
 
     def _load_file(self, name: str, path: Path) -> None:
         """Load a file as a table."""
@@ -279,23 +279,23 @@ class Database:
         """A message of DuckDB in one line, with the tables that exist."""
         if missing := _MISSING.search(error):
             name = missing.group(1)
-            known = [*TABLES, *sorted(self._loaded - set(TABLES))]
+            names = [*TABLES, *sorted(self._loaded - set(TABLES))]
             channels = self.channels if "/" in name else ()
-            close = get_close_matches(name, [*known, *channels], 1) or get_close_matches(name.lower(), known, 1)
+            close = get_close_matches(name, [*names, *channels], 1) or get_close_matches(name.lower(), names, 1)
             nearest = f" (did you mean {close[0]}?)" if close else ""
             more = f"the channels {', '.join(channels)}" if channels else "channels in double quotes"
-            return f"there is no table {name}{nearest}; there are {', '.join(known)}, and {more}"
-        kind, _, words = error.partition(": ")
-        line = re.search(r"^LINE (\d+):", words, re.M)
-        words = " ".join(re.split(r"^LINE \d+:|\n\s*Candidate functions:", words, maxsplit=1, flags=re.M)[0].split())
+            return f"there is no table {name}{nearest}; there are {', '.join(names)}, and {more}"
+        kind, _, text = error.partition(": ")
+        line = re.search(r"^LINE (\d+):", text, re.M)
+        text = " ".join(re.split(r"^LINE \d+:|\n\s*Candidate functions:", text, maxsplit=1, flags=re.M)[0].split())
         if "file system operations are disabled" in error or "is disabled through configuration" in error:
-            return f"queries only read what they are given ({words}); `files=` gives a file"
-        if re.search(r'Referenced column "[^"]*[/ ][^"]*" not found', words):
-            words += " (text stands in 'single quotes', names in \"double\" ones)"
-        if "TIMESTAMPTZ_NS" in words:
-            words += " Such functions take t::timestamptz, which is exact to the microsecond."
+            return f"queries only read what they are given ({text}); `files=` gives a file"
+        if re.search(r'Referenced column "[^"]*[/ ][^"]*" not found', text):
+            text += " (text stands in 'single quotes', names in \"double\" ones)"
+        if "TIMESTAMPTZ_NS" in text:
+            text += " Such functions take t::timestamptz, which is exact to the microsecond."
         where = f", in line {line.group(1)}" if line and "\n" in query.strip() else ""
-        return f"SQL{where}: {words}" if kind.endswith("Error") else f"SQL: {error}"
+        return f"SQL{where}: {text}" if kind.endswith("Error") else f"SQL: {error}"
 
 
 def _duckdb() -> Any:

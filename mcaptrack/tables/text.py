@@ -27,8 +27,8 @@ def write(path: Path, pieces: Iterable[Any], form: str) -> None:
                 written.update(piece)
                 stream.write(piece)
     with path.open("rb") as stream:
-        found = hashlib.file_digest(stream, "sha256").hexdigest()
-    if found != written.hexdigest():
+        reread = hashlib.file_digest(stream, "sha256").hexdigest()
+    if reread != written.hexdigest():
         raise RuntimeError(f"{path}: what was written can't be read back")
 
 
@@ -49,8 +49,10 @@ def csv(table: Any, has_header: bool = True) -> Iterator[bytes]:
         elif pa.types.is_dictionary(field.type):
             table = table.set_column(number, field.name, table.column(number).cast(pa.string()))
         elif pa.types.is_nested(field.type) or pa.types.is_binary(field.type):
-            words = [None if value is None else json.dumps(_plain(value)) for value in table.column(number).to_pylist()]
-            table = table.set_column(number, field.name, pa.array(words, pa.string()))
+            values = [
+                None if value is None else json.dumps(_plain(value)) for value in table.column(number).to_pylist()
+            ]
+            table = table.set_column(number, field.name, pa.array(values, pa.string()))
     for start in range(0, max(table.num_rows, 1), _PIECE):
         piece = io.BytesIO()
         write_csv(table.slice(start, _PIECE), piece, WriteOptions(include_header=has_header and start == 0))
@@ -62,8 +64,8 @@ def iso(column: Any) -> Any:
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    words = column.cast(pa.timestamp(column.type.unit)).cast(pa.string())
-    return pc.binary_join_element_wise(pc.replace_substring(words, " ", "T"), "Z" if column.type.tz else "", "")
+    texts = column.cast(pa.timestamp(column.type.unit)).cast(pa.string())
+    return pc.binary_join_element_wise(pc.replace_substring(texts, " ", "T"), "Z" if column.type.tz else "", "")
 
 
 def rows(table: Any) -> Iterator[dict[str, Any]]:

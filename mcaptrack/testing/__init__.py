@@ -95,8 +95,8 @@ def check_predictor(predictor: Predictor, *, rotates: bool = False, seed: int = 
     if rotates:
         turned = people._replace(xy_m=xy_m @ turn.T)
         laws["rotates: forecasts rotate with the positions"] = turned, mean @ turn.T, turn @ cov @ turn.T, slice(None)
-    for law, (given, wanted_mean, wanted_cov, which) in laws.items():
-        found_mean, found_cov = (part[which] for part in ask(given))
+    for law, (changed, wanted_mean, wanted_cov, which) in laws.items():
+        found_mean, found_cov = (part[which] for part in ask(changed))
         close = np.allclose(found_mean, wanted_mean, atol=1e-6) and np.allclose(found_cov, wanted_cov, atol=1e-6)
         unchanged = all(np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in zip(people, kept, strict=True))
         if not (close and unchanged):

@@ -22,11 +22,6 @@ from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SIGHTINGS, TRACKS, VIDEO
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.protocol import Colour, Transform, check_options, traits_of
 
-Result = list[tuple[Frame, ...]]
-
-
-# The error of a broken law.
-
 
 class LawError(AssertionError):
     """A transform or a predictor breaks a law; the message says which one, and where."""
@@ -64,14 +59,14 @@ def check_transform(transform: Transform, frames: Sequence[Frame] | None = None,
     """
     declares(transform, (), seed)
     sample = sample_frames(transform.reads, seed, colour=traits_of(transform).colour) if frames is None else frames
-    given = list(sample)
-    if not given:
+    inputs = list(sample)
+    if not inputs:
         raise LawError("there are no frames to check the transform with")
     guard = Guard(type(transform).__name__)
     try:
         with guard.step():
             for law in LAWS.values():
-                law(transform, [frame._replace(rows=frame.rows.copy()) for frame in given], seed)
+                law(transform, [frame._replace(rows=frame.rows.copy()) for frame in inputs], seed)
     finally:
         with collected():
             guard.end()
@@ -188,20 +183,20 @@ def _tracks(rng: np.random.Generator, step_s: float) -> list[Frame]:
     frames = []
     for number in range(40):
         place = place + speed * step_s + rng.normal(0, 0.05, place.shape)
-        there = np.flatnonzero(rng.random(5) > 0.2)
+        seen = np.flatnonzero(rng.random(5) > 0.2)
         if rng.random() < 0.1:
             names[rng.integers(5)] = 50 + number
         rows = TRACKS.rows(
-            track_id=names[there].astype(np.int64),
-            x_px=place[there, 0] * 20 + 200,
-            y_px=place[there, 1] * 20 + 200,
-            w_px=np.full(len(there), 10.0),
-            h_px=np.full(len(there), 30.0),
-            x_m=place[there, 0],
-            y_m=place[there, 1],
-            score=rng.random(len(there)),
-            observed=rng.random(len(there)) > 0.1,
-            source_id=np.full(len(there), -1),
+            track_id=names[seen].astype(np.int64),
+            x_px=place[seen, 0] * 20 + 200,
+            y_px=place[seen, 1] * 20 + 200,
+            w_px=np.full(len(seen), 10.0),
+            h_px=np.full(len(seen), 30.0),
+            x_m=place[seen, 0],
+            y_m=place[seen, 1],
+            score=rng.random(len(seen)),
+            observed=rng.random(len(seen)) > 0.1,
+            source_id=np.full(len(seen), -1),
         )
         frames.append(Frame(seconds_to_ns(number * step_s), number, rows[rng.permutation(len(rows))]))
     return frames

@@ -83,12 +83,12 @@ _TRACKERS: Final = {"sort": "SORT", "bytetrack": "ByteTrack", "ocsort": "OC-SORT
 _FIRST_TRACKER: Final = next(iter(_TRACKERS))
 
 
-def tracker_name(made: Provenance | None) -> str:
+def tracker_name(provenance: Provenance | None) -> str:
     """Return the name of the tracker of a channel, by how it was made."""
-    stage = STAGES.get(made.transform) if made else None
-    if made is None or stage is None or stage.default.reads is not DETECTIONS:
+    stage = STAGES.get(provenance.transform) if provenance else None
+    if provenance is None or stage is None or stage.default.reads is not DETECTIONS:
         return "tracks as given"
-    return _TRACKERS.get(str(made.parameters.get(stage.option, _FIRST_TRACKER)), "tracker")
+    return _TRACKERS.get(str(provenance.parameters.get(stage.option, _FIRST_TRACKER)), "tracker")
 
 
 def find_panels(opened: log.Log, prefix: str, suffix: str = views.SUFFIX) -> list[Panel]:
@@ -100,8 +100,8 @@ def find_panels(opened: log.Log, prefix: str, suffix: str = views.SUFFIX) -> lis
     out = []
     for title, name, rest in names:
         topic = f"{prefix}/{name}"
-        found = (topic + rest, topic)
-        view = next((one + suffix for one in found if one + suffix in opened.channels), "")
+        candidates = (topic + rest, topic)
+        view = next((candidate + suffix for candidate in candidates if candidate + suffix in opened.channels), "")
         if view:
             shown = view.removesuffix(suffix)
             events = topic + "/events" if topic + "/events" in opened.channels else ""
@@ -167,7 +167,7 @@ def compare(
         for done, (t_ns, parts) in enumerate(shown, 1):
             if ground is None and scene in opened.channels:
                 ground = _Ground(opened, scene, span, max(16, round(parts[0].shape[1] * len(parts) * _GROUND)))
-            counters = [_counter(panel, one, t_ns) for panel, one in zip(panels, happened, strict=True)]
+            counters = [_counter(panel, events, t_ns) for panel, events in zip(panels, happened, strict=True)]
             captions = _captions(panels, happened, t_ns)
             clock = _clock((t_ns - start_ns) / NS_PER_S)
             titles = [panel.title for panel in panels]
@@ -205,7 +205,7 @@ def _from_above(
     seen = sights(scenes_of(opened, panels[1].view, span), width, path, len(times))
     for number, (t_ns, sight) in enumerate(zip(times.tolist(), seen, strict=True)):
         plain = empty_ground(sight, path, number)
-        yield t_ns, [one.drawn(plain.copy(), t_ns, sight) for one in drawn]
+        yield t_ns, [drawing.drawn(plain.copy(), t_ns, sight) for drawing in drawn]
 
 
 def _panel_width(options: RenderOptions, usual_px: int, count: int) -> int:
@@ -232,18 +232,18 @@ def _happened(opened: log.Log, panel: Panel, start_ns: int) -> _Happened:
     first: dict[int, int] = {}
     for _, _, joined in joined_parts(TRACKS, frames):
         ids, where = np.unique(joined.rows["track_id"], return_index=True)
-        for one, at in zip(ids.tolist(), joined.row_ns[where].tolist(), strict=True):
-            first.setdefault(one, at)
+        for track_id, at in zip(ids.tolist(), joined.row_ns[where].tolist(), strict=True):
+            first.setdefault(track_id, at)
     born_ns = np.sort(np.fromiter(first.values(), np.int64, len(first)))
     rows = []
     if panel.events:
         for frame in opened.frame_columns(panel.events, EVENTS):
             rows += [(frame.t_ns, row, EventKind(int(row["kind"]))) for row in frame.rows]
     is_compared = any(kind in (EventKind.MISS, EventKind.FALSE_TRACK, EventKind.SWITCH) for _, _, kind in rows)
-    wanted = [one for one in rows if one[2] is EventKind.SWITCH or one[2] in _REPAIRS]
-    words = [describe(row, f"at {(at - start_ns) / NS_PER_S:.1f} s", interval_s) for at, row, _ in wanted]
+    wanted = [item for item in rows if item[2] is EventKind.SWITCH or item[2] in _REPAIRS]
+    texts = [describe(row, f"at {(at - start_ns) / NS_PER_S:.1f} s", interval_s) for at, row, _ in wanted]
     t_ns = np.array([at for at, _, _ in wanted], np.int64)
-    return _Happened(t_ns, words, [kind is EventKind.SWITCH for _, _, kind in wanted], born_ns, is_compared)
+    return _Happened(t_ns, texts, [kind is EventKind.SWITCH for _, _, kind in wanted], born_ns, is_compared)
 
 
 def _counter(panel: Panel, happened: _Happened, now_ns: int) -> str:
@@ -262,12 +262,12 @@ def _counter(panel: Panel, happened: _Happened, now_ns: int) -> str:
 
 def _captions(panels: Sequence[Panel], happened: Sequence[_Happened], now_ns: int) -> list[str]:
     """The events of the last seconds as texts, the newest first."""
-    found = []
-    for panel, one in zip(panels, happened, strict=True):
-        low = int(np.searchsorted(one.t_ns, now_ns - seconds_to_ns(_SHOWN_S), "right"))
-        high = int(np.searchsorted(one.t_ns, now_ns, "right"))
-        found += [(int(one.t_ns[n]), f"{panel.title}: {one.words[n]}") for n in range(low, high)]
-    return [words for _, words in sorted(found, key=lambda pair: -pair[0])]
+    captions = []
+    for panel, events in zip(panels, happened, strict=True):
+        low = int(np.searchsorted(events.t_ns, now_ns - seconds_to_ns(_SHOWN_S), "right"))
+        high = int(np.searchsorted(events.t_ns, now_ns, "right"))
+        captions += [(int(events.t_ns[n]), f"{panel.title}: {events.words[n]}") for n in range(low, high)]
+    return [caption for _, caption in sorted(captions, key=lambda pair: -pair[0])]
 
 
 def _clock(seconds: float) -> str:
@@ -305,18 +305,18 @@ def _composed(
     top = header + height
     _write(out, clock, (line // 3, top + round(line * 1.6)), round(line * 1.7), _INK, space)
     lines = int((total - top - line * 2.2) // (line * 1.25))
-    for number, words in enumerate(captions[: max(lines, 0)]):
+    for number, caption in enumerate(captions[: max(lines, 0)]):
         at = (line // 3, top + round(line * (3.2 + 1.25 * number)))
-        _write(out, words, at, line, _INK if number == 0 else _FAINT, space)
+        _write(out, caption, at, line, _INK if number == 0 else _FAINT, space)
     return out
 
 
-def _write(image: Image, words: str, at: tuple[int, int], line_px: int, bgr: Any, most_px: int) -> int:
+def _write(image: Image, text: str, at: tuple[int, int], line_px: int, bgr: Any, most_px: int) -> int:
     """Write a line of text from its lower left corner on, smaller if it is too long; returns where it ends."""
     import cv2
 
     font, size = cv2.FONT_HERSHEY_SIMPLEX, line_px / 34
-    wide = cv2.getTextSize(words, font, size, 1)[0][0]
+    wide = cv2.getTextSize(text, font, size, 1)[0][0]
     size *= min(1.0, max(most_px, 1) / max(wide, 1))
-    cv2.putText(image, words, at, font, size, bgr, 1, cv2.LINE_AA)
-    return at[0] + int(cv2.getTextSize(words, font, size, 1)[0][0])
+    cv2.putText(image, text, at, font, size, bgr, 1, cv2.LINE_AA)
+    return at[0] + int(cv2.getTextSize(text, font, size, 1)[0][0])

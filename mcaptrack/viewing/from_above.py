@@ -97,11 +97,11 @@ class LabelPlaces:
         return drawn
 
 
-def text_size(words: str, font_size: float) -> tuple[float, float]:
+def text_size(text: str, font_size: float) -> tuple[float, float]:
     """Width and height in px of a text of annotations in a video."""
     import cv2
 
-    (wide, high), below = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, font_size / 24, 1)
+    (wide, high), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, font_size / 24, 1)
     return float(wide + 2), float(high + below + 1)
 
 
@@ -153,7 +153,7 @@ def drawing(scene: Any, sight: Sight) -> Any:
         for line in entity.lines:
             points = np.array([(point.x, point.y, point.z) for point in line.points], float).reshape(-1, 3)
             px = sight.to_pixels(_placed(line.pose, points))
-            shades: list[Shade] = [(one.r, one.g, one.b, one.a) for one in line.colors]
+            shades: list[Shade] = [(color.r, color.g, color.b, color.a) for color in line.colors]
             plain = (line.color.r, line.color.g, line.color.b, line.color.a)
             shades = shades[1::2] if line.type == _LIST else shades
             _line(out, _ANNOTATED.get(line.type, _ANNOTATED[_STRIP]), px, plain, line.thickness / 2, shades)
@@ -199,8 +199,8 @@ def _line(
         _paint(part.fill_color, fill)
 
 
-def _text(out: Any, words: str, at_px: Floats, rgba: Shade) -> None:
-    text = out.texts.add(text=words, font_size=_TEXT_PX)
+def _text(out: Any, content: str, at_px: Floats, rgba: Shade) -> None:
+    text = out.texts.add(text=content, font_size=_TEXT_PX)
     text.position.x, text.position.y = at_px.tolist()
     _paint(text.text_color, rgba)
     _paint(text.background_color, (BACKGROUND[2] / 255, BACKGROUND[1] / 255, BACKGROUND[0] / 255, 1.0))

@@ -51,11 +51,10 @@ _INK: Final = (235, 230, 225)
 
 
 class HeatMap(NamedTuple):
-    """A heat map: the topic of its tracks, the person-seconds of all cells, and the highest density in s/m2."""
+    """A heat map: the topic of its tracks, and the person-seconds of all cells."""
 
     topic: str
     person_s: float
-    most_s_per_m2: float
 
 
 def draw_heat_map(
@@ -103,7 +102,7 @@ def draw_heat_map(
     image = _with_legend(image, most, float(heat.person_s.sum()), topic)
     data = encode_image(image, "jpeg" if SUFFIXES[output.suffix.lower()] == "jpeg" else "png")
     publish_bytes(output, data)
-    return HeatMap(topic, float(heat.person_s.sum()), most)
+    return HeatMap(topic, float(heat.person_s.sum()))
 
 
 def _channel(opened: log.Log, prefix: str, topics: Sequence[str]) -> str:
@@ -116,9 +115,9 @@ def _channel(opened: log.Log, prefix: str, topics: Sequence[str]) -> str:
             raise McaptrackError(f"{opened.path}: {topics[0]} holds {channel.schema_name}, not tracks to count")
         return channel.topic
     for name in _BEST:
-        found = opened.channels.get(f"{prefix}/{name}")
-        if found is not None and found.holds(TRACKS):
-            return found.topic
+        channel_found = opened.channels.get(f"{prefix}/{name}")
+        if channel_found is not None and channel_found.holds(TRACKS):
+            return channel_found.topic
     raise McaptrackError(f"{opened.path} has no tracks of {prefix} yet; {call('run', opened.path)} makes them")
 
 
@@ -242,8 +241,8 @@ def occupancy(
 
 def _steps(t_ns: Ints, track_id: NDArray[Any], xy_m: Floats, max_gap_ns: int) -> tuple[Floats, Floats, Floats]:
     """The steps of all tracks: where each begins, how far it goes, and how long it takes, in seconds."""
-    known = np.isfinite(xy_m).all(axis=1)
-    times, ids, at = t_ns[known], track_id[known], xy_m[known]
+    has_place = np.isfinite(xy_m).all(axis=1)
+    times, ids, at = t_ns[has_place], track_id[has_place], xy_m[has_place]
     order = np.lexsort((times, ids))
     times, ids, at = times[order], ids[order], at[order]
     last = run_ends(run_starts(ids, times=times, max_gap=max_gap_ns))
@@ -293,7 +292,7 @@ def _heat(opened: log.Log, topic: str, pictures: str | None, options: RenderOpti
     for _, _, joined in joined_parts(TRACKS, frames):
         rows, t_ns = joined.rows, joined.row_ns
         classes = rows["class_id"].astype(np.int64)
-        wanted = [one for one in np.unique(classes).tolist() if one == UNKNOWN or is_person(class_name(one, names))]
+        wanted = [kind for kind in np.unique(classes).tolist() if kind == UNKNOWN or is_person(class_name(kind, names))]
         kept = np.isin(classes, wanted) & (t_ns >= first) & (t_ns <= (t_ns if last is None else last))
         parts.append((t_ns[kept], rows["track_id"][kept].astype(np.int64), rows["x_m"][kept], rows["y_m"][kept]))
     if not parts or not sum(len(part[0]) for part in parts):
@@ -321,8 +320,8 @@ def _smooth(heat: Occupancy) -> Floats:
     import cv2
 
     padded = np.pad(heat.person_s, 2)
-    found = np.asarray(cv2.GaussianBlur(padded, (0, 0), 0.8), np.float64)
-    return found / max(float(found.max()), 1e-12)
+    smoothed = np.asarray(cv2.GaussianBlur(padded, (0, 0), 0.8), np.float64)
+    return smoothed / max(float(smoothed.max()), 1e-12)
 
 
 def _over_picture(scene: Image, heat: Occupancy, plane: GroundPlane) -> Image:
@@ -341,8 +340,8 @@ def _over_picture(scene: Image, heat: Occupancy, plane: GroundPlane) -> Image:
     cells[~is_ground] = -10
     grid = _smooth(heat)
     place = cells.astype(np.float32).reshape(height, width, 2)
-    found = cv2.remap(grid.astype(np.float32), place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderValue=0)
-    return _painted((scene * 0.75).astype(np.uint8), np.asarray(found, np.float64))
+    density = cv2.remap(grid.astype(np.float32), place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderValue=0)
+    return _painted((scene * 0.75).astype(np.uint8), np.asarray(density, np.float64))
 
 
 def _from_above(heat: Occupancy, width_px: int) -> Image:
@@ -358,8 +357,8 @@ def _from_above(heat: Occupancy, width_px: int) -> Image:
     y = -(np.arange(size[1]) + 0.5 - size[1] / 2) / scale + middle[1]
     across, up = (x - low[0]) / heat.cell_m + 1.5, (y - low[1]) / heat.cell_m + 1.5
     column, row = np.meshgrid(across.astype(np.float32), up.astype(np.float32))
-    found = cv2.remap(_smooth(heat).astype(np.float32), column, row, cv2.INTER_LINEAR, borderValue=0)
-    return draw(_painted(from_above.ground(sight), np.asarray(found, np.float64)), from_above.grid(sight))
+    density = cv2.remap(_smooth(heat).astype(np.float32), column, row, cv2.INTER_LINEAR, borderValue=0)
+    return draw(_painted(from_above.ground(sight), np.asarray(density, np.float64)), from_above.grid(sight))
 
 
 def _painted(image: Image, share: Floats) -> Image:
@@ -387,13 +386,13 @@ def _with_legend(image: Image, most: float, total_s: float, topic: str) -> Image
     strip[line // 2 : line // 2 + line, line : line + long] = colours
     font, size = cv2.FONT_HERSHEY_SIMPLEX, line / 34
     for share in (0.0, 0.5, 1.0) if long > line * 8 else (0.0, 1.0):
-        words = f"{most * share**2:.2g}" + (" s/m2" if share == 1 else "")
+        text = f"{most * share**2:.2g}" + (" s/m2" if share == 1 else "")
         cv2.putText(
-            strip, words, (line + round(long * share * 0.96), round(line * 2.6)), font, size, _INK, 1, cv2.LINE_AA
+            strip, text, (line + round(long * share * 0.96), round(line * 2.6)), font, size, _INK, 1, cv2.LINE_AA
         )
     amount = f"{total_s:.0f} person-seconds" if total_s < 600 else f"{total_s / 60:.0f} person-minutes"
-    words = f"{amount} of {topic}"
-    wide = cv2.getTextSize(words, font, size, 1)[0][0]
+    text = f"{amount} of {topic}"
+    wide = cv2.getTextSize(text, font, size, 1)[0][0]
     size *= min(1.0, (width - long - 4.5 * line) / max(wide, 1))
-    cv2.putText(strip, words, (round(long + 3.5 * line), round(line * 1.4)), font, size, _INK, 1, cv2.LINE_AA)
+    cv2.putText(strip, text, (round(long + 3.5 * line), round(line * 1.4)), font, size, _INK, 1, cv2.LINE_AA)
     return np.concatenate([image, strip])

@@ -71,9 +71,9 @@ _TIME: Final = re.compile(rb'<span class="at" data-ns="(-?[0-9]{1,19})">([^<>]{1
 
 def is_about(page: bytes, fingerprint: str) -> bool:
     """Return whether a page is a report on one log with this fingerprint, in its current state."""
-    found = _DATA.search(page)
+    match = _DATA.search(page)
     try:
-        data: Any = json.loads(found[1]) if found else None
+        data: Any = json.loads(match[1]) if match else None
         logs = data["logs"]
         return bool(len(logs) == 1 and logs[0]["digest"] == fingerprint)
     except (ValueError, TypeError, KeyError, RecursionError):
@@ -89,9 +89,9 @@ def with_links(page: bytes, link_to: Callable[[int], str]) -> bytes:
     '<a class="at" href="http://a/?t=5&amp;b">0:01</a>'
     """
 
-    def linked(found: re.Match[bytes]) -> bytes:
-        address = html.escape(link_to(int(found[1])), quote=True).encode()
-        return b'<a class="at" href="' + address + b'">' + found[2] + b"</a>"
+    def linked(match: re.Match[bytes]) -> bytes:
+        address = html.escape(link_to(int(match[1])), quote=True).encode()
+        return b'<a class="at" href="' + address + b'">' + match[2] + b"</a>"
 
     return _TIME.sub(linked, page)
 
@@ -140,12 +140,12 @@ def find_moments(opened: log.Log) -> list[LinkedEvent]:
 
     Channels that can't be read are left out, with a warning.
     """
-    found: list[tuple[int, str, str, str]] = []
+    moments: list[tuple[int, str, str, str]] = []
     for topic, channel in sorted(opened.channels.items()):
         if not channel.holds(EVENTS):
             continue
-        made = Provenance.from_metadata(channel.metadata)
-        tracks = made.input if made else topic.removesuffix("/events")
+        provenance = Provenance.from_metadata(channel.metadata)
+        tracks = provenance.input if provenance else topic.removesuffix("/events")
         try:
             joined = join_frames(EVENTS, opened.frame_columns(topic, EVENTS))
             nouns = _nouns(opened, tracks)
@@ -158,9 +158,9 @@ def find_moments(opened: log.Log) -> list[LinkedEvent]:
             row = joined.rows[at]
             t_ns = int(joined.row_ns[at])
             text = describe(row, f"at {seconds_of(opened, t_ns):.1f} s", 0.0, nouns)
-            found.append((t_ns, tracks, EVENT_KINDS[EventKind(int(row["kind"]))], text))
-    found.sort(key=lambda one: (one[0], one[1]))
-    return [LinkedEvent(number, *one) for number, one in enumerate(found, 1)]
+            moments.append((t_ns, tracks, EVENT_KINDS[EventKind(int(row["kind"]))], text))
+    moments.sort(key=lambda moment: (moment[0], moment[1]))
+    return [LinkedEvent(number, *moment) for number, moment in enumerate(moments, 1)]
 
 
 def _nouns(opened: log.Log, topic: str) -> Nouns:
@@ -181,7 +181,7 @@ def opening_moment(opened: log.Log, moments: Sequence[LinkedEvent]) -> tuple[int
     half as many of them as there are at most; without any tracks, the start of the log.
     """
     for name in _BEST:
-        first = next((one for one in moments if one.topic.endswith(f"/{name}")), None)
+        first = next((moment for moment in moments if moment.topic.endswith(f"/{name}")), None)
         if first is not None:
             return before(first.t_ns, opened.start_ns), f"a second before event {first.event} ({first.text})"
     for name in _BEST:
@@ -209,7 +209,7 @@ def before(t_ns: int, start_ns: int) -> int:
 
 def video_formats(opened: log.Log) -> dict[str, str]:
     """Return the channels of pictures that depend on earlier ones, with their codecs, by topic."""
-    found = {}
+    formats = {}
     for topic, channel in sorted(opened.channels.items()):
         if not foreign.holds_pictures(channel) or not channel.messages:
             continue
@@ -218,5 +218,5 @@ def video_formats(opened: log.Log) -> dict[str, str]:
         except (McaptrackError, StopIteration):
             continue  # viewers say so themselves
         if is_video_codec(first.format):
-            found[topic] = first.format
-    return found
+            formats[topic] = first.format
+    return formats

@@ -213,9 +213,9 @@ def sights(scenes: Iterable[Any], width_px: int, path: RobotPath | None, count: 
     """The part of the ground in each picture: the surroundings of the robot, or all boxes and people of the scenes."""
     size = width_px // 2 * 2, max(2, round(width_px * _HEIGHT) // 2 * 2)
     if path is not None:
-        known = np.flatnonzero(np.isfinite(path.at_m).all(axis=1))
-        if len(known):
-            nearest = known[np.abs(known[None] - np.arange(count)[:, None]).argmin(axis=1)]
+        placed = np.flatnonzero(np.isfinite(path.at_m).all(axis=1))
+        if len(placed):
+            nearest = placed[np.abs(placed[None] - np.arange(count)[:, None]).argmin(axis=1)]
             return [Sight(x, y, size[0] / _AROUND_M, *size) for x, y in path.at_m[nearest].tolist()]
     places = [
         (shape.pose.position.x, shape.pose.position.y)
@@ -251,8 +251,8 @@ def chosen_pictures(opened: log.Log, times: Ints, what: str, output: Path, optio
         numbers = numbers[np.flatnonzero(np.diff(ticks, prepend=-1))]
     if not len(numbers):
         end = "the end" if options.end_s is None else f"{options.end_s:g} s"
-        there = f"the {what} are from 0 to {(int(times[-1]) - int(times[0])) / NS_PER_S:.3f} s"
-        raise McaptrackError(f"{opened.path} has no {what[:-1]} between {options.start_s:g} s and {end}; {there}")
+        period = f"the {what} are from 0 to {(int(times[-1]) - int(times[0])) / NS_PER_S:.3f} s"
+        raise McaptrackError(f"{opened.path} has no {what[:-1]} between {options.start_s:g} s and {end}; {period}")
     return numbers
 
 

@@ -248,7 +248,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.request_version = "HTTP/1.1"  # in 0.9 there would be no status
         self._head(HTTPStatus(code), {"Content-Length": "0", "Connection": "close"})
 
-    def log_message(self, format: str, *words: object) -> None:  # noqa: A002  # the name that the library gives it
+    def log_message(self, format: str, *values: object) -> None:  # noqa: A002  # the name that the library gives it
         """Print nothing."""
 
     def _answer(self, with_body: bool) -> None:
@@ -271,21 +271,21 @@ class _Handler(BaseHTTPRequestHandler):
                 self._send(stream, content, with_body)
 
     def _send(self, stream: BinaryIO, path: Path, with_body: bool) -> None:
-        there = os.fstat(stream.fileno())
-        tag = f'"{there.st_size:x}-{there.st_mtime_ns:x}"'
-        span, status = range(there.st_size), HTTPStatus.OK
+        status_of_file = os.fstat(stream.fileno())
+        tag = f'"{status_of_file.st_size:x}-{status_of_file.st_mtime_ns:x}"'
+        span, status = range(status_of_file.st_size), HTTPStatus.OK
         if with_body and self.headers.get("If-Range", tag).strip(" \t") == tag:  # only GET has ranges
-            span, status = requested_range(self.headers.get_all("Range", []), there.st_size)
+            span, status = requested_range(self.headers.get_all("Range", []), status_of_file.st_size)
         headers = {
             **_kind_of(path.name if path.suffix == ".json" else ""),
             "Content-Length": str(len(span)),
             "ETag": tag,
-            "Last-Modified": formatdate(there.st_mtime, usegmt=True),
+            "Last-Modified": formatdate(status_of_file.st_mtime, usegmt=True),
         }
         if status == HTTPStatus.PARTIAL_CONTENT:
-            headers["Content-Range"] = f"bytes {span.start}-{span.stop - 1}/{there.st_size}"
+            headers["Content-Range"] = f"bytes {span.start}-{span.stop - 1}/{status_of_file.st_size}"
         elif status == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
-            headers["Content-Range"] = f"bytes */{there.st_size}"
+            headers["Content-Range"] = f"bytes */{status_of_file.st_size}"
         self._head(status, headers)
         if with_body and span:
             try:
@@ -329,20 +329,20 @@ def requested_range(fields: list[str], size: int) -> tuple[range, HTTPStatus]:
     asked = _RANGES.fullmatch(fields[0].strip(" \t")) if len(fields) == 1 else None
     if asked is None:
         return whole
-    found = []
+    spans = []
     for text in filter(None, (text.strip(" \t") for text in asked[1].split(","))):
         spec = _RANGE.fullmatch(text)
         if spec is None or not any(spec.groups()):
             return whole
         first, last = (_number(digits) if digits else None for digits in spec.groups())
         if first is None:
-            found.append(range(max(0, size - (last or 0)), size))
+            spans.append(range(max(0, size - (last or 0)), size))
         elif last is not None and last < first:
             return whole
         else:
-            found.append(range(first, size if last is None else min(size, last + 1)))
-    satisfiable = [span for span in found if len(span)]
-    if not found:
+            spans.append(range(first, size if last is None else min(size, last + 1)))
+    satisfiable = [span for span in spans if len(span)]
+    if not spans:
         return whole
     if not satisfiable:
         return range(0), HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE

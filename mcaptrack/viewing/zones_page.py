@@ -95,7 +95,9 @@ def _is_simple(zone: Zone) -> bool:
 
 def _drawn(zones: Sequence[Zone]) -> list[dict[str, Any]]:
     drawn = ({"name": zone.name, "line": zone.is_line, "points": zone.parts[0][0]} for zone in zones)
-    return [one | ({"classes": zone.classes} if zone.classes else {}) for one, zone in zip(drawn, zones, strict=True)]
+    return [
+        shape | ({"classes": zone.classes} if zone.classes else {}) for shape, zone in zip(drawn, zones, strict=True)
+    ]
 
 
 def _places(opened: log.Log, prefix: str) -> Floats:

@@ -87,8 +87,8 @@ def tracks(shown: PeopleInParts, t_ns: Ints, frame_id: str, style: TrackStyle, c
     instants = _Instants(t_ns, frame_id)
     for first, last, people in shown.parts(BATCH):
         has_body = people.has_body()
-        known = np.asarray(np.isfinite(people.at_m).all(axis=1), np.bool_)
-        lines = trails(people, known, t_ns)
+        placed = np.asarray(np.isfinite(people.at_m).all(axis=1), np.bool_)
+        lines = trails(people, placed, t_ns)
         longest = lines.row.shape[1] - 1
         rgb = np.broadcast_to(_WHITE, (len(people.number), 3)) if style.is_white else colours(people.number)
         body_rgb = rgb if style.is_white else class_colours(people.class_id, classes)
@@ -96,10 +96,10 @@ def tracks(shown: PeopleInParts, t_ns: Ints, frame_id: str, style: TrackStyle, c
         alpha, body_alpha = 0.875 * strength, 0.625 * strength
         places = np.column_stack([people.at_m, people.body.base_m()])
         apart_m = np.zeros(len(people.number))
-        apart_m[known] = label_places.heights(t_ns, people.frame[known], people.number[known], people.at_m[known])
+        apart_m[placed] = label_places.heights(t_ns, people.frame[placed], people.number[placed], people.at_m[placed])
         for span, scene in instants.batches(first, last):
             rows = np.arange(*np.searchsorted(people.frame, [span.start, span.stop]))
-            rows = rows[known[rows]]
+            rows = rows[placed[rows]]
             for points, is_solid, these in _alike(lines.points, has_body, rows):
                 trail = places[lines.row[these, -points:], : 3 if is_solid else 2]
                 opacity = fade(points, longest + 1)
@@ -128,7 +128,7 @@ def detections(frames: Sequence[Frame], t_ns: Ints, frame_id: str, classes: Mapp
     instants = _Instants(t_ns, frame_id)
     joined = join_frames(DETECTIONS, frames)
     body = bodies_of(joined.rows)
-    known = np.flatnonzero(np.isfinite(np.column_stack([body.centre_m, body.size_m])).all(axis=1))
+    complete = np.flatnonzero(np.isfinite(np.column_stack([body.centre_m, body.size_m])).all(axis=1))
     number = joined.rows["source_id"].astype(np.int64)
     if (number < 0).any() or len(np.unique(np.stack([joined.frame, number]), axis=1).T) < len(number):
         number = np.arange(len(number)) - joined.ends[joined.frame]
@@ -137,9 +137,9 @@ def detections(frames: Sequence[Frame], t_ns: Ints, frame_id: str, classes: Mapp
         labels_of(number, class_id, classes if len(np.unique(class_id)) > 1 else None),
         class_colours(class_id, classes),
     )
-    bounds = np.searchsorted(joined.frame[known], np.arange(len(t_ns) + 1))
+    bounds = np.searchsorted(joined.frame[complete], np.arange(len(t_ns) + 1))
     for span, scene in instants.batches():
-        rows = known[bounds[span.start] : bounds[span.stop]]
+        rows = complete[bounds[span.start] : bounds[span.stop]]
         some = body.chosen(rows)
         scene.boxes(
             joined.frame[rows] - span.start, label[rows], some, rgb[rows], np.full(len(rows), _DETECTED), rgb[rows],
@@ -158,8 +158,8 @@ def _alike(points: Ints, has_body: NDArray[np.bool_], rows: Ints) -> Iterator[tu
 
 def class_colours(class_id: Ints, classes: Mapping[int, str]) -> Floats:
     """The colours of classes (N,), (N, 3)."""
-    known, which = np.unique(class_id, return_inverse=True)
-    table = [class_colour(one, classes.get(one, "")) for one in known.tolist()]
+    unique, which = np.unique(class_id, return_inverse=True)
+    table = [class_colour(class_number, classes.get(class_number, "")) for class_number in unique.tolist()]
     return np.array(table, float).reshape(-1, 3)[which]
 
 
@@ -170,9 +170,9 @@ def predictions(frames: Sequence[Frame], t_ns: Ints, frame_id: str, bodies: Sequ
     """
     instants = _Instants(t_ns, frame_id)
     wanted = latest(frames, t_ns)
-    for first, last, found in forecasts_in_parts(frames, wanted, BATCH, is_whole=bool(bodies)):
+    for first, last, forecasts in forecasts_in_parts(frames, wanted, BATCH, is_whole=bool(bodies)):
         futures = [
-            (raised(future, frames, bodies), ellipses(future.spread_m2), colours(future.number)) for future in found
+            (raised(future, frames, bodies), ellipses(future.spread_m2), colours(future.number)) for future in forecasts
         ]
         for span, scene in instants.batches(first, last):
             for future, (half, turn), rgb in futures:
@@ -193,8 +193,8 @@ def raised(future: ForecastPaths, frames: Sequence[Frame], bodies: Sequence[Fram
     if not bodies:
         return future
     height = base_heights(bodies, frame_times(frames)[future.message], future.number)
-    known = np.isfinite(height)
-    height[~known] = np.median(height[known]) if known.any() else 0.0
+    has_height = np.isfinite(height)
+    height[~has_height] = np.median(height[has_height]) if has_height.any() else 0.0
     along = np.broadcast_to(height[:, None, None], (*future.path_m.shape[:2], 1))
     return future._replace(
         path_m=np.concatenate([future.path_m, along], axis=2), end_m=np.column_stack([future.end_m, height])

@@ -67,9 +67,9 @@ class PictureTimes(NamedTuple):
         yield from zip(times, range(span.start, span.stop), drawn.messages(), strict=True)
 
 
-def fade(count: int, longest: int, strongest: float = 0.875, weakest: float = 0.125) -> Floats:
+def fade(count: int, longest: int, weakest: float = 0.125) -> Floats:
     """The opacities of the last ``count`` of ``longest`` lines; the last is the strongest."""
-    return np.linspace(weakest, strongest, longest)[longest - count :]
+    return np.linspace(weakest, 0.875, longest)[longest - count :]
 
 
 def detections(frames: Sequence[Frame], pictures: PictureTimes, planes: Planes) -> View:
@@ -182,8 +182,8 @@ def predictions(
     # Planes are those of pictures, and forecasts are made between them.
     last = np.searchsorted(pictures.t_ns, made_ns, "right") - 1
     seen_ns = pictures.t_ns[np.maximum(last, 0)] if len(pictures.t_ns) else made_ns
-    for first, until, found in forecasts_in_parts(frames, wanted, BATCH):
-        futures = found if planes else []
+    for first, until, forecasts in forecasts_in_parts(frames, wanted, BATCH):
+        futures = forecasts if planes else []
         once = [] if has_own else [_in_pixels(future, planes, made_ns[future.message]) for future in futures]
         for span, drawn in pictures.batches(first, until):
             for number, future in enumerate(futures):

@@ -43,8 +43,8 @@ _MOST_STEPS: Final = 4
 
 def extents(labels: NDArray[Any], size_px: float) -> Floats:
     """Width and height (N, 2) in px of labels (N,), numbers or texts, as far as it can be known."""
-    known, which = np.unique(labels, return_inverse=True)
-    length = np.array([len(str(label)) for label in known.tolist()], np.float64)
+    unique, which = np.unique(labels, return_inverse=True)
+    length = np.array([len(str(label)) for label in unique.tolist()], np.float64)
     wide = length[which.reshape(-1)] * (_WIDE * size_px)
     return np.stack([wide, np.full(len(wide), _HIGH * size_px)], axis=-1)
 
@@ -135,7 +135,7 @@ def _meeting(frame: Ints, number: Ints, corner_px: Floats, extent_px: Floats) ->
     of, left, wide = frame[order], corner_px[order, 0], extent_px[order, 0]
     low = corner_px[order, 1]
     top = low - extent_px[order, 1]
-    found: list[tuple[Ints, Ints]] = []
+    overlaps: list[tuple[Ints, Ints]] = []
     near = np.arange(max(len(order) - 1, 0))
     step = 1
     while len(near):  # neighbours by their left edges, as long as the first one reaches so far
@@ -144,11 +144,11 @@ def _meeting(frame: Ints, number: Ints, corner_px: Floats, extent_px: Floats) ->
         is_near = (of[near] == of[other]) & (left[other] < left[near] + wide[near])
         near, other = near[is_near], other[is_near]
         hit = (low[near] > top[other]) & (low[other] > top[near])
-        found.append((order[near[hit]], order[other[hit]]))
+        overlaps.append((order[near[hit]], order[other[hit]]))
         step += 1
-    one, other = (np.concatenate([pair[n] for pair in found] or [np.empty(0, np.int64)]) for n in range(2))
-    is_first = number[one] < number[other]
-    return np.where(is_first, one, other).astype(np.int64), np.where(is_first, other, one).astype(np.int64)
+    first, other = (np.concatenate([pair[n] for pair in overlaps] or [np.empty(0, np.int64)]) for n in range(2))
+    is_first = number[first] < number[other]
+    return np.where(is_first, first, other).astype(np.int64), np.where(is_first, other, first).astype(np.int64)
 
 
 def _held(at_ns: Ints, frame: Ints, number: Ints, lower: Ints, higher: Ints) -> tuple[Ints, Ints, Floats]:
@@ -170,13 +170,13 @@ def _held(at_ns: Ints, frame: Ints, number: Ints, lower: Ints, higher: Ints) -> 
     keys = frame * len(ids) + which
     rows = np.argsort(keys, kind="stable")
     sorted_keys = keys[rows]
-    found = []
-    for one in (of // len(ids), of % len(ids)):
-        wanted = at * len(ids) + one
+    rows_of_both = []
+    for member in (of // len(ids), of % len(ids)):
+        wanted = at * len(ids) + member
         place = np.minimum(np.searchsorted(sorted_keys, wanted), len(rows) - 1)
-        found.append(np.where(sorted_keys[place] == wanted, rows[place], -1))
-    both = (found[0] >= 0) & (found[1] >= 0)
-    return found[0][both].astype(np.int64), found[1][both].astype(np.int64), age_s[both]
+        rows_of_both.append(np.where(sorted_keys[place] == wanted, rows[place], -1))
+    both = (rows_of_both[0] >= 0) & (rows_of_both[1] >= 0)
+    return rows_of_both[0][both].astype(np.int64), rows_of_both[1][both].astype(np.int64), age_s[both]
 
 
 # The styles of tracks: tracked, re-tracked and ground truth can be told apart at a glance.

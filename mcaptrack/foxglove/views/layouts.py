@@ -232,8 +232,8 @@ class CameraChannels(NamedTuple):
 
     def topics(self, suffix: str, on: Collection[str]) -> dict[str, bool]:
         """The topics of all views with a suffix, and whether each is on."""
-        found = sorted(name.removesuffix(suffix) for name in self.names if name.endswith(suffix))
-        return {f"{self.prefix}/{name}{suffix}": name in on for name in found}
+        having = sorted(name.removesuffix(suffix) for name in self.names if name.endswith(suffix))
+        return {f"{self.prefix}/{name}{suffix}": name in on for name in having}
 
     def has_view(self, name: str) -> bool:
         """Whether a channel has a view."""
@@ -246,10 +246,10 @@ class CameraChannels(NamedTuple):
 
 def best_channels(names: Collection[str]) -> list[str]:
     """The channels to switch on, of those below the prefix: the best tracks, and their forecasts."""
-    found = [name for name in _BEST if name in names][:1]
+    best = [name for name in _BEST if name in names][:1]
     of_these = "retracks/predictions"
-    forecasts = [of_these for name in found if name.startswith("retracks") and of_these in names]
-    return found + forecasts + zones_of(found, names)
+    forecasts = [of_these for name in best if name.startswith("retracks") and of_these in names]
+    return best + forecasts + zones_of(best, names)
 
 
 def zones_of(chosen: Collection[str], names: Collection[str]) -> list[str]:
@@ -259,8 +259,8 @@ def zones_of(chosen: Collection[str], names: Collection[str]) -> list[str]:
 
 def eye_on(places_m: Floats, planes: Planes, t_ns: int) -> Eye:
     """A view of the positions of people (N, 2), from the side of the camera."""
-    known = places_m[np.isfinite(places_m).all(axis=1)]
-    low, high = np.quantile(known, [0.02, 0.98], axis=0) if len(known) else (np.full(2, -5.0), np.full(2, 5.0))
+    placed = places_m[np.isfinite(places_m).all(axis=1)]
+    low, high = np.quantile(placed, [0.02, 0.98], axis=0) if len(placed) else (np.full(2, -5.0), np.full(2, 5.0))
     middle, radius = (low + high) / 2, max(2.5, float(np.hypot(*(high - low))) / 2)
     bearing, plane = 0.0, plane_at(planes, t_ns)
     if plane is not None:
@@ -276,12 +276,12 @@ def make(camera: CameraChannels) -> dict[str, bytes]:
     """The layout files that are useful for a log, by their names; none if there is nothing to see."""
     if not camera.has_any_view():
         return {}
-    made = {TRACKING: _tracking(camera)}
+    files = {TRACKING: _tracking(camera)}
     if sum(any(camera.has_view(name) for name in names) for _, names in _KINDS) > 1:
-        made[COMPARING] = _comparing(camera)
+        files[COMPARING] = _comparing(camera)
     if camera.has_view("predictions") or camera.has_view("retracks/predictions"):
-        made[PREDICTIONS] = _predictions(camera)
-    return made
+        files[PREDICTIONS] = _predictions(camera)
+    return files
 
 
 def _tracking(camera: CameraChannels) -> bytes:
@@ -300,12 +300,12 @@ def _comparing(camera: CameraChannels) -> bytes:
     upper: list[Tree] = []
     shown = []
     for number, (title, names) in enumerate(_KINDS):
-        found = [name for name in names if camera.has_view(name)][:1]
-        found += [f"{name}{_ZONES}" for name in found if camera.has_view(f"{name}{_ZONES}")]
-        if found:
-            shown += found
-            upper += _image(camera, panels, f"picture{number}", title, found) or _ground(
-                camera, panels, f"ground{number}", title, found
+        shown_of_kind = [name for name in names if camera.has_view(name)][:1]
+        shown_of_kind += [f"{name}{_ZONES}" for name in shown_of_kind if camera.has_view(f"{name}{_ZONES}")]
+        if shown_of_kind:
+            shown += shown_of_kind
+            upper += _image(camera, panels, f"picture{number}", title, shown_of_kind) or _ground(
+                camera, panels, f"ground{number}", title, shown_of_kind
             )
     lower = [*_ground(camera, panels, "ground", "All", shown), *_plots(camera, panels)]
     events = [part for title, names in _KINDS for part in _events(camera, panels, title, names)]
@@ -363,9 +363,9 @@ def _errors(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
     }
     if not paths:
         return []
-    words = "ground truth" if camera.is_truth_known else "later tracks"
+    text = "ground truth" if camera.is_truth_known else "later tracks"
     most = limit_of(camera.highest.get(ERRORS))
-    panels["Plot!errors"] = plot_panel(f"Prediction errors (m), against {words}", paths, most)
+    panels["Plot!errors"] = plot_panel(f"Prediction errors (m), against {text}", paths, most)
     return ["Plot!errors"]
 
 
@@ -429,18 +429,18 @@ def _plots(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
 
 def _events(camera: CameraChannels, panels: dict[str, Any], title: str, names: Collection[str]) -> list[Tree]:
     """The text of events of the first of these channels that has any."""
-    found = [f"{name}{_EVENTS}" for name in names if f"{name}{_EVENTS}" in camera.names][:1]
-    for topic in found:
+    with_events = [f"{name}{_EVENTS}" for name in names if f"{name}{_EVENTS}" in camera.names][:1]
+    for topic in with_events:
         panels[f"RosOut!{title}"] = log_panel(f"{title}: events", f"{camera.prefix}/{topic}")
-    return [f"RosOut!{title}" for _ in found]
+    return [f"RosOut!{title}" for _ in with_events]
 
 
 def _event_text_or_log(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
     """The text of events, if there is any; otherwise the contents of the log."""
-    found = _events(camera, panels, "Tracking", ("retracks/full", "retracks", "tracks"))
-    if not found:
+    events = _events(camera, panels, "Tracking", ("retracks/full", "retracks", "tracks"))
+    if not events:
         panels["SourceInfo!log"] = panel("Log", {})
-    return found or ["SourceInfo!log"]
+    return events or ["SourceInfo!log"]
 
 
 def _columns(left: Sequence[Tree], right: Sequence[Tree], share: float) -> Tree:

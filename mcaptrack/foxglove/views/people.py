@@ -63,8 +63,8 @@ class People(NamedTuple):
 
     def has_body(self) -> NDArray[np.bool_]:
         """Which people (S,) have a 3D box."""
-        known = np.isfinite(self.body.centre_m).all(axis=1) & np.isfinite(self.body.size_m).all(axis=1)
-        return np.asarray(known, np.bool_)
+        is_complete = np.isfinite(self.body.centre_m).all(axis=1) & np.isfinite(self.body.size_m).all(axis=1)
+        return np.asarray(is_complete, np.bool_)
 
 
 class Trails(NamedTuple):
@@ -130,9 +130,9 @@ class PeopleInParts:
         self._last: tuple[int, People] | None = None
 
     def parts(self, batch: int) -> Iterator[tuple[int, int, People]]:
-        """Parts of the times, as long as so many of them or a multiple: their first and last, and the people at them.
+        """Yield parts of the times, each a multiple of ``batch``: first, last, and the people at these times.
 
-        There are also the people at the times before that trails of these people come from. ``People.frame`` are
+        The people at earlier times that trails need are included. ``People.frame`` are
         indices of all times.
         """
         length = max(round(_PART_ROWS / max(self._each, 1e-9) / batch), 1) * batch
@@ -188,14 +188,14 @@ def base_heights(tracks: Sequence[Frame], made_ns: Ints, number: Ints) -> Floats
     """
     joined = join_frames(TRACKS, tracks)
     base = bodies_of(joined.rows).base_m()
-    known = np.isfinite(base)
-    base, t_ns, of = base[known], joined.row_ns[known], joined.rows["track_id"][known].astype(np.int64)
+    has_height = np.isfinite(base)
+    base, t_ns, of = base[has_height], joined.row_ns[has_height], joined.rows["track_id"][has_height].astype(np.int64)
     order = np.lexsort((t_ns, of))
     base, t_ns, of = base[order], t_ns[order], of[order]
     out = np.full(len(number), np.nan)
-    for one in np.intersect1d(number, of).tolist():
-        low, high = np.searchsorted(of, [one, one + 1])
-        wanted = number == one
+    for track_id in np.intersect1d(number, of).tolist():
+        low, high = np.searchsorted(of, [track_id, track_id + 1])
+        wanted = number == track_id
         before = np.searchsorted(t_ns[low:high], made_ns[wanted], "right") - 1
         out[wanted] = base[low + np.maximum(before, 0)]
     return out
@@ -206,8 +206,8 @@ def labels_of(number: Ints, class_id: Ints, names: Mapping[int, str] | None) -> 
     if not len(number) or names is None:
         return number
     pairs, which = np.unique(np.stack([number, class_id]), axis=1, return_inverse=True)
-    called = {one: _shortened(class_name(one, names), _NAME_LENGTH) for one in np.unique(class_id).tolist()}
-    return np.array([f"{one} {called[of]}" for one, of in pairs.T.tolist()])[which.reshape(-1)]
+    called = {kind: _shortened(class_name(kind, names), _NAME_LENGTH) for kind in np.unique(class_id).tolist()}
+    return np.array([f"{person} {called[of]}" for person, of in pairs.T.tolist()])[which.reshape(-1)]
 
 
 def _shortened(text: str, length: int) -> str:
@@ -215,15 +215,15 @@ def _shortened(text: str, length: int) -> str:
     return text if len(text) <= length else text[: length - 1] + "\N{HORIZONTAL ELLIPSIS}"
 
 
-def trails(people: People, known: NDArray[np.bool_], at_ns: Ints) -> Trails:
-    """The trails of people with a ``known`` position (S,); trails do not pass unknown positions.
+def trails(people: People, has_place: NDArray[np.bool_], at_ns: Ints) -> Trails:
+    """The trails of people that have a place by ``has_place`` (S,); trails do not pass unknown places.
 
     Their points are at the ticks of a slow clock, the same ones in picture after picture: so trails don't move, and a
     compressed log hardly grows by them.
     """
     t_ns = at_ns[people.frame]
     order = np.lexsort((t_ns, people.number))
-    order = order[known[order]]
+    order = order[has_place[order]]
     number, t_sorted = people.number[order], t_ns[order]
     tick = t_sorted // _TICK_NS
     is_anchor = run_starts(number, tick)
@@ -314,13 +314,13 @@ def ellipses(spread_m2: Floats) -> tuple[Floats, Floats]:
 
     NaN where a covariance is not known or not positive.
     """
-    known = np.asarray(np.isfinite(spread_m2).all(axis=(1, 2)), np.bool_)
-    values, vectors = np.linalg.eigh(np.where(known[:, None, None], spread_m2, np.eye(2)))
-    known &= values[:, 0] >= -1e-9 * np.abs(values[:, 1])
+    is_positive = np.asarray(np.isfinite(spread_m2).all(axis=(1, 2)), np.bool_)
+    values, vectors = np.linalg.eigh(np.where(is_positive[:, None, None], spread_m2, np.eye(2)))
+    is_positive &= values[:, 0] >= -1e-9 * np.abs(values[:, 1])
     half = np.sqrt(CHI2_95 * np.maximum(values[:, ::-1], 0))
     turn = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
     turn = np.where(turn > np.pi / 2, turn - np.pi, np.where(turn <= -np.pi / 2, turn + np.pi, turn))
-    return np.where(known[:, None], half, np.nan), np.where(known, turn, np.nan)
+    return np.where(is_positive[:, None], half, np.nan), np.where(is_positive, turn, np.nan)
 
 
 def ellipse_points(centre_m: Floats, half_m: Floats, turn: Floats, points: int) -> Floats:

@@ -63,15 +63,15 @@ def tracks(frames: Sequence[Frame], camera: MovingCamera, style: TrackStyle, cla
     unit = unit_of_width(camera.width_px)
     pictures = PictureTimes(camera.t_ns, camera.stamp_ns)
     for first, last, people in PeopleInParts(frames, camera.at_ns, (), classes).parts(BATCH):
-        known = np.flatnonzero(people.has_body())
+        with_body = np.flatnonzero(people.has_body())
         rgb = np.broadcast_to(_WHITE, (len(people.number), 3)) if style.is_white else colours(people.number)
         body_rgb = rgb if style.is_white else class_colours(people.class_id, classes)
         alpha = np.where(people.observed, OBSERVED, INTERPOLATED)
-        px, is_seen = _on_pictures(corners(people.body.chosen(known))[:, _EDGES], people.frame[known], camera)
-        named, corner = _label_corners(people, known, px, is_seen, unit, camera.at_ns)
+        px, is_seen = _on_pictures(corners(people.body.chosen(with_body))[:, _EDGES], people.frame[with_body], camera)
+        named, corner = _label_corners(people, with_body, px, is_seen, unit, camera.at_ns)
         for span, drawn in pictures.batches(first, last):
-            some = slice(*np.searchsorted(people.frame[known], [span.start, span.stop]))
-            rows = known[some]
+            some = slice(*np.searchsorted(people.frame[with_body], [span.start, span.stop]))
+            rows = with_body[some]
             frame = people.frame[rows] - span.start
             thickness = style.thickness * unit
             _draw(drawn, frame, px[some], is_seen[some], body_rgb[rows], alpha[rows, None], thickness)
@@ -161,7 +161,7 @@ def _on_pictures(ends_m: Floats, picture: Ints, camera: MovingCamera) -> tuple[F
     size = np.array([camera.width_px, camera.height_px], float)
     with np.errstate(invalid="ignore"):
         is_seen &= (np.abs(px - size / 2) < _MOST_WIDTHS * size.max()).all(axis=(2, 3))
-        known = np.where(is_seen[..., None, None], px, np.nan).reshape(len(px), -1, 2)
-        low, high = np.fmin.reduce(known, axis=1), np.fmax.reduce(known, axis=1)
+        seen_px = np.where(is_seen[..., None, None], px, np.nan).reshape(len(px), -1, 2)
+        low, high = np.fmin.reduce(seen_px, axis=1), np.fmax.reduce(seen_px, axis=1)
         is_inside = ((high > 0) & (low < size)).all(axis=1)
     return px, np.asarray(is_seen & is_inside[:, None], np.bool_)

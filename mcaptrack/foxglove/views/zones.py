@@ -51,9 +51,9 @@ class ZoneCaptions(NamedTuple):
                 rows = joined.rows[joined.rows["zone_id"] == zone.number]
                 names = ("forward", "backward") if zone.is_line else ("inside", "tracks")
                 pairs = zip(*(rows[name].tolist() for name in names), strict=True)
-                known: dict[tuple[int, int], str] = {}
+                texts_of_counts: dict[tuple[int, int], str] = {}
                 form = "{}: {} forward, {} back" if zone.is_line else "{}: {} inside, {} so far"
-                kept.extend(known.setdefault(pair, form.format(zone.name, *pair)) for pair in pairs)
+                kept.extend(texts_of_counts.setdefault(pair, form.format(zone.name, *pair)) for pair in pairs)
         return cls(frame_times(counts), texts)
 
     def at(self, zone: int, t_ns: Ints) -> list[str]:
@@ -61,7 +61,7 @@ class ZoneCaptions(NamedTuple):
         if not len(self.t_ns):
             return [""] * len(t_ns)
         place = np.maximum(np.searchsorted(self.t_ns, t_ns, "right") - 1, 0)
-        return [self.texts[zone][one] for one in place.tolist()]
+        return [self.texts[zone][frame] for frame in place.tolist()]
 
 
 class ZoneShape(NamedTuple):
@@ -99,14 +99,14 @@ def on_ground(zones: Sequence[ZoneShape], captions: ZoneCaptions, frame_id: str)
         span = slice(start, min(start + BATCH, len(t_ns)))
         scene = SceneMessages(t_ns[span], frame_id, life_ns)
         frame = np.arange(len(t_ns[span]))
-        for place, one in enumerate(zones):
-            rings = one.rings_m()
+        for place, zone in enumerate(zones):
+            rings = zone.rings_m()
             if not rings:
                 continue
-            rgb = _LINE if one.zone.is_line else _ZONE
+            rgb = _LINE if zone.zone.is_line else _ZONE
             label = rings[0].mean(axis=0)
             texts = captions.texts[place][span]
-            scene.zone(frame, one.zone.name, rings, not one.zone.is_line, label, texts, (*rgb, _ALPHA), one.height_m)
+            scene.zone(frame, zone.zone.name, rings, not zone.zone.is_line, label, texts, (*rgb, _ALPHA), zone.height_m)
         yield from zip(t_ns[span].tolist(), range(span.start, span.stop), scene.messages(), strict=True)
 
 
@@ -128,26 +128,29 @@ def on_pictures(
         t_ns = pictures.t_ns[span]
         which = np.searchsorted(since, t_ns, "right")
         taken: list[Floats] = []
-        for place, one in enumerate(zones):
+        for place, zone in enumerate(zones):
             texts = np.array(captions.at(place, t_ns), object)
             down_px: float | None = None  # the same in all pictures of a batch, so that labels don't jump
-            for frame, rings in _seen(one, t_ns, which, planes, path, height_px):
+            for frame, rings in _seen(zone, t_ns, which, planes, path, height_px):
                 if _is_drawn(rings):
                     size, corner = _label_of(rings[0], height_px)
                     down_px = _free_place(taken, corner, size, texts[frame]) if down_px is None else down_px
-                    _draw(drawn, frame, rings, one, texts, height_px, corner + np.array([0.0, down_px]), size)
+                    _draw(drawn, frame, rings, zone, texts, height_px, corner + np.array([0.0, down_px]), size)
         yield from pictures.numbered(span, drawn)
 
 
 def _seen(
-    one: ZoneShape, t_ns: Ints, which: Ints, planes: Planes, path: CameraPath | None, height_px: float
+    shape: ZoneShape, t_ns: Ints, which: Ints, planes: Planes, path: CameraPath | None, height_px: float
 ) -> Iterator[tuple[Ints, list[Floats]]]:
     """The rings of a zone in pictures: groups of pictures in which they are at the same place."""
-    if one.zone.units == "metres":
+    if shape.zone.units == "metres":
         for number in np.unique(which).tolist() if planes else ():
-            yield np.flatnonzero(which == number), [planes[number][1].metres_to_pixels(ring) for ring in one.rings_m()]
+            yield (
+                np.flatnonzero(which == number),
+                [planes[number][1].metres_to_pixels(ring) for ring in shape.rings_m()],
+            )
         return
-    rings = one.rings_px(height_px)
+    rings = shape.rings_px(height_px)
     if path is None:
         yield np.arange(len(t_ns)), rings
         return
@@ -191,7 +194,7 @@ def _draw(
     drawn: Annotations,
     frame: Ints,
     rings: Sequence[Floats],
-    one: ZoneShape,
+    shape: ZoneShape,
     texts: NDArray[Any],
     height_px: float,
     corner: Floats,
@@ -199,16 +202,16 @@ def _draw(
 ) -> None:
     """Draw a zone in some pictures, with a label of this size that begins at ``corner`` (2,)."""
     count = len(frame)
-    rgb = np.broadcast_to(_LINE if one.zone.is_line else _ZONE, (count, 3))
+    rgb = np.broadcast_to(_LINE if shape.zone.is_line else _ZONE, (count, 3))
     thickness = max(1.5, height_px / 240)
     alpha = np.full(count, _ALPHA)
-    if one.zone.is_line:
+    if shape.zone.is_line:
         pairs = np.concatenate([np.repeat(line, 2, axis=0)[1:-1] for line in rings])
         drawn.pairs(
             frame, np.broadcast_to(pairs, (count, *pairs.shape)), rgb, np.full(len(pairs) // 2, _ALPHA), thickness
         )
     fill = _FILL if len(rings) == 1 else 0.0
-    for ring in () if one.zone.is_line else rings:
+    for ring in () if shape.zone.is_line else rings:
         drawn.loops(frame, np.broadcast_to(ring, (count, *ring.shape)), rgb, alpha, thickness, fill)
     drawn.labels(frame, np.broadcast_to(corner, (count, 2)), texts[frame], rgb, size)
 

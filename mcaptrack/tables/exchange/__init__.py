@@ -82,24 +82,24 @@ def boxes_topic(opened: log.Log, topic: str | None = None) -> str:
 
     Raises McaptrackError, with the channels that there are, if there is none or if there are several cameras.
     """
-    there = sorted(
+    with_boxes = sorted(
         channel.topic
         for channel in log.topics_with_schema(opened, [DETECTIONS.name, TRACKS.name])
         if channel.messages and any(channel.holds(schema) for schema in (DETECTIONS, TRACKS))
     )
     if topic is not None:
-        if topic in there:
+        if topic in with_boxes:
             return topic
         opened.channel(topic)  # says what there is
-        raise McaptrackError(f"{opened.path}: {topic} has no detections and no tracks; {_listed(there)} have")
-    if not there:
+        raise McaptrackError(f"{opened.path}: {topic} has no detections and no tracks; {_listed(with_boxes)} have")
+    if not with_boxes:
         raise McaptrackError(f"{opened.path} has no detections and no tracks to write; run a stage first")
     best: list[str] = []
     for camera in cameras(opened):
         names = (f"{prefix}/{name}" for name in _PREFERRED for prefix in (camera.prefix, *camera.names))
-        found = next((name for name in names if name in there), None)
-        best += [found] if found else []
-    best = best or there
+        preferred = next((name for name in names if name in with_boxes), None)
+        best += [preferred] if preferred else []
+    best = best or with_boxes
     if len(best) > 1:
         raise McaptrackError(f"{opened.path} has boxes in {_listed(best)}; choose one with `topic=`")
     return best[0]
@@ -161,4 +161,4 @@ def write_boxes(
     lost += [text.describe_mot_numbers(boxes.classes)] if form == "mot" else []
     lost += [text.describe_merged(form, boxes.classes)] if form in ("mot", "kitti") else []
     lost += [cvat.describe_classes(boxes)] if form == "cvat" else []
-    return WrittenBoxes(chosen, len(boxes.frame), (*boxes.notes, *(f"{output}: {one}" for one in lost if one)))
+    return WrittenBoxes(chosen, len(boxes.frame), (*boxes.notes, *(f"{output}: {note}" for note in lost if note)))

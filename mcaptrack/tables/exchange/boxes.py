@@ -62,11 +62,6 @@ class BoxTable:
         return {number: class_name(number, self.names) for number in np.unique(self.class_id).tolist()}
 
     @property
-    def row_ns(self) -> Ints:
-        """The time of each row (N,)."""
-        return self.t_ns[np.searchsorted(self.frames, self.frame)]
-
-    @property
     def last_frame(self) -> int:
         """The number of the last frame."""
         return int(self.frames[-1])
@@ -74,14 +69,14 @@ class BoxTable:
     def left_out(self, form: str, holds: frozenset[str]) -> str:
         """The contents of rows that the file lacks, as text; "" if nothing is missing."""
         scored = np.isfinite(self.score)
-        there = {
+        has_contents = {
             "sizes and headings of 3D boxes": self.has_3d,
             "positions in metres": "metres" not in holds and bool(np.isfinite(self.xy_m).any()),
             "scores": "scores" not in holds and bool(scored.any()),
             "which boxes were filled in": "observed" not in holds and not self.observed.all(),
         }
-        words = [what for what, is_there in there.items() if is_there]
-        out = [f"{_NAMES[form]} has no place for {' and '.join(words)}; they are left out"] if words else []
+        lacking = [what for what, is_there in has_contents.items() if is_there]
+        out = [f"{_NAMES[form]} has no place for {' and '.join(lacking)}; they are left out"] if lacking else []
         if form in ("mot", "kitti") and scored.any() and not scored.all():
             out.append(f"{int((~scored).sum()):,} boxes without a score have 1 there")
         return "; ".join(out)
@@ -131,8 +126,8 @@ def read_boxes(opened: log.Log, topic: str) -> BoxTable:
 def _frame_numbers(topic: str, numbers: Ints) -> tuple[Ints, list[str]]:
     """The numbers of frames (F,), and notes: numbers that don't rise are replaced by the order of the frames."""
     if len(numbers) and (numbers[0] < 0 or (np.diff(numbers) <= 0).any()):
-        words = f"{topic}: several of its frames are of one picture; its frames are counted instead, from 0"
-        return np.arange(len(numbers)), [words]
+        text = f"{topic}: several of its frames are of one picture; its frames are counted instead, from 0"
+        return np.arange(len(numbers)), [text]
     return numbers, []
 
 

@@ -64,7 +64,7 @@ def write_recording(opened: log.Log, output: Path, topic: str, progress: Progres
     rerun = library()
     channel = opened.channel(topic)
     frames = opened.frame_columns(topic, SCHEMAS[channel.schema_name])
-    camera = next((one for one in cameras(opened) if topic in one.topics), None)
+    camera = next((each for each in cameras(opened) if topic in each.topics), None)
     recording = rerun.RecordingStream(_APPLICATION, recording_id=output.stem, send_properties=False)
     job = _Job(rerun, recording, opened)
     with publish(output) as part:
@@ -152,8 +152,8 @@ class _Job:
             self._at(frame.t_ns, frame.index)
             ids = rows["class_id"].astype(np.int64) if is_detections else rows["track_id"]
             texts = [
-                " ".join(([] if is_detections else [str(one)]) + ([] if kind == PERSON else [class_name(kind, names)]))
-                for one, kind in zip(ids.tolist(), rows["class_id"].tolist(), strict=True)
+                " ".join(([] if is_detections else [str(id_)]) + ([] if kind == PERSON else [class_name(kind, names)]))
+                for id_, kind in zip(ids.tolist(), rows["class_id"].tolist(), strict=True)
             ]
             boxes = columns_to_boxes(rows)
             here = np.isfinite(boxes).all(axis=1)
@@ -179,7 +179,7 @@ class _Job:
         solid = placed & np.isfinite(size).all(axis=1)
         labels = np.array(texts, object)
         if solid.any():
-            turns = [rr.RotationAxisAngle(axis=[0, 0, 1], radians=one) for one in rows["heading_rad"][solid].tolist()]
+            turns = [rr.RotationAxisAngle(axis=[0, 0, 1], radians=row) for row in rows["heading_rad"][solid].tolist()]
             boxes = rr.Boxes3D(
                 centers=xyz[solid],
                 sizes=size[solid],
@@ -193,15 +193,15 @@ class _Job:
 
     def _trails(self, frame: Frame, trails: dict[int, deque[tuple[int, Floats]]]) -> None:
         rows = frame.rows
-        for one, x, y, z in zip(rows["track_id"].tolist(), rows["x_m"], rows["y_m"], rows["z_m"], strict=True):
+        for track_id, x, y, z in zip(rows["track_id"].tolist(), rows["x_m"], rows["y_m"], rows["z_m"], strict=True):
             if np.isfinite(x):
-                trails.setdefault(one, deque()).append((frame.t_ns, np.array([x, y, np.nan_to_num(z)])))
-        for one in list(trails):
-            while trails[one] and trails[one][0][0] < frame.t_ns - _TRAIL_NS:
-                trails[one].popleft()
-            if not trails[one]:
-                del trails[one]
-        long = {one: [place for _, place in trail] for one, trail in trails.items() if len(trail) > 1}
+                trails.setdefault(track_id, deque()).append((frame.t_ns, np.array([x, y, np.nan_to_num(z)])))
+        for track_id in list(trails):
+            while trails[track_id] and trails[track_id][0][0] < frame.t_ns - _TRAIL_NS:
+                trails[track_id].popleft()
+            if not trails[track_id]:
+                del trails[track_id]
+        long = {long_id: [place for _, place in trail] for long_id, trail in trails.items() if len(trail) > 1}
         ids = np.array(list(long), np.int64)
         self._recording.log(_TRAILS, self._rr.LineStrips3D(list(long.values()), colors=colours(ids)))
 
@@ -210,8 +210,8 @@ class _Job:
             self._at(frame.t_ns, None)
             ids = np.unique(frame.rows["track_id"])
             strips = []
-            for one in ids.tolist():
-                own = frame.rows[frame.rows["track_id"] == one]
+            for track_id in ids.tolist():
+                own = frame.rows[frame.rows["track_id"] == track_id]
                 strips.append(np.stack([own["x_m"], own["y_m"], np.zeros(len(own))], axis=-1))
             shown = self._rr.LineStrips3D(
                 strips, colors=np.concatenate([colours(ids), np.full((len(ids), 1), 0.5)], axis=1)

@@ -26,7 +26,7 @@ _KITTI_UNKNOWN: Final = "-10 {box} -1 -1 -1 -1000 -1000 -1000 -10"
 def mot(boxes: BoxTable) -> Iterator[bytes]:
     """MOTChallenge with 9 columns: frame from 1, id, left, top, width, height, confidence, class, visibility (-1)."""
     number = mot_numbers(boxes.classes)
-    kinds = [number[one] for one in boxes.class_id.tolist()]
+    kinds = [number[kind] for kind in boxes.class_id.tolist()]
     yield from _joined(
         f"{frame + 1},{track},{x!r},{y!r},{w!r},{h!r},{_text(score) or 1},{kind},-1\n"
         for frame, track, (x, y, w, h), score, kind in zip(
@@ -37,16 +37,16 @@ def mot(boxes: BoxTable) -> Iterator[bytes]:
 
 def mot_numbers(classes: dict[int, str]) -> dict[int, int]:
     """The numbers of MOTChallenge for classes; others get numbers after the last one of MOTChallenge."""
-    known = {name: number for number, name in MOT_CLASSES.items()}
+    number_of_name = {name: number for number, name in MOT_CLASSES.items()}
     out: dict[int, int] = {}
     following = max(MOT_CLASSES) + 1
-    for one, name in classes.items():
+    for kind, name in classes.items():
         if is_person(name):
-            out[one] = PERSON
-        elif name.casefold() in known:
-            out[one] = known[name.casefold()]
+            out[kind] = PERSON
+        elif name.casefold() in number_of_name:
+            out[kind] = number_of_name[name.casefold()]
         else:
-            out[one] = following
+            out[kind] = following
             following += 1
     return out
 
@@ -54,13 +54,13 @@ def mot_numbers(classes: dict[int, str]) -> dict[int, int]:
 def describe_mot_numbers(classes: dict[int, str]) -> str:
     """Say which classes have no number of MOTChallenge; "" if all have one."""
     numbers = mot_numbers(classes)
-    words = [f"{name} is {numbers[one]}" for one, name in classes.items() if numbers[one] not in MOT_CLASSES]
-    return f"MOTChallenge has no number for some classes, and no names: {', '.join(words)}" if words else ""
+    renumbered = [f"{name} is {numbers[kind]}" for kind, name in classes.items() if numbers[kind] not in MOT_CLASSES]
+    return f"MOTChallenge has no number for some classes, and no names: {', '.join(renumbered)}" if renumbered else ""
 
 
 def kitti(boxes: BoxTable) -> Iterator[bytes]:
     """KITTI tracking: frame, id, type, truncated, occluded, and the box by its corners; the score as column 18."""
-    names = {one: kitti_name(name) for one, name in boxes.classes.items()}
+    names = {kind: kitti_name(name) for kind, name in boxes.classes.items()}
     has_scores = bool(np.isfinite(boxes.score).any())
 
     def line(frame: int, track: int, name: str, box: list[float], score: np.float32) -> str:
@@ -84,10 +84,10 @@ def describe_merged(form: str, classes: dict[int, str]) -> str:
     """Say which classes have one name in KITTI, or one number in MOTChallenge; "" if none have."""
     numbers = mot_numbers(classes)
     groups: dict[str, list[str]] = {}
-    for one, name in classes.items():
-        groups.setdefault(kitti_name(name) if form == "kitti" else str(numbers[one]), []).append(name)
-    words = [f"{' and '.join(names)} are both {shared}" for shared, names in groups.items() if len(names) > 1]
-    return f"classes that the file can't tell apart: {', '.join(words)}" if words else ""
+    for kind, name in classes.items():
+        groups.setdefault(kitti_name(name) if form == "kitti" else str(numbers[kind]), []).append(name)
+    merged = [f"{' and '.join(names)} are both {shared}" for shared, names in groups.items() if len(names) > 1]
+    return f"classes that the file can't tell apart: {', '.join(merged)}" if merged else ""
 
 
 def boxes_csv(boxes: BoxTable) -> Iterator[bytes]:
@@ -129,7 +129,7 @@ def boxes_csv(boxes: BoxTable) -> Iterator[bytes]:
                     kind if kind else "",
                     names[kind] if kind else "",
                     int(boxes.observed[row]),
-                    *(repr(one) if np.isfinite(one) else "" for one in boxes.xy_m[row].tolist()),
+                    *(repr(value) if np.isfinite(value) else "" for value in boxes.xy_m[row].tolist()),
                 ]
             )
         if held.tell() > 2**16:

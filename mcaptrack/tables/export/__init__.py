@@ -58,15 +58,15 @@ def default_folder(path: Location) -> Path:
 
 
 def main_file(path: Location, folder: Path, form: Format = "parquet") -> Path:
-    """The file of a log in a folder that is written last: where it stands, all tables do."""
+    """The file of a log that is written last: if it exists, all tables of the log do."""
     return folder / "recordings" / f"recording={recording_name(path)}" / f"part-0.{form}"
 
 
 def current_file(contents: LogTables, folder: Path, name: str) -> Path | None:
     """The Parquet file of a table in a folder, if it is up to date."""
     path = folder.joinpath(name, f"recording={contents.recording}", "part-0.parquet")
-    known = tables.file_metadata(path, "parquet") or {}
-    stored = (known.get("recording"), known.get("table_version"), known.get("source"))
+    metadata = tables.file_metadata(path, "parquet") or {}
+    stored = (metadata.get("recording"), metadata.get("table_version"), metadata.get("source"))
     now = (file_name(contents.opened.path), tables.TABLE_VERSION)
     return path if stored[:2] == now and stored[2] == contents.source(name) else None
 
@@ -126,16 +126,16 @@ def export(
 def _write_all(job: _Job, topics: Sequence[str], blobs: bool, progress: Callable[[str, int, int], None]) -> None:
     opened = job.contents.opened
     *names, last = TABLES
-    known = job.known_topics()
-    wanted = sorted({*topics, *(topic for topic in known if topic in opened.channels)})
+    topics_before = job.known_topics()
+    wanted = sorted({*topics, *(topic for topic in topics_before if topic in opened.channels)})
     total = len(TABLES) + len(wanted)
     for count, name in enumerate(names, start=1):
         job.table(name)
         progress("export", count, total)
     for count, topic in enumerate(wanted, start=len(TABLES)):
-        job.messages(topic, blobs if topic in topics else known[topic])
+        job.messages(topic, blobs if topic in topics else topics_before[topic])
         progress("export", count, total)
-    job.remove([topic for topic in known if topic not in wanted])
+    job.remove([topic for topic in topics_before if topic not in wanted])
     job.table(last)
     progress("export", total, total)
 
@@ -153,42 +153,42 @@ class _Job:
 
     def table(self, name: str) -> None:
         """Update one of ``TABLES``."""
-        words = {"lineage": self.contents.lineage(name), "source": self.contents.source(name)}
-        words |= owner_words(self.contents.opened, self.folder) if name == "recordings" else {}
+        metadata = {"lineage": self.contents.lineage(name), "source": self.contents.source(name)}
+        metadata |= owner_words(self.contents.opened, self.folder) if name == "recordings" else {}
         path = self.path(name)
-        if not self._stands(name, path, words["source"]):
-            made = self.contents.pieces(name)
+        if not self._stands(name, path, metadata["source"]):
+            pieces = self.contents.pieces(name)
             note = self.contents.notes.get(name)
-            self._write(name, path, made, words | ({"note": note} if note else {}), TABLES[name].order)
+            self._write(name, path, pieces, metadata | ({"note": note} if note else {}), TABLES[name].order)
             self.done.notes += [f"{name}: {note}"] if note else []
 
     def messages(self, topic: str, blobs: bool) -> None:
         """Update the table of a channel."""
         name = f"{TOPICS}/{topic_folder(topic)}"
         path = self.path(*name.split("/"))
-        words = {"topic": topic, "blobs": str(blobs).lower(), "source": self.contents.messages_source(topic, blobs)}
-        known = tables.file_metadata(path, self.form) or {}
-        if not self._stands(name, path, words["source"]):
-            made, left_out = self.contents.message_pieces(topic, blobs)
-            words |= {"left_out": ", ".join(left_out)} if left_out else {}
-            self._write(name, path, made, words, ("topic", "t_ns"))
-        left = words.get("left_out") or known.get("left_out")
+        metadata = {"topic": topic, "blobs": str(blobs).lower(), "source": self.contents.messages_source(topic, blobs)}
+        metadata_before = tables.file_metadata(path, self.form) or {}
+        if not self._stands(name, path, metadata["source"]):
+            pieces, left_out = self.contents.message_pieces(topic, blobs)
+            metadata |= {"left_out": ", ".join(left_out)} if left_out else {}
+            self._write(name, path, pieces, metadata, ("topic", "t_ns"))
+        left = metadata.get("left_out") or metadata_before.get("left_out")
         self.done.notes += [f"{topic}: {left} left out, bytes; `blobs=True` keeps them"] if left else []
 
     def _stands(self, name: str, path: Path, source: str) -> bool:
         """Whether a table is up to date and may stay."""
         if self.force:
             return False
-        known = tables.file_metadata(path, self.form) or {}
-        if (known.get("source"), known.get("table_version")) != (source, tables.TABLE_VERSION):
+        metadata = tables.file_metadata(path, self.form) or {}
+        if (metadata.get("source"), metadata.get("table_version")) != (source, tables.TABLE_VERSION):
             return False
-        self.done.rows[name] = int(known["rows"])
+        self.done.rows[name] = int(metadata["rows"])
         return True
 
-    def _write(self, name: str, path: Path, made: object, words: dict[str, str], order: Sequence[str]) -> None:
-        rows = made.num_rows  # type: ignore[attr-defined]  # a table, which only tables knows
-        words |= {"version": __version__, "recording": file_name(self.contents.opened.path), "rows": str(rows)}
-        if tables.write(path, made, words, order, self.form, self.force):
+    def _write(self, name: str, path: Path, pieces: object, metadata: dict[str, str], order: Sequence[str]) -> None:
+        rows = pieces.num_rows  # type: ignore[attr-defined]  # a table, which only tables knows
+        metadata |= {"version": __version__, "recording": file_name(self.contents.opened.path), "rows": str(rows)}
+        if tables.write(path, pieces, metadata, order, self.form, self.force):
             self.done.written.append(name)
         self.done.rows[name] = rows
 
@@ -196,9 +196,9 @@ class _Job:
         """The channels of this log with tables of their own in the folder, and whether these have bytes."""
         out = {}
         for path in self._topic_files():
-            known = tables.file_metadata(path, self.form) or {}
-            if known.get("recording") == file_name(self.contents.opened.path) and "topic" in known:
-                out[known["topic"]] = known.get("blobs") == "true"
+            metadata = tables.file_metadata(path, self.form) or {}
+            if metadata.get("recording") == file_name(self.contents.opened.path) and "topic" in metadata:
+                out[metadata["topic"]] = metadata.get("blobs") == "true"
         return out
 
     def _topic_files(self) -> Iterator[Path]:

@@ -99,15 +99,15 @@ def location_of(path: Location) -> str:
 
 def best_tracks(camera: Camera, topics: Iterable[str]) -> str | None:
     """The topic of the tracks that stand for a camera; None if it has none."""
-    there = set(topics)
-    return next((name for below in _BEST if (name := f"{camera.prefix}/{below}") in there), None)
+    available = set(topics)
+    return next((name for below in _BEST if (name := f"{camera.prefix}/{below}") in available), None)
 
 
 def about_channels(opened: log.Log) -> dict[str, Any]:
     """The warnings that the channels of a log carry, and the versions that made them."""
-    made = [Provenance.from_metadata(channel.metadata) for _, channel in sorted(opened.channels.items())]
-    warnings = list(dict.fromkeys((code, message) for one in made if one for code, message in one.warnings))
-    versions = sorted({one.version for one in made if one})
+    provenances = [Provenance.from_metadata(channel.metadata) for _, channel in sorted(opened.channels.items())]
+    warnings = list(dict.fromkeys((code, message) for how in provenances if how for code, message in how.warnings))
+    versions = sorted({how.version for how in provenances if how})
     said = [{"code": code, "message": message} for code, message in warnings]
     return {
         "warnings": len(warnings),
@@ -118,10 +118,10 @@ def about_channels(opened: log.Log) -> dict[str, Any]:
 
 def worst_score(topics: Sequence[str], scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The scores of the camera with the lowest IDF1, of the tracks in ``topics``; empty without ground truth."""
-    found = [row for topic in topics if (row := _headline([one for one in scores if one["topic"] == topic]))]
-    if not found:
+    headlines = [row for topic in topics if (row := _headline([score for score in scores if score["topic"] == topic]))]
+    if not headlines:
         return {}
-    worst = min(found, key=lambda row: row["IDF1"])
+    worst = min(headlines, key=lambda row: row["IDF1"])
     return {"scored": worst["topic"]} | {name: worst[name] for name in ("similarity", "gate", *_SCORES)}
 
 
@@ -147,18 +147,18 @@ class LogTables:
 
     def table(self, name: str) -> Any:
         """One of ``TABLES`` as Arrow, without the column ``recording``."""
-        made = self.pieces(name)
-        return made.table() if isinstance(made, TablePieces) else made
+        pieces = self.pieces(name)
+        return pieces.table() if isinstance(pieces, TablePieces) else pieces
 
     def pieces(self, name: str) -> Any:
-        """The same; a table with many rows as ``TablePieces``, which are made while they are read."""
+        """As ``table``, but a table with many rows comes as ``TablePieces``, which are made while they are read."""
         table = TABLES[name]
         if table.rows_of is not None:
             channels = {topic: self._frames(topic) for topic in self.topics(name)}
             of_tracks = {topic: self._track_names(topic) for topic in channels} if table.is_of_tracks() else {}
             zones = {topic: self._zone_names(topic) for topic in channels} if table.is_of_zones() else {}
             return tables.rows_in_pieces(table.rows_of, channels, self._class_names, of_tracks, zones)
-        made: Mapping[str, Callable[[], Any]] = {
+        makers: Mapping[str, Callable[[], Any]] = {
             "frames": self._places,
             "track_summary": lambda: tables.summary_table(
                 {topic: self._frames(topic) for topic in self.topics("tracks")}, self._class_names
@@ -169,7 +169,7 @@ class LogTables:
             ),
             "recordings": lambda: tables.records_table(table, [self._recording()]),
         }
-        return made[name]()
+        return makers[name]()
 
     def topics(self, name: str) -> list[str]:
         """The channels from which a table is made, in order."""
@@ -187,10 +187,10 @@ class LogTables:
         if schema is None:
             raise KeyError(name)
         ours = log.topics_with_schema(self.opened, [schema.name])
-        found = [channel.topic for channel in ours if channel.holds(schema)]
+        found_topics = [channel.topic for channel in ours if channel.holds(schema)]
         if schema is DETECTIONS:
-            found += [topic for topic in self.opened.channels if holds_boxes(self.opened, topic)]
-        return sorted(found)
+            found_topics += [topic for topic in self.opened.channels if holds_boxes(self.opened, topic)]
+        return sorted(found_topics)
 
     def source(self, name: str) -> str:
         """A digest of the input of a table, which changes when the table may change. Reads no messages."""
@@ -207,10 +207,10 @@ class LogTables:
         while todo:
             topic = todo.pop()
             channel = self.opened.channels.get(topic)
-            made = Provenance.from_metadata(channel.metadata) if channel and topic not in out else None
-            if made and made.transform != "view":
-                out[topic] = {"transform": made.transform, "input": made.input, "parameters": made.parameters}
-                todo.append(made.input)
+            how = Provenance.from_metadata(channel.metadata) if channel and topic not in out else None
+            if how and how.transform != "view":
+                out[topic] = {"transform": how.transform, "input": how.input, "parameters": how.parameters}
+                todo.append(how.input)
         return json.dumps(out, sort_keys=True, separators=(",", ":"))
 
     # Foreign channels
@@ -224,8 +224,8 @@ class LogTables:
 
     def messages(self, topic: str, blobs: bool = False) -> tuple[Any, list[str]]:
         """The messages of any channel as a flat table, and the fields that were left out; as ``message_pieces``."""
-        made, left_out = self.message_pieces(topic, blobs)
-        return made.table(), left_out
+        pieces, left_out = self.message_pieces(topic, blobs)
+        return pieces.table(), left_out
 
     def message_pieces(self, topic: str, blobs: bool = False) -> tuple[TablePieces, list[str]]:
         """The messages of any channel as a flat table in pieces, and the fields that were left out.
@@ -255,10 +255,10 @@ class LogTables:
         topics = self.topics("frames")
         names = [*topics, *(file_name(part.path) for part in self.opened.parts)]
 
-        def made() -> Iterator[Any]:
+        def pieces() -> Iterator[Any]:
             return (tables.frames_table({topic: self._pointers(topic)}, names) for topic in topics)
 
-        return TablePieces(TABLES["frames"].arrow, sum(self.opened.channel(topic).messages for topic in topics), made)
+        return TablePieces(TABLES["frames"].arrow, sum(self.opened.channel(topic).messages for topic in topics), pieces)
 
     def _frames(self, topic: str) -> FrameColumns:
         if topic not in self._kept:
@@ -286,17 +286,17 @@ class LogTables:
 
     def _track_names(self, topic: str) -> TrackNames:
         """The names of the classes of the tracks, and of the ground truth, that the rows of a channel are about."""
-        made = provenance_of(self.opened, topic)
+        how = provenance_of(self.opened, topic)
         base = topic
         for beside in ("/events", "/errors", "/decisions", "/appearance"):
             base = base.removesuffix(beside)
-        if made and made.zones:
-            base = made.input
+        if how and how.zones:
+            base = how.input
         beside = base.removesuffix("/predictions")
         near = (base,) if base == beside else (f"{beside}/online", beside, input_of(self.opened.channel(base).metadata))
-        there = set(self.topics("tracks"))
-        tracks = next((one for one in near if one in there), "")
-        truth = next((one for one in made.references if one in there), "") if made else ""
+        track_topics = set(self.topics("tracks"))
+        tracks = next((near_topic for near_topic in near if near_topic in track_topics), "")
+        truth = next((reference for reference in how.references if reference in track_topics), "") if how else ""
 
         def names(of: str) -> dict[int, str]:
             return tables.names_by_track(self._frames(of), self._class_names.get(of, {})) if of else {}
@@ -305,11 +305,11 @@ class LogTables:
 
     def _zone_names(self, topic: str) -> dict[int, str]:
         """The names of the zones that the rows of a channel are about."""
-        made = provenance_of(self.opened, topic)
-        return {int(number): name for number, name in made.zones.items() if number.isdecimal()} if made else {}
+        how = provenance_of(self.opened, topic)
+        return {int(number): name for number, name in how.zones.items() if number.isdecimal()} if how else {}
 
-    def _note(self, name: str, words: str) -> None:
-        self.notes[name] = "; ".join([*filter(None, [self.notes.get(name)]), words])
+    def _note(self, name: str, note: str) -> None:
+        self.notes[name] = "; ".join([*filter(None, [self.notes.get(name)]), note])
 
     def _pointers(self, topic: str, of_rows: bool = True) -> Pointers:
         places = self.opened.places(topic)
@@ -330,8 +330,8 @@ class LogTables:
 
     def _scored(self, camera: Camera) -> list[str]:
         names = (*evaluation.SCORED, evaluation.FULL, *evaluation.FORECASTS)
-        known = [camera.truth, *(f"{camera.prefix}/{name}" for name in names)]
-        return [topic for topic in known if topic in self.opened.channels]
+        candidates = [camera.truth, *(f"{camera.prefix}/{name}" for name in names)]
+        return [topic for topic in candidates if topic in self.opened.channels]
 
     @cached_property
     def _scores(self) -> list[dict[str, Any]]:
@@ -357,9 +357,9 @@ class LogTables:
         rows = [row for topic in self.topics("ground_planes") for row in self._frames(topic).rows()]
         planes = {_origin_of_plane(row) for row in rows}
         sources = {
-            channel.topic: dict(made.parameters)
+            channel.topic: dict(provenance.parameters)
             for channel in opened.channels.values()
-            if (made := Provenance.from_metadata(channel.metadata)) and made.transform == "ingest"
+            if (provenance := Provenance.from_metadata(channel.metadata)) and provenance.transform == "ingest"
         }
         span: tuple[int | None, int | None] = (opened.start_ns, opened.end_ns) if messages else (None, None)
         if messages and opened.end_ns > LAST_NS:
@@ -384,8 +384,8 @@ class LogTables:
 
     def _as_a_whole(self) -> dict[str, Any]:
         """The columns that tell a log from thousands of others."""
-        there = self.topics("tracks")
-        best = [topic for one in cameras(self.opened) if (topic := best_tracks(one, there))]
+        topics = self.topics("tracks")
+        best = [topic for camera in cameras(self.opened) if (topic := best_tracks(camera, topics))]
         return {
             "location": location_of(self.opened.path),
             "cameras": len(cameras(self.opened)),
@@ -395,10 +395,10 @@ class LogTables:
         }
 
     def _count_tracks(self, topic: str) -> int:
-        found: set[int] = set()
+        ids: set[int] = set()
         for _, _, joined in joined_parts(TRACKS, self._frames(topic)):
-            found.update(np.unique(joined.rows["track_id"]).tolist())
-        return len(found)
+            ids.update(np.unique(joined.rows["track_id"]).tolist())
+        return len(ids)
 
 
 def _origin_of_plane(row: np.void) -> str:
@@ -413,20 +413,20 @@ def _order_of_scores(row: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def _channel(channel: log.Channel) -> dict[str, object]:
-    made = Provenance.from_metadata(channel.metadata)
+    how = Provenance.from_metadata(channel.metadata)
     out: dict[str, object] = {
         "topic": channel.topic,
         "schema": channel.schema_name or None,
         "messages": channel.messages,
         "encoding": channel.message_encoding or None,
     }
-    if made:
+    if how:
         names = ("transform", "input", "version", "digest", "input_digest", "weights_sha256", "frame_id")
-        out |= {name: getattr(made, name) or None for name in names}
-        out["parameters"] = json.dumps(made.parameters, sort_keys=True, separators=(",", ":"))
-        out["compared_with"] = json.dumps(dict(made.references), sort_keys=True) if made.references else None
+        out |= {name: getattr(how, name) or None for name in names}
+        out["parameters"] = json.dumps(how.parameters, sort_keys=True, separators=(",", ":"))
+        out["compared_with"] = json.dumps(dict(how.references), sort_keys=True) if how.references else None
     return out
 
 
-def _digest(words: list[Any]) -> str:
-    return hashlib.sha256(json.dumps(words).encode()).hexdigest()
+def _digest(parts: list[Any]) -> str:
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()

@@ -55,10 +55,10 @@ def refuse_tables_of_another(opened: log.Log, path: Location, folder: Path) -> N
     """Raise McaptrackError if a folder has tables of another log than ``opened``, which is or will be at ``path``."""
     name = recording_name(path)
     try:
-        there = [entry.removeprefix(_PREFIX) for entry in os.listdir(folder / _TABLE) if entry.startswith(_PREFIX)]
+        recordings = [entry.removeprefix(_PREFIX) for entry in os.listdir(folder / _TABLE) if entry.startswith(_PREFIX)]
     except OSError:
         return
-    for taken in sorted(there):
+    for taken in sorted(recordings):
         if recording_key(taken) != recording_key(name):
             continue
         for form in FORMATS:
@@ -123,13 +123,13 @@ def _recorded(opened: log.Log) -> dict[str, str]:
     """Digests of what was recorded, by topic."""
     channels = []
     for channel in opened.channels.values():
-        made = Provenance.from_metadata(channel.metadata)
-        if channel.messages and (made is None or (made.transform == INGEST and _REPLACEABLE not in made.parameters)):
-            channels.append((not foreign.holds_pictures(channel), -channel.messages, channel.topic, made))
-    channels.sort(key=lambda one: one[:3])
+        how = Provenance.from_metadata(channel.metadata)
+        if channel.messages and (how is None or (how.transform == INGEST and _REPLACEABLE not in how.parameters)):
+            channels.append((not foreign.holds_pictures(channel), -channel.messages, channel.topic, how))
+    channels.sort(key=lambda row: row[:3])
     return {
-        topic: ((made.digest if made else "") or opened.fingerprint(topic))[:32]
-        for _, _, topic, made in channels[:_MOST_CHANNELS]
+        topic: ((how.digest if how else "") or opened.fingerprint(topic))[:32]
+        for _, _, topic, how in channels[:_MOST_CHANNELS]
     }
 
 

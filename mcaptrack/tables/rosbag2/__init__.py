@@ -32,10 +32,9 @@ from mcaptrack.sources.frames import transforms_of
 from mcaptrack.tables.rosbag2 import messages
 from mcaptrack.tables.rosbag2.messages import message, typestore
 
-__all__ = ["STORAGES", "Storage", "WrittenBag", "default_folder", "write_bag"]
+__all__ = ["Storage", "WrittenBag", "default_folder", "write_bag"]
 
 Storage = Literal["mcap", "sqlite3"]
-STORAGES: Final[tuple[Storage, ...]] = ("mcap", "sqlite3")
 #: The version of the format of metadata.yaml: readers accept earlier ones, not later ones.
 _VERSION: Final = 8
 _METADATA: Final = "metadata.yaml"
@@ -155,15 +154,15 @@ def _write(
             )
             done.messages[stream.topic] = 0
             pending.append(_with(stream, connection))
-        for t_ns, stream, connection, found in heapq.merge(*pending, key=lambda one: one[0]):
-            writer.write(connection, t_ns, store.serialize_cdr(found, stream.kind))
+        for t_ns, stream, connection, content in heapq.merge(*pending, key=lambda item: item[0]):
+            writer.write(connection, t_ns, store.serialize_cdr(content, stream.kind))
             done.messages[stream.topic] += 1
             count += 1
             progress(count)
 
 
 def _with(stream: _Stream, connection: Any) -> Iterator[tuple[int, _Stream, Any, Any]]:
-    return ((t_ns, stream, connection, found) for t_ns, found in stream.messages)
+    return ((t_ns, stream, connection, content) for t_ns, content in stream.messages)
 
 
 class _Job:
@@ -177,10 +176,10 @@ class _Job:
     def channels(self) -> list[tuple[str, Schema]]:
         """The channels with rows to write."""
         wanted = (DETECTIONS, TRACKS, PREDICTIONS)
-        found = log.topics_with_schema(self._opened, [schema.name for schema in wanted])
+        channels = log.topics_with_schema(self._opened, [schema.name for schema in wanted])
         return [
             (channel.topic, SCHEMAS[channel.schema_name])
-            for channel in sorted(found, key=lambda one: one.topic)
+            for channel in sorted(channels, key=lambda channel: channel.topic)
             if channel.holds(SCHEMAS[channel.schema_name])
         ]
 
@@ -212,11 +211,11 @@ class _Job:
             self._notes.append(f"{topic}: {lost:,} rows without a {lacking} are not in the bag")
         if is_flat:
             flat = prefix.strip("/")
-            found = ((frame.t_ns, messages.boxes_2d(frame, flat, names)) for frame in frames)
-            out.append(_Stream(topic, "vision_msgs/msg/Detection2DArray", found))
+            boxes = ((frame.t_ns, messages.boxes_2d(frame, flat, names)) for frame in frames)
+            out.append(_Stream(topic, "vision_msgs/msg/Detection2DArray", boxes))
         else:
-            found = ((frame.t_ns, messages.boxes_3d(frame, in_metres, names)) for frame in frames)
-            out.append(_Stream(topic, "vision_msgs/msg/Detection3DArray", found))
+            boxes = ((frame.t_ns, messages.boxes_3d(frame, in_metres, names)) for frame in frames)
+            out.append(_Stream(topic, "vision_msgs/msg/Detection3DArray", boxes))
         if schema is TRACKS and places.any():
             drawn = ((frame.t_ns, messages.track_markers(frame, in_metres, names)) for frame in frames)
             out.append(_Stream(f"{topic}/markers", "visualization_msgs/msg/MarkerArray", drawn))
@@ -243,7 +242,7 @@ class _Job:
             for frame in frames:
                 ids = np.unique(frame.rows["track_id"]).astype(np.int64)
                 heights = base_heights(tracks, np.full(len(ids), frame.t_ns), ids)
-                out.append({one: up for one, up in zip(ids.tolist(), heights.tolist(), strict=True) if np.isfinite(up)})
+                out.append({id_: up for id_, up in zip(ids.tolist(), heights.tolist(), strict=True) if np.isfinite(up)})
             return out
         return [{} for _ in frames]
 
@@ -252,16 +251,16 @@ class _Job:
         tree = transforms_of(self._opened)
         out = []
         for topic, is_static in (("/tf_static", True), ("/tf", False)):
-            found = [one for one in (tree.series.values() if tree else ()) if one.is_static == is_static]
+            wanted = [series for series in (tree.series.values() if tree else ()) if series.is_static == is_static]
             poses = sorted(
                 (int(t_ns), number, at)
-                for number, one in enumerate(found)
-                for at, t_ns in enumerate(one.t_ns.tolist())
+                for number, series in enumerate(wanted)
+                for at, t_ns in enumerate(series.t_ns.tolist())
                 if 0 <= t_ns < _LAST_S * NS_PER_S
             )
             if poses:
                 self.total += len(poses)
-                moved = ((t_ns, _transform(found[number], at)) for t_ns, number, at in poses)
+                moved = ((t_ns, _transform(wanted[number], at)) for t_ns, number, at in poses)
                 out.append(_Stream(topic, "tf2_msgs/msg/TFMessage", moved, is_static))
         return out
 

@@ -92,13 +92,13 @@ def boxes_2d(frame: Frame, frame_id: str, names: Mapping[int, str]) -> Any:
     """A vision_msgs/Detection2DArray of the rows with a box in pixels."""
     rows = frame.rows[has_pixels(frame.rows)]
     head = header(frame.t_ns, frame_id)
-    found = []
+    boxes = []
     for row, guess in zip(rows, _guesses(rows, names, [pose(0.0, 0.0, 0.0)] * len(rows)), strict=True):
         x, y, w, h = (float(row[name]) for name in ("x_px", "y_px", "w_px", "h_px"))
         centre = message("vision_msgs/Pose2D", message("vision_msgs/Point2D", x + w / 2, y + h / 2), 0.0)
         box = message("vision_msgs/BoundingBox2D", centre, w, h)
-        found.append(message("vision_msgs/Detection2D", head, [guess], box, _id_of(row)))
-    return message("vision_msgs/Detection2DArray", head, found)
+        boxes.append(message("vision_msgs/Detection2D", head, [guess], box, _id_of(row)))
+    return message("vision_msgs/Detection2DArray", head, boxes)
 
 
 def boxes_3d(frame: Frame, frame_id: str, names: Mapping[int, str]) -> Any:
@@ -107,11 +107,11 @@ def boxes_3d(frame: Frame, frame_id: str, names: Mapping[int, str]) -> Any:
     head = header(frame.t_ns, frame_id)
     centre, size, heading = _bodies(rows)
     places = [pose(x, y, z, turn) for (x, y, z), turn in zip(centre.tolist(), heading.tolist(), strict=True)]
-    found = []
+    boxes = []
     for row, extent, at, guess in zip(rows, size.tolist(), places, _guesses(rows, names, places), strict=True):
         box = message("vision_msgs/BoundingBox3D", at, message("geometry_msgs/Vector3", *extent))
-        found.append(message("vision_msgs/Detection3D", head, [guess], box, _id_of(row)))
-    return message("vision_msgs/Detection3DArray", head, found)
+        boxes.append(message("vision_msgs/Detection3D", head, [guess], box, _id_of(row)))
+    return message("vision_msgs/Detection3DArray", head, boxes)
 
 
 def has_pixels(rows: Rows) -> Any:
@@ -254,8 +254,8 @@ def _by_track(rows: Rows) -> Iterator[tuple[int, Rows]]:
     """The steps of each forecast, in order, by rising id."""
     order = np.lexsort((rows["step"], rows["track_id"]))
     rows = rows[order]
-    known = np.unique(rows["track_id"])
-    begins = np.searchsorted(rows["track_id"], known)
-    ends = np.searchsorted(rows["track_id"], known, "right")
-    for number, begin, end in zip(known.tolist(), begins, ends, strict=True):
+    ids = np.unique(rows["track_id"])
+    begins = np.searchsorted(rows["track_id"], ids)
+    ends = np.searchsorted(rows["track_id"], ids, "right")
+    for number, begin, end in zip(ids.tolist(), begins, ends, strict=True):
         yield number, rows[begin:end]

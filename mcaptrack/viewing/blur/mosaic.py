@@ -53,8 +53,8 @@ def hide(image: Image, boxes: Floats) -> tuple[Image, Bools]:
             continue
         cell = 1 << level
         inside = np.zeros((height, width), np.bool_)
-        for one in own.tolist():
-            inside[top[one] : bottom[one], left[one] : right[one]] = True
+        for number in own.tolist():
+            inside[top[number] : bottom[number], left[number] : right[number]] = True
         x, y = int(left[own].min()) // cell * cell, int(top[own].min()) // cell * cell
         part = image[y : int(bottom[own].max()), x : int(right[own].max())]
         rows, columns = -(-part.shape[0] // cell), -(-part.shape[1] // cell)

@@ -107,7 +107,7 @@ class Pieces(NamedTuple):
 
 
 def joined(parts: Sequence[Pieces], width: int) -> Pieces:
-    """All pieces of these, of states of so many numbers."""
+    """Join pieces; ``width`` is the number of values of a state."""
     if not parts:
         none, no = np.empty(0, np.int64), np.empty(0, np.bool_)
         return Pieces(none, none, np.empty((0, width)), np.empty((0, width)), (no, no))
@@ -120,8 +120,8 @@ def around(t_ns: Ints, states: Floats, near_ns: int) -> Pieces:
     """Detections as pieces around their times."""
     halves = [(t_ns - near_ns, t_ns, False, True), (t_ns, t_ns + near_ns, True, False)]
     parts = [
-        Pieces(first, last, states, states, (np.full(len(t_ns), one), np.full(len(t_ns), other)))
-        for first, last, one, other in halves
+        Pieces(first, last, states, states, (np.full(len(t_ns), sign), np.full(len(t_ns), other)))
+        for first, last, sign, other in halves
     ]
     return joined(parts, states.shape[1])
 
@@ -161,15 +161,15 @@ def _first_at(run: Ints, t_ns: Ints, rows: Ints, wanted_ns: Ints) -> Ints:
     base = int(t_ns.min())
     length = int(t_ns.max()) - base + seconds_to_ns(MAX_GAP_S)
     keys = run.astype(np.float64) * length + (t_ns - base)
-    found = np.searchsorted(keys, run[rows].astype(np.float64) * length + (wanted_ns - base))
-    return found.astype(np.int64)
+    rows_found = np.searchsorted(keys, run[rows].astype(np.float64) * length + (wanted_ns - base))
+    return rows_found.astype(np.int64)
 
 
-def _motion(t_ns: Ints, places: Floats, one: Ints, other: Ints) -> Floats:
+def _motion(t_ns: Ints, places: Floats, first: Ints, other: Ints) -> Floats:
     """The motion of places (N, P) between two rows, by second."""
-    passed = np.maximum(t_ns[other] - t_ns[one], 1)[:, None] / NS_PER_S
-    out: Floats = (places[other] - places[one]) / passed
-    out[other == one] = 0
+    passed = np.maximum(t_ns[other] - t_ns[first], 1)[:, None] / NS_PER_S
+    out: Floats = (places[other] - places[first]) / passed
+    out[other == first] = 0
     return out
 
 
@@ -200,7 +200,7 @@ def shows_people(name: str) -> bool:
 def people_among(class_id: NDArray[Any], names: Mapping[int, str]) -> Bools:
     """Which rows (N,) are people, or of unknown class."""
     numbers = class_id.astype(np.int64)
-    wanted = [one for one in np.unique(numbers).tolist() if one == UNKNOWN or shows_people(class_name(one, names))]
+    wanted = [kind for kind in np.unique(numbers).tolist() if kind == UNKNOWN or shows_people(class_name(kind, names))]
     return np.asarray(np.isin(numbers, wanted), np.bool_)
 
 
@@ -232,15 +232,15 @@ def people_in_space(opened: log.Log, pictures: str, problems: list[str]) -> list
     cameras: dict[str, MovingCamera | None] = {}
     for topic in sorted(opened.channels):
         try:
-            found = _read(opened, topic)
+            boxes_read = _read(opened, topic)
         except DamagedError:
             raise
         except McaptrackError as error:
             problems.append(f"{topic}: {error}")
             continue
-        if found is None:
+        if boxes_read is None:
             continue
-        pieces, frame_ns, frame_id = found
+        pieces, frame_ns, frame_id = boxes_read
         if frame_id not in cameras:
             try:
                 cameras[frame_id] = moving_camera(opened, pictures, frame_id)
@@ -256,7 +256,7 @@ def people_in_space(opened: log.Log, pictures: str, problems: list[str]) -> list
 def _read(opened: log.Log, topic: str) -> tuple[Pieces, Ints, str] | None:
     """The people in a channel of 3D boxes, the times of its frames and its frame of reference; None for others."""
     channel = opened.channels[topic]
-    schema: Schema | None = next((one for one in (TRACKS, DETECTIONS) if channel.holds(one)), None)
+    schema: Schema | None = next((candidate for candidate in (TRACKS, DETECTIONS) if channel.holds(candidate)), None)
     frames: Sequence[Frame]
     if schema is not None:
         frame_id = frame_id_of(channel.metadata)
@@ -264,8 +264,8 @@ def _read(opened: log.Log, topic: str) -> tuple[Pieces, Ints, str] | None:
             return None
         frames, names = opened.frame_columns(topic, schema), class_names(channel.metadata)
     elif holds_boxes_3d(opened, topic):
-        found = named_detections(opened, topic)
-        schema, frames, frame_id, names = DETECTIONS, found.frames, found.frame_id, found.classes
+        named = named_detections(opened, topic)
+        schema, frames, frame_id, names = DETECTIONS, named.frames, named.frame_id, named.classes
     else:
         return None
     parts: list[tuple[Ints, Ints, Floats]] = []
@@ -275,9 +275,9 @@ def _read(opened: log.Log, topic: str) -> tuple[Pieces, Ints, str] | None:
         turned = np.isfinite(state[:, 6])
         state[~turned, 3:5] = state[~turned, 3:5].max(axis=1, keepdims=True, initial=0)
         state[~turned, 6] = 0
-        known = np.isfinite(state).all(axis=1) & people_among(part.rows["class_id"], names)
+        usable = np.isfinite(state).all(axis=1) & people_among(part.rows["class_id"], names)
         number = part.rows["track_id"] if schema is TRACKS else np.zeros(len(state), np.int64)
-        parts.append((part.row_ns[known], number[known].astype(np.int64), state[known]))
+        parts.append((part.row_ns[usable], number[usable].astype(np.int64), state[usable]))
     if not sum(len(part[0]) for part in parts):
         return None
     t_ns, number, state = (np.concatenate([part[n] for part in parts]) for n in range(3))
@@ -303,12 +303,12 @@ def outlines(states: Floats, picture: Ints, camera: MovingCamera) -> Floats:
     for number in np.unique(camera.lens[picture]).tolist():
         lens, mine = camera.lenses[number], camera.lens[picture] == number
         flat = points[mine].reshape(-1, 3)
-        found = project(flat, lens, np.eye(3), np.zeros(3))[0]
+        flat_px = project(flat, lens, np.eye(3), np.zeros(3))[0]
         with np.errstate(invalid="ignore", divide="ignore"):
             straight = flat[:, :2] / flat[:, 2:] * lens.focal_px + lens.centre_px
-        beyond = np.isnan(found).any(axis=1)
-        found[beyond] = straight[beyond].clip(-_FAR_PX, _FAR_PX)
-        px[mine] = found.reshape(px[mine].shape)
+        beyond = np.isnan(flat_px).any(axis=1)
+        flat_px[beyond] = straight[beyond].clip(-_FAR_PX, _FAR_PX)
+        px[mine] = flat_px.reshape(px[mine].shape)
     px[~is_ahead] = np.nan
     low, high = np.fmin.reduce(px, axis=1), np.fmax.reduce(px, axis=1)
     size = np.array([camera.width_px, camera.height_px], np.float64)
@@ -336,19 +336,19 @@ class HiddenPeople:
         usual = float(np.median(np.diff(self._at_ns))) if len(self._at_ns) > 1 else 0.0
         near_ns = round(min(_NEAR_PICTURES * usual, seconds_to_ns(_NEAR_S)))
         pieces, topics, looked = [], [], [np.empty(0, np.int64)]
-        known = {topic for one in of_pictures for topic in (*one.topics, one.truth, one.boxes or "")}
-        for topic in sorted(known & set(opened.channels)):
-            found = _people(opened, topic)
-            if found is not None:
-                schema, frame_ns, t_ns, track_id, boxes = found
+        wanted = {topic for camera in of_pictures for topic in (*camera.topics, camera.truth, camera.boxes or "")}
+        for topic in sorted(wanted & set(opened.channels)):
+            boxes_read = _people(opened, topic)
+            if boxes_read is not None:
+                schema, frame_ns, t_ns, track_id, boxes = boxes_read
                 pieces.append(_linked(t_ns, track_id, boxes) if schema is TRACKS else around(t_ns, boxes, near_ns))
                 topics.append(topic)
                 looked.append(frame_ns)
         problems: list[str] = []
         self._in_space = people_in_space(opened, pictures, problems)
         self.problems = tuple(problems)
-        self.topics = tuple(sorted({*topics, *(one.topic for one in self._in_space)}))
-        self.frame_ns = np.unique(np.concatenate([*looked, *(one.frame_ns for one in self._in_space)]))
+        self.topics = tuple(sorted({*topics, *(seen.topic for seen in self._in_space)}))
+        self.frame_ns = np.unique(np.concatenate([*looked, *(seen.frame_ns for seen in self._in_space)]))
         self._pieces = joined(pieces, 4)
         self._block: tuple[int, list[Floats]] = (-1, [])
 
@@ -363,7 +363,7 @@ class HiddenPeople:
 
     def unplaced(self) -> int:
         """The number of pictures into which boxes in space can't be projected: where the camera was is not known."""
-        return max((int(one.unknown().sum()) for one in self._in_space), default=0)
+        return max((int(seen.unknown().sum()) for seen in self._in_space), default=0)
 
     def at(self, number: int) -> Floats:
         """The boxes (N, 4) to hide in a picture, with their margins; quick for pictures in order."""
@@ -375,7 +375,7 @@ class HiddenPeople:
     def between(self, first: int, last: int) -> list[Floats]:
         """The boxes (N, 4) to hide in each of the pictures ``first`` to before ``last``, with their margins."""
         at_ns = self._at_ns[first:last]
-        parts = [self._pieces.at(at_ns), *(one.between(first, last) for one in self._in_space)]
+        parts = [self._pieces.at(at_ns), *(seen.between(first, last) for seen in self._in_space)]
         picture, boxes, unseen_s = (np.concatenate([part[n] for part in parts]) for n in range(3))
         order = np.argsort(picture, kind="stable")
         boxes = _with_margins(boxes, unseen_s)[order]
@@ -391,21 +391,21 @@ def _people(opened: log.Log, topic: str) -> tuple[Schema, Ints, Ints, Ints, Floa
     channel = opened.channels[topic]
     names = class_names(channel.metadata)
     frames: Sequence[Frame]
-    schema = next((one for one in (TRACKS, DETECTIONS) if channel.holds(one)), None)
+    schema = next((candidate for candidate in (TRACKS, DETECTIONS) if channel.holds(candidate)), None)
     if schema is not None:
         frames = opened.frame_columns(topic, schema)
     elif foreign.holds_detections(channel):
-        schema, found = DETECTIONS, foreign.named_detections(opened, topic)
-        frames, names = found.frames, names | found.classes
+        schema, named = DETECTIONS, foreign.named_detections(opened, topic)
+        frames, names = named.frames, names | named.classes
     else:
         return None
     parts: list[tuple[Ints, Ints, Floats]] = []
     for _, _, part in joined_parts(schema, frames):
         boxes, rows = columns_to_boxes(part.rows), part.rows
-        known = np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > 0).all(axis=1)
-        known &= people_among(rows["class_id"], names)
+        usable = np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > 0).all(axis=1)
+        usable &= people_among(rows["class_id"], names)
         number = rows["track_id"] if schema is TRACKS else np.zeros(len(rows), np.int64)
-        parts.append((part.row_ns[known], number[known].astype(np.int64), boxes[known]))
+        parts.append((part.row_ns[usable], number[usable].astype(np.int64), boxes[usable]))
     if not sum(len(part[0]) for part in parts) and not _has_pixels(schema, frames):
         return None
     t_ns, number, boxes = (np.concatenate([part[n] for part in parts]) for n in range(3)) if parts else _NOTHING

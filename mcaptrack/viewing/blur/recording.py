@@ -55,21 +55,23 @@ def blurrable(opened: log.Log, only: str | None = None) -> dict[str, HiddenPeopl
     boxes in space that can't be placed in the pictures, and of pictures that no detector saw.
     """
     out: dict[str, HiddenPeople] = {}
-    there: list[Camera] = [one for one in cameras(opened) if one.pictures and (only is None or one.prefix == only)]
+    with_pictures: list[Camera] = [
+        camera for camera in cameras(opened) if camera.pictures and (only is None or camera.prefix == only)
+    ]
     problems: list[str] = []
-    for topic in dict.fromkeys(camera.pictures for camera in there if camera.pictures):
-        people = HiddenPeople(opened, [camera for camera in there if camera.pictures == topic], topic)
+    for topic in dict.fromkeys(camera.pictures for camera in with_pictures if camera.pictures):
+        people = HiddenPeople(opened, [camera for camera in with_pictures if camera.pictures == topic], topic)
         problems += people.problems
         if people.topics:
             out[topic] = people
             _warn_of_pictures(opened, topic, people)
-    if not there:
+    if not with_pictures:
         raise McaptrackError(f"{opened.path} has no pictures{_of(only)} in which people could be hidden")
     if not out:
-        found = ", ".join(dict.fromkeys(str(camera.pictures) for camera in there))
+        picture_topics = ", ".join(dict.fromkeys(str(camera.pictures) for camera in with_pictures))
         why = f" ({'; '.join(dict.fromkeys(problems))})" if problems else ""
         raise McaptrackError(
-            f"{opened.path} has {found} and no boxes of people in them to hide{why}; "
+            f"{opened.path} has {picture_topics} and no boxes of people in them to hide{why}; "
             f"{call('run', opened.path)} finds people"
         )
     for problem in dict.fromkeys(problems):
@@ -88,8 +90,8 @@ def _warn_of_pictures(opened: log.Log, topic: str, people: HiddenPeople) -> None
     said = [f"no detector saw {unseen:,} of the {total:,} pictures of {topic}"] if unseen else []
     if unplaced:
         said.append(f"where the camera was is not known for {unplaced:,} of the {total:,} pictures of {topic}")
-    for words in said:
-        warn(f"{opened.path}: {words}; people in them may be recognisable", "not-blurred")
+    for text in said:
+        warn(f"{opened.path}: {text}; people in them may be recognisable", "not-blurred")
 
 
 def warn_of_rest(opened: log.Log, blurred: Sequence[str]) -> None:
@@ -104,7 +106,7 @@ def warn_of_rest(opened: log.Log, blurred: Sequence[str]) -> None:
     if rest:
         warn(f"{opened.path}: {', '.join(rest)} are kept as recorded and may show people", "not-blurred")
     ours = {attachment_of(name) for name in LAYOUTS}
-    kept = sorted({one.name for part in opened.parts for one in part.index.attachments} - ours)
+    kept = sorted({attachment.name for part in opened.parts for attachment in part.index.attachments} - ours)
     if kept:
         warn(f"{opened.path}: the attachments {', '.join(kept)} are kept as they are", "not-blurred")
 

@@ -47,7 +47,7 @@ def player_html(
     ``opens_at`` is the picture that it begins with, ``still``.
     """
     data = {
-        "seconds": [round(one, 3) for one in seconds],
+        "seconds": [round(second, 3) for second in seconds],
         "numbers": taken.numbers,
         "sizes": taken.sizes,
         "layers": taken.layers,
@@ -114,7 +114,7 @@ class ShownColumn(NamedTuple):
 def table_html(columns: Sequence[ShownColumn], rows: int) -> str:
     """Return a table of some rows as HTML. ``columns`` hold all rows, or the first and the last ones of more."""
     shown = len(columns[0].texts) if columns else 0
-    lines = [[_short(one.texts[row]) for one in columns] for row in range(shown)]
+    lines = [[_short(column.texts[row]) for column in columns] for row in range(shown)]
     gap = FIRST if shown < rows else -1
     caption = f"{rows:,} rows, {len(columns)} columns"
     if shown < rows:

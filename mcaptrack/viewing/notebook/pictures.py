@@ -213,23 +213,23 @@ def find_drawings(opened: log.Log, prefix: str, topics: Sequence[str]) -> ToShow
     with a warning. Raises McaptrackError if there is nothing to see, if a given channel can't be drawn, or if the views
     of given ones don't fit together.
     """
-    given = [_full(opened, prefix, topic) for topic in topics]
-    if len(given) == 1 and given[0] in opened.channels and holds_pictures(opened.channels[given[0]]):
-        return ToShow([], given[0], opened.times(given[0]))
-    without = [topic for topic in given if not _has_view(opened, topic)]
+    full_topics = [_full(opened, prefix, topic) for topic in topics]
+    if len(full_topics) == 1 and full_topics[0] in opened.channels and holds_pictures(opened.channels[full_topics[0]]):
+        return ToShow([], full_topics[0], opened.times(full_topics[0]))
+    without = [topic for topic in full_topics if not _has_view(opened, topic)]
     if without:
-        for topic in given:
+        for topic in full_topics:
             _schema_of(opened, topic)
-        return _drawn_now(opened, prefix, given)
+        return _drawn_now(opened, prefix, full_topics)
     try:
-        shown = pipeline.find_views(opened, prefix, given)
+        shown = pipeline.find_views(opened, prefix, full_topics)
     except McaptrackError as error:
-        found = [topic for topic in _candidates(opened, prefix) if not given][:1]
-        if not found and (given or pipeline.camera_at(opened, prefix).pictures is None):
+        usable = [topic for topic in _candidates(opened, prefix) if not full_topics][:1]
+        if not usable and (full_topics or pipeline.camera_at(opened, prefix).pictures is None):
             raise
-        if not found:
+        if not usable:
             warn(f"nothing is drawn on the pictures: {error}", "nothing-found")
-        return _drawn_now(opened, prefix, found)
+        return _drawn_now(opened, prefix, usable)
     t_ns = opened.times(shown.pictures or shown.views[0])
     return ToShow([_recorded(opened, topic) for topic in shown.views], shown.pictures, t_ns)
 
@@ -241,16 +241,16 @@ def _full(opened: log.Log, prefix: str, topic: str) -> str:
 
 
 def _has_view(opened: log.Log, topic: str) -> bool:
-    begin = tuple(one + suffix for one in (topic, topic + FULL) for suffix in views.SUFFIXES)
+    begin = tuple(name + suffix for name in (topic, topic + FULL) for suffix in views.SUFFIXES)
     is_view = any(suffix in topic for suffix in views.SUFFIXES)
-    return is_view or any(one.startswith(begin) for one in opened.channels)
+    return is_view or any(channel.startswith(begin) for channel in opened.channels)
 
 
 def _candidates(opened: log.Log, prefix: str) -> list[str]:
     """Return the channels of a camera that can be drawn, the best ones first."""
     best = [f"{prefix}/{name}" for name in _BEST]
-    there = [*best, *sorted(pipeline.camera_at(opened, prefix).topics)]
-    return [one for one in dict.fromkeys(there) if one in opened.channels and _kind(opened.channels[one])]
+    names = [*best, *sorted(pipeline.camera_at(opened, prefix).topics)]
+    return [topic for topic in dict.fromkeys(names) if topic in opened.channels and _kind(opened.channels[topic])]
 
 
 def _kind(channel: log.Channel) -> Schema | None:
@@ -261,8 +261,8 @@ def _schema_of(opened: log.Log, topic: str) -> Schema:
     """Return the schema of a channel to draw. Raises McaptrackError if it can't be drawn."""
     schema = _kind(opened.channel(topic))
     if schema is None:
-        there = list_names(sorted(one.topic for one in opened.channels.values() if _kind(one)))
-        raise McaptrackError(f"{opened.path}: {topic} has no boxes, tracks or predictions to draw; there are {there}")
+        names = list_names(sorted(channel.topic for channel in opened.channels.values() if _kind(channel)))
+        raise McaptrackError(f"{opened.path}: {topic} has no boxes, tracks or predictions to draw; there are {names}")
     return schema
 
 
@@ -358,7 +358,7 @@ class PictureSource:
         if self._pictures is not None:
             tried = numbers[np.unique(np.linspace(0, len(numbers) - 1, _TRIED).astype(int))]
             small = (self._small(frame.rows, width_px) for frame in self._pictures.frames(tried.tolist()))
-            sizes = [len(encode_image(one, "jpeg", _QUALITY)) for one in small]
+            sizes = [len(encode_image(picture, "jpeg", _QUALITY)) for picture in small]
             each += _AS_TEXT * float(np.mean(sizes)) if sizes else 0.0
         return max(1, ceil(len(numbers) / max(1.0, min(_MOST, most_bytes / each))))
 
@@ -374,7 +374,7 @@ class PictureSource:
             out.sizes.append(size)
             if self._pictures is not None:
                 out.jpegs.append(encode_image(self._small(image, width_px), "jpeg", _QUALITY))
-            out.drawn.append([out.strokes.of(one) if one is not None else [[], []] for one in drawings])
+            out.drawn.append([out.strokes.of(drawing) if drawing is not None else [[], []] for drawing in drawings])
             progress("show", done, len(numbers))
         if not out.t_ns:
             raise McaptrackError(f"{self._opened.path}: no picture of {self.topic} in this period can be decoded")
@@ -385,8 +385,8 @@ class PictureSource:
         for _, size, image, drawings in self._drawn_on(np.array([number]), width_px or _STILL_PX):
             width = width_px or min(_STILL_PX, size[0])
             out = scaled(image, width) if self._pictures is not None else image
-            for one in drawings:
-                out = draw(out, one, out.shape[1] / size[0]) if one is not None else out
+            for drawing in drawings:
+                out = draw(out, drawing, out.shape[1] / size[0]) if drawing is not None else out
             return out
         where = f"{self._opened.path}: {self.topic} at {self.seconds(int(self.t_ns[number])):.3f} s"
         raise McaptrackError(f"{where} can't be decoded: the video has no key picture before it")

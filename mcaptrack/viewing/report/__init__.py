@@ -141,12 +141,12 @@ def draw(report: LogReport, at: int, total: int) -> None:
     )
     report.background, report.sequence, report.highlights = None, None, []
     report.doubts, report.doubtful_tracks = [], []
-    for one in report.track_sets.values():
-        one.frames = []
+    for track_set in report.track_sets.values():
+        track_set.frames = []
 
 
 def page(reports: Sequence[LogReport]) -> str:
-    """The whole page; logs that are not rendered yet are."""
+    """Return the whole page; logs that were not rendered yet are rendered first."""
     for k, report in enumerate(reports):
         if not report.html:
             draw(report, k, len(reports))
@@ -158,7 +158,7 @@ def page(reports: Sequence[LogReport]) -> str:
         colours=[_hex(foxglove.colour(k)) for k in range(COLOURS)],
         summary=summarize(reports),
         comparison=_comparison(reports) if len(reports) > 1 else None,
-        logs=[{"file": one.file, "short": _in_short(one), "html": one.html} for one in reports],
+        logs=[{"file": report.file, "short": _in_short(report), "html": report.html} for report in reports],
         data=data(reports),
     )
 
@@ -168,10 +168,10 @@ def _hex(rgba: Sequence[float]) -> str:
 
 
 def _in_short(report: LogReport) -> str:
-    found = before_after(report, report.results) if report.results else None
-    if found is not None:
-        return " → ".join(number(int(value)) for value in found.values("IDSW")) + " switches"
-    tracks = next((one for one in report.data["tracks"] if one["role"] in ("tracks", "offline")), None)
+    scores = before_after(report, report.results) if report.results else None
+    if scores is not None:
+        return " → ".join(number(int(value)) for value in scores.values("IDSW")) + " switches"
+    tracks = next((row for row in report.data["tracks"] if row["role"] in ("tracks", "offline")), None)
     return f"{counted(tracks['tracks'], 'track')}, no ground truth" if tracks else "no tracks"
 
 
@@ -179,39 +179,43 @@ def _comparison(reports: Sequence[LogReport]) -> dict[str, Any]:
     """Scores by log, and of all logs together."""
     pairs = [(report, before_after(report, report.results) if report.results else None) for report in reports]
     sure = [intervals_of([report]) for report in reports]
-    rows = [_comparison_row(report.file, found, one) for (report, found), one in zip(pairs, sure, strict=True)]
+    rows = [_comparison_row(report.file, scores, sides) for (report, scores), sides in zip(pairs, sure, strict=True)]
     together = combined_results(reports)
     if together:
-        whole = before_after(next(one for one in reports if one.results), together)
+        whole = before_after(next(report for report in reports if report.results), together)
         rows.append(_comparison_row("", whole, intervals_of(reports)))
     columns = ["log", "within", "change of IDF1 (95 %)", "re-tracking is", *_COMPARED]
     charts = []
     for key, label, is_share in (("IDSW", "identity switches", False), ("IDF1", "identities kept (IDF1), %", True)):
         values = [
-            (report.name, *map(float, found.values(key)))
-            for report, found in pairs
-            if found and found.tracked and found.retracked
+            (report.name, *map(float, scores.values(key)))
+            for report, scores in pairs
+            if scores and scores.tracked and scores.retracked
         ]
         if values:
             axis = Axis(label, 1.0 if is_share else round_most([np.array([v[1:] for v in values]).ravel()]), is_share)
             chart = pairs_chart(f"{label} by log", values, axis, ("tracked", "re-tracked"))  # type: ignore[arg-type]
             charts.append({"chart": chart, "title": label, "caption": ""})
-    known = [(report.name, one.idf1) for report, one in zip(reports, sure, strict=True) if one and one.idf1[1].is_known]
-    if known:
+    ranges = [
+        (report.name, sides.idf1)
+        for report, sides in zip(reports, sure, strict=True)
+        if sides and sides.idf1[1].is_known
+    ]
+    if ranges:
         title = "IDF1 with 95 % intervals, by log"
         chart = ranges_chart(
-            title, known, Axis("identities kept (IDF1), %", 1.0, percent=True), ("tracked", "re-tracked")
+            title, ranges, Axis("identities kept (IDF1), %", 1.0, percent=True), ("tracked", "re-tracked")
         )
         caption = "Logs with bars that overlap may only have other people in them. Bars: bootstrap over people."
         charts.append({"chart": chart, "title": "Intervals.", "caption": caption})
     return {"columns": columns, "rows": rows, "figures": charts}
 
 
-def _comparison_row(file: str, found: BeforeAfter | None, sure: Intervals | None) -> dict[str, Any]:
-    if found is None:
+def _comparison_row(file: str, scores: BeforeAfter | None, sure: Intervals | None) -> dict[str, Any]:
+    if scores is None:
         return {"file": file, "rule": "no ground truth", "cells": [NONE] * (len(_COMPARED) + 2)}
-    sides = [metrics.summary(side.score) if side else None for side in (found.tracked, found.retracked)]
-    similarity, gate = found.rule
+    sides = [metrics.summary(side.score) if side else None for side in (scores.tracked, scores.retracked)]
+    similarity, gate = scores.rule
     return {
         "file": file,
         "rule": f"{gate:g} m" if similarity == "metres" else f"IoU {gate:g}",

@@ -144,23 +144,23 @@ def histogram_chart(title: str, rows: Sequence[Bars], edges: Floats, label: str)
     """Histograms one above the other, in the same bins with ``edges`` (B + 1,) and on the same scale."""
     x = Axis(label, float(edges[-1]))
     left, width, row = 12, WIDTH - _RIGHT - 12, 74
-    top = max([1e-9, *(float(one.shares.max(initial=0)) for one in rows)])
+    top = max([1e-9, *(float(bars.shares.max(initial=0)) for bars in rows)])
     bottom = row * len(rows) + 6
 
     def at(value: float) -> float:
         return left + min(max(value / x.most, 0), 1) * width
 
     drawn = []
-    for k, one in enumerate(rows, start=1):
+    for k, part in enumerate(rows, start=1):
         bars = []
-        for low, high, share in zip(edges[:-1].tolist(), edges[1:].tolist(), one.shares.tolist(), strict=True):
+        for low, high, share in zip(edges[:-1].tolist(), edges[1:].tolist(), part.shares.tolist(), strict=True):
             tall = share / top * (row - 14)
             if tall > 0:
                 place = (at(low), row * k - tall, max(at(high) - at(low) - 1, 0.5), tall)
                 bars.append((*map(_fixed, place), f"{low:g} to {high:g}: {100 * share:.1f} %"))
-        median = _fixed(at(one.median))
+        median = _fixed(at(part.median))
         drawn.append(
-            {"bars": bars, "floor": row * k, "median": median, "name": one.name, "role": one.role, "text": one.text}
+            {"bars": bars, "floor": row * k, "median": median, "name": part.name, "role": part.role, "text": part.text}
         )
     return {
         "kind": "histogram", "title": title, "width": WIDTH, "height": bottom + 34,

@@ -103,20 +103,20 @@ class LogReport:
     @property
     def on_prediction_clock(self) -> dict[str, TrackSet]:
         """The tracks at the prediction rate; without any, those of the tracker."""
-        there = {role: one for role, one in self.track_sets.items() if role in ("samples", "offline")}
-        return there or {role: one for role, one in self.track_sets.items() if role == "tracks"}
+        resampled = {role: track_set for role, track_set in self.track_sets.items() if role in ("samples", "offline")}
+        return resampled or {role: track_set for role, track_set in self.track_sets.items() if role == "tracks"}
 
     @property
     def headline(self) -> BeforeAfter | None:
         """The scores before and after re-tracking that the whole page counts by; None without scores."""
-        return compared({role: one.topic for role, one in self.track_sets.items()}, self.results)
+        return compared({role: track_set.topic for role, track_set in self.track_sets.items()}, self.results)
 
     @property
     def compared_roles(self) -> tuple[str, str]:
         """The roles of tracks before and after re-tracking; "" for those that are missing."""
-        found = self.headline
-        if found is not None:
-            return found.roles
+        headline = self.headline
+        if headline is not None:
+            return headline.roles
         before, after = (next((role for role in roles if role in self.track_sets), "") for roles in (BEFORE, AFTER))
         return before, after
 
@@ -151,27 +151,29 @@ def zone_section(opened: log.Log, prefix: str, names: Mapping[str, str]) -> dict
     counted = pipeline.counted_zones(opened, prefix)
     if not counted:
         return {"columns": _OF_ZONES, "rows": [], "line_columns": _OF_LINES, "lines": [], "figures": [], "data": {}}
-    shown = [(one, _ROLES.get(one.topic.removeprefix(prefix + "/"), "samples")) for one in counted]
+    shown = [(channel, _ROLES.get(channel.topic.removeprefix(prefix + "/"), "samples")) for channel in counted]
     shown.sort(key=lambda pair: ([*_ROLES.values(), "samples"].index(pair[1]), pair[0].topic))
-    called = {one.topic: names.get(role, one.topic) if role != "samples" else one.topic for one, role in shown}
-    zones = list({zone.name: zone for one in counted for zone in one.zones}.values())
+    called = {
+        channel.topic: names.get(role, channel.topic) if role != "samples" else channel.topic for channel, role in shown
+    }
+    zones = list({zone.name: zone for channel in counted for zone in channel.zones}.values())
     groups: dict[bool, list[dict[str, Any]]] = {False: [], True: []}
     for zone in zones:
         rows = [
-            {"name": called[one.topic], "role": role, "topic": one.topic, "cells": _cells(total)}
-            for one, role in shown
-            for total in one.totals
+            {"name": called[channel.topic], "role": role, "topic": channel.topic, "cells": _cells(total)}
+            for channel, role in shown
+            for total in channel.totals
             if (total.zone, total.is_line) == (zone.name, zone.is_line)
         ]
         groups[zone.is_line].append({"zone": zone.name, "rows": rows})
     some = [zone for zone in zones if not zone.is_line][:_CHARTS]
-    inside = {one.topic: _inside(opened, one.topic, one.zones) for one in counted}
+    inside = {channel.topic: _inside(opened, channel.topic, channel.zones) for channel in counted}
     figures = []
     for zone in some:
         lines = [
-            Line(short(called[one.topic]), role, *inside[one.topic][zone.name])
-            for one, role in shown
-            if zone.name in inside[one.topic]
+            Line(short(called[channel.topic]), role, *inside[channel.topic][zone.name])
+            for channel, role in shown
+            if zone.name in inside[channel.topic]
         ]
         figures.append(_chart(zone.name, lines))
     left = sum(not zone.is_line for zone in zones) - len(some)
@@ -182,18 +184,18 @@ def zone_section(opened: log.Log, prefix: str, names: Mapping[str, str]) -> dict
         "lines": groups[True],
         "figures": figures,
         "left_out": left,
-        "data": {one.topic: [total.to_json() for total in one.totals] for one in counted},
+        "data": {channel.topic: [total.to_json() for total in channel.totals] for channel in counted},
     }
 
 
-def _cells(one: ZoneTotals) -> list[str]:
-    if one.is_line:
-        return [number(value) for value in (one.tracks, one.forward, one.backward)]
+def _cells(totals: ZoneTotals) -> list[str]:
+    if totals.is_line:
+        return [number(value) for value in (totals.tracks, totals.forward, totals.backward)]
     return [
-        *(number(value) for value in (one.tracks, one.visits, one.entered, one.left)),
-        *(NONE if value is None else number(value, 1, "s") for value in (one.mean_dwell_s, one.median_dwell_s)),
-        number(one.most_inside),
-        NONE if one.mean_inside is None else number(one.mean_inside, 2),
+        *(number(value) for value in (totals.tracks, totals.visits, totals.entered, totals.left)),
+        *(NONE if value is None else number(value, 1, "s") for value in (totals.mean_dwell_s, totals.median_dwell_s)),
+        number(totals.most_inside),
+        NONE if totals.mean_inside is None else number(totals.mean_inside, 2),
     ]
 
 
@@ -254,7 +256,7 @@ def gather(
         out.doubtful_tracks = find_doubtful_tracks(decisions)
     progress(f"{opened.path}: pictures")
     _read_pictures(opened, out)
-    out.zones = zone_section(opened, prefix, {role: one.name for role, one in out.track_sets.items()})
+    out.zones = zone_section(opened, prefix, {role: track_set.name for role, track_set in out.track_sets.items()})
     out.data = plain(
         _recording(opened) | {"name": out.name, "camera": prefix} | _statistics(out) | {"notes": out.notes}
     )
@@ -271,7 +273,7 @@ def _read(opened: log.Log, out: LogReport) -> None:
     camera = pipeline.camera_at(opened, out.prefix)
     tracker = tracker_name(provenance_of(opened, f"{out.prefix}/tracks"))
     sampled = provenance_of(opened, f"{out.prefix}/samples")
-    is_corrected = sampled is not None and any(one.endswith(f"/{CORRECTED}") for one in sampled.references)
+    is_corrected = sampled is not None and any(reference.endswith(f"/{CORRECTED}") for reference in sampled.references)
     names = {
         "tracks": f"{tracker}{EVERY_PICTURE}" if f"{out.prefix}/samples" in opened.channels else tracker,
         "samples": f"{tracker}, corrected" if is_corrected else tracker,
@@ -281,11 +283,11 @@ def _read(opened: log.Log, out: LogReport) -> None:
     }
     for below, role in ROLES.items():
         topic = camera.truth if role == "truth" else f"{out.prefix}/{below}"
-        there = opened.channels.get(topic)
-        if there is None:
+        channel = opened.channels.get(topic)
+        if channel is None:
             continue
-        if not there.holds(TRACKS):
-            out.notes.append(f"{topic} holds {there.schema_name or 'no schema'}, not tracks; it is left out")
+        if not channel.holds(TRACKS):
+            out.notes.append(f"{topic} holds {channel.schema_name or 'no schema'}, not tracks; it is left out")
             continue
         try:
             frames = read_ground_truth(opened, out.prefix) if role == "truth" else opened.frames(topic, TRACKS)
@@ -296,8 +298,8 @@ def _read(opened: log.Log, out: LogReport) -> None:
             continue
         out.track_sets[role] = TrackSet(topic, role, names[role], frames)
     out.has_only_people = all(
-        nouns_of(one.frames, (), (class_names(opened.channel(one.topic).metadata), {})) is PEOPLE
-        for one in out.track_sets.values()
+        nouns_of(track_set.frames, (), (class_names(opened.channel(track_set.topic).metadata), {})) is PEOPLE
+        for track_set in out.track_sets.values()
     )
     try:
         out.planes = pipeline.read_planes(opened, out.prefix) or ()
@@ -336,14 +338,14 @@ def _classes(opened: log.Log, out: LogReport, topic: str) -> tuple[dict[int, str
 
 def _compare_people(opened: log.Log, out: LogReport) -> None:
     """Compare tracks before and after re-tracking with each true person, by the rule of the headline."""
-    found = out.headline
-    if found is None:
+    headline = out.headline
+    if headline is None:
         return
-    for role in filter(None, found.roles):
-        one = out.track_sets[role]
-        rule = MatchRule(*found.rule)  # type: ignore[arg-type]  # a similarity
-        classes = _classes(opened, out, one.topic)
-        scores = person_scores(out.track_sets["truth"].frames, one.frames, rule, (out.name, one.topic), classes)
+    for role in filter(None, headline.roles):
+        tracks = out.track_sets[role]
+        rule = MatchRule(*headline.rule)  # type: ignore[arg-type]  # a similarity
+        classes = _classes(opened, out, tracks.topic)
+        scores = person_scores(out.track_sets["truth"].frames, tracks.frames, rule, (out.name, tracks.topic), classes)
         if scores is not None:
             out.people[role] = scores
 
@@ -360,13 +362,13 @@ def _find_events(opened: log.Log, out: LogReport) -> None:
         tracks = out.track_sets[role]
         if not any(len(frame.rows) for frame in tracks.frames):
             continue
-        known = _recorded(opened, tracks.topic + "/events")
+        counted_events = _recorded(opened, tracks.topic + "/events")
         classes = _classes(opened, out, tracks.topic)
-        if known is None or (headline is not None and known[1] != headline.rule):
+        if counted_events is None or (headline is not None and counted_events[1] != headline.rule):
             frames = repaired_tracks(tracks.frames, provenance_of(opened, tracks.topic))
-            found = find_events(frames, ground_truth, options, out.name, tracks.topic, classes)
-            known = found.events, found.rule
-        events, rule = known
+            track_events = find_events(frames, ground_truth, options, out.name, tracks.topic, classes)
+            counted_events = track_events.events, track_events.rule
+        events, rule = counted_events
         span_ns = (out.start_ns, out.end_ns)
         args = (tracks.frames, ground_truth, span_ns, classes)
         out.channel_events.append(summarize_events(tracks.topic, events, rule, *args))
@@ -386,11 +388,11 @@ def _decisions(opened: log.Log, topic: str) -> list[Frame]:
 def _recorded(opened: log.Log, topic: str) -> tuple[list[Frame], MatchRule | None] | None:
     """The events in the log and the rule of their matches; None if there are none or they are out of date."""
     channel = opened.channels.get(topic)
-    made = Provenance.from_metadata(channel.metadata) if channel else None
-    if channel is None or made is None or channel.schema_name != EVENTS.name or pipeline.is_stale(opened, topic):
+    provenance = Provenance.from_metadata(channel.metadata) if channel else None
+    if channel is None or provenance is None or channel.schema_name != EVENTS.name or pipeline.is_stale(opened, topic):
         return None
-    similarity: Any = made.parameters.get("similarity")
-    gate = made.parameters.get("gate")
+    similarity: Any = provenance.parameters.get("similarity")
+    gate = provenance.parameters.get("gate")
     rule = None
     if similarity in get_args(Similarity) and isinstance(gate, float | int):
         rule = MatchRule(similarity, float(gate))
@@ -409,7 +411,7 @@ def _read_pictures(opened: log.Log, out: LogReport) -> None:
             add_thumbnails(events, _with_boxes(out, channel.topic), pictures, out.start_ns)
         if out.doubts and out.repairs is not None:
             tracks = _with_boxes(out, out.repairs.topic)
-            add_thumbnails([one.event for one in out.doubts], tracks, pictures, out.start_ns)
+            add_thumbnails([doubt.event for doubt in out.doubts], tracks, pictures, out.start_ns)
     except DamagedError:
         raise
     except McaptrackError as error:
@@ -421,17 +423,18 @@ def _read_pictures(opened: log.Log, out: LogReport) -> None:
 
 def _with_boxes(out: LogReport, topic: str) -> list[Frame]:
     """The rows of tracks with boxes in pictures: of the tracker instead of its samples, with the same ids."""
-    role = next(one.role for one in out.track_sets.values() if one.topic == topic)
+    role = next(track_set.role for track_set in out.track_sets.values() if track_set.topic == topic)
     return out.track_sets["tracks" if role == "samples" and "tracks" in out.track_sets else role].frames
 
 
 def _statistics(out: LogReport) -> dict[str, Any]:
     """All statistics, as JSON."""
     track_sets = [
-        {"topic": one.topic, "name": one.name, "role": one.role} | statistics.track_statistics(one.frames)
-        for one in out.track_sets.values()
+        {"topic": track_set.topic, "name": track_set.name, "role": track_set.role}
+        | statistics.track_statistics(track_set.frames)
+        for track_set in out.track_sets.values()
     ]
-    resampled = {one.topic: one.frames for one in out.on_prediction_clock.values()}
+    resampled = {track_set.topic: track_set.frames for track_set in out.on_prediction_clock.values()}
     if "truth" in out.track_sets:
         ground_truth = out.track_sets["truth"]
         at_ns = np.unique(np.concatenate([np.empty(0, np.int64), *map(frame_times, resampled.values())]))
@@ -468,16 +471,16 @@ def _recording(opened: log.Log) -> dict[str, Any]:
 
 
 def _channel(opened: log.Log, channel: log.Channel) -> dict[str, Any]:
-    made = Provenance.from_metadata(channel.metadata)
+    provenance = Provenance.from_metadata(channel.metadata)
     names = ("transform", "input", "version", "weights_sha256", "digest", "input_digest")
     return {
         "topic": channel.topic,
         "schema": channel.schema_name,
         "encoding": channel.message_encoding,
         "messages": channel.messages,
-        **{key: (getattr(made, key) or None) if made else None for key in names},
-        "references": dict(made.references) if made else {},
-        "parameters": dict(made.parameters) if made else None,
+        **{key: (getattr(provenance, key) or None) if provenance else None for key in names},
+        "references": dict(provenance.references) if provenance else {},
+        "parameters": dict(provenance.parameters) if provenance else None,
         "stale": pipeline.is_stale(opened, channel.topic),
     }
 

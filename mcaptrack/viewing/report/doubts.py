@@ -84,17 +84,17 @@ def find_doubts(
     if repairs is None:
         return []
     rows, t_ns = rows_by_track(tracks)
-    known = {
+    joins = {
         (frame.t_ns, int(row["track_id"]), int(row["source_id"])): row
         for frame in decisions
         for row in frame.rows[frame.rows["kind"] == DecisionKind.JOINED]
     }
-    found = []
+    doubts = []
     for event in repairs.events:
         if int(event.row["kind"]) != EventKind.JOINED:
             continue
-        decided = known.get((event.t_ns, int(event.row["track_id"]), int(event.row["source_id"])))
-        if known and (decided is None or decided["probability"] >= _UNSURE):
+        decided = joins.get((event.t_ns, int(event.row["track_id"]), int(event.row["source_id"])))
+        if joins and (decided is None or decided["probability"] >= _UNSURE):
             continue
         away_m = _away_m(rows, t_ns, event)
         if away_m is None or (decided is None and away_m < _LEAST_M):
@@ -103,18 +103,18 @@ def find_doubts(
         if decided is not None:
             likely = float(decided["probability"])
             doubt = doubt._replace(probability=likely, alternative_id=int(decided["alternative_id"]))
-        found.append(doubt)
-    return sorted(found, key=lambda one: (one.probability or 0.0, -one.away_m, one.event.t_ns))[:_MOST]
+        doubts.append(doubt)
+    return sorted(doubts, key=lambda doubt: (doubt.probability or 0.0, -doubt.away_m, doubt.event.t_ns))[:_MOST]
 
 
 def find_doubtful_tracks(decisions: Sequence[Frame]) -> list[DoubtfulTrack]:
     """The tracks that were kept or left out with a probability below ``_UNSURE``, the least likely first."""
-    found = [
+    doubtful = [
         DoubtfulTrack(frame.t_ns, row)
         for frame in decisions
         for row in frame.rows[(frame.rows["kind"] != DecisionKind.JOINED) & (frame.rows["probability"] < _UNSURE)]
     ]
-    return sorted(found, key=lambda one: (float(one.row["probability"]), one.t_ns))[:_MOST]
+    return sorted(doubtful, key=lambda track: (float(track.row["probability"]), track.t_ns))[:_MOST]
 
 
 def _away_m(rows: Any, t_ns: Any, event: IdentityEvent) -> float | None:
@@ -137,7 +137,7 @@ def _away_m(rows: Any, t_ns: Any, event: IdentityEvent) -> float | None:
 
 
 def _verdict(people: PersonScores, event: IdentityEvent) -> tuple[str, bool | None]:
-    """Compare a repair with the ground truth: words, and whether it is right; None if that is not known."""
+    """Compare a repair with the ground truth: return a text, and whether it is right (None if not known)."""
     own = people.track == int(event.row["track_id"])
     when, who = people.t_ns[own], people.person[own]
     order = np.argsort(when, kind="stable")

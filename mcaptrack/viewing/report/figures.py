@@ -35,50 +35,53 @@ _NO_GROUND = (
 def scene_map(report: LogReport) -> dict[str, Any]:
     """Tracks over the picture, or on the ground."""
     sets = [report.track_sets[role] for role in ("tracks", "offline", "truth") if role in report.track_sets]
-    sets = [one for one in sets if any(len(frame.rows) for frame in one.frames)]
+    sets = [tracks for tracks in sets if any(len(frame.rows) for frame in tracks.frames)]
     if not sets:
         return {"missing": "There are no tracks to draw.", "maps": [], "plans": []}
     if report.background is not None:
         plane = plane_of(report)
-        drawn = _with_paths(sets, [pixel_paths(one.frames, plane) for one in sets])
+        drawn = _with_paths(sets, [pixel_paths(tracks.frames, plane) for tracks in sets])
         if drawn:
-            maps = [_map(one, paths, picture_map(paths, report.background, report.start_s)) for one, paths in drawn]
+            maps = [
+                _map(tracks, paths, picture_map(paths, report.background, report.start_s)) for tracks, paths in drawn
+            ]
             return {"missing": "", "maps": maps, "jpeg": report.background.jpeg, "plans": _plans(sets)}
         why = "No track has a place in the picture"
     else:
         why = report.missing.get("pictures", "There are no pictures")
-    drawn = _with_paths(sets, [ground_paths(one.frames) for one in sets])
+    drawn = _with_paths(sets, [ground_paths(tracks.frames) for tracks in sets])
     if not drawn:
         return {"missing": _NO_GROUND, "maps": [], "plans": []}
     span = ground_span([path.points for _, paths in drawn for path in paths])
-    maps = [_map(one, paths, ground_map(paths, span, report.start_s)) for one, paths in drawn]
+    maps = [_map(tracks, paths, ground_map(paths, span, report.start_s)) for tracks, paths in drawn]
     return {"missing": f"{why}; here is the ground instead.", "maps": maps, "jpeg": b"", "plans": []}
 
 
 def _plans(sets: Sequence[TrackSet]) -> list[dict[str, Any]]:
     """Plans of the ground in metres: of re-tracked people, or of tracks, and of the ground truth."""
-    chosen = {"truth" if one.role == "truth" else "tracks": one for one in sets}
-    drawn = _with_paths([*chosen.values()], [ground_paths(one.frames) for one in chosen.values()])
+    chosen = {"truth" if tracks.role == "truth" else "tracks": tracks for tracks in sets}
+    drawn = _with_paths([*chosen.values()], [ground_paths(tracks.frames) for tracks in chosen.values()])
     span = ground_span([path.points for _, paths in drawn for path in paths])
-    return [_map(one, paths, ground_map(paths, span, 0.0)) for one, paths in drawn]
+    return [_map(tracks, paths, ground_map(paths, span, 0.0)) for tracks, paths in drawn]
 
 
 def heat(report: LogReport) -> dict[str, Any] | None:
     """The map of where people spent their time: re-tracked people, or tracks; None without positions in metres."""
     for role in ("offline", "online", "samples", "tracks"):
-        one = report.track_sets.get(role)
-        found = heat_map(one.frames) if one is not None and any(len(frame.rows) for frame in one.frames) else None
-        if one is not None and found is not None:
-            return found | {"name": short(one.name), "role": one.role, "note": report.metres_note}
+        tracks = report.track_sets.get(role)
+        if tracks is None or not any(len(frame.rows) for frame in tracks.frames):
+            continue
+        if (values := heat_map(tracks.frames)) is not None:
+            return values | {"name": short(tracks.name), "role": tracks.role, "note": report.metres_note}
     return None
 
 
 def _with_paths(sets: Sequence[TrackSet], paths: Sequence[list[TrackPath]]) -> list[tuple[TrackSet, list[TrackPath]]]:
-    return [(one, own) for one, own in zip(sets, paths, strict=True) if own]
+    return [(tracks, own) for tracks, own in zip(sets, paths, strict=True) if own]
 
 
-def _map(one: TrackSet, paths: Sequence[TrackPath], values: dict[str, Any]) -> dict[str, Any]:
-    return values | {"name": short(one.name), "role": one.role, "count": counted(len(paths), "track")}
+def _map(tracks: TrackSet, paths: Sequence[TrackPath], values: dict[str, Any]) -> dict[str, Any]:
+    return values | {"name": short(tracks.name), "role": tracks.role, "count": counted(len(paths), "track")}
 
 
 def identity_events(report: LogReport) -> dict[str, Any]:
@@ -91,13 +94,13 @@ def identity_events(report: LogReport) -> dict[str, Any]:
         "timelines": [_timeline(channel, shown, report) for channel, shown in pairs],
         "highlights": [_highlights(channel, shown, report) for channel, shown in pairs if channel.events],
         "doubts": [
-            _event(one.event, one.text(), report) | {"is_wrong": one.is_right is False} for one in report.doubts
+            _event(doubt.event, doubt.text(), report) | {"is_wrong": doubt.is_right is False} for doubt in report.doubts
         ],
-        "have_odds": any(one.probability is not None for one in report.doubts),
+        "have_odds": any(doubt.probability is not None for doubt in report.doubts),
         "doubtful_tracks": [
-            {"text": one.text("person" if report.has_only_people else "object"), "t_ns": one.t_ns}
-            | {"clock": clock((one.t_ns - report.start_ns) / NS_PER_S), "is_wrong": False, "thumbnails": []}
-            for one in report.doubtful_tracks
+            {"text": doubtful_track.text("person" if report.has_only_people else "object"), "t_ns": doubtful_track.t_ns}
+            | {"clock": clock((doubtful_track.t_ns - report.start_ns) / NS_PER_S), "is_wrong": False, "thumbnails": []}
+            for doubtful_track in report.doubtful_tracks
         ],
         "view": command("view", Path(report.file)),
     }
@@ -112,13 +115,13 @@ def _event(event: IdentityEvent, text: str, report: LogReport) -> dict[str, Any]
         "t_ns": event.t_ns,
         "clock": clock(seconds),
         "thumbnails": [
-            _thumbnail(one, when) for one, when in ((event.before, "before"), (event.after, "after")) if one
+            _thumbnail(image, when) for image, when in ((event.before, "before"), (event.after, "after")) if image
         ],
     }
 
 
 def _set_of(report: LogReport, channel: ChannelEvents) -> TrackSet:
-    return next(one for one in report.track_sets.values() if one.topic == channel.topic)
+    return next(track_set for track_set in report.track_sets.values() if track_set.topic == channel.topic)
 
 
 def _title(channel: ChannelEvents, name: str) -> str:
@@ -128,14 +131,14 @@ def _title(channel: ChannelEvents, name: str) -> str:
 
 
 def _timeline(channel: ChannelEvents, shown: Sequence[IdentityEvent], report: LogReport) -> dict[str, Any]:
-    one, span = _set_of(report, channel), channel.span_s
+    tracks, span = _set_of(report, channel), channel.span_s
     most = max([1, *channel.births, *channel.ends])
     places = [f"{100 * (event.t_ns - report.start_ns) / NS_PER_S / span:.1f}%" for event in channel.events]
     chosen = {id(event) for event in shown}
     bars = enumerate(zip(channel.births, channel.ends, strict=True))
     return {
-        "title": _title(channel, short(one.name)),
-        "role": one.role,
+        "title": _title(channel, short(tracks.name)),
+        "role": tracks.role,
         "rule": rule_text(*channel.rule) if channel.rule else "",
         "span": clock(span),
         "bars": [(f"{100 * k / BARS:.2f}%", 18 * born / most, 12 * ended / most) for k, (born, ended) in bars],
@@ -163,12 +166,12 @@ def _highlights(channel: ChannelEvents, shown: Sequence[IdentityEvent], report: 
     }
 
 
-def _thumbnail(one: Thumbnail, when: str) -> dict[str, Any]:
-    at = number(one.at_s, 1, "s")
-    values = {"jpeg": one.jpeg, "side": SIDE_PX, "when": f"{when} {at}", "title": f"{when}, at {at}", "box": None}
-    if one.box is None:
+def _thumbnail(thumbnail: Thumbnail, when: str) -> dict[str, Any]:
+    at = number(thumbnail.at_s, 1, "s")
+    values = {"jpeg": thumbnail.jpeg, "side": SIDE_PX, "when": f"{when} {at}", "title": f"{when}, at {at}", "box": None}
+    if thumbnail.box is None:
         return values
-    x, y, w, h = (f"{value:.1f}" for value in one.box.xywh)
-    box = {"x": x, "y": y, "w": w, "h": h, "label": one.box.label, "colour": one.box.identity % COLOURS}
-    box |= {"label_x": f"{max(one.box.xywh[0], 2):.1f}", "label_y": f"{max(one.box.xywh[1] - 4, 14):.1f}"}
-    return values | {"title": f"{when}, at {at}: track {one.box.label}", "box": box}
+    x, y, w, h = (f"{value:.1f}" for value in thumbnail.box.xywh)
+    box = {"x": x, "y": y, "w": w, "h": h, "label": thumbnail.box.label, "colour": thumbnail.box.identity % COLOURS}
+    box |= {"label_x": f"{max(thumbnail.box.xywh[0], 2):.1f}", "label_y": f"{max(thumbnail.box.xywh[1] - 4, 14):.1f}"}
+    return values | {"title": f"{when}, at {at}: track {thumbnail.box.label}", "box": box}

@@ -35,7 +35,7 @@ _LEAST_SPREAD: Final = 0.05
 
 
 def per_hour(row: Row, name: str) -> float | None:
-    """A count by hours of the log; None where one of them is not known."""
+    """A count per hour of the log; None if the count or the duration is not known."""
     count, hours = row.get(name), (row.get("duration_s") or 0) / 3600
     return None if count is None or hours <= 0 else count / hours
 
@@ -75,20 +75,20 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
 
 def _versions(rows: Sequence[Row]) -> dict[str, int]:
     """The number of logs with results of each version; "" for those without results."""
-    found: dict[str, int] = {}
+    counts: dict[str, int] = {}
     for row in rows:
         text = row.get("versions") or ""
-        found[text] = found.get(text, 0) + 1
-    return dict(sorted(found.items()))
+        counts[text] = counts.get(text, 0) + 1
+    return dict(sorted(counts.items()))
 
 
 def worst(rows: Sequence[Row]) -> dict[str, list[Row]]:
     """The logs with the lowest IDF1, the most identity switches by time, and the most warnings."""
 
     def ranked(value: Callable[[Row], float | None]) -> list[Row]:
-        known = [(value(row), str(row["recording"]), row) for row in rows]
-        found = sorted((number, name, at) for at, (number, name, _) in enumerate(known) if number is not None)
-        return [rows[at] for _, _, at in found[:_LISTED]]
+        valued = [(value(row), str(row["recording"]), row) for row in rows]
+        ranking = sorted((number, name, at) for at, (number, name, _) in enumerate(valued) if number is not None)
+        return [rows[at] for _, _, at in ranking[:_LISTED]]
 
     def most(name: str) -> Callable[[Row], float | None]:
         return lambda row: -value if (value := per_hour(row, name)) else None
@@ -102,44 +102,54 @@ def worst(rows: Sequence[Row]) -> dict[str, list[Row]]:
 
 def outliers(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Logs with a value far from that of most others, the farthest first: how many times as large as the median."""
-    found: list[dict[str, Any]] = []
+    far_off: list[dict[str, Any]] = []
     for name, (unit, value) in MEASURES.items():
-        known = [(row, number) for row in rows if (number := value(row)) is not None and number > 0]
-        if len(known) < _ENOUGH:
+        valued = [(row, number) for row in rows if (number := value(row)) is not None and number > 0]
+        if len(valued) < _ENOUGH:
             continue
-        logs = np.log([number for _, number in known])
+        logs = np.log([number for _, number in valued])
         middle = float(np.median(logs))
         spread = max(_BY_MAD * float(np.median(np.abs(logs - middle))), _LEAST_SPREAD)
         far = (logs - middle) / spread
-        found += [
-            {"row": known[at][0], "measure": name, "unit": unit, "value": known[at][1], "median": float(np.exp(middle)),
-             "deviations": float(far[at])}
+        far_off += [
+            {
+                "row": valued[at][0],
+                "measure": name,
+                "unit": unit,
+                "value": valued[at][1],
+                "median": float(np.exp(middle)),
+                "deviations": float(far[at]),
+            }
             for at in np.flatnonzero(np.abs(far) > _FAR).tolist()
-        ]  # fmt: skip
-    return sorted(found, key=lambda one: (-abs(one["deviations"]), str(one["row"]["recording"])))[: 2 * _LISTED]
+        ]
+    return sorted(far_off, key=lambda outlier: (-abs(outlier["deviations"]), str(outlier["row"]["recording"])))[
+        : 2 * _LISTED
+    ]
 
 
 def warnings_by_code(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """The codes of warnings: how many logs have each, one of its messages, and a log with it."""
-    found: dict[str, dict[str, Any]] = {}
+    by_code: dict[str, dict[str, Any]] = {}
     for row in rows:
-        known: dict[str, str] = {}
+        first_messages: dict[str, str] = {}
         for code, message in _notices_in(row.get("warning_texts")):
-            known.setdefault(code, message)
-        for code, message in known.items():
-            one = found.setdefault(code, {"code": code, "logs": 0, "message": message, "recording": row["recording"]})
-            one["logs"] += 1
-    return sorted(found.values(), key=lambda one: (-one["logs"], one["code"]))
+            first_messages.setdefault(code, message)
+        for code, message in first_messages.items():
+            entry = by_code.setdefault(
+                code, {"code": code, "logs": 0, "message": message, "recording": row["recording"]}
+            )
+            entry["logs"] += 1
+    return sorted(by_code.values(), key=lambda entry: (-entry["logs"], entry["code"]))
 
 
 def _notices_in(text: str | None) -> Iterator[tuple[str, str]]:
     try:
-        found = json.loads(text or "[]")
+        notices = json.loads(text or "[]")
     except ValueError:
         return
-    for one in found if isinstance(found, list) else []:
-        if isinstance(one, dict):
-            yield str(one.get("code", "other")), str(one.get("message", ""))
+    for notice in notices if isinstance(notices, list) else []:
+        if isinstance(notice, dict):
+            yield str(notice.get("code", "other")), str(notice.get("message", ""))
 
 
 def trends(rows: Sequence[Row]) -> dict[str, Any] | None:
@@ -162,7 +172,7 @@ def trends(rows: Sequence[Row]) -> dict[str, Any] | None:
     bins = np.unique(at)
     if len(bins) < 3:
         return None
-    members = [[dated[k] for k in np.flatnonzero(at == one).tolist()] for one in bins.tolist()]
+    members = [[dated[k] for k in np.flatnonzero(at == number).tolist()] for number in bins.tolist()]
     return {
         "first": datetime.fromtimestamp(first, UTC).date().isoformat(),
         "bin": name,
@@ -180,8 +190,8 @@ def _quartiles(members: Sequence[Sequence[Row]], value: Callable[[Row], float | 
     """Quartiles and mean of a value in each bin; None without any."""
     out: dict[str, list[float | None]] = {"low": [], "median": [], "high": [], "mean": []}
     for some in members:
-        known: Floats = np.array([number for row in some if (number := value(row)) is not None], np.float64)
-        numbers = [*np.percentile(known, [25, 50, 75]).tolist(), float(known.mean())] if len(known) else [None] * 4
+        values: Floats = np.array([number for row in some if (number := value(row)) is not None], np.float64)
+        numbers = [*np.percentile(values, [25, 50, 75]).tolist(), float(values.mean())] if len(values) else [None] * 4
         for name, number in zip(out, numbers, strict=True):
             out[name].append(number)
     return out

@@ -31,7 +31,7 @@ def fleet_data(rows: Sequence[Row]) -> dict[str, Any]:
         return [{name: row.get(name) for name in _KEPT} for row in some]
 
     far = fleet.outliers(rows)
-    found: dict[str, Any] = plain(
+    data: dict[str, Any] = plain(
         {
             "schema_version": SCHEMA_VERSION,
             "mcaptrack_version": __version__,
@@ -39,12 +39,13 @@ def fleet_data(rows: Sequence[Row]) -> dict[str, Any]:
             "trends": fleet.trends(rows),
             "worst": {name: kept(some) for name, some in fleet.worst(rows).items()},
             "outliers": [
-                {"recording": one["row"]["recording"]} | {k: v for k, v in one.items() if k != "row"} for one in far
+                {"recording": outlier["row"]["recording"]} | {k: v for k, v in outlier.items() if k != "row"}
+                for outlier in far
             ],
             "warnings": fleet.warnings_by_code(rows),
         }
     )
-    return found
+    return data
 
 
 def fleet_page(rows: Sequence[Row], title: str, element: str, data: Mapping[str, Any], link: Link) -> str:
@@ -61,17 +62,17 @@ def fleet_page(rows: Sequence[Row], title: str, element: str, data: Mapping[str,
 
     tables = []
     for name, (heading, lacking) in _LISTS.items():
-        some = [listed(by_name[one["recording"]]) for one in data["worst"][name]]
+        some = [listed(by_name[row["recording"]]) for row in data["worst"][name]]
         tables.append({"heading": heading, "rows": some, "missing": "" if some else lacking})
     far = [
-        listed(by_name[one["recording"]])
+        listed(by_name[outlier["recording"]])
         | {
-            "measure": one["measure"],
-            "value": number(one["value"], 1, one["unit"]),
-            "median": number(one["median"], 1, one["unit"]),
-            "times": f"{number(one['value'] / one['median'], 2)} times",
+            "measure": outlier["measure"],
+            "value": number(outlier["value"], 1, outlier["unit"]),
+            "median": number(outlier["median"], 1, outlier["unit"]),
+            "times": f"{number(outlier['value'] / outlier['median'], 2)} times",
         }
-        for one in data["outliers"]
+        for outlier in data["outliers"]
     ]
     return render(
         "fleet.html",
@@ -111,45 +112,45 @@ def _cells(row: Row) -> list[str]:
     ]
 
 
-def _text(found: Mapping[str, Any]) -> str:
-    words = f"{counted(found['logs'], 'log')}, {number(found['hours'], 1)} hours"
-    words += f", {counted(found['tracks'], 'track')}." if found["tracks"] else "."
-    if found["scored"]:
-        words += f" {counted(found['scored'], 'log')} with ground truth: half of them keep more than "
-        words += f"{percent(found['median_IDF1'])} of identities (IDF1)."
+def _text(summary: Mapping[str, Any]) -> str:
+    text = f"{counted(summary['logs'], 'log')}, {number(summary['hours'], 1)} hours"
+    text += f", {counted(summary['tracks'], 'track')}." if summary["tracks"] else "."
+    if summary["scored"]:
+        text += f" {counted(summary['scored'], 'log')} with ground truth: half of them keep more than "
+        text += f"{percent(summary['median_IDF1'])} of identities (IDF1)."
     else:
-        words += " How good the tracks are is not known without ground truth."
+        text += " How good the tracks are is not known without ground truth."
     lacking = [
-        f"{counted(found[name], 'log')} {said}"
+        f"{counted(summary[name], 'log')} {said}"
         for name, said in (("empty", "without messages"), ("without_tracks", "without tracks"))
-        if found[name]
+        if summary[name]
     ]
-    return words + (f" {' and '.join(lacking)}." if lacking else "")
+    return text + (f" {' and '.join(lacking)}." if lacking else "")
 
 
-def _tiles(found: Mapping[str, Any]) -> list[dict[str, str]]:
-    versions = ", ".join(f"{name or 'none'}: {count}" for name, count in found["versions"].items())
+def _tiles(summary: Mapping[str, Any]) -> list[dict[str, str]]:
+    versions = ", ".join(f"{name or 'none'}: {count}" for name, count in summary["versions"].items())
     tiles = [
-        ("logs", number(found["logs"]), f"{number(found['bytes'] / 1e9, 2, 'GB')}"),
-        ("hours", number(found["hours"], 1), ""),
-        ("tracks", number(found["tracks"]), ""),
-        ("median IDF1", percent(found["median_IDF1"]), f"of {counted(found['scored'], 'log')} with ground truth"),
-        ("identity switches", number(found["IDSW"]), ""),
-        ("logs with warnings", number(found["with_warnings"]), ""),
-        ("versions of results", number(len(found["versions"])), versions),
+        ("logs", number(summary["logs"]), f"{number(summary['bytes'] / 1e9, 2, 'GB')}"),
+        ("hours", number(summary["hours"], 1), ""),
+        ("tracks", number(summary["tracks"]), ""),
+        ("median IDF1", percent(summary["median_IDF1"]), f"of {counted(summary['scored'], 'log')} with ground truth"),
+        ("identity switches", number(summary["IDSW"]), ""),
+        ("logs with warnings", number(summary["with_warnings"]), ""),
+        ("versions of results", number(len(summary["versions"])), versions),
     ]
     return [{"label": label, "value": value, "note": note} for label, value, note in tiles]
 
 
-def _trends(found: Mapping[str, Any] | None) -> list[dict[str, Any]]:
+def _trends(trends: Mapping[str, Any] | None) -> list[dict[str, Any]]:
     """Charts of what changed over time."""
-    if found is None:
+    if trends is None:
         return []
-    days = np.array(found["days"])
-    x = Axis(f"days since {found['first']} (UTC)", round_most([days]))
+    days = np.array(trends["days"])
+    x = Axis(f"days since {trends['first']} (UTC)", round_most([days]))
 
     def values(name: str, part: str) -> Any:
-        return np.array([np.nan if value is None else value for value in found[name][part]], np.float64)
+        return np.array([np.nan if value is None else value for value in trends[name][part]], np.float64)
 
     charts = []
     for name, label, is_share in (
@@ -160,21 +161,21 @@ def _trends(found: Mapping[str, Any] | None) -> list[dict[str, Any]]:
         middle, low, high = (values(name, part) for part in ("median", "low", "high"))
         if not np.isfinite(middle).any():
             continue
-        known = np.isfinite(middle)
+        has_value = np.isfinite(middle)
         y = Axis(label, 1.0 if is_share else round_most([high]), is_share)
-        line = Line("median", "offline", days[known], middle[known], low[known], high[known])
+        line = Line("median", "offline", days[has_value], middle[has_value], low[has_value], high[has_value])
         chart = line_chart(f"{label} over time", [line], x, y)
         charts.append(
-            {"chart": chart, "title": label, "caption": f"of the logs of each {found['bin']}, with quartiles"}
+            {"chart": chart, "title": label, "caption": f"of the logs of each {trends['bin']}, with quartiles"}
         )
-    counts = np.array(found["logs"], np.float64)
+    counts = np.array(trends["logs"], np.float64)
     warned = values("warnings", "mean")
     lines = [Line("logs", "tracks", days, counts)]
     chart = line_chart("logs over time", lines, x, Axis("logs", round_most([counts])))
-    charts.append({"chart": chart, "title": "logs", "caption": f"of each {found['bin']}"})
+    charts.append({"chart": chart, "title": "logs", "caption": f"of each {trends['bin']}"})
     if np.nanmax(warned, initial=0) > 0:
-        known = np.isfinite(warned)
-        line = Line("mean", "online", days[known], warned[known])
+        has_value = np.isfinite(warned)
+        line = Line("mean", "online", days[has_value], warned[has_value])
         chart = line_chart("warnings over time", [line], x, Axis("warnings by log", round_most([warned])))
-        charts.append({"chart": chart, "title": "warnings by log", "caption": f"mean of each {found['bin']}"})
+        charts.append({"chart": chart, "title": "warnings by log", "caption": f"mean of each {trends['bin']}"})
     return charts

@@ -42,9 +42,9 @@ def times(count: int) -> str:
     return {1: "once", 2: "twice"}.get(count, f"{number(count)} times")
 
 
-def counted(count: int, one: str, many: str = "") -> str:
+def counted(count: int, singular: str, many: str = "") -> str:
     """A count with its noun: 1 track, 2 tracks."""
-    return f"{number(count)} {one if count == 1 else many or one + 's'}"
+    return f"{number(count)} {singular if count == 1 else many or singular + 's'}"
 
 
 def short(name: str) -> str:
@@ -145,11 +145,11 @@ def curves_svg(forecasts: Mapping[str, Displacement]) -> str:
 
 def _chart(forecasts: Mapping[str, Displacement], squared: bool, title: str) -> dict[str, object]:
     lines = []
-    for number, (name, one) in enumerate(forecasts.items()):
-        recall, error = one.curve(squared)
+    for number, (name, displacement) in enumerate(forecasts.items()):
+        recall, error = displacement.curve(squared)
         shown = recall > _LEAST_RECALL
         x, y = thinned(recall[shown], error[shown])
-        count = int((one.d_obs_m2 < TAU_M2).sum())
+        count = int((displacement.d_obs_m2 < TAU_M2).sum())
         dot = (float(recall[count - 1]), float(error[count - 1])) if count else None
         lines.append(Line(name, f"c{number % COLOURS}", x, y, dot=dot))
     # The wrong pairs at the end of a curve have errors without bound: the axis ends where all lines can be told apart.

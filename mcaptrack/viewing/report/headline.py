@@ -26,7 +26,7 @@ class BeforeAfter(NamedTuple):
     roles: tuple[str, str] = ("", "")
 
     def values(self, name: str) -> list[float]:
-        """A score of those that exist."""
+        """A score before and after re-tracking, as far as these were scored."""
         return [summary(row.score)[name] for row in (self.tracked, self.retracked) if row is not None]
 
 
@@ -69,9 +69,9 @@ def compared(topics: Mapping[str, str], results: Sequence[EvaluationRow]) -> Bef
     """The scores that a page compares, of the topics of tracks by role; None if nothing was scored."""
     is_3d = bool(results) and all(row.is_3d for row in results)
     for similarity, gate in _RULES_3D if is_3d else _RULES:
-        found = {role: result_of(results, topic, similarity, gate) for role, topic in topics.items()}
-        before = next((role for role in BEFORE if found.get(role)), "")
-        after = next((role for role in AFTER if found.get(role)), "")
+        rows = {role: result_of(results, topic, similarity, gate) for role, topic in topics.items()}
+        before = next((role for role in BEFORE if rows.get(role)), "")
+        after = next((role for role in AFTER if rows.get(role)), "")
         if before or after:
-            return BeforeAfter((similarity, gate), found.get(before), found.get(after), (before, after))
+            return BeforeAfter((similarity, gate), rows.get(before), rows.get(after), (before, after))
     return None

@@ -171,14 +171,14 @@ def add_thumbnails(events: Sequence[IdentityEvent], tracks: Sequence[Frame], pic
         unseen_ns = seconds_to_ns(float(np.nan_to_num(event_row["duration_s"]))) + 1000
         old = _row_at(rows, t_ns, int(event_row["track_id" if is_join else "previous_id"]), event.t_ns - unseen_ns)
         new = _row_at(rows, t_ns, int(event_row["track_id"]), event.t_ns)
-        region = _region([found[1] for found in (old, new) if found], event_row)
+        region = _region([place[1] for place in (old, new) if place], event_row)
         if region is None or not len(pictures.t_ns):
             continue
         usual_ns = seconds_to_ns(frame_interval_s(tracks))
         before_ns = old[0] if old else event.t_ns - usual_ns
-        for at_ns, found, is_after in ((before_ns, old, False), (event.t_ns, new, True)):
+        for at_ns, place, is_after in ((before_ns, old, False), (event.t_ns, new, True)):
             number = max(int(np.searchsorted(pictures.t_ns, at_ns, "right")) - 1, 0)
-            wanted.setdefault(number, []).append((event, is_after, found[1] if found else None, region))
+            wanted.setdefault(number, []).append((event, is_after, place[1] if place else None, region))
     for frame in pictures.frames(wanted):
         image = np.asarray(frame.rows, np.uint8)
         for event, is_after, row, region in wanted[frame.index]:

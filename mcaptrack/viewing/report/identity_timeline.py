@@ -53,21 +53,23 @@ def pieces(identity: Ints, t_ns: Ints, start_ns: int, interval_ns: float) -> lis
     begin = (t_ns[first] - start_ns) / NS_PER_S
     due = np.append(t_ns[1:], np.iinfo(np.int64).max)[last]
     end = (np.minimum(t_ns[last] + round(interval_ns), due) - start_ns) / NS_PER_S
-    return [IdentitySpan(*one) for one in zip(identity[first].tolist(), begin.tolist(), end.tolist(), strict=True)]
+    return [IdentitySpan(*span) for span in zip(identity[first].tolist(), begin.tolist(), end.tolist(), strict=True)]
 
 
 def identity_timeline(report: LogReport) -> dict[str, Any]:
     """The values of the section."""
     span_s = max((report.end_ns - report.start_ns) / NS_PER_S, 1e-9)
     scored = [(report.track_sets[role], report.people[role]) for role in report.compared_roles if role in report.people]
-    rows = _of_people(report, [one for _, one in scored]) if scored else _of_tracks(report)
+    rows = _of_people(report, [people for _, people in scored]) if scored else _of_tracks(report)
     kept = sorted(sorted(rows, key=lambda row: -row["seconds"])[:_MOST], key=lambda row: row["begins"])
     headline = report.headline
     return {
         "rows": [{**row, "lanes": [_lane(lane, span_s) for lane in row["lanes"]]} for row in kept],
         "left_out": len(rows) - len(kept),
         "has_truth": bool(scored),
-        "lanes": [{"name": short(one.name), "role": one.role, "switches": _switches(people)} for one, people in scored],
+        "lanes": [
+            {"name": short(side.name), "role": side.role, "switches": _switches(people)} for side, people in scored
+        ],
         "rule": rule_text(*headline.rule) if headline else "",
         "span": clock(span_s),
         "ticks": [
@@ -92,11 +94,11 @@ def _of_people(report: LogReport, sides: Sequence[PersonScores]) -> list[dict[st
     out = []
     for person, low, high in _groups(truth["track_id"]):
         lanes = [("truth", pieces(np.zeros(high - low, np.int64), t_ns[low:high], report.start_ns, interval_ns))]
-        for one in sides:
-            low_match, high_match = np.searchsorted(one.person, [person, person + 1])
+        for side in sides:
+            low_match, high_match = np.searchsorted(side.person, [person, person + 1])
             own = slice(int(low_match), int(high_match))
-            step_ns = _interval_ns(one.frame_ns)
-            lanes.append(("ids", pieces(one.track[own], one.t_ns[own], report.start_ns, step_ns)))
+            step_ns = _interval_ns(side.frame_ns)
+            lanes.append(("ids", pieces(side.track[own], side.t_ns[own], report.start_ns, step_ns)))
         out.append(_row(person, lanes))
     return out
 
@@ -120,10 +122,10 @@ def _known(source: Ints, track: int) -> Ints:
 
     A track without any has its own id.
     """
-    there = np.flatnonzero(source >= 0)
-    if not len(there):
+    with_id = np.flatnonzero(source >= 0)
+    if not len(with_id):
         return np.full(len(source), track)
-    return source[there[np.maximum(np.searchsorted(there, np.arange(len(source)), "right") - 1, 0)]]
+    return source[with_id[np.maximum(np.searchsorted(with_id, np.arange(len(source)), "right") - 1, 0)]]
 
 
 def _row(identity: int, lanes: list[tuple[str, list[IdentitySpan]]]) -> dict[str, Any]:
@@ -134,8 +136,8 @@ def _row(identity: int, lanes: list[tuple[str, list[IdentitySpan]]]) -> dict[str
 
 def _groups(ids: Any) -> Iterator[tuple[int, int, int]]:
     """Each id of sorted rows, and its first row and the row after its last."""
-    known, first = np.unique(ids, return_index=True)
-    yield from zip(known.tolist(), first.tolist(), np.append(first, len(ids))[1:].tolist(), strict=True)
+    unique, first = np.unique(ids, return_index=True)
+    yield from zip(unique.tolist(), first.tolist(), np.append(first, len(ids))[1:].tolist(), strict=True)
 
 
 def _interval_ns(t_ns: Ints) -> float:
@@ -145,9 +147,9 @@ def _interval_ns(t_ns: Ints) -> float:
 
 def _lane(lane: tuple[str, list[IdentitySpan]], span_s: float) -> dict[str, Any]:
     """A lane as coordinates in percent; pieces that are too short to be seen are drawn a little longer."""
-    kind, found = lane
+    kind, spans = lane
     out = []
-    for piece in found:
+    for piece in spans:
         left = 100 * piece.first_s / span_s
         width = max(100 * (piece.last_s - piece.first_s) / span_s, _LEAST)
         seconds = f"{number(piece.first_s, 1)} to {number(piece.last_s, 1, 's')}"
@@ -171,10 +173,10 @@ def people_over_time(report: LogReport) -> dict[str, Any] | None:
     span_s = max((report.end_ns - report.start_ns) / NS_PER_S, 1e-9)
     scale, unit = (60.0, "minutes") if span_s > _MINUTES else (1.0, "seconds")
     lines = []
-    for one in sets:
-        at_s, count = counts_over_time(one.frames, report.start_ns, span_s)
+    for tracks in sets:
+        at_s, count = counts_over_time(tracks.frames, report.start_ns, span_s)
         if len(at_s):
-            lines.append(Line(short(one.name), one.role, at_s / scale, count, dashed=one.role == "truth"))
+            lines.append(Line(short(tracks.name), tracks.role, at_s / scale, count, dashed=tracks.role == "truth"))
     if not lines:
         return None
     noun = "people" if report.has_only_people else "objects"

@@ -103,8 +103,8 @@ def ground_paths(frames: Sequence[Frame]) -> list[TrackPath]:
 
 
 def _split(rows: Rows, t_ns: Ints, at: Floats) -> list[TrackPath]:
-    known = np.isfinite(at).all(axis=1)
-    rows, t_ns, at = rows[known], t_ns[known], at[known]
+    has_place = np.isfinite(at).all(axis=1)
+    rows, t_ns, at = rows[has_place], t_ns[has_place], at[has_place]
     starts = run_starts(rows["track_id"])
     spans = zip(np.flatnonzero(starts).tolist(), np.flatnonzero(run_ends(starts)).tolist(), strict=True)
     return [
@@ -159,15 +159,15 @@ def heat_map(frames: Sequence[Frame]) -> dict[str, Any] | None:
     import cv2
 
     rows, t_ns = rows_by_track(frames)
-    found = occupancy(t_ns, rows["track_id"], np.stack([rows["x_m"], rows["y_m"]], axis=-1))
-    most = float(found.person_s.max(initial=0.0))
+    stays = occupancy(t_ns, rows["track_id"], np.stack([rows["x_m"], rows["y_m"]], axis=-1))
+    most = float(stays.person_s.max(initial=0.0))
     if most <= 0:
         return None
-    high, wide = found.person_s.shape
+    high, wide = stays.person_s.shape
     picture = np.empty((high, wide, 4), np.uint8)
     picture[..., :3] = _HEAT[::-1]
-    picture[..., 3] = np.rint(255 * np.sqrt(found.person_s[::-1] / most)).astype(np.uint8)
-    low_m, size_m = np.array(found.low_m), np.array([wide, high]) * found.cell_m
+    picture[..., 3] = np.rint(255 * np.sqrt(stays.person_s[::-1] / most)).astype(np.uint8)
+    low_m, size_m = np.array(stays.low_m), np.array([wide, high]) * stays.cell_m
     room = np.array([_GROUND[0] - _AXIS_PX, _GROUND[1] - _AXIS_PX])
     scale = float((room / size_m).min())
     width, height = (size_m * scale).round(1).tolist()
@@ -181,8 +181,8 @@ def heat_map(frames: Sequence[Frame]) -> dict[str, Any] | None:
         "left": _AXIS_PX, "width": width, "height": height, "view_width": _GROUND[0], "view_height": round(height + 34),
         "x_ticks": [(f"{_AXIS_PX + (at - low_m[0]) * scale:.1f}", f"{at:g}") for at in ticks[0].tolist()],
         "y_ticks": [(f"{height - (at - low_m[1]) * scale:.1f}", f"{at:g}") for at in ticks[1].tolist()],
-        "most": number(most, 0 if most >= 10 else 1, "s"), "cell": number(found.cell_m, 2, "m"),
-        "total": number(float(found.person_s.sum()) / 60, 1, "min"),
+        "most": number(most, 0 if most >= 10 else 1, "s"), "cell": number(stays.cell_m, 2, "m"),
+        "total": number(float(stays.person_s.sum()) / 60, 1, "min"),
     }  # fmt: skip
 
 

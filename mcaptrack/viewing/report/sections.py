@@ -30,15 +30,17 @@ Figure = dict[str, Any]
 
 def scores(report: LogReport) -> dict[str, Any]:
     """All scores by rule, and statistics of tracks that need no ground truth."""
-    found = before_after(report, report.results) if report.results else None
+    headline = before_after(report, report.results) if report.results else None
     of_all = [row for row in report.results if row.of_class is None]
     # The tracker's tracks at the prediction rate are compared with the re-tracked ones: one number for one thing.
     beside = report.track_sets["tracks"].topic if {"tracks", "samples"} <= set(report.track_sets) else ""
     first = [
-        row for row in of_all if (found is None or (row.similarity, row.gate) == found.rule) and row.tracks != beside
+        row
+        for row in of_all
+        if (headline is None or (row.similarity, row.gate) == headline.rule) and row.tracks != beside
     ]
     of_classes = [row for row in report.results if row.of_class is not None]
-    of_classes = [row for row in of_classes if found is None or (row.similarity, row.gate) == found.rule]
+    of_classes = [row for row in of_classes if headline is None or (row.similarity, row.gate) == headline.rule]
     rest = [row for row in of_all if row not in first]
     rules = sorted({(row.similarity, row.gate) for row in rest})
     return {
@@ -62,7 +64,7 @@ def _columns(results: Sequence[EvaluationRow]) -> list[str]:
 
 def _score_groups(results: Sequence[EvaluationRow], report: LogReport) -> list[dict[str, Any]]:
     """A group of rows for each rule, and for each class; the best value of a group is marked."""
-    known = {one.topic: (one.name, one.role) for one in report.track_sets.values()}
+    names = {track_set.topic: (track_set.name, track_set.role) for track_set in report.track_sets.values()}
     groups: dict[tuple[str, float, str], list[EvaluationRow]] = {}
     for row in results:
         groups.setdefault((row.similarity, row.gate, row.of_class or ""), []).append(row)
@@ -73,7 +75,7 @@ def _score_groups(results: Sequence[EvaluationRow], report: LogReport) -> list[d
         best = {key: _best([values[key] for values in all_values], key) for key in columns}
         rows = []
         for row, values in zip(members, all_values, strict=True):
-            name, role = known.get(row.tracks, (row.tracks, "truth"))
+            name, role = names.get(row.tracks, (row.tracks, "truth"))
             cells = [
                 (_score_text(key, values[key]), len(members) > 1 and best[key] is not None and values[key] == best[key])
                 for key in columns
@@ -86,8 +88,8 @@ def _score_groups(results: Sequence[EvaluationRow], report: LogReport) -> list[d
 
 def _best(values: Sequence[float | None], key: str) -> float | None:
     """The best value of a column; None if none is known."""
-    known = [one for one in values if one is not None]
-    return (min if key in _LOWEST else max)(known) if known else None
+    present = [value for value in values if value is not None]
+    return (min if key in _LOWEST else max)(present) if present else None
 
 
 def _score_text(key: str, value: float | None) -> str:
@@ -97,38 +99,38 @@ def _score_text(key: str, value: float | None) -> str:
 
 
 def _track_rows(report: LogReport) -> list[dict[str, Any]]:
-    repairs = {one.topic: one.counts["joined"] + one.counts["parted"] for one in report.channel_events}
+    repairs = {events.topic: events.counts["joined"] + events.counts["parted"] for events in report.channel_events}
     return [
         {
-            "name": one["name"],
-            "role": one["role"],
-            "topic": one["topic"],
+            "name": tracks["name"],
+            "role": tracks["role"],
+            "topic": tracks["topic"],
             "cells": [
-                number(one["tracks"]),
-                number(one["median_s"], 1, "s"),
-                number(one["longest_s"], 1, "s"),
-                percent(one["observed_share"], 0),
-                number(repairs.get(one["topic"]) if one["role"] == "offline" else None),
+                number(tracks["tracks"]),
+                number(tracks["median_s"], 1, "s"),
+                number(tracks["longest_s"], 1, "s"),
+                percent(tracks["observed_share"], 0),
+                number(repairs.get(tracks["topic"]) if tracks["role"] == "offline" else None),
             ],
         }
-        for one in report.data["tracks"]
+        for tracks in report.data["tracks"]
     ]
 
 
 def forecasts(report: LogReport) -> dict[str, Any]:
     """Errors by recall and by horizon, and calibration."""
-    found = report.data["forecasts"]
-    if not found:
+    errors = report.data["forecasts"]
+    if not errors:
         reason = "the log has no ground truth" if "truth" not in report.track_sets else "none have a known future"
         if not any(channel["schema"] == "mcaptrack.Predictions" for channel in report.data["channels"]):
             reason = f"the log holds none; {command('predict', Path(report.file))} makes them"
         return {"figures": [], "missing": [f"There are no forecasts that could be scored: {reason}."]}
-    known = {one.topic: (one.name, one.role) for one in report.track_sets.values()}
-    members = [(one, *known.get(one["tracks"], (one["tracks"], "truth"))) for one in found]
+    names = {track_set.topic: (track_set.name, track_set.role) for track_set in report.track_sets.values()}
+    members = [(entry, *names.get(entry["tracks"], (entry["tracks"], "truth"))) for entry in errors]
     figures = [_by_recall(members)]
-    parts = [part for one in found for part in (one["by_horizon"], one["constant_velocity"]) if part]
+    parts = [part for entry in errors for part in (entry["by_horizon"], entry["constant_velocity"]) if part]
     most = round_most(np.array(part[key], float) for part in parts for key in ("mean_m", "three_quarters_m"))
-    figures += [_by_horizon(one, name, role, most) for one, name, role in members if one["by_horizon"]["n"]]
+    figures += [_by_horizon(entry, name, role, most) for entry, name, role in members if entry["by_horizon"]["n"]]
     with_covariance = [member for member in members if member[0]["calibration"]]
     if with_covariance:
         return {"figures": [*figures, _reliability(with_covariance)], "missing": []}
@@ -138,8 +140,8 @@ def forecasts(report: LogReport) -> dict[str, Any]:
 
 def _by_recall(members: Sequence[tuple[dict[str, Any], str, str]]) -> Figure:
     lines = [
-        Line(short(name), role, np.array(one["curve_recall"]), np.array(one["curve_ADE_m"]))
-        for one, name, role in members
+        Line(short(name), role, np.array(errors["curve_recall"]), np.array(errors["curve_ADE_m"]))
+        for errors, name, role in members
     ]
     y = Axis("mean displacement error, m", round_most(line.y for line in lines))
     x = Axis("recall: share of people with a forecast", 1.0)
@@ -150,8 +152,8 @@ def _by_recall(members: Sequence[tuple[dict[str, Any], str, str]]) -> Figure:
     }
 
 
-def _by_horizon(one: dict[str, Any], name: str, role: str, most: float) -> Figure:
-    part, baseline = one["by_horizon"], one["constant_velocity"]
+def _by_horizon(errors: dict[str, Any], name: str, role: str, most: float) -> Figure:
+    part, baseline = errors["by_horizon"], errors["constant_velocity"]
     ahead = np.array(part["ahead_s"])
     band = (np.array(part["quarter_m"]), np.array(part["three_quarters_m"]))
     lines = [Line(short(name), role, ahead, np.array(part["mean_m"]), *band)]
@@ -171,8 +173,8 @@ def _by_horizon(one: dict[str, Any], name: str, role: str, most: float) -> Figur
 
 def _reliability(members: Sequence[tuple[dict[str, Any], str, str]]) -> Figure:
     lines = []
-    for one, name, role in members:
-        nominal, held = (np.array([part[key] for part in one["calibration"]]) for key in ("nominal", "held"))
+    for errors, name, role in members:
+        nominal, held = (np.array([part[key] for part in errors["calibration"]]) for key in ("nominal", "held"))
         lines.append(Line(short(name), role, nominal, held))
     title = "Share of true futures inside the forecast ellipses, against their probability"
     axes = Axis("probability, %", 1.0, percent=True), Axis("share inside, %", 1.0, percent=True)
@@ -180,11 +182,11 @@ def _reliability(members: Sequence[tuple[dict[str, Any], str, str]]) -> Figure:
         f"{name}: "
         + ", ".join(
             f"{percent(part['held'], 0)} in {percent(part['nominal'], 0)}"
-            for part in one["calibration"]
+            for part in errors["calibration"]
             if part["nominal"] in LEVELS
         )
-        + f", NLL {number(one['NLL'], 2)}"
-        for one, name, _ in members
+        + f", NLL {number(errors['NLL'], 2)}"
+        for errors, name, _ in members
     )
     return {
         "chart": line_chart(title, lines, *axes, diagonal="calibrated"),
@@ -214,21 +216,21 @@ def motion(report: LogReport) -> dict[str, Any]:
 
 
 def _histogram(
-    report: LogReport, found: dict[str, Any], title: str, x: str, note: str, unit: str, of: str, digits: int
+    report: LogReport, histogram: dict[str, Any], title: str, x: str, note: str, unit: str, of: str, digits: int
 ) -> Figure:
-    known = {one.topic: one for one in report.track_sets.values()}
-    edges = np.array(found["edges"])
+    track_sets = {track_set.topic: track_set for track_set in report.track_sets.values()}
+    edges = np.array(histogram["edges"])
     bars, texts = [], []
-    for part in found["series"]:
+    for part in histogram["series"]:
         if not part["n"]:
             continue
-        one = known[part["topic"]]
+        tracks = track_sets[part["topic"]]
         shares = np.array(part["counts"]) / part["n"]
         median = f"median {number(part['median'], digits, unit)}"
-        bars.append(Bars(short(one.name), one.role, shares, part["median"], median))
+        bars.append(Bars(short(tracks.name), tracks.role, shares, part["median"], median))
         beyond = f" ({number(part['above'])} of them beyond)" if part["above"] else ""
-        texts.append(f"{short(one.name)} {counted(part['n'], of)}{beyond}")
-    high = f"the highest bar is {percent(max(float(one.shares.max(initial=0)) for one in bars), 0)}"
+        texts.append(f"{short(tracks.name)} {counted(part['n'], of)}{beyond}")
+    high = f"the highest bar is {percent(max(float(bar.shares.max(initial=0)) for bar in bars), 0)}"
     return {
         "chart": histogram_chart(f"Histograms: {x}", bars, edges, x),
         "title": title,

@@ -108,33 +108,33 @@ def forecast_statistics(sequence: EvaluationInput, results: Sequence[EvaluationR
     """The errors of the forecasts of a sequence, by recall and by horizon, beside those of constant velocity."""
     out = []
     for candidate in sequence.candidates:
-        of_all = [one for one in results if one.tracks == candidate.name and one.of_class is None]
-        found = next((one.displacement for one in of_all if one.displacement), None)
+        of_all = [result for result in results if result.tracks == candidate.name and result.of_class is None]
+        displacement = next((result.displacement for result in of_all if result.displacement), None)
         rows = next((frame.rows for frame in candidate.forecasts or () if len(frame.rows)), None)
-        if found is None or rows is None:
+        if displacement is None or rows is None:
             continue
         step_s = float(rows["ahead_s"][0]) / int(rows["step"][0])
-        recall, ade = thinned(*found.curve())
-        summary = found.summary()
+        recall, ade = thinned(*displacement.curve())
+        summary = displacement.summary()
         values = {
             "tracks": candidate.name,
             "forecasts": candidate.forecasts_name,
             "curve_recall": recall.tolist(),
             "curve_ADE_m": ade.tolist(),
-            "by_horizon": _by_horizon(found, step_s),
+            "by_horizon": _by_horizon(displacement, step_s),
             "constant_velocity": None,
-            "calibration": [{"nominal": part["level"], "held": part["held"]} for part in found.reliability()],
+            "calibration": [{"nominal": part["level"], "held": part["held"]} for part in displacement.reliability()],
             "NLL": summary["NLL"],
         }
-        baseline = _constant_velocity(sequence, candidate, step_s, found.error_m.shape[1])
+        baseline = _constant_velocity(sequence, candidate, step_s, displacement.error_m.shape[1])
         if baseline is not None:
             values["constant_velocity"] = _by_horizon(baseline, step_s)
         out.append(values)
     return out
 
 
-def _by_horizon(found: Displacement, step_s: float) -> dict[str, Any]:
-    away = found.errors_by_step()
+def _by_horizon(displacement: Displacement, step_s: float) -> dict[str, Any]:
+    away = displacement.errors_by_step()
     quartiles = np.percentile(away, [25, 75], axis=0) if len(away) else np.empty((2, 0))
     return {
         "n": len(away),
