@@ -184,14 +184,17 @@ def local_name(location: Location, suffix: str) -> Path:
 def distinct_names(names: Sequence[str], places: Sequence[Location]) -> list[str]:
     """The names of logs that are used together; equal ones get as many of their folders as make them differ.
 
-    ``places`` are the locations of the logs, without links. Raises McaptrackError if two have the same name even so:
-    their rows and scores would be taken for those of one log.
+    ``places`` are the locations of the logs, without links. Raises McaptrackError if one is there twice, so
+    that it would count twice, or if two have the same name even so: their rows would be taken for those of one log.
 
     Examples
     --------
     >>> distinct_names(["walk", "walk", "run"], [Path("/a/walk.mcap"), Path("/b/walk.mcap"), Path("/a/run.mcap")])
     ['a/walk', 'b/walk', 'run']
     """
+    twice = next((place for place, count in Counter(places).items() if count > 1), None)
+    if twice is not None:
+        raise McaptrackError(f"{twice} is named twice; name it once")
     distinct = list(names)
     for depth in range(1, 1 + max((len(place.parts) for place in places), default=0)):
         again = {name for name, count in Counter(distinct).items() if count > 1}
@@ -204,8 +207,6 @@ def distinct_names(names: Sequence[str], places: Sequence[Location]) -> list[str
     first: dict[str, Location] = {}
     for name, place in zip(distinct, places, strict=True):
         if name in first:
-            if place == first[name]:
-                raise McaptrackError(f"{place} is named twice; name it once")
             raise McaptrackError(
                 f"{first[name]} and {place} would both be {name.rpartition('/')[2]}, and their rows those of one log; "
                 "rename one of them, or take them one by one"

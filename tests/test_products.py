@@ -265,6 +265,19 @@ def test_logs_that_are_used_together_have_names_of_their_own_or_are_refused(name
         assert len({one["name"] for one in page.data["logs"]}) == 2
 
 
+def test_a_log_by_two_names_does_not_count_twice(tmp_path, finished):
+    link = tmp_path / "link.mcap"
+    link.symlink_to(finished)
+    rows = "select count(*) as n from tracks"
+    assert mcaptrack.query([finished, link], rows).to_pydict() == mcaptrack.query(finished, rows).to_pydict()
+    for refused in (
+        lambda: mcaptrack.report([finished, link], tmp_path / "a.html"),
+        lambda: mcaptrack.evaluate([link, finished]),
+    ):
+        with pytest.raises(McaptrackError, match=r"walk\.mcap is named twice; name it once"):
+            refused()
+
+
 def test_a_log_is_known_by_what_was_recorded_wherever_it_is_and_whatever_was_added(tmp_path):
     folder, path = tmp_path / "T", log_of(tmp_path / "x/l.mcap")
     mcaptrack.export(path, folder)
