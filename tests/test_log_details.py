@@ -7,7 +7,6 @@ import struct
 import sys
 import zlib
 from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -272,24 +271,6 @@ def test_channels_that_were_made_from_each_other_may_be_many(tmp_path, shallow):
     ]
     shown = done("info", path).out
     assert f"/c{count - 1:04}" in shown
-
-
-def test_a_copy_that_differs_in_any_byte_is_not_taken(tmp_path, monkeypatch):
-    """It is compared in blocks, as far as it is a copy."""
-    extend_log = import_module("mcaptrack.log.extend")  # mcaptrack.log.extend itself is a function
-    monkeypatch.setattr(extend_log, "BLOCK", 4)
-    source, copy = bytes(range(11)), tmp_path / "copy"
-    for end in range(12):
-        for changed in (None, *range(11)):
-            found = bytearray(source)
-            if changed is not None:
-                found[changed] ^= 1
-            copy.write_bytes(found)
-            if changed is None or changed >= end:
-                extend_log._compare(source, copy, end)
-            else:
-                with pytest.raises(McaptrackError, match="does not hold what was written to it"):
-                    extend_log._compare(source, copy, end)
 
 
 def test_indexes_that_list_another_number_of_messages_than_was_counted_are_noticed(tmp_path):

@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 
 from mcaptrack.cli import common
-from mcaptrack.fleet import FleetStatus, Running
 from mcaptrack.pipeline import LAYOUTS, layout_path
 from tests.commands import call, done
 
@@ -175,17 +174,3 @@ def test_many_inputs_are_ingested_by_workers_and_once(folder, monkeypatch):
     assert (folder / "made" / "x.mcap").exists()
     code, _, err = call("ingest", "labels/x.txt", "labels/y.txt", "-o", "z.mcap")
     assert (code, "can't all be written to z.mcap" in err) == (1, True)
-
-
-def test_the_table_on_a_terminal_names_the_logs_that_run(folder):
-    from rich.console import Console
-
-    from mcaptrack.cli.many import table_of
-
-    running = (Running(Path("logs/\x1b[31mx.mcap"), "detect", 3, 4, 12.3, 250_000_000), Running(Path("y.mcap")))
-    console = Console(file=io.StringIO(), width=80)
-    console.print(table_of(FleetStatus(9, {"done": 3, "killed": 1}, running, 61.0)))
-    shown = console.file.getvalue()
-    assert "4 of 9 logs in 61 s: 3 done, 1 killed" in shown
-    assert [part for part in ("detect", "75%", "12", "250") if part not in shown] == []
-    assert "\x1b" not in shown

@@ -138,14 +138,6 @@ class TestPlayer:
         assert found.data["sizes"] == [[320, 180]] * 60
         assert found.data["numbers"] == list(range(60))
 
-    def test_it_opens_at_the_first_event_and_names_all(self, finished, player):
-        data = shown(player).data
-        with mcaptrack.view(finished) as server:
-            events = [one for one in server.events if one.topic == "/camera/retracks"]
-            at_s = server.at_s
-        assert [text for _, text in data["events"]] == [one.text for one in events]
-        assert abs(data["seconds"][data["open"]] - at_s) <= 0.1
-
     def test_it_opens_where_viewers_do_and_names_events_of_its_period_and_tracks(self, finished, monkeypatch):
         start_ns = start_of(finished)
         at = [("retracks", 1.0), ("retracks", 3.0), ("tracks", 3.1), ("retracks", 5.0)]
@@ -159,16 +151,6 @@ class TestPlayer:
             data = shown(log.show(start_s=2.0, end_s=4.0, width=64)).data
         assert data["events"] == [[3.0, "retracks 3.0"]]
         assert data["seconds"][data["open"]] == 2.9
-
-    def test_pictures_are_left_out_evenly_where_their_size_was_estimated_too_small(self, finished, monkeypatch):
-        monkeypatch.setattr("mcaptrack.viewing.notebook.pictures.PictureSource.step", lambda *_: 1)
-        with mcaptrack.open(finished) as log:
-            small = log.show(max_mb=0.2)
-        data = shown(small).data
-        assert small.every in (2, 4, 8)
-        assert data["numbers"] == list(range(0, 60, small.every))
-        assert data["seconds"] == [round(number / 10, 3) for number in data["numbers"]]
-        assert len(shown(small).pictures) == len(data["drawn"]) == small.pictures
 
     def test_it_opens_no_connection_and_runs_only_its_own_script(self, player):
         page = shown(player).page

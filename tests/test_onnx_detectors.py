@@ -160,18 +160,6 @@ class TestLayouts:
         assert len(found[0]) == 1
         assert found == boxes(OnnxDetector(file=str(whole)), picture)
 
-    def test_a_graph_that_gives_pixels_already_is_not_decoded_again(self, network):
-        cells = np.concatenate([onnx_graphs.cells(SIZE, step) for step in (8, 16, 32)])
-        rows = np.zeros((1, len(cells), 85))
-        rows[0, :, :4], rows[0, 7, 4:6] = cells, (0.8, 1.0)
-        data = model(
-            [node("Identity", ["rows"], ["output"])],
-            [value("x", [1, 3, 128, 160])],
-            [value("output", None)],
-            {"rows": tensor(rows, "rows")},
-        )
-        assert boxes(OnnxDetector(file=str(network(data=data)), layout="yolox"), PICTURE) == [[(56, 0, 8, 8)]]
-
 
 class TestConvention:
     def test_what_tells_two_layouts_apart_may_come_late(self, network):
@@ -212,33 +200,6 @@ class TestConvention:
         words = refused(OnnxDetector(file=str(network()), layout="rtdetr"))
         assert "gives output 1 x 420 x 85" in words
         assert words.endswith("that fits yolox, yolox-legacy")
-
-    def test_what_finds_the_same_in_two_layouts_has_to_be_chosen(self, network):
-        rows = np.zeros((1, 420, 85))
-        rows[0, 7, 4:6] = (0.8, 1.0)  # whatever the picture
-        data = model(
-            [node("Identity", ["rows"], ["output"])],
-            [value("x", [1, 3, 128, 160])],
-            [value("output", None)],
-            {"rows": tensor(rows, "rows")},
-        )
-        for count in (1, 30):
-            words = refused(OnnxDetector(file=str(network(data=data))), *[PICTURE] * count)
-            assert words.endswith("finds much the same read as yolox and yolox-legacy; choose with `layout=`")
-
-    def test_scores_that_are_no_likelihoods_are_refused(self, network):
-        rows = np.zeros((1, 420, 85))
-        rows[0, 7, 4:6] = (3.0, 2.0)
-        data = model(
-            [node("Identity", ["rows"], ["output"])],
-            [value("x", [1, 3, 128, 160])],
-            [value("output", None)],
-            {"rows": tensor(rows, "rows")},
-        )
-        assert "no likelihoods" in refused(OnnxDetector(file=str(network(data=data))))
-        assert "in frame 0 scores are no likelihoods" in refused(
-            OnnxDetector(file=str(network(data=data)), layout="yolox")
-        )
 
 
 def constant(shape: tuple[int, ...], number: float = 0.0, inputs: list[bytes] | None = None) -> bytes:
@@ -450,11 +411,6 @@ class TestClasses:
         with mcaptrack.open(log) as opened:
             assert set(opened.array("detections", "/camera/hats")["class_id"].tolist()) == {2}
         assert Provenance.from_metadata(metadata_of(log, "/camera/hats")).classes == {"2": "hat"}
-
-    def test_metadata_that_are_no_names_are_left_out(self, network):
-        for text in ("[1, 2]", "{'a': 'b'}", "open('x')", "(" * 500, "{0: 'a'"):
-            path = network("ultralytics", metadata={"names": text})
-            assert boxes(OnnxDetector(file=str(path)), PICTURE) == [[pytest.approx(BLOCK, abs=1e-3)]]
 
 
 @pytest.fixture(scope="module")

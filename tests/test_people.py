@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 
 from mcaptrack.transforms.detect.median_background import Background, Sampler
-from mcaptrack.transforms.detect.people import Separator, _Crop, _joined_parts
+from mcaptrack.transforms.detect.people import Separator, _joined_parts
 from mcaptrack.transforms.detect.person_model import (
     Learner,
     Person,
-    _fit_height,
-    _mode,
-    _scaled,
     region_boxes,
     regions,
     typical_heights,
@@ -30,45 +27,6 @@ def drawn(size: tuple[int, int], *boxes: tuple[int, int, int, int]) -> np.ndarra
     for x, y, w, h in boxes:
         mask[y : y + h, x : x + w] = 255
     return mask
-
-
-@pytest.mark.parametrize(
-    ("values", "wanted"),
-    [([3], 3), ([2, 1], 1.5), ([10, 3, 1, 2], 1.5), ([0, 5, 5.25, 5.75, 9], 5.125), ([1, 2, 9, 9.5, 9.75], 9.625)],
-)
-def test_the_densest_half_is_halved_until_two_values_are_left(values, wanted):
-    assert _mode(np.array(values, float)) == wanted
-
-
-class TestHeightOverFeet:
-    FOOT = np.array([50.0, 70.0, 90.0, 110.0, 130.0, 150.0])
-
-    def fit(self, height, foot=FOOT, weight=None, picture=200):
-        weight = np.ones(len(foot)) if weight is None else np.array(weight, float)
-        return _fit_height(foot, np.array(height, float), weight, picture)
-
-    def test_a_line_is_found_beside_regions_that_do_not_follow_it(self):
-        height = 10 + 0.2 * self.FOOT
-        foot = np.append(self.FOOT, [60.0, 80.0, 100.0])
-        slope, level = self.fit(np.append(height, [60.0, 5.0, 70.0]), foot)
-        assert (slope, level) == (pytest.approx(0.2), pytest.approx(10))
-
-    def test_those_with_more_weight_decide(self):
-        foot = np.concatenate([self.FOOT, self.FOOT])
-        height = np.concatenate([10 + 0.2 * self.FOOT, 40 + 0.4 * self.FOOT])
-        for heavy, (slope, level) in (([3] * 6 + [1] * 6, (0.2, 10)), ([1] * 6 + [3] * 6, (0.4, 40))):
-            assert self.fit(height, foot, heavy) == (pytest.approx(slope), pytest.approx(level))
-
-    def test_who_is_farther_away_is_not_taller(self):
-        slope, level = self.fit(30 - 0.02 * self.FOOT)
-        assert (slope, level) == (0, pytest.approx(np.median(30 - 0.02 * self.FOOT)))
-
-    @pytest.mark.parametrize(("spread", "is_level"), [(20.0, True), (20.5, False)])
-    def test_feet_that_spread_over_a_tenth_of_the_picture_or_less_give_no_slope(self, spread, is_level):
-        foot = np.linspace(100.0, 100.0 + spread, 6)
-        slope, level = self.fit(20 + 0.2 * (foot - 100), foot)
-        assert (slope == 0) == is_level
-        assert level == pytest.approx(np.median(20 + 0.2 * (foot - 100)) if is_level else 0, abs=1e-6)
 
 
 def joined(boxes: np.ndarray, expected: np.ndarray) -> set[frozenset[int]]:
@@ -216,17 +174,6 @@ class TestLearning:
         """Of a person of 50 pixels."""
         assert (self.learned([box] * 8, person_px=50.0) is not None) == is_known
 
-    def test_a_region_is_scaled_around_its_middle(self):
-        region = np.ones((ROWS, 7), bool)
-        region[3:5, 2] = False
-        np.testing.assert_array_equal(
-            _scaled(np.repeat(region, 2, axis=1)[:, :14])[:, 1:15], np.repeat(region, 2, 1) * 255
-        )
-        half = _scaled(np.ones((12, 4), bool))
-        assert half.shape == (ROWS, 10)
-        assert half[:-1, 3:7].min() == 255
-        assert _scaled(np.ones((48, 16), bool)).shape == (ROWS, 10)
-
     def test_people_are_at_least_eight_pixels_tall(self):
         person = Person(0.1, 5.0, np.zeros((ROWS, 10), np.float32))
         assert (person.height(20), person.height(30), person.height(50)) == (8, 8, 10)
@@ -361,30 +308,6 @@ class TestSeparating:
         assert gain == pytest.approx(float(gains.max()))
         assert gains[place[1], place[0]] == gains.max()
 
-    def test_the_share_that_has_to_be_seen_is_of_what_a_whole_person_gains(self):
-        """On average over pixels that are foreground as often as the shape says."""
-        whole = 0.0
-        for share in PERSON.template.astype(float).ravel().tolist():
-            whole += share * math.log((0.03 + 0.97 * share) / 0.03) + (1 - share) * math.log(1 - share)
-        for least in (0.25, 0.5):
-            assert Separator(PERSON, least)._least == pytest.approx(least * whole, rel=1e-4)
-
-    def test_a_crop_has_its_margin_and_its_points(self):
-        region = np.zeros((6, 8), bool)
-        region[2:, 3:5] = True
-        crop = _Crop(region, 1.0, (4, 5))
-        assert crop.ink.shape == (16, 16)
-        np.testing.assert_array_equal(crop.ink[5:11, 4:12], region)
-        assert crop.ink.sum() == region.sum()
-        half = _Crop(region, 2.0, (4, 5))
-        assert half.ink.shape == (22, 24)
-        assert half.to_picture(4 + 2 * 3, 5 + 2 * 2) == (3, 2)
-        unknown = crop.beyond(2, 1, (11, 8))
-        for row in range(16):
-            for column in range(16):
-                x, y = 2 + column + 0.5 - 4, 1 + row + 0.5 - 5
-                assert unknown[row, column] == (x < 0 or x > 11 or y < 0 or y > 8)
-
 
 class TestBackground:
     STILL = np.full((40, 48, 3), (100, 120, 140), np.uint8)
@@ -429,15 +352,6 @@ class TestBackground:
         image[:] = 120
         image[20:24, 20:24] = 80
         assert (grey.mask(image, shadows=True)[20:24, 20:24] == 255).all()
-
-    @pytest.mark.parametrize("factor", [0.8, 0.97, 1.1])
-    def test_light_that_changes_everywhere_is_compensated(self, factor):
-        image = cv2.convertScaleAbs(self.STILL, alpha=factor)
-        image[20:24, 20:24] = 250
-        same = self.background()._same_light(image)
-        assert np.abs(same[:16].astype(int) - self.STILL[:16]).max() <= 1
-        almost = cv2.convertScaleAbs(self.STILL, alpha=1.01)
-        assert self.background()._same_light(almost) is almost
 
     def test_a_pixel_beside_another_colour_may_have_it(self):
         still = self.STILL.copy()

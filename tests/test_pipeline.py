@@ -104,15 +104,6 @@ def test_missing_inputs_are_made_first_and_reported(fresh):
         assert "/camera/predictions" not in opened.channels
 
 
-def test_a_second_run_has_nothing_to_do(fresh):
-    report, _ = run_all(fresh)
-    assert report.stages == ["detect", "track", "sample", "predict", "retrack"]
-    before = fresh.read_bytes()
-    report, said = run_all(fresh)
-    assert (report.stages, said) == ([], [])
-    assert fresh.read_bytes() == before
-
-
 def test_running_a_stage_again_replaces_only_its_channels(fresh):
     run_all(fresh)
     before = digests(fresh)
