@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -15,7 +16,7 @@ import pytest
 from mcaptrack import foxglove, log, notices, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
-from mcaptrack.pipeline import drawing, run
+from mcaptrack.pipeline import drawing
 from mcaptrack.pipeline import write as writing
 from mcaptrack.pipeline.checks import _lacks
 from mcaptrack.pipeline.plan import check_spaces
@@ -25,6 +26,7 @@ from mcaptrack.schema.provenance import CLOCK, INGEST, VIEW, Provenance, digest
 from mcaptrack.transforms import STAGES, KnnDetector, OcSort, Predict, Retrack, Sample, Sort, Transform
 from tests.worlds import boxes_at, ns, tracks_at, walk
 
+run = sys.modules["mcaptrack.pipeline.run"]  # the package has a function of this name
 PLANE = GroundPlane((0.1, 0, 0, 0, 0.1, 0, 0, 0, 1), 640, 480)
 Channels = Mapping[str, tuple[Schema, Provenance | None, Sequence[Frame]]]
 
