@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -89,154 +89,108 @@ def stages_of(jobs: Iterable[pipeline.Job]) -> list[str]:
 
 
 EARLIER = "/camera/{} was made from an earlier /camera/{}: running {} again, as before".format
-#: What differs, the options of the plan, the stages that run, what is said, and what is warned of.
-PLANS: dict[str, tuple[dict[str, Any], dict[str, Any], list[str], list[str], list[tuple[str, str]]]] = {
-    "nothing": ({}, {}, [], [], []),
-    "other boxes": (
-        {"detections": {"digest": "D"}},
-        {},
-        ["track", "sample", "predict", "retrack"],
-        [
-            EARLIER("tracks", "detections", "track"),
-            EARLIER("samples", "tracks", "sample"),
-            EARLIER("predictions", "samples", "predict"),
-            EARLIER("retracks", "samples", "retrack"),
-        ],
-        [],
-    ),
-    "other samples": (
-        {"samples": {"digest": "S"}},
-        {},
-        ["predict", "retrack"],
-        [EARLIER("predictions", "samples", "predict"), EARLIER("retracks", "samples", "retrack")],
-        [],
-    ),
-    "force": ({}, {"force": True}, ["track", "sample", "predict", "retrack"], [], []),
-    "force, though due": (
-        {"detections": {"digest": "D"}},
-        {"force": True},
-        ["track", "sample", "predict", "retrack"],
-        [],
-        [],
-    ),
-    "another tracker, chosen": (
+STAGES_OF_ALL = ["track", "sample", "predict", "retrack"]
+AGAIN = [
+    EARLIER("tracks", "detections", "track"),
+    EARLIER("samples", "tracks", "sample"),
+    EARLIER("predictions", "samples", "predict"),
+    EARLIER("retracks", "samples", "retrack"),
+]
+
+
+class Plan(NamedTuple):
+    """What differs, the options of the plan, the stages that run, what is said, and what is warned of."""
+
+    changed: dict[str, Any] = {}
+    options: dict[str, Any] = {}
+    stages: Sequence[str] = ()
+    said: Sequence[str] = ()
+    warned: str = ""
+    code: str = "other-settings"
+
+
+def other_settings(words: str, **defaults: Transform) -> Plan:
+    """Nothing runs, but what a channel was made with is said to be other than the defaults now."""
+    topic, _, differs = words.partition(": ")
+    message = f"/camera/{topic} was made with other settings than now ({differs}); {{force}} takes these"
+    return Plan(options={"defaults": defaults}, warned=message)
+
+
+NEW_BOXES, NEW_SAMPLES = {"detections": {"digest": "D"}}, {"samples": {"digest": "S"}}
+WITHOUT = "it was made with strange, which {} does not have".format
+MANY_OTHERS = Retrack(min_history=3, drift_ratio=0.5, link_s=1.0, smooth=False, max_age_s=1.0)
+PLANS = {
+    "nothing": Plan(),
+    "other boxes": Plan(NEW_BOXES, {}, STAGES_OF_ALL, AGAIN),
+    "other samples": Plan(NEW_SAMPLES, {}, STAGES_OF_ALL[2:], AGAIN[2:]),
+    "force": Plan({}, {"force": True}, STAGES_OF_ALL),
+    "force, though due": Plan(NEW_BOXES, {"force": True}, STAGES_OF_ALL),
+    "another tracker, chosen": Plan(
         {},
         {"defaults": {"track": OcSort()}, "chosen": ("tracker",)},
-        ["track", "sample", "predict", "retrack"],
-        [
-            "/camera/tracks was made by another tracker: running track again",
-            EARLIER("samples", "tracks", "sample"),
-            EARLIER("predictions", "samples", "predict"),
-            EARLIER("retracks", "samples", "retrack"),
-        ],
-        [],
+        STAGES_OF_ALL,
+        ["/camera/tracks was made by another tracker: running track again", *AGAIN[1:]],
     ),
-    "another predictor, chosen": (
+    "another predictor, chosen": Plan(
         {},
         {"defaults": {"predict": Predict(predictor="kalman")}, "chosen": ("predictor",)},
         ["predict"],
         ["/camera/predictions was made by another predictor: running predict again"],
-        [],
     ),
-    "the same tracker, chosen": ({}, {"defaults": {"track": Sort()}, "chosen": ("tracker",)}, [], [], []),
-    "another tracker, not chosen": (
-        {},
-        {"defaults": {"track": OcSort()}, "chosen": ("detector",)},
-        [],
-        [],
-        [("/camera/tracks was made with other settings than now (OcSort, not Sort); {force} takes these", "other-settings")],
+    "the same tracker, chosen": Plan(options={"defaults": {"track": Sort()}, "chosen": ("tracker",)}),
+    "another tracker, not chosen": other_settings("tracks: OcSort, not Sort", track=OcSort()),
+    "one other setting": other_settings("tracks: max_age_s 2.0, not 1.4", track=Sort(max_age_s=2.0)),
+    "three other settings": other_settings(
+        "tracks: max_age_s 2.0, not 1.4; min_hits_s 0.5, not 0.3; min_iou 0.25, not 0.2",
+        track=Sort(max_age_s=2.0, min_hits_s=0.5, min_iou=0.25),
     ),
-    "one other setting": (
-        {},
-        {"defaults": {"track": Sort(max_age_s=2.0)}},
-        [],
-        [],
-        [("/camera/tracks was made with other settings than now (max_age_s 2.0, not 1.4); {force} takes these", "other-settings")],
+    "five other settings, said once": other_settings(
+        "retracks: min_history 3, not 2; drift_ratio 0.5, not 0.08; max_age_s 1.0, not 2.0; and 2 more",
+        retrack=MANY_OTHERS,
     ),
-    "three other settings": (
-        {},
-        {"defaults": {"track": Sort(max_age_s=2.0, min_hits_s=0.5, min_iou=0.25)}},
-        [],
-        [],
-        [("/camera/tracks was made with other settings than now (max_age_s 2.0, not 1.4; min_hits_s 0.5, not 0.3; min_iou 0.25, not 0.2); {force} takes these", "other-settings")],
-    ),
-    "five other settings, said once": (
-        {},
-        {"defaults": {"retrack": Retrack(min_history=3, drift_ratio=0.5, link_s=1.0, smooth=False, max_age_s=1.0)}},
-        [],
-        [],
-        [("/camera/retracks was made with other settings than now (min_history 3, not 2; drift_ratio 0.5, not 0.08; max_age_s 1.0, not 2.0; and 2 more); {force} takes these", "other-settings")],
-    ),
-    "other settings, where it runs as before": (
-        {"detections": {"digest": "D"}},
-        {"defaults": {"sample": Sample(max_gap_s=3.0)}},
-        ["track", "sample", "predict", "retrack"],
-        [
-            EARLIER("tracks", "detections", "track"),
-            EARLIER("samples", "tracks", "sample"),
-            EARLIER("predictions", "samples", "predict"),
-            EARLIER("retracks", "samples", "retrack"),
-        ],
-        [("/camera/samples was made with other settings than now (max_gap_s 3.0, not 2.0); {force} takes these", "other-settings")],
-    ),
-    "a parameter that is gone": (
-        {"predictions": {"parameters": {"strange": 1, "more": 2}}, "samples": {"digest": "S"}},
+    "other settings, where it runs as before": other_settings(
+        "samples: max_gap_s 3.0, not 2.0", sample=Sample(max_gap_s=3.0)
+    )._replace(changed=NEW_BOXES, stages=STAGES_OF_ALL, said=AGAIN),
+    "a parameter that is gone": Plan(
+        {"predictions": {"parameters": {"strange": 1, "more": 2}}, **NEW_SAMPLES},
         {},
         ["retrack"],
-        [EARLIER("retracks", "samples", "retrack")],
-        [("/camera/predictions is out of date and stays as it is: it was made with more, strange, which Predict does not have", "out-of-date")],
+        AGAIN[3:],
+        "/camera/predictions is out of date and stays as it is: it was made with more, strange, which Predict does not "
+        "have",
+        "out-of-date",
     ),
-    "a parameter that is gone, and force": (
+    "a parameter that is gone, and force": Plan(
         {"tracks": {"parameters": {"strange": 1}}},
         {"force": True},
-        ["sample", "predict", "retrack"],
+        STAGES_OF_ALL[1:],
         [],
-        [("/camera/tracks is not made again, it stays as it is: it was made with strange, which Sort does not have", "left-out")],
+        f"/camera/tracks is not made again, it stays as it is: {WITHOUT('Sort')}",
+        "left-out",
     ),
-    "a parameter that is gone, and another setting": (
-        {"predictions": {"parameters": {"strange": 1}}},
-        {"defaults": {"predict": Predict()}},
-        [],
-        [],
-        [("/camera/predictions was made with other settings than now (it was made with strange, which Predict does not have); {force} takes these", "other-settings")],
+    "a parameter that is gone, and another setting": other_settings(
+        f"predictions: {WITHOUT('Predict')}", predict=Predict()
+    )._replace(changed={"predictions": {"parameters": {"strange": 1}}}),
+    "compared with something that is gone": Plan(
+        {"predictions": {"references": {"/camera/truth": "x"}}}, {}, ["predict"], AGAIN[2:3]
     ),
-    "compared with something that is gone": (
-        {"predictions": {"references": {"/camera/truth": "x"}}},
-        {},
-        ["predict"],
-        [EARLIER("predictions", "samples", "predict")],
-        [],
+    "compared with nothing, as now": Plan({"predictions": {"references": {"/camera/truth": ""}}}),
+    "compared with something else": Plan(
+        {"predictions": {"references": {"/camera/tracks": "T"}}}, {}, ["predict"], AGAIN[2:3]
     ),
-    "compared with nothing, as now": ({"predictions": {"references": {"/camera/truth": ""}}}, {}, [], [], []),
-    "compared with something else": (
-        {"predictions": {"references": {"/camera/tracks": "T"}}},
-        {},
-        ["predict"],
-        [EARLIER("predictions", "samples", "predict")],
-        [],
+    "a plane that is gone": Plan(
+        {"tracks": {"parameters": parameters_of("track", Sort(ground_planes=((0, PLANE),)))}}, {}, STAGES_OF_ALL, AGAIN
     ),
-    "a plane that is gone": (
-        {"tracks": {"parameters": parameters_of("track", Sort(ground_planes=((0, PLANE),)))}},
-        {},
-        ["track", "sample", "predict", "retrack"],
-        [
-            EARLIER("tracks", "detections", "track"),
-            EARLIER("samples", "tracks", "sample"),
-            EARLIER("predictions", "samples", "predict"),
-            EARLIER("retracks", "samples", "retrack"),
-        ],
-        [],
-    ),
-}  # fmt: skip
+}
 
 
-@pytest.mark.parametrize(("changed", "options", "stages", "said", "warned"), PLANS.values(), ids=PLANS)
-def test_what_runs_why_and_what_is_said_of_it(changed, options, stages, said, warned, tmp_path):
+@pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)
+def test_what_runs_why_and_what_is_said_of_it(plan, tmp_path):
     path = tmp_path / "a.mcap"
-    force = f"`mcaptrack.run('{path}', force=True)`"
-    found = planned(path, finished(**changed), **options)
-    assert (stages_of(found[0]), found[1]) == (stages, said)
-    assert found[2] == [(message.replace("{force}", force), code) for message, code in warned]
+    jobs, said, warned = planned(path, finished(**plan.changed), **plan.options)
+    assert (stages_of(jobs), said) == (list(plan.stages), list(plan.said))
+    message = plan.warned.replace("{force}", f"`mcaptrack.run('{path}', force=True)`")
+    assert warned == ([(message, plan.code)] if message else [])
 
 
 def test_a_stage_runs_with_what_is_asked_or_else_as_before(tmp_path):
