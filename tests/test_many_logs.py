@@ -95,21 +95,6 @@ def test_commands_that_combine_logs_take_folders_and_lists(folder, monkeypatch):
     assert {one["sequence"] for one in json.loads(done("evaluate", "-", "--json").out)["results"]} == {"a"}
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--timeout", "soon"], "--timeout needs a time such as 90s, 10m or 2h, not 'soon'"),
-        (["--memory-limit", "1"], "--memory-limit needs a size such as 2GB or 500MB, not '1': that is too little"),
-        (
-            ["--ledger", "logs/a.mcap"],
-            "logs/a.mcap is not a ledger: it does not begin with a line of JSON; give another name",
-        ),
-    ],
-)
-def test_what_is_wrong_is_one_line(folder, words, said):
-    assert call("check", "logs", *words) == (1, "", f"mcaptrack: {said}\n")
-
-
 def test_lines_of_json_say_when_what_ended_and_how(folder, monkeypatch):
     (folder / "logs" / "noise.mcap").write_bytes(b"noise")
     monkeypatch.setattr(common, "PROGRESS_S", 0.0)

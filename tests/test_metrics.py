@@ -195,37 +195,12 @@ def test_laws_of_all_scores(frames):
         assert twice["FN"] == 2 * found["FN"]
 
 
-TRACKEVAL = {
-    "HOTA": "HOTA",
-    "DetA": "DetA",
-    "AssA": "AssA",
-    "LocA": "LocA",
-    "MOTA": "MOTA",
-    "IDF1": "IDF1",
-    "IDP": "IDP",
-    "IDR": "IDR",
-    "IDSW": "IDSW",
-    "FP": "CLR_FP",
-    "FN": "CLR_FN",
-    "Frag": "Frag",
-    "MT": "MT",
-    "PT": "PT",
-    "ML": "ML",
-}
-MOTMETRICS = {
-    "MOTA": "mota",
-    "IDF1": "idf1",
-    "IDP": "idp",
-    "IDR": "idr",
-    "IDSW": "num_switches",
-    "FP": "num_false_positives",
-    "FN": "num_misses",
-    "Frag": "num_fragmentations",
-    "MT": "mostly_tracked",
-    "PT": "partially_tracked",
-    "ML": "mostly_lost",
-    "GT": "num_unique_objects",
-}
+NAMES = ("HOTA", "DetA", "AssA", "LocA", "MOTA", "IDF1", "IDP", "IDR", "IDSW", "Frag", "MT", "PT", "ML")
+TRACKEVAL = {name: name for name in NAMES} | {"FP": "CLR_FP", "FN": "CLR_FN"}
+MOTMETRICS = {name: name.lower() for name in ("MOTA", "IDF1", "IDP", "IDR")} | {
+    "IDSW": "num_switches", "FP": "num_false_positives", "FN": "num_misses", "Frag": "num_fragmentations",
+    "MT": "mostly_tracked", "PT": "partially_tracked", "ML": "mostly_lost", "GT": "num_unique_objects",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("rules", "columns"), [("trackeval", TRACKEVAL), ("motmetrics", MOTMETRICS)])

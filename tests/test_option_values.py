@@ -6,7 +6,6 @@ import inspect
 import io
 import json
 import logging
-import re
 import sys
 from contextlib import redirect_stdout
 from contextvars import copy_context
@@ -23,19 +22,8 @@ from mcaptrack.cli.many import ManyOptions
 from mcaptrack.cli.settings import Declared, Setting
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import FleetStatus, Running
-from tests.commands import GROUP, call, done
+from tests.commands import GROUP, Terminal, call, done
 from tests.test_settings import another, options_of, words_for
-
-
-class Terminal(io.StringIO):
-    """A stream that is a terminal."""
-
-    def isatty(self) -> bool:
-        return True
-
-    def shown(self) -> str:
-        """What was written, without colours and moves of the cursor."""
-        return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", self.getvalue())
 
 
 @pytest.fixture

@@ -31,6 +31,7 @@ from mcaptrack.log.check_summary import Finding
 from mcaptrack.notices import Notice
 from mcaptrack.pipeline.summary import Corrected, Looks, Repair, Summary, SummaryScores
 from tests.commands import call, run_result, zones_file
+from tests.worlds import write_clip
 
 SNAPSHOT = Path(__file__).parent / "printed.txt"
 SECOND = 10**9
@@ -363,6 +364,14 @@ def of_mistakes(to: Transcript) -> None:
         to.run(f"tune x.mcap --search {search}")
     for time in ("0", "0.0h", "-1", "1d", "m", "''", "1.", "'1 2'"):
         to.run(f"check x.mcap --timeout={time}")
+    to.run("check x.mcap --memory-limit 1")
+    to.run("check x.mcap --ledger x.mcap")
+    write_clip(Path("clip.mp4"), options={"bf": "0"})
+    for words in ("--quality 60", "--image-format jpeg --quality 0", "--image-format png --quality 9",
+                  "--image-format jpeg --keyframe-interval-s 1", "--keyframe-interval-s 0"):  # fmt: skip
+        to.run(f"ingest clip.mp4 -o c.mcap {words}")
+    to.run("ingest truth.txt -o c.mcap --quality 20")
+    to.lines.append(f"c.mcap is there: {Path('c.mcap').exists()}")
     to.run("run x.mcap", run=McaptrackError("give `fps=25` or `force=True`; `mcaptrack.run('a b.mcap', events=False)`"))
 
 
