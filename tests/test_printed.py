@@ -362,6 +362,9 @@ def of_mistakes(to: Transcript) -> None:
         to.run(f"evaluate x.mcap --fail-under {limit}")
     for search in ("min-iou=0.1", "min-iou=1:2:3", "min-iou=", "min-iou=a:b"):
         to.run(f"tune x.mcap --search {search}")
+    for words in ("alpha", "alhpa=1", "alpha=x", "min_hits=1.5", "trim_ends=maybe", "alpha=1 --set alpha=2",
+                  "link_s=1 --link-s 2", "alpha=2 --profile paper"):  # fmt: skip
+        to.run(f"retrack a.mcap --set {words}")
     for time in ("0", "0.0h", "-1", "1d", "m", "''", "1.", "'1 2'"):
         to.run(f"check x.mcap --timeout={time}")
     to.run("check x.mcap --memory-limit 1")
