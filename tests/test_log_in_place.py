@@ -88,16 +88,6 @@ def test_a_copy_elsewhere_is_the_same_as_the_change_in_place(tmp_path):
     assert contents(copy) == contents(path)
 
 
-def test_numbers_of_channels_never_collide(tmp_path):
-    path = tmp_path / "a.mcap"
-    recorded(path)
-    for value in range(1, 4):
-        add_results(path, value)
-        with log.read(path) as opened:
-            assert len(set(opened.index.channels)) == len(opened.index.channels) == 3
-            assert opened.index.channels[1].topic == "/video"
-
-
 def test_a_log_that_may_not_be_written_to_says_what_to_do(tmp_path, monkeypatch):
     path = tmp_path / "a.mcap"
     recorded(path)

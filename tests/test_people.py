@@ -62,27 +62,6 @@ def test_parts_above_each_other_are_joined_up_to_the_height_of_one_person(seed):
     assert sorted(np.concatenate(groups).tolist()) == list(range(count))
 
 
-@pytest.mark.parametrize(
-    ("lower", "is_one"),
-    [
-        ((10, 23, 4, 9), True),
-        ((10, 24, 4, 9), True),  # together 24 rows: 1.2 times 20
-        ((10, 25, 4, 9), False),
-        ((14, 23, 4, 9), True),  # a column aside
-        ((15, 23, 4, 9), False),
-        ((6, 23, 4, 9), True),
-        ((5, 23, 4, 9), False),
-        ((10, 25, 4, 7), True),
-        ((10, 26, 4, 7), False),  # 8 rows lie between them
-        ((10, 16, 4, 14), True),
-    ],
-)
-def test_parts_at_the_ends_of_the_distances(lower, is_one):
-    found = np.array([(10, 9, 4, 9, 36), (*lower, lower[2] * lower[3])])
-    alone, groups = _joined_parts(found, np.array([20.0, 20.0]))
-    assert (len(alone), len(groups)) == ((0, 1) if is_one else (2, 0))
-
-
 class TestRegions:
     @pytest.mark.parametrize(
         ("box", "person_px", "there"),
@@ -250,12 +229,6 @@ class TestSeparating:
         tall = Person(0.0, 60.0, template())
         assert len(Separator(tall, 0.5).boxes(drawn((200, 200), (0, 80, wide, 8)))[0]) == there
 
-    @pytest.mark.parametrize(("box", "there"), [((40, 40, 6, 4), 1), ((40, 40, 23, 1), 0), ((40, 40, 18, 8), 1)])
-    def test_the_ends_of_what_is_enough_belong_to_it(self, box, there):
-        """Of a person of 20 pixels: an area of six percent of 400, and two fifths of the height."""
-        small = Person(0.0, 20.0, template())
-        assert len(Separator(small, 0.5).boxes(drawn((100, 100), box))[0]) == there
-
     @pytest.mark.parametrize("count", [1, 2, 3, 4])
     def test_a_box_around_several_people_carries_how_many_they_are(self, count):
         separator = Separator(PERSON, 0.5)
@@ -281,32 +254,6 @@ class TestSeparating:
         boxes, people = Separator(PERSON, 0.5).boxes(mask)
         assert (boxes.tolist(), people.tolist()) == ([[*map(float, box)]] * is_large, [0] * is_large)
         assert Separator(PERSON, 0.5).counts(mask, np.array([box], float)).tolist() == [0]
-
-    def test_a_place_gains_what_its_pixels_say(self):
-        """The log-likelihood of a person at each place, summed pixel by pixel."""
-        separator = Separator(PERSON, 0.5)
-        rng = np.random.default_rng(2)
-        ink = (rng.random((30, 26)) > 0.4).astype(np.float32)
-        shape = np.clip(PERSON.template.astype(float), 0, 0.97)
-        hit, miss = np.log((0.03 + 0.97 * shape) / 0.03), np.log(1 - shape)
-        others = [(12, 26)]
-        left = ink.copy()
-        for row in range(ROWS):
-            for column in range(12):
-                y, x = 26 - ROWS + 1 + row, 12 - 6 + column
-                left[y, x] *= 1 - shape[row, column]
-        gains = separator._gains(ink, separator._filter(1 - ink, separator._miss), others)
-        for x, y in ((0, 0), (12, 26), (25, 29), (6, 23), (20, 10)):
-            total = 0.0
-            for row in range(ROWS):
-                for column in range(12):
-                    at_y, at_x = y - ROWS + 1 + row, x - 6 + column
-                    if 0 <= at_y < 30 and 0 <= at_x < 26:
-                        total += left[at_y, at_x] * hit[row, column] + (1 - ink[at_y, at_x]) * miss[row, column]
-            assert gains[y, x] == pytest.approx(total, rel=1e-4, abs=1e-3)
-        place, gain = separator._best(ink, separator._filter(1 - ink, separator._miss), others)
-        assert gain == pytest.approx(float(gains.max()))
-        assert gains[place[1], place[0]] == gains.max()
 
 
 class TestBackground:
