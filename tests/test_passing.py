@@ -450,12 +450,6 @@ def test_vp9_superframes_are_taken_apart_as_ffmpeg_does(tmp_path):
     assert CODECS["vp9"].inspect(two + two + index).is_key is False
 
 
-def test_words_in_a_file_that_are_not_utf_8_are_no_obstacle(tmp_path):
-    path = made("a.mp4", options=X264)(tmp_path)
-    path.write_bytes(path.read_bytes().replace(b"VideoHandler", b"VideoHandl\xe9r"))
-    assert len(list(open_video(path).pictures())) == 20
-
-
 @pytest.mark.parametrize("name", ["a.mp4", "a.webm", "a.avi"])
 def test_a_file_with_bytes_that_changed_is_read_or_refused_in_a_line(tmp_path, name):
     path = tmp_path / name

@@ -503,6 +503,103 @@ def scored(*errors: float) -> list[Frame]:
     return [Frame(ns(n), n, row) for n, row in enumerate(rows)]
 
 
+def test_people_are_where_the_best_tracks_say(tmp_path):
+    """Re-tracked, tracked, true or sampled: the first that knows a place."""
+    names = ("retracks", "tracks", "truth", "samples")
+    channels = {f"/camera/{name}": (TRACKS, Provenance(INGEST, {}), at(float(n))) for n, name in enumerate(names)}
+    for number, name in enumerate(names):
+        with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+            assert writing._positions(opened, "/camera", {})[:, 0].tolist() == pytest.approx(
+                [number, np.nan] * 2, nan_ok=True
+            )
+            shown = {"/camera/retracks": drawing.ChannelToDraw(TRACKS, at(9.0, 1), "", "")}
+            assert writing._positions(opened, "/camera", shown)[0].tolist() == [9.0, 0.0]
+        nowhere = [Frame(0, 0, tracks_at({1: (float("nan"), 1.0)}))] * (number % 2)
+        wrong = (DETECTIONS, Provenance(INGEST, {}), [Frame(0, 0, boxes_at([(1, 1)]))])
+        channels[f"/camera/{name}"] = (TRACKS, Provenance(INGEST, {}), nowhere) if number < 2 else wrong
+    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+        assert writing._positions(opened, "/camera", {}).shape == (0, 2)
+
+
+def test_forecasts_of_re_tracked_people_come_first(tmp_path):
+    def known(of_retracks: list[Frame], of_samples: list[Frame]) -> int:
+        channels = {
+            "/camera/retracks/predictions": (PREDICTIONS, None, of_retracks),
+            "/camera/predictions": (PREDICTIONS, None, of_samples),
+        }
+        with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+            return writing._last_step(opened, "/camera", {})
+
+    assert [known(forecast(1, 3, 2), forecast(1, 9)), known(forecast(), forecast(1, 9)), known([], [])] == [3, 9, 0]
+    nan = float("nan")
+    for first, second, is_known in (
+        ([nan, 1.0], [], True),
+        ([nan, nan], [nan, 2.0], True),
+        ([nan], [nan], False),
+        ([], [], False),
+    ):
+        channels = {
+            "/camera/retracks/predictions/scores": (FORECAST_SCORES, None, scored(*first)),
+            "/camera/predictions/scores": (FORECAST_SCORES, None, scored(*second)),
+        }
+        with log.read(written(tmp_path / "b.mcap", channels)) as opened:
+            assert writing._is_truth_known(opened, "/camera", {}) is is_known
+
+
+def test_a_camera_starts_with_its_first_picture_or_row(tmp_path):
+    ingested = Provenance(INGEST, {})
+    frames = [Frame(ns(n), n, tracks_at({1: (0.0, 0.0)})) for n in (5, 6)]
+    early = [Frame(ns(2), 0, tracks_at({1: (0.0, 0.0)}))]
+    path = written(
+        tmp_path / "a.mcap", {"/camera/tracks": (TRACKS, ingested, frames), "/other/tracks": (TRACKS, ingested, early)}
+    )
+    with log.read(path) as opened:
+        camera = pipeline.camera_at(opened, "/camera")
+        shown = {
+            "/camera/x": drawing.ChannelToDraw(TRACKS, early, "", ""),
+            "/camera/y": drawing.ChannelToDraw(TRACKS, [], "", ""),
+        }
+        none = np.empty(0, np.int64)
+        assert writing._start_ns(opened, camera, {}, none) == ns(5)
+        assert writing._start_ns(opened, camera, shown, none) == ns(2)
+        assert writing._start_ns(opened, camera, shown, np.array([ns(1), ns(9)])) == ns(1)
+    with log.read(written(tmp_path / "b.mcap", {})) as opened:
+        assert writing._start_ns(opened, camera, {}, none) == 0
+
+
+def test_what_was_ingested_is_drawn_once_and_again_when_it_is_new(tmp_path):
+    ingested = Provenance(INGEST, {}, digest="x")
+    for suffix, schema, frames in (
+        ("scene", TRACKS, at(0.0)),
+        ("image", DETECTIONS, [Frame(0, 0, boxes_at([(1, 1)]))]),
+    ):
+        other = "image" if suffix == "scene" else "scene"
+        for view, drawn_from, is_shown in (
+            (suffix, "x", False),
+            (suffix, "y", True),
+            (other, "x", True),
+            ("", "", True),
+        ):
+            channels = {
+                "/camera/labels": (schema, ingested, frames),
+                "/camera/made": (schema, replace(ingested, transform="track"), frames),
+                "/camera/recorded": (schema, None, frames),
+                "/other/labels": (schema, ingested, frames),
+                "/camera/scores": (FORECAST_SCORES, ingested, scored(1.0)),
+            }  # fmt: skip
+            if view:
+                channels[f"/camera/labels/view/{view}"] = (
+                    TRACKS,
+                    Provenance(VIEW, {}, "/camera/labels", drawn_from),
+                    [],
+                )
+            with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+                shown = writing._channels_to_draw(opened, pipeline.camera_at(opened, "/camera"), {})
+            assert list(shown) == ["/camera/labels"] * is_shown
+            for one in shown.values():
+                assert (one.schema, one.digest, one.made_by, len(one.frames)) == (schema, "x", "", len(frames))
+
+
 def views_of(
     names: Mapping[str, tuple[Schema, str]], pictures: Sequence[int] = ()
 ) -> list[tuple[str, str, str, str, list[int]]]:

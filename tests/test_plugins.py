@@ -436,7 +436,10 @@ def test_files_and_environment_choose_them_and_set_their_options(place, monkeypa
     (place / "mcaptrack.toml").write_text("[track]\ntrack-id = 4\n")
     done("track", "a.mcap", "-q", "--tracker=single")
     assert made("/camera/tracks").parameters["track_id"] == 4
+    (place / "mcaptrack.toml").unlink()
     monkeypatch.setenv("MCAPTRACK_TRACK_TRACKER", "single")
+    done("track", "a.mcap", "-q", "--track-id", "5")
+    assert made("/camera/tracks").parameters["track_id"] == 5
     monkeypatch.setenv("MCAPTRACK_TRACK_TRACK_ID", "6")
     done("run", "a.mcap", "-q", "--no-tables", "--force")
     assert made("/camera/tracks").parameters["track_id"] == 6
