@@ -165,6 +165,23 @@ def test_a_chunk_that_is_larger_than_its_index_says_is_not_read(tmp_path, monkey
             Messages(source, one.index)._open(batch._replace(is_direct=False))
 
 
+def test_progress_of_a_check_is_told_at_each_block(tmp_path, monkeypatch):
+    data = records.MAGIC + HEADER + SCHEMA * 5 + END + pack(Opcode.FOOTER, bytes(20)) + records.MAGIC
+    (tmp_path / "a.mcap").write_bytes(data)
+    first = 8 + len(HEADER)
+    monkeypatch.setattr(records, "BLOCK", first)
+    assert len(SCHEMA) == 33
+    told = []
+    log.check(tmp_path / "a.mcap", lambda *step: told.append(step))
+    assert told == [
+        ("check", at, len(data)) for at in (first, first + 33, first + 66, first + 99, first + 132, first + 165)
+    ]
+    told.clear()
+    monkeypatch.setattr(records, "BLOCK", 66)
+    log.check(tmp_path / "a.mcap", lambda *step: told.append(step))
+    assert [at for _, at, _ in told] == [first + 66, first + 132]
+
+
 def recovered(folder: Path, *body: bytes) -> tuple[list[str], list[int], bytes]:
     """What is lost of a log of these records, the times of the messages that are saved, and the saved log."""
     path, saved = folder / "a.mcap", folder / "saved.mcap"

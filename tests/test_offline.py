@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mcaptrack.geometry.assignment import assign_by_gain, assign_pairs_by_gain
 from mcaptrack.transforms import PROFILES
-from mcaptrack.transforms.retrack.identity_swaps import find_swaps
+from mcaptrack.transforms.retrack.identity_swaps import _continuity, find_swaps
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
 from mcaptrack.transforms.retrack.linking import link_tracks, misfits
 from mcaptrack.transforms.retrack.motion_model import (
@@ -25,6 +25,21 @@ from tests.worlds import places, walk
 MODEL = MotionModel(noise_m=0.1, speed_m_per_s=1.5, drift_m_per_s=0.15, drift_ratio=0.0)
 STEP_S = 0.4
 DEFAULT = PROFILES["default"]
+
+
+def test_what_tracks_keep_of_their_input_ids_is_counted_by_hand():
+    """An id is compared with the last one that each of the two tracks had before; -1 is none."""
+    rng = np.random.default_rng(2)
+    a, b = (np.where(rng.random((40, 9)) < 0.3, -1, rng.integers(0, 3, (40, 9))) for _ in range(2))
+    wanted = np.zeros(a.shape)
+    for row in range(len(a)):
+        last_a = last_b = -1
+        for at, (one, other) in enumerate(zip(a[row], b[row], strict=True)):
+            for now, own, others in ((one, last_a, last_b), (other, last_b, last_a)):
+                if now != -1:
+                    wanted[row, at] += int(now == own) - int(now == others)
+            last_a, last_b = (one if one != -1 else last_a), (other if other != -1 else last_b)
+    assert _continuity(a, b).tolist() == wanted.tolist()
 
 
 @given(seed=st.integers(0, 2**32 - 1))

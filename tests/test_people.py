@@ -13,6 +13,7 @@ from mcaptrack.transforms.detect.people import Separator, _joined_parts
 from mcaptrack.transforms.detect.person_model import (
     Learner,
     Person,
+    _fit_height,
     region_boxes,
     regions,
     typical_heights,
@@ -27,6 +28,37 @@ def drawn(size: tuple[int, int], *boxes: tuple[int, int, int, int]) -> np.ndarra
     for x, y, w, h in boxes:
         mask[y : y + h, x : x + w] = 255
     return mask
+
+
+class TestHeightOverFeet:
+    FOOT = np.array([50.0, 70.0, 90.0, 110.0, 130.0, 150.0])
+
+    def fit(self, height, foot=FOOT, weight=None, picture=200):
+        weight = np.ones(len(foot)) if weight is None else np.array(weight, float)
+        return _fit_height(foot, np.array(height, float), weight, picture)
+
+    def test_a_line_is_found_beside_regions_that_do_not_follow_it(self):
+        height = 10 + 0.2 * self.FOOT
+        foot = np.append(self.FOOT, [60.0, 80.0, 100.0])
+        slope, level = self.fit(np.append(height, [60.0, 5.0, 70.0]), foot)
+        assert (slope, level) == (pytest.approx(0.2), pytest.approx(10))
+
+    def test_those_with_more_weight_decide(self):
+        foot = np.concatenate([self.FOOT, self.FOOT])
+        height = np.concatenate([10 + 0.2 * self.FOOT, 40 + 0.4 * self.FOOT])
+        for heavy, (slope, level) in (([3] * 6 + [1] * 6, (0.2, 10)), ([1] * 6 + [3] * 6, (0.4, 40))):
+            assert self.fit(height, foot, heavy) == (pytest.approx(slope), pytest.approx(level))
+
+    def test_who_is_farther_away_is_not_taller(self):
+        slope, level = self.fit(30 - 0.02 * self.FOOT)
+        assert (slope, level) == (0, pytest.approx(np.median(30 - 0.02 * self.FOOT)))
+
+    @pytest.mark.parametrize(("spread", "is_level"), [(20.0, True), (20.5, False)])
+    def test_feet_that_spread_over_a_tenth_of_the_picture_or_less_give_no_slope(self, spread, is_level):
+        foot = np.linspace(100.0, 100.0 + spread, 6)
+        slope, level = self.fit(20 + 0.2 * (foot - 100), foot)
+        assert (slope == 0) == is_level
+        assert level == pytest.approx(np.median(20 + 0.2 * (foot - 100)) if is_level else 0, abs=1e-6)
 
 
 def joined(boxes: np.ndarray, expected: np.ndarray) -> set[frozenset[int]]:
@@ -299,6 +331,15 @@ class TestBackground:
         image[:] = 120
         image[20:24, 20:24] = 80
         assert (grey.mask(image, shadows=True)[20:24, 20:24] == 255).all()
+
+    @pytest.mark.parametrize("factor", [0.8, 0.97, 1.1])
+    def test_light_that_changes_everywhere_is_compensated(self, factor):
+        image = cv2.convertScaleAbs(self.STILL, alpha=factor)
+        image[20:24, 20:24] = 250
+        same = self.background()._same_light(image)
+        assert np.abs(same[:16].astype(int) - self.STILL[:16]).max() <= 1
+        almost = cv2.convertScaleAbs(self.STILL, alpha=1.01)
+        assert self.background()._same_light(almost) is almost
 
     def test_a_pixel_beside_another_colour_may_have_it(self):
         still = self.STILL.copy()
