@@ -152,6 +152,16 @@ class TestPlayer:
         assert data["events"] == [[3.0, "retracks 3.0"]]
         assert data["seconds"][data["open"]] == 2.9
 
+    def test_pictures_are_left_out_evenly_where_their_size_was_estimated_too_small(self, finished, monkeypatch):
+        monkeypatch.setattr("mcaptrack.viewing.notebook.pictures.PictureSource.step", lambda *_: 1)
+        with mcaptrack.open(finished) as log:
+            small = log.show(max_mb=0.2)
+        data = shown(small).data
+        assert small.every in (2, 4, 8)
+        assert data["numbers"] == list(range(0, 60, small.every))
+        assert data["seconds"] == [round(number / 10, 3) for number in data["numbers"]]
+        assert len(shown(small).pictures) == len(data["drawn"]) == small.pictures
+
     def test_it_opens_no_connection_and_runs_only_its_own_script(self, player):
         page = shown(player).page
         (policy,) = (one["content"] for one in page.of("meta") if one.get("http-equiv") == "Content-Security-Policy")

@@ -123,6 +123,18 @@ def test_a_lost_track_is_continued_once():
     assert {1} < set(names(found[30:]))
 
 
+@pytest.mark.parametrize("steps", [1, 256])
+def test_a_track_that_began_before_another_was_lost_does_not_continue_it(steps, monkeypatch):
+    """Tracks are written after 4 s: then the other one, 1.2 m aside, has been over for long."""
+    monkeypatch.setattr(likelihood, "_STEPS", steps)
+
+    def path(n: int) -> dict[int, tuple[float, float]]:
+        out = {1: (0.5 * n, 0.0)} if n < 22 else {}
+        return out | {2: (0.5 * n, 1.2)} if n >= 20 else out
+
+    assert len(names(online(walk(path, 60), confirm_s=4.0, adapt_online=False, link_confidence=0.01))) == 2
+
+
 def test_many_who_leave_are_not_those_who_come_after_them():
     """People pass one after another, four seconds apart; who comes in at the left is not who went out at the right."""
 
