@@ -138,37 +138,6 @@ def test_heads_of_messages_are_where_the_index_says(count):
     assert [len(part) for part in none] == [0, 0, 0]
 
 
-def test_damage_in_a_part_is_at_its_place_in_the_whole():
-    assert str(Damaged("a hole", 12).moved(30)) == "byte 42: a hole"
-    assert str(Damaged("a hole", 0).moved(30)) == "byte 30: a hole"
-    assert str(Damaged("a hole").moved(30)) == "a hole"
-
-
-def test_messages_outside_of_chunks_are_read_in_batches_of_a_block(tmp_path, monkeypatch):
-    path = tmp_path / "a.mcap"
-    write_stock(path, SOME, use_chunking=False)
-    whole = path.read_bytes()
-    places = {topic: [] for topic in "ab"}
-    for topic, t_ns, sequence, data in SOME:
-        head = records.MESSAGE_HEAD.pack(1, sequence, t_ns, t_ns // 2)[2:]
-        places[topic].append(whole.index(head + data) - 11)
-    monkeypatch.setattr(located, "BLOCK", 300)
-    with log.read(path) as one:
-        for topic, at in places.items():
-            number = next(n for n, channel in one.index.channels.items() if channel.topic == topic)
-            source = ByteSource.of(OpenFile.at(path))
-            batches = located.MessageBatches(source, one.index, [number], (None, None))
-            by_block: dict[int, list[int]] = {}
-            for place in at:
-                by_block.setdefault(place // 300, []).append(place)
-            assert [batch.offset.tolist() for batch in batches] == list(by_block.values())
-            assert 2 < len(by_block) < len(at)
-            assert [batch.is_direct for batch in batches] == [True] * len(by_block)
-            assert batches.offset.tolist() == at
-            assert batches.batch.tolist() == [n for n, some in enumerate(by_block.values()) for _ in some]
-            assert set(batches.chunk_offset.tolist()) == {-1}
-
-
 HEADER = pack(Opcode.HEADER, records.text(""), records.text(""))
 END = pack(Opcode.DATA_END, bytes(4))
 SCHEMA = pack(Opcode.SCHEMA, (1).to_bytes(2, "little"), *[records.text("name")] * 2, records.raw(b"{}"))

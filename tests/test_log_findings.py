@@ -57,94 +57,57 @@ def index(number: int, *entries: tuple[int, int]) -> bytes:
 
 A, B = schema(1), channel(2, 1)
 SIZE = len(message(2, 5))
-BESIDE = len(A) + len(B)
 WHOLE = [chunk(message(2, 5), message(2, 7), times=(5, 7)), index(2, (5, 0), (7, SIZE))]
+
+FIVE, SEVEN, LATE = message(2, 5), message(2, 7), message(2, 2**63)
+OTHER = schema(1, "Other")
+
+
+def with_head(*records: bytes) -> list[bytes]:
+    """The records of a data section that begins as usual; the fourth is the first of these."""
+    return [HEADER, A, B, *records, END]
+
 
 #: The records of a data section: which of them the finding names by its first byte, its kind, and how bad it is.
 CASES: dict[str, tuple[Sequence[bytes], int, str, str]] = {
     "no header": ([A, HEADER, B, *WHOLE, END], 0, "no-header", "error"),
-    "an index without a chunk": ([HEADER, A, B, index(2, (5, 0)), *WHOLE, END], 3, "stray-index", "error"),
-    "an index after another record": ([HEADER, A, B, *WHOLE, A, index(2, (5, 0)), END], 6, "stray-index", "error"),
-    "two indexes of a channel": ([HEADER, A, B, *WHOLE, WHOLE[1], END], 5, "double-index", "error"),
-    "a message outside": ([HEADER, A, B, *WHOLE, message(2, 9), END], 5, "unchunked", "warning"),
-    "statistics before the end": ([HEADER, A, B, *WHOLE, record(0x0B, bytes(46)), END], 5, "misplaced", "error"),
-    "a record of a kind to come": ([HEADER, A, B, *WHOLE, record(0x10, b"?"), END], 5, "unknown", "warning"),
+    "an index without a chunk": (with_head(index(2, (5, 0)), *WHOLE), 3, "stray-index", "error"),
+    "an index after another record": (with_head(*WHOLE, A, index(2, (5, 0))), 6, "stray-index", "error"),
+    "two indexes of a channel": (with_head(*WHOLE, WHOLE[1]), 5, "double-index", "error"),
+    "a message outside": (with_head(*WHOLE, message(2, 9)), 5, "unchunked", "warning"),
+    "statistics before the end": (with_head(*WHOLE, record(0x0B, bytes(46))), 5, "misplaced", "error"),
+    "a record of a kind to come": (with_head(*WHOLE, record(0x10, b"?")), 5, "unknown", "warning"),
     "a schema of number zero": ([HEADER, A, schema(0), B, *WHOLE, END], 2, "schema-zero", "error"),
-    "a schema that changes": ([HEADER, A, B, schema(1, "Other"), *WHOLE, END], 3, "two-schemas", "error"),
-    "a channel that changes": ([HEADER, A, B, channel(2, 1, "/b"), *WHOLE, END], 3, "two-channels", "error"),
+    "a schema that changes": (with_head(OTHER, *WHOLE), 3, "two-schemas", "error"),
+    "a channel that changes": (with_head(channel(2, 1, "/b"), *WHOLE), 3, "two-channels", "error"),
     "a channel of a schema that comes later": ([HEADER, B, A, *WHOLE, END], 1, "no-schema", "error"),
     "messages of a channel that comes later": ([HEADER, A, *WHOLE, B, END], 2, "no-channel", "error"),
-    "a message of a channel that comes later": ([HEADER, A, message(2, 5), B, END], 2, "no-channel", "error"),
+    "a message of a channel that comes later": ([HEADER, A, FIVE, B, END], 2, "no-channel", "error"),
     "a chunk without a checksum": (
-        [HEADER, A, B, chunk(message(2, 5), times=(5, 5), has_checksum=False), index(2, (5, 0)), END],
-        3,
-        "no-checksum",
-        "warning",
+        with_head(chunk(FIVE, times=(5, 5), has_checksum=False), index(2, (5, 0))), 3, "no-checksum", "warning"
     ),
-    "a chunk without an index": ([HEADER, A, B, WHOLE[0], END], 3, "no-message-index", "warning"),
-    "a chunk that ends later than it says": (
-        [HEADER, A, B, chunk(message(2, 5), times=(5, 4)), index(2, (5, 0)), END],
-        3,
-        "chunk-times",
-        "error",
-    ),
-    "a chunk that begins earlier than it says": (
-        [HEADER, A, B, chunk(message(2, 5), times=(6, 5)), index(2, (5, 0)), END],
-        3,
-        "chunk-times",
-        "error",
-    ),
-    "a message that no index lists": (
-        [HEADER, A, B, chunk(message(2, 5), message(2, 7), times=(5, 7)), index(2, (5, 0)), END],
-        3,
-        "not-listed",
-        "error",
-    ),
+    "a chunk without an index": (with_head(WHOLE[0]), 3, "no-message-index", "warning"),
+    "a chunk that ends later": (with_head(chunk(FIVE, times=(5, 4)), index(2, (5, 0))), 3, "chunk-times", "error"),
+    "a chunk that begins earlier": (with_head(chunk(FIVE, times=(6, 5)), index(2, (5, 0))), 3, "chunk-times", "error"),
+    "a message that no index lists": (with_head(WHOLE[0], index(2, (5, 0))), 3, "not-listed", "error"),
     "an index that points elsewhere": (
-        [HEADER, A, B, chunk(message(2, 5), times=(5, 5)), index(2, (5, 3)), END],
-        4,
-        "wrong-index",
-        "error",
+        with_head(chunk(FIVE, times=(5, 5)), index(2, (5, 3))), 4, "wrong-index", "error"
     ),
-    "an index with another time": (
-        [HEADER, A, B, chunk(message(2, 5), times=(5, 5)), index(2, (6, 0)), END],
-        4,
-        "wrong-index",
-        "error",
-    ),
+    "an index with another time": (with_head(chunk(FIVE, times=(5, 5)), index(2, (6, 0))), 4, "wrong-index", "error"),
     "messages that go back within a chunk": (
-        [HEADER, A, B, chunk(message(2, 7), message(2, 5), times=(5, 7)), index(2, (7, 0), (5, SIZE)), END],
-        3,
-        "order",
-        "warning",
+        with_head(chunk(SEVEN, FIVE, times=(5, 7)), index(2, (7, 0), (5, SIZE))), 3, "order", "warning"
     ),
     "messages that go back from chunk to chunk": (
-        [HEADER, A, B, *WHOLE, chunk(message(2, 6), times=(6, 6)), index(2, (6, 0)), END],
-        5,
-        "order",
-        "warning",
+        with_head(*WHOLE, chunk(message(2, 6), times=(6, 6)), index(2, (6, 0))), 5, "order", "warning"
     ),
     "a message after the year 2262": (
-        [HEADER, A, B, chunk(message(2, 2**63), times=(2**63, 2**63)), index(2, (2**63, 0)), END],
-        3,
-        "late",
-        "warning",
+        with_head(chunk(LATE, times=(2**63, 2**63)), index(2, (2**63, 0))), 3, "late", "warning"
     ),
     "a schema that changes within a chunk": (
-        [
-            HEADER,
-            A,
-            B,
-            chunk(schema(1, "Other"), message(2, 5), times=(5, 5)),
-            index(2, (5, len(schema(1, "Other")))),
-            END,
-        ],
-        3,
-        "two-schemas",
-        "error",
+        with_head(chunk(OTHER, FIVE, times=(5, 5)), index(2, (5, len(OTHER)))), 3, "two-schemas", "error"
     ),
-    "no end of the data": ([HEADER, A, B, *WHOLE], 5, "no-data-end", "error"),
-}
+    "no end of the data": (with_head(*WHOLE)[:-1], 5, "no-data-end", "error"),
+}  # fmt: skip
 
 
 def put_together(path: Path, records: Sequence[bytes]) -> list[int]:
@@ -268,47 +231,38 @@ CHUNK_INDEX = record(
     + text("")
     + struct.pack("<QQ", 2 * SIZE, 2 * SIZE),
 )
-OTHER_SCHEMA, OTHER_CHANNEL = schema(1, "Other"), channel(2, 1, "/b")
+#: The records of a summary, and what is found of them: kind, level and words.
+LACKING: dict[str, tuple[Sequence[bytes], list[tuple[str, str, str]]]] = {
+    "nothing": ([A, B, CHUNK_INDEX, STATISTICS], []),
+    "schemas and channels": ([CHUNK_INDEX, STATISTICS], []),
+    "a schema": (
+        [schema(3), B, CHUNK_INDEX, STATISTICS],
+        [("summary-no-schema", "warning", "schema 1 is missing in the summary")],
+    ),
+    "a channel": (
+        [A, channel(3, 1, "/b"), CHUNK_INDEX, STATISTICS],
+        [("summary-no-channel", "error", "channel 2 is missing in the summary")],
+    ),
+    "a schema as it is": (
+        [OTHER, B, CHUNK_INDEX, STATISTICS],
+        [("summary-schema", "error", "schema 1 in the summary differs from that in the data section")],
+    ),
+    "a channel as it is": (
+        [A, channel(2, 1, "/b"), CHUNK_INDEX, STATISTICS],
+        [("summary-channel", "error", "channel 2 in the summary differs from that in the data section")],
+    ),
+    "chunks": (
+        [A, B, STATISTICS],
+        [("no-chunk-index", "warning", "the summary lists no chunks: finding a message takes a scan")],
+    ),
+    "statistics": (
+        [A, B, CHUNK_INDEX],
+        [("no-statistics", "warning", "there are no statistics: counting takes a scan")],
+    ),
+}
 
 
-@pytest.mark.parametrize(
-    ("records", "found"),
-    [
-        ([A, B, CHUNK_INDEX, STATISTICS], []),
-        ([CHUNK_INDEX, STATISTICS], []),
-        (
-            [schema(3), B, CHUNK_INDEX, STATISTICS],
-            [("summary-no-schema", "warning", "schema 1 is missing in the summary")],
-        ),
-        (
-            [A, channel(3, 1, "/b"), CHUNK_INDEX, STATISTICS],
-            [("summary-no-channel", "error", "channel 2 is missing in the summary")],
-        ),
-        (
-            [OTHER_SCHEMA, B, CHUNK_INDEX, STATISTICS],
-            [("summary-schema", "error", "schema 1 in the summary differs from that in the data section")],
-        ),
-        (
-            [A, OTHER_CHANNEL, CHUNK_INDEX, STATISTICS],
-            [("summary-channel", "error", "channel 2 in the summary differs from that in the data section")],
-        ),
-        (
-            [A, B, STATISTICS],
-            [("no-chunk-index", "warning", "the summary lists no chunks: finding a message takes a scan")],
-        ),
-        ([A, B, CHUNK_INDEX], [("no-statistics", "warning", "there are no statistics: counting takes a scan")]),
-    ],
-    ids=[
-        "whole",
-        "no schemas and channels",
-        "no schema",
-        "no channel",
-        "another schema",
-        "another channel",
-        "no chunks",
-        "no statistics",
-    ],
-)
+@pytest.mark.parametrize(("records", "found"), LACKING.values(), ids=LACKING)
 def test_what_a_summary_lacks_is_a_warning_where_it_costs_time_and_an_error_where_it_hides_messages(
     records, found, tmp_path
 ):

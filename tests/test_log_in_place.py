@@ -6,6 +6,7 @@ import errno
 import os
 import random
 import zlib
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -88,16 +89,6 @@ def test_a_copy_elsewhere_is_the_same_as_the_change_in_place(tmp_path):
     assert contents(copy) == contents(path)
 
 
-def test_numbers_of_channels_never_collide(tmp_path):
-    path = tmp_path / "a.mcap"
-    recorded(path)
-    for value in range(1, 4):
-        add_results(path, value)
-        with log.read(path) as opened:
-            assert len(set(opened.index.channels)) == len(opened.index.channels) == 3
-            assert opened.index.channels[1].topic == "/video"
-
-
 def test_a_log_that_may_not_be_written_to_says_what_to_do(tmp_path, monkeypatch):
     path = tmp_path / "a.mcap"
     recorded(path)
@@ -161,6 +152,28 @@ def test_bytes_that_are_read_back_otherwise_than_written_leave_the_log_as_it_was
             with log.read(path) as opened, log.extend(opened, copy) as writer:
                 writer.add_message(writer.add_channel("/new", SCHEMA, "json", {}, "media"), 1, 1, bytes(1000))
     assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("at", [0, 70_000, -1])
+def test_a_copy_that_differs_in_any_byte_is_not_published(at, tmp_path, monkeypatch):
+    path, copy = tmp_path / "a.mcap", tmp_path / "copy.mcap"
+    recorded(path, count=3)
+    extending = import_module("mcaptrack.log.extend")  # mcaptrack.log.extend itself is a function
+    monkeypatch.setattr(extending, "BLOCK", 1000)
+
+    def copy_wrongly(source, end, stream) -> None:
+        data = bytearray(source[0:end])
+        data[at] ^= 1
+        stream.write(bytes(data))
+
+    monkeypatch.setattr(extending, "_copy_bytes", copy_wrongly)
+    with (
+        pytest.raises(McaptrackError, match="does not hold what was written to it"),
+        log.read(path) as opened,
+        log.extend(opened, copy),
+    ):
+        pass
     assert list(tmp_path.iterdir()) == [path]
 
 

@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import GroundTracker
 from mcaptrack.transforms.ground import state
-from mcaptrack.transforms.ground.tracker import LostTracks, _Run, continuations
+from mcaptrack.transforms.ground.tracker import LostTracks, continuations
 from tests.effects.ground import NAMES, Box, boxes
 
 GAP = range(20, 50)
@@ -162,47 +162,3 @@ def test_a_track_that_still_coasts_may_be_continued_too_and_lost_ones_stay_lost(
     assert sorted(frames[5].rows["track_id"].tolist()) == sorted(frames[-1].rows["track_id"].tolist())
     assert [len(one.rows) for one in (frames[30], frames[50], frames[-1])] == [1, 1, 2]
     assert frames[50].rows["y_m"][0] == pytest.approx(0.7, abs=0.1)
-
-
-@pytest.mark.parametrize(
-    ("what", "kept"),
-    [
-        ({"xx": 0.1, "xy": 0.0, "yy": 0.1}, True),
-        ({"xx": 0.0, "xy": 0.0, "yy": 0.1}, False),
-        ({"xx": 0.1, "xy": 0.0, "yy": 0.0}, False),
-        ({"xx": 0.1, "xy": 0.1, "yy": 0.1}, False),  # singular
-        ({"xx": 0.1, "xy": np.nan, "yy": 0.1}, False),
-        ({"xx": np.inf, "xy": 0.0, "yy": 0.1}, False),
-    ],
-)
-def test_covariances_that_are_none_are_not_used(what: dict[str, float], kept: bool):
-    run = _Run(GroundTracker(class_names=NAMES))
-    (frame,) = boxes(lambda _: [(3.0, 1.0), (1.0, 2.0)], 1)
-    for name, value in what.items():
-        frame.rows[f"cov_{name}_m2"][0] = value
-    (table,) = run.detections([frame])
-    assert len(table) == state.DETECTION_ROWS + 3 * kept
-    assert table[state.X].tolist() == [1.0, 3.0]  # in an order of their own
-    if kept:
-        assert table[state.COVARIANCE, 1].tolist() == [what["xx"], what["xy"], what["yy"]]
-        assert np.isnan(table[state.COVARIANCE, 0]).all()
-
-
-@pytest.mark.parametrize(
-    ("options", "left"),
-    [
-        ({}, [1, 2, 3]),
-        ({"min_score": 0.5}, [2, 3]),
-        ({"class_id": 3}, [1, 3]),
-        ({"min_score": 0.6, "class_id": 3}, [3]),
-    ],
-)
-def test_detections_that_are_used(options: dict[str, float], left: list[int]):
-    """Scores of 0.4, 0.5, none, and one without a position."""
-    (frame,) = boxes(lambda _: [(1.0, 0.0), (2.0, 0.0), (3.0, 0.0), (4.0, 0.0)], 1)
-    frame.rows["score"], frame.rows["class_id"] = [0.4, 0.5, np.nan, 0.9], [3, 1, 3, 3]
-    frame.rows["y_m"][3] = np.nan
-    run = _Run(GroundTracker(class_names=NAMES, **options))
-    (found,) = run.detections([frame])
-    assert found[state.X].tolist() == left
-    assert run._left_out == 1

@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 
 from mcaptrack.cli import common
-from mcaptrack.fleet import FleetStatus, Running
 from mcaptrack.pipeline import LAYOUTS, layout_path
 from tests.commands import call, done
 
@@ -96,21 +95,6 @@ def test_commands_that_combine_logs_take_folders_and_lists(folder, monkeypatch):
     assert {one["sequence"] for one in json.loads(done("evaluate", "-", "--json").out)["results"]} == {"a"}
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--timeout", "soon"], "--timeout needs a time such as 90s, 10m or 2h, not 'soon'"),
-        (["--memory-limit", "1"], "--memory-limit needs a size such as 2GB or 500MB, not '1': that is too little"),
-        (
-            ["--ledger", "logs/a.mcap"],
-            "logs/a.mcap is not a ledger: it does not begin with a line of JSON; give another name",
-        ),
-    ],
-)
-def test_what_is_wrong_is_one_line(folder, words, said):
-    assert call("check", "logs", *words) == (1, "", f"mcaptrack: {said}\n")
-
-
 def test_lines_of_json_say_when_what_ended_and_how(folder, monkeypatch):
     (folder / "logs" / "noise.mcap").write_bytes(b"noise")
     monkeypatch.setattr(common, "PROGRESS_S", 0.0)
@@ -175,17 +159,3 @@ def test_many_inputs_are_ingested_by_workers_and_once(folder, monkeypatch):
     assert (folder / "made" / "x.mcap").exists()
     code, _, err = call("ingest", "labels/x.txt", "labels/y.txt", "-o", "z.mcap")
     assert (code, "can't all be written to z.mcap" in err) == (1, True)
-
-
-def test_the_table_on_a_terminal_names_the_logs_that_run(folder):
-    from rich.console import Console
-
-    from mcaptrack.cli.many import table_of
-
-    running = (Running(Path("logs/\x1b[31mx.mcap"), "detect", 3, 4, 12.3, 250_000_000), Running(Path("y.mcap")))
-    console = Console(file=io.StringIO(), width=80)
-    console.print(table_of(FleetStatus(9, {"done": 3, "killed": 1}, running, 61.0)))
-    shown = console.file.getvalue()
-    assert "4 of 9 logs in 61 s: 3 done, 1 killed" in shown
-    assert [part for part in ("detect", "75%", "12", "250") if part not in shown] == []
-    assert "\x1b" not in shown

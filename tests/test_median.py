@@ -11,14 +11,12 @@ from scipy import ndimage
 
 import mcaptrack
 from mcaptrack import McaptrackError, log, pipeline
-from mcaptrack.geometry.affine import IDENTITY
 from mcaptrack.geometry.assignment import assign
 from mcaptrack.geometry.boxes import columns_to_boxes, iou
 from mcaptrack.notices import collected
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import STAGES, KnnDetector, MedianDetector
-from mcaptrack.transforms.detect import median
-from mcaptrack.transforms.detect.median_background import MAX_SAMPLES, Background, Sampler
+from mcaptrack.transforms.detect.median_background import Background
 from mcaptrack.transforms.detect.people import Separator
 from mcaptrack.transforms.detect.person_model import Learner, Person, closed
 from tests.drawn import HEIGHT, WIDTH, figure, film, walk
@@ -296,17 +294,6 @@ def test_a_log_is_read_twice_and_its_detections_are_those_of_the_pictures(tmp_pa
     assert known["median"] is MedianDetector
 
 
-def test_samples_lie_evenly_over_all_that_came():
-    for count in (10, MAX_SAMPLES, MAX_SAMPLES + 1, 1000, 5000):
-        sampler = Sampler()
-        for number in range(count):
-            sampler.add(lambda number=number: np.full((1, 1, 3), number % 251, np.uint8))
-        kept = len(sampler.pictures)
-        assert min(count, MAX_SAMPLES // 2) <= kept <= MAX_SAMPLES
-        steps = np.diff([int(picture[0, 0, 0]) for picture in sampler.pictures]) % 251
-        assert len(set(steps.tolist())) <= 1
-
-
 def test_the_background_is_the_median_of_each_channel_and_the_noise_its_deviation():
     rng = np.random.default_rng(3)
     samples = [rng.integers(100, 120 if n < 5 else 220, (12, 16, 3), dtype=np.uint8) for n in range(9)]
@@ -347,28 +334,3 @@ def test_the_same_people_are_found_wherever_the_picture_is_cut():
     moved = np.roll(mask, (17, 90), axis=(0, 1))
     np.testing.assert_allclose(separator.boxes(moved)[0], separator.boxes(mask)[0] + [90, 17, 0, 0], atol=1e-6)
     assert len(separator.boxes(mask)[0]) == 3
-
-
-@pytest.mark.parametrize(
-    ("times_s", "history_s", "begins_s"),
-    [
-        ([n * 0.2 for n in range(10)], 600.0, [0.0]),  # 1.8 s, ten pictures
-        ([n * 0.2 for n in range(9)], 600.0, []),
-        ([n * 0.199 for n in range(10)], 600.0, []),
-        ([n * 0.1 for n in range(10)], 1.7, [0.0]),  # half of the history is enough
-        ([n * 0.1 for n in range(41)], 2.0, [0.0, 2.0]),
-        ([n * 0.1 for n in range(30)], 2.0, [0.0]),  # the last block is shorter than half of the history
-        ([n * 0.1 for n in range(31)], 2.0, [0.0, 2.0]),
-    ],
-)
-def test_blocks_of_time_that_have_a_background(times_s, history_s, begins_s):
-    view, detector = median._View((16, 24, 3)), MedianDetector(history_s=history_s)
-    picture = np.full((16, 24, 3), 90, np.uint8)
-    for number, t_s in enumerate(times_s):
-        view.add(median._Picture(ns(7 + t_s), picture, IDENTITY, number == 4), detector)
-        if number == 4:  # one that could not be registered is no sample
-            view.add(median._Picture(ns(7 + t_s), picture, IDENTITY), detector)
-    view.close(detector)
-    assert [begin_ns for begin_ns, _ in view._blocks] == [ns(7 + t_s) for t_s in begins_s]
-    assert view.is_short == (not begins_s)
-    assert (view.lost, len(view.to_reference)) == ({4}, len(times_s) + 1)

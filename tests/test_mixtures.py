@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.stats import chi2, multivariate_normal
 
-from mcaptrack import Scores
-from mcaptrack.cli.evaluate import print_results
-from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
 from mcaptrack.evaluation.forecasts import score_forecasts
 from mcaptrack.evaluation.metrics.displacement import RELIABILITY_LEVELS, ellipse_levels, negative_log_likelihood
 from mcaptrack.foxglove.views.people import ellipses, forecasts
@@ -80,15 +75,6 @@ def test_the_likelihood_equals_that_of_scipy(weight, narrow, wide, error):
     wanted = -np.log((1 - weight) * parts[0] + weight * parts[1])
     found = negative_log_likelihood(np.array([error]), cov[None], tails(weight, narrow, wide))
     assert found.item() == pytest.approx(wanted)
-
-
-def test_the_density_integrates_to_one():
-    cov, shape = np.array([[0.3, 0.1], [0.1, 0.2]]), (0.3, 0.4, 2.4)
-    side = np.linspace(-6, 6, 301)
-    grid = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
-    several = Tails(*(np.full(len(grid), part) for part in shape))
-    density = np.exp(-negative_log_likelihood(grid, np.broadcast_to(cov, (len(grid), 2, 2)), several))
-    assert density.sum() * (side[1] - side[0]) ** 2 == pytest.approx(1, abs=1e-4)
 
 
 def forecast(count: int = 2, steps: int = 3) -> Forecast:
@@ -177,18 +163,6 @@ def test_scores_are_those_of_the_mixture():
     assert found["mixture"].summary()["NLL"] == pytest.approx(-np.log(wanted / (2 * np.pi)))
     # 1 - exp(-2) = 86.5 % of the normal distribution lie nearer
     assert [part["held"] for part in found["normal"].reliability()] == [0.0] * 8 + [1.0] * 3
-
-
-def test_evaluate_prints_the_reliability_below_the_errors(capsys):
-    made = Forecast(np.array([[[2.4, 0.9]]]), np.eye(2)[None, None])  # 1 - exp(-0.405) = 33 % lie nearer
-    frames = [Frame(5 * 400_000_000, 5, forecast_to_rows(np.array([1]), made, 0.4))]
-    candidate = Candidate("/camera/samples", None, walk(), frames, "/camera/predictions")
-    options = EvaluateOptions(similarities=("metres",), gates_m=(1.0,))
-    print_results(Scores(evaluate([EvaluationInput("walk", walk(), [candidate])], options).results, (), ()))
-    *_, head, row = capsys.readouterr().out.rstrip().splitlines()
-    levels = [f"in {100 * level:g} %" for level in RELIABILITY_LEVELS]
-    assert re.split("  +", head.strip()) == ["reliability of", *levels]
-    assert row.split() == ["/camera/samples", *["0.000"] * 3, *["1.000"] * 8]
 
 
 def test_forecasts_without_covariance_have_no_reliability():

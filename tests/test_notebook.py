@@ -138,14 +138,6 @@ class TestPlayer:
         assert found.data["sizes"] == [[320, 180]] * 60
         assert found.data["numbers"] == list(range(60))
 
-    def test_it_opens_at_the_first_event_and_names_all(self, finished, player):
-        data = shown(player).data
-        with mcaptrack.view(finished) as server:
-            events = [one for one in server.events if one.topic == "/camera/retracks"]
-            at_s = server.at_s
-        assert [text for _, text in data["events"]] == [one.text for one in events]
-        assert abs(data["seconds"][data["open"]] - at_s) <= 0.1
-
     def test_it_opens_where_viewers_do_and_names_events_of_its_period_and_tracks(self, finished, monkeypatch):
         start_ns = start_of(finished)
         at = [("retracks", 1.0), ("retracks", 3.0), ("tracks", 3.1), ("retracks", 5.0)]

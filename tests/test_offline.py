@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import multivariate_t
 
 from mcaptrack.geometry.assignment import assign_by_gain, assign_pairs_by_gain
 from mcaptrack.transforms import PROFILES
@@ -18,8 +17,6 @@ from mcaptrack.transforms.retrack.linking import link_tracks, misfits
 from mcaptrack.transforms.retrack.motion_model import (
     MotionModel,
     State,
-    StateRows,
-    Trajectories,
     smooth,
     to_trajectories,
 )
@@ -43,72 +40,6 @@ def test_what_tracks_keep_of_their_input_ids_is_counted_by_hand():
                     wanted[row, at] += int(now == own) - int(now == others)
             last_a, last_b = (one if one != -1 else last_a), (other if other != -1 else last_b)
     assert _continuity(a, b).tolist() == wanted.tolist()
-
-
-def one_path(xy: np.ndarray, start: int = 0) -> Trajectories:
-    steps = start + np.arange(len(xy))
-    return Trajectories(np.array([0, len(xy)]), steps, xy, np.full(len(xy), MODEL.noise_m))
-
-
-def joint(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (n, 2) and variance (n,) of every true position given all measured ones, from one joint Gaussian."""
-    count = len(xy)
-    move = np.array([[1, STEP_S], [0, 1]])
-    noise = MODEL.drift_m_per_s**2 * np.array([[STEP_S**3 / 3, STEP_S**2 / 2], [STEP_S**2 / 2, STEP_S]])
-    seen = np.flatnonzero(np.isfinite(xy[:, 0]))
-    # a flat prior of the first position, as in a filter that starts at its measurement
-    cov = np.zeros((2 * count, 2 * count))
-    cov[:2, :2] = np.diag([1e3, MODEL.speed_m_per_s**2])
-    for k in range(1, count):
-        row = move @ cov[2 * k - 2 : 2 * k, : 2 * k]
-        cov[2 * k : 2 * k + 2, : 2 * k] = row
-        cov[: 2 * k, 2 * k : 2 * k + 2] = row.T
-        cov[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = move @ cov[2 * k - 2 : 2 * k, 2 * k - 2 : 2 * k] @ move.T + noise
-    at = 2 * np.arange(count)
-    gain = cov[np.ix_(at, at[seen])] @ np.linalg.inv(
-        cov[np.ix_(at[seen], at[seen])] + MODEL.noise_m**2 * np.eye(len(seen))
-    )
-    variance = np.diag(cov[np.ix_(at, at)] - gain @ cov[np.ix_(at[seen], at)])
-    return gain @ xy[seen], variance
-
-
-class TestMotion:
-    def test_smoothed_positions_are_the_mean_given_all_measurements(self):
-        rng = np.random.default_rng(3)
-        xy = np.cumsum(rng.normal(0.4, 0.1, (14, 2)), axis=0)
-        xy[5:8] = np.nan
-        _, _, smoothed = smooth(MODEL, one_path(xy), STEP_S)
-        mean, variance = joint(xy)
-        np.testing.assert_allclose(smoothed.mean[:, :2], mean, atol=1e-3)
-        np.testing.assert_allclose(smoothed.cov[:, 0], variance, rtol=0.01)
-
-    def test_tracks_are_smoothed_independently_of_each_other(self):
-        rng = np.random.default_rng(4)
-        parts = [rng.normal(0, 3, (n, 2)) for n in (9, 1, 4)]
-        first = np.array([0, 9, 10, 14])
-        together = Trajectories(
-            first, np.concatenate([np.arange(n) for n in (9, 1, 4)]), np.concatenate(parts), np.full(14, 0.1)
-        )
-        whole = smooth(MODEL, together, STEP_S)
-        for k, part in enumerate(parts):
-            for a, b in zip(whole, smooth(MODEL, one_path(part), STEP_S), strict=True):
-                np.testing.assert_allclose(a.mean[first[k] : first[k + 1]], b.mean, atol=1e-9)
-
-    def test_the_backward_filter_is_the_forward_filter_in_reversed_time(self):
-        xy = np.cumsum(np.random.default_rng(5).normal(0.3, 0.2, (10, 2)), axis=0)
-        _, backward, _ = smooth(MODEL, one_path(xy), STEP_S)
-        forward, _, _ = smooth(MODEL, one_path(xy[::-1]), STEP_S)
-        np.testing.assert_allclose(backward.mean[:, :2], forward.mean[::-1, :2])
-        np.testing.assert_allclose(backward.mean[:, 2:], -forward.mean[::-1, 2:])
-
-    def test_two_predictions_in_a_row_equal_one_over_the_whole_time(self):
-        state = StateRows(np.array([[1.0], [2], [0.5], [-1]]), np.array([[0.1], [0.02], [0.3]]))
-        one = StateRows(np.empty((4, 1)), np.empty((3, 1)))
-        MODEL.predict(state, 1.2, one)
-        for seconds in (0.4, 0.8):
-            MODEL.predict(state, seconds, state)  # in place
-        np.testing.assert_allclose(one.mean, state.mean)
-        np.testing.assert_allclose(one.cov, state.cov)
 
 
 @given(seed=st.integers(0, 2**32 - 1))
@@ -186,48 +117,11 @@ class TestEncounters:
         course, _ = find_swaps(self.apart(slice(8, 15), 0.05), np.full((1, 40), 5.0), STEP_S, 0.05, 1.5)
         assert np.flatnonzero(course[0]).tolist() == list(range(8, 15))
 
-    @pytest.mark.parametrize(("turn", "drift"), [(0.0, 0.05), (0.4, 0.15), (0.7, 0.4), (1.6, 1.2)])
-    def test_the_gain_is_that_of_the_most_likely_drift(self, turn, drift):
-        """One walks around the other: the faster, the more their relative velocity drifts. By a filter for each path."""
-        angle = turn * STEP_S * np.arange(30)
-        away = np.stack([1.5 * np.cos(angle), 1.5 * np.sin(angle)], axis=-1)
-        away += np.random.default_rng(1).normal(0, 0.05, (30, 2))
-        away[12:] *= -1
-        course, gain = find_swaps(away[None], np.full((1, 30), 5.0), STEP_S, 0.05, 1.5)
-        assert np.flatnonzero(course[0]).tolist() == list(range(12, 30))
-        none = {one: self.log_likelihood(away, one) for one in (0.05, 0.15, 0.4, 1.2)}
-        swapped = {one: self.log_likelihood(np.where(course[0][:, None], -away, away), one) for one in none}
-        assert max(swapped, key=swapped.get) == drift
-        assert gain[0] == pytest.approx(swapped[drift] - 5.0 - none[drift])
-
-    def log_likelihood(self, away: np.ndarray, drift: float) -> float:
-        """Of relative positions (T, 2) of two people with a measurement noise of 0.05 m each."""
-        move = np.array([[1, STEP_S], [0, 1]])
-        noise = drift**2 * np.array([[STEP_S**3 / 3, STEP_S**2 / 2], [STEP_S**2 / 2, STEP_S]])
-        mean, cov = np.stack([away[0], np.zeros(2)]), np.diag([2 * 0.05**2, 2 * 1.5**2])
-        total = 0.0
-        for at in away[1:]:
-            mean, cov = move @ mean, move @ cov @ move.T + noise
-            variance = cov[0, 0] + 2 * 0.05**2
-            off = at - mean[0]
-            total += multivariate_t(shape=variance * np.eye(2), df=6).logpdf(off)
-            gain = cov[:, 0] / variance
-            mean, cov = mean + np.outer(gain, off), cov - np.outer(gain, cov[0])
-        return float(total)
-
     def test_without_a_swap_none_is_found(self):
         for seed in range(20):
             course, gain = find_swaps(self.apart(slice(0, 0), 0.1, seed), np.full((1, 40), 5.0), STEP_S, 0.1, 1.5)
             assert not course.any()
             assert gain[0] <= 0
-
-    def test_encounters_are_disjoint_and_span_gaps(self):
-        one, two = self.apart(slice(20, None), 0.05), self.apart(slice(0, 0), 0.05, 1)
-        one[0, 17:23] = np.nan
-        course, _ = find_swaps(np.concatenate([one, two]), np.full((2, 40), 5.0), STEP_S, 0.05, 1.5)
-        assert course[0, 23:].all()
-        assert not course[0, :17].any()
-        assert not course[1].any()
 
 
 class TestOffline:

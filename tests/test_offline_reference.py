@@ -168,15 +168,16 @@ def test_pieces_with_one_input_id_may_be_linked_within_6_s_however_they_move(sin
 
 @given(seed=SEEDS)
 @settings(max_examples=25)
-def test_links_are_the_same_without_a_table_of_all_pairs(seed):
+def test_links_are_the_same_without_a_table_of_all_pairs_and_in_batches_of_any_size(seed):
     rng = np.random.default_rng(seed)
     model, _ = models(rng)
     out, _ = laid_out(scattered(rng, 14), model.noise_m)
     forward, backward, _ = smooth(model, out, 0.4)
     whole = link_tracks(model, out, forward, backward, 0.4, 20.0, 0.1)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(linking, "_TABLE_CELLS", 1)
-        assert link_tracks(model, out, forward, backward, 0.4, 20.0, 0.1).tolist() == whole.tolist()
+    for name, value in (("_TABLE_CELLS", 1), ("_BATCH", int(rng.integers(1, 9)))):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(linking, name, value)
+            assert link_tracks(model, out, forward, backward, 0.4, 20.0, 0.1).tolist() == whole.tolist()
 
 
 @given(seed=SEEDS)
@@ -254,20 +255,6 @@ def test_decisions_at_encounters_equal_the_reference(seed):
         rows = slice(out.first[k], out.first[k + 1])
         found = dict(zip(out.step[rows].tolist(), (names[o] for o in owner[rows].tolist()), strict=True))
         assert {step: found[step] for step in paths[name]} == wanted[name]
-
-
-@given(seed=SEEDS)
-@settings(max_examples=10)
-def test_links_are_the_same_in_batches_of_any_size(seed):
-    rng = np.random.default_rng(seed)
-    model, _ = models(rng)
-    out, _ = laid_out(scattered(rng, 12), model.noise_m)
-    forward, backward, _ = smooth(model, out, 0.4)
-    whole = linking.candidates(out, forward, backward, 0.4, 20.0)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(linking, "_BATCH", int(rng.integers(1, 9)))
-        parts = linking.candidates(out, forward, backward, 0.4, 20.0)
-    assert [one.tolist() for one in parts] == [one.tolist() for one in whole]
 
 
 @given(seed=SEEDS)

@@ -123,18 +123,6 @@ def test_a_lost_track_is_continued_once():
     assert {1} < set(names(found[30:]))
 
 
-def test_a_track_that_was_continued_is_not_lost_any_more():
-    """One comes back after 4 s; another one comes out 2 s later, where the first would be if it had not."""
-
-    def path(n: int) -> dict[int, tuple[float, float]]:
-        out = hidden(10)(n)
-        return out | {3: (0.5 * n, 1.2)} if n >= 35 else out
-
-    found = online(walk(path, 60))
-    assert ids(found[30]) == [1]
-    assert [len(set(ids(frame))) for frame in found[35:]] == [2] * 25
-
-
 @pytest.mark.parametrize("steps", [1, 256])
 def test_a_track_that_began_before_another_was_lost_does_not_continue_it(steps, monkeypatch):
     """Tracks are written after 4 s: then the other one, 1.2 m aside, has been over for long."""

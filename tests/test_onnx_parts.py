@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -157,78 +156,6 @@ COUNT = len(places(8, 16, 32))
 def test_the_shape_of_one_output_tells_how_boxes_are_arranged(shape, kind):
     assert outputs.ultralytics_kind({"out": array(*shape)}, SIZE) == kind
     assert outputs.ultralytics_kind({"out": array(*shape), "more": array(1)}, SIZE) is None
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "fits"),
-    [(0, 1, True), (-0.0009, 1.0009, True), (-0.0011, 1, False), (0, 1.0011, False), (0, math.nan, False)],
-)
-def test_likelihoods_are_from_0_to_1_but_for_what_is_rounded(low, high, fits):
-    if fits:
-        assert outputs.likelihoods(np.array([low, high])).tolist() == [low, high]
-    else:
-        with pytest.raises(MisreadError, match="scores are no likelihoods from 0 to 1"):
-            outputs.likelihoods(np.array([low, high]))
-    assert outputs.likelihoods(np.empty(0)).size == 0
-
-
-def boxes(xyxy: Any, scores: Any, labels: Any = None, least: float = 0.1):
-    xyxy, scores = np.array(xyxy, float), np.array(scores, float)
-    return outputs._boxes(xyxy, scores, np.zeros(len(scores)) if labels is None else np.array(labels, float), least)
-
-
-LARGE = [10.0, 10.0, 30.0, 40.0]
-
-
-@pytest.mark.parametrize(
-    ("given", "scores", "labels", "words"),
-    [
-        ([[0, 0, 1, 2.0]], [0.4], None, "boxes are given as shares of the input"),
-        ([[0, 0, 1, 2.0]], [0.39], None, ""),
-        ([[0, 0, 1, 2.01]], [0.4], None, ""),
-        ([[-2.5, 0, 1, 1]], [0.4], None, ""),
-        ([[30, 10, 10, 40], LARGE], [0.9, 0.9], None, ""),
-        ([[30, 10, 10, 40], [10, 40, 30, 10], LARGE], [0.9] * 3, None, "boxes end before they begin"),
-        ([[30, 10, 10, 40], [10, 40, 30, 10], LARGE], [0.9, 0.2, 0.2], None, "boxes end before they begin"),
-        ([[10, 10, 10, 10]], [0.9], None, ""),
-        ([LARGE, LARGE], [0.4, 0.3], [1.0, 1.5], ""),
-        ([LARGE, LARGE], [0.4, 0.4], [1.0, 1.5], "classes are not whole numbers"),
-    ],
-)
-def test_sure_boxes_tell_what_the_outputs_cannot_be(given, scores, labels, words):
-    if words:
-        with pytest.raises(MisreadError, match=words):
-            boxes(given, scores, labels)
-    else:
-        assert boxes(given, scores, labels).xyxy.tolist() == given
-
-
-def test_boxes_are_kept_from_the_least_score_on_and_scores_end_at_1():
-    found = boxes([LARGE] * 4, [0.0999, 0.1, 1.0005, 0.5], [1, 2, 3, 4])
-    assert (found.score.tolist(), found.label.tolist()) == ([0.1, 1.0, 0.5], [2, 3, 4])
-    assert found.label.dtype.kind == "i"
-
-
-def test_boxes_that_follow_the_grid_are_centres_in_pixels_or_an_error():
-    cells = np.array(places(8, 16, 32), float)
-    centre = (cells[:, :2] + 0.5) * cells[:, 2:]
-    rng = np.random.default_rng(1)
-    size = rng.uniform(5, 30, centre.shape)
-    kind = outputs._kind_of_places
-    assert kind(np.hstack([centre, size]), SIZE) == "pixels"
-    assert kind(np.hstack([rng.uniform(-1, 1, centre.shape), size]), SIZE) == "offsets"
-    assert kind(np.hstack([rng.uniform(-1, 1, centre.shape), centre]), SIZE) == "offsets"
-    assert kind(np.hstack([centre[:, :1], rng.uniform(-1, 1, (len(cells), 1)), size]), SIZE) == "offsets"
-    assert kind(np.hstack([centre[:, ::-1], size]), SIZE) == "offsets"
-    assert kind(np.hstack([centre, centre[:, :1], size[:, :1]]), SIZE) == "pixels"
-    assert kind(np.hstack([centre * 0.3, size]), SIZE) == "pixels"
-    with pytest.raises(MisreadError, match="given by their corners, and centre and size are expected"):
-        kind(np.hstack([centre - size / 2, centre + size / 2]), SIZE)
-    with pytest.raises(MisreadError, match="given as shares of the input, and pixels are expected"):
-        kind(np.hstack([centre / WIDE, size / WIDE]), SIZE)
-    three = [np.tile(centre[cells[:, 2] == stride], (3, 1)) for stride in (8, 16, 32)]
-    rows = np.concatenate(three)
-    assert kind(np.hstack([rows, rows * 0 + 9]), SIZE, 3) == "pixels"
 
 
 # The graph

@@ -4,27 +4,21 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from itertools import pairwise
-from typing import get_type_hints
 
-import numpy as np
 import pytest
 
 from mcaptrack.transforms import (
-    STAGES,
     TRACKERS,
     TRANSFORMS,
     GroundTracker,
-    OnnxDetector,
     RetrackByConsistency,
 )
-from mcaptrack.transforms.protocol import bare_type
 from mcaptrack.transforms.retrack import RetrackOptions
 from tests.effects import Case, ground, others, retrack, sort
 from tests.tiers import one_in
 
 CASES = retrack.CASES | sort.CASES | others.CASES | ground.CASES
 KINDS = dict(TRANSFORMS) | dict(TRACKERS) | {"consistency": RetrackByConsistency, "ground": GroundTracker}
-BUILT_IN = {f"{stage} {name}": kind for stage, one in STAGES.items() for name, kind in one.built_in().items()}
 ORDER = ("least", "more", "most")
 
 
@@ -48,37 +42,3 @@ def test_every_option_has_a_scene():
     options = {(kind, o.name) for kind, made in KINDS.items() for o in fields(made) if not o.metadata.get("context")}
     shared = {("consistency", o.name) for o in fields(RetrackOptions)}  # their scenes are those of retrack
     assert set(CASES) == options - shared
-
-
-#: Ranges that don't follow from what an option is.
-RANGES = {
-    "class_id": (0, 2**31 - 1),
-    "direction_frames": (2, 100),
-    "history_s": (0.1, 1e6),
-    "horizon_s": (0.1, 60.0),
-    "least_visible": (0.05, 1.0),
-    "link_confidence": (0.01, 0.99),
-    "max_memory_mb": (10, 1_000_000),
-    "max_pixels": (1000, 10**9),
-    "min_history": (1, 100),
-    "min_hits": (0, 1000),
-    "overlap": (0.0, 0.5),
-    "rate_hz": (0.1, 1000.0),
-    "sigma_m": (1e-6, 1e6),
-}
-SHARES = {"alpha", "beta", "birth_score", "max_iou", "min_iou", "low_min_iou", "track_confidence"}
-ANY = {"min_score", "high_score", "new_score"}
-
-
-@pytest.mark.parametrize("kind", BUILT_IN.values(), ids=BUILT_IN)
-def test_ranges_quantities_are_not_negative_and_shares_are_within_0_and_1(kind):
-    for option in fields(kind):
-        name, hint = option.name, get_type_hints(kind)[option.name]
-        if option.metadata.get("context") or bare_type(hint) not in (int, float):
-            continue
-        is_share = name in SHARES or (issubclass(kind, OnnxDetector) and name == "min_score")
-        usual = (0.0, 1.0) if is_share else (-np.inf, np.inf) if name in ANY else (0.0, 1e6)
-        assert (option.metadata["least"], option.metadata["most"]) == RANGES.get(name, usual), name
-        low, high = option.metadata["search"] or (option.metadata["least"], option.metadata["most"])
-        assert option.metadata["least"] <= low < high <= option.metadata["most"]
-        assert option.default is None or low <= option.default <= high

@@ -208,24 +208,3 @@ def test_a_parameter_has_an_option_in_all_transforms_of_a_stage_or_in_none():
             for field in fields(kind):
                 has_flag.setdefault(field.name, set()).add(field.metadata.get("flag", True))
         assert {name for name, values in has_flag.items() if len(values) > 1} == set()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--set", "alpha"], "--set needs name=value, as in --set alpha=0.5, not 'alpha'"),
-        (["--set", "alhpa=1"], "--set alhpa=1: there is no parameter alhpa; did you mean alpha?"),
-        (["--set", "alpha=x"], "--set alpha=x: 'x' is not a number"),
-        (["--set", "min_hits=1.5"], "--set min_hits=1.5: '1.5' is not a whole number"),
-        (["--set", "trim_ends=maybe"], "--set trim_ends=maybe: 'maybe' is not true or false"),
-        (["--set", "alpha=1", "--set", "alpha=2"], "--set gives alpha twice"),
-        (["--set", "link_s=1", "--link-s", "2"], "--set link_s and the option of this name are both given; give one"),
-        (["--profile", "paper", "--set", "alpha=2"], "alpha has to be from 0 to 1, not 2.0"),
-    ],
-)
-def test_set_refuses_what_is_no_parameter_or_no_value(words, message, folder):
-    before = (folder / "a.mcap").read_bytes()
-    code, out, err = call("retrack", "a.mcap", *words)
-    assert (code, out, err.count("\n")) == (1, "", 1)
-    assert err.startswith(f"mcaptrack: {message}")
-    assert (folder / "a.mcap").read_bytes() == before

@@ -450,12 +450,6 @@ def test_vp9_superframes_are_taken_apart_as_ffmpeg_does(tmp_path):
     assert CODECS["vp9"].inspect(two + two + index).is_key is False
 
 
-def test_words_in_a_file_that_are_not_utf_8_are_no_obstacle(tmp_path):
-    path = made("a.mp4", options=X264)(tmp_path)
-    path.write_bytes(path.read_bytes().replace(b"VideoHandler", b"VideoHandl\xe9r"))
-    assert len(list(open_video(path).pictures())) == 20
-
-
 @pytest.mark.parametrize("name", ["a.mp4", "a.webm", "a.avi"])
 def test_a_file_with_bytes_that_changed_is_read_or_refused_in_a_line(tmp_path, name):
     path = tmp_path / name
@@ -485,28 +479,3 @@ def test_bytes_of_strangers_are_no_key_picture_or_one_but_never_an_accident(name
         assert unit.pictures >= 0
         assert head.has_picture or not head.is_key
         codec.with_parameter_sets(payload, unit.sets)
-
-
-MISTAKES = {
-    "a CRF beyond its end": (
-        ["--quality", "60"],
-        "--quality is H.264's constant rate factor, a number from 1 to 51 (1",
-    ),
-    "a JPEG quality of nothing": (["--image-format", "jpeg", "--quality", "0"], "from 1 to 100, not 0"),
-    "a quality of PNG": (["--image-format", "png", "--quality", "9"], "PNG keeps pictures exactly as they are"),
-    "key pictures of JPEG": (["--image-format", "jpeg", "--keyframe-interval-s", "1"], "as jpeg, every picture stands"),
-    "no time between key pictures": (["--keyframe-interval-s", "0"], "from 0.01 to 60, not 0"),
-    "labels": (["--quality", "20"], "labels.txt is a label file; --quality is for videos"),
-}
-
-
-@pytest.mark.parametrize(("words", "said"), MISTAKES.values(), ids=MISTAKES)
-def test_mistakes_are_said_in_a_line(tmp_path, words, said, request):
-    made("clip.mp4", options=X264)(tmp_path)
-    (tmp_path / "labels.txt").write_text("1,3,10,20,4,8,1,-1,-1,-1\n")
-    source = "labels.txt" if "labels" in request.node.callspec.id else "clip.mp4"
-    code, out, err = call("ingest", source, "-o", "x.mcap", *words, folder=tmp_path)
-    assert (code, out) == (1, "")
-    assert said in err
-    assert err.count("\n") == 1
-    assert not (tmp_path / "x.mcap").exists()

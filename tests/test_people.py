@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 
 from mcaptrack.transforms.detect.median_background import Background, Sampler
-from mcaptrack.transforms.detect.people import Separator, _Crop, _joined_parts
+from mcaptrack.transforms.detect.people import Separator, _joined_parts
 from mcaptrack.transforms.detect.person_model import (
     Learner,
     Person,
     _fit_height,
-    _mode,
-    _scaled,
     region_boxes,
     regions,
     typical_heights,
@@ -30,14 +28,6 @@ def drawn(size: tuple[int, int], *boxes: tuple[int, int, int, int]) -> np.ndarra
     for x, y, w, h in boxes:
         mask[y : y + h, x : x + w] = 255
     return mask
-
-
-@pytest.mark.parametrize(
-    ("values", "wanted"),
-    [([3], 3), ([2, 1], 1.5), ([10, 3, 1, 2], 1.5), ([0, 5, 5.25, 5.75, 9], 5.125), ([1, 2, 9, 9.5, 9.75], 9.625)],
-)
-def test_the_densest_half_is_halved_until_two_values_are_left(values, wanted):
-    assert _mode(np.array(values, float)) == wanted
 
 
 class TestHeightOverFeet:
@@ -102,27 +92,6 @@ def test_parts_above_each_other_are_joined_up_to_the_height_of_one_person(seed):
     groups = [np.array([at]) for at in alone] + several
     assert {frozenset(group.tolist()) for group in groups} == joined(found, expected)
     assert sorted(np.concatenate(groups).tolist()) == list(range(count))
-
-
-@pytest.mark.parametrize(
-    ("lower", "is_one"),
-    [
-        ((10, 23, 4, 9), True),
-        ((10, 24, 4, 9), True),  # together 24 rows: 1.2 times 20
-        ((10, 25, 4, 9), False),
-        ((14, 23, 4, 9), True),  # a column aside
-        ((15, 23, 4, 9), False),
-        ((6, 23, 4, 9), True),
-        ((5, 23, 4, 9), False),
-        ((10, 25, 4, 7), True),
-        ((10, 26, 4, 7), False),  # 8 rows lie between them
-        ((10, 16, 4, 14), True),
-    ],
-)
-def test_parts_at_the_ends_of_the_distances(lower, is_one):
-    found = np.array([(10, 9, 4, 9, 36), (*lower, lower[2] * lower[3])])
-    alone, groups = _joined_parts(found, np.array([20.0, 20.0]))
-    assert (len(alone), len(groups)) == ((0, 1) if is_one else (2, 0))
 
 
 class TestRegions:
@@ -216,17 +185,6 @@ class TestLearning:
         """Of a person of 50 pixels."""
         assert (self.learned([box] * 8, person_px=50.0) is not None) == is_known
 
-    def test_a_region_is_scaled_around_its_middle(self):
-        region = np.ones((ROWS, 7), bool)
-        region[3:5, 2] = False
-        np.testing.assert_array_equal(
-            _scaled(np.repeat(region, 2, axis=1)[:, :14])[:, 1:15], np.repeat(region, 2, 1) * 255
-        )
-        half = _scaled(np.ones((12, 4), bool))
-        assert half.shape == (ROWS, 10)
-        assert half[:-1, 3:7].min() == 255
-        assert _scaled(np.ones((48, 16), bool)).shape == (ROWS, 10)
-
     def test_people_are_at_least_eight_pixels_tall(self):
         person = Person(0.1, 5.0, np.zeros((ROWS, 10), np.float32))
         assert (person.height(20), person.height(30), person.height(50)) == (8, 8, 10)
@@ -303,12 +261,6 @@ class TestSeparating:
         tall = Person(0.0, 60.0, template())
         assert len(Separator(tall, 0.5).boxes(drawn((200, 200), (0, 80, wide, 8)))[0]) == there
 
-    @pytest.mark.parametrize(("box", "there"), [((40, 40, 6, 4), 1), ((40, 40, 23, 1), 0), ((40, 40, 18, 8), 1)])
-    def test_the_ends_of_what_is_enough_belong_to_it(self, box, there):
-        """Of a person of 20 pixels: an area of six percent of 400, and two fifths of the height."""
-        small = Person(0.0, 20.0, template())
-        assert len(Separator(small, 0.5).boxes(drawn((100, 100), box))[0]) == there
-
     @pytest.mark.parametrize("count", [1, 2, 3, 4])
     def test_a_box_around_several_people_carries_how_many_they_are(self, count):
         separator = Separator(PERSON, 0.5)
@@ -334,56 +286,6 @@ class TestSeparating:
         boxes, people = Separator(PERSON, 0.5).boxes(mask)
         assert (boxes.tolist(), people.tolist()) == ([[*map(float, box)]] * is_large, [0] * is_large)
         assert Separator(PERSON, 0.5).counts(mask, np.array([box], float)).tolist() == [0]
-
-    def test_a_place_gains_what_its_pixels_say(self):
-        """The log-likelihood of a person at each place, summed pixel by pixel."""
-        separator = Separator(PERSON, 0.5)
-        rng = np.random.default_rng(2)
-        ink = (rng.random((30, 26)) > 0.4).astype(np.float32)
-        shape = np.clip(PERSON.template.astype(float), 0, 0.97)
-        hit, miss = np.log((0.03 + 0.97 * shape) / 0.03), np.log(1 - shape)
-        others = [(12, 26)]
-        left = ink.copy()
-        for row in range(ROWS):
-            for column in range(12):
-                y, x = 26 - ROWS + 1 + row, 12 - 6 + column
-                left[y, x] *= 1 - shape[row, column]
-        gains = separator._gains(ink, separator._filter(1 - ink, separator._miss), others)
-        for x, y in ((0, 0), (12, 26), (25, 29), (6, 23), (20, 10)):
-            total = 0.0
-            for row in range(ROWS):
-                for column in range(12):
-                    at_y, at_x = y - ROWS + 1 + row, x - 6 + column
-                    if 0 <= at_y < 30 and 0 <= at_x < 26:
-                        total += left[at_y, at_x] * hit[row, column] + (1 - ink[at_y, at_x]) * miss[row, column]
-            assert gains[y, x] == pytest.approx(total, rel=1e-4, abs=1e-3)
-        place, gain = separator._best(ink, separator._filter(1 - ink, separator._miss), others)
-        assert gain == pytest.approx(float(gains.max()))
-        assert gains[place[1], place[0]] == gains.max()
-
-    def test_the_share_that_has_to_be_seen_is_of_what_a_whole_person_gains(self):
-        """On average over pixels that are foreground as often as the shape says."""
-        whole = 0.0
-        for share in PERSON.template.astype(float).ravel().tolist():
-            whole += share * math.log((0.03 + 0.97 * share) / 0.03) + (1 - share) * math.log(1 - share)
-        for least in (0.25, 0.5):
-            assert Separator(PERSON, least)._least == pytest.approx(least * whole, rel=1e-4)
-
-    def test_a_crop_has_its_margin_and_its_points(self):
-        region = np.zeros((6, 8), bool)
-        region[2:, 3:5] = True
-        crop = _Crop(region, 1.0, (4, 5))
-        assert crop.ink.shape == (16, 16)
-        np.testing.assert_array_equal(crop.ink[5:11, 4:12], region)
-        assert crop.ink.sum() == region.sum()
-        half = _Crop(region, 2.0, (4, 5))
-        assert half.ink.shape == (22, 24)
-        assert half.to_picture(4 + 2 * 3, 5 + 2 * 2) == (3, 2)
-        unknown = crop.beyond(2, 1, (11, 8))
-        for row in range(16):
-            for column in range(16):
-                x, y = 2 + column + 0.5 - 4, 1 + row + 0.5 - 5
-                assert unknown[row, column] == (x < 0 or x > 11 or y < 0 or y > 8)
 
 
 class TestBackground:

@@ -169,15 +169,6 @@ def test_a_limit_that_is_no_number_is_refused(monkeypatch, given):
         list(decode_gray([EncodedPicture(0, 0, "png", png(8, 8))]))
 
 
-def test_pictures_that_no_h264_stream_holds_are_refused_with_what_helps(tmp_path):
-    folder = tmp_path / "images"
-    folder.mkdir()
-    (folder / "0.png").write_bytes(png(8000, 4500))
-    with pytest.raises(McaptrackError, match=r"8000 x 4500 pixels, .* at most 35.7 megapixels; `image_format='jpeg'`"):
-        open_video(folder, VideoOptions(fps=Fraction(1)))
-    assert open_video(folder, VideoOptions(fps=Fraction(1), image_format="jpeg")).width_px == 8000
-
-
 # What is no file
 
 

@@ -104,15 +104,6 @@ def test_missing_inputs_are_made_first_and_reported(fresh):
         assert "/camera/predictions" not in opened.channels
 
 
-def test_a_second_run_has_nothing_to_do(fresh):
-    report, _ = run_all(fresh)
-    assert report.stages == ["detect", "track", "sample", "predict", "retrack"]
-    before = fresh.read_bytes()
-    report, said = run_all(fresh)
-    assert (report.stages, said) == ([], [])
-    assert fresh.read_bytes() == before
-
-
 def test_running_a_stage_again_replaces_only_its_channels(fresh):
     run_all(fresh)
     before = digests(fresh)
@@ -310,27 +301,6 @@ class TestCompleteRun:
         assert rows["/camera/retracks", "metres"]["mode"] == "offline"
         assert rows["/camera/retracks/online", "metres"]["mode"] == "online"
         assert rows["/camera/retracks/online", "metres"]["displacement"]["ADE_m"] < 1.5
-
-    def test_online_tracks_and_forecasts_do_not_depend_on_later_pictures(self, finished, tmp_path):
-        """Cut the video in half: what was written of the first half stays as it was."""
-        with log.read(finished) as opened:
-            frames = opened.frames("/camera/samples", TRACKS)
-            whole = {
-                name: opened.frames(f"/camera/{name}", schema)
-                for name, schema in (
-                    ("retracks/online", TRACKS),
-                    ("retracks/predictions", PREDICTIONS),
-                    ("predictions", PREDICTIONS),
-                )
-            }
-        half = frames[: len(frames) // 2]
-        _, online, predictions, *_ = zip(*Retrack()(half), strict=True)
-        plain = [frame for (frame,) in Predict()(half)]
-        for name, part in (("retracks/online", online), ("retracks/predictions", predictions), ("predictions", plain)):
-            for cut, full in zip(part, whole[name], strict=False):
-                assert cut.t_ns == full.t_ns
-                np.testing.assert_array_equal(cut.rows["track_id"], full.rows["track_id"])
-                np.testing.assert_array_equal(cut.rows["x_m"], full.rows["x_m"])
 
 
 def test_new_detections_give_a_new_estimate_of_the_scale(footage, tmp_path):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
-from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -26,8 +26,7 @@ from mcaptrack.schema.provenance import CLOCK, INGEST, VIEW, Provenance, digest
 from mcaptrack.transforms import STAGES, KnnDetector, OcSort, Predict, Retrack, Sample, Sort, Transform
 from tests.worlds import boxes_at, ns, tracks_at, walk
 
-runner = import_module("mcaptrack.pipeline.run")  # the package has a function of its name
-
+run = sys.modules["mcaptrack.pipeline.run"]  # the package has a function of this name
 PLANE = GroundPlane((0.1, 0, 0, 0, 0.1, 0, 0, 0, 1), 640, 480)
 Channels = Mapping[str, tuple[Schema, Provenance | None, Sequence[Frame]]]
 
@@ -90,154 +89,108 @@ def stages_of(jobs: Iterable[pipeline.Job]) -> list[str]:
 
 
 EARLIER = "/camera/{} was made from an earlier /camera/{}: running {} again, as before".format
-#: What differs, the options of the plan, the stages that run, what is said, and what is warned of.
-PLANS: dict[str, tuple[dict[str, Any], dict[str, Any], list[str], list[str], list[tuple[str, str]]]] = {
-    "nothing": ({}, {}, [], [], []),
-    "other boxes": (
-        {"detections": {"digest": "D"}},
-        {},
-        ["track", "sample", "predict", "retrack"],
-        [
-            EARLIER("tracks", "detections", "track"),
-            EARLIER("samples", "tracks", "sample"),
-            EARLIER("predictions", "samples", "predict"),
-            EARLIER("retracks", "samples", "retrack"),
-        ],
-        [],
-    ),
-    "other samples": (
-        {"samples": {"digest": "S"}},
-        {},
-        ["predict", "retrack"],
-        [EARLIER("predictions", "samples", "predict"), EARLIER("retracks", "samples", "retrack")],
-        [],
-    ),
-    "force": ({}, {"force": True}, ["track", "sample", "predict", "retrack"], [], []),
-    "force, though due": (
-        {"detections": {"digest": "D"}},
-        {"force": True},
-        ["track", "sample", "predict", "retrack"],
-        [],
-        [],
-    ),
-    "another tracker, chosen": (
+STAGES_OF_ALL = ["track", "sample", "predict", "retrack"]
+AGAIN = [
+    EARLIER("tracks", "detections", "track"),
+    EARLIER("samples", "tracks", "sample"),
+    EARLIER("predictions", "samples", "predict"),
+    EARLIER("retracks", "samples", "retrack"),
+]
+
+
+class Plan(NamedTuple):
+    """What differs, the options of the plan, the stages that run, what is said, and what is warned of."""
+
+    changed: dict[str, Any] = {}
+    options: dict[str, Any] = {}
+    stages: Sequence[str] = ()
+    said: Sequence[str] = ()
+    warned: str = ""
+    code: str = "other-settings"
+
+
+def other_settings(words: str, **defaults: Transform) -> Plan:
+    """Nothing runs, but what a channel was made with is said to be other than the defaults now."""
+    topic, _, differs = words.partition(": ")
+    message = f"/camera/{topic} was made with other settings than now ({differs}); {{force}} takes these"
+    return Plan(options={"defaults": defaults}, warned=message)
+
+
+NEW_BOXES, NEW_SAMPLES = {"detections": {"digest": "D"}}, {"samples": {"digest": "S"}}
+WITHOUT = "it was made with strange, which {} does not have".format
+MANY_OTHERS = Retrack(min_history=3, drift_ratio=0.5, link_s=1.0, smooth=False, max_age_s=1.0)
+PLANS = {
+    "nothing": Plan(),
+    "other boxes": Plan(NEW_BOXES, {}, STAGES_OF_ALL, AGAIN),
+    "other samples": Plan(NEW_SAMPLES, {}, STAGES_OF_ALL[2:], AGAIN[2:]),
+    "force": Plan({}, {"force": True}, STAGES_OF_ALL),
+    "force, though due": Plan(NEW_BOXES, {"force": True}, STAGES_OF_ALL),
+    "another tracker, chosen": Plan(
         {},
         {"defaults": {"track": OcSort()}, "chosen": ("tracker",)},
-        ["track", "sample", "predict", "retrack"],
-        [
-            "/camera/tracks was made by another tracker: running track again",
-            EARLIER("samples", "tracks", "sample"),
-            EARLIER("predictions", "samples", "predict"),
-            EARLIER("retracks", "samples", "retrack"),
-        ],
-        [],
+        STAGES_OF_ALL,
+        ["/camera/tracks was made by another tracker: running track again", *AGAIN[1:]],
     ),
-    "another predictor, chosen": (
+    "another predictor, chosen": Plan(
         {},
         {"defaults": {"predict": Predict(predictor="kalman")}, "chosen": ("predictor",)},
         ["predict"],
         ["/camera/predictions was made by another predictor: running predict again"],
-        [],
     ),
-    "the same tracker, chosen": ({}, {"defaults": {"track": Sort()}, "chosen": ("tracker",)}, [], [], []),
-    "another tracker, not chosen": (
-        {},
-        {"defaults": {"track": OcSort()}, "chosen": ("detector",)},
-        [],
-        [],
-        [("/camera/tracks was made with other settings than now (OcSort, not Sort); {force} takes these", "other-settings")],
+    "the same tracker, chosen": Plan(options={"defaults": {"track": Sort()}, "chosen": ("tracker",)}),
+    "another tracker, not chosen": other_settings("tracks: OcSort, not Sort", track=OcSort()),
+    "one other setting": other_settings("tracks: max_age_s 2.0, not 1.4", track=Sort(max_age_s=2.0)),
+    "three other settings": other_settings(
+        "tracks: max_age_s 2.0, not 1.4; min_hits_s 0.5, not 0.3; min_iou 0.25, not 0.2",
+        track=Sort(max_age_s=2.0, min_hits_s=0.5, min_iou=0.25),
     ),
-    "one other setting": (
-        {},
-        {"defaults": {"track": Sort(max_age_s=2.0)}},
-        [],
-        [],
-        [("/camera/tracks was made with other settings than now (max_age_s 2.0, not 1.4); {force} takes these", "other-settings")],
+    "five other settings, said once": other_settings(
+        "retracks: min_history 3, not 2; drift_ratio 0.5, not 0.08; max_age_s 1.0, not 2.0; and 2 more",
+        retrack=MANY_OTHERS,
     ),
-    "three other settings": (
-        {},
-        {"defaults": {"track": Sort(max_age_s=2.0, min_hits_s=0.5, min_iou=0.25)}},
-        [],
-        [],
-        [("/camera/tracks was made with other settings than now (max_age_s 2.0, not 1.4; min_hits_s 0.5, not 0.3; min_iou 0.25, not 0.2); {force} takes these", "other-settings")],
-    ),
-    "five other settings, said once": (
-        {},
-        {"defaults": {"retrack": Retrack(min_history=3, drift_ratio=0.5, link_s=1.0, smooth=False, max_age_s=1.0)}},
-        [],
-        [],
-        [("/camera/retracks was made with other settings than now (min_history 3, not 2; drift_ratio 0.5, not 0.08; max_age_s 1.0, not 2.0; and 2 more); {force} takes these", "other-settings")],
-    ),
-    "other settings, where it runs as before": (
-        {"detections": {"digest": "D"}},
-        {"defaults": {"sample": Sample(max_gap_s=3.0)}},
-        ["track", "sample", "predict", "retrack"],
-        [
-            EARLIER("tracks", "detections", "track"),
-            EARLIER("samples", "tracks", "sample"),
-            EARLIER("predictions", "samples", "predict"),
-            EARLIER("retracks", "samples", "retrack"),
-        ],
-        [("/camera/samples was made with other settings than now (max_gap_s 3.0, not 2.0); {force} takes these", "other-settings")],
-    ),
-    "a parameter that is gone": (
-        {"predictions": {"parameters": {"strange": 1, "more": 2}}, "samples": {"digest": "S"}},
+    "other settings, where it runs as before": other_settings(
+        "samples: max_gap_s 3.0, not 2.0", sample=Sample(max_gap_s=3.0)
+    )._replace(changed=NEW_BOXES, stages=STAGES_OF_ALL, said=AGAIN),
+    "a parameter that is gone": Plan(
+        {"predictions": {"parameters": {"strange": 1, "more": 2}}, **NEW_SAMPLES},
         {},
         ["retrack"],
-        [EARLIER("retracks", "samples", "retrack")],
-        [("/camera/predictions is out of date and stays as it is: it was made with more, strange, which Predict does not have", "out-of-date")],
+        AGAIN[3:],
+        "/camera/predictions is out of date and stays as it is: it was made with more, strange, which Predict does not "
+        "have",
+        "out-of-date",
     ),
-    "a parameter that is gone, and force": (
+    "a parameter that is gone, and force": Plan(
         {"tracks": {"parameters": {"strange": 1}}},
         {"force": True},
-        ["sample", "predict", "retrack"],
+        STAGES_OF_ALL[1:],
         [],
-        [("/camera/tracks is not made again, it stays as it is: it was made with strange, which Sort does not have", "left-out")],
+        f"/camera/tracks is not made again, it stays as it is: {WITHOUT('Sort')}",
+        "left-out",
     ),
-    "a parameter that is gone, and another setting": (
-        {"predictions": {"parameters": {"strange": 1}}},
-        {"defaults": {"predict": Predict()}},
-        [],
-        [],
-        [("/camera/predictions was made with other settings than now (it was made with strange, which Predict does not have); {force} takes these", "other-settings")],
+    "a parameter that is gone, and another setting": other_settings(
+        f"predictions: {WITHOUT('Predict')}", predict=Predict()
+    )._replace(changed={"predictions": {"parameters": {"strange": 1}}}),
+    "compared with something that is gone": Plan(
+        {"predictions": {"references": {"/camera/truth": "x"}}}, {}, ["predict"], AGAIN[2:3]
     ),
-    "compared with something that is gone": (
-        {"predictions": {"references": {"/camera/truth": "x"}}},
-        {},
-        ["predict"],
-        [EARLIER("predictions", "samples", "predict")],
-        [],
+    "compared with nothing, as now": Plan({"predictions": {"references": {"/camera/truth": ""}}}),
+    "compared with something else": Plan(
+        {"predictions": {"references": {"/camera/tracks": "T"}}}, {}, ["predict"], AGAIN[2:3]
     ),
-    "compared with nothing, as now": ({"predictions": {"references": {"/camera/truth": ""}}}, {}, [], [], []),
-    "compared with something else": (
-        {"predictions": {"references": {"/camera/tracks": "T"}}},
-        {},
-        ["predict"],
-        [EARLIER("predictions", "samples", "predict")],
-        [],
+    "a plane that is gone": Plan(
+        {"tracks": {"parameters": parameters_of("track", Sort(ground_planes=((0, PLANE),)))}}, {}, STAGES_OF_ALL, AGAIN
     ),
-    "a plane that is gone": (
-        {"tracks": {"parameters": parameters_of("track", Sort(ground_planes=((0, PLANE),)))}},
-        {},
-        ["track", "sample", "predict", "retrack"],
-        [
-            EARLIER("tracks", "detections", "track"),
-            EARLIER("samples", "tracks", "sample"),
-            EARLIER("predictions", "samples", "predict"),
-            EARLIER("retracks", "samples", "retrack"),
-        ],
-        [],
-    ),
-}  # fmt: skip
+}
 
 
-@pytest.mark.parametrize(("changed", "options", "stages", "said", "warned"), PLANS.values(), ids=PLANS)
-def test_what_runs_why_and_what_is_said_of_it(changed, options, stages, said, warned, tmp_path):
+@pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)
+def test_what_runs_why_and_what_is_said_of_it(plan, tmp_path):
     path = tmp_path / "a.mcap"
-    force = f"`mcaptrack.run('{path}', force=True)`"
-    found = planned(path, finished(**changed), **options)
-    assert (stages_of(found[0]), found[1]) == (stages, said)
-    assert found[2] == [(message.replace("{force}", force), code) for message, code in warned]
+    jobs, said, warned = planned(path, finished(**plan.changed), **plan.options)
+    assert (stages_of(jobs), said) == (list(plan.stages), list(plan.said))
+    message = plan.warned.replace("{force}", f"`mcaptrack.run('{path}', force=True)`")
+    assert warned == ([(message, plan.code)] if message else [])
 
 
 def test_a_stage_runs_with_what_is_asked_or_else_as_before(tmp_path):
@@ -437,7 +390,7 @@ def test_what_was_odd_when_a_channel_was_made_is_said_for_what_runs_and_what_it_
 
         def said(made: dict[str, Provenance], is_all: bool) -> list[tuple[str, str]]:
             with notices.listening(lambda _: None), notices.collected() as heard:
-                runner.warn_findings(opened, "/camera", made, (), is_all)
+                run.warn_findings(opened, "/camera", made, (), is_all)
             return [(one.message, one.code) for one in heard]
 
         now = Provenance("predict", {}, "/camera/samples", warnings=[("strange", "odd now")])
@@ -466,7 +419,7 @@ def test_a_guessed_scale_is_said_of_what_is_in_metres(tmp_path, stage, assumed, 
         notices.listening(lambda _: None),
         notices.collected() as said,
     ):
-        runner.warn_findings(opened, "/camera", {"/camera/other": Provenance(stage, {})}, [(0, plane)], is_all=False)
+        run.warn_findings(opened, "/camera", {"/camera/other": Provenance(stage, {})}, [(0, plane)], is_all=False)
     assert [(one.message, one.code) for one in said] == [(GUESSED, "assumed-ground-plane")] * is_said
 
 
@@ -487,14 +440,14 @@ def test_tracks_that_are_only_linked_or_passed_on_are_said(tmp_path, parameters,
         f"along the ground. To insist: `mcaptrack.retrack('{path}', side_view=True)`"
     )
     with log.read(path) as opened, notices.listening(lambda _: None), notices.collected() as said:
-        runner.warn_findings(opened, "/camera", {"/camera/x": Provenance("retrack", parameters)}, (), is_all=False)
+        run.warn_findings(opened, "/camera", {"/camera/x": Provenance("retrack", parameters)}, (), is_all=False)
     assert [(one.message, one.code) for one in said] == [(words, "held-back")] * bool(done)
 
 
 def test_little_memory_is_said_in_numbers(monkeypatch):
-    monkeypatch.setattr(runner, "free_memory", lambda: 160_000_000)
+    monkeypatch.setattr(run, "free_memory", lambda: 160_000_000)
     with notices.listening(lambda _: None), notices.collected() as said:
-        runner.warn_memory([Frame(n * 40_000_000, n, DETECTIONS.empty(10)) for n in range(50_000)])
+        run.warn_memory([Frame(n * 40_000_000, n, DETECTIONS.empty(10)) for n in range(50_000)])
     assert [(one.message, one.code) for one in said] == [
         (
             "500,000 boxes, of people who are seen for 6 hours together, take about 0.5 GB of memory, and 0.2 GB are "
@@ -521,8 +474,8 @@ def test_free_memory_is_the_least_that_linux_grants(monkeypatch, files, free):
             raise FileNotFoundError
         return files[path.name]
 
-    monkeypatch.setattr(runner.Path, "read_text", read_text)
-    assert runner.free_memory() == free
+    monkeypatch.setattr(run.Path, "read_text", read_text)
+    assert run.free_memory() == free
 
 
 # What is drawn
@@ -530,24 +483,6 @@ def test_free_memory_is_the_least_that_linux_grants(monkeypatch, files, free):
 
 def at(x: float, frames: int = 2) -> list[Frame]:
     return [Frame(ns(n), n, tracks_at({1: (x, 0.0), 2: (float("nan"), 0.0)})) for n in range(frames)]
-
-
-def test_people_are_where_the_best_tracks_say(tmp_path):
-    """Re-tracked, tracked, true or sampled: the first that knows a place."""
-    names = ("retracks", "tracks", "truth", "samples")
-    channels = {f"/camera/{name}": (TRACKS, Provenance(INGEST, {}), at(float(n))) for n, name in enumerate(names)}
-    for number, name in enumerate(names):
-        with log.read(written(tmp_path / "a.mcap", channels)) as opened:
-            assert writing._positions(opened, "/camera", {})[:, 0].tolist() == pytest.approx(
-                [number, np.nan] * 2, nan_ok=True
-            )
-            shown = {"/camera/retracks": drawing.ChannelToDraw(TRACKS, at(9.0, 1), "", "")}
-            assert writing._positions(opened, "/camera", shown)[0].tolist() == [9.0, 0.0]
-        nowhere = [Frame(0, 0, tracks_at({1: (float("nan"), 1.0)}))] * (number % 2)
-        wrong = (DETECTIONS, Provenance(INGEST, {}), [Frame(0, 0, boxes_at([(1, 1)]))])
-        channels[f"/camera/{name}"] = (TRACKS, Provenance(INGEST, {}), nowhere) if number < 2 else wrong
-    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
-        assert writing._positions(opened, "/camera", {}).shape == (0, 2)
 
 
 def forecast(*steps: int) -> list[Frame]:
@@ -566,6 +501,24 @@ def scored(*errors: float) -> list[Frame]:
     for row, error in zip(rows, errors, strict=True):
         row["ade_m"] = error
     return [Frame(ns(n), n, row) for n, row in enumerate(rows)]
+
+
+def test_people_are_where_the_best_tracks_say(tmp_path):
+    """Re-tracked, tracked, true or sampled: the first that knows a place."""
+    names = ("retracks", "tracks", "truth", "samples")
+    channels = {f"/camera/{name}": (TRACKS, Provenance(INGEST, {}), at(float(n))) for n, name in enumerate(names)}
+    for number, name in enumerate(names):
+        with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+            assert writing._positions(opened, "/camera", {})[:, 0].tolist() == pytest.approx(
+                [number, np.nan] * 2, nan_ok=True
+            )
+            shown = {"/camera/retracks": drawing.ChannelToDraw(TRACKS, at(9.0, 1), "", "")}
+            assert writing._positions(opened, "/camera", shown)[0].tolist() == [9.0, 0.0]
+        nowhere = [Frame(0, 0, tracks_at({1: (float("nan"), 1.0)}))] * (number % 2)
+        wrong = (DETECTIONS, Provenance(INGEST, {}), [Frame(0, 0, boxes_at([(1, 1)]))])
+        channels[f"/camera/{name}"] = (TRACKS, Provenance(INGEST, {}), nowhere) if number < 2 else wrong
+    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+        assert writing._positions(opened, "/camera", {}).shape == (0, 2)
 
 
 def test_forecasts_of_re_tracked_people_come_first(tmp_path):

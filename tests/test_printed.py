@@ -1,472 +1,407 @@
-"""Text and JSON of commands have the same numbers, and -o writes what would be printed."""
+"""What commands print, as a whole: each command line and its lines are those in tests/printed.txt.
+
+A text that was changed on purpose is written anew by ``PRINTED=write pytest tests/test_printed.py``; the difference of
+the file is what changes for users. What varies between systems is replaced by #: times, bytes and versions.
+"""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
+import os
 import re
-import shutil
-import sys
-from dataclasses import replace
+import shlex
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import pyarrow as pa
 import pytest
 
-from mcaptrack import log
-from tests.commands import GROUP, call, done
-from tests.logs import SOME, write_stock
+import mcaptrack
+from mcaptrack import fleet
+from mcaptrack.api.several import CameraResult
+from mcaptrack.api.upkeep import LogCheck, LogRecovery
+from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation.zones import ZoneTotals
+from mcaptrack.fleet import FleetResult, LogOutcome
+from mcaptrack.log.check import CheckResult
+from mcaptrack.log.check_summary import Finding
+from mcaptrack.notices import Notice
+from mcaptrack.pipeline.summary import Corrected, Looks, Repair, Summary, SummaryScores
+from tests.commands import call, run_result, zones_file
+from tests.worlds import write_clip
 
-#: Commands with --output for what they print, and arguments for each.
-PRINTING = {
-    "check": [],
-    "evaluate": [],
-    "info": [],
-    "query": ["select topic, count(*) from tracks group by all order by all"],
-}
-
-
-def data(*words: object) -> list[dict[str, Any]]:
-    """Run a command that has to succeed, and return its results."""
-    return json.loads(done(*words, "--json").out)["results"]
-
-
-def tables(text: str) -> list[tuple[list[str], list[list[str]]]]:
-    """Parse the tables in a text: head and rows of each as lists of cells; an empty line is a row without cells."""
-    found = []
-    for part in re.split(r"\n\n(?=\S+(?: \S+)*  +\S)", text.rstrip("\n")):
-        head, *rows = ([cell for cell in re.split(r"  +", line.strip()) if cell] for line in part.split("\n"))
-        found.append((head, rows))
-    return found
-
-
-@pytest.fixture(scope="module")
-def twice(finished, tmp_path_factory) -> tuple[Path, Path]:
-    """A log with all channels, and a copy without some, in which detections are newer than tracks."""
-    less = tmp_path_factory.mktemp("twice") / "less.mcap"
-    done("drop", finished, "/camera/retracks/predictions", "-o", less, "-q")
-    done("detect", less, "--threshold", "30", "-q")
-    return finished, less
+SNAPSHOT = Path(__file__).parent / "printed.txt"
+SECOND = 10**9
+START = 1_700_000_000 * SECOND
+#: What differs from system to system or from release to release, and isn't what a text is about.
+VARYING = (
+    (r"[\d,]+(?= bytes\b)|(?<=bytes became )\d+", "#"),
+    (r"(?<=\"bytes\": )\d+", "#"),
+    (r"(?<=\"version\": )\"[^\"]+\"", "#"),
+    (r"[0-9a-f]{40,}", "#"),
+)
 
 
-@pytest.fixture(scope="module", params=[1, 2], ids=["one log", "two logs"])
-def scored(request, twice) -> tuple[list[str], list[dict[str, Any]], str, str]:
-    logs = [*twice][: request.param]
-    first = ["sequence"] if request.param == 2 else []
-    return first, data("evaluate", *logs), done("evaluate", *logs).out, done("evaluate", *logs, "--csv").out
+class Transcript:
+    """Command lines and what they print: to stdout as it is, to stderr after "! ", and exit codes other than 0."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def head(self, title: str) -> None:
+        self.lines += ["", f"# {title}"]
+
+    def run(self, line: str, shows_answer: bool = True, **results: Any) -> None:
+        """Run a command; ``results`` are what functions of the library return or raise instead of doing anything."""
+        with pytest.MonkeyPatch.context() as patch:
+            for name, result in results.items():
+                patch.setattr(mcaptrack, name, returning(result))
+            code, out, err = call(*shlex.split(line))
+        if out.startswith("{\n"):
+            out = json.dumps(json.loads(out))
+        printed = [*(out.splitlines() if shows_answer else []), *(f"! {one}" for one in err.splitlines())]
+        printed = [normalised(one) for one in printed if not re.match(r"!   time ", one)]
+        self.lines += ["", f"$ mcaptrack {line}", *printed, *([f"exit code {code}"] if code else [])]
+
+    def took(self) -> None:
+        """Leave out how long the last command took."""
+        self.lines = [re.sub(r"(?<= in )[\d.]+ s$", "# s", one) for one in self.lines]
 
 
-class TestEvaluate:
-    HEAD = ["tracks", "by", "MOTA", "IDF1", "HOTA", "IDSW", "FP", "FN", "Frag"]
-    FORECASTS = {
-        "ADE m": "ADE_m",
-        "FDE m": "FDE_m",
-        "ADE m²": "ADE_squared_m2",
-        "recall": "recall",
-        "false": "false_forecasts_per_frame",
-        "drift m": "consistency_m",
-        "NLL": "NLL",
-        "in 50 %": "coverage_50",
-        "in 90 %": "coverage_90",
-        "in 95 %": "coverage_95",
+def normalised(line: str) -> str:
+    for pattern, instead in VARYING:
+        line = re.sub(pattern, instead, line)
+    return re.sub(r"\d+\.\d{7,}", lambda number: f"{float(number[0]):.6f}", line).rstrip()
+
+
+def returning(result: Any) -> Callable[..., Any]:
+    def function(*_: Any, **__: Any) -> Any:
+        if isinstance(result, Exception):
+            raise result
+        return result
+
+    return function
+
+
+# Commands on a log of labels: two people walk beside each other, one of them is missed once
+
+
+def write_labels() -> None:
+    places = [(frame, person, frame + 20 * person) for frame in range(90) for person in (0, 1)]
+    Path("truth.txt").write_text("".join(f"{f + 1},{p + 1},{x},24,8,8,1,1,1\n" for f, p, x in places))
+    seen = [one for one in places if one[:2] != (40, 0)]
+    Path("boxes.txt").write_text("".join(f"{f + 1},-1,{x + 0.5},24,8,8,0.9,-1,-1,-1\n" for f, p, x in seen))
+    Path("plane.txt").write_text("0.1,0,0\n0,0.1,0\n0,0,1\n")
+    zones_file(Path())
+
+
+def of_a_log(to: Transcript) -> None:
+    write_labels()
+    labels = "--as detections --truth truth.txt --ground-plane plane.txt --fps 10"
+    to.run(f"ingest boxes.txt {labels} -o a.mcap")
+    to.run("run a.mcap --no-tables --predictor kalman")
+    to.run("run a.mcap --no-tables")
+    to.run("drop a.mcap '/camera/retracks/*' -o b.mcap")
+    to.run("track b.mcap --min-hits-s 2")
+    to.run("events a.mcap")
+    to.run("zones a.mcap --zones zones.geojson")
+    to.run("export a.mcap -o tables -v")
+    to.run("export a.mcap -o tables -v")
+    to.run("info b.mcap")
+    to.run("check a.mcap")
+    to.run("evaluate a.mcap")
+    to.run("evaluate a.mcap b.mcap --similarity metres --gate-m 1")
+    to.run("evaluate a.mcap b.mcap --csv --similarity iou")
+    to.run("evaluate a.mcap --json --similarity iou --topic /camera/tracks")
+    to.run("evaluate a.mcap --fail-under IDF1=1.5 --fail-under mota=-1 --similarity iou --topic /camera/tracks")
+    to.run("query a.mcap 'select topic, count(*) as n from tracks group by all order by all'")
+    to.took()
+
+
+# Results that are given
+
+
+def several_cameras() -> dict[str, CameraResult]:
+    def camera(is_scene: bool = False, **counts: Any) -> CameraResult:
+        return CameraResult(
+            ("track",), {"/x/tracks": 3}, {"/x/tracks": 4}, {"/x/tracks": 2}, Summary(**counts), is_scene
+        )
+
+    scores = SummaryScores((0.5, 0.755), (3, 2), "by boxes")
+    return {
+        "left": camera(pictures=1000, boxes=2000, tracks=1, ground_plane="given", appearance=Looks(True, 0.9, 8)),
+        "right": camera(tracks=1200, repair=Repair(1100, 0, 0, 0), scores=scores, appearance=Looks(False, 0.55, 12)),
+        "scene": camera(True, tracks=9),
     }
 
-    def test_the_table_groups_scores_by_similarity_and_gate(self, scored):
-        first, results, text, _ = scored
-        (head, rows), *_ = tables(text)
-        assert head == [*first, *self.HEAD]
-        wanted: list[list[str]] = []
-        before = None
-        for one in sorted(
-            results, key=lambda r: (r["sequence"] == "COMBINED", r["sequence"], r["similarity"], r["gate"])
-        ):
-            by = f"IoU {one['gate']:g}" if one["similarity"] == "iou" else f"{one['gate']:g} m"
-            values = [one[name] for name in self.HEAD[2:]]
-            numbers = [f"{100 * value:.1f}" if isinstance(value, float) else str(value) for value in values]
-            if before not in (None, (one["sequence"], by)):
-                wanted.append([])
-            before = one["sequence"], by
-            wanted.append([*([one["sequence"]] if first else []), one["tracks"], by, *numbers])
-        assert rows == wanted
-        assert len({row[0] for row in wanted if row}) > 1
 
-    def test_predictions_have_a_table_with_a_row_for_each_channel(self, scored):
-        first, results, text, _ = scored
-        _, (head, rows), *_ = tables(text)
-        assert head == [*first, "forecasts of", *self.FORECASTS]
-        made: dict[tuple[str, ...], dict[str, Any]] = {}
-        for one in results:
-            if "displacement" in one:
-                key = (one["sequence"], one["tracks"]) if first else (one["tracks"],)
-                made.setdefault(key, one["displacement"])
-        assert rows == [
-            [*key, *("-" if found[name] is None else f"{found[name]:.3f}" for name in self.FORECASTS.values())]
-            for key, found in made.items()
-        ]
-        assert rows
-
-    def test_numbers_are_aligned_right(self, scored):
-        _, _, text, _ = scored
-        for part in re.split(r"\n\n(?=\S+(?: \S+)*  +\S)", text.rstrip("\n")):
-            lines = [line.rstrip() for line in part.split("\n") if line.strip()]
-            assert len({len(line) for line in lines}) == 1
-
-    def test_csv_has_the_values_of_the_json(self, scored):
-        _, results, _, text = scored
-        rows = list(csv.DictReader(io.StringIO(text)))
-        plain = [{key: value for key, value in one.items() if key != "displacement"} for one in results]
-        assert rows == [{key: "" if value is None else str(value) for key, value in one.items()} for one in plain]
-
-    def test_a_score_at_the_limit_passes(self, finished):
-        asked = ["evaluate", finished, "--similarity", "iou", "--topic", "/camera/tracks"]
-        (one,) = data(*asked)
-        assert 0.05 < one["MOTA"] < 1
-        assert call(*asked, "--fail-under", f"mota={one['MOTA']!r}").code == 0
-        missed = call(*asked, "--fail-under", f"MOTA={one['MOTA'] + 1e-4!r}", "--fail-under", "idf1=0")
-        assert missed.code == 4
-        assert missed.err.splitlines() == [
-            f"walk /camera/tracks iou 0.5: MOTA {one['MOTA']:.4f} is under {one['MOTA'] + 1e-4:g}"
-        ]
-
-    def test_the_limit_is_for_several_logs_together(self, twice):
-        asked = ["evaluate", *twice, "--similarity", "metres", "--gate-m", "1"]
-        missed = call(*asked, "--fail-under", "idf1=1.5")
-        together = [one for one in data(*asked) if one["sequence"] == "COMBINED"]
-        assert [line.partition(":")[0] for line in missed.err.splitlines()[-len(together) :]] == [
-            f"COMBINED {one['tracks']} metres 1" for one in together
-        ]
-        assert sum(" is under " in line for line in missed.err.splitlines()) == len(together)
+SUMMARIES = (
+    Summary(),
+    Summary(tracks=0, boxes=0, forecasts=0, ground_plane="estimated", appearance=Looks(False, None, 0)),
+    Summary(
+        pictures=1000, boxes=2000, tracks=1200, repair=Repair(1, 2, 3, 4000), corrected=Corrected(1200, 3, 40),
+        scores=SummaryScores((0.5, 0.75), (1234, 5), "within 1 m"), forecasts=1234, horizon_s=4.8,
+        ground_plane="assumed", camera_motion="shaking", appearance=Looks(True, 0.914, 1),
+    ),
+    Summary(boxes=1200, frame_id="map", tracks=1, repair=Repair(1000, 0, 0, 0), appearance=Looks(False, 0.55, 12)),
+)  # fmt: skip
 
 
-class TestInfo:
-    def test_every_channel_has_a_line_with_its_schema_and_messages(self, twice):
-        for path in twice:
-            (one,) = data("info", path)
-            first, begin, head, *rest = done("info", path).out.splitlines()
-            seconds = (one["end_ns"] - one["start_ns"]) / 1e9
-            assert first == f"{path}  {one['bytes']:,} bytes, {one['messages']:,} messages, {seconds:.3f} s"
-            assert begin == f"starts at {one['start_ns'] / 1e9:.3f} s"
-            assert head.split() == ["topic", "schema", "messages", "per", "second"]
-            channels = [[c["topic"], c["schema"], f"{c['messages']:,}"] for c in one["channels"]]
-            for row, channel in zip(channels, one["channels"], strict=True):
-                row.extend([] if channel["rate_hz"] is None else [f"{channel['rate_hz']:.1f}"])
-            assert [line.split() for line in rest[: len(channels)]] == channels
-            assert rest[len(channels)] == "lineage"
-            assert len({len(line) for line in [head, *rest[: len(channels)]]}) == 1  # numbers end below each other
-
-    def test_info_agrees_with_the_log(self, twice):
-        for path in twice:
-            (one,) = data("info", path)
-            with log.read(path) as opened:
-                assert (one["log"], one["bytes"]) == (str(path), path.stat().st_size)
-                assert (one["start_ns"], one["end_ns"]) == (opened.start_ns, opened.end_ns)
-                found = {c["topic"]: (c["id"], c["schema"], c["encoding"], c["messages"]) for c in one["channels"]}
-                assert found == {
-                    topic: (c.id, c.schema_name, c.message_encoding, c.messages) for topic, c in opened.channels.items()
-                }
-                assert [c["topic"] for c in one["channels"]] == sorted(opened.channels)
-            assert one["messages"] == sum(c["messages"] for c in one["channels"])
-            assert {c["part"] for c in one["channels"]} == {"log"}
-            assert not any(c["replaced"] for c in one["channels"])
-            recorded = [c for c in one["channels"] if c["transform"] is None]
-            assert all(c["input"] is c["version"] is c["parameters"] is c["references"] is None for c in recorded)
-
-    def test_each_channel_is_once_in_the_tree_below_its_input(self, twice):
-        for path in twice:
-            (one,) = data("info", path)
-            channels = {c["topic"]: c for c in one["channels"]}
-            lines = done("info", path, "-v").out.partition("\nlineage\n")[2].splitlines()
-            above: list[str] = []
-            seen = []
-            for line in lines:
-                depth, words = len(re.match(r"[│├└─ ]*", line)[0]) // 4, re.sub(r"^[│├└─ ]+", "", line)
-                if not words.startswith("/"):  # what -v adds: the parameters of the channel above
-                    made = channels[above[depth - 2]]["parameters"]
-                    assert words == ", ".join(f"{key}={value}" for key, value in sorted(made.items()))
-                    continue
-                topic, *rest = words.split("  ")
-                del above[depth - 1 :]
-                source = channels[topic]["input"]
-                assert (above[-1] if above else None) == (source if source in channels else None)
-                above.append(topic)
-                wanted = [channels[topic]["transform"]] if channels[topic]["transform"] else []
-                assert rest == wanted + (["out of date"] if channels[topic]["stale"] else [])
-                seen.append(topic)
-            assert sorted(seen) == sorted(topic for topic, c in channels.items() if c["transform"] != "view")
-            assert any(channels[topic]["stale"] for topic in seen) == (path == twice[1])
-
-    def test_parameters_are_shown_with_verbose_only(self, finished):
-        brief, full = (done("info", finished, *more).out.splitlines() for more in ([], ["-v"]))
-        assert [line for line in full if "=" not in line] == brief
-        assert len(full) > len(brief)
+def of_runs(to: Transcript) -> None:
+    for summary in SUMMARIES:
+        to.run("run x.mcap", run=run_result(summary=summary))
+    said = tuple(Notice(words, code) for words, code in (("a", "other"), ("b", "lost"), ("c", "other")))
+    parts = {"read": 0.5, "track": 7.25, "write": 0.49, "detect": 2.5}
+    to.run("run x.mcap", run=run_result(stages=("track",), warnings=said, summary=SUMMARIES[0], seconds=10.0,
+                                        seconds_by_part=parts))  # fmt: skip
+    cameras = several_cameras()
+    apart = {"left_out": {"up": "has no tracks; give `topic=`"}, "not_fused": "there is no ground; `min_iou=0.5`"}
+    to.run("run x.mcap", run=run_result(cameras=cameras, left_out=apart["left_out"], summary=Summary(tracks=9)))
+    to.run("run x.mcap", run=run_result(cameras={"left": cameras["left"]}, **apart))
+    to.run("run x.mcap --json", run=run_result(cameras={"scene": cameras["scene"]}, **apart))
+    stages = run_result(
+        stages=("detect", "track"), frames={"/a/detections": 1000, "/a/tracks": 10},
+        rows={"/a/detections": 12345, "/a/tracks": 20}, tracks={"/a/tracks": 1001}, tables={"tracks": 5, "frames": 6},
+        events={"/a/tracks": {"birth": 3, "end": 0, "switch": 1}, "/b": {"birth": 0}},
+        written_to=Path("other.mcap"), written_because="ROS reads it",
+    )  # fmt: skip
+    for more in ("", "-v", "-q", "--json"):
+        to.run(f"events x.mcap {more}".strip(), events=stages)
+    to.run("events x.mcap", events=run_result(stages=("events",), written_because="why", written_to=None))
+    to.run("fuse x.mcap", fuse=run_result(stages=("fuse",), frames={"/yard/detections": 4, "/other/x": 2}))
 
 
-class TestChecked:
-    @pytest.fixture
-    def bad(self, finished, tmp_path) -> Path:
-        """A log with a byte changed in the middle and its end cut off."""
-        raw = bytearray(finished.read_bytes())
-        raw[len(raw) // 3] ^= 1
-        path = tmp_path / "bad.mcap"
-        path.write_bytes(raw[: len(raw) * 5 // 6])
-        return path
+def of_zones(to: Transcript) -> None:
+    room = ZoneTotals("room", False, 3, 4, 2, 1, 50.0, 12.54, 11.0, 2, 1.5)
+    door = ZoneTotals("door", True, 7, forward=5, backward=6)
+    counted = {"/a/tracks": [door, room], "/b/tracks": [ZoneTotals("room", False, 0)]}
+    to.run("zones x.mcap --zones z", zones=run_result(zones=counted, stages=("zones",), written_because="ROS reads it"))
+    to.run("zones x.mcap --zones z", zones=run_result(zones={"/a": [door]}, written_to=None, written_because="why"))
+    to.run("zones x.mcap --zones z --json -q", zones=run_result(zones={"/a": [room]}, stages=("zones",)))
+    to.run("run x.mcap", run=run_result(zones={"/a": [room]}, summary=Summary()))
 
-    @pytest.fixture
-    def odd(self, tmp_path) -> Path:
-        """A log without chunks, with a byte changed in its summary."""
-        path = tmp_path / "odd.mcap"
-        write_stock(path, SOME, use_chunking=False)
-        raw = bytearray(path.read_bytes())
-        raw[-60] ^= 1
-        path.write_bytes(raw)
-        return path
 
-    def test_findings_are_listed_in_a_table(self, finished, bad, odd):
-        for logs in ([finished, bad], [bad, odd, finished]):
-            outcome = call("check", *logs)
-            results = json.loads(call("check", *logs, "--json").out)["results"]
-            assert outcome.code == 1
-            assert [one["log"] for one in results] == [str(path) for path in logs]
-            lines = [line.split() for line in outcome.out.splitlines()]
-            for one in results:
-                verdict = "sound" if one["sound"] else "damaged"
-                words = f"{one['log']}: {verdict}; {one['messages']} messages in {one['chunks']} chunks"
-                assert lines.pop(0) == words.split()
-                if one["findings"]:
-                    assert lines.pop(0) == ["byte", "times", "kind"]
-                for f in one["findings"]:
-                    cells = f"{f['level']} {f['byte']} {f['times']} {f['kind']} {f['words']}"
-                    assert lines.pop(0) == cells.split()
-            assert not lines
-        assert {f["level"] for one in results for f in one["findings"]} == {"error", "warning"}
+def channel(topic: str, messages: int, rate_hz: float | None = None, **more: Any) -> dict[str, Any]:
+    plain = dict.fromkeys(("input", "transform", "plugins", "parameters", "frame", "references"))
+    plain |= {"schema": "test.Thing", "stale": False, "replaced": False}
+    return plain | {"topic": topic, "messages": messages, "rate_hz": rate_hz} | more
 
-    def test_quiet_prints_errors_only(self, finished, odd):
-        assert done("check", finished, "-q").out == ""
-        (one,) = json.loads(call("check", odd, "--json").out)["results"]
-        lines = call("check", odd, "-q").out.splitlines()
-        errors = [f for f in one["findings"] if f["level"] == "error"]
-        assert len(lines) == 1 + len(errors) < 1 + len(one["findings"])
 
-    def test_text_and_json_agree_on_what_was_saved_and_lost(self, bad, tmp_path):
-        outcome = call("recover", bad, "-o", tmp_path / "b.mcap")
-        (one,) = json.loads(call("recover", bad, "-o", tmp_path / "c.mcap", "--json", "-q").out)["results"]
-        assert outcome.code == 3
-        assert one["lost"]
-        assert (one["log"], one["output"]) == (str(bad), str(tmp_path / "c.mcap"))
-        assert outcome.err.splitlines() == [
-            f"{tmp_path / 'b.mcap'}: {one['messages']} messages in {one['chunks']} chunks are saved",
-            *(f"lost: {words}" for words in one["lost"]),
-        ]
-        with log.read(tmp_path / "c.mcap") as opened:
-            assert sum(channel.messages for channel in opened.channels.values()) == one["messages"] > 0
+def frame(name: str, parent: str | None, **more: Any) -> dict[str, Any]:
+    plain = {"static": False, "rate_hz": 12.345, "start_ns": START + SECOND, "end_ns": START + 2 * SECOND}
+    return plain | {"frame": name, "parent": parent, "gaps": [], "jumps": []} | more
 
-    def test_the_first_twenty_losses_are_printed(self, finished, tmp_path, monkeypatch):
-        from mcaptrack.log import recover as real
 
-        lost = [f"thing {number}" for number in range(22)]
-        monkeypatch.setattr(log, "recover", lambda *args: replace(real(*args), lost=lost[:count]))
-        for count, more, said in ((20, [], 20), (22, [], 20), (22, ["-v"], 22)):
-            lines = call("recover", finished, "-o", tmp_path / "a.mcap", "--force", *more).err.splitlines()
-            lines = [line for line in lines if line.startswith("lost: ")]
-            wanted = [f"lost: thing {number}" for number in range(said)]
-            assert lines == wanted + (["lost: 2 more; -v shows them"] if said < count else [])
+def of_contents(to: Transcript) -> None:
+    def info(line: str, **changed: Any) -> None:
+        plain = {"log": "a\x1b.mcap", "bytes": 12345, "messages": 6789, "start_ns": START}
+        plain |= {"end_ns": START + 1_500_000_000, "results": None, "channels": [], "frames": None}
+        to.run(line, info=SimpleNamespace(to_json=lambda: plain | changed))
 
-    def test_drop_counts_messages_and_bytes(self, finished, tmp_path):
-        with log.read(finished) as opened:
-            gone = {t: c.messages for t, c in opened.channels.items() if t.startswith("/camera/retracks/online")}
-        target = tmp_path / "b.mcap"
-        outcome = done("drop", finished, "/camera/retracks/online*", "-o", target)
-        before, after = finished.stat().st_size, target.stat().st_size
-        assert outcome.err.splitlines()[-1] == (
-            f"{target}: {', '.join(sorted(gone))} with {sum(gone.values())} messages left out; {before} bytes became {after}"
+    plugin = {"name": "own", "distribution": "pkg", "version": "1.2"}
+    channels = [
+        channel("/a", 1234, 29.97),
+        channel("/a", 5, 10.04, replaced=True),
+        channel("/a/b", 7, input="/a", transform="track", frame="map", stale=True, parameters={"b": 2, "a": 1},
+                references=["/x/events", "/x/corrected"], plugins={"transform": plugin}),
+        channel("/a/c", 7, input="/a", transform="track",
+                plugins={"transform": plugin | {"distribution": "", "version": ""}}),
+        channel("/a/view", 7, input="/a", transform="view"),
+        channel("/d", 7, input="/gone", transform="track"),
+    ]  # fmt: skip
+    info("info x.mcap -v", channels=channels, results="a.results.mcap")
+    cameras = [channel("/b/x", 1, camera="b"), channel("/imu", 1), channel("/a/x", 1, camera="a")]
+    info("info x.mcap", channels=cameras, start_ns=1_234_567_890, end_ns=1_234_567_890)
+    for start_ns in (315_532_800 * SECOND - 1, 315_532_800 * SECOND, START + 5_999_999):  # dates from 1980 on
+        info("info x.mcap", start_ns=start_ns, end_ns=start_ns)
+    info("info x.mcap", messages=0, frames=[])
+    gaps = [{"start_ns": START + n * SECOND, "end_ns": START + n * SECOND + SECOND // 2} for n in range(4)]
+    jumps = [{"t_ns": START + SECOND // 4, "distance_m": 1.234, "angle_deg": 44.6}]
+    frames = [
+        frame("map", None), frame("base", "map", gaps=gaps, jumps=jumps), frame("eye", "base", static=True),
+        frame("foot", "base", gaps=gaps[:1], jumps=jumps * 2),
+    ]  # fmt: skip
+    info("info x.mcap --frames", frames=frames)
+    deep = [channel(f"/{n}", 1, input=f"/{n - 1}", transform="track") for n in range(1, 34)]
+    info("info x.mcap", channels=deep)
+
+
+def of_upkeep(to: Transcript) -> None:
+    cut = Finding("error", "cut-off", 123, "the file is cut off")
+    late = Finding("warning", "late", 5, "messages later than 2262", 3)
+    beside = CheckResult(Path("a.results.mcap"), 1, 1, [])
+    for findings, more in (([cut, late], ("", "-q", "--json")), ([late], ("", "-q"))):
+        files = (CheckResult(Path("a.mcap"), 12, 3, findings), beside)
+        for one in more:
+            to.run(f"check x.mcap {one}".strip(), check=LogCheck(Path("a.mcap"), files, ()))
+    for count, more in ((0, ""), (20, ""), (22, ""), (22, "-v"), (2, "--json -q")):
+        lost = tuple(f"byte {n}" for n in range(count))
+        saved = LogRecovery(Path("a.mcap"), Path("saved.mcap"), 12, 3, lost, ())
+        to.run(f"recover x.mcap -o saved.mcap {more}".strip(), recover=saved)
+
+
+def of_calibration(to: Transcript) -> None:
+    line = "people walk on one line"
+    cameras = {
+        "few": ("", 0.0, 0, None, None, None, None, "too few pairs", "", 0.0),
+        "agrees": ("", 0.0, 1200, 0.1, 0.3, None, None, "it agrees with the others", "", -0.5),
+        "off": ("rigid", 2.5, 90, 1.0, 2.0, 0.1, 0.2, "", line, 0.25),
+        "before": ("full", 2.5, 90, None, 2.0, 0.1, None, "", "", 0.0),
+    }
+    found = {name: mcaptrack.CameraCorrection(*one, homography=None) for name, one in cameras.items()}
+    given = Path("a.mcap"), found, {"off": "/off/plane", "before": "/before/plane"}, ("before",), ("/agrees/plane",)
+    for is_dry_run in (False, True):
+        result = mcaptrack.CalibrateResult(
+            *given, is_dry_run, (), None if is_dry_run else Path("b.mcap"), "why", (), 1.26
         )
-        assert call("drop", finished, "/camera/truth", "-o", target).code == 1
-        (one,) = data("drop", finished, "/camera/retracks/online*", "-o", target, "--force")
-        assert one == {"log": str(target), "dropped": sorted(gone), "messages": sum(gone.values()), "bytes": after}
+        to.run("calibrate x.mcap", calibrate=result)
 
 
-class TestRun:
-    def test_a_stage_prints_a_line_for_each_channel(self, fresh):
-        copy = fresh.with_name("copy.mcap")
-        shutil.copyfile(fresh, copy)
-        (one,) = data("track", fresh, "-q")
-        lines = done("track", copy).err.splitlines()
-        stated = {line.split()[0]: " ".join(line.split()[1:]) for line in lines if line.startswith("  ")}
-        for topic, rows in one["rows"].items():
-            tracks = f"{one['tracks'][topic]:,} tracks, " if topic in one["tracks"] else ""
-            assert stated.pop(topic) == f"{tracks}{rows:,} rows in {one['frames'][topic]:,} frames"
-        stated.pop("time", None)  # of a slow machine
-        assert list(stated) == ["next"]
-        assert one["tracks"].keys() == {"/camera/tracks"}
-        with log.read(fresh) as opened:
-            from mcaptrack.schema import TRACKS
-
-            made = opened.rows("/camera/tracks", TRACKS).rows
-        assert (one["rows"]["/camera/tracks"], one["tracks"]["/camera/tracks"]) == (
-            len(made),
-            len(set(made["track_id"])),
-        )
-        assert (one["log"], one["written_to"]) == (str(fresh), str(fresh))
-        assert len({line.index(line.split()[1]) for line in lines if line.startswith("  ")}) == 1
-
-    def test_the_summary_of_a_run_agrees_with_the_log(self, finished, tmp_path):
-        path = tmp_path / "walk.mcap"
-        shutil.copyfile(finished, path)
-        (one,) = data("run", path, "-q")
-        found, lines = one["summary"], done("run", path).err.splitlines()
-        stated = {line.split("  ")[1].strip(): re.split(r"  +", line.strip())[1] for line in lines if line[:2] == "  "}
-        assert stated["boxes"] == f"{found['boxes']:,} in {found['pictures']:,} pictures"
-        assert stated["tracks"] == f"{found['tracks']:,}"
-        assert stated["forecasts"].startswith(f"{found['forecasts']:,}, {found['horizon_s']:g} s ahead")
-        assert (one["stages"], one["written_to"]) == ([], None)
-        assert f"{path}: nothing to do, everything is up to date" in lines
-        (score,) = data("evaluate", path, "--similarity", "iou", "--topic", "/camera/tracks")
-        del score
-        for key, value in found["repair"].items():
-            assert re.search(rf"(?<![\d,]){value:,}(?![\d,])", stated["re-tracked"]), key
-
-    def test_events_are_counted_by_kind(self, finished, tmp_path):
-        path = tmp_path / "walk.mcap"
-        shutil.copyfile(finished, path)
-        outcome = done("events", path)
-        (one,) = data("events", path)
-        assert one["events"]
-        for topic, kinds in one["events"].items():
-            words = ", ".join(f"{kind} {count}" for kind, count in kinds.items() if count) or "nothing happened"
-            assert f"{topic}: {words}" in outcome.err.splitlines()
-
-    def test_tables_are_named_with_their_rows(self, finished, tmp_path):
-        outcome = done("export", finished, "-o", tmp_path / "t", "-v")
-        (one,) = data("export", finished, "-o", tmp_path / "u", "-q")
-        folder = tmp_path / "t"
-        assert f"{folder}: " + ", ".join(f"{name} {rows}" for name, rows in one["rows"].items()) in outcome.err
-        assert f"{folder}: written {', '.join(one['written'])}" in outcome.err
-        assert sorted(path.name for path in folder.iterdir()) == sorted(one["written"])
-        again = done("export", finished, "-o", folder, "-v")
-        assert f"{folder}: written nothing, all tables are up to date" in again.err
-        (one,) = data("export", finished, "-o", folder)
-        assert (one["written"], one["log"], one["folder"]) == ([], str(finished), str(folder))
+SCORES = {"IDF1": 0.75, "MOTA": 0.5, "HOTA": 0.25, "IDSW": 1, "FP": 2, "FN": 3}
 
 
-def test_tune_prints_scores_and_settings(finished, tmp_path):
-    words = [
-        "tune",
-        finished,
-        "--trials",
-        "6",
-        "--search",
-        "min-iou=0.2:0.9",
-        "--search",
-        "max-age-s=0:2",
-        "--seed",
-        "3",
-    ]
-    (one,) = data(*words, "-o", tmp_path / "a.toml")
-    outcome = done(*words, "-o", tmp_path / "b.toml")
-    (head, rows), settings = tables(outcome.out)[0], outcome.out.rpartition("\n\n")[2].splitlines()
-    assert head == ["IDF1", "MOTA", "HOTA", "IDSW", "FP", "FN"]
-    for row, scores in zip(rows, (one["default_scores"], one["scores"]), strict=False):
-        values = [scores[name] for name in head]
-        assert row[1:] == [f"{100 * v:.1f}" if isinstance(v, float) else str(v) for v in values]
-    assert [row[0] for row in rows[:2]] == ["defaults", "best"]
-    assert settings == [f"{name.replace('_', '-')} = {value}" for name, value in one["settings"].items()]
-    (score,) = data("evaluate", finished, "--similarity", "iou", "--topic", "/camera/tracks")
-    assert {name: one["default_scores"][name] for name in head} == {name: pytest.approx(score[name]) for name in head}
-    assert (one["stage"], one["trials"]) == ("track", 6)
-
-
-@pytest.mark.parametrize("command", sorted(PRINTING))
-def test_output_writes_what_would_be_printed(command, finished, tmp_path):
-    for more in ([], ["--json"]):
-        words = [command, finished, *PRINTING[command], *more]
-        printed = done(*words)
-        target = tmp_path / f"out{len(more)}.txt"
-        outcome = done(*words, "-o", target)
-        assert outcome.out == ""
-        assert target.read_text() == printed.out != ""
-        before = target.read_bytes()
-        refused = call(*words, "-o", target)
-        assert (refused.code, refused.out, refused.err.count("\n")) == (1, "", 1)
-        target.write_text("old")
-        done(*words, "-o", target, "--force")
-        assert target.read_bytes() == before
-
-
-@pytest.mark.parametrize("command", sorted(GROUP.commands))
-def test_switches_are_off_by_default(command):
-    flags = {p.name: p.default for p in GROUP.commands[command].params if p.param_type_name == "option" and p.is_flag}
-    off = {"force", "json", "quiet", "verbose", "csv", "gif", "tables", "blobs", "in_place", "open_"} & flags.keys()
-    assert {name: flags[name] for name in off} == dict.fromkeys(off, False) | (
-        {"tables": True} if command == "run" else {}
+def tuned(best: int = 3, similarity: str = "iou", **changed: Any) -> mcaptrack.TuneResult:
+    given = {"stage": "track", "metric": "IDF1", "settings": {"max_age_s": 2.5}, "scores": SCORES, "trials": 7}
+    return mcaptrack.TuneResult(
+        **given | changed,
+        default_scores=SCORES | {"IDF1": 0.5},
+        best=best,
+        similarity=similarity,
+        notes=(),
+        warnings=(),
     )
 
 
-@pytest.mark.parametrize(
-    ("text", "wanted"),
-    [
-        ("0", 0),
-        ("1777636800", 1_777_636_800 * 10**9),
-        ("1777636800.25", 1_777_636_800_250_000_000),
-        ("1777636800123456789/1000000000", 1_777_636_800_123_456_789),
-        ("2026-05-01T12:00:00Z", 1_777_636_800 * 10**9),
-        ("2026-05-01T12:00:00", 1_777_636_800 * 10**9),
-        ("2026-05-01T14:30:00+02:30", 1_777_636_800 * 10**9),
-        ("2026-05-01T12:00:01.000003Z", 1_777_636_801_000_003_000),
-        ("9223372035", 9_223_372_035 * 10**9),
-        ("9223372037", None),
-        ("-1", None),
-        ("1969-12-31T23:59:59Z", None),
-        ("2300-01-01T00:00:00Z", None),
-        ("noon", None),
-    ],
+def of_tuning(to: Transcript) -> None:
+    to.run("tune x.mcap", tune=tuned())
+    to.run("tune x.mcap -o b.toml --metric mota --stage sample", tune=tuned(metric="MOTA", stage="sample"))
+    to.lines += Path("mcaptrack.toml").read_text().splitlines() + Path("b.toml").read_text().splitlines()
+    to.run("tune x.mcap -o c.toml --json", tune=tuned(best=0))
+    for words, similarity in (
+        ("--gate-m 1 --min-iou 0.4", "iou"),
+        ("--gate-m 1 --min-iou 0.4", "metres"),
+        ("--tracker sort --stage sample", "iou"),
+        ("--fps 5 --camera c", "iou"),
+        ("--truth t.txt --fps 5 --point foot --camera c --topic /t", "iou"),
+        ("--truth t.txt --point foot --ground-plane p.txt", "iou"),
+    ):
+        to.run(f"tune x.mcap -o c.toml -q {words}", shows_answer=False, tune=tuned(best=0, similarity=similarity))
+
+
+def of_answers(to: Transcript) -> None:
+    answer = pa.table({"n": [1, 1000], "word": ["a\x1b[31m", "x" * 70], "x": [0.5, None]})
+    for more in ("", "--rows 1", "--rows 1 -q", "--rows 1 --format csv", "--format jsonl", "--json"):
+        to.run(f"query x.mcap 'select 1' {more}".strip(), query=answer)
+    to.run("query x.mcap 'select 1'", query=answer.slice(0, 0))
+    to.run("query x.mcap 'select 1'", query=pa.table({"a": ["x" * 1001, "x" * 1000]}))
+    to.run("query --tables --rows 2 --format csv", list_tables=mcaptrack.TableList((), (), ()))
+    for line in ("--format parquet", "--format arrow", "--json --format csv", "--with a=", "-f none.sql", "-f bad.sql",
+                 "-f q.sql --tables", "-o x.mcap --force"):  # fmt: skip
+        query = "" if line.startswith("-f") else "'select 1' "
+        to.run(f"query x.mcap {query}{line}", query=answer)
+    for line in ("x.mcap", "", "'select 1'", "x.mcap FROM x", "x.mcap ';'"):
+        to.run(f"query {line}", query=answer)
+
+
+@contextmanager
+def fleets_end_with(*outcomes: LogOutcome[Any], stopped: str = "") -> Iterator[None]:
+    """Let logs end like this, one after the other, instead of starting processes."""
+
+    def run(*_: Any, on_outcome: Callable[[LogOutcome[Any]], None], **__: Any) -> FleetResult[Any]:
+        for outcome in outcomes:
+            on_outcome(outcome)
+        return FleetResult(outcomes, 4.0, stopped)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fleet, "run", run)
+        yield
+
+
+def of_many_logs(to: Transcript) -> None:
+    said = (Notice("x", "lost"), Notice("y", "lost"), Notice("z", "other"))
+    happened = {"/a": {"birth": 2, "end": 0}, "/b": {"switch": 1}}
+    whole = run_result(
+        stages=("track", "track", "sample"), cameras=several_cameras(), summary=Summary(tracks=1200), warnings=said,
+        events=happened, log=Path("x.mcap"),
+    )  # fmt: skip
+    nothing = run_result(summary=Summary(tracks=1), events={"/a": {"birth": 0}}, log=Path("y.mcap"))
+    x, y, z = Path("x.mcap"), Path("y.mcap"), Path("z.mcap")
+    outcomes = (
+        LogOutcome(y, "done", nothing, printed="hello\nworld", tries=1, seconds=2.0, cpu_seconds=1.5, peak_bytes=250_000_000),
+        LogOutcome(x, "done", whole, tries=1),
+        LogOutcome(z, "failed", error="it is cut off, says `topic=`", detail="last\nwords", tries=2, cpu_seconds=0.5),
+    )  # fmt: skip
+    with fleets_end_with(*outcomes):
+        for line in (
+            "run x.mcap y.mcap z.mcap",
+            "events x.mcap y.mcap z.mcap",
+            "run x.mcap y.mcap z.mcap --json-lines",
+        ):
+            to.run(line)
+    with fleets_end_with(
+        LogOutcome(x, "skipped"), LogOutcome(z, "killed", error="z.mcap: its worker died", detail="why")
+    ):
+        to.run("run x.mcap z.mcap -v")
+    left = [LogOutcome(Path(f"{n}.mcap"), "not-tried") for n in range(18)]
+    with fleets_end_with(*outcomes[1:], *left, stopped="the disk is full"):
+        to.run("run x.mcap y.mcap z.mcap")
+    one, other = (LogCheck(path, (CheckResult(path, 12, 3, []),), ()) for path in (x, y))
+    with fleets_end_with(LogOutcome(y, "done", other), LogOutcome(x, "done", one), LogOutcome(z, "skipped")):
+        to.run("check x.mcap y.mcap z.mcap")
+
+
+def of_mistakes(to: Transcript) -> None:
+    for command in ("detect", "track", "sample", "predict", "retrack", "run", "events", "render", "recover", "ingest"):
+        to.run(f"{command} x.mcap y.mcap -o z.mcap")
+    for gates in ("0", "1,-1", "inf", "nan", "1,", "''"):
+        to.run(f"evaluate x.mcap --gate-m {gates}")
+    for limit in ("idf1", "idf1=", "luck=1"):
+        to.run(f"evaluate x.mcap --fail-under {limit}")
+    for search in ("min-iou=0.1", "min-iou=1:2:3", "min-iou=", "min-iou=a:b"):
+        to.run(f"tune x.mcap --search {search}")
+    for words in ("alpha", "alhpa=1", "alpha=x", "min_hits=1.5", "trim_ends=maybe", "alpha=1 --set alpha=2",
+                  "link_s=1 --link-s 2", "alpha=2 --profile paper"):  # fmt: skip
+        to.run(f"retrack a.mcap --set {words}")
+    for time in ("0", "0.0h", "-1", "1d", "m", "''", "1.", "'1 2'"):
+        to.run(f"check x.mcap --timeout={time}")
+    to.run("check x.mcap --memory-limit 1")
+    to.run("check x.mcap --ledger x.mcap")
+    write_clip(Path("clip.mp4"), options={"bf": "0"})
+    for words in ("--quality 60", "--image-format jpeg --quality 0", "--image-format png --quality 9",
+                  "--image-format jpeg --keyframe-interval-s 1", "--keyframe-interval-s 0"):  # fmt: skip
+        to.run(f"ingest clip.mp4 -o c.mcap {words}")
+    to.run("ingest truth.txt -o c.mcap --quality 20")
+    to.lines.append(f"c.mcap is there: {Path('c.mcap').exists()}")
+    to.run("run x.mcap", run=McaptrackError("give `fps=25` or `force=True`; `mcaptrack.run('a b.mcap', events=False)`"))
+
+
+PARTS: Sequence[tuple[str, Callable[[Transcript], None]]] = (
+    ("A log of labels", of_a_log),
+    ("Runs and stages", of_runs),
+    ("Zones", of_zones),
+    ("Contents", of_contents),
+    ("Check and recover", of_upkeep),
+    ("Calibrate", of_calibration),
+    ("Tune", of_tuning),
+    ("Query", of_answers),
+    ("Many logs", of_many_logs),
+    ("Mistakes", of_mistakes),
 )
-def test_start_time_sets_the_first_timestamp(text, wanted, tmp_path, monkeypatch):
+
+
+def test_commands_print_what_the_snapshot_has(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "clip.txt").write_text("1,1,1,1,2,2\n3,1,1,1,2,2\n")
-    outcome = call("ingest", "clip.txt", "--fps", "10", f"--start-time={text}")
-    assert outcome.code == (wanted is None)
-    if wanted is None:
-        assert outcome.err.count("\n") == 1
-        assert "--start-time" in outcome.err
-        assert text in outcome.err
-    else:
-        (one,) = data("info", "clip.mcap")
-        assert (one["start_ns"], one["end_ns"]) == (wanted, wanted + 200_000_000)
-
-
-class Terminal(io.StringIO):
-    """A stream that is a terminal."""
-
-    def isatty(self) -> bool:
-        return True
-
-
-def test_progress_is_shown_on_a_terminal_only(monkeypatch):
-    from mcaptrack.cli.common import Talk
-
-    now = iter(0.06 * n for n in range(1000))
-    monkeypatch.setattr("mcaptrack.cli.common.monotonic", lambda: next(now))
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setenv("COLUMNS", "100")
-    shown = {}
-    for name, kind, quiet in (("terminal", Terminal, False), ("pipe", io.StringIO, False), ("quiet", Terminal, True)):
-        with monkeypatch.context() as patch, Talk(quiet).open() as talk:
-            patch.setattr("sys.stderr", kind())
-            for done_ in range(11):
-                talk.progress("detect", done_, 10)
-            talk.progress("track", 3, 7)
-            talk.progress("track", 7, 7)
-            talk.say("a line")
-            talk.progress("sample", 2, 2)
-            talk._stop()
-            shown[name] = sys.stderr.getvalue()
-    assert (shown["pipe"], shown["quiet"]) == ("a line\n", "")
-    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown["terminal"])
-    before, after = text.split("a line\n")
-    assert "detect" in before
-    assert "10/10" in before
-    assert " 7/7 " in before
-    assert "sample" not in before
-    assert "2/2" in after
-    assert "detect" not in after  # what was said before a line is over
+    for name in ("x.mcap", "y.mcap", "z.mcap", "bad.sql"):
+        Path(name).write_bytes(b"\xff")
+    Path("q.sql").write_text("select 2")
+    to = Transcript()
+    for title, part in PARTS:
+        to.head(title)
+        part(to)
+    found = [*to.lines[1:], ""]
+    if os.environ.get("PRINTED") == "write":
+        SNAPSHOT.write_text("\n".join(found), encoding="utf-8")
+    assert found == SNAPSHOT.read_text(encoding="utf-8").split("\n")
