@@ -14,7 +14,6 @@ import pytest
 
 from mcaptrack import notices, registry
 from mcaptrack.errors import McaptrackError
-from mcaptrack.predictors import NAMES
 from mcaptrack.registry import BUILT_IN, KINDS, blamed, entry_of, find, names
 from mcaptrack.transforms import STAGES, ByteTrack, Sort
 from tests.distributions import package
@@ -62,10 +61,6 @@ def test_every_built_in_name_is_found_and_is_its_class_again(kind):
         entry = find(kind, name)
         assert (entry.name, entry.kind, entry.distribution, entry.is_built_in) == (name, kind, "mcaptrack", True)
         assert entry_of(kind, entry.cls) == entry
-
-
-def test_predictors_that_need_no_file_are_the_built_in_ones_but_onnx():
-    assert set(NAMES) == set(BUILT_IN["predictor"]) - {"onnx"}
 
 
 @pytest.mark.parametrize("stage", [stage for stage in STAGES.values() if stage.kind], ids=lambda stage: stage.name)
@@ -366,19 +361,6 @@ def test_parameters_that_there_are_not_are_said_with_those_that_there_are(instal
         STAGES["track"].make("nearest", gian=1.0)
     with pytest.raises(McaptrackError, match="sample has one transform only"):
         STAGES["sample"].find("nearest")
-
-
-def test_the_groups_of_entry_points_are_those_of_the_documentation():
-    groups = {f"mcaptrack.{kind}s" for kind in KINDS}
-    assert groups == {
-        "mcaptrack.detectors",
-        "mcaptrack.trackers",
-        "mcaptrack.predictors",
-        "mcaptrack.retrackers",
-        "mcaptrack.fusers",
-    }
-    for group in groups:
-        assert f".{group.partition('.')[2]}``" in (registry.__doc__ or "")
 
 
 @pytest.mark.parametrize(

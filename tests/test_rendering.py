@@ -85,10 +85,6 @@ def test_what_is_drawn_is_scaled_with_the_picture():
     assert abs(np.array(spans[0]) / 2 - np.array(spans[1])).max() <= 2
 
 
-def test_a_picture_where_nothing_is_stays_as_it_is():
-    assert np.array_equal(draw(GREY, annotations()), GREY)
-
-
 def test_lines_of_a_list_are_drawn_one_by_one_and_leave_gaps():
     message = ImageAnnotations()
     part = message.points.add(type=4, thickness=2)

@@ -13,7 +13,6 @@ from mcaptrack.viewing.report import charts
 from mcaptrack.viewing.report.charts import Axis, Bars, Line
 from mcaptrack.viewing.report.headline import rules_text
 from mcaptrack.viewing.report.scene_map import SceneBackground, TrackPath, ground_map, heat_map, picture_map
-from mcaptrack.viewing.report.statistics import speeds_m_per_s
 from mcaptrack.viewing.report.summary import change_text, verdict
 from tests.worlds import walk
 
@@ -83,11 +82,6 @@ def test_values_before_and_after_and_their_intervals_stand_on_one_scale():
     assert (float(low), float(high)) == pytest.approx((ticks["0"] + span / 4, ticks["0"] + 3 * span / 4), abs=0.11)
     assert (role, other, below - y) == ("tracks", "offline", 6)
     assert len(chart["rows"][1]["name"]) == 48
-
-
-def test_the_way_from_the_end_of_a_track_to_the_start_of_the_next_is_no_speed():
-    frames = walk(lambda tick: {1: (0.4 * tick, 0.0)} if tick < 5 else {2: (100 + 0.4 * tick, 0.0)}, 10)
-    assert speeds_m_per_s(frames) == pytest.approx([1.0] * 8)
 
 
 @pytest.mark.parametrize("span_s", [0.4, 7.0, 59.0, 61.0, 3600.0, 90000.0, 1e7])

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.optimize import linear_sum_assignment
 
 import mcaptrack
 from mcaptrack import log
@@ -32,8 +31,7 @@ from mcaptrack.viewing.report.doubts import find_doubts
 from mcaptrack.viewing.report.figures import identity_events
 from mcaptrack.viewing.report.identity_events import summarize_events
 from mcaptrack.viewing.report.identity_timeline import counts_over_time, identity_timeline, mean_numbers, pieces
-from mcaptrack.viewing.report.scene_map import heat_map
-from tests.worlds import crossing_tracks, ns, tracks_at, walk, write_eventful
+from tests.worlds import crossing_tracks, ns, tracks_at, write_eventful
 
 
 @pytest.fixture(scope="module")
@@ -289,19 +287,6 @@ def test_those_who_stay_longest_have_a_bar(told, monkeypatch):
 # Maps and doubts
 
 
-def test_a_heat_map_is_darkest_where_people_stay(told):
-    frames = walk(lambda tick: {1: (0.25, 0.25) if tick < 20 else (0.25 + tick - 20, 0.25)}, 26)
-    found = heat_map(frames)
-    import cv2
-
-    picture = cv2.imdecode(np.frombuffer(found["png"], np.uint8), cv2.IMREAD_UNCHANGED)
-    opacity = picture[..., 3]
-    assert opacity.shape[0] == 1
-    assert (opacity.max(), int(opacity.argmax())) == (255, 0)
-    assert found["total"] == "0.2\N{NO-BREAK SPACE}min"  # 25 steps of 0.4 s
-    assert heat_map([]) is None
-
-
 def joined(jump_m: float, other: bool) -> tuple[list[Frame], list[Frame]]:
     """Tracks that join the tracker's 1 and 2 over a gap of 2 s, a ``jump_m`` away; and the ground truth, another
     person after the gap if ``other``.
@@ -425,16 +410,3 @@ def test_only_times_become_links_and_addresses_are_escaped(content, address):
 def test_pages_with_other_numbers_are_not_about_the_log(data):
     assert not is_about(b'<script type="application/json" id="mcaptrack-report">' + data + b"</script>", "a")
     assert json.loads("1") == 1
-
-
-def test_the_best_assignment_is_that_of_scipy():
-    truth, tracks = swapped(np.random.default_rng(7))
-    found = person_scores(truth, tracks, MatchRule("metres", 1.0))
-    near = np.zeros((200, 1200), int)
-    for a, b in zip(truth, tracks, strict=True):
-        for row in a.rows:
-            for other in b.rows:
-                away = np.hypot(row["x_m"] - other["x_m"], row["y_m"] - other["y_m"])
-                near[int(row["track_id"]), int(other["track_id"])] += away <= 1.0
-    rows, columns = linear_sum_assignment(-near)
-    assert found.hits.sum() == near[rows, columns].sum()

@@ -104,32 +104,3 @@ def test_a_forecast_with_rest_has_the_mean_and_covariance_of_both():
             cov = sum(share * (spread + np.outer(at - mean, at - mean)) for share, at, spread in parts)
             np.testing.assert_allclose(found.mean[one, step], mean)
             np.testing.assert_allclose(found.cov[one, step], cov)
-
-
-def test_a_predictor_sees_the_people_of_a_frame_each_in_the_unit_of_its_class(monkeypatch: pytest.MonkeyPatch):
-    """Two people, a car, one who is interpolated, and one who is new."""
-    seen: list[tuple] = []
-
-    def predict_among(predictor, past, known, people):
-        seen.append((past.copy(), known.copy(), people))
-        return Forecast(np.zeros((len(past), 12, 2)), np.tile(np.eye(2), (len(past), 12, 1, 1)))
-
-    monkeypatch.setattr(forecasts, "predict_among", predict_among)
-    monkeypatch.setattr(forecasts, "uses_people", lambda _: True)
-    forecaster = forecasts.Forecaster("cv", 4.8, 3, 2.5, NAMES)
-    for tick in range(4):
-        ids = [9, 2, 7, 5, *([4] if tick == 3 else [])]
-        rows = TRACKS.rows(
-            track_id=ids, class_id=[1, 3, 1, 1, 1][: len(ids)], x_m=[8.0 * k + tick for k in range(len(ids))],
-            y_m=[1.0] * len(ids), observed=[True, True, True, tick != 3, True][: len(ids)], source_id=[-1] * len(ids),
-        )  # fmt: skip
-        made = forecaster.predict(Frame(ns(tick / 2.5), tick, rows))
-    past, known, people = seen[-1]
-    assert np.unique(made["track_id"]).tolist() == [2, 7, 9]  # not the interpolated one, and not the new one
-    assert past[:, -1].tolist() == [[3.0, 1.0], [11.0 / 4, 0.25], [19.0, 1.0]]  # in units of 1 and 4 m
-    assert people.xy_m[:, -1].tolist() == [[3.0, 1.0], [11.0 / 4, 0.25], [19.0, 1.0], [35.0, 1.0]]
-    assert people.valid[:, -3:].tolist() == [[True] * 3] * 3 + [[False, False, True]]
-    assert people.moment.tolist() == [0, 1, 0, 0]
-    assert people.row.tolist() == [0, 1, 2]
-    assert known[:, -3:].all()
-    assert [len(one[0]) for one in seen] == [0, 0, 4, 3]

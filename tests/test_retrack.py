@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
 from itertools import pairwise
 
@@ -12,30 +11,16 @@ import pytest
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.histories import Holt
 from mcaptrack.predictors import Forecast
-from mcaptrack.transforms import PROFILES, Retrack, RetrackByConsistency
+from mcaptrack.transforms import PROFILES
 from mcaptrack.transforms.retrack.consistency import SmoothedHistory
 from mcaptrack.transforms.retrack.options import (
     mahalanobis,
-    metric_distances,
-    paper_covariance,
-    position_distances,
     prediction_distances,
 )
 from tests.tiers import one_in
 from tests.worlds import ids, places, tracks_at, walk
 
 PAPER, AUTHORS, DEFAULT = PROFILES["paper"], PROFILES["authors"], PROFILES["default"]
-#: Algorithm 1 with the distance between predicted and measured position, without the offline steps.
-NOW = RetrackByConsistency(
-    distance="now",
-    noise_m=0.5,
-    same_id_bonus=1.0,
-    max_age_s=4.8,
-    link_s=0.0,
-    resolve_swaps=False,
-    smooth=False,
-    track_confidence=0.0,
-)
 every_profile = pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
 
 
@@ -73,11 +58,6 @@ class TestDistance:
         off, cov = np.array([[3.0, 4.0], [1.0, 1.0]]), np.array([np.diag([9.0, 16.0]), [[2.0, 1.0], [1.0, 2.0]]])
         np.testing.assert_allclose(mahalanobis(off, cov), [np.sqrt(2), np.sqrt(2 / 3)])
 
-    def test_the_covariance_grows_as_in_the_paper(self):
-        cov = paper_covariance(np.array([1, 4]), 3, 0.5)
-        np.testing.assert_allclose(cov[:, :, 0, 0], [[0.25, 0.5, 0.75], [1.0, 1.25, 1.5]])
-        np.testing.assert_allclose(cov[:, :, 0, 1], 0)
-
     def test_eq_2_by_hand(self):
         """A track predicted one step ago at 0, 1, 2, ...; an observation predicts the same positions 2 m further.
 
@@ -90,28 +70,6 @@ class TestDistance:
         assert prediction_distances(tracks, age, seen, "max", 1.0)[0, 0] == pytest.approx(each.max())
         assert prediction_distances(tracks, age, seen, "first", 1.0)[0, 0] == pytest.approx(each[0])
         assert prediction_distances(tracks, age, seen, "mean", 2.0)[0, 0] == pytest.approx(each.mean() / 2)
-
-    def test_older_tracks_overlap_less(self):
-        """Ages 1, 9 and 12 leave 11, 3 and no steps, each track by its own."""
-        tracks = forecast(line(0, 1), line(0, 1), line(0, 1))
-        seen = forecast(line(0, 0))
-        distance = prediction_distances(tracks, np.array([1, 9, 12]), seen, "mean", 1.0)[:, 0]
-        steps = np.arange(1, 12)
-        assert distance[0] == pytest.approx(((1 + steps) / np.sqrt(2 * steps + 1)).mean())
-        steps = np.arange(1, 4)
-        assert distance[1] == pytest.approx(((9 + steps) / np.sqrt(9 + 2 * steps)).mean())
-        assert distance[2] == np.inf
-
-    def test_the_covariance_of_a_predictor_replaces_that_of_the_paper(self):
-        tracks, seen = forecast(line(0, 0), variance=3.0), forecast(line(0, 0) + [2, 0], variance=1.0)
-        assert prediction_distances(tracks, np.array([1]), seen, "mean", None)[0, 0] == pytest.approx(1.0)
-
-    def test_the_distance_of_predicted_and_measured_position_by_hand(self):
-        tracks = forecast(line(0, 1), line(0, 1), variance=0.75)
-        xy = np.array([[3.0, 1.0]])
-        distance = position_distances(tracks, np.array([3, 13]), xy, 0.5, None)
-        np.testing.assert_allclose(distance, [[1.0], [np.inf]])
-        np.testing.assert_allclose(metric_distances(tracks, np.array([2, 13]), xy), [[np.sqrt(2)], [np.nan]])
 
 
 class TestSmoothing:
@@ -131,28 +89,9 @@ class TestSmoothing:
         assert known.tolist() == [[True, True, True]]
         np.testing.assert_allclose(rebuilt[0, :, 0], [5 - smooth[-1] - smooth[-2], 5 - smooth[-1], 5])
 
-    def test_without_smoothing_the_past_is_as_it_was_observed(self):
-        past = np.array([[[0.0, 1], [1, 1], [3, 0], [2, 5]]])
-        history = SmoothedHistory.of_observations(Holt(1.0, 0.0), past, np.ones((1, 4), bool))
-        np.testing.assert_allclose(history.positions()[0], past)
-
 
 class TestBranches:
     """Lines 4 to 18 of Algorithm 1, one by one, on people who walk along the first axis."""
-
-    @every_profile
-    def test_a_person_who_walks_on_is_one_track(self, profile):
-        offline, online, *_ = run(profile, walk(lambda n: {7: (0.5 * n, 0.0)}, 20))
-        assert set(paths(offline)) == {1}
-        assert set(paths(online)) == {1}
-        assert along(paths(offline)[1], {tick: (0.5 * tick, 0.0) for tick in range(20)})
-
-    @every_profile
-    def test_a_new_input_id_on_the_same_path_continues_the_track(self, profile):
-        frames = walk(lambda n: {7 if n < 10 else 8: (0.5 * n, 0.0)}, 24)
-        offline, *_ = run(profile, frames)
-        (who,) = paths(offline)
-        assert along(paths(offline)[who], {tick: (0.5 * tick, 0.0) for tick in range(24)})
 
     @every_profile
     def test_an_unmatched_track_coasts_and_is_matched_again_within_its_maximum_age(self, profile):
@@ -163,136 +102,6 @@ class TestBranches:
         assert along(paths(offline)[who], {tick: (0.5 * tick, 0.0) for tick in range(26)})
         filled = [tick for tick, frame in enumerate(offline) if not frame.rows["observed"].all()]
         assert set(range(10, 13)) <= set(filled)
-
-    @every_profile
-    def test_after_the_maximum_age_a_new_track_begins(self, profile):
-        gone = range(10, 26)  # 6.4 s
-        frames = walk(lambda n: {7 if n < 10 else 8: (0.5 * n, 0.0)} if n not in gone else {}, 40)
-        offline, *_ = run(replace(profile, link_s=0.0), frames)
-        assert len(paths(offline)) == 2
-        assert all(len(frame.rows) == 0 for frame in offline[10:26])
-
-    @every_profile
-    def test_the_age_is_in_seconds_and_does_not_count_frames(self, profile):
-        """The same gap, but the log has no frames there at all."""
-        frames = [f for f in walk(lambda n: {7: (0.5 * n, 0.0)}, 40) if not 10 <= f.index < 26]
-        offline, *_ = run(replace(profile, link_s=0.0), frames)
-        assert len(paths(offline)) == 2
-
-    @every_profile
-    def test_an_unmatched_observation_starts_a_track(self, profile):
-        frames = walk(lambda n: {7: (0.5 * n, 0.0)} | ({9: (0.0, 20.0 + 0.5 * n)} if n >= 6 else {}), 24)
-        offline, _, predictions, *_ = run(profile, frames)
-        assert len(paths(offline)) == 2
-        assert min(paths(offline)[2]) == 6  # with the past of its first observation
-        assert {row["track_id"] for row in predictions[-1].rows} == {1, 2}
-
-    @every_profile
-    def test_tracks_shorter_than_the_probation_are_left_out(self, profile):
-        frames = walk(lambda n: {7: (0.5 * n, 0.0)} | ({9: (0.0, 20.0)} if n in range(8, 12) else {}), 24)
-        offline, *_ = run(profile, frames)
-        assert len(paths(offline)) == 1
-
-    def test_pairs_outside_the_gate_are_not_matched(self):
-        def jump(n):
-            return {7: (0.5 * n, 0.0 if n < 10 else 40.0)}
-
-        offline, *_ = run(DEFAULT, walk(jump, 24))
-        assert len(paths(offline)) == 2
-
-    def test_the_gate_in_metres_limits_how_far_a_track_jumps(self):
-        frames = walk(lambda n: {7 if n < 10 else 8: (0.0, 0.0 if n < 10 else 4.0)} if not 10 <= n < 20 else {}, 32)
-        near, *_ = run(replace(NOW, gate_m=None), frames)
-        far, *_ = run(NOW, frames)
-        assert len(paths(near)) == 1
-        assert len(paths(far)) == 2
-
-    def test_two_people_who_pass_each_other_keep_their_ids(self):
-        frames = walk(lambda n: {1: (0.5 * n, 0.0), 2: (10 - 0.5 * n, 0.6)}, 24)
-        offline, *_ = run(DEFAULT, frames)
-        assert {round(path[23][1], 1): round(path[0][1], 1) for path in paths(offline).values()} == {0.0: 0.0, 0.6: 0.6}
-
-    def test_input_ids_decide_where_positions_are_ambiguous(self):
-        """Two walk abreast, 0.3 m apart, in noise. Identity switches are fewer with the bonus for the same input id."""
-        rng = np.random.default_rng(5)
-        noise = rng.normal(0, 0.25, (60, 2))
-
-        def pair(n):
-            return {1: (0.5 * n, noise[n, 0]), 2: (0.5 * n, 0.3 + noise[n, 1])}
-
-        def switches(profile):
-            _, online, *_ = run(profile, walk(pair, 60))
-            sources = [dict(zip(ids(f), f.rows["source_id"].tolist(), strict=True)) for f in online[3:]]
-            return sum(a != b for a, b in pairwise(sources))
-
-        assert switches(DEFAULT) < switches(replace(DEFAULT, same_id_bonus=0.0))
-
-    def test_near_pairs_are_matched_first(self):
-        """The total cost of two tracks and two observations is least crosswise, but one pair is near enough for priority."""
-        frames = walk(lambda n: {1: (0.0, 0.0), 2: (1.0, 0.0)}, 8)
-        late = walk(lambda n: {3: (0.05, 0.0), 4: (-1.0, 0.0)}, 8)
-        frames += [f._replace(t_ns=f.t_ns + 8 * 400_000_000, index=8 + f.index) for f in late]
-        options = {
-            "distance": "first",
-            "covariance": "paper",
-            "min_history": 1,
-            "max_distance": 3.0,
-            "same_id_bonus": 0.0,
-        }
-        plain = replace(NOW, **options, gate_m=None, noise_m=0.0, priority_distance=0.0)
-        sure = replace(plain, priority_distance=0.15)
-        by = [
-            {f.rows["source_id"][k]: f.rows["track_id"][k] for f in run(p, frames)[1][8:] for k in range(len(f.rows))}
-            for p in (plain, sure)
-        ]
-        assert by[1][3] == 1  # 0.05 m from track 1: matched first
-
-    def test_an_observation_needs_a_history(self):
-        frames = walk(lambda n: {1: (0.5 * n, 0.0)} if n < 3 else {}, 10)
-        for profile, least in ((PAPER, 4), (NOW, 2)):
-            assert profile.min_history == least
-            _, online, *_ = run(replace(profile, min_track_s=0.0), frames)
-            assert any(len(frame.rows) for frame in online) == (least <= 3 and profile.min_hits <= 1)
-
-    def test_backfill_takes_unclaimed_samples_or_all_or_none(self):
-        """Id 5 walks and then jumps away: its samples before the jump belong to track 1."""
-
-        def path(n):
-            return {5: (0.5 * n, 0.0) if n < 12 else (0.5 * n, 30.0)}
-
-        frames = walk(path, 24)
-        rows = {}
-        for backfill in ("none", "unclaimed", "all"):
-            offline, *_ = run(replace(AUTHORS, backfill=backfill), frames)
-            rows[backfill] = sum(len(frame.rows) for frame in offline)
-        assert rows["none"] < rows["unclaimed"] < rows["all"]
-        assert rows["unclaimed"] <= 24
-
-    def test_birth_from_raw_or_smoothed_positions_changes_the_first_prediction(self):
-        wild = [0.0, 1.0, 1.0, 3.0]
-        frames = walk(lambda n: {1: (wild[min(n, 3)] + max(n - 3, 0), 0.0)}, 6)
-        first = {}
-        for birth in ("raw", "smoothed"):
-            _, _, predictions, *_ = run(replace(PAPER, birth=birth, min_hits=0), frames)
-            first[birth] = predictions[3].rows["x_m"][:2].tolist()
-        assert first["raw"] == [4.0, 5.0]  # (3 - 0) / 3 a step
-        level, trend = 1.0, 0.0
-        for displacement in (0.0, 2.0):
-            new = 0.5 * displacement + 0.5 * (level + trend)
-            level, trend = new, 0.5 * (new - level) + 0.5 * trend
-        smooth = (1.0 + 0.5 + level) / 3
-        np.testing.assert_allclose(first["smoothed"], [3 + smooth, 3 + 2 * smooth])
-
-    @every_profile
-    def test_online_tracks_and_predictions_have_the_same_ids_and_times(self, profile):
-        frames = walk(lambda n: {7: (0.5 * n, 0.0), 8: (0.0, 15.0 + n)} if n % 7 else {7: (0.5 * n, 0.0)}, 30)
-        _, online, predictions, *_ = run(profile, frames)
-        seen: Counter[int] = Counter()
-        for now, then in zip(online, predictions, strict=True):
-            assert now.t_ns == then.t_ns
-            seen.update(now.rows["track_id"][now.rows["observed"]].tolist())
-            least = 4 if isinstance(profile, Retrack) else 1  # a track is confirmed before it is predicted
-            assert sorted(set(then.rows["track_id"].tolist())) == [one for one in ids(now) if seen[one] >= least]
 
     @pytest.mark.parametrize(
         ("profile", "horizon_s", "steps"),
@@ -315,13 +124,6 @@ class TestBranches:
         assert [ids(frame) for frame in two] == [[1]] * 12
         one = run(replace(PAPER, distance="now", horizon_s=0.4), frames)[0]
         assert [ids(frame) for frame in one] == [[1]] * 12
-
-    def test_online_rows_are_at_the_measured_positions(self):
-        frames = walk(lambda n: {7: (0.5 * n, np.sin(n))}, 20)
-        _, online, *_ = run(DEFAULT, frames)
-        for tick, frame in enumerate(online[3:], start=3):
-            assert places(frame) == {1: (0.5 * tick, round(np.sin(tick), 3))}
-            assert frame.rows["source_id"].tolist() == [7]
 
 
 class TestFailuresOfThePaper:

@@ -258,18 +258,6 @@ def test_encounters_begin_and_end_as_in_the_reference():
         assert [(names[i], names[j], *steps) for i, j, *steps in found] == encounters(paths)
 
 
-def test_the_timeout_of_merged_detections_restarts_with_every_occlusion():
-    """Two walk abreast and are merged into one detection twice, for 2.4 s each; the timeout is 3 s, coasting 1.2 s."""
-
-    def path(tick: int):
-        if tick in range(15, 21) or tick in range(25, 31):
-            return {1: (0.4 * tick, 0.0)}
-        return {1: (0.4 * tick, 0.6), 2: (0.4 * tick, -0.6)}
-
-    online = [len(frame.rows) for _, frame, *_ in FEW(walk(path, 34))]
-    assert online[10:] == [2] * 24
-
-
 def abreast(apart_m: float, aside_m: float, until: int, since: int = 15) -> list[Frame]:
     """Two walk so far apart; from tick 15 on one is missed, and from ``since`` on the other is so far aside, towards her."""
 

@@ -90,23 +90,6 @@ def test_people_walk_come_in_and_leave_at_borders(scenes):
     assert moves > 20_000
 
 
-def test_some_stand_some_walk_and_some_ride(scenes):
-    parts = [np.split(rows[:, 2:], np.flatnonzero(np.diff(rows[:, 1])) + 1) for rows in map(by_person, scenes)]
-    speeds = np.array([np.hypot(*(path[-1] - path[0])) / (len(path) * STEP_S) for paths in parts for path in paths])
-    still, walk, ride = (((low <= speeds) & (speeds < high)).mean() for low, high in ((0, 0.3), (0.8, 1.8), (2, 9)))
-    assert still > 0.03
-    assert walk > 0.3
-    assert ride > 0.05
-
-
-def test_no_two_scenes_have_the_same_faults():
-    found = [crowds.faults(np.random.default_rng([seed, 1])) for seed in range(200)]
-    assert len(set(found)) == 200
-    for name in ("merge_m", "doubles", "clutter", "lit", "beside", "breaks_per_min", "swap"):
-        share = np.mean([getattr(how, name) > 0 for how in found])
-        assert 0.03 < share < 0.9, name
-
-
 def test_the_fit_finds_the_weights_that_drew_the_data():
     rng = np.random.default_rng(1)
     features = rng.normal([1.0, -2.0], [1.0, 3.0], (40_000, 2))

@@ -171,15 +171,6 @@ def test_rows_are_those_that_stand_beside(ran):
             assert tables[0].equals(tables[1]), name
 
 
-def test_scores_are_those_of_results_that_stand_beside(ran):
-    if ran["words"][0] == "--topic":
-        return  # without ground truth
-    scores = [json.loads(done("evaluate", ran[name], "--json").out)["results"] for name in ("path", "beside")]
-    text = json.dumps(scores[0]).replace(str(ran["path"]), str(ran["beside"]))
-    assert '"IDF1"' in text
-    assert json.loads(text) == scores[1]
-
-
 def test_a_second_run_does_nothing_and_a_stage_again_stays_whole(ran, tmp_path):
     shutil.copytree(ran["path"].parent, tmp_path / "drive")
     path = tmp_path / "drive" / ran["path"].name

@@ -47,14 +47,6 @@ def by_rosbags(folder: Path) -> list[tuple[str, int, bytes]]:
         return [(c.topic, t, reader.deserialize(raw, c.msgtype).data.tobytes()) for c, t, raw in reader.messages()]
 
 
-def by_mcap_ros2(path: Path) -> list[tuple[str, int, bytes]]:
-    """All messages of a file by mcap_ros2, decoded."""
-    factory = pytest.importorskip("mcap_ros2.decoder").DecoderFactory()
-    with path.open("rb") as stream:
-        decoded = make_reader(stream, decoder_factories=[factory]).iter_decoded_messages()
-        return [(channel.topic, m.log_time, bytes(ros.data)) for _, channel, m, ros in decoded]
-
-
 def on_disk(folder: Path) -> dict[str, tuple[int, bytes]]:
     return {entry.name: (entry.stat().st_mtime_ns, entry.read_bytes()) for entry in folder.iterdir() if entry.is_file()}
 
@@ -145,13 +137,6 @@ def test_no_command_changes_a_recording_that_ros_tools_read(path, tmp_path):
         assert "/robot/front/detections" in opened.channels
         assert "/robot/front/retracks" not in opened.channels
     assert not list(path.parent.glob("*.retracks*"))
-
-
-def test_mcap_ros2_reads_a_recording_that_has_results(path):
-    before = by_mcap_ros2(path)
-    assert before == by_rosbags(path.parent)
-    done("detect", path, "--detector", "knn")
-    assert by_mcap_ros2(path) == before
 
 
 def test_what_was_written_where_and_why_stands_in_the_data(path):

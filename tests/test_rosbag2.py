@@ -18,7 +18,6 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.foxglove import class_colour
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
-from tests.commands import call, done
 from tests.worlds import boxed, boxes_at, ns, tracks_at
 
 NAMES = {"1": "pedestrian", "3": "car"}
@@ -203,12 +202,6 @@ class TestFolders:
     def path(self, tmp_path):
         return written(tmp_path / "a.mcap", {"/lidar/tracks": (TRACKS, DRIVE)})
 
-    def test_the_default_stands_beside_the_log(self, path):
-        said = done("export", path, "--format", "rosbag2").err
-        assert (path.parent / "a.rosbag2" / "a.rosbag2.mcap").is_file()
-        assert "a.rosbag2" in said
-        assert not (path.parent / "a.tables").exists()
-
     def test_a_bag_is_replaced_on_request_only_and_nothing_else_is(self, path, tmp_path):
         mcaptrack.export(path, tmp_path / "bag", form="rosbag2")
         with pytest.raises(McaptrackError, match="force=True"):
@@ -233,8 +226,3 @@ class TestFolders:
     def test_parameters_of_tables_change_nothing(self, path, tmp_path):
         result = mcaptrack.export(path, tmp_path / "bag", form="rosbag2", topic="/lidar/tracks")
         assert [one.code for one in result.warnings] == ["option-not-used"]
-
-    def test_several_logs_need_several_folders(self, path, tmp_path):
-        other = written(tmp_path / "b.mcap", {"/lidar/tracks": (TRACKS, DRIVE)})
-        assert call("export", path, other, "--format", "rosbag2", "-o", tmp_path / "bag").code == 1
-        assert not (tmp_path / "bag").exists()

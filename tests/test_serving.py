@@ -162,17 +162,10 @@ RANGES = {
 }
 
 
-@pytest.mark.parametrize(("text", "wanted"), RANGES.items(), ids=[text[:12] for text in RANGES])
-def test_ranges_follow_the_standard(text, wanted):
-    span, status = requested_range([text], N)
-    assert (status, span) == wanted
-
-
-def test_two_range_fields_are_ignored():
+def test_ranges_follow_the_standard():
+    for text, (status, span) in RANGES.items():
+        assert requested_range([text], N) == (span, status), text[:20]
     assert requested_range(["bytes=0-1", "bytes=2-3"], N) == (range(N), WHOLE)
-
-
-def test_an_empty_file_has_no_range(tmp_path):
     assert requested_range(["bytes=0-"], 0) == requested_range(["bytes=-5"], 0) == (range(0), NOWHERE)
 
 

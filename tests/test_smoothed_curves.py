@@ -55,13 +55,6 @@ def of_track(frames: list[Frame], number: int) -> dict[int, np.ndarray]:
     return {k: np.stack([one["x_m"], one["y_m"]], axis=-1) for k, one in rows.items() if len(one)}
 
 
-def test_one_step_by_hand():
-    """A person walks 1 m a step and stops: displacements 1, 1, 0 give levels 1, 1, 0.5, and a mean of 5/6."""
-    samples = walk(lambda n: {1: (float(min(n, 2)), 0.0)}, 4)
-    *_, last = smoothed_predictions(samples, Predict(predictor="cv", horizon_s=0.8))
-    assert last.rows["x_m"].tolist() == pytest.approx([2 + 5 / 6, 2 + 10 / 6])
-
-
 @pytest.mark.parametrize("predictor", ["cv", "kalman"])
 def test_smoothed_predictions_are_those_of_smoothed_tracks(predictor):
     """Two tracks, one of which begins late, has a gap and begins again, and their pasts smoothed one by one."""
@@ -85,13 +78,6 @@ def test_smoothed_predictions_are_those_of_smoothed_tracks(predictor):
                 alone = walk(lambda k, xy=xy: {1: tuple(xy[k])}, len(xy))
                 *_, (wanted,) = predict(alone)
                 np.testing.assert_allclose(predictions[n], of_track([wanted], 1)[wanted.index], atol=1e-6)
-
-
-def test_walks_without_noise_are_predicted_as_they_are():
-    samples = walk(lambda n: {1: (0.5 * n, 0.1 * n)}, 20)
-    predict = Predict(predictor="red")
-    for one, (other,) in zip(smoothed_predictions(samples, predict), predict(samples), strict=True):
-        np.testing.assert_allclose(one.rows["x_m"], other.rows["x_m"], atol=1e-4)
 
 
 def swept(truth: dict, tracks: dict, made: list[tuple], tau: float, horizon: int) -> tuple[float, float, float]:

@@ -28,7 +28,7 @@ from hypothesis import strategies as st
 
 from mcaptrack import tables
 from mcaptrack.errors import McaptrackError
-from mcaptrack.schema import EVENTS, PREDICTIONS, SCHEMAS, TRACKS, Frame
+from mcaptrack.schema import EVENTS, SCHEMAS, TRACKS, Frame
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.tables import TABLES, Pointers
 from mcaptrack.tables import files as tables_files
@@ -226,22 +226,6 @@ def test_the_document_of_the_tables_is_what_the_schemas_say():
     assert tool.with_tables(text) == text, "run tools/tables_doc.py"
 
 
-def test_tables_without_rows_keep_their_columns(tmp_path):
-    tables.write(tmp_path / "a.parquet", tables.rows_table(PREDICTIONS, {}), {})
-    read = pq.read_table(tmp_path / "a.parquet")
-    assert read.num_rows == 0
-    assert read.schema.names == [
-        "topic",
-        "frame",
-        "t",
-        "t_ns",
-        "row",
-        *(column.name for column in PREDICTIONS.columns),
-        "class",
-    ]
-    assert tables.verify(tmp_path / "a.parquet") == 0
-
-
 # Columns that are added later
 
 
@@ -325,16 +309,6 @@ def test_a_track_is_summed_up(tmp_path):
     assert (first["observed_share"], second["observed_share"]) == (0.75, 0.5)
     assert (second["path_m"], second["mean_speed_m_s"], second["max_speed_m_s"]) == (2.0, 2.0, 2.0)
     assert second["first_x_px"] is None
-
-
-def test_a_track_without_positions_has_no_path_and_one_row_no_speed():
-    rows = tracks_at({1: (np.nan, np.nan), 2: (5.0, 6.0)})
-    nowhere, once = tables.summary_table({"/a": collect(TRACKS, [Frame(5, 0, rows)])}).to_pylist()
-    assert [nowhere[name] for name in ("path_m", "mean_speed_m_s", "max_speed_m_s", "first_x_m", "last_y_m")] == [
-        None
-    ] * 5
-    assert (once["path_m"], once["mean_speed_m_s"], once["max_speed_m_s"], once["last_x_m"]) == (0.0, None, None, 5.0)
-    assert tables.summary_table({}).num_rows == 0
 
 
 @given(st.data())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +14,6 @@ from mcaptrack.notices import Notice, listening
 from mcaptrack.predictors import NAMES, Forecast, make
 from mcaptrack.predictors.position_noise import PositionNoise
 from mcaptrack.predictors.tail_calibration import (
-    TABLES,
     Learned,
     TailCalibration,
     counts_of,
@@ -54,12 +52,6 @@ class TestTable:
         assert ((table.wide_weight > 0) & (table.wide_weight < 1)).all()
         assert table.short[0] > 1
         assert (table.coasting > 1).all()
-
-    def test_the_file_says_what_it_was_made_of(self):
-        card = json.loads(TABLES.read_text())["card"]
-        assert "synthetic" in card["data"]
-        assert card["licence"] == "Apache-2.0"
-        assert "tools/fit_tails.py" in card["made_by"]
 
     def test_networks_with_other_weights_and_other_predictors_have_none(self):
         assert table_of("red:mine.safetensors") is None
@@ -322,21 +314,6 @@ class TestInTransforms:
         calm = spread([frame for (frame,) in Predict()(walkers())])
         assert calm[-1] < 0.3 * calm[3]  # the first, by the table
 
-    @pytest.mark.parametrize("name", ["predictions", "retracks"])
-    def test_predictions_depend_on_the_past_alone(self, name):
-        def run(frames: list[Frame]) -> list[Frame]:
-            if name == "predictions":
-                return [frame for (frame,) in Predict()(frames)]
-            return [frames[2] for frames in PROFILES["default"](frames)]
-
-        frames = walkers(ticks=50, noise_m=0.1)
-        whole, begun = run(frames), run(frames[:30])
-        for one, other in zip(whole[:30], begun, strict=True):
-            assert one.rows.dtype == other.rows.dtype
-            for column in one.rows.dtype.names:
-                np.testing.assert_allclose(one.rows[column], other.rows[column], rtol=1e-6)
-        assert any(len(frame.rows) for frame in begun)
-
     def test_interpolated_positions_say_nothing_about_noise(self, monkeypatch):
         """A quarter of the positions is interpolated between neighbours: their noise is smaller, and like theirs."""
         found: list[tuple[float, float]] = []
@@ -394,10 +371,3 @@ class TestInTransforms:
             for name in ("red", "cv"):
                 list(Predict(predictor=name)(walkers(ticks=8)))
         assert warned == []
-
-    def test_means_are_those_of_the_predictor(self):
-        frames = walkers(ticks=20)
-        *_, (last,) = Predict()(frames)
-        past = np.stack([[frame.rows["x_m"], frame.rows["y_m"]] for frame in frames[-8:]], axis=0).transpose(2, 0, 1)
-        mean, _ = make("red", 12, 0.4).predict(past, np.ones(past.shape[:2], bool))
-        np.testing.assert_allclose(np.stack([last.rows["x_m"], last.rows["y_m"]], -1).reshape(-1, 12, 2), mean)

@@ -7,8 +7,6 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import TRACKS, Frame, framing
@@ -51,42 +49,9 @@ def full(tracks, retracks):
     ]
 
 
-def test_every_box_gets_the_name_that_its_track_has():
-    out = full([{7: 0.1 * n} for n in range(9)], [{1: (7, 0.4 * n)} for n in range(3)])
-    assert out == [{1: (7, round(0.1 * n, 6))} for n in range(9)]
-
-
 def test_the_first_number_of_a_track_is_zero():
     out = full([{0: 0.1 * n} for n in range(9)], [{0: (0, 0.4 * n)} for n in range(3)])
     assert out == [{0: (0, round(0.1 * n, 6))} for n in range(9)]
-
-
-def test_rows_without_a_box_have_no_source_and_were_not_observed():
-    tracks = [Frame(ns(n / 10), n, boxes({7: 0.1 * n} if n not in (1, 2) else {})) for n in range(9)]
-    samples = [Frame(ns(0.4 * n), 4 * n, named({1: (7, 0.4 * n)})) for n in range(3)]
-    rows = np.concatenate([frame.rows for frame in to_video_rate(tracks, samples, ())])
-    assert rows["source_id"].tolist() == [7, -1, -1, *[7] * 6]
-    assert rows["observed"].tolist() == [True, False, False, *[True] * 6]
-    nothing = [Frame(0, 0, named({1: (-1, 0.0)}))]
-    assert [len(frame.rows) for frame in to_video_rate(tracks[:1], nothing, ())] == [1]
-
-
-def test_a_track_that_is_two_people_changes_its_name_half_way_between_the_ticks():
-    out = full([{7: 0.1 * n} for n in range(9)], [{1: (7, 0.0)}, {2: (7, 0.4)}, {2: (7, 0.8)}])
-    assert [[who for who, (source, _) in f.items() if source == 7] for f in out] == [[1]] * 3 + [[2]] * 6
-
-
-def test_two_tracks_that_are_one_person_have_one_name_and_the_hole_between_them_is_filled():
-    tracks = [{7: 0.1 * n} if n <= 5 else {8: 0.1 * n} if n >= 10 else {} for n in range(17)]
-    out = full(tracks, [{1: (7, 0.0)}, {1: (7, 0.4)}, {1: (-1, 0.8)}, {1: (8, 1.2)}, {1: (8, 1.6)}])
-    assert [set(f) for f in out] == [{1}] * 17
-    assert [f[1][0] for f in out] == [7] * 6 + [-1] * 4 + [8] * 7
-    np.testing.assert_allclose([f[1][1] for f in out], 0.1 * np.arange(17), atol=1e-6)
-
-
-def test_boxes_of_a_false_track_are_left_out():
-    out = full([{7: 0.1 * n, 9: 5.0} for n in range(9)], [{1: (7, 0.4 * n)} for n in range(3)])
-    assert all(set(f) == {1} for f in out)
 
 
 def test_without_re_tracked_tracks_every_frame_is_there_without_rows():
@@ -99,25 +64,6 @@ def test_without_re_tracked_tracks_every_frame_is_there_without_rows():
     near = [tracks[0], *(tracks[0]._replace(t_ns=t_ns, index=t_ns) for t_ns in (1, 2))]
     found = to_video_rate(near, [Frame(0, 0, named({1: (7, 0.0)}))], ())
     assert [one.rows["track_id"].tolist() for one in found] == [[1], [1], []]
-
-
-@given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=25)
-def test_no_id_is_at_two_places_and_no_box_has_two_ids(seed):
-    rng = np.random.default_rng(seed)
-    tracks = [{int(i): float(i) for i in range(5) if rng.random() < 0.7} for _ in range(20)]
-    retracks = []
-    for _ in range(5):
-        sources = rng.permutation(5)[: rng.integers(0, 6)]
-        retracks.append({int(10 + rng.permutation(5)[k]) + 10 * k: (int(s), float(s)) for k, s in enumerate(sources)})
-    frames = [Frame(ns(n / 10), n, boxes(people)) for n, people in enumerate(tracks)]
-    out = to_video_rate(frames, [Frame(ns(0.4 * n), n, named(people)) for n, people in enumerate(retracks)], ())
-    for before, after in zip(frames, out, strict=True):
-        who, source = after.rows["track_id"].tolist(), after.rows["source_id"]
-        assert len(set(who)) == len(who)
-        used = source[source >= 0].tolist()
-        assert len(set(used)) == len(used)
-        assert set(used) <= set(before.rows["track_id"].tolist())
 
 
 def test_a_log_gets_them_beside_the_others(tmp_path):
@@ -156,13 +102,6 @@ def test_boxes_have_metres_by_the_plane_of_their_time():
     known = linked_tracks(samples, (), planes)[1].rows
     assert (known["x_m"].tolist(), known["y_m"].tolist()) == ([1.0], [0.0])
     assert np.isnan(linked_tracks(tracks, (), ())[0].rows["x_m"]).all()
-
-
-def test_of_two_boxes_with_one_id_the_nearer_to_its_sample_is_taken():
-    tracks = [{7: 0.1 * n, 8: 0.1 * n + 0.05} for n in range(5)]
-    out = full(tracks, [{1: (7, 0.0)}, {1: (8, 0.4)}])
-    assert [frame[1][0] for frame in out] == [7, 7, out[2][1][0], 8, 8]
-    assert [len(frame) for frame in out] == [1] * 5
 
 
 class TestRowByRow:
