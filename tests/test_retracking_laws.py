@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DecisionKind, Frame, Rows
-from mcaptrack.transforms import PROFILES, Retrack, RetrackByConsistency
+from mcaptrack.transforms import PROFILES, RetrackByConsistency
 from mcaptrack.transforms.retrack import Retracking, likelihood
 from tests.tiers import one_in
 from tests.worlds import assert_same_rows, noisy_tracks, ns, places, walk
@@ -19,8 +19,6 @@ from tests.worlds import assert_same_rows, noisy_tracks, ns, places, walk
 SEEDS = st.integers(0, 2**32 - 1)
 #: "now" compares predictions of the current step, which the other distances of Algorithm 1 don't.
 METHODS = dict(PROFILES) | {"now": RetrackByConsistency(distance="now", noise_m=0.3)}
-#: Columns of predictions that follow the errors of all tracks so far.
-DISTRIBUTION = ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "wide_weight", "narrow_scale", "wide_scale")
 every_method = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 
 
@@ -92,42 +90,6 @@ def test_rows_do_not_depend_on_how_many_steps_are_written_at_once(steps, monkeyp
     for found, rows in zip(outputs(PROFILES["default"], frames), wanted, strict=True):
         same(found, rows)
     assert not wanted[1]["observed"].all()
-
-
-def by_place(rows: Rows) -> Rows:
-    """Sort the rows of a frame by position, so that their order doesn't depend on ids."""
-    return rows[np.lexsort((rows["y_m"], rows["x_m"]))]
-
-
-@pytest.mark.parametrize("method", one_in(2, METHODS.values()), ids=METHODS)
-@given(seed=SEEDS)
-@settings(max_examples=2)
-def test_crowds_far_apart_do_not_affect_each_other(method, seed):
-    """The noise is given, nothing is linked or left out, and online tracks don't adapt, because all of this follows the
-    whole log; so do ellipses, and how likely joins are.
-    """
-    rng = np.random.default_rng(seed)
-    method = replace(method, noise_m=0.15, link_s=0.0, track_confidence=0.0)
-    if isinstance(method, Retrack):
-        method = replace(method, adapt_online=False)
-    one, two = noisy_tracks(rng, ticks=40), noisy_tracks(rng, ticks=40)
-    two = [b._replace(t_ns=a.t_ns) for a, b in zip(one, moved(two, np.eye(2), np.array([5e3, 0.0])), strict=True)]
-    for frame in two:
-        frame.rows["track_id"] += 1000
-    both = [a._replace(rows=np.concatenate([a.rows, b.rows])) for a, b in zip(one, two, strict=True)]
-    for crowd, here in ((one, False), (two, True)):
-        renamed: dict[int, int] = {}
-        for result, alone in zip(method(both), method(crowd), strict=True):
-            for together, wanted in zip(result, alone, strict=True):
-                a, b = by_place(together.rows[(together.rows["x_m"] > 2500) == here]), by_place(wanted.rows)
-                assert len(a) == len(b)
-                assert all(
-                    renamed.setdefault(k, m) == m
-                    for k, m in zip(b["track_id"].tolist(), a["track_id"].tolist(), strict=True)
-                )
-                of_the_log = {name: a[name] for name in (*DISTRIBUTION, "probability") if name in a.dtype.names}
-                same(a, b, track_id=a["track_id"], **of_the_log)
-        assert len(set(renamed.values())) == len(renamed)
 
 
 def standing(first: list[tuple[float, float]], then: list[tuple[float, float]], gap: range, ticks: int) -> list[Frame]:

@@ -38,10 +38,6 @@ def scenes():
     return crowds.scenes(5, STEPS)
 
 
-def by_person(rows: np.ndarray) -> np.ndarray:
-    return rows[np.lexsort((rows[:, 0], rows[:, 1]))]
-
-
 def test_everything_that_was_fitted_says_that_it_was_fitted_on_synthetic_data():
     cards = {
         path: json.loads(path.read_text())["card"] for path in (WEIGHTS, PACKAGE / "predictors/trained/tails.json")
@@ -68,26 +64,6 @@ def test_a_seed_gives_the_same_scenes_again_and_another_one_others(scenes):
     assert all(np.array_equal(one, two) for one, two in zip(scenes, again, strict=True))
     first = scenes[0][scenes[0][:, 0] < 2]
     assert not np.array_equal(first[:, 2:], crowds.scenes(6, 2)[0][:, 2:])
-
-
-def test_people_walk_come_in_and_leave_at_borders(scenes):
-    """Nobody appears in the middle; nobody jumps; a step is not faster than a bicycle that is given way to."""
-    inside = moves = 0
-    for rows in map(by_person, scenes):
-        low, high = rows[:, 2:].min(axis=0), rows[:, 2:].max(axis=0)
-        assert len(np.unique(rows[:, :2], axis=0)) == len(rows)
-        same = rows[1:, 1] == rows[:-1, 1]
-        assert (np.diff(rows[:, 0])[same] == 1).all()
-        speed = np.hypot(*np.diff(rows[:, 2:], axis=0)[same].T) / STEP_S
-        assert speed.max() < 12
-        moves += len(speed)
-        begins = np.flatnonzero(np.append(True, ~same))
-        begins = begins[rows[begins, 0] > 0]
-        far = np.minimum(rows[begins, 2:] - low, high - rows[begins, 2:]).min(axis=1)
-        assert (far < 6).all()  # a cyclist has gone that far within a step
-        inside += len(begins)
-    assert inside > 200
-    assert moves > 20_000
 
 
 def test_the_fit_finds_the_weights_that_drew_the_data():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 
 import motmetrics as mm
@@ -126,22 +125,6 @@ def test_classes_are_joined_by_name_and_the_others_are_named():
         f"a: rows of /lidar/tracks of classes that the ground truth doesn't have are not compared: {count} of cart",
         "a: /lidar/tracks has no tracks of classes that the ground truth has; all are misses: 60 of car",
     ]
-
-
-def test_overlaps_by_hand():
-    car = [0, 0, 0.75, 4, 2, 1.5, 0]
-    for moved, bev, space in (
-        ([1, 0, 0.75, 4, 2, 1.5, 0], 6 / 10, 6 / 10),
-        ([0, 0, 1.5, 4, 2, 1.5, math.pi], 1, 1 / 3),
-        ([0, 0, 0.75, 4, 2, 1.5, math.pi / 2], 1 / 3, 1 / 3),
-    ):
-        truth, tracks = [frame(0, [car], [1], [2])], [frame(0, [moved], [5], [2])]
-        for similarity, iou in (("bev-iou", bev), ("3d-iou", space)):
-            for least, is_match in ((iou - 1e-9, True), (min(1, iou + 1e-6), iou == 1)):
-                row = scored(truth, tracks, EvaluateOptions((similarity,), min_iou=least))[0][similarity, least, None]
-                assert row["FN"] == 1 - is_match, (moved, similarity, least)
-                if is_match:
-                    assert row["LocA"] >= iou - 1e-9
 
 
 def test_averages_are_given_at_the_largest_gate_for_tracks_with_scores():
