@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Callable
@@ -66,13 +65,6 @@ def test_a_half_written_log_stays_as_it_is_and_is_read_as_it_was(command, half, 
     if command not in ("view", "check"):
         assert outcome.code == other.code
         assert outcome.out.replace(str(half), str(whole)) == other.out
-
-
-@pytest.mark.parametrize("command", ["info", "evaluate", "query"])
-def test_the_journal_is_among_the_json_warnings(command, half, out):
-    outcome = done(command, *READING[command](half, out), "--json", "-q")
-    warnings = json.loads(outcome.out)["warnings"]
-    assert [warning["code"] for warning in warnings if "left half written" in warning["message"]] == ["journal"]
 
 
 def test_the_next_command_that_writes_restores_the_log_with_a_warning(half, whole, tmp_path):

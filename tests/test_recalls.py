@@ -121,15 +121,6 @@ def one_frame(n_truth: int, matched: int, false: int) -> Matchup:
     return Matchup(*ids, (similarity,), 0.5, n_truth, matched + false)
 
 
-def test_a_tracker_that_finds_all_counts_at_every_recall():
-    """Of four objects so many are kept as the recall asks for, and at least the first."""
-    found = average_over_recalls([ScoredMatchup(one_frame(4, 4, 0), np.array([0.9, 0.8, 0.7, 0.6]))])
-    kept = [max(1, 4 * k // 40) for k in range(1, 41)]
-    assert found["AMOTA"] == 1.0
-    assert found["sAMOTA"] == pytest.approx(sum(min(1, n / (4 * k / 40)) for k, n in enumerate(kept, 1)) / 40)
-    assert found["AMOTA_unscaled"] == pytest.approx(sum(kept) / 4 / 40)
-
-
 def test_what_is_never_reached_counts_as_nothing():
     found = average_over_recalls([ScoredMatchup(one_frame(4, 1, 0), np.array([0.3]))], worst=0.0)
     assert found["sAMOTA"] == pytest.approx(sum(min(1, 0.25 / (k / 40)) for k in range(1, 11)) / 40)

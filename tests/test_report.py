@@ -20,7 +20,6 @@ from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, ev
 from mcaptrack.evaluation.events import MatchRule, find_events
 from mcaptrack.evaluation.metrics.displacement import combine_displacements, displacement
 from mcaptrack.evaluation.metrics.pairing import Forecasts, Positions
-from mcaptrack.foxglove.palette import COUNT as COLOURS
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import Predict
@@ -317,14 +316,6 @@ def test_thumbnails_show_the_tracks_before_and_after(story):
             assert seen[around].mean() < 60
 
 
-def test_colours_are_those_of_viewers(finished):
-    text, _, reader = report_on(finished)
-    for identity in (0, 1, 8, 20, 21, 47):
-        red, green, blue, _ = (round(255 * part) for part in foxglove.colour(identity))
-        assert f".c{identity % COLOURS}{{stroke:#{red:02x}{green:02x}{blue:02x}}}" in text
-    assert {one["class"] for one in reader.of("path")} <= {"halo", *(f"c{k}" for k in range(COLOURS))}
-
-
 # Statistics that are not known
 
 
@@ -357,15 +348,6 @@ def test_without_metres_it_says_that_speeds_are_not_known(tmp_path):
     assert "Tracks can't be drawn" in words
     assert numbers["logs"][0]["speed_m_per_s"] is None
     assert numbers["logs"][0]["dwell_s"]["series"][0]["median"] == pytest.approx(3.0)
-
-
-def test_without_forecasts_it_says_which_command_makes_them(finished, tmp_path):
-    less = tmp_path / "less.mcap"
-    printed("drop", finished, "*predictions*", "-o", less, "-q")
-    _, numbers, reader = report_on(less)
-    assert "mcaptrack predict less.mcap" in "".join(reader.text)
-    assert numbers["logs"][0]["forecasts"] == []
-    assert all("displacement" not in result for result in numbers["results"])
 
 
 def test_ground_truth_of_another_time_is_reported_and_the_rest_shown(tmp_path):

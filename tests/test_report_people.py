@@ -28,7 +28,6 @@ from mcaptrack.viewing.report import _comparison as comparison
 from mcaptrack.viewing.report.charts import Line
 from mcaptrack.viewing.report.contents import TrackSet
 from mcaptrack.viewing.report.doubts import find_doubts
-from mcaptrack.viewing.report.figures import identity_events
 from mcaptrack.viewing.report.identity_events import summarize_events
 from mcaptrack.viewing.report.identity_timeline import counts_over_time, identity_timeline, mean_numbers, pieces
 from tests.worlds import crossing_tracks, ns, tracks_at, write_eventful
@@ -92,24 +91,6 @@ def people(rows, matched, hits, switches, false_rows=0) -> PersonScores:
     none = np.empty(0, np.int64)
     columns = (np.array(column) for column in (rows, matched, hits, switches))
     return PersonScores(np.arange(len(rows)), *columns, false_rows, none, none, none, none)
-
-
-def test_intervals_hold_the_value_and_shrink_with_more_people():
-    rng = np.random.default_rng(0)
-
-    def sample(count: int) -> PersonScores:
-        rows = rng.integers(50, 150, count)
-        hits = (rows * rng.uniform(0.4, 0.9, count)).astype(int)
-        return people(rows, rows - 2, hits, rng.integers(0, 4, count), 20)
-
-    few, many = sample(12), sample(400)
-    widths = []
-    for one in (few, many):
-        found = intervals([one], [one]).idf1[0]
-        assert found.value == pytest.approx(one.idf1())
-        assert found.low < found.value < found.high
-        widths.append(found.high - found.low)
-    assert widths[1] < 0.4 * widths[0]  # about 1 / sqrt(400 / 12) = 0.17
 
 
 def test_a_change_of_all_people_is_sure_and_that_of_one_is_not():
@@ -262,14 +243,6 @@ def test_all_logs_together_have_the_people_of_all(told):
     assert [row["cells"][2] for row in rows] == ["2 → 1", "2 → 1", "4 → 2"]
 
 
-def test_every_event_has_a_mark_and_those_that_are_shown_a_long_one(told):
-    shown = [part[:1] for part in told.highlights]
-    found = identity_events(replace(told, highlights=shown))["timelines"]
-    assert [len(one["highlights"]) for one in found] == [1, 1]
-    assert [len(one["marks"]) for one in found] == [len(one.events) for one in told.channel_events]
-    assert all(one["highlights"][0][0] in one["marks"] for one in found)
-
-
 def test_those_who_stay_longest_have_a_bar(told, monkeypatch):
     """Person 50 leaves half way; there is room for one."""
     monkeypatch.setattr(import_module("mcaptrack.viewing.report.identity_timeline"), "_MOST", 1)
@@ -338,13 +311,6 @@ def test_the_farthest_repair_is_the_first_whenever_it_happened():
     told = summarize_events("/a", found.events, None, both, None, (0, ns(16)))
     doubts = find_doubts(told, both, None)
     assert [(int(one.event.row["track_id"]), round(one.away_m, 1)) for one in doubts] == [(8, 2.5), (7, 1.5)]
-
-
-def test_the_time_of_an_event_stands_once(text):
-    events = re.findall(r'<figcaption><span class="at"[^>]*>([^<]+)</span> ([^<]+)</figcaption>', text)
-    assert len(events) >= 3
-    assert any("became track" in words for _, words in events)
-    assert not any(re.search(r"\bat [0-9]|[0-9]\s+s\s+at\b|\s,", words) for _, words in events)
 
 
 def test_every_row_of_a_table_hides_the_same_columns_on_a_phone(text):

@@ -18,7 +18,6 @@ from mcaptrack.foxglove import class_colour
 from mcaptrack.pipeline import summary
 from mcaptrack.schema import TRACKS
 from mcaptrack.sources import fixed_frame
-from mcaptrack.viewing.report import gather, page
 from tests.commands import done
 from tests.robot_runs import OBJECTS, passing_robot, place, write_passing
 from tests.tiers import thorough
@@ -139,19 +138,6 @@ def test_without_a_robot_all_places_are_in_the_video(tmp_path):
     assert image.shape == (240, 320, 3)
     assert (bright < 60).any()
     assert (bright > 260).any()
-
-
-def test_the_report_has_averages_over_recalls_where_evaluate_has_them(passed):
-    scores = {
-        (row.tracks, row.of_class): row.averages["AMOTA"]
-        for row in mcaptrack.evaluate(passed, similarity="metres", gate_m=2.0).results
-    }
-    assert scores["/lidar/retracks/full", "car"] == 1.0
-    with log.read(passed) as opened:
-        text = page([gather(opened, None)])
-    assert "AMOTA: MOTA averaged over recalls" in text
-    assert ">AMOTA<" in text
-    assert ">AMOTP_m<" in text
 
 
 def test_a_run_across_classes_tracks_and_retracks_so_until_told_otherwise(passed, tmp_path):

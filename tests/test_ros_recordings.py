@@ -16,8 +16,7 @@ from rosbags.rosbag2 import Writer as Writer2
 
 from mcaptrack import log
 from mcaptrack.schema import TRACKS
-from mcaptrack.schema.provenance import Provenance
-from tests.bags import MOT, ROS2, T0, bag1, bag2, picture, plain
+from tests.bags import ROS2, T0, bag1, bag2, picture, plain
 from tests.commands import GROUP, call, done, zones_file
 
 COMMANDS = GROUP.commands
@@ -234,17 +233,6 @@ def test_recordings_are_told_by_profile_and_by_the_metadata_beside_them(
         from mcaptrack.sources.ingest.sidecar import recording_of
 
         assert bool(recording_of(opened)) == is_beside
-
-
-def test_a_log_that_was_made_of_a_bag_takes_results_itself(path, tmp_path):
-    """It is a log of ours, whatever ROS tools can read of it; the bag stays as it is."""
-    out = tmp_path / "out.mcap"
-    (tmp_path / "gt.txt").write_text(MOT)
-    done("ingest", path.parent, "--truth", tmp_path / "gt.txt", "-o", out)
-    done("run", out, "-q")
-    assert not out.with_name("out.results.mcap").exists()
-    with log.read(out) as opened:
-        assert Provenance.from_metadata(opened.channel("/robot/front/tracks").metadata)
 
 
 def others(folder: Path) -> list[Path]:

@@ -313,20 +313,6 @@ def test_files_of_3d_boxes_are_compared_by_their_times(tmp_path):
             assert row[name] == pytest.approx(wanted["metres", 2.0, row["class"]][name])
 
 
-def test_a_report_on_cars_does_not_call_them_people(tmp_path):
-    truth, tracks = drawn(12)
-    log = tmp_path / "log.mcap"
-    for role, frames in (("truth", truth), ("tracks", tracks)):
-        (tmp_path / f"{role}.csv").write_text(lines(frames))
-        target = {"into": log} if log.exists() else {"output": log}
-        mcaptrack.ingest(tmp_path / f"{role}.csv", role=role, **target)
-    text = mcaptrack.report(log, tmp_path / "page.html").page.read_text()
-    assert "Where objects moved" in text
-    assert "How objects move" in text
-    assert "Counted within 2 m on the ground" in text
-    assert re.search(r"Car \d: track \d became track \d", text)
-
-
 @pytest.mark.parametrize(("similarity", "gate", "by_class"), [("metres", 3.0, True), ("bev-iou", 0.1, False)])
 def test_it_makes_no_difference_how_many_pairs_are_compared_at_once(similarity, gate, by_class, monkeypatch):
     """Each frame beside distances or overlaps of all its pairs; in one go, some frames at a time, and frame by frame."""

@@ -27,7 +27,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-import mcaptrack
 from mcaptrack import log
 from mcaptrack.api.viewing import LogServer
 from mcaptrack.errors import McaptrackError
@@ -506,16 +505,6 @@ def test_layout_files_are_served_as_they_were_edited(tmp_path):
             OPENED,
             "serving until Ctrl-C ...",
         ]
-
-
-def test_a_log_is_served_from_start_to_close(tmp_path):
-    path = extended(tmp_path / "a.mcap")
-    server = mcaptrack.view(path, layout="comparing").start()
-    assert ask(server.logs[0])[2] == path.read_bytes()
-    assert {name: ask(address)[2] for name, address in server.layouts.items()} == {"comparing": b'{"layout": 2}'}
-    server.close()
-    with pytest.raises(OSError, match="refused"):
-        ask(server.logs[0])
 
 
 def test_links_are_printed_for_people_as_the_server_has_them(tmp_path, monkeypatch):

@@ -56,12 +56,6 @@ def test_a_new_track_waits_where_most_tracks_of_the_log_were_soon_over(lasting, 
     assert written(found, lambda x, y: y > -1)[0] == first
 
 
-def test_tracks_are_written_before_they_are_confirmed_but_not_predicted():
-    results = list(PROFILES["default"](walk(walker(1, range(20), 0.0), 20)))
-    assert [len(result[1].rows) for result in results] == [1] * 20
-    assert [len(result[2].rows) > 0 for result in results] == [False] * 3 + [True] * 17
-
-
 def test_what_a_gap_of_the_log_ends_was_not_short():
     """Ten people are there for two ticks before each gap, which ends their tracks."""
     frames = walk(lambda n: {100 * n + k: (10.0 * k, 0.0) for k in range(10)} if n < 8 else {1: (50.0, 50.0)}, 9)

@@ -341,12 +341,6 @@ def test_summaries_are_what_duckdb_makes_of_the_rows(data):
 # Faults
 
 
-def test_a_folder_that_can_not_be_written_is_said(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(McaptrackError, match="can't be written"):
-        tables.write(tmp_path / "file" / "t.parquet", tables.rows_table(TRACKS, {}), {})
-
-
 def two_tables():
     """A table of which the file has several pages, and another."""
     rng = np.random.default_rng(0)
