@@ -114,3 +114,17 @@ def test_the_page_about_tools_names_each_of_them_with_options_that_it_has():
             path = ROOT / (script if script.endswith(".py") else script.replace(".", "/") + ".py")
             for option in re.findall(r"(?<=[ `])--[\w-]+", line):
                 assert f'"{option}"' in path.read_text(), (script, option)
+
+
+# Tests are skipped for want of a package only where `make test` doesn't install it
+
+
+INSTALLED = {
+    re.split(r"[^\w-]", wanted)[0] for wanted in PROJECT["dependencies"] + PROJECT["optional-dependencies"]["test"]
+}
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "tests").rglob("*.py")), ids=lambda path: path.name)
+def test_no_test_is_skipped_for_want_of_a_package_that_is_installed(path):
+    skipped = re.findall(r"importorskip\(\"([\w-]+)", path.read_text())
+    assert not {name for name in skipped if name in INSTALLED}
