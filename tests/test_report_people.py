@@ -194,10 +194,7 @@ def without_sources(frames: list[Frame], ticks: set[int]) -> list[Frame]:
     return out
 
 
-@given(
-    st.lists(st.integers(0, 2), max_size=40),
-    st.lists(st.integers(1, 4), min_size=40, max_size=40),
-)
+@given(st.lists(st.integers(0, 2), max_size=40), st.lists(st.integers(1, 4), min_size=40, max_size=40))
 def test_pieces_cover_their_rows_and_nothing_twice(identity, steps):
     t_ns = np.cumsum(np.array(steps[: len(identity)], np.int64)) * 10**9
     found = pieces(np.array(identity, np.int64), t_ns, 0, 1e9)

@@ -23,10 +23,7 @@ from mcaptrack.transforms import PROFILES, Retrack
 from mcaptrack.transforms.retrack.assignments import PEOPLE, Movers, join_classes, movers_of, split_classes, usual_score
 from mcaptrack.transforms.retrack.consistency import SmoothedHistory
 from mcaptrack.transforms.retrack.methods import KeptIds
-from mcaptrack.transforms.retrack.options import (
-    mahalanobis,
-    prediction_distances,
-)
+from mcaptrack.transforms.retrack.options import mahalanobis, prediction_distances
 from mcaptrack.transforms.retrack.shown_tracks import GrowingHull
 from tests.commands import call
 from tests.tiers import one_in

@@ -123,10 +123,7 @@ def check_whole(path: Path, recorded: list[Raw]) -> None:
         assert entry["duration"]["nanoseconds"] == max(times) - min(times)
 
 
-RUNS = {
-    "pictures": (record, ("--detector", "knn")),
-    "boxes": (drive, ("--topic", "/lidar/boxes")),
-}
+RUNS = {"pictures": (record, ("--detector", "knn")), "boxes": (drive, ("--topic", "/lidar/boxes"))}
 
 
 @pytest.fixture(scope="module", params=RUNS)

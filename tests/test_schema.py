@@ -361,23 +361,9 @@ message Some {
 
 
 def test_provenance_comes_back_from_its_metadata():
-    whole = Provenance(
-        "track",
-        {"b": 1.5, "a": None},
-        "/in",
-        "d1",
-        "d2",
-        "w",
-        {"/t": "d3"},
-        {"transform": Plugin("own", "own:It", "pkg", "1")},
-        {"1": "person"},
-        "1",
-        "map",
-        {"layout": "x"},
-        [["lost", "words"]],
-        "0.0.9",
-        {"1": "door"},
-    )
+    plugins = {"transform": Plugin("own", "own:It", "pkg", "1")}
+    first = ("track", {"b": 1.5, "a": None}, "/in", "d1", "d2", "w", {"/t": "d3"}, plugins, {"1": "person"}, "1", "map")
+    whole = Provenance(*first, {"layout": "x"}, [["lost", "words"]], "0.0.9", {"1": "door"})
     assert Provenance.from_metadata(whole.to_metadata()) == whole
     least = Provenance("sample", {})
     assert Provenance.from_metadata(least.to_metadata() | {"other": "1", "mcaptrack.later": "2"}) == replace(

@@ -428,9 +428,7 @@ def slow(sequences) -> dict[str, float]:
         "AMOTA": values(nuscenes, motar, 0),
         "AMOTP": values(nuscenes, lambda _, s, fp, fn, apart: apart / (total - fn), GATE_M),
         "sAMOTA": values(
-            ab3dmot,
-            lambda r, s, fp, fn, _: min(1, max(0, 1 - (s + fp + fn - (1 - r) * total) / (r * total))),
-            0,
+            ab3dmot, lambda r, s, fp, fn, _: min(1, max(0, 1 - (s + fp + fn - (1 - r) * total) / (r * total))), 0
         ),
         "AMOTA_unscaled": values(ab3dmot, lambda r, s, fp, fn, _: 1 - (s + fp + fn) / total, 0),
     }

@@ -19,7 +19,7 @@ from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.testing import LAWS, LawError, check_predictor, sample_frames
 from mcaptrack.transforms import PROFILES, Predict
 from mcaptrack.transforms.retrack import likelihood
-from tests.worlds import ns
+from tests.worlds import ns, tracks_at
 
 STEPS = 12
 SOCIAL = make("social", STEPS, 0.4)
@@ -53,17 +53,9 @@ def nothing_seen() -> None:
 
 
 def frame(tick: int, rows: dict[int, tuple[float, float]], unseen: tuple[int, ...] = (), cars: tuple[int, ...] = ()):
-    ids = np.array(list(rows))
-    places = np.array(list(rows.values()), float)
-    kind = np.where(np.isin(ids, cars), 3, 1)
-    content = TRACKS.rows(
-        track_id=ids,
-        x_m=places[:, 0],
-        y_m=places[:, 1],
-        observed=~np.isin(ids, unseen),
-        source_id=np.full(len(ids), -1),
-        class_id=kind,
-    )
+    content = tracks_at(rows)
+    content["observed"] = ~np.isin(list(rows), unseen)
+    content["class_id"] = np.where(np.isin(list(rows), cars), 3, 1)
     return Frame(ns(0.4 * tick), tick, content)
 
 

@@ -212,6 +212,11 @@ def walking(rng: np.random.Generator, count: int = 45) -> list[Frame]:
     return frames
 
 
+def box_of(row: np.void) -> Box:
+    left, top, width, height, score = (float(row[name]) for name in ("x_px", "y_px", "w_px", "h_px", "score"))
+    return Box(left, top, left + width, top + height, score, int(row["class_id"]))
+
+
 @pytest.mark.parametrize("name", TRACKERS)
 @given(seed=st.integers(0, 2**32 - 1), data=st.data())
 @settings(max_examples=15)
@@ -219,23 +224,7 @@ def test_tracks_equal_the_reference(name, seed, data):
     values = SHARED | OWN[name]
     options = TRACKERS[name](**data.draw(st.fixed_dictionaries({k: st.sampled_from(v) for k, v in values.items()})))
     frames = walking(np.random.default_rng(seed))
-    boxes = [
-        (
-            frame.t_ns,
-            [
-                Box(
-                    float(r["x_px"]),
-                    float(r["y_px"]),
-                    float(r["x_px"] + r["w_px"]),
-                    float(r["y_px"] + r["h_px"]),
-                    float(r["score"]),
-                    int(r["class_id"]),
-                )
-                for r in frame.rows
-            ],
-        )
-        for frame in frames
-    ]
+    boxes = [(frame.t_ns, [box_of(row) for row in frame.rows]) for frame in frames]
     wanted = REFERENCES[name](options).run(boxes)
     for (frame,), tracks in zip(options(frames), wanted, strict=True):
         rows = frame.rows

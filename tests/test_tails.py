@@ -14,20 +14,13 @@ from mcaptrack.geometry.mixtures import Tails, squared_radius
 from mcaptrack.notices import Notice, listening
 from mcaptrack.predictors import NAMES, Forecast, make, vehicle_tails
 from mcaptrack.predictors.position_noise import PositionNoise
-from mcaptrack.predictors.tail_calibration import (
-    Learned,
-    TailCalibration,
-    counts_of,
-    fit_mixture,
-    follow,
-    table_of,
-)
+from mcaptrack.predictors.tail_calibration import Learned, TailCalibration, counts_of, fit_mixture, follow, table_of
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.predictions import tails_of
 from mcaptrack.transforms import PROFILES, forecasts
 from mcaptrack.transforms.motion_limits import LIMITS
 from mcaptrack.transforms.predict import Predict
-from tests.worlds import ns
+from tests.worlds import ns, tracks_at
 
 STEP_NS = 400_000_000
 
@@ -37,11 +30,8 @@ def walkers(count: int = 6, ticks: int = 80, noise_m: float = 0.01, seed: int = 
     rng = np.random.default_rng(seed)
     out = []
     for tick in range(ticks):
-        ids = np.arange(1, count + 1)
-        xy = np.stack([0.5 * tick + np.zeros(count), 8.0 * ids], axis=-1) + noise_m * rng.normal(size=(count, 2))
-        rows = TRACKS.rows(
-            track_id=ids, x_m=xy[:, 0], y_m=xy[:, 1], observed=np.ones(count, bool), source_id=np.full(count, -1)
-        )
+        noise = noise_m * rng.normal(size=(count, 2))
+        rows = tracks_at({n + 1: (0.5 * tick + noise[n, 0], 8.0 * (n + 1) + noise[n, 1]) for n in range(count)})
         out.append(Frame(tick * STEP_NS, tick, rows))
     return out
 

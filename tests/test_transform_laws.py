@@ -15,14 +15,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO
 from mcaptrack.testing import LAWS, sample_frames
-from mcaptrack.transforms import (
-    PROFILES,
-    TRACKERS,
-    TRANSFORMS,
-    KnnDetector,
-    RetrackByConsistency,
-    Transform,
-)
+from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS, KnnDetector, RetrackByConsistency, Transform
 from mcaptrack.transforms.protocol import bare_type
 from tests.tiers import one_in
 
