@@ -341,28 +341,6 @@ def test_parameters_that_there_are_not_are_said_with_those_that_there_are(instal
         STAGES["sample"].find("nearest")
 
 
-@pytest.mark.parametrize(
-    ("code", "changed"),
-    [
-        ("import os; os.chdir('/')", "the working folder"),
-        ("import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)", "the handling of SIGINT"),
-        ("import signal; signal.signal(signal.SIGTERM, lambda *_: None)", "the handling of SIGTERM"),
-    ],
-)
-def test_an_import_changes_neither_the_working_folder_nor_the_handling_of_signals(
-    installed, tmp_path, monkeypatch, code, changed
-):
-    monkeypatch.chdir(tmp_path)
-    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    (installed / "own_trackers" / "__init__.py").write_text(f"{code}\n{PLUGIN.replace('from __future__', '#')}")
-    with notices.collected() as warnings, notices.listening(warnings.append):
-        assert find("tracker", "nearest").name == "nearest"
-    words = f"the import of tracker nearest (own-trackers 1.5) changed {changed}; this was undone"
-    assert [notice.message for notice in warnings] == [words]
-    assert Path.cwd() == tmp_path
-    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
-
-
 def test_an_exit_without_a_word_is_an_error_that_names_the_package(installed):
     """In the process itself; a child process may end so."""
     code = (

@@ -32,6 +32,7 @@ from mcaptrack.viewing.report.identity_events import SIDE_PX, add_thumbnails, mo
 from mcaptrack.viewing.report.scene_map import SceneBackground, TrackPath, ground_map, heat_map, picture_map, simplified
 from mcaptrack.viewing.report.summary import change_text, verdict
 from tests.commands import call, done, printed
+from tests.logs import add_rows
 from tests.worlds import ns, tracks_at, walk
 
 
@@ -84,14 +85,8 @@ INGESTED = Provenance("ingest", {})
 def write(path: Path, channels: dict[str, list[Frame]], made: Provenance = INGESTED, schema=TRACKS) -> Path:
     with log.create(path) as writer:
         for topic, frames in channels.items():
-            add(writer, topic, frames, schema, made)
+            add_rows(writer, topic, schema, frames, made=made)
     return path
-
-
-def add(writer, topic, frames, schema, made=INGESTED):
-    number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", made.to_metadata())
-    for frame in frames:
-        writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
 
 
 # Numbers
@@ -142,8 +137,14 @@ def predicted(tmp_path_factory) -> Path:
     file = tmp_path_factory.mktemp("predicted") / "predicted.mcap"
     with log.create(file) as writer:
         for topic, frames in tracks.items():
-            add(writer, topic, frames, TRACKS)
-        add(writer, "/camera/predictions", [f for (f,) in Predict(predictor="kalman")(samples)], PREDICTIONS)
+            add_rows(writer, topic, TRACKS, frames, made=INGESTED)
+        add_rows(
+            writer,
+            "/camera/predictions",
+            PREDICTIONS,
+            [f for (f,) in Predict(predictor="kalman")(samples)],
+            made=INGESTED,
+        )
     return file
 
 
@@ -368,7 +369,7 @@ def test_damaged_pictures_are_reported_and_the_ground_is_shown(tmp_path):
     path = tmp_path / "torn.mcap"
     frames = walk(lambda tick: {1: (tick * 0.4, 0.0)}, 20)
     with log.create(path) as writer:
-        add(writer, "/camera/tracks", frames, TRACKS)
+        add_rows(writer, "/camera/tracks", TRACKS, frames, made=INGESTED)
         number = writer.add_channel("/camera/video", foxglove.schema_record(foxglove.IMAGE), "protobuf", {})
         writer.add_message(number, 0, 0, foxglove.pack_picture(foxglove.IMAGE, 0, "camera", "jpeg", b"no picture"))
     _, _, reader = report_on(path)

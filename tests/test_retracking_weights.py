@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -12,21 +11,13 @@ import pytest
 import mcaptrack
 from mcaptrack.predictors.weights import load
 from mcaptrack.transforms.retrack import cut_links, false_tracks, joins, linking
-from mcaptrack.transforms.retrack.false_tracks import FEATURES
 from mcaptrack.transforms.retrack.motion_model import to_trajectories
 from mcaptrack.transforms.retrack.weights import WEIGHTS, weights_of
 from tools import crowds
-from tools.corruptions import STEP_S
 from tools.fit_retrack import (
-    Pairs,
-    cuts_of,
-    decisions_of,
     logistic,
     owners_of,
-    pairs_of,
-    people_of,
     prepare,
-    relinks_of,
 )
 
 STEPS = 60
@@ -86,21 +77,6 @@ def test_what_differs_from_scene_to_scene_is_not_put_down_to_features():
     assert abs(apart[0]) < 0.15
 
 
-def test_the_best_set_of_links_is_that_of_all_permutations():
-    rng = np.random.default_rng(3)
-    ends, begins = (side.ravel() for side in np.indices((5, 5)))
-    gain = rng.uniform(-3.5, 4, 25)
-    right = (ends == begins) * 1.0
-    features = np.full((25, len(linking.FEATURES)), np.nan)
-    features[:, linking.FEATURES.index("gap")] = np.arange(25)
-    found, is_right, gap_s = Pairs(5, ends, begins, features, right).best(gain)
-    table = gain.reshape(5, 5) + 4.0
-    best = max(permutations(range(5)), key=lambda order: table[range(5), order].sum())
-    assert found.sum() == pytest.approx((table[range(5), best] - 4.0).sum())
-    assert is_right.sum() == sum(a == b for a, b in enumerate(best))
-    assert sorted(gap_s.tolist()) == [5 * a + b for a, b in enumerate(best)]
-
-
 def test_tracks_belong_to_the_person_they_follow_and_doubles_and_clutter_to_nobody():
     steps = np.arange(40)
     walk = np.column_stack([steps, np.full(40, 3), steps * 0.4, np.zeros(40)])
@@ -116,24 +92,3 @@ def test_tracks_belong_to_the_person_they_follow_and_doubles_and_clutter_to_nobo
     found = owners_of(run, paths)[row]
     assert (found[source == 3] == 3).mean() > 0.95
     assert (found[np.isin(source, (7, 9))] == -1).all()
-
-
-def test_a_person_is_told_from_a_double_and_a_broken_track_has_a_right_link():
-    """All that the fit asks of re-tracking, in a scene where the answers are known."""
-    steps = np.arange(60)
-    walk = np.column_stack([steps, np.full(60, 3), steps * 0.4, np.zeros(60)])
-    other = walk + [0, 1, 0, 9.0]
-    made = np.concatenate([walk, other[:20], other[30:] + [0, 4, 0, 0], walk[10:25] + [0, 6, 0, 0.7]])
-    run = prepare(np.concatenate([walk, other]), made)
-    pairs, cuts, links = pairs_of(run), cuts_of(run), relinks_of(run)
-    assert pairs.right.sum() == 1
-    assert pairs.features[pairs.right > 0, linking.FEATURES.index("gap")] == pytest.approx(11 * STEP_S)
-    assert len(cuts.are_right) == len(cuts.features)
-    assert len(links.are_right) == len(links.features)
-    features, share, count, throughout = people_of(run)
-    assert not throughout.any()
-    assert sorted(zip(share.tolist(), count.tolist(), strict=True)) == [(0.0, 15.0), (1.0, 50.0), (1.0, 60.0)]
-    assert features.shape == (3, len(FEATURES))
-    joined, people = decisions_of(run)
-    assert people.are_right.tolist().count(True) == 2
-    assert joined.are_right.all()

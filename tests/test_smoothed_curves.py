@@ -20,16 +20,11 @@ from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import Predict
 from tests.commands import printed
 from tests.forecasts import forecasts, positions, predicted
+from tests.logs import add_rows
 from tests.worlds import walk
 
 RECORDED = Provenance("record", {})
 SVG = "{http://www.w3.org/2000/svg}"
-
-
-def add(writer, topic: str, frames: list[Frame], schema, made: Provenance = RECORDED) -> None:
-    number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", made.to_metadata())
-    for frame in frames:
-        writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
 
 
 def smoothed_past(xy: np.ndarray) -> np.ndarray:
@@ -143,9 +138,9 @@ def walked(tmp_path_factory) -> Path:
     file = tmp_path_factory.mktemp("walked") / "walked.mcap"
     with log.create(file) as writer:
         for topic, frames in {"truth": truth, "samples": samples, "retracks/online": samples}.items():
-            add(writer, f"/camera/{topic}", frames, TRACKS)
+            add_rows(writer, f"/camera/{topic}", TRACKS, frames, made=RECORDED)
         for topic in ("predictions", "retracks/predictions"):
-            add(writer, f"/camera/{topic}", made, PREDICTIONS, known)
+            add_rows(writer, f"/camera/{topic}", PREDICTIONS, made, made=known)
     return file
 
 
@@ -207,12 +202,12 @@ def test_predictions_of_unknown_making_are_not_smoothed(tmp_path):
     samples = walk(lambda n: {1: (0.4 * n, 0.0)}, 20)
     with log.create(file) as writer:
         for topic in ("truth", "samples"):
-            add(writer, f"/camera/{topic}", samples, TRACKS)
+            add_rows(writer, f"/camera/{topic}", TRACKS, samples, made=RECORDED)
     with pytest.raises(McaptrackError, match=r"recorded\.mcap has no /camera/predictions; .* makes them"):
         mcaptrack.evaluate(file, smoothed=True)
     with log.create(tmp_path / "b.mcap") as writer:
         for topic in ("truth", "samples"):
-            add(writer, f"/camera/{topic}", samples, TRACKS)
-        add(writer, "/camera/predictions", [f for (f,) in Predict()(samples)], PREDICTIONS)
+            add_rows(writer, f"/camera/{topic}", TRACKS, samples, made=RECORDED)
+        add_rows(writer, "/camera/predictions", PREDICTIONS, [f for (f,) in Predict()(samples)], made=RECORDED)
     with pytest.raises(McaptrackError, match=r"/camera/predictions of .*b.mcap is recorded: how it was predicted"):
         mcaptrack.evaluate(tmp_path / "b.mcap", smoothed=True)
