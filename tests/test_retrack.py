@@ -1,4 +1,4 @@
-"""Re-tracking: Eq. 1 to 3 and every branch of Algorithm 1 by hand, and the paper's four failures as small scenes."""
+"""Re-tracking: the four failures of the paper as small scenes, and the limits of its options."""
 
 from __future__ import annotations
 
@@ -14,16 +14,12 @@ from scipy.spatial import ConvexHull
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.histories import Holt
-from mcaptrack.predictors import Forecast
 from mcaptrack.schema import DECISIONS, PREDICTIONS, TRACKS, Frame, framing
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import PROFILES, Retrack
 from mcaptrack.transforms.retrack.assignments import PEOPLE, Movers, join_classes, movers_of, split_classes, usual_score
-from mcaptrack.transforms.retrack.consistency import SmoothedHistory
 from mcaptrack.transforms.retrack.methods import KeptIds
-from mcaptrack.transforms.retrack.options import mahalanobis, prediction_distances
 from mcaptrack.transforms.retrack.shown_tracks import GrowingHull
 from tests.commands import call
 from tests.tiers import one_in
@@ -52,65 +48,8 @@ def along(path: dict[int, tuple[float, float]], truth: dict[int, tuple[float, fl
     return path.keys() == truth.keys() and all(np.hypot(*np.subtract(path[t], truth[t])) < 0.02 for t in truth)
 
 
-def line(start: float, step: float, count: int = 12) -> np.ndarray:
-    """A forecast along the first axis: start + step, start + 2 step, ..."""
-    return np.stack([start + step * np.arange(1, count + 1), np.zeros(count)], axis=-1)
-
-
-def forecast(*means: np.ndarray, variance: float = 1.0) -> Forecast:
-    mean = np.stack(means)
-    return Forecast(mean, np.broadcast_to(variance * np.eye(2), (*mean.shape, 2)))
-
-
-class TestDistance:
-    def test_eq_1_by_hand(self):
-        off, cov = np.array([[3.0, 4.0], [1.0, 1.0]]), np.array([np.diag([9.0, 16.0]), [[2.0, 1.0], [1.0, 2.0]]])
-        np.testing.assert_allclose(mahalanobis(off, cov), [np.sqrt(2), np.sqrt(2 / 3)])
-
-    def test_eq_2_by_hand(self):
-        """A track predicted one step ago at 0, 1, 2, ...; an observation predicts the same positions 2 m further.
-
-        Step j of the overlap (from 1): variances j + 1 and j, so the distance is 2 / sqrt(2 j + 1), for 11 steps.
-        """
-        tracks, seen = forecast(line(0, 1)), forecast(line(1, 1) + [2, 0])
-        each = 2 / np.sqrt(2 * np.arange(1, 12) + 1)
-        age = np.array([1])
-        assert prediction_distances(tracks, age, seen, "mean", 1.0)[0, 0] == pytest.approx(each.mean())
-        assert prediction_distances(tracks, age, seen, "max", 1.0)[0, 0] == pytest.approx(each.max())
-        assert prediction_distances(tracks, age, seen, "first", 1.0)[0, 0] == pytest.approx(each[0])
-        assert prediction_distances(tracks, age, seen, "mean", 2.0)[0, 0] == pytest.approx(each.mean() / 2)
-
-
-class TestSmoothing:
-    def test_eq_3_over_a_gap_by_hand(self):
-        """Observed at 0 and 1, and three steps later at 5: displacements 1, 4/3, 4/3, 4/3."""
-        holt = Holt(0.5, 0.5)
-        past = np.array([[[np.nan, np.nan], [0.0, 0], [1, 0]]])
-        history = SmoothedHistory.of_observations(holt, past, np.isfinite(past[..., 0]))
-        history.append(holt, np.array([[5.0, 0.0]]), np.array([3]))
-        level, trend = 1.0, 0.0
-        smooth = [level]
-        for displacement in (4 / 3, 4 / 3, 4 / 3):
-            new = 0.5 * displacement + 0.5 * (level + trend)
-            level, trend = new, 0.5 * (new - level) + 0.5 * trend
-            smooth.append(level)
-        rebuilt, known = history.positions()
-        assert known.tolist() == [[True, True, True]]
-        np.testing.assert_allclose(rebuilt[0, :, 0], [5 - smooth[-1] - smooth[-2], 5 - smooth[-1], 5])
-
-
-class TestBranches:
-    """Lines 4 to 18 of Algorithm 1, one by one, on people who walk along the first axis."""
-
-    @every_profile
-    def test_an_unmatched_track_coasts_and_is_matched_again_within_its_maximum_age(self, profile):
-        """Occluded for three steps, then under another id; matched once that id has a past. The gap is interpolated."""
-        frames = walk(lambda n: {7 if n < 10 else 8: (0.5 * n, 0.0)} if not 10 <= n < 13 else {}, 26)
-        offline, *_ = run(profile, frames)
-        (who,) = paths(offline)
-        assert along(paths(offline)[who], {tick: (0.5 * tick, 0.0) for tick in range(26)})
-        filled = [tick for tick, frame in enumerate(offline) if not frame.rows["observed"].all()]
-        assert set(range(10, 13)) <= set(filled)
+class TestHorizon:
+    """Horizons of prediction, on people who walk along the first axis."""
 
     @pytest.mark.parametrize(
         ("profile", "horizon_s", "steps"),
@@ -209,26 +148,6 @@ class TestFailuresOfThePaper:
         raw = replace(PAPER, alpha=1.0, beta=0.0)
         assert drift(PAPER) < 0.8 * drift(raw)
         assert drift(DEFAULT) < 0.8 * drift(raw)
-
-
-def test_the_profile_authors_keeps_what_two_matches_in_a_row_confirm():
-    """Observed at ticks 0 to 9, 13 to 16 and from 20 on: four positions give a prediction, so 16, 23, 24 match.
-
-    A single match at the end of a track is left out; in the middle, before a confirmed end, it is kept.
-    """
-
-    def crowd(n, last):
-        name = next((name for name, start, end in ((1, 0, 9), (2, 13, 16), (3, 20, last)) if start <= n <= end), None)
-        return {name: (0.5 * n, 0.0)} if name else {}
-
-    def ticks(profile, last) -> list[int]:
-        offline, *_ = run(profile, walk(lambda n: crowd(n, last), 40))
-        (path,) = paths(offline).values()
-        return list(path)
-
-    assert ticks(AUTHORS, 23) == list(range(10))
-    assert ticks(replace(AUTHORS, trim_ends=False), 23) == list(range(24))
-    assert ticks(AUTHORS, 24) == list(range(25))
 
 
 def test_a_log_without_people_gives_frames_without_rows():

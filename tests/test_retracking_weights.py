@@ -11,13 +11,10 @@ import pytest
 import mcaptrack
 from mcaptrack.predictors.weights import load
 from mcaptrack.transforms.retrack import cut_links, false_tracks, joins, linking
-from mcaptrack.transforms.retrack.motion_model import to_trajectories
 from mcaptrack.transforms.retrack.weights import WEIGHTS, weights_of
 from tools import crowds
 from tools.fit_retrack import (
     logistic,
-    owners_of,
-    prepare,
 )
 
 STEPS = 60
@@ -75,20 +72,3 @@ def test_what_differs_from_scene_to_scene_is_not_put_down_to_features():
     apart = logistic(gap[:, None], right * 1.0, np.ones(len(gap)), scene)
     assert together[0] > 0.5
     assert abs(apart[0]) < 0.15
-
-
-def test_tracks_belong_to_the_person_they_follow_and_doubles_and_clutter_to_nobody():
-    steps = np.arange(40)
-    walk = np.column_stack([steps, np.full(40, 3), steps * 0.4, np.zeros(40)])
-    double = walk[10:25] + [0, 4, 0, 0.6]
-    clutter = np.column_stack([steps[:20], np.full(20, 9), np.full(20, 8.0), np.full(20, 30.0)])
-    run = prepare(walk, np.concatenate([walk, double, clutter]))
-    step, track, source, _ = run.args[2].of(run.args[3], run.args[4])
-    truth = {3: walk, 7: double, 9: clutter}
-    xy = np.array(
-        [truth[who][np.flatnonzero(truth[who][:, 0] == at)[0], 2:] for at, who in zip(step, source, strict=True)]
-    )
-    _, row, paths = to_trajectories(step, track, xy, 0.2)
-    found = owners_of(run, paths)[row]
-    assert (found[source == 3] == 3).mean() > 0.95
-    assert (found[np.isin(source, (7, 9))] == -1).all()

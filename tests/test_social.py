@@ -209,15 +209,6 @@ class TestSocial:
         np.testing.assert_allclose(north.mean, east.mean[..., ::-1], atol=1e-9)
         np.testing.assert_allclose(north.cov, east.cov[..., ::-1, ::-1], atol=1e-9)
 
-    def test_people_beyond_twelve_metres_have_no_influence(self):
-        xy_m, valid = crowd(3, 2)
-        alone = SOCIAL.predict(xy_m[:1], valid[:1])
-        for away, is_seen in ((25.0, False), (3.0, True)):
-            other = xy_m[1:] - xy_m[1:, -1:] + xy_m[:1, -1:] + [away, 0.0]
-            people = PeopleSeen(np.concatenate([xy_m[:1], other]), valid, np.zeros(2, int), np.array([0]))
-            found = SOCIAL.predict(xy_m[:1], valid[:1], people)
-            assert (np.abs(found.mean - alone.mean).max() > 1e-3) == is_seen
-
     def test_the_formulas_are_those_of_attention(self):
         """Against loops over tracks, people and steps, on the same features."""
         xy_m, valid = crowd(11, 6)

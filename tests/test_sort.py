@@ -84,13 +84,6 @@ def test_ages_are_in_seconds_where_the_frame_rate_changes():
     assert ids([f for (f,) in Sort(max_age_s=0.6, min_hits_s=0.1)(frames)][-1]) == [3]
 
 
-def test_tracks_terminate_in_a_gap_of_an_hour():
-    frames = detections(lambda n: [(50, 60)], 40)
-    late = [f._replace(t_ns=f.t_ns + (ns(3600) if f.index >= 20 else 0)) for f in frames]
-    out = [f for (f,) in Sort(max_age_s=1.0, min_hits_s=0.1)(late)]
-    assert (ids(out[19]), ids(out[-1])) == ([1], [2])
-
-
 def test_a_score_at_the_limit_and_the_largest_class_pass():
     rows = boxes_at([(50, 50), (120, 50)])
     rows["score"], rows["class_id"] = [0.5, np.nextafter(np.float32(0.5), np.float32(0))], [2**31 - 1, 1]

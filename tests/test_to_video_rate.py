@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import TRACKS, Frame, framing
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.transforms.to_video_rate import linked_tracks, mended_ends, to_video_rate
-from tests.commands import printed
 from tests.worlds import ns
 
 
@@ -65,17 +63,6 @@ def test_without_re_tracked_tracks_every_frame_is_there_without_rows():
     near = [tracks[0], *(tracks[0]._replace(t_ns=t_ns, index=t_ns) for t_ns in (1, 2))]
     found = to_video_rate(near, [Frame(0, 0, named({1: (7, 0.0)}))], ())
     assert [one.rows["track_id"].tolist() for one in found] == [[1], [1], []]
-
-
-def test_a_log_gets_them_beside_the_others(tmp_path):
-    rows = "".join(f"{frame},1,{10 + frame},20,10,30,1,-1,-1,-1\n" for frame in range(1, 41))
-    (tmp_path / "t.txt").write_text(rows)
-    printed("ingest", tmp_path / "t.txt", "--as", "tracks", "--fps", 10, "-o", tmp_path / "l.mcap")
-    printed("retrack", tmp_path / "l.mcap")
-    (result,) = json.loads(printed("info", tmp_path / "l.mcap", "--json")[0])["results"]
-    channels = {channel["topic"]: channel for channel in result["channels"]}
-    assert channels["/camera/retracks/full"]["messages"] == channels["/camera/tracks"]["messages"] == 40
-    assert not channels["/camera/retracks/full"]["stale"]
 
 
 def test_boxes_have_metres_by_the_plane_of_their_time():
