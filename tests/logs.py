@@ -85,8 +85,9 @@ IMU = {
 }
 
 
-def add_rows(writer, topic, schema, frames, transform="track", source="/camera/detections"):
-    made = Provenance(transform, {"max_age_s": 1.4}, source).to_metadata()
+def add_rows(writer, topic, schema, frames, transform="track", source="/camera/detections", made=None):
+    """Add a channel with rows; ``made`` says how in place of the transform and its source."""
+    made = (made or Provenance(transform, {"max_age_s": 1.4}, source)).to_metadata()
     number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", made, group=topic)
     for frame in frames:
         writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))

@@ -13,7 +13,7 @@ from mcaptrack.geometry.camera_motion import CameraPose
 from mcaptrack.geometry.camera_path import Verdict
 from mcaptrack.notices import collected
 from mcaptrack.pipeline.rebuild import differing
-from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema import Frame
 from mcaptrack.transforms import (
     KnnDetector,
     MedianDetector,
@@ -174,12 +174,3 @@ def test_own_options_are_those_with_a_default_that_the_interface_does_not_have()
     assert (width.name, width.annotation, width.default, width.metadata["least"]) == ("width", float, 1.5, 0.5)
     assert (names.name, names.default) == ("names", ("a", "b"))
     assert own_options(len) == []  # nothing is known of its arguments' defaults
-
-
-def test_frames_of_one_row_last_no_time():
-    assert (
-        longest_track_s(
-            [Frame(ns(3), 0, TRACKS.rows(track_id=[1], x_m=[0.0], y_m=[0.0], observed=[True], source_id=[-1]))]
-        )
-        == 0
-    )

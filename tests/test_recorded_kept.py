@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shlex
 import shutil
 from pathlib import Path
 from typing import get_args
@@ -157,19 +156,3 @@ def test_nothing_that_is_ingested_takes_the_place_of_a_recorded_channel(
     code, err = mcaptrack("ingest", source, *options, *more)
     assert code == 0, err
     assert theirs(path) == content
-
-
-def test_labels_beside_a_recording_that_has_such_a_channel(stock, tmp_path):
-    """The recording becomes a log with all that is in it; the labels stand in another camera's place, at its times."""
-    path = record(tmp_path / "m.mcap", "/camera/truth", source=stock / "robot.mcap")
-    found = lines(tmp_path / "gt.txt", 1, 2)
-    out = tmp_path / "out.mcap"
-    for force in ([], ["--force"]):
-        code, err = mcaptrack("ingest", path, "--truth", found, *force, "-o", out)
-        assert (code, out.exists()) == (1, False)
-        assert "m.mcap has /camera/truth, which other software recorded" in err
-    options = shlex.split(re.search(r"(--camera \S+) puts", err)[1])
-    assert mcaptrack("ingest", path, "--truth", found, *options, "-o", out)[0] == 0
-    assert theirs(out) == theirs(path)
-    with log.read(out) as opened:
-        assert opened.times("/camera/labels/truth").tolist() == opened.times("/camera/image").tolist()

@@ -90,6 +90,7 @@ def test_every_file_of_the_conformance_suite_holds_what_is_written_beside_it(dat
             chunks = {chunk.offset: chunk for chunk in index.chunks}
             for f in _fields(said, "ChunkIndex"):
                 chunk = chunks[int(f["chunk_start_offset"])]
+                sizes = (chunk.length, chunk.compressed_size, chunk.uncompressed_size)
                 names = (
                     "chunk_length",
                     "compressed_size",
@@ -97,13 +98,7 @@ def test_every_file_of_the_conformance_suite_holds_what_is_written_beside_it(dat
                     "message_start_time",
                     "message_end_time",
                 )
-                assert [int(f[name]) for name in names] == [
-                    chunk.length,
-                    chunk.compressed_size,
-                    chunk.uncompressed_size,
-                    chunk.start_ns,
-                    chunk.end_ns,
-                ]
+                assert tuple(int(f[name]) for name in names) == (*sizes, chunk.start_ns, chunk.end_ns)
             (end,) = _fields(said, "DataEnd")
             assert int(end["data_section_crc"]) == index.data_crc
 

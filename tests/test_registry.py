@@ -14,7 +14,6 @@ import pytest
 
 from mcaptrack import notices, registry
 from mcaptrack.errors import McaptrackError
-from mcaptrack.predictors import NAMES
 from mcaptrack.registry import BUILT_IN, KINDS, blamed, entry_of, find, names
 from mcaptrack.transforms import STAGES, ByteTrack, Sort
 from tests.distributions import package
@@ -62,10 +61,6 @@ def test_every_built_in_name_is_found_and_is_its_class_again(kind):
         entry = find(kind, name)
         assert (entry.name, entry.kind, entry.distribution, entry.is_built_in) == (name, kind, "mcaptrack", True)
         assert entry_of(kind, entry.cls) == entry
-
-
-def test_predictors_that_need_no_file_are_the_built_in_ones_but_onnx():
-    assert set(NAMES) == set(BUILT_IN["predictor"]) - {"onnx"}
 
 
 @pytest.mark.parametrize("stage", [stage for stage in STAGES.values() if stage.kind], ids=lambda stage: stage.name)
@@ -287,30 +282,25 @@ def test_the_place_of_a_failure_is_named_also_below_a_folder_called_mcaptrack(tm
     del sys.modules["deep_tracker"]
 
 
-@pytest.mark.parametrize(
-    ("text", "name", "said"),
-    [
-        (
-            "",
-            "nosuch",
-            "no tracker is called nosuch; there are sort, bytetrack, ocsort, ground, nearest; an installed package",
-        ),
-        ("", "ocsrot", "no tracker is called ocsrot; did you mean ocsort\\? there are"),
-        ("", "missing_module:A", "tracker missing_module:A can't be imported: ModuleNotFoundError: No module named"),
-        ("raise SystemError('two\\nlines')", "own_trackers:A", "can't be imported: SystemError: two lines"),
-        ("x = (", "nearest", r"tracker nearest \(own-trackers 1.5\) can't be imported: SyntaxError"),
-        ("", "nearest", r"tracker nearest \(own-trackers 1.5\): own_trackers has no class Nearest"),
-        ("Nearest = 3", "own_trackers:Nearest", "Nearest in own_trackers is no class but of type int"),
-        (
-            "import functools\nNearest = functools.partial(int)",
-            "own_trackers:Nearest",
-            "Nearest in own_trackers is no class but of type partial",
-        ),
-        ("raise SystemExit(0)", "own_trackers:Nearest", "can't be imported: SystemExit: 0"),
-        ("", "own_trackers:", "own_trackers: is not of the form module:Class"),
-        ("", "a b:C", "a b:C is not of the form module:Class"),
-    ],
-)
+KNOWN = "there are sort, bytetrack, ocsort, ground, nearest"
+PARTIAL = "import functools\nNearest = functools.partial(int)"
+#: The code of the package, the name that is given, and what is said of it.
+WRONG_NAMES = [
+    ("", "nosuch", f"no tracker is called nosuch; {KNOWN}; an installed package"),
+    ("", "ocsrot", "no tracker is called ocsrot; did you mean ocsort\\? there are"),
+    ("", "missing_module:A", "tracker missing_module:A can't be imported: ModuleNotFoundError: No module named"),
+    ("raise SystemError('two\\nlines')", "own_trackers:A", "can't be imported: SystemError: two lines"),
+    ("x = (", "nearest", r"tracker nearest \(own-trackers 1.5\) can't be imported: SyntaxError"),
+    ("", "nearest", r"tracker nearest \(own-trackers 1.5\): own_trackers has no class Nearest"),
+    ("Nearest = 3", "own_trackers:Nearest", "Nearest in own_trackers is no class but of type int"),
+    (PARTIAL, "own_trackers:Nearest", "Nearest in own_trackers is no class but of type partial"),
+    ("raise SystemExit(0)", "own_trackers:Nearest", "can't be imported: SystemExit: 0"),
+    ("", "own_trackers:", "own_trackers: is not of the form module:Class"),
+    ("", "a b:C", "a b:C is not of the form module:Class"),
+]
+
+
+@pytest.mark.parametrize(("text", "name", "said"), WRONG_NAMES)
 def test_what_cannot_be_found_is_said_in_one_line(installed, text, name, said):
     (installed / "own_trackers" / "__init__.py").write_text(text)
     with pytest.raises(McaptrackError, match=said) as refused:
@@ -318,43 +308,26 @@ def test_what_cannot_be_found_is_said_in_one_line(installed, text, name, said):
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        (PLUGIN.replace("@dataclass(frozen=True, kw_only=True)", ""), "is no dataclass"),
-        (
-            PLUGIN.replace("reads: ClassVar = DETECTIONS", ""),
-            r"reads no schema \(the class attribute reads\); a tracker",
-        ),
-        (
-            PLUGIN.replace('{"": TRACKS}', '{"": DETECTIONS}'),
-            "writes mcaptrack.Detections; a tracker writes mcaptrack.Tr",
-        ),
-        (PLUGIN.replace('{"": TRACKS}', "TRACKS"), "writes nothing"),
-        (PLUGIN.replace("__call__", "call"), "can't be called with frames"),
-        (PLUGIN.replace("gain: float", "gain: dict"), "Nearest.gain is a dict; a parameter is a float"),
-        (
-            PLUGIN.replace("    reads:", '    colour: ClassVar = "blue"\n    reads:'),
-            "has colour = 'blue'; it is 'bgr' or 'grey'",
-        ),
-        (PLUGIN.replace("    reads:", "    passes: ClassVar = 3\n    reads:"), "has passes = 3; it is 1 or 2"),
-        (
-            PLUGIN.replace("    reads:", '    space: ClassVar = "metres"\n    reads:'),
-            "has space = 'metres'; it is 'picture' or 'ground'",
-        ),
-        (
-            PLUGIN.replace("    reads:", "    keeps_unseen: ClassVar = 1\n    reads:"),
-            "has keeps_unseen = 1; it is True or False",
-        ),
-        (PLUGIN.replace("gain: float", "tracker: float"), "a parameter can't have the name of the option `tracker=`"),
-        (
-            PLUGIN.replace('gain: float = option(2.0, "how much", least=0.0)', "gain: float"),
-            "Nearest.gain has no default",
-        ),
-    ],
-)
-def test_a_class_that_cannot_track_is_refused_in_one_line(installed, text, said):
-    (installed / "own_trackers" / "__init__.py").write_text(text)
+#: A part of the plugin, what stands in its place, and what is said of that.
+WRONG_CLASSES = [
+    ("@dataclass(frozen=True, kw_only=True)", "", "is no dataclass"),
+    ("reads: ClassVar = DETECTIONS", "", r"reads no schema \(the class attribute reads\); a tracker"),
+    ('{"": TRACKS}', '{"": DETECTIONS}', "writes mcaptrack.Detections; a tracker writes mcaptrack.Tr"),
+    ('{"": TRACKS}', "TRACKS", "writes nothing"),
+    ("__call__", "call", "can't be called with frames"),
+    ("gain: float", "gain: dict", "Nearest.gain is a dict; a parameter is a float"),
+    ("    reads:", '    colour: ClassVar = "blue"\n    reads:', "has colour = 'blue'; it is 'bgr' or 'grey'"),
+    ("    reads:", "    passes: ClassVar = 3\n    reads:", "has passes = 3; it is 1 or 2"),
+    ("    reads:", '    space: ClassVar = "metres"\n    reads:', "has space = 'metres'; it is 'picture' or 'ground'"),
+    ("    reads:", "    keeps_unseen: ClassVar = 1\n    reads:", "has keeps_unseen = 1; it is True or False"),
+    ("gain: float", "tracker: float", "a parameter can't have the name of the option `tracker=`"),
+    (' = option(2.0, "how much", least=0.0)', "", "Nearest.gain has no default"),
+]
+
+
+@pytest.mark.parametrize(("part", "instead", "said"), WRONG_CLASSES)
+def test_a_class_that_cannot_track_is_refused_in_one_line(installed, part, instead, said):
+    (installed / "own_trackers" / "__init__.py").write_text(PLUGIN.replace(part, instead))
     with pytest.raises(McaptrackError, match=said) as refused:
         STAGES["track"].find("nearest")
     assert "\n" not in str(refused.value)
@@ -366,41 +339,6 @@ def test_parameters_that_there_are_not_are_said_with_those_that_there_are(instal
         STAGES["track"].make("nearest", gian=1.0)
     with pytest.raises(McaptrackError, match="sample has one transform only"):
         STAGES["sample"].find("nearest")
-
-
-def test_the_groups_of_entry_points_are_those_of_the_documentation():
-    groups = {f"mcaptrack.{kind}s" for kind in KINDS}
-    assert groups == {
-        "mcaptrack.detectors",
-        "mcaptrack.trackers",
-        "mcaptrack.predictors",
-        "mcaptrack.retrackers",
-        "mcaptrack.fusers",
-    }
-    for group in groups:
-        assert f".{group.partition('.')[2]}``" in (registry.__doc__ or "")
-
-
-@pytest.mark.parametrize(
-    ("code", "changed"),
-    [
-        ("import os; os.chdir('/')", "the working folder"),
-        ("import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)", "the handling of SIGINT"),
-        ("import signal; signal.signal(signal.SIGTERM, lambda *_: None)", "the handling of SIGTERM"),
-    ],
-)
-def test_an_import_changes_neither_the_working_folder_nor_the_handling_of_signals(
-    installed, tmp_path, monkeypatch, code, changed
-):
-    monkeypatch.chdir(tmp_path)
-    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    (installed / "own_trackers" / "__init__.py").write_text(f"{code}\n{PLUGIN.replace('from __future__', '#')}")
-    with notices.collected() as warnings, notices.listening(warnings.append):
-        assert find("tracker", "nearest").name == "nearest"
-    words = f"the import of tracker nearest (own-trackers 1.5) changed {changed}; this was undone"
-    assert [notice.message for notice in warnings] == [words]
-    assert Path.cwd() == tmp_path
-    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
 
 
 def test_an_exit_without_a_word_is_an_error_that_names_the_package(installed):

@@ -85,10 +85,6 @@ def test_what_is_drawn_is_scaled_with_the_picture():
     assert abs(np.array(spans[0]) / 2 - np.array(spans[1])).max() <= 2
 
 
-def test_a_picture_where_nothing_is_stays_as_it_is():
-    assert np.array_equal(draw(GREY, annotations()), GREY)
-
-
 def test_lines_of_a_list_are_drawn_one_by_one_and_leave_gaps():
     message = ImageAnnotations()
     part = message.points.add(type=4, thickness=2)
@@ -150,20 +146,8 @@ def test_a_log_becomes_a_video_of_its_pictures(finished, tmp_path):
     assert result["views"] == ["/camera/retracks/full/view/image", "/camera/retracks/predictions/view/image"]
     found = clip(tmp_path / "all.mp4")
     assert len(found) == result["pictures"]
-    printed(
-        "render",
-        finished,
-        "--topic",
-        "/camera/truth",
-        "--width",
-        160,
-        "--gif",
-        "--end-s",
-        1.05,
-        "--force",
-        "-o",
-        tmp_path / "a.gif",
-    )
+    words = ("--topic", "/camera/truth", "--width", 160, "--gif", "--end-s", 1.05, "--force", "-o", tmp_path / "a.gif")
+    printed("render", finished, *words)
     small = clip(tmp_path / "a.gif")
     assert [t for t, _ in small] == pytest.approx(np.arange(len(small)) / 10, abs=0.06)
     assert 9 <= len(small) <= 11

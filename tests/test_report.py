@@ -20,15 +20,19 @@ from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, ev
 from mcaptrack.evaluation.events import MatchRule, find_events
 from mcaptrack.evaluation.metrics.displacement import combine_displacements, displacement
 from mcaptrack.evaluation.metrics.pairing import Forecasts, Positions
-from mcaptrack.foxglove.palette import COUNT as COLOURS
+from mcaptrack.evaluation.people import Interval, Intervals
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import Predict
 from mcaptrack.viewing.report import ELEMENT, charts, data, gather, page, statistics
+from mcaptrack.viewing.report.charts import Axis, Bars, Line
 from mcaptrack.viewing.report.formatting import environment, plain
+from mcaptrack.viewing.report.headline import rules_text
 from mcaptrack.viewing.report.identity_events import SIDE_PX, add_thumbnails, most_important, summarize_events
-from mcaptrack.viewing.report.scene_map import simplified
+from mcaptrack.viewing.report.scene_map import SceneBackground, TrackPath, ground_map, heat_map, picture_map, simplified
+from mcaptrack.viewing.report.summary import change_text, verdict
 from tests.commands import call, done, printed
+from tests.logs import add_rows
 from tests.worlds import ns, tracks_at, walk
 
 
@@ -81,14 +85,8 @@ INGESTED = Provenance("ingest", {})
 def write(path: Path, channels: dict[str, list[Frame]], made: Provenance = INGESTED, schema=TRACKS) -> Path:
     with log.create(path) as writer:
         for topic, frames in channels.items():
-            add(writer, topic, frames, schema, made)
+            add_rows(writer, topic, schema, frames, made=made)
     return path
-
-
-def add(writer, topic, frames, schema, made=INGESTED):
-    number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", made.to_metadata())
-    for frame in frames:
-        writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
 
 
 # Numbers
@@ -120,6 +118,8 @@ def test_several_logs_are_combined_as_evaluate_combines_them(finished, tmp_path)
     assert any(result["sequence"] == "COMBINED" for result in scored)
     assert len([one for one in reader.of("details") if one.get("class") == "log"]) == 2
     assert "both logs together" in "".join(reader.text)
+    code, _, err = call("report", finished, other)
+    assert (code, "-o" in err) == (1, True)  # it would stand beside neither
 
 
 @pytest.fixture(scope="module")
@@ -137,8 +137,14 @@ def predicted(tmp_path_factory) -> Path:
     file = tmp_path_factory.mktemp("predicted") / "predicted.mcap"
     with log.create(file) as writer:
         for topic, frames in tracks.items():
-            add(writer, topic, frames, TRACKS)
-        add(writer, "/camera/predictions", [f for (f,) in Predict(predictor="kalman")(samples)], PREDICTIONS)
+            add_rows(writer, topic, TRACKS, frames, made=INGESTED)
+        add_rows(
+            writer,
+            "/camera/predictions",
+            PREDICTIONS,
+            [f for (f,) in Predict(predictor="kalman")(samples)],
+            made=INGESTED,
+        )
     return file
 
 
@@ -315,14 +321,6 @@ def test_thumbnails_show_the_tracks_before_and_after(story):
             assert seen[around].mean() < 60
 
 
-def test_colours_are_those_of_viewers(finished):
-    text, _, reader = report_on(finished)
-    for identity in (0, 1, 8, 20, 21, 47):
-        red, green, blue, _ = (round(255 * part) for part in foxglove.colour(identity))
-        assert f".c{identity % COLOURS}{{stroke:#{red:02x}{green:02x}{blue:02x}}}" in text
-    assert {one["class"] for one in reader.of("path")} <= {"halo", *(f"c{k}" for k in range(COLOURS))}
-
-
 # Statistics that are not known
 
 
@@ -357,15 +355,6 @@ def test_without_metres_it_says_that_speeds_are_not_known(tmp_path):
     assert numbers["logs"][0]["dwell_s"]["series"][0]["median"] == pytest.approx(3.0)
 
 
-def test_without_forecasts_it_says_which_command_makes_them(finished, tmp_path):
-    less = tmp_path / "less.mcap"
-    printed("drop", finished, "*predictions*", "-o", less, "-q")
-    _, numbers, reader = report_on(less)
-    assert "mcaptrack predict less.mcap" in "".join(reader.text)
-    assert numbers["logs"][0]["forecasts"] == []
-    assert all("displacement" not in result for result in numbers["results"])
-
-
 def test_ground_truth_of_another_time_is_reported_and_the_rest_shown(tmp_path):
     frames = walk(lambda tick: {1: (tick * 0.4, 0.0)}, 20)
     later = [Frame(f.t_ns + ns(1000), f.index, f.rows) for f in frames]
@@ -380,7 +369,7 @@ def test_damaged_pictures_are_reported_and_the_ground_is_shown(tmp_path):
     path = tmp_path / "torn.mcap"
     frames = walk(lambda tick: {1: (tick * 0.4, 0.0)}, 20)
     with log.create(path) as writer:
-        add(writer, "/camera/tracks", frames, TRACKS)
+        add_rows(writer, "/camera/tracks", TRACKS, frames, made=INGESTED)
         number = writer.add_channel("/camera/video", foxglove.schema_record(foxglove.IMAGE), "protobuf", {})
         writer.add_message(number, 0, 0, foxglove.pack_picture(foxglove.IMAGE, 0, "camera", "jpeg", b"no picture"))
     _, _, reader = report_on(path)
@@ -400,27 +389,11 @@ def test_channels_of_another_schema_are_left_out_and_named(tmp_path):
 
 _NASTY = "/<script>alert(1)</script>\"'><img src=x onerror=alert(2)>javascript:alert(3)\u202egnp.\u0007\u2066&lt;]]>"
 _ELEMENTS = {
-    *(
-        "html",
-        "head",
-        "meta",
-        "link",
-        "title",
-        "style",
-        "body",
-        "main",
-        "script",
-        "section",
-        "div",
-        "p",
-        "ul",
-        "ol",
-        "li",
-    ),
-    *("h1", "h2", "h3", "h4", "b", "bdi", "code", "small", "span", "dl", "dt", "dd", "details", "summary", "figure"),
-    *("figcaption", "table", "caption", "thead", "tbody", "tr", "th", "td", "svg", "g", "line", "rect", "path", "text"),
-    *("polyline", "polygon", "circle", "image", "use"),
-}
+    "html", "head", "meta", "link", "title", "style", "body", "main", "script", "section", "div", "p", "ul", "ol", "li",
+    "h1", "h2", "h3", "h4", "b", "bdi", "code", "small", "span", "dl", "dt", "dd", "details", "summary", "figure",
+    "figcaption", "table", "caption", "thead", "tbody", "tr", "th", "td", "svg", "g", "line", "rect", "path", "text",
+    "polyline", "polygon", "circle", "image", "use",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -544,18 +517,11 @@ def test_the_same_log_gives_the_same_bytes_wherever_it_lies(finished, tmp_path):
     assert report_on(finished)[0] == report_on(moved)[0]
 
 
-def test_the_page_stands_beside_the_log_and_is_not_replaced_unasked(finished, tmp_path):
+def test_the_page_stands_beside_the_log_which_it_never_replaces(finished, tmp_path):
     path = tmp_path / "walk.mcap"
     path.write_bytes(finished.read_bytes())
     before = path.read_bytes()
     printed("report", path, "-q")
-    first = (tmp_path / "walk.report.html").read_bytes()
-    code, _, err = call("report", path)
-    assert code == 1
-    assert "--force" in err
-    printed("report", path, "--force", "-q")
-    assert (tmp_path / "walk.report.html").read_bytes() == first
-    assert path.read_bytes() == before
     assert sorted(p.name for p in tmp_path.iterdir()) == ["walk.mcap", "walk.report.html"]
     code, _, err = call("report", path, "-o", path, "--force")
     assert code == 1
@@ -563,22 +529,148 @@ def test_the_page_stands_beside_the_log_and_is_not_replaced_unasked(finished, tm
     assert path.read_bytes() == before
 
 
-def test_several_logs_need_a_name_for_their_page(finished):
-    code, _, err = call("report", finished, finished)
-    assert code == 1
-    assert "-o" in err
+# Charts and maps of the report: where each thing stands, by hand
 
 
-def test_a_damaged_log_is_refused_in_one_line(finished, tmp_path):
-    path = tmp_path / "broken.mcap"
-    with log.read(finished) as opened:
-        number = opened.channel("/camera/predictions").id
-        chunk = next(one for one in opened.index.chunks if number in one.message_index_offsets)
-    whole = bytearray(finished.read_bytes())
-    whole[chunk.offset + chunk.length - 1] ^= 1
-    path.write_bytes(whole)
-    code, _, err = call("report", path, folder=tmp_path)
-    assert code == 1
-    assert "is damaged: byte" in err
-    assert err.count("\n") == 1
-    assert not path.with_suffix(".report.html").exists()
+#: The corners of a chart of lines, in px.
+LEFT, RIGHT, TOP, BOTTOM = 46.0, 334.0, 26.0, 230.0
+
+
+def places(points: str) -> np.ndarray:
+    return np.array([[float(part) for part in one.split(",")] for one in points.split()])
+
+
+def test_lines_stand_at_their_values_and_end_at_the_border():
+    x, y = np.array([0.0, 5.0, 10.0, 10.0, 2.0]), np.array([0.0, 4.0, 8.0, 16.0, np.nan])
+    band = np.array([0.0, 2.0, 4.0, 6.0, 0.0]), np.array([2.0, 6.0, 8.0, 20.0, 0.0])
+    line = Line("one", "tracks", x, y, *band, dot=(5.0, 4.0))
+    chart = charts.line_chart("t", [line], Axis("s", 10.0), Axis("m", 8.0))
+    wanted = [(LEFT, BOTTOM), ((LEFT + RIGHT) / 2, (TOP + BOTTOM) / 2), (RIGHT, TOP), (RIGHT, TOP)]
+    assert places(chart["lines"][0]["points"]) == pytest.approx(np.array(wanted), abs=0.06)
+    around = places(chart["bands"][0]["points"])
+    assert len(around) == 8
+    assert around[:, 0] == pytest.approx([LEFT, 190.0, RIGHT, RIGHT, RIGHT, RIGHT, 190.0, LEFT], abs=0.06)
+    assert around[:4, 1] == pytest.approx([BOTTOM, 179.0, 128.0, 77.0], abs=0.06)
+    assert around[4:, 1] == pytest.approx([TOP, TOP, 77.0, 179.0], abs=0.06)
+    ((dot_x, dot_y, role),) = chart["dots"]
+    assert (float(dot_x), float(dot_y), role) == (190.0, 128.0, "tracks")
+    assert [(float(at), text) for at, text in chart["y_ticks"]] == [
+        (230.0, "0"), (179.0, "2"), (128.0, "4"), (77.0, "6"), (26.0, "8")
+    ]  # fmt: skip
+
+
+def test_names_of_lines_that_end_together_stand_one_below_the_other_in_the_chart():
+    for end in (0.0, 4.0, 8.0):
+        lines = [Line(f"name {n}", "tracks", np.array([0.0, 10.0]), np.array([0.0, end])) for n in range(4)]
+        chart = charts.line_chart("t", lines, Axis("s", 10.0), Axis("m", 8.0))
+        at = np.array([float(place) for place, _, _ in chart["names"]])
+        assert (np.diff(at) >= 14 - 0.11).all()
+        assert at[0] >= TOP - 1
+        assert at[-1] <= BOTTOM + 5
+        assert [name for _, name, _ in chart["names"]] == [f"name {n}" for n in range(4)]
+
+
+def test_bars_are_as_high_as_their_share_and_the_median_stands_at_its_value():
+    rows = [
+        Bars("a", "tracks", np.array([0.5, 0.25, 0.0]), 1.0, ""),
+        Bars("b", "truth", np.array([0.0, 0.1, 0.5]), 3.0, ""),
+    ]
+    chart = charts.histogram_chart("t", rows, np.array([0.0, 1.0, 2.0, 4.0]), "s")
+    left, right = chart["left"], chart["right"]
+    for number, (row, shares) in enumerate(zip(chart["rows"], ((0.5, 0.25), (0.1, 0.5)), strict=True), 1):
+        tall = [float(bar[3]) for bar in row["bars"]]
+        assert tall == pytest.approx([60 * share / 0.5 for share in shares], abs=0.06)
+        assert [float(bar[1]) + float(bar[3]) for bar in row["bars"]] == pytest.approx([74 * number] * 2, abs=0.11)
+    assert float(chart["rows"][0]["median"]) == pytest.approx(left + (right - left) / 4, abs=0.06)
+    assert float(chart["rows"][1]["bars"][1][0]) == pytest.approx(left + (right - left) / 2, abs=0.06)
+    assert float(chart["rows"][1]["bars"][1][2]) == pytest.approx((right - left) / 2 - 1, abs=0.06)
+
+
+def test_values_before_and_after_and_their_intervals_stand_on_one_scale():
+    sides = ((0.5, 0.25, 0.75), (1.0, 0.9, 1.0))
+    chart = charts.ranges_chart("t", [("log", sides), ("x" * 60, sides)], Axis("%", 1.0, percent=True), ("a", "b"))
+    ticks = {text: float(at) for at, text in chart["x_ticks"]}
+    row = chart["rows"][0]
+    middle = (ticks["0"] + ticks["100"]) / 2
+    assert (float(row["before"]), float(row["after"])) == pytest.approx((middle, ticks["100"]), abs=0.11)
+    (low, high, role, y), (_, _, other, below) = row["bars"]
+    span = ticks["100"] - ticks["0"]
+    assert (float(low), float(high)) == pytest.approx((ticks["0"] + span / 4, ticks["0"] + 3 * span / 4), abs=0.11)
+    assert (role, other, below - y) == ("tracks", "offline", 6)
+    assert len(chart["rows"][1]["name"]) == 48
+
+
+@pytest.mark.parametrize("span_s", [0.4, 7.0, 59.0, 61.0, 3600.0, 90000.0, 1e7])
+def test_ticks_of_time_are_few_and_even(span_s):
+    found = charts.time_ticks(span_s)
+    assert 2 <= len(found) <= 8
+    assert found[0] == 0
+    assert found[-1] <= span_s * (1 + 1e-9)
+    assert np.diff(found) == pytest.approx(found[1])
+    assert found[-1] + found[1] > span_s
+
+
+def path(points) -> TrackPath:
+    return TrackPath(7, np.array(points, float), 10.0, 12.5)
+
+
+def way_of(text: str) -> np.ndarray:
+    """The points of the data of an SVG path: a start, and steps."""
+    start, *steps = re.findall(r"(-?\d+) (-?\d+)", text)
+    return np.cumsum(np.array([start, *steps], int), axis=0)
+
+
+def test_north_is_up_on_the_plan_and_both_axes_have_one_scale():
+    span = np.array([0.0, 0.0]), np.array([10.0, 10.0])
+    found = ground_map([path([(0, 0), (10, 0), (10, 5)])], span, 8.0)
+    at = way_of(found["tracks"][0]["way"])
+    east, north = at[1] - at[0], at[2] - at[1]
+    assert east[0] > 100
+    assert east[1] == north[0] == 0
+    assert north[1] == pytest.approx(-east[0] / 2, abs=1)
+    assert at[0][1] == pytest.approx(found["height"] - found["left"], abs=1)
+    bar_px = float(found["bar_end"]) - found["left"]
+    assert bar_px * 10 / float(found["bar_label"].split()[0]) == pytest.approx(east[0], abs=1)
+    assert found["tracks"][0]["title"] == "7: 2.0 to 4.5\N{NO-BREAK SPACE}s"
+
+
+def test_paths_on_the_picture_are_in_its_pixels():
+    behind = SceneBackground(b"", 320, 240, 0.5)
+    found = picture_map([path([(100, 100), (300, 100), (300, 400)])], behind, 0.0)
+    assert way_of(found["tracks"][0]["way"]).tolist() == [[50, 50], [150, 50], [150, 200]]
+
+
+def test_the_heat_map_has_north_at_its_top():
+    """Ten seconds in the south-west, then a walk to the north-east."""
+    frames = walk(lambda tick: {1: (0.25, 0.25) if tick < 25 else (0.25 + (tick - 25), 0.25 + 2 * (tick - 25))}, 30)
+    found = heat_map(frames)
+    opacity = cv2.imdecode(np.frombuffer(found["png"], np.uint8), cv2.IMREAD_UNCHANGED)[..., 3]
+    high, wide = opacity.shape
+    assert high > wide > 1
+    assert np.unravel_index(opacity.argmax(), opacity.shape) == (high - 1, 0)
+    assert opacity[0, -1] > 0
+    assert opacity[0, 0] == 0
+    heights = [float(at) for at, text in found["y_ticks"]]
+    assert heights == sorted(heights, reverse=True)
+
+
+@pytest.mark.parametrize(
+    ("change", "word", "text"),
+    [
+        ((0.05, 0.01, 0.09), "better", "+5.0 (+1.0 to +9.0)"),
+        ((-0.05, -0.09, -0.01), "worse", "-5.0 (-9.0 to -1.0)"),
+        ((0.05, -0.01, 0.11), "not sure", "+5.0 (-1.0 to +11.0)"),
+        ((0.05, np.nan, np.nan), "unknown: 3 people", "+5.0"),
+    ],
+)
+def test_better_is_said_only_if_the_whole_interval_says_so(change, word, text):
+    one = Interval(*change)
+    found = Intervals(3, (one, one), one, one)
+    assert (verdict(found), change_text(found)) == (word, text)
+    assert (verdict(None), change_text(None)) == ("\N{EN DASH}", "\N{EN DASH}")
+
+
+def test_rules_that_differ_in_their_limit_are_said_together():
+    rules = [("iou", 0.5), ("metres", 0.5), ("metres", 1.0), ("metres", 2.0)]
+    assert rules_text(rules) == "by overlap of boxes of at least 0.5; within 0.5, 1 or 2 m on the ground"
+    assert rules_text([]) == ""

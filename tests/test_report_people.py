@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.optimize import linear_sum_assignment
 
 import mcaptrack
 from mcaptrack import log
@@ -29,11 +28,9 @@ from mcaptrack.viewing.report import _comparison as comparison
 from mcaptrack.viewing.report.charts import Line
 from mcaptrack.viewing.report.contents import TrackSet
 from mcaptrack.viewing.report.doubts import find_doubts
-from mcaptrack.viewing.report.figures import identity_events
 from mcaptrack.viewing.report.identity_events import summarize_events
 from mcaptrack.viewing.report.identity_timeline import counts_over_time, identity_timeline, mean_numbers, pieces
-from mcaptrack.viewing.report.scene_map import heat_map
-from tests.worlds import crossing_tracks, ns, tracks_at, walk, write_eventful
+from tests.worlds import crossing_tracks, ns, tracks_at, write_eventful
 
 
 @pytest.fixture(scope="module")
@@ -94,24 +91,6 @@ def people(rows, matched, hits, switches, false_rows=0) -> PersonScores:
     none = np.empty(0, np.int64)
     columns = (np.array(column) for column in (rows, matched, hits, switches))
     return PersonScores(np.arange(len(rows)), *columns, false_rows, none, none, none, none)
-
-
-def test_intervals_hold_the_value_and_shrink_with_more_people():
-    rng = np.random.default_rng(0)
-
-    def sample(count: int) -> PersonScores:
-        rows = rng.integers(50, 150, count)
-        hits = (rows * rng.uniform(0.4, 0.9, count)).astype(int)
-        return people(rows, rows - 2, hits, rng.integers(0, 4, count), 20)
-
-    few, many = sample(12), sample(400)
-    widths = []
-    for one in (few, many):
-        found = intervals([one], [one]).idf1[0]
-        assert found.value == pytest.approx(one.idf1())
-        assert found.low < found.value < found.high
-        widths.append(found.high - found.low)
-    assert widths[1] < 0.4 * widths[0]  # about 1 / sqrt(400 / 12) = 0.17
 
 
 def test_a_change_of_all_people_is_sure_and_that_of_one_is_not():
@@ -215,10 +194,7 @@ def without_sources(frames: list[Frame], ticks: set[int]) -> list[Frame]:
     return out
 
 
-@given(
-    st.lists(st.integers(0, 2), max_size=40),
-    st.lists(st.integers(1, 4), min_size=40, max_size=40),
-)
+@given(st.lists(st.integers(0, 2), max_size=40), st.lists(st.integers(1, 4), min_size=40, max_size=40))
 def test_pieces_cover_their_rows_and_nothing_twice(identity, steps):
     t_ns = np.cumsum(np.array(steps[: len(identity)], np.int64)) * 10**9
     found = pieces(np.array(identity, np.int64), t_ns, 0, 1e9)
@@ -264,14 +240,6 @@ def test_all_logs_together_have_the_people_of_all(told):
     assert [row["cells"][2] for row in rows] == ["2 → 1", "2 → 1", "4 → 2"]
 
 
-def test_every_event_has_a_mark_and_those_that_are_shown_a_long_one(told):
-    shown = [part[:1] for part in told.highlights]
-    found = identity_events(replace(told, highlights=shown))["timelines"]
-    assert [len(one["highlights"]) for one in found] == [1, 1]
-    assert [len(one["marks"]) for one in found] == [len(one.events) for one in told.channel_events]
-    assert all(one["highlights"][0][0] in one["marks"] for one in found)
-
-
 def test_those_who_stay_longest_have_a_bar(told, monkeypatch):
     """Person 50 leaves half way; there is room for one."""
     monkeypatch.setattr(import_module("mcaptrack.viewing.report.identity_timeline"), "_MOST", 1)
@@ -287,19 +255,6 @@ def test_those_who_stay_longest_have_a_bar(told, monkeypatch):
 
 
 # Maps and doubts
-
-
-def test_a_heat_map_is_darkest_where_people_stay(told):
-    frames = walk(lambda tick: {1: (0.25, 0.25) if tick < 20 else (0.25 + tick - 20, 0.25)}, 26)
-    found = heat_map(frames)
-    import cv2
-
-    picture = cv2.imdecode(np.frombuffer(found["png"], np.uint8), cv2.IMREAD_UNCHANGED)
-    opacity = picture[..., 3]
-    assert opacity.shape[0] == 1
-    assert (opacity.max(), int(opacity.argmax())) == (255, 0)
-    assert found["total"] == "0.2\N{NO-BREAK SPACE}min"  # 25 steps of 0.4 s
-    assert heat_map([]) is None
 
 
 def joined(jump_m: float, other: bool) -> tuple[list[Frame], list[Frame]]:
@@ -353,13 +308,6 @@ def test_the_farthest_repair_is_the_first_whenever_it_happened():
     told = summarize_events("/a", found.events, None, both, None, (0, ns(16)))
     doubts = find_doubts(told, both, None)
     assert [(int(one.event.row["track_id"]), round(one.away_m, 1)) for one in doubts] == [(8, 2.5), (7, 1.5)]
-
-
-def test_the_time_of_an_event_stands_once(text):
-    events = re.findall(r'<figcaption><span class="at"[^>]*>([^<]+)</span> ([^<]+)</figcaption>', text)
-    assert len(events) >= 3
-    assert any("became track" in words for _, words in events)
-    assert not any(re.search(r"\bat [0-9]|[0-9]\s+s\s+at\b|\s,", words) for _, words in events)
 
 
 def test_every_row_of_a_table_hides_the_same_columns_on_a_phone(text):
@@ -425,16 +373,3 @@ def test_only_times_become_links_and_addresses_are_escaped(content, address):
 def test_pages_with_other_numbers_are_not_about_the_log(data):
     assert not is_about(b'<script type="application/json" id="mcaptrack-report">' + data + b"</script>", "a")
     assert json.loads("1") == 1
-
-
-def test_the_best_assignment_is_that_of_scipy():
-    truth, tracks = swapped(np.random.default_rng(7))
-    found = person_scores(truth, tracks, MatchRule("metres", 1.0))
-    near = np.zeros((200, 1200), int)
-    for a, b in zip(truth, tracks, strict=True):
-        for row in a.rows:
-            for other in b.rows:
-                away = np.hypot(row["x_m"] - other["x_m"], row["y_m"] - other["y_m"])
-                near[int(row["track_id"]), int(other["track_id"])] += away <= 1.0
-    rows, columns = linear_sum_assignment(-near)
-    assert found.hits.sum() == near[rows, columns].sum()

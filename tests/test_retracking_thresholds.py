@@ -52,6 +52,13 @@ def compare(ours: Callable[[float], bool], reference: Callable[[float], bool], l
     assert edge(ours, low, high) == pytest.approx(edge(reference, low, high), abs=(high - low) / 2**15)
 
 
+def by_reference(frames: list[Frame]):
+    """Offline tracks, online tracks and forecasts of the slow reference, which predicts nothing here."""
+    samples = [[dict(zip(row.dtype.names, row.tolist(), strict=True)) for row in frame.rows] for frame in frames]
+    tracker = OnlineTracker(FEW, lambda points: (np.zeros((1, 2)), np.zeros((1, 2, 2))), 1)
+    return tracker.run(samples, [frame.t_ns for frame in frames])
+
+
 def jump(to_m: float, name: int, gap: int, beside_m: float | None) -> list[Frame]:
     """Person 7 stands at 0 m and, after a gap, at ``to_m`` under the id ``name``; 9 stood far away before.
 
@@ -68,32 +75,20 @@ def jump(to_m: float, name: int, gap: int, beside_m: float | None) -> list[Frame
     return walk(path, 15 + gap)
 
 
-@pytest.mark.parametrize(
-    ("name", "gap", "beside_m"),
-    one_in(
-        2,
-        [
-            (7, 0, None),
-            (9, 0, None),
-            (99, 0, None),
-            (99, 1, None),
-            (7, 2, None),
-            (7, 0, 1.65),
-            (7, 0, 1.75),
-            (9, 2, 1.0),
-        ],
-    ),
-    ids=[
-        "same id",
-        "known id",
-        "new id",
-        "new id after a gap",
-        "same id after a gap",
-        "in a crowd",
-        "beside a crowd",
-        "known id in a crowd",
-    ],
-)
+#: The id after the gap, the ticks of the gap, and how far beside somebody else is.
+JUMPS = {
+    "same id": (7, 0, None),
+    "known id": (9, 0, None),
+    "new id": (99, 0, None),
+    "new id after a gap": (99, 1, None),
+    "same id after a gap": (7, 2, None),
+    "in a crowd": (7, 0, 1.65),
+    "beside a crowd": (7, 0, 1.75),
+    "known id in a crowd": (9, 2, 1.0),
+}
+
+
+@pytest.mark.parametrize(("name", "gap", "beside_m"), one_in(2, JUMPS.values()), ids=JUMPS)
 def test_the_longest_jump_that_a_track_follows(name, gap, beside_m):
     def sources(rows) -> list[tuple[int, int]]:
         return [(int(row["track_id"]), int(row["source_id"])) for row in rows]
@@ -103,11 +98,7 @@ def test_the_longest_jump_that_a_track_follows(name, gap, beside_m):
         return (1, name) in sources(offline.rows)
 
     def reference(to_m: float) -> bool:
-        frames = jump(to_m, name, gap, beside_m)
-        samples = [[dict(zip(row.dtype.names, row.tolist(), strict=True)) for row in frame.rows] for frame in frames]
-        offline, _, _ = OnlineTracker(FEW, lambda points: (np.zeros((1, 2)), np.zeros((1, 2, 2))), 1).run(
-            samples, [frame.t_ns for frame in frames]
-        )
+        offline, _, _ = by_reference(jump(to_m, name, gap, beside_m))
         return (1, name) in sources(offline[-1])
 
     compare(ours, reference, 0.0, 20.0)
@@ -258,18 +249,6 @@ def test_encounters_begin_and_end_as_in_the_reference():
         assert [(names[i], names[j], *steps) for i, j, *steps in found] == encounters(paths)
 
 
-def test_the_timeout_of_merged_detections_restarts_with_every_occlusion():
-    """Two walk abreast and are merged into one detection twice, for 2.4 s each; the timeout is 3 s, coasting 1.2 s."""
-
-    def path(tick: int):
-        if tick in range(15, 21) or tick in range(25, 31):
-            return {1: (0.4 * tick, 0.0)}
-        return {1: (0.4 * tick, 0.6), 2: (0.4 * tick, -0.6)}
-
-    online = [len(frame.rows) for _, frame, *_ in FEW(walk(path, 34))]
-    assert online[10:] == [2] * 24
-
-
 def abreast(apart_m: float, aside_m: float, until: int, since: int = 15) -> list[Frame]:
     """Two walk so far apart; from tick 15 on one is missed, and from ``since`` on the other is so far aside, towards her."""
 
@@ -300,11 +279,7 @@ def test_how_far_aside_a_detection_is_that_of_two():
         return len(online.rows) == 1
 
     def reference(aside_m: float) -> bool:
-        frames = abreast(apart_m, aside_m, last + 1, since)
-        samples = [[dict(zip(row.dtype.names, row.tolist(), strict=True)) for row in frame.rows] for frame in frames]
-        _, online, _ = OnlineTracker(FEW, lambda points: (np.zeros((1, 2)), np.zeros((1, 2, 2))), 1).run(
-            samples, [frame.t_ns for frame in frames]
-        )
+        _, online, _ = by_reference(abreast(apart_m, aside_m, last + 1, since))
         return len(online[-1]) == 1
 
     compare(ours, reference, 0.0, apart_m / 2)

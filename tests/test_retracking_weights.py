@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -12,21 +11,10 @@ import pytest
 import mcaptrack
 from mcaptrack.predictors.weights import load
 from mcaptrack.transforms.retrack import cut_links, false_tracks, joins, linking
-from mcaptrack.transforms.retrack.false_tracks import FEATURES
-from mcaptrack.transforms.retrack.motion_model import to_trajectories
 from mcaptrack.transforms.retrack.weights import WEIGHTS, weights_of
 from tools import crowds
-from tools.corruptions import STEP_S
 from tools.fit_retrack import (
-    Pairs,
-    cuts_of,
-    decisions_of,
     logistic,
-    owners_of,
-    pairs_of,
-    people_of,
-    prepare,
-    relinks_of,
 )
 
 STEPS = 60
@@ -36,10 +24,6 @@ PACKAGE = Path(mcaptrack.__file__).parent
 @pytest.fixture(scope="module")
 def scenes():
     return crowds.scenes(5, STEPS)
-
-
-def by_person(rows: np.ndarray) -> np.ndarray:
-    return rows[np.lexsort((rows[:, 0], rows[:, 1]))]
 
 
 def test_everything_that_was_fitted_says_that_it_was_fitted_on_synthetic_data():
@@ -70,43 +54,6 @@ def test_a_seed_gives_the_same_scenes_again_and_another_one_others(scenes):
     assert not np.array_equal(first[:, 2:], crowds.scenes(6, 2)[0][:, 2:])
 
 
-def test_people_walk_come_in_and_leave_at_borders(scenes):
-    """Nobody appears in the middle; nobody jumps; a step is not faster than a bicycle that is given way to."""
-    inside = moves = 0
-    for rows in map(by_person, scenes):
-        low, high = rows[:, 2:].min(axis=0), rows[:, 2:].max(axis=0)
-        assert len(np.unique(rows[:, :2], axis=0)) == len(rows)
-        same = rows[1:, 1] == rows[:-1, 1]
-        assert (np.diff(rows[:, 0])[same] == 1).all()
-        speed = np.hypot(*np.diff(rows[:, 2:], axis=0)[same].T) / STEP_S
-        assert speed.max() < 12
-        moves += len(speed)
-        begins = np.flatnonzero(np.append(True, ~same))
-        begins = begins[rows[begins, 0] > 0]
-        far = np.minimum(rows[begins, 2:] - low, high - rows[begins, 2:]).min(axis=1)
-        assert (far < 6).all()  # a cyclist has gone that far within a step
-        inside += len(begins)
-    assert inside > 200
-    assert moves > 20_000
-
-
-def test_some_stand_some_walk_and_some_ride(scenes):
-    parts = [np.split(rows[:, 2:], np.flatnonzero(np.diff(rows[:, 1])) + 1) for rows in map(by_person, scenes)]
-    speeds = np.array([np.hypot(*(path[-1] - path[0])) / (len(path) * STEP_S) for paths in parts for path in paths])
-    still, walk, ride = (((low <= speeds) & (speeds < high)).mean() for low, high in ((0, 0.3), (0.8, 1.8), (2, 9)))
-    assert still > 0.03
-    assert walk > 0.3
-    assert ride > 0.05
-
-
-def test_no_two_scenes_have_the_same_faults():
-    found = [crowds.faults(np.random.default_rng([seed, 1])) for seed in range(200)]
-    assert len(set(found)) == 200
-    for name in ("merge_m", "doubles", "clutter", "lit", "beside", "breaks_per_min", "swap"):
-        share = np.mean([getattr(how, name) > 0 for how in found])
-        assert 0.03 < share < 0.9, name
-
-
 def test_the_fit_finds_the_weights_that_drew_the_data():
     rng = np.random.default_rng(1)
     features = rng.normal([1.0, -2.0], [1.0, 3.0], (40_000, 2))
@@ -125,56 +72,3 @@ def test_what_differs_from_scene_to_scene_is_not_put_down_to_features():
     apart = logistic(gap[:, None], right * 1.0, np.ones(len(gap)), scene)
     assert together[0] > 0.5
     assert abs(apart[0]) < 0.15
-
-
-def test_the_best_set_of_links_is_that_of_all_permutations():
-    rng = np.random.default_rng(3)
-    ends, begins = (side.ravel() for side in np.indices((5, 5)))
-    gain = rng.uniform(-3.5, 4, 25)
-    right = (ends == begins) * 1.0
-    features = np.full((25, len(linking.FEATURES)), np.nan)
-    features[:, linking.FEATURES.index("gap")] = np.arange(25)
-    found, is_right, gap_s = Pairs(5, ends, begins, features, right).best(gain)
-    table = gain.reshape(5, 5) + 4.0
-    best = max(permutations(range(5)), key=lambda order: table[range(5), order].sum())
-    assert found.sum() == pytest.approx((table[range(5), best] - 4.0).sum())
-    assert is_right.sum() == sum(a == b for a, b in enumerate(best))
-    assert sorted(gap_s.tolist()) == [5 * a + b for a, b in enumerate(best)]
-
-
-def test_tracks_belong_to_the_person_they_follow_and_doubles_and_clutter_to_nobody():
-    steps = np.arange(40)
-    walk = np.column_stack([steps, np.full(40, 3), steps * 0.4, np.zeros(40)])
-    double = walk[10:25] + [0, 4, 0, 0.6]
-    clutter = np.column_stack([steps[:20], np.full(20, 9), np.full(20, 8.0), np.full(20, 30.0)])
-    run = prepare(walk, np.concatenate([walk, double, clutter]))
-    step, track, source, _ = run.args[2].of(run.args[3], run.args[4])
-    truth = {3: walk, 7: double, 9: clutter}
-    xy = np.array(
-        [truth[who][np.flatnonzero(truth[who][:, 0] == at)[0], 2:] for at, who in zip(step, source, strict=True)]
-    )
-    _, row, paths = to_trajectories(step, track, xy, 0.2)
-    found = owners_of(run, paths)[row]
-    assert (found[source == 3] == 3).mean() > 0.95
-    assert (found[np.isin(source, (7, 9))] == -1).all()
-
-
-def test_a_person_is_told_from_a_double_and_a_broken_track_has_a_right_link():
-    """All that the fit asks of re-tracking, in a scene where the answers are known."""
-    steps = np.arange(60)
-    walk = np.column_stack([steps, np.full(60, 3), steps * 0.4, np.zeros(60)])
-    other = walk + [0, 1, 0, 9.0]
-    made = np.concatenate([walk, other[:20], other[30:] + [0, 4, 0, 0], walk[10:25] + [0, 6, 0, 0.7]])
-    run = prepare(np.concatenate([walk, other]), made)
-    pairs, cuts, links = pairs_of(run), cuts_of(run), relinks_of(run)
-    assert pairs.right.sum() == 1
-    assert pairs.features[pairs.right > 0, linking.FEATURES.index("gap")] == pytest.approx(11 * STEP_S)
-    assert len(cuts.are_right) == len(cuts.features)
-    assert len(links.are_right) == len(links.features)
-    features, share, count, throughout = people_of(run)
-    assert not throughout.any()
-    assert sorted(zip(share.tolist(), count.tolist(), strict=True)) == [(0.0, 15.0), (1.0, 50.0), (1.0, 60.0)]
-    assert features.shape == (3, len(FEATURES))
-    joined, people = decisions_of(run)
-    assert people.are_right.tolist().count(True) == 2
-    assert joined.are_right.all()

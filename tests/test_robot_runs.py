@@ -18,8 +18,7 @@ from mcaptrack.foxglove import class_colour
 from mcaptrack.pipeline import summary
 from mcaptrack.schema import TRACKS
 from mcaptrack.sources import fixed_frame
-from mcaptrack.viewing.report import gather, page
-from tests.commands import call, done
+from tests.commands import done
 from tests.robot_runs import OBJECTS, passing_robot, place, write_passing
 from tests.tiers import thorough
 
@@ -125,13 +124,6 @@ def test_a_video_from_above_follows_the_robot_and_has_all_objects_in_their_place
     assert np.abs(away - [32, 28, 26]).max() < 40
 
 
-def test_a_video_of_recorded_boxes_follows_the_robot_too(passed, tmp_path):
-    result = mcaptrack.render(passed, tmp_path / "a.mp4", topic="/lidar/boxes", end_s=0.05)
-    assert result.views == ("/lidar/boxes/view/scene",)
-    with av.open(str(tmp_path / "a.mp4")) as container:
-        assert next(container.decode(video=0)).to_ndarray(format="bgr24")[360, 480].min() > 180
-
-
 def test_without_a_robot_all_places_are_in_the_video(tmp_path):
     rows = [f"{n * 100_000_000},{k},{100 + 300 * k + n},{50 - 20 * k},0.5,4,2,1.5,0" for n in range(16) for k in (1, 2)]
     (tmp_path / "truth.csv").write_text("\n".join(["t_ns,id,x_m,y_m,z_m,length_m,width_m,height_m,heading_rad", *rows]))
@@ -146,27 +138,6 @@ def test_without_a_robot_all_places_are_in_the_video(tmp_path):
     assert image.shape == (240, 320, 3)
     assert (bright < 60).any()
     assert (bright > 260).any()
-
-
-def test_info_names_the_frame_of_metres(passed):
-    frames = {channel.topic: channel.frame for channel in mcaptrack.info(passed).channels}
-    assert frames["/lidar/boxes"] is None
-    assert {frames[f"/lidar/{name}"] for name in ("truth", "tracks", "retracks", "retracks/full")} == {"map"}
-    lines = done("info", passed).out.splitlines()
-    assert [line for line in lines if "/lidar/tracks" in line and line.endswith("  track  in map")]
-
-
-def test_the_report_has_averages_over_recalls_where_evaluate_has_them(passed):
-    scores = {
-        (row.tracks, row.of_class): row.averages["AMOTA"]
-        for row in mcaptrack.evaluate(passed, similarity="metres", gate_m=2.0).results
-    }
-    assert scores["/lidar/retracks/full", "car"] == 1.0
-    with log.read(passed) as opened:
-        text = page([gather(opened, None)])
-    assert "AMOTA: MOTA averaged over recalls" in text
-    assert ">AMOTA<" in text
-    assert ">AMOTP_m<" in text
 
 
 def test_a_run_across_classes_tracks_and_retracks_so_until_told_otherwise(passed, tmp_path):
@@ -238,10 +209,3 @@ def test_errors_of_predictions_are_those_of_each_class_alone(passed):
     assert [tuple(line.split()[:2]) for line in table[1:4]] == [
         ("/lidar/samples", "all" if name is None else name) for name in rows
     ]
-
-
-@pytest.mark.parametrize("second", [("--topic", "/radar/boxes"), ("--topic=/radar/boxes",)])
-def test_a_second_topic_is_refused_instead_of_the_first_being_ignored(second):
-    found = call("run", "robot.mcap", "--topic", "/lidar/boxes", *second)
-    assert found.code == 2
-    assert "--topic is given as /lidar/boxes and as /radar/boxes; give one" in found.err

@@ -16,8 +16,7 @@ from rosbags.rosbag2 import Writer as Writer2
 
 from mcaptrack import log
 from mcaptrack.schema import TRACKS
-from mcaptrack.schema.provenance import Provenance
-from tests.bags import MOT, ROS2, T0, bag1, bag2, picture, plain
+from tests.bags import ROS2, T0, bag1, bag2, picture, plain
 from tests.commands import GROUP, call, done, zones_file
 
 COMMANDS = GROUP.commands
@@ -45,14 +44,6 @@ def by_rosbags(folder: Path) -> list[tuple[str, int, bytes]]:
     """All messages of a folder by rosbags, decoded."""
     with AnyReader([folder]) as reader:
         return [(c.topic, t, reader.deserialize(raw, c.msgtype).data.tobytes()) for c, t, raw in reader.messages()]
-
-
-def by_mcap_ros2(path: Path) -> list[tuple[str, int, bytes]]:
-    """All messages of a file by mcap_ros2, decoded."""
-    factory = pytest.importorskip("mcap_ros2.decoder").DecoderFactory()
-    with path.open("rb") as stream:
-        decoded = make_reader(stream, decoder_factories=[factory]).iter_decoded_messages()
-        return [(channel.topic, m.log_time, bytes(ros.data)) for _, channel, m, ros in decoded]
 
 
 def on_disk(folder: Path) -> dict[str, tuple[int, bytes]]:
@@ -145,13 +136,6 @@ def test_no_command_changes_a_recording_that_ros_tools_read(path, tmp_path):
         assert "/robot/front/detections" in opened.channels
         assert "/robot/front/retracks" not in opened.channels
     assert not list(path.parent.glob("*.retracks*"))
-
-
-def test_mcap_ros2_reads_a_recording_that_has_results(path):
-    before = by_mcap_ros2(path)
-    assert before == by_rosbags(path.parent)
-    done("detect", path, "--detector", "knn")
-    assert by_mcap_ros2(path) == before
 
 
 def test_what_was_written_where_and_why_stands_in_the_data(path):
@@ -249,17 +233,6 @@ def test_recordings_are_told_by_profile_and_by_the_metadata_beside_them(
         from mcaptrack.sources.ingest.sidecar import recording_of
 
         assert bool(recording_of(opened)) == is_beside
-
-
-def test_a_log_that_was_made_of_a_bag_takes_results_itself(path, tmp_path):
-    """It is a log of ours, whatever ROS tools can read of it; the bag stays as it is."""
-    out = tmp_path / "out.mcap"
-    (tmp_path / "gt.txt").write_text(MOT)
-    done("ingest", path.parent, "--truth", tmp_path / "gt.txt", "-o", out)
-    done("run", out, "-q")
-    assert not out.with_name("out.results.mcap").exists()
-    with log.read(out) as opened:
-        assert Provenance.from_metadata(opened.channel("/robot/front/tracks").metadata)
 
 
 def others(folder: Path) -> list[Path]:

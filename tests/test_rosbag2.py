@@ -18,7 +18,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.foxglove import class_colour
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
-from tests.commands import call, done
+from tests.logs import add_rows
 from tests.worlds import boxed, boxes_at, ns, tracks_at
 
 NAMES = {"1": "pedestrian", "3": "car"}
@@ -44,10 +44,8 @@ def read(folder: Path) -> dict[str, list[tuple[int, Any]]]:
 def written(path: Path, channels: dict[str, tuple[Any, list[Frame]]], frame_id: str = "map", source: str = "") -> Path:
     with log.create(path) as writer:
         for topic, (schema, frames) in channels.items():
-            made = Provenance("track", {}, source, classes=NAMES, frame_id=frame_id).to_metadata()
-            number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", made)
-            for frame in frames:
-                writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
+            made = Provenance("track", {}, source, classes=NAMES, frame_id=frame_id)
+            add_rows(writer, topic, schema, frames, made=made)
     return path
 
 
@@ -160,10 +158,7 @@ def test_boxes_in_pixels_become_detections_in_2d(tmp_path):
     path = tmp_path / "a.mcap"
     with log.create(path) as writer:
         for topic, schema, frames in (("/c/tracks", TRACKS, tracks), ("/c/detections", DETECTIONS, detections)):
-            made = Provenance("ingest", {}).to_metadata()
-            number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", made)
-            for frame in frames:
-                writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
+            add_rows(writer, topic, schema, frames, made=Provenance("ingest", {}))
     result = mcaptrack.export(path, tmp_path / "bag", form="rosbag2-sqlite3")
     assert [one.message for one in result.warnings] == ["/c/tracks: 1 rows without a box in pixels are not in the bag"]
     found = read(tmp_path / "bag")
@@ -203,12 +198,6 @@ class TestFolders:
     def path(self, tmp_path):
         return written(tmp_path / "a.mcap", {"/lidar/tracks": (TRACKS, DRIVE)})
 
-    def test_the_default_stands_beside_the_log(self, path):
-        said = done("export", path, "--format", "rosbag2").err
-        assert (path.parent / "a.rosbag2" / "a.rosbag2.mcap").is_file()
-        assert "a.rosbag2" in said
-        assert not (path.parent / "a.tables").exists()
-
     def test_a_bag_is_replaced_on_request_only_and_nothing_else_is(self, path, tmp_path):
         mcaptrack.export(path, tmp_path / "bag", form="rosbag2")
         with pytest.raises(McaptrackError, match="force=True"):
@@ -233,8 +222,3 @@ class TestFolders:
     def test_parameters_of_tables_change_nothing(self, path, tmp_path):
         result = mcaptrack.export(path, tmp_path / "bag", form="rosbag2", topic="/lidar/tracks")
         assert [one.code for one in result.warnings] == ["option-not-used"]
-
-    def test_several_logs_need_several_folders(self, path, tmp_path):
-        other = written(tmp_path / "b.mcap", {"/lidar/tracks": (TRACKS, DRIVE)})
-        assert call("export", path, other, "--format", "rosbag2", "-o", tmp_path / "bag").code == 1
-        assert not (tmp_path / "bag").exists()

@@ -77,13 +77,6 @@ class TestAllCameras:
         assert said(result, "left-out")[0].startswith("the camera labelled is left out")
         assert not [topic for topic in topics(path) if topic.startswith("/labelled/tracks")]
 
-    def test_it_says_what_each_begins_with(self, ran: tuple[Path, RunResult]) -> None:
-        notes = ran[1].notes
-        assert "running 3 cameras, east, north, south; `camera=` names those to run" in notes
-        wanted = "south has detections in /south/detections already: it is tracked from these, nothing is detected"
-        assert wanted in notes
-        assert "fusing east, north, south to /world" in notes
-
     def test_a_camera_is_run_as_if_it_were_alone(self, ran: tuple[Path, RunResult], path: Path) -> None:
         alone = mcaptrack.run(path, camera="north", tables=False)
         assert not alone.cameras
@@ -98,12 +91,6 @@ class TestAllCameras:
         assert again.is_up_to_date
         assert list(again.cameras) == list(ran[1].cameras)
         assert ran[0].read_bytes() == before
-
-    def test_commands_take_the_scene_and_say_so(self, ran: tuple[Path, RunResult], tmp_path: Path) -> None:
-        told = done("report", ran[0], "-o", tmp_path / "r.html").err
-        assert (
-            "several cameras, /east, /labelled, /north, /south, /world: taking /world; --camera chooses another" in told
-        )
 
     def test_the_command_prints_a_line_for_each_camera(self, ran: tuple[Path, RunResult]) -> None:
         told = done("run", ran[0], "--no-tables").err

@@ -112,12 +112,6 @@ class TestDoctor:
         code, _, err = call("doctor", url, "-q")
         assert (code, err.count("\n"), err.count(words)) == (1, 1, 1), err
 
-    def test_expired_credentials_are_named(self, store):
-        with store.failing(lambda _: "expired"):
-            code, _, err = self.access(str(NIGHT))
-        words = "objects can't be listed and objects can't be written: the credentials have expired; renew them"
-        assert (code, err) == (1, f"mcaptrack: {NIGHT}: {words}\n")
-
     @pytest.mark.parametrize(
         ("url", "shown"), [("night", "night"), ("https://me:secret@example.org/x", "https://example.org/x")]
     )

@@ -20,16 +20,11 @@ from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import Predict
 from tests.commands import printed
 from tests.forecasts import forecasts, positions, predicted
+from tests.logs import add_rows
 from tests.worlds import walk
 
 RECORDED = Provenance("record", {})
 SVG = "{http://www.w3.org/2000/svg}"
-
-
-def add(writer, topic: str, frames: list[Frame], schema, made: Provenance = RECORDED) -> None:
-    number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", made.to_metadata())
-    for frame in frames:
-        writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
 
 
 def smoothed_past(xy: np.ndarray) -> np.ndarray:
@@ -55,13 +50,6 @@ def of_track(frames: list[Frame], number: int) -> dict[int, np.ndarray]:
     return {k: np.stack([one["x_m"], one["y_m"]], axis=-1) for k, one in rows.items() if len(one)}
 
 
-def test_one_step_by_hand():
-    """A person walks 1 m a step and stops: displacements 1, 1, 0 give levels 1, 1, 0.5, and a mean of 5/6."""
-    samples = walk(lambda n: {1: (float(min(n, 2)), 0.0)}, 4)
-    *_, last = smoothed_predictions(samples, Predict(predictor="cv", horizon_s=0.8))
-    assert last.rows["x_m"].tolist() == pytest.approx([2 + 5 / 6, 2 + 10 / 6])
-
-
 @pytest.mark.parametrize("predictor", ["cv", "kalman"])
 def test_smoothed_predictions_are_those_of_smoothed_tracks(predictor):
     """Two tracks, one of which begins late, has a gap and begins again, and their pasts smoothed one by one."""
@@ -85,13 +73,6 @@ def test_smoothed_predictions_are_those_of_smoothed_tracks(predictor):
                 alone = walk(lambda k, xy=xy: {1: tuple(xy[k])}, len(xy))
                 *_, (wanted,) = predict(alone)
                 np.testing.assert_allclose(predictions[n], of_track([wanted], 1)[wanted.index], atol=1e-6)
-
-
-def test_walks_without_noise_are_predicted_as_they_are():
-    samples = walk(lambda n: {1: (0.5 * n, 0.1 * n)}, 20)
-    predict = Predict(predictor="red")
-    for one, (other,) in zip(smoothed_predictions(samples, predict), predict(samples), strict=True):
-        np.testing.assert_allclose(one.rows["x_m"], other.rows["x_m"], atol=1e-4)
 
 
 def swept(truth: dict, tracks: dict, made: list[tuple], tau: float, horizon: int) -> tuple[float, float, float]:
@@ -157,9 +138,9 @@ def walked(tmp_path_factory) -> Path:
     file = tmp_path_factory.mktemp("walked") / "walked.mcap"
     with log.create(file) as writer:
         for topic, frames in {"truth": truth, "samples": samples, "retracks/online": samples}.items():
-            add(writer, f"/camera/{topic}", frames, TRACKS)
+            add_rows(writer, f"/camera/{topic}", TRACKS, frames, made=RECORDED)
         for topic in ("predictions", "retracks/predictions"):
-            add(writer, f"/camera/{topic}", made, PREDICTIONS, known)
+            add_rows(writer, f"/camera/{topic}", PREDICTIONS, made, made=known)
     return file
 
 
@@ -221,12 +202,12 @@ def test_predictions_of_unknown_making_are_not_smoothed(tmp_path):
     samples = walk(lambda n: {1: (0.4 * n, 0.0)}, 20)
     with log.create(file) as writer:
         for topic in ("truth", "samples"):
-            add(writer, f"/camera/{topic}", samples, TRACKS)
+            add_rows(writer, f"/camera/{topic}", TRACKS, samples, made=RECORDED)
     with pytest.raises(McaptrackError, match=r"recorded\.mcap has no /camera/predictions; .* makes them"):
         mcaptrack.evaluate(file, smoothed=True)
     with log.create(tmp_path / "b.mcap") as writer:
         for topic in ("truth", "samples"):
-            add(writer, f"/camera/{topic}", samples, TRACKS)
-        add(writer, "/camera/predictions", [f for (f,) in Predict()(samples)], PREDICTIONS)
+            add_rows(writer, f"/camera/{topic}", TRACKS, samples, made=RECORDED)
+        add_rows(writer, "/camera/predictions", PREDICTIONS, [f for (f,) in Predict()(samples)], made=RECORDED)
     with pytest.raises(McaptrackError, match=r"/camera/predictions of .*b.mcap is recorded: how it was predicted"):
         mcaptrack.evaluate(tmp_path / "b.mcap", smoothed=True)

@@ -10,7 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from threading import Thread
@@ -41,6 +41,7 @@ from tests.onnx_graphs import (
     tensor,
     value,
 )
+from tests.tiers import one_in
 
 SIZE = (512, 384)
 PICTURE = blue_blocks(SIZE, (64, 32, 32, 32), (224, 160, 32, 32))
@@ -62,6 +63,12 @@ USES: dict[str, tuple[Callable[[Path], None], list[int | str], list[str]]] = {
     "detector": (detect, [1, 3, 384, 512], ["detect", "--to", "/camera/strange", "--detector"]),
     "predictor": (predict, ["B", 4, 2], ["predict", "--to", "/camera/strange", "--predictor"]),
 }
+
+
+def alternating(cases: Iterable[object]) -> list[object]:
+    """Each case in one of the uses by default, and in the others in the thorough tier: each takes seconds."""
+    uses = list(USES)
+    return one_in(2, [(case, use) for n, case in enumerate(cases) for use in (uses[n % 2], uses[1 - n % 2])])
 
 
 def test_every_use_of_networks_is_tested_here():
@@ -222,8 +229,7 @@ def _in_folder(popen, folder):
     return lambda *words, **options: popen(*words, **(options | {"cwd": folder}))
 
 
-@pytest.mark.parametrize("use", USES)
-@pytest.mark.parametrize("how", TAKING)
+@pytest.mark.parametrize(("how", "use"), alternating(TAKING))
 def test_what_takes_too_much_is_ended(use, how, monkeypatch):
     build, words = TAKING[how]
     monkeypatch.setenv("MCAPTRACK_MAX_NETWORK_S", "2" if how == "time" else "1000")
@@ -313,8 +319,7 @@ def test_a_network_that_breaks_its_process_is_named(use):
     assert refused(use, LOOP(USES[use][1])) == "strange.onnx can't be run: the process that ran it was ended by SIGSEGV"
 
 
-@pytest.mark.parametrize("use", USES)
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(("number", "use"), alternating([signal.SIGINT, signal.SIGTERM, signal.SIGKILL]))
 def test_signals_end_a_command_and_its_network(use, number, template, folder):
     log = shutil.copyfile(template, folder / "log.mcap")
     Path("strange.onnx").write_bytes(LOOP(USES[use][1]))

@@ -17,7 +17,6 @@ from mcaptrack.schema import DETECTIONS, VIDEO
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import STAGES, OnnxDetector
 from mcaptrack.transforms.protocol import Suited, traits_of
-from tests.commands import call
 
 BOX = {"x_px": [10.0], "y_px": [10.0], "w_px": [8.0], "h_px": [20.0]}
 
@@ -71,14 +70,6 @@ def test_a_run_takes_the_tracker_that_suits_the_detector_and_says_so(log):
     assert "track by ocsort, which suits the detector" in notes[0]
 
 
-def test_another_tracker_can_be_chosen(log):
-    assert run(log, detector=Choosy(), tracker="sort") == ("sort", [])
-
-
-def test_a_detector_that_names_none_gets_the_usual_one(log):
-    assert run(log, detector=Plain()) == ("sort", [])
-
-
 def test_a_log_with_detections_alone_gets_the_suited_tracker_too(log):
     mcaptrack.detect(log, detector="knn")
     assert run(log)[0] == "sort"
@@ -91,14 +82,6 @@ def test_another_detector_brings_its_tracker(log):
     assert run(log)[0] == "ocsort"  # nothing is due
     assert run(log, detector=Plain(), tracker="sort") == ("sort", [])
     assert run(log, detector=Choosy(), tracker="bytetrack") == ("bytetrack", [])
-
-
-def test_the_command_line_says_it_on_stderr(log, monkeypatch):
-    monkeypatch.chdir(Path(__file__).parents[1])
-    said = call("run", log, "--detector", "tests.test_suited_trackers:Choosy", "--no-tables")
-    assert said.code == 0
-    assert "track by ocsort, which suits the detector tests.test_suited_trackers:Choosy; --tracker chooses" in said.err
-    assert tracker_of(log) == "ocsort"
 
 
 def test_suited_trackers_exist():

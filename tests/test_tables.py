@@ -8,6 +8,7 @@ import errno
 import gc
 import io
 import json
+import math
 import os
 import resource
 import signal
@@ -27,10 +28,11 @@ from hypothesis import strategies as st
 
 from mcaptrack import tables
 from mcaptrack.errors import McaptrackError
-from mcaptrack.schema import EVENTS, PREDICTIONS, SCHEMAS, TRACKS, Frame
+from mcaptrack.schema import EVENTS, SCHEMAS, TRACKS, Frame
 from mcaptrack.schema.frame_columns import collect
-from mcaptrack.tables import TABLES, Pointers
+from mcaptrack.tables import TABLES, Pointers, text
 from mcaptrack.tables import files as tables_files
+from mcaptrack.tables.messages import messages_table
 from tests.commands import call
 from tests.strategies import columns
 from tests.tiers import one_in
@@ -229,22 +231,6 @@ def test_the_page_of_the_tables_has_every_column_with_unit_and_meaning():
             assert (unit, meaning) == tuple(field.metadata[key].decode() for key in (b"unit", b"description"))
 
 
-def test_tables_without_rows_keep_their_columns(tmp_path):
-    tables.write(tmp_path / "a.parquet", tables.rows_table(PREDICTIONS, {}), {})
-    read = pq.read_table(tmp_path / "a.parquet")
-    assert read.num_rows == 0
-    assert read.schema.names == [
-        "topic",
-        "frame",
-        "t",
-        "t_ns",
-        "row",
-        *(column.name for column in PREDICTIONS.columns),
-        "class",
-    ]
-    assert tables.verify(tmp_path / "a.parquet") == 0
-
-
 # Columns that are added later
 
 
@@ -330,16 +316,6 @@ def test_a_track_is_summed_up(tmp_path):
     assert second["first_x_px"] is None
 
 
-def test_a_track_without_positions_has_no_path_and_one_row_no_speed():
-    rows = tracks_at({1: (np.nan, np.nan), 2: (5.0, 6.0)})
-    nowhere, once = tables.summary_table({"/a": collect(TRACKS, [Frame(5, 0, rows)])}).to_pylist()
-    assert [nowhere[name] for name in ("path_m", "mean_speed_m_s", "max_speed_m_s", "first_x_m", "last_y_m")] == [
-        None
-    ] * 5
-    assert (once["path_m"], once["mean_speed_m_s"], once["max_speed_m_s"], once["last_x_m"]) == (0.0, None, None, 5.0)
-    assert tables.summary_table({}).num_rows == 0
-
-
 @given(st.data())
 @settings(max_examples=15)
 def test_summaries_are_what_duckdb_makes_of_the_rows(data):
@@ -368,12 +344,6 @@ def test_summaries_are_what_duckdb_makes_of_the_rows(data):
 
 
 # Faults
-
-
-def test_a_folder_that_can_not_be_written_is_said(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(McaptrackError, match="can't be written"):
-        tables.write(tmp_path / "file" / "t.parquet", tables.rows_table(TRACKS, {}), {})
 
 
 def two_tables():
@@ -580,3 +550,74 @@ def test_rows_about_tracks_have_the_class_of_the_track_or_of_the_object_that_is_
     found = {(row["topic"], row["row"]): row["class"] for row in table.to_pylist()}
     assert [found["/b/events", n] for n in range(4)] == ["car", "dog", None, None]
     assert {found["/a/events", n] for n in range(4)} == {None}
+
+
+# Tables as text, and fields of recorded messages as columns, at their limits
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 4, 5, 8, 9])
+def test_a_table_is_written_in_pieces_that_lack_nothing(count, monkeypatch):
+    monkeypatch.setattr(text, "_PIECE", 4)
+    values = {"n": list(range(count)), "word": [f'"{n}", é' for n in range(count)], "x": [n / 4 for n in range(count)]}
+    table = pa.table(values)
+    pieces = list(text.csv(table))
+    assert len(pieces) == max(1, math.ceil(count / 4))
+    head, *rows = csv.reader(io.StringIO(b"".join(pieces).decode()))
+    assert head == ["n", "word", "x"]
+    assert [(int(n), word, float(x)) for n, word, x in rows] == list(zip(*values.values(), strict=True))
+    assert [json.loads(line) for line in text.json_lines(table)] == table.to_pylist()
+
+
+def column(*values: object) -> pa.ChunkedArray:
+    """The column that a field with these values becomes."""
+    places = Pointers("a.mcap", *(np.arange(len(values)) for _ in range(5)))
+    pieces, _ = messages_table("/t", "s", places, [{("a",): value} for value in values], blobs=True)
+    return pa.concat_tables(pieces).column("a")
+
+
+@pytest.mark.parametrize(
+    ("values", "kind", "wanted"),
+    [
+        ([True, False], "bool", [True, False]),
+        ([1, None], "int64", [1, None]),
+        ([-(2**63), 2**63 - 1], "int64", None),
+        ([0, 2**63], "uint64", None),
+        ([2**64 - 1], "uint64", None),
+        ([-1, 2**63], "string", ["-1", str(2**63)]),
+        ([2**64], "string", [str(2**64)]),
+        ([-(2**63) - 1], "string", [str(-(2**63) - 1)]),
+        ([1, 0.5], "double", [1.0, 0.5]),
+        ([2**53, -(2**53), 0.5], "double", None),
+        ([2**53 + 1, 0.5], "string", [str(2**53 + 1), "0.5"]),
+        ([-(2**53) - 1, 0.5], "string", [str(-(2**53) - 1), "0.5"]),
+        ([True, 1], "string", ["true", "1"]),
+        (["é", "b"], "string", None),
+        (["é", 1], "string", ['"é"', "1"]),
+        ([b"\x01\xff"], "binary", None),
+        ([b"\x01\xff", 1], "string", ['"01ff"', "1"]),
+        ([[1, 2], [], None], "list<item: int64>", [[1, 2], [], None]),
+        ([[1], [0.5]], "list<item: double>", [[1.0], [0.5]]),
+        ([[1], ["a"]], "string", ["[1]", '["a"]']),
+        ([[1], 2], "string", ["[1]", "2"]),
+        ([["\ud800é"]], "list<item: string>", [["?é"]]),
+        ([None, None], "double", None),
+    ],
+)
+def test_a_field_becomes_the_narrowest_column_that_holds_all_its_values(values, kind, wanted):
+    found = column(*values)
+    assert str(found.type).replace("element", "item") == kind
+    assert found.to_pylist() == (values if wanted is None else wanted)
+
+
+def test_fields_of_bytes_are_left_out_unless_they_are_wanted():
+    places = Pointers("a.mcap", *(np.arange(3) for _ in range(5)))
+    rows = [{("a", "b"): b"x", ("T",): 1}, {("a", "b"): None, ("c_ns",): 5}, {("c_ns",): 7}]
+    for blobs in (False, True):
+        pieces, left_out = messages_table("/t", "", places, rows, blobs=blobs)
+        table = pa.concat_tables(pieces)
+        assert left_out == ([] if blobs else ["a.b"])
+        assert table.column_names[-2 - blobs :] == [*["a_b"][: int(blobs)], "T_2", "c_ns"]  # t is the time
+        assert table.column("T_2").to_pylist() == [1, None, None]
+        assert table.column("c_ns").to_pylist() == [None, 5, 7]
+        words = table.schema.field("c_ns").metadata
+        assert words == {b"unit": b"ns", b"description": b"field c_ns of the message", b"path": b"c_ns"}

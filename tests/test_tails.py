@@ -12,21 +12,15 @@ import pytest
 from mcaptrack.evaluation.metrics.displacement import ellipse_levels
 from mcaptrack.geometry.mixtures import Tails, squared_radius
 from mcaptrack.notices import Notice, listening
-from mcaptrack.predictors import NAMES, Forecast, make
+from mcaptrack.predictors import NAMES, Forecast, make, vehicle_tails
 from mcaptrack.predictors.position_noise import PositionNoise
-from mcaptrack.predictors.tail_calibration import (
-    TABLES,
-    Learned,
-    TailCalibration,
-    counts_of,
-    fit_mixture,
-    follow,
-    table_of,
-)
-from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.predictors.tail_calibration import Learned, TailCalibration, counts_of, fit_mixture, follow, table_of
+from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.predictions import tails_of
-from mcaptrack.transforms import PROFILES
+from mcaptrack.transforms import PROFILES, forecasts
+from mcaptrack.transforms.motion_limits import LIMITS
 from mcaptrack.transforms.predict import Predict
+from tests.worlds import ns, tracks_at
 
 STEP_NS = 400_000_000
 
@@ -36,11 +30,8 @@ def walkers(count: int = 6, ticks: int = 80, noise_m: float = 0.01, seed: int = 
     rng = np.random.default_rng(seed)
     out = []
     for tick in range(ticks):
-        ids = np.arange(1, count + 1)
-        xy = np.stack([0.5 * tick + np.zeros(count), 8.0 * ids], axis=-1) + noise_m * rng.normal(size=(count, 2))
-        rows = TRACKS.rows(
-            track_id=ids, x_m=xy[:, 0], y_m=xy[:, 1], observed=np.ones(count, bool), source_id=np.full(count, -1)
-        )
+        noise = noise_m * rng.normal(size=(count, 2))
+        rows = tracks_at({n + 1: (0.5 * tick + noise[n, 0], 8.0 * (n + 1) + noise[n, 1]) for n in range(count)})
         out.append(Frame(tick * STEP_NS, tick, rows))
     return out
 
@@ -54,12 +45,6 @@ class TestTable:
         assert ((table.wide_weight > 0) & (table.wide_weight < 1)).all()
         assert table.short[0] > 1
         assert (table.coasting > 1).all()
-
-    def test_the_file_says_what_it_was_made_of(self):
-        card = json.loads(TABLES.read_text())["card"]
-        assert "synthetic" in card["data"]
-        assert card["licence"] == "Apache-2.0"
-        assert "tools/fit_tails.py" in card["made_by"]
 
     def test_networks_with_other_weights_and_other_predictors_have_none(self):
         assert table_of("red:mine.safetensors") is None
@@ -322,21 +307,6 @@ class TestInTransforms:
         calm = spread([frame for (frame,) in Predict()(walkers())])
         assert calm[-1] < 0.3 * calm[3]  # the first, by the table
 
-    @pytest.mark.parametrize("name", ["predictions", "retracks"])
-    def test_predictions_depend_on_the_past_alone(self, name):
-        def run(frames: list[Frame]) -> list[Frame]:
-            if name == "predictions":
-                return [frame for (frame,) in Predict()(frames)]
-            return [frames[2] for frames in PROFILES["default"](frames)]
-
-        frames = walkers(ticks=50, noise_m=0.1)
-        whole, begun = run(frames), run(frames[:30])
-        for one, other in zip(whole[:30], begun, strict=True):
-            assert one.rows.dtype == other.rows.dtype
-            for column in one.rows.dtype.names:
-                np.testing.assert_allclose(one.rows[column], other.rows[column], rtol=1e-6)
-        assert any(len(frame.rows) for frame in begun)
-
     def test_interpolated_positions_say_nothing_about_noise(self, monkeypatch):
         """A quarter of the positions is interpolated between neighbours: their noise is smaller, and like theirs."""
         found: list[tuple[float, float]] = []
@@ -395,9 +365,167 @@ class TestInTransforms:
                 list(Predict(predictor=name)(walkers(ticks=8)))
         assert warned == []
 
-    def test_means_are_those_of_the_predictor(self):
-        frames = walkers(ticks=20)
-        *_, (last,) = Predict()(frames)
-        past = np.stack([[frame.rows["x_m"], frame.rows["y_m"]] for frame in frames[-8:]], axis=0).transpose(2, 0, 1)
-        mean, _ = make("red", 12, 0.4).predict(past, np.ones(past.shape[:2], bool))
-        np.testing.assert_allclose(np.stack([last.rows["x_m"], last.rows["y_m"]], -1).reshape(-1, 12, 2), mean)
+
+# Forecasts of vehicles are mixtures, by class and by whether they stand
+
+
+TABLE = {"ahead_s": [1.0, 2.0], "wide_weight": [0.2, 0.4], "narrow_scale": [0.1, 0.4], "wide_scale": [2.0, 8.0]}
+TABLES = {
+    "red": {kind: {"standing": TABLE, "moving": TABLE | {"wide_weight": [0.5, 0.5]}} for kind in ("car", "truck")}
+}
+
+
+def forecast(count: int, steps: int = 3) -> Forecast:
+    half = np.random.default_rng(0).normal(size=(count, steps, 2, 2))
+    return Forecast(np.zeros((count, steps, 2)), half @ half.transpose(0, 1, 3, 2))
+
+
+def test_mixtures_by_hand(monkeypatch: pytest.MonkeyPatch):
+    """A standing car, a moving bus, a person, and a car whose speed is unknown; steps at 0.75, 1.5 and 2.25 s."""
+    monkeypatch.setattr(vehicle_tails, "_tables", lambda: TABLES)
+    given = forecast(4)
+    names, speed = ["car", "bus", "person", "car"], np.array([0.4, 0.5, 9.0, np.nan])
+    made, shapes = vehicle_tails.calibrated("red", given, 0.75, names, speed)
+    assert shapes is not None
+    narrow, wide = np.array([0.1, 0.2, 0.4]), np.array([2.0, 4.0, 8.0])  # the logarithms are interpolated
+    for row, weight in ((0, np.array([0.2, 0.3, 0.4])), (1, np.full(3, 0.5))):
+        whole = (1 - weight) * narrow + weight * wide
+        np.testing.assert_allclose(made.cov[row], given.cov[row] * whole[:, None, None])
+        np.testing.assert_allclose([part[row] for part in shapes], [weight, narrow / whole, wide / whole])
+    np.testing.assert_array_equal(made.cov[2:], given.cov[2:])
+    assert np.isnan([part[2:] for part in shapes]).all()
+    np.testing.assert_array_equal(made.mean, given.mean)
+    assert vehicle_tails.calibrated("cv", given, 0.75, names, speed) == (given, None)
+
+
+def test_the_tables_that_ship_are_distributions_for_all_vehicles():
+    tables = json.loads(vehicle_tails.TABLES.read_text())
+    assert "no recordings" in tables["card"]["data"]
+    assert {name for name, row in LIMITS.items() if row.turns} == set(vehicle_tails.TABLE_OF)
+    names = sorted(vehicle_tails.TABLE_OF)
+    for speed in (0.0, 5.0):
+        _, shapes = vehicle_tails.calibrated("red", forecast(len(names)), 0.4, names, np.full(len(names), speed))
+        assert shapes is not None
+        weight, narrow, wide = shapes
+        np.testing.assert_allclose((1 - weight) * narrow + weight * wide, 1.0)
+        assert (weight > 0).all()
+        assert (weight < 1).all()
+        assert (narrow > 0).all()
+        assert (narrow < wide).all()
+
+
+def test_only_forecasts_of_vehicles_in_metres_are_mixtures():
+    frames = []
+    for tick in range(10):
+        rows = TRACKS.rows(
+            track_id=[1, 2], class_id=[3, 1], x_m=[4.0 * tick, 0.5 * tick], y_m=[0.0, 9.0], observed=[True] * 2,
+            source_id=[1, 2], vx_m_per_s=[10.0, 1.25], vy_m_per_s=[0.0] * 2,
+        )  # fmt: skip
+        frames.append(Frame(tick * 400_000_000, tick, rows))
+    last = [rows.rows for (rows,) in Predict(predictor="red", class_names=((1, "person"), (3, "car")))(frames)][-1]
+    is_mixture = {one: np.isfinite(last["wide_weight"][last["track_id"] == one]) for one in (1, 2)}
+    assert len(is_mixture[1]) == 12
+    assert is_mixture[1].all()
+    assert len(is_mixture[2]) == 12
+    assert not is_mixture[2].any()
+
+
+# Predictions of vehicles that stand: they stay, and ellipses are as small as that is certain
+
+
+CLASS_NAMES = ((1, "pedestrian"), (3, "car"))
+STEPS = 10
+
+
+def last_forecast(class_id: int, speed_m_per_s: float, in_metres: bool, stops: int = 0, predictor: str = "red") -> Rows:
+    """The forecast of an object along x, with or without the velocities that a tracker in metres gives."""
+    velocity = {"vx_m_per_s": [speed_m_per_s], "vy_m_per_s": [0.0]} if in_metres else {}
+    frames = []
+    for tick in range(STEPS):
+        x_m = speed_m_per_s * min(tick, STEPS - stops) / 2.5
+        rows = TRACKS.rows(
+            track_id=[1], x_m=[x_m], y_m=[0.0], observed=[True], source_id=[-1], class_id=[class_id], **velocity
+        )
+        frames.append(Frame(ns(tick / 2.5), tick, rows))
+    return [frame.rows for (frame,) in Predict(predictor=predictor, class_names=CLASS_NAMES)(frames)][-1]
+
+
+def axis_m(rows: Rows) -> float:
+    """Half of the longer axis of the last 95 % ellipse, by its largest eigenvalue."""
+    xx, xy, yy = (float(rows[name][-1]) for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2"))
+    return float(np.sqrt(-2 * np.log(0.05) * np.linalg.eigvalsh([[xx, xy], [xy, yy]])[-1]))
+
+
+@pytest.fixture
+def as_predicted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ellipses as predictors make them: otherwise they follow the log, and those of vehicles are mixtures."""
+    monkeypatch.setattr(TailCalibration, "of", lambda *_: None)
+    monkeypatch.setattr(vehicle_tails, "_tables", dict)
+
+
+@pytest.mark.usefixtures("as_predicted")
+@pytest.mark.parametrize("predictor", ["red", "kalman", "cv"])
+def test_a_car_that_stands_has_an_ellipse_of_a_few_metres(predictor: str):
+    before, now = (axis_m(last_forecast(3, 0.0, known, predictor=predictor)) for known in (False, True))
+    assert before > 8
+    assert 1 < now < 7
+    assert now < before / 2
+
+
+@pytest.mark.usefixtures("as_predicted")
+@pytest.mark.parametrize(("class_id", "speed_m_per_s"), [(3, 8.0), (1, 0.0), (1, 1.3)])
+def test_what_moves_and_people_are_predicted_as_without_velocities(class_id: int, speed_m_per_s: float):
+    given, without = (last_forecast(class_id, speed_m_per_s, known) for known in (True, False))
+    for name in ("x_m", "y_m", "cov_xx_m2", "cov_yy_m2"):
+        np.testing.assert_allclose(given[name], without[name], rtol=1e-6)
+
+
+@pytest.mark.usefixtures("as_predicted")
+def test_a_car_that_has_just_stopped_may_go_on():
+    """Its history still has the way that it went."""
+    stopped, stands = (axis_m(last_forecast(3, speed, True, stops=3)) for speed in (8.0, 0.0))
+    assert stopped > 3 * stands
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_stands_by_hand(seed: int):
+    """Objects with different pasts: their speed over up to seven steps; a single step says nothing."""
+    rng = np.random.default_rng(seed)
+    past, unit_m = np.cumsum(rng.normal(0, 0.05, (8, 10, 2)), axis=1), rng.choice([1.0, 4.0], 8)
+    known_from = [0, 1, 2, 3, 5, 7, 8, 9]
+    for one, first in zip(past, known_from, strict=True):
+        one[:first] = np.nan
+    found = forecasts._standing(past, unit_m, 0.4)
+    for one, unit, first, stays in zip(past, unit_m, known_from, found, strict=True):
+        begin = max(first, 2)  # seven steps back at most
+        steps = 9 - begin
+        if steps < 2:
+            assert stays == 0
+        else:
+            speed = np.linalg.norm(one[-1] - one[begin]) / (0.4 * steps * unit)
+            assert stays == pytest.approx(0.95 * np.exp(-((speed / 0.15) ** 2)))
+
+
+def test_a_forecast_with_rest_has_the_mean_and_covariance_of_both():
+    """Each step is a mixture of two distributions, whose moments are added up."""
+    rng = np.random.default_rng(1)
+    now, stay, noise_m, unit_m = (
+        rng.normal(size=(3, 2)),
+        np.array([0.0, 0.3, 0.95]),
+        rng.uniform(0.1, 0.4, 3),
+        np.array([4.0, 1.0, 2.0]),
+    )
+    half = rng.normal(size=(3, 5, 2, 2))
+    forecast = Forecast(rng.normal(size=(3, 5, 2)), half @ half.transpose(0, 1, 3, 2))
+    found = forecasts._with_rest(forecast, now, stay, noise_m, unit_m, 0.4)
+    for one in range(3):
+        for step in range(5):
+            creep = 0.03 * unit_m[one] * 0.4 * (step + 1)
+            parts = (
+                (stay[one], now[one], (noise_m[one] ** 2 + creep**2) * np.eye(2)),
+                (1 - stay[one], forecast.mean[one, step], forecast.cov[one, step]),
+            )
+            mean = sum(share * at for share, at, _ in parts)
+            cov = sum(share * (spread + np.outer(at - mean, at - mean)) for share, at, spread in parts)
+            np.testing.assert_allclose(found.mean[one, step], mean)
+            np.testing.assert_allclose(found.cov[one, step], cov)

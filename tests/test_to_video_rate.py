@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import itertools
-import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import TRACKS, Frame, framing
-from mcaptrack.transforms.to_video_rate import linked_tracks, to_video_rate
-from tests.commands import printed
+from mcaptrack.schema.frame_columns import collect
+from mcaptrack.transforms.to_video_rate import linked_tracks, mended_ends, to_video_rate
 from tests.worlds import ns
 
 
@@ -51,42 +48,9 @@ def full(tracks, retracks):
     ]
 
 
-def test_every_box_gets_the_name_that_its_track_has():
-    out = full([{7: 0.1 * n} for n in range(9)], [{1: (7, 0.4 * n)} for n in range(3)])
-    assert out == [{1: (7, round(0.1 * n, 6))} for n in range(9)]
-
-
 def test_the_first_number_of_a_track_is_zero():
     out = full([{0: 0.1 * n} for n in range(9)], [{0: (0, 0.4 * n)} for n in range(3)])
     assert out == [{0: (0, round(0.1 * n, 6))} for n in range(9)]
-
-
-def test_rows_without_a_box_have_no_source_and_were_not_observed():
-    tracks = [Frame(ns(n / 10), n, boxes({7: 0.1 * n} if n not in (1, 2) else {})) for n in range(9)]
-    samples = [Frame(ns(0.4 * n), 4 * n, named({1: (7, 0.4 * n)})) for n in range(3)]
-    rows = np.concatenate([frame.rows for frame in to_video_rate(tracks, samples, ())])
-    assert rows["source_id"].tolist() == [7, -1, -1, *[7] * 6]
-    assert rows["observed"].tolist() == [True, False, False, *[True] * 6]
-    nothing = [Frame(0, 0, named({1: (-1, 0.0)}))]
-    assert [len(frame.rows) for frame in to_video_rate(tracks[:1], nothing, ())] == [1]
-
-
-def test_a_track_that_is_two_people_changes_its_name_half_way_between_the_ticks():
-    out = full([{7: 0.1 * n} for n in range(9)], [{1: (7, 0.0)}, {2: (7, 0.4)}, {2: (7, 0.8)}])
-    assert [[who for who, (source, _) in f.items() if source == 7] for f in out] == [[1]] * 3 + [[2]] * 6
-
-
-def test_two_tracks_that_are_one_person_have_one_name_and_the_hole_between_them_is_filled():
-    tracks = [{7: 0.1 * n} if n <= 5 else {8: 0.1 * n} if n >= 10 else {} for n in range(17)]
-    out = full(tracks, [{1: (7, 0.0)}, {1: (7, 0.4)}, {1: (-1, 0.8)}, {1: (8, 1.2)}, {1: (8, 1.6)}])
-    assert [set(f) for f in out] == [{1}] * 17
-    assert [f[1][0] for f in out] == [7] * 6 + [-1] * 4 + [8] * 7
-    np.testing.assert_allclose([f[1][1] for f in out], 0.1 * np.arange(17), atol=1e-6)
-
-
-def test_boxes_of_a_false_track_are_left_out():
-    out = full([{7: 0.1 * n, 9: 5.0} for n in range(9)], [{1: (7, 0.4 * n)} for n in range(3)])
-    assert all(set(f) == {1} for f in out)
 
 
 def test_without_re_tracked_tracks_every_frame_is_there_without_rows():
@@ -99,36 +63,6 @@ def test_without_re_tracked_tracks_every_frame_is_there_without_rows():
     near = [tracks[0], *(tracks[0]._replace(t_ns=t_ns, index=t_ns) for t_ns in (1, 2))]
     found = to_video_rate(near, [Frame(0, 0, named({1: (7, 0.0)}))], ())
     assert [one.rows["track_id"].tolist() for one in found] == [[1], [1], []]
-
-
-@given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=25)
-def test_no_id_is_at_two_places_and_no_box_has_two_ids(seed):
-    rng = np.random.default_rng(seed)
-    tracks = [{int(i): float(i) for i in range(5) if rng.random() < 0.7} for _ in range(20)]
-    retracks = []
-    for _ in range(5):
-        sources = rng.permutation(5)[: rng.integers(0, 6)]
-        retracks.append({int(10 + rng.permutation(5)[k]) + 10 * k: (int(s), float(s)) for k, s in enumerate(sources)})
-    frames = [Frame(ns(n / 10), n, boxes(people)) for n, people in enumerate(tracks)]
-    out = to_video_rate(frames, [Frame(ns(0.4 * n), n, named(people)) for n, people in enumerate(retracks)], ())
-    for before, after in zip(frames, out, strict=True):
-        who, source = after.rows["track_id"].tolist(), after.rows["source_id"]
-        assert len(set(who)) == len(who)
-        used = source[source >= 0].tolist()
-        assert len(set(used)) == len(used)
-        assert set(used) <= set(before.rows["track_id"].tolist())
-
-
-def test_a_log_gets_them_beside_the_others(tmp_path):
-    rows = "".join(f"{frame},1,{10 + frame},20,10,30,1,-1,-1,-1\n" for frame in range(1, 41))
-    (tmp_path / "t.txt").write_text(rows)
-    printed("ingest", tmp_path / "t.txt", "--as", "tracks", "--fps", 10, "-o", tmp_path / "l.mcap")
-    printed("retrack", tmp_path / "l.mcap")
-    (result,) = json.loads(printed("info", tmp_path / "l.mcap", "--json")[0])["results"]
-    channels = {channel["topic"]: channel for channel in result["channels"]}
-    assert channels["/camera/retracks/full"]["messages"] == channels["/camera/tracks"]["messages"] == 40
-    assert not channels["/camera/retracks/full"]["stale"]
 
 
 def test_boxes_have_metres_by_the_plane_of_their_time():
@@ -156,13 +90,6 @@ def test_boxes_have_metres_by_the_plane_of_their_time():
     known = linked_tracks(samples, (), planes)[1].rows
     assert (known["x_m"].tolist(), known["y_m"].tolist()) == ([1.0], [0.0])
     assert np.isnan(linked_tracks(tracks, (), ())[0].rows["x_m"]).all()
-
-
-def test_of_two_boxes_with_one_id_the_nearer_to_its_sample_is_taken():
-    tracks = [{7: 0.1 * n, 8: 0.1 * n + 0.05} for n in range(5)]
-    out = full(tracks, [{1: (7, 0.0)}, {1: (8, 0.4)}])
-    assert [frame[1][0] for frame in out] == [7, 7, out[2][1][0], 8, 8]
-    assert [len(frame) for frame in out] == [1] * 5
 
 
 class TestRowByRow:
@@ -292,3 +219,99 @@ def at_time(frames: list[Frame], who: int, t_ns: int, most_ns: int) -> float | N
         if t_ns == low or (low < t_ns < high and high - low <= most_ns):
             return start + (t_ns - low) / max(high - low, 1) * (end - start)
     return None
+
+
+# Where tracks of boxes in space begin and end, on scenes in numbers
+
+
+def moving(spans: dict[int, set[int]], count: int = 60, rate_hz: float = 10.0, **others: float) -> list[Frame]:
+    """Frames with tracks that go 3 m/s north and 4 m/s east from (id, 0), each detected in some of the frames."""
+    frames = []
+    for n in range(count):
+        known = [one for one, found in spans.items() if min(found) <= n <= max(found)]
+        t = n / rate_hz
+        rows = TRACKS.rows(
+            track_id=known,
+            x_m=[one + 3 * t for one in known],
+            y_m=[4 * t] * len(known),
+            vx_m_per_s=[3.0] * len(known),
+            vy_m_per_s=[4.0] * len(known),
+            observed=[n in spans[one] for one in known],
+            source_id=known,
+        )
+        for name, value in ({"length_m": 4.0} | others).items():
+            rows[name] = value
+        frames.append(Frame(round(t * 1e9), n, rows))
+    return frames
+
+
+def spans_of(frames) -> dict[int, list[int]]:
+    out: dict[int, list[int]] = {}
+    for n, frame in enumerate(frames):
+        for one in frame.rows["track_id"].tolist():
+            out.setdefault(one, []).append(n)
+    return out
+
+
+@pytest.mark.parametrize("part_rows", [1 << 16, 5])
+def test_tracks_have_a_row_before_the_first_and_one_after_the_last(part_rows: int, monkeypatch):
+    monkeypatch.setattr(framing, "PART_ROWS", part_rows)
+    seen = {3: set(range(10, 31)), 5: set(range(60)), 1: set(range(2, 4)), 9: set(range(20, 24))}
+    frames = moving(seen)
+    out = mended_ends(collect(TRACKS, frames))
+    spans = spans_of(out)
+    assert {one: (found[0], found[-1]) for one, found in spans.items()} == {
+        3: (9, 31),
+        5: (0, 59),
+        1: (2, 3),
+        9: (19, 24),
+    }
+    assert all(len(found) == found[-1] - found[0] + 1 for found in spans.values())
+    for n, (frame, before) in enumerate(zip(out, frames, strict=True)):
+        assert (frame.t_ns, frame.index) == (before.t_ns, before.index)
+        assert frame.rows["track_id"].tolist() == sorted(frame.rows["track_id"].tolist())
+        for row in frame.rows:
+            one = int(row["track_id"])
+            assert (row["x_m"], row["y_m"]) == pytest.approx((one + 0.3 * n, 0.4 * n), abs=1e-5)
+            assert row["observed"] == (n in seen[one])
+            assert row["source_id"] == (one if n in seen[one] else -1)
+
+
+@pytest.mark.parametrize("part_rows", [1 << 16, 3])
+@pytest.mark.parametrize(
+    ("found", "rate_hz", "last"),
+    [
+        ({*range(10), 21}, 10.0, 10),  # a lone box after 1.2 s: the track ends before it
+        ({*range(10), 17}, 10.0, 18),  # after 0.8 s it is one more
+        ({*range(10), 21, 22}, 10.0, 23),  # two are no chance
+        ({*range(10), 21, 33}, 10.0, 10),  # two that are both alone are
+        ({*range(10), 21, 22, 40}, 10.0, 23),
+        ({*range(10), 13}, 2.0, 14),  # 2 s, but only three frames without a box
+        ({*range(10), 22}, 20.0, 23),  # 12 frames, but 0.65 s
+        ({0, 30}, 10.0, 0),  # too few rows are left to say how it moves on
+    ],
+)
+def test_a_lone_box_after_a_long_gap_does_not_continue_a_track(
+    found: set[int], rate_hz: float, last: int, part_rows: int, monkeypatch
+):
+    monkeypatch.setattr(framing, "PART_ROWS", part_rows)
+    frames = moving({4: found, 8: set(range(60))}, rate_hz=rate_hz)
+    spans = spans_of(mended_ends(collect(TRACKS, frames)))
+    assert spans == {4: list(range(last + 1)), 8: list(range(60))}
+
+
+def test_tracks_are_not_moved_on_over_gaps_of_the_log():
+    frames = moving({4: set(range(10, 20)), 6: set(range(60))}, 60)
+    paused = [frame._replace(t_ns=frame.t_ns + (200_000_000 if n >= 10 else 0)) for n, frame in enumerate(frames)]
+    assert spans_of(mended_ends(collect(TRACKS, paused)))[4] == list(range(10, 21))
+    seldom = moving({4: set(range(10, 20))}, 60, rate_hz=1.0)
+    assert spans_of(mended_ends(collect(TRACKS, seldom)))[4] == list(range(10, 20))
+
+
+def test_only_tracks_of_boxes_in_space_are_mended():
+    seen = {4: set(range(10, 31))}
+    frames = moving(seen)
+    samples = [frame._replace(rows=frame.rows.copy()) for frame in frames[::4]]
+    assert spans_of(to_video_rate(frames, samples, ()))[4] == list(range(9, 32))
+    for others in ({"w_px": 10.0}, {"vx_m_per_s": np.nan}, {"length_m": np.nan}):
+        assert spans_of(to_video_rate(moving(seen, **others), samples, ()))[4] == list(range(10, 31)), others

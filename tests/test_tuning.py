@@ -13,9 +13,9 @@ import pytest
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions
-from mcaptrack.evaluation.tuning import Range, Task, declared_ranges, tune
+from mcaptrack.evaluation.tuning import Range, Task, tune
 from mcaptrack.schema import Frame
-from mcaptrack.transforms import STAGES, TRACKERS, TRANSFORMS, Sort
+from mcaptrack.transforms import STAGES, Sort
 from tests.commands import call, printed
 from tests.worlds import boxed, boxes_at, detections, ns
 
@@ -38,16 +38,6 @@ def chance(monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
 
 
-def test_every_tracker_declares_ranges_that_it_accepts():
-    for kind in {**TRANSFORMS, **TRACKERS}.values():
-        for name, part in declared_ranges(kind).items():
-            for value in (part.low, part.high):
-                kind(**{name: int(value) if part.whole else value})
-    assert {"max_age_s", "min_iou"} <= set(declared_ranges(Sort))
-    assert "inertia" in declared_ranges(TRACKERS["ocsort"])
-    assert "high_score" in declared_ranges(TRACKERS["bytetrack"])
-
-
 def test_ranges_of_every_search_are_within_the_limits_of_the_parameter():
     kinds = {kind for stage in STAGES.values() for kind in stage.built_in().values()}
     declared = [one.metadata for kind in kinds for one in fields(kind) if one.metadata.get("search")]
@@ -57,17 +47,15 @@ def test_ranges_of_every_search_are_within_the_limits_of_the_parameter():
         assert given["least"] <= low < high <= given["most"], given
 
 
-def test_a_search_finds_the_age_that_keeps_an_identity(chance):
+@pytest.mark.parametrize("with_optuna", [False, True])
+def test_a_search_finds_the_age_that_keeps_an_identity(with_optuna, monkeypatch):
+    if not with_optuna:
+        monkeypatch.setitem(sys.modules, "optuna", None)
     first, best = tune(Sort(), [scene()], {"max_age_s": Range(0.1, 6.0, False)}, IOU, trials=25)
     assert first.number == 0
     assert first.parameters == {}
     assert best.parameters["max_age_s"] > 2.4
     assert best.scores["IDF1"] > first.scores["IDF1"] + 0.2
-
-
-def test_a_search_with_optuna_finds_the_age_that_keeps_an_identity():
-    _, best = tune(Sort(), [scene()], {"max_age_s": Range(0.1, 6.0, False)}, IOU, trials=25)
-    assert best.parameters["max_age_s"] > 2.4
 
 
 @pytest.mark.parametrize("with_optuna", [False, True])

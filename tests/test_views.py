@@ -148,24 +148,6 @@ def test_drawings_follow_a_camera_that_sways(name):
     assert count > 5
 
 
-def test_kinds_of_tracks_differ():
-    rows = [Frame(int(PICTURES[n]), n, boxed({2: (n, 5)})) for n in range(6)]
-    sort, retracked, true = (messages(f"/c/{name}", TRACKS, rows)[5] for name in ("tracks", "retracks/full", "truth"))
-    assert [line.type for line in drawn(sort)] == [LIST]  # sides and trail, and no closed line
-    sides = xy(drawn(sort)[0])
-    for x in (5, 15):
-        assert {(x, 5), (x, 25)} <= set(sides)
-    thick, thin = drawn(retracked)[0], drawn(true)[0]
-    assert (thick.type, thin.type) == (LOOP, LOOP)
-    assert thick.thickness > thin.thickness
-    assert (thin.outline_color.r, thin.outline_color.g, thin.outline_color.b) == (1, 1, 1)
-    colour = foxglove.colour(2)[:3]
-    for line in (thick.outline_color, drawn(sort)[0].outline_colors[0], retracked.texts[0].background_color):
-        assert (line.r, line.g, line.b) == colour
-    places = {(text.position.x, text.position.y) for message in (sort, retracked, true) for text in message.texts}
-    assert len(places) == 3  # no number hides another
-
-
 def test_interpolated_positions_are_fainter():
     for name in ("tracks", "retracks/full"):
         rows = [Frame(int(PICTURES[n]), n, boxed({2: (n, 5)}, observed=n != 4)) for n in range(6)]
@@ -216,17 +198,6 @@ def test_forecasts_come_back_to_pixels_and_fade_into_the_future():
     assert opacity[:4] == opacity[4:] == sorted(opacity[:4], reverse=True)
     assert xy(both)[0] == (0, 10)
     assert xy(both)[7] == (50, 10)
-
-
-def test_an_ellipse_is_as_wide_as_95_percent_ask_for():
-    """Axes of a known covariance under a known plane, by hand: 5.991 is the quantile of chi squared."""
-    rows = FORECAST.copy()
-    rows["cov_xx_m2"], rows["cov_yy_m2"] = 4.0, 1.0
-    ellipse = drawn(messages("/c/predictions", PREDICTIONS, [Frame(ns(0.4), 1, rows)])[3])[0]
-    points = np.array(xy(ellipse)) - [20, 40]  # 10 px a metre
-    assert abs(points[:, 0]).max() == pytest.approx(10 * np.sqrt(5.991 * 4), abs=PX)
-    inside = (points[:, 0] / (10 * np.sqrt(5.991 * 4))) ** 2 + (points[:, 1] / (10 * np.sqrt(5.991))) ** 2
-    np.testing.assert_allclose(inside, 1, atol=0.02)
 
 
 def test_an_ellipse_of_a_plane_in_perspective_is_mapped_point_by_point():

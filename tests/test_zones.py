@@ -24,7 +24,7 @@ from mcaptrack.schema import TRACKS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS, F
 from mcaptrack.schema.framing import join_frames
 from mcaptrack.sources.zones import parse_zones, read_zones, to_geojson, zones_from_json, zones_to_json
 from tests.commands import call, done
-from tests.worlds import ns, tracks_at, walk
+from tests.worlds import ns, walk
 
 SQUARE = [[-2.0, 9.0], [2.0, 9.0], [2.0, 13.0], [-2.0, 13.0], [-2.0, 9.0]]
 LINE = [[0.0, 5.0], [0.0, 20.0]]
@@ -269,38 +269,6 @@ class TestGeometry:
             assert (one.visits, one.entered, one.left, one.tracks) == (two.visits, two.left, two.entered, two.tracks)
         assert (mirrored[2].forward, mirrored[2].backward) == (totals[2].backward, totals[2].forward)
 
-    @settings(max_examples=6, deadline=None)
-    @given(st.integers(0, 10**6))
-    def test_the_halves_of_a_zone_hold_together_what_it_holds(self, seed):
-        frames = wandering(seed, people=3, ticks=60)
-        halves = [[[-2, 9], [0.5, 9], [0.5, 13], [-2, 13], [-2, 9]], [[0.5, 9], [2, 9], [2, 13], [0.5, 13], [0.5, 9]]]
-        content = collection(*(feature(str(n), "Polygon", [ring]) for n, ring in enumerate((SQUARE, *halves))))
-        inside = join_frames(ZONE_COUNTS, count(frames, content, 0.0)[0].counts).rows["inside"].reshape(-1, 3)
-        assert (inside[:, 0] == inside[:, 1] + inside[:, 2]).all()
-
-    def test_noise_at_an_edge_counts_once(self):
-        at = [-1.0, -0.1, 0.1, -0.1, 0.1, -0.1, 0.1, 0.15, 1.0, 1.1, 0.1, -0.1, 0.1, 1.0, 0.1, -0.1, 0.1, -0.05, -1.0]
-        frames = walk(lambda tick: {7: (at[tick], 1.0)}, len(at), 1)
-        zone = collection(
-            feature("room", "Polygon", [[[0, -5], [9, -5], [9, 5], [0, 5], [0, -5]]]),
-            feature("door", "LineString", [[0, -5], [0, 5]]),
-        )
-        found, (room, door) = count(frames, zone)
-        assert told(found.visits, found.crossings) == ({(1, 7, ns(6), ns(17), False, False)}, {
-            (2, 7, ns(6), True), (2, 7, ns(17), False)
-        })  # fmt: skip
-        assert (room.visits, room.tracks, room.dwell_s, door.forward, door.backward) == (1, 1, 11.0, 1, 1)
-        noisy = count(frames, zone, 0.0)[1]
-        assert (noisy[0].visits, noisy[1].forward) == (5, 5)
-
-    def test_a_track_that_is_lost_and_found_again_is_one_visit_unless_the_gap_is_long(self):
-        seen = [0, 1, 2, 5, 6, 12, 13]
-        frames = [Frame(ns(t), t, tracks_at({1: (0.0, 11.0)} if t in seen else {})) for t in range(14)]
-        found, (square, *_) = count(frames, ZONES, gap_s=4.0)
-        assert (square.visits, square.tracks, square.entered, square.dwell_s) == (2, 1, 0, 7.0)
-        inside = [int(frame.rows["inside"][0]) for frame in found.counts]
-        assert inside == [1] * 7 + [0] * 5 + [1] * 2
-
     def test_in_a_narrow_zone_the_margin_is_half_the_area_by_the_circumference(self):
         # 0.4 m wide and 3.6 m long: 1.44 / 8 / 2 = 0.09, so that 0.1 m inside is a visit and 0.05 m is none
         content = collection(feature("strip", "Polygon", [[[0, 0], [0.4, 0], [0.4, 3.6], [0, 3.6], [0, 0]]]))
@@ -523,17 +491,6 @@ class TestRun:
             metadata = opened.channel("/camera/truth/zones/visits").metadata
         assert json.loads(metadata["mcaptrack.zones"]) == {"1": "line 1"}
         assert json.loads(metadata["mcaptrack.parameters"])["margin_m"] == 0.5
-
-    def test_tables_and_json_have_the_names(self, place):
-        said = json.loads(done("zones", place / "a.mcap", "--json").out)["results"][0]
-        square = said["zones"]["/camera/truth"][0]
-        assert (square["zone"], square["visits"]) == ("square", square["entered"] + 0 * square["left"])
-        with mcaptrack.open(place / "a.mcap") as opened:
-            rows = opened.table("zone_visits").to_pylist()
-            assert {row["zone"] for row in rows} == {"square", "ring"}
-            assert {row["class"] for row in rows} == {"person"}
-            assert {row["zone"] for row in opened.table("zone_counts").to_pylist()} == {"square", "ring", "gate"}
-            assert {row["zone"] for row in opened.table("zone_crossings").to_pylist()} == {"gate"}
 
     def test_the_log_view_tells_them_in_order(self, place):
         from foxglove_schemas_protobuf.Log_pb2 import Log
