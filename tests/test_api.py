@@ -282,14 +282,9 @@ def test_results_are_shown_in_a_line(tmp_path):
     page = ReportResult(Path("page.html"), 12, {"many": [0] * 1000}, ())
     assert repr(page) == f"ReportResult({str(page.page)!r}, 12 bytes)"
     row = {
-        "sequence": "<a>",
-        "tracks": "/camera/tracks",
-        "similarity": "iou",
-        "gate": 0.5,
-        "HOTA": 0.5,
-        "MOTA": -0.25,
+        "sequence": "<a>", "tracks": "/camera/tracks", "similarity": "iou", "gate": 0.5, "HOTA": 0.5, "MOTA": -0.25,
         "IDF1": 1,
-    }
+    }  # fmt: skip
     scores = Scores((SimpleNamespace(to_json=lambda: row),), (), ())  # type: ignore[arg-type]
     assert repr(scores) == "Scores(1 results; `rows` returns them)"
     shown = [

@@ -320,12 +320,9 @@ class TestHistories:
 
 class TestResample:
     frames = (
-        Frame(0, 0, tracks_at({1: (0, 0), 2: (5, 5)})),
-        Frame(10, 1, tracks_at({1: (1, 2)})),
-        Frame(20, 2, tracks_at({})),
-        Frame(30, 3, tracks_at({})),
-        Frame(40, 4, tracks_at({1: (4, 8), 2: (9, 9)})),
-    )
+        Frame(0, 0, tracks_at({1: (0, 0), 2: (5, 5)})), Frame(10, 1, tracks_at({1: (1, 2)})),
+        Frame(20, 2, tracks_at({})), Frame(30, 3, tracks_at({})), Frame(40, 4, tracks_at({1: (4, 8), 2: (9, 9)})),
+    )  # fmt: skip
 
     def at(self, times, hole=100):
         out, at = resample(self.frames, np.array(times), hole)

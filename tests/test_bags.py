@@ -371,11 +371,8 @@ class TestRosbag2:
 
     def test_faults_are_lines(self, tmp_path):
         faults = {
-            "a.db3": b"SQLite format 3\0" + bytes(500),
-            "b.db3": b"x",
-            "c.mcap": b"\x89MCAP0\r\nxx",
-            "d.mcap": b"",
-        }
+            "a.db3": b"SQLite format 3\0" + bytes(500), "b.db3": b"x", "c.mcap": b"\x89MCAP0\r\nxx", "d.mcap": b"",
+        }  # fmt: skip
         for name, data in faults.items():
             (tmp_path / name).write_bytes(data)
             with pytest.raises(McaptrackError, match=rf"{name} (is|can't)[^\n]*$"):

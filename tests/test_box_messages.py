@@ -304,14 +304,11 @@ def test_derived_objects_have_a_shape_and_a_certainty_out_of_255_and_move_if_the
         derived(writer, *stated, number=40 + number)
         for number, stated in enumerate(
             [
-                (1, [4.0, 2.0, 1.5], 6, 204),
-                (3, [1.75, 0.25], 4, 255, 0),
-                (2, [0.5], 0, 0),
-                (0, [], 7, 100),
+                (1, [4.0, 2.0, 1.5], 6, 204), (3, [1.75, 0.25], 4, 255, 0), (2, [0.5], 0, 0), (0, [], 7, 100),
                 (1, [1.0], 7, 1),
             ]
         )
-    ]
+    ]  # fmt: skip
     message = writer.new("derived_object_msgs/ObjectArray", header(writer, START_NS, "map"), objects)
     found = read(writer, message, encoding)
     sizes = [(4, 2, 1.5), (0.5, 0.5, 1.75), (1, 1, 1), *[(np.nan,) * 3] * 2]  # radars know no shape

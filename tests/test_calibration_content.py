@@ -48,18 +48,15 @@ def entry(place: int, value: float) -> list[float]:
 @pytest.mark.parametrize(
     ("values", "turn", "place"),
     [
-        ({"extrinsic": POSE}, TURN, PLACE),
-        ({"RT": [*POSE, [0, 0, 0, 1]]}, TURN, PLACE),
-        ({"T_cam_world": np.ravel(POSE).tolist()}, TURN, PLACE),
-        ({"tvec": [4, 5, 6], "RT": POSE}, TURN, PLACE),
+        ({"extrinsic": POSE}, TURN, PLACE), ({"RT": [*POSE, [0, 0, 0, 1]]}, TURN, PLACE),
+        ({"T_cam_world": np.ravel(POSE).tolist()}, TURN, PLACE), ({"tvec": [4, 5, 6], "RT": POSE}, TURN, PLACE),
         ({"R": TURN, "t": PLACE, "RT": POSE}, TURN, PLACE),
         ({"rotation_matrix": EYE, "translation": [[4], [5], [6]], "RT": POSE}, EYE, [4, 5, 6]),
         ({"rvec": [0, 0, np.pi / 2], "tvec": PLACE, "RT": [*POSE[:2], [0, 0, 1, 9]]}, TURN, PLACE),
         ({"rvec": [0, 0, np.pi / 2], "R": EYE, "tvec": PLACE}, TURN, PLACE),
-        ({"rvec": np.ravel(TURN).tolist(), "tvec": PLACE}, TURN, PLACE),
-        ({"K": K}, None, None),
+        ({"rvec": np.ravel(TURN).tolist(), "tvec": PLACE}, TURN, PLACE), ({"K": K}, None, None),
     ],
-)
+)  # fmt: skip
 def test_poses(read, values, turn, place):
     one = read(values)
     for found, wanted, shape in ((one.rotation, turn, (3, 3)), (one.translation, place, (3,))):
@@ -177,19 +174,14 @@ def test_coefficients_of_distortion(read, given, model, bent):
     ("given", "size"),
     [
         ({"image_width": 640, "image_height": 480}, (640, 480)),
-        ({"image_Width": "640.0", "imageHeight": 480}, (640, 480)),
-        ({"width": 99_999, "height": 1}, (99_999, 1)),
+        ({"image_Width": "640.0", "imageHeight": 480}, (640, 480)), ({"width": 99_999, "height": 1}, (99_999, 1)),
         ({"width": 9, "height": 9, "image_width": 640, "image_height": 480}, (640, 480)),
-        ({"image_size": [640, 480]}, (640, 480)),
-        ({"image_size": "640 480"}, (640, 480)),
+        ({"image_size": [640, 480]}, (640, 480)), ({"image_size": "640 480"}, (640, 480)),
         ({"image_size": [640, 480], "image_width": 1280, "height": 960}, (1280, 960)),
-        ({"image_size": [640, 480, 3]}, None),
-        ({"image_size": "640 480 3"}, None),
-        ({"image_size": [640]}, None),
-        ({"image_width": 640}, None),
-        ({"image_height": 480}, None),
+        ({"image_size": [640, 480, 3]}, None), ({"image_size": "640 480 3"}, None), ({"image_size": [640]}, None),
+        ({"image_width": 640}, None), ({"image_height": 480}, None),
     ],
-)
+)  # fmt: skip
 def test_sizes_of_pictures(read, given, size):
     assert read(given, M1=K).size == size
 

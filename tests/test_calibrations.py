@@ -323,14 +323,11 @@ class TestGround:
     @pytest.mark.parametrize(
         ("topic", "is_rectified"),
         [
-            ("/front/image_rect", True),
-            ("/front/image_rect_color/compressed", True),
-            ("/front/rectified/image", True),
-            ("/front/image_raw/compressed", False),
-            ("/direct/image", False),
+            ("/front/image_rect", True), ("/front/image_rect_color/compressed", True),
+            ("/front/rectified/image", True), ("/front/image_raw/compressed", False), ("/direct/image", False),
             ("/rect/front/image", False),
         ],
-    )
+    )  # fmt: skip
     def test_rectified_pictures_by_their_topic(self, topic, is_rectified):
         assert is_rectified_topic(topic) is is_rectified
 

@@ -24,26 +24,16 @@ from tests.worlds import tracks_at
 #: Where a stage may be told to write: beside its usual channel, below it, elsewhere, and under names that mean something
 #: below another camera.
 TARGETS = [
-    "/camera/other",
-    "/camera/retracks/mine",
-    "/elsewhere",
-    "/x/y/predictions",
-    "/x/retracks",
-    "/other/truth",
-    "bare",
-]
+    "/camera/other", "/camera/retracks/mine", "/elsewhere", "/x/y/predictions", "/x/retracks", "/other/truth", "bare",
+]  # fmt: skip
 #: Every stage somewhere, and something everywhere.
 PLACES = [*zip([*STAGES, *STAGES], TARGETS, strict=False)]
 #: How each command that can be told a camera is called on a log, and what of its JSON has to stay.
 READING = {
-    "evaluate": (),
-    "report": ("-o", "page.html", "--force"),
-    "events": (),
-    "zones": ("--zones", "zones.geojson"),
-    "render": ("-o", "walk.gif", "--force", "--width", "64"),
-    "run": ("--no-tables",),
+    "evaluate": (), "report": ("-o", "page.html", "--force"), "events": (), "zones": ("--zones", "zones.geojson"),
+    "render": ("-o", "walk.gif", "--force", "--width", "64"), "run": ("--no-tables",),
     "tune": ("--trials", "1", "-o", "tuned.toml"),
-} | dict.fromkeys(TRANSFORMS, ())
+} | dict.fromkeys(TRANSFORMS, ())  # fmt: skip
 
 
 @pytest.fixture
@@ -190,12 +180,9 @@ def test_stages_do_not_replace_ingested_detections(template, tmp_path):
 
 
 LAYOUTS = [
-    ("/front/image_raw", "/front/detections"),
-    ("/front/image_raw", "/front/boxes"),
-    ("/front/camera/image", "/front/yolo/boxes"),
-    ("/cam0/image", "/detector/out"),
-    ("/image", "/boxes"),
-]
+    ("/front/image_raw", "/front/detections"), ("/front/image_raw", "/front/boxes"),
+    ("/front/camera/image", "/front/yolo/boxes"), ("/cam0/image", "/detector/out"), ("/image", "/boxes"),
+]  # fmt: skip
 
 
 def label(path: Path, topic: str) -> None:

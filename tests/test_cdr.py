@@ -139,11 +139,8 @@ def test_hostile_bytes_are_refused_or_read_as_rosbags_reads_them():
 def test_rows_whose_layout_depends_on_their_place():
     """Nine bytes, then two: each row begins elsewhere, modulo 8."""
     fields = [
-        RosField("kind", "uint32"),
-        RosField("odd", "uint8"),
-        RosField("track_id", "int64"),
-        RosField("b", "uint8"),
-    ]
+        RosField("kind", "uint32"), RosField("odd", "uint8"), RosField("track_id", "int64"), RosField("b", "uint8"),
+    ]  # fmt: skip
     text = "X[] rows\n" + "=" * 80 + "\nMSG: mcaptrack_msgs/X\n" + "\n".join(f"{f.kind} {f.name}" for f in fields)
     store, name = store_of(EVENTS, text)
     rows = [store.types["mcaptrack_msgs/msg/X"](kind=n, odd=n, track_id=-n, b=7) for n in range(40)]

@@ -366,17 +366,13 @@ def test_tables_without_a_class_column_are_read_as_before(tmp_path):
     ("classes", "words"),
     [
         ({1: "car"}, "class 1 is a person; give 'car' another number"),
-        ({2: ""}, "the name of class 2 is printable text"),
-        ({2: "a\nb"}, "the name of class 2 is printable text"),
+        ({2: ""}, "the name of class 2 is printable text"), ({2: "a\nb"}, "the name of class 2 is printable text"),
         ({2: "x" * 201}, "the name of class 2 is printable text of at most 200 characters"),
-        ({2: "\ud800"}, "the name of class 2 is printable text"),
-        ({2: 3}, "the name of class 2 is printable text"),
-        ({-1: "x"}, "a class is a whole number from 0"),
-        ({2**32: "x"}, "a class is a whole number from 0"),
-        ({"2": "x"}, "a class is a whole number from 0"),
-        (["x"], "`classes=` is a mapping"),
+        ({2: "\ud800"}, "the name of class 2 is printable text"), ({2: 3}, "the name of class 2 is printable text"),
+        ({-1: "x"}, "a class is a whole number from 0"), ({2**32: "x"}, "a class is a whole number from 0"),
+        ({"2": "x"}, "a class is a whole number from 0"), (["x"], "`classes=` is a mapping"),
     ],
-)
+)  # fmt: skip
 def test_names_that_cant_be_are_refused(tmp_path, classes, words):
     with (
         mcaptrack.open(tmp_path / "a.mcap", create=True) as opened,

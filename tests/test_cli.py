@@ -130,17 +130,9 @@ class TestCommands:
     def test_output_profile_and_mode_of_retrack(self, finished, tmp_path):
         before = finished.read_bytes()
         printed(
-            "retrack",
-            finished,
-            "--profile",
-            "paper",
-            "--set",
-            "sigma_m=2",
-            "--mode",
-            "offline",
-            "-o",
+            "retrack", finished, "--profile", "paper", "--set", "sigma_m=2", "--mode", "offline", "-o",
             tmp_path / "p.mcap",
-        )
+        )  # fmt: skip
         assert finished.read_bytes() == before
         (result,) = json.loads(printed("info", tmp_path / "p.mcap", "--json")[0])["results"]
         made = {channel["topic"]: channel["parameters"] for channel in result["channels"]}
@@ -157,29 +149,9 @@ class TestEvaluate:
     def test_scores_as_json(self, finished):
         rows = json.loads(printed("evaluate", finished, "--json")[0])["results"]
         keys = {
-            "sequence",
-            "tracks",
-            "mode",
-            "similarity",
-            "gate",
-            "rules",
-            "MOTA",
-            "IDF1",
-            "IDP",
-            "IDR",
-            "HOTA",
-            "DetA",
-            "AssA",
-            "LocA",
-            "IDSW",
-            "FP",
-            "FN",
-            "Frag",
-            "MT",
-            "PT",
-            "ML",
-            "GT",
-        }
+            "sequence", "tracks", "mode", "similarity", "gate", "rules", "MOTA", "IDF1", "IDP", "IDR", "HOTA", "DetA",
+            "AssA", "LocA", "IDSW", "FP", "FN", "Frag", "MT", "PT", "ML", "GT",
+        }  # fmt: skip
         assert all(keys <= set(row) for row in rows)
         modes = {row["tracks"]: row["mode"] for row in rows}
         assert modes == {
@@ -192,19 +164,9 @@ class TestEvaluate:
         displaced = [row for row in rows if "displacement" in row]
         assert {row["tracks"] for row in displaced} == {"/camera/samples", "/camera/retracks/online"}
         wanted = {
-            "ADE_m",
-            "FDE_m",
-            "ADE_squared_m2",
-            "recall",
-            "AADE_m",
-            "false_forecasts_per_frame",
-            "consistency_m",
-            "NLL",
-            "reliability",
-            "coverage_50",
-            "coverage_90",
-            "coverage_95",
-        }
+            "ADE_m", "FDE_m", "ADE_squared_m2", "recall", "AADE_m", "false_forecasts_per_frame", "consistency_m",
+            "NLL", "reliability", "coverage_50", "coverage_90", "coverage_95",
+        }  # fmt: skip
         assert wanted <= set(displaced[0]["displacement"])
 
     def test_scores_as_csv(self, finished):
@@ -230,14 +192,9 @@ class TestEvaluate:
         ]
         assert [(row["similarity"], row["MOTA"], row["IDF1"]) for row in rows] == [("iou", 1.0, 1.0)]
         out, _ = printed(
-            "evaluate",
-            footage.ground_truth,
-            "--truth",
-            footage.ground_truth,
-            "--ground-plane",
-            footage.ground_plane,
+            "evaluate", footage.ground_truth, "--truth", footage.ground_truth, "--ground-plane", footage.ground_plane,
             "--json",
-        )
+        )  # fmt: skip
         assert [row["similarity"] for row in json.loads(out)["results"]] == ["iou", "metres", "metres", "metres"]
 
     def test_scores_are_written_to_a_file(self, finished, tmp_path):

@@ -36,15 +36,9 @@ def walkers(schema, rate_hz, seconds=8):
         x_m = 1.2 * number / rate_hz + noise.normal(0, 0.03, 3)
         y_m = np.array([0.0, 3.0, 6.0]) + noise.normal(0, 0.03, 3)
         columns = {
-            "x_m": x_m,
-            "y_m": y_m,
-            "x_px": 40 * x_m,
-            "y_px": 40 * y_m,
-            "w_px": [20.0] * 3,
-            "h_px": [60.0] * 3,
-            "score": [0.9] * 3,
-            "class_id": [1] * 3,
-        }
+            "x_m": x_m, "y_m": y_m, "x_px": 40 * x_m, "y_px": 40 * y_m, "w_px": [20.0] * 3, "h_px": [60.0] * 3,
+            "score": [0.9] * 3, "class_id": [1] * 3,
+        }  # fmt: skip
         if schema is TRACKS:
             columns |= {"track_id": [1, 2, 3], "source_id": [-1] * 3, "observed": [True] * 3}
         yield Frame(round(number * 10**9 / rate_hz), number, schema.rows(**columns))

@@ -32,16 +32,10 @@ def frame(number: int, boxes: dict[int, tuple[float, float]]) -> Frame:
     """A frame of tracks: boxes of 10 x 20 px at these places by id, which are metres, too."""
     places = np.array(list(boxes.values()), float).reshape(-1, 2)
     rows = TRACKS.rows(
-        track_id=list(boxes),
-        x_px=places[:, 0] * 10,
-        y_px=places[:, 1] * 10,
-        w_px=np.full(len(boxes), 10.0),
-        h_px=np.full(len(boxes), 20.0),
-        x_m=places[:, 0],
-        y_m=places[:, 1],
-        observed=np.ones(len(boxes), bool),
+        track_id=list(boxes), x_px=places[:, 0] * 10, y_px=places[:, 1] * 10, w_px=np.full(len(boxes), 10.0),
+        h_px=np.full(len(boxes), 20.0), x_m=places[:, 0], y_m=places[:, 1], observed=np.ones(len(boxes), bool),
         source_id=np.full(len(boxes), -1),
-    )
+    )  # fmt: skip
     return Frame(number * STEP_NS, number, rows)
 
 

@@ -128,21 +128,11 @@ def _damages(path: Path) -> dict[str, tuple[bytes, set[str]]]:
 @pytest.mark.parametrize(
     "kind",
     [
-        "not an MCAP file",
-        "cut off in a chunk",
-        "cut off in the summary",
-        "a chunk's data",
-        "a chunk's times",
-        "a chunk's declared size",
-        "a message index",
-        "an attachment",
-        "an attachment's length",
-        "a record of another kind",
-        "the summary",
-        "where the summary is",
-        "a chunk twice",
+        "not an MCAP file", "cut off in a chunk", "cut off in the summary", "a chunk's data", "a chunk's times",
+        "a chunk's declared size", "a message index", "an attachment", "an attachment's length",
+        "a record of another kind", "the summary", "where the summary is", "a chunk twice",
     ],
-)
+)  # fmt: skip
 def test_damage_is_found_by_name_and_what_is_whole_is_saved(chunked, tmp_path, kind):
     true = triples(chunked)
     damaged, errors = _damages(chunked)[kind]
@@ -360,13 +350,10 @@ def test_recovering_is_proposed_where_something_shows_that_it_is_a_log(what, tem
     path = tmp_path / "a.mcap"
     whole = template.read_bytes()
     content = {
-        "text": b"frame,x,y\n1,2,3\n",
-        "nothing": b"",
-        "a JPEG file": b"\xff\xd8\xff\xe0" + bytes(2000),
-        "no beginning": b"\0" * 8 + whole[8:],
-        "no end": whole[: len(whole) * 2 // 3],
+        "text": b"frame,x,y\n1,2,3\n", "nothing": b"", "a JPEG file": b"\xff\xd8\xff\xe0" + bytes(2000),
+        "no beginning": b"\0" * 8 + whole[8:], "no end": whole[: len(whole) * 2 // 3],
         "neither": b"\0" * 8 + whole[8 : len(whole) * 2 // 3],
-    }[what]
+    }[what]  # fmt: skip
     path.write_bytes(content)
     refused = call("info", path)
     assert refused.code == 1

@@ -175,15 +175,10 @@ def test_without_linking_nothing_is_cut_and_profiles_of_the_paper_write_no_decis
 
 def test_the_least_likely_tracks_come_first_and_sure_ones_not_at_all():
     rows = DECISIONS.rows(
-        kind=[1, 2, 2, 3, 3],
-        track_id=[1, 1, 2, -1, -1],
-        previous_id=[5, -1, -1, -1, -1],
-        source_id=[6, 5, 6, 7, 8],
-        probability=[0.1, 0.95, 0.6, 0.55, 0.9],
-        alternative_id=[-1] * 5,
-        duration_s=[0.4, 9.0, 8.0, 7.0, 6.0],
+        kind=[1, 2, 2, 3, 3], track_id=[1, 1, 2, -1, -1], previous_id=[5, -1, -1, -1, -1], source_id=[6, 5, 6, 7, 8],
+        probability=[0.1, 0.95, 0.6, 0.55, 0.9], alternative_id=[-1] * 5, duration_s=[0.4, 9.0, 8.0, 7.0, 6.0],
         frames=[0, 20, 19, 18, 17],
-    )
+    )  # fmt: skip
     found = find_doubtful_tracks([Frame(0, 0, rows)])
     assert [one.text("person") for one in found] == [
         "the tracker's 7 is left out: no person with 55\N{NO-BREAK SPACE}%, 7.0\N{NO-BREAK SPACE}s long",

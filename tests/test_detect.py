@@ -313,16 +313,10 @@ def test_a_camera_that_turns_slowly_is_refused(name):
 @pytest.mark.parametrize(
     ("shape", "max_pixels", "halved"),
     [
-        ((8, 8), 64, (8, 8)),
-        ((8, 8), 63, (4, 4)),
-        ((8, 8), 16, (4, 4)),
-        ((8, 8), 15, (2, 2)),
-        ((9, 7), 20, (4, 3)),
-        ((4, 100), 10, (2, 50)),
-        ((100, 3), 10, (100, 3)),
-        ((2, 2), 1, (2, 2)),
+        ((8, 8), 64, (8, 8)), ((8, 8), 63, (4, 4)), ((8, 8), 16, (4, 4)), ((8, 8), 15, (2, 2)), ((9, 7), 20, (4, 3)),
+        ((4, 100), 10, (2, 50)), ((100, 3), 10, (100, 3)), ((2, 2), 1, (2, 2)),
     ],
-)
+)  # fmt: skip
 def test_pictures_are_halved_until_they_are_small_enough_or_narrow(shape, max_pixels, halved):
     image, halvings = halve(np.zeros(shape, np.uint8), max_pixels)
     assert image.shape == halved == tuple(side >> halvings for side in shape)

@@ -99,16 +99,9 @@ def driven(xs_m: Sequence[float | None]) -> list[Frame]:
     for tick, x_m in enumerate(xs_m):
         name += tick > 0 and x_m is not None and xs_m[tick - 1] is None
         rows = TRACKS.rows(
-            track_id=[name],
-            x_m=[x_m or 0.0],
-            y_m=[0.0],
-            vx_m_per_s=[0.0],
-            vy_m_per_s=[0.0],
-            score=[0.8],
-            class_id=[3],
-            observed=[True],
-            source_id=[name],
-        )
+            track_id=[name], x_m=[x_m or 0.0], y_m=[0.0], vx_m_per_s=[0.0], vy_m_per_s=[0.0], score=[0.8],
+            class_id=[3], observed=[True], source_id=[name],
+        )  # fmt: skip
         out.append(Frame(ns(tick / 2.5), tick, rows if x_m is not None else TRACKS.empty()))
     return out
 
