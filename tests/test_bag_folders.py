@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -54,11 +55,8 @@ def test_files_of_a_folder_are_one_recording(folder):
     with collected() as warnings:
         bag = open_bag(folder)
     assert not warnings
-    assert [(one.topic, count) for one, count in bag.declared_counts.items()] == [
-        ("/talk", 2),
-        ("/talk", 3),
-        ("/other", 1),
-    ]
+    counts = [(one.topic, count) for one, count in bag.declared_counts.items()]
+    assert counts == [("/talk", 2), ("/talk", 3), ("/other", 1)]
     assert bag.connections == list(bag.declared_counts)
     first, second, other = bag.connections
     found = list(bag.messages(ReadingNotes()))
@@ -132,15 +130,12 @@ def test_one_file_has_what_metadata_beside_it_says_of_it(folder):
         assert (bag.bag.distro, bag.bag.packed, bag.bag.topics, bag.bag.text) == (distro, bool(distro), (), b"")
         assert bag.findings.lost == []
         bag.close()
-    assert (names_file(folder / "metadata.yaml", "z.db3"), names_file(folder / "metadata.yaml", "a.db3")) == (
-        True,
-        False,
-    )
-    assert (is_packed(folder / "metadata.yaml", "z.db3"), is_packed(folder / "metadata.yaml", "a.db3")) == (True, False)
-    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: [")
-    assert (names_file(folder / "metadata.yaml", "a"), is_packed(folder / "metadata.yaml", "a")) == (True, False)
-    (folder / "metadata.yaml").write_text("else: 1")
-    assert (names_file(folder / "metadata.yaml", "a"), is_packed(folder / "metadata.yaml", "a")) == (False, False)
+    path = folder / "metadata.yaml"
+    for name, is_its_own in (("z.db3", True), ("a.db3", False)):
+        assert names_file(path, name) == is_packed(path, name) == is_its_own
+    for text, is_named in (("rosbag2_bagfile_information: [", True), ("else: 1", False)):
+        path.write_text(text)
+        assert (names_file(path, "a"), is_packed(path, "a")) == (is_named, False)
 
 
 @pytest.mark.parametrize("kind", ["db3", "mcap"])
@@ -161,14 +156,10 @@ def test_messages_that_are_compressed_one_by_one_share_a_limit(tmp_path, monkeyp
     (tmp_path / "metadata.yaml").write_text(described(name, topics={"/talk": 3}, mode="MESSAGE"))
 
     def read(limit: int) -> list[int]:
-        monkeypatch.setattr(
-            decompression, "limit_of", lambda size: limit if size == (tmp_path / name).stat().st_size else 0
-        )
-        bag = open_bag(tmp_path)
-        try:
+        own = (tmp_path / name).stat().st_size
+        monkeypatch.setattr(decompression, "limit_of", lambda size: limit if size == own else 0)
+        with closing(open_bag(tmp_path)) as bag:
             return [len(message.payload) for _, message in bag.messages(ReadingNotes())]
-        finally:
-            bag.close()
 
     assert read(600) == sizes
     with pytest.raises(McaptrackError, match=f"{name}: the message at 2 ns can't be decompressed"):
@@ -198,14 +189,14 @@ def test_metadata_that_is_refused(folder, changed, said):
 
 def test_metadata_of_old_and_new_versions(folder):
     path = folder / "metadata.yaml"
-    text = (
-        path.read_text()
-        .replace("[a.db3, b.db3]", "[bag/a.db3, bag/b.db3]")
-        .replace("compression_mode: ''", "compression_mode: NONE")
-    )
-    path.write_text(
-        text.replace("offered_qos_profiles: 'q'", "offered_qos_profiles: [{depth: 3}], type_description_hash: R1")
-    )
+    text = path.read_text()
+    for old, new in (
+        ("[a.db3, b.db3]", "[bag/a.db3, bag/b.db3]"),
+        ("compression_mode: ''", "compression_mode: NONE"),
+        ("offered_qos_profiles: 'q'", "offered_qos_profiles: [{depth: 3}], type_description_hash: R1"),
+    ):
+        text = text.replace(old, new)
+    path.write_text(text)
     bag, names = read_metadata(path)
     assert names == ["a.db3", "b.db3"]
     assert (bag.distro, bag.packed, bag.text) == ("humble", False, path.read_bytes())

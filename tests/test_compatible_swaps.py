@@ -117,7 +117,7 @@ def test_who_meets_six_others_in_a_row_keeps_one_identity():
 def test_more_encounters_than_a_solver_should_get_at_once_are_decided_one_after_another(monkeypatch):
     met = [([1, 2], 0, 9, 4.0), ([2, 3], 5, 9, 5.0), ([3, 4], 10, 9, 4.0)]
     for most, wanted in ((3, [0, 2]), (2, [1])):
-        monkeypatch.setattr(identity_swaps, "_MOST", most)
+        monkeypatch.setattr(identity_swaps, "_COMPATIBLE_SWAPS_MOST", most)
         with collected() as said:
             assert chosen(met) == wanted
         assert len(said) == (most < 3)
