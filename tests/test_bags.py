@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import zstandard
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
@@ -25,7 +24,6 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.sources.ingest import IngestOptions, ingest
-from mcaptrack.sources.ingest.bags import rosbag2
 from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables
 from tests.bags import MOT, ROS1, ROS2, STRING1, T0, bag1, bag2, camera_bag, database
 from tests.commands import call
@@ -329,19 +327,6 @@ class TestRosbag2:
         assert first[2] == (STRING1, "", b"")
         assert second[2][1] == "ros2msg"
 
-    def test_what_a_killed_recorder_left_beside_its_database_is_read(self, tmp_path):
-        database(tmp_path / "a.db3", 3, [], [(1, "/a", STRING1, "cdr", "")])
-        db = sqlite3.connect(tmp_path / "a.db3", isolation_level=None)
-        db.execute("PRAGMA journal_mode=WAL")
-        db.execute("PRAGMA wal_autocheckpoint=0")
-        db.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (1, 5, x'00010000')")
-        (tmp_path / "left").mkdir()
-        for name in ("a.db3", "a.db3-wal"):
-            (tmp_path / "left" / name).write_bytes((tmp_path / name).read_bytes())
-        db.close()
-        make(tmp_path / "left" / "a.db3", tmp_path / "a.mcap")
-        assert recorded(tmp_path / "a.mcap") == [("/a", 5, 5, b"\0\1\0\0")]
-
     def test_messages_of_no_topic_are_missed(self, tmp_path):
         database(tmp_path / "a.db3", 3, [(1, 5, b"a"), (7, 6, b"b")], [(1, "/a", STRING1, "cdr", "")])
         report = make(tmp_path / "a.db3", tmp_path / "a.mcap")
@@ -526,15 +511,6 @@ def test_real_recordings_are_kept_whole(data, tmp_path):
         assert report.lost == []
         seen += 1
     assert seen >= 10
-
-
-@pytest.mark.parametrize(("left", "most"), [(1000, 2000), (2000, 1000)])
-def test_a_packed_message_is_within_what_is_left_and_within_the_limit_of_one(left, most, monkeypatch):
-    monkeypatch.setattr(rosbag2, "_MAX_MESSAGE_BYTES", most)
-    pack = zstandard.ZstdCompressor().compress
-    assert rosbag2._unpack_message(pack(bytes(1000)), Path("a"), 7, left) == bytes(1000)
-    with pytest.raises(McaptrackError, match="a: the message at 7 ns can't be decompressed: it says that it has 1001 "):
-        rosbag2._unpack_message(pack(bytes(1001)), Path("a"), 7, left)
 
 
 def test_a_database_may_run_nothing_of_its_own(tmp_path, monkeypatch):

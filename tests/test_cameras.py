@@ -148,24 +148,6 @@ def test_stages_do_not_replace_channels_of_other_stages(path):
     assert path.read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    ("stage", "below"),
-    [*((stage, "") for stage in STAGES), ("track", "/view/image"), ("retrack", "/view/scene")]
-    + [("retrack", f"/{suffix}") for suffix in ("online", "predictions", "decisions", "full")],
-)
-def test_stages_do_not_replace_recorded_channels(path, stage, below):
-    """This holds for all outputs and for their views."""
-    with log.read(path) as opened, log.extend(opened) as writer:
-        channel = writer.add_channel(f"/theirs{below}", ("", "", b""), "json", {})
-        writer.add_message(channel, 1, 0, b'{"mine": 1}')
-    outcome = call(stage, path, "--to", "/theirs")
-    with log.read(path) as opened:
-        assert [message.payload for message in opened.messages(f"/theirs{below}")] == [b'{"mine": 1}']
-    takes = {"", *(f"/{suffix}" for suffix in TRANSFORMS[stage].writes)} | ({"/full"} if stage == "retrack" else set())
-    if below in takes:
-        assert (outcome.code, "was recorded by others" in outcome.err) == (1, True), outcome.err
-
-
 def test_stages_do_not_replace_ingested_detections(template, tmp_path):
     rows = "".join(f"{n},-1,{10 + 2 * n},20,10,34,1,-1,-1,-1\n" for n in range(1, 30))
     (tmp_path / "det.txt").write_text(rows)

@@ -90,16 +90,6 @@ class TestCommands:
             "/camera/samples",
         ]
 
-    def test_info_as_json(self, finished):
-        data = json.loads(printed("info", finished, "--json")[0])
-        assert data["schema_version"] == 1
-        (result,) = data["results"]
-        channels = {channel["topic"]: channel for channel in result["channels"]}
-        assert channels["/camera/retracks"]["input"] == "/camera/samples"
-        assert channels["/camera/retracks"]["parameters"]["retracker"] == "likelihood"
-        assert not any(channel["stale"] for channel in result["channels"])
-        assert result["messages"] == sum(channel["messages"] for channel in result["channels"])
-
     def test_output_profile_and_mode_of_retrack(self, finished, tmp_path):
         before = finished.read_bytes()
         words = ("--profile", "paper", "--set", "sigma_m=2", "--mode", "offline")
