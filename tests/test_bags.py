@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
@@ -24,6 +25,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.sources.ingest import IngestOptions, ingest
+from mcaptrack.sources.ingest.bags import rosbag2
 from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables
 from tests.bags import MOT, ROS1, ROS2, STRING1, T0, bag1, bag2, camera_bag, database
 from tests.commands import call
@@ -511,6 +513,15 @@ def test_real_recordings_are_kept_whole(data, tmp_path):
         assert report.lost == []
         seen += 1
     assert seen >= 10
+
+
+@pytest.mark.parametrize(("left", "most"), [(1000, 2000), (2000, 1000)])
+def test_a_packed_message_is_within_what_is_left_and_within_the_limit_of_one(left, most, monkeypatch):
+    monkeypatch.setattr(rosbag2, "_MAX_MESSAGE_BYTES", most)
+    pack = zstandard.ZstdCompressor().compress
+    assert rosbag2._unpack_message(pack(bytes(1000)), Path("a"), 7, left) == bytes(1000)
+    with pytest.raises(McaptrackError, match="a: the message at 7 ns can't be decompressed: it says that it has 1001 "):
+        rosbag2._unpack_message(pack(bytes(1001)), Path("a"), 7, left)
 
 
 def test_a_database_may_run_nothing_of_its_own(tmp_path, monkeypatch):
