@@ -364,9 +364,3 @@ class TestLogs:
         for command in ("calibrate", "fuse"):
             told = call(command, path)
             assert (told.code, f"{path}: {topic}: {what}" in told.err) == (1, True)
-
-    def test_a_log_of_one_camera_is_refused(self, tmp_path: Path) -> None:
-        path = write_log(tmp_path / "one.mcap", CAMERAS[:1])
-        told = call("calibrate", path)
-        assert told.code == 1
-        assert "two cameras with detections and measured ground planes are compared" in told.err

@@ -193,14 +193,6 @@ def test_label_files_are_scored_by_class(separator, tmp_path):
     assert counts == {None: (2, 10, 0), "person": (1, 0, 0), "car": (1, 10, 0)}
 
 
-def test_classes_of_files_that_are_not_there_or_not_used_are_said(tmp_path):
-    truth = table(tmp_path, "t.csv", ["person", "car"])
-    with pytest.raises(McaptrackError, match=r"t\.csv has no class 'horse'; `classes=` takes person, car, or all"):
-        mcaptrack.evaluate(truth, truth=truth, classes="person,horse")
-    with pytest.raises(McaptrackError, match=r"k\.csv holds no boxes, only 10 dog"):
-        mcaptrack.evaluate(table(tmp_path, "k.csv", ["dog"]), truth=truth, classes="car")
-
-
 def test_frames_and_names_of_other_formats_are_scored_by_class(tmp_path):
     """COCO beside a table: their frames are compared, and their classes by name."""
     truth = table(tmp_path, "t.csv", ["person", "car"])

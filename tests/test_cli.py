@@ -270,11 +270,6 @@ class TestErrors:
         assert (code, err.count("\n")) == (1, 1)
         assert "add pictures with `mcaptrack ingest VIDEO --into labels.mcap`" in err
 
-    def test_control_characters_in_names_are_escaped(self, place):
-        code, _, err = call("info", "\x1b[2Jevil.mcap", folder=place)
-        assert code == 1
-        assert "\x1b" not in err
-
     def test_lost_data_exits_with_3(self, tmp_path):
         write_clip(tmp_path / "a.avi", frames=30, codec="mjpeg", pixels="yuvj420p", size=(320, 240))
         raw = (tmp_path / "a.avi").read_bytes()
