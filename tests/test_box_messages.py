@@ -16,8 +16,8 @@ from mcaptrack.sources.foreign.boxes_3d.box import Message3d
 from mcaptrack.sources.foreign.boxes_3d.recorded import recorded
 from tests.ros_messages import BAR, Ros
 from tests.space_logs import (
+    SEEN,
     START_NS,
-    Seen,
     covered,
     detection_3d_array,
     header,
@@ -29,10 +29,6 @@ from tests.space_logs import (
     scene_update_json,
 )
 
-#: Half a turn to the left of the x axis is y.
-SEEN = Seen(
-    np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]), np.array([4.0, 2.0, 1.5]), number=12
-)
 ENCODINGS = ("ros1", "cdr", "json")
 
 JSK = (

@@ -14,7 +14,7 @@ import pytest
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.labels import box_rows, delimited, json_boxes, yolo
 from mcaptrack.sources.ingest.labels.box_rows import fitted
-from mcaptrack.sources.ingest.labels.content import Labels, WantedClasses
+from mcaptrack.sources.ingest.labels.content import Labels
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline
 
@@ -540,13 +540,6 @@ def test_a_folder_of_labels_has_no_more_than_its_limits(tmp_path, monkeypatch):
 # Times
 
 
-def test_halves_of_nanoseconds_are_rounded_to_the_even_one():
-    """At 2048 pictures a second the third one is at 976562.5 ns, the seventh at 2929687.5 ns."""
-    times = Timeline.spaced(12, Fraction(2048), 0, "it").t_ns.tolist()
-    assert times[2::4] == [976562, 2929688, 4882812]
-    assert times[1::2] == [488281, 1464844, 2441406, 3417969, 4394531, 5371094]
-
-
 @pytest.mark.parametrize(
     ("seconds", "fps", "times", "words"),
     [
@@ -604,11 +597,3 @@ def test_times_of_labels_belong_to_the_nearest_picture_that_is_near(tmp_path):
     ):
         with pytest.raises(McaptrackError, match=re.escape(words)):
             placed(tmp_path, made, *times)
-
-
-def test_columns_7_and_8_of_motchallenge_are_score_and_class_but_for_mot15(tmp_path):
-    # In MOT15 column 8 is a position, and all boxes are of people.
-    for more, kind in (("", 1), (",0.75", 1), (",0.75,2", 2), (",0.75,2,-1", 2), (",0.75,2,-1,-1", 1)):
-        labels = read(tmp_path, f"1,-1,10,20,30,40{more}\n", name="det.txt", wanted=WantedClasses("all"))
-        np.testing.assert_equal(labels.score, [0.75 if more else np.nan])
-        assert labels.class_id.tolist() == [kind]

@@ -26,9 +26,8 @@ from mcaptrack.sources.foreign.boxes_3d.box import Box3d, Message3d
 from mcaptrack.sources.foreign.boxes_3d.recorded import recorded
 from tests.ros_messages import Ros
 from tests.space_logs import (
-    NAMES as CLASS_NAMES,
-)
-from tests.space_logs import (
+    NAMES,
+    SEEN,
     START_NS,
     WAYS,
     Robot,
@@ -68,7 +67,7 @@ def test_the_same_log_gives_the_same_detections_in_every_form(way, tmp_path):
     np.testing.assert_allclose(rows["score"], [row["score"] for row in wanted], atol=1e-6)
     assert found.frame_id == "map"
     if way == "detections of ros 1":
-        assert rows["class_id"].tolist() == [1 + CLASS_NAMES.index(row["class"]) for row in wanted]
+        assert rows["class_id"].tolist() == [1 + NAMES.index(row["class"]) for row in wanted]
         assert set(rows["source_id"].tolist()) == {-1}
         listed = ", ".join(map(str, sorted(set(rows["class_id"].tolist()))))
         words = "1 counts as people, and others move as objects of unknown class do"
@@ -151,11 +150,6 @@ _KIND = MessageType("foxglove.SceneUpdate", "protobuf", b"", "protobuf")
 
 def boxes_of(writer: Ros, message) -> Message3d:
     return boxes_3d_decoder(writer.kind)(writer.pack(message))
-
-
-SEEN = Seen(
-    np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]), np.array([4.0, 2.0, 1.5]), number=12
-)
 
 
 def test_markers_that_are_no_cubes_are_counted_and_lists_of_cubes_are_boxes():
