@@ -540,6 +540,13 @@ def test_a_folder_of_labels_has_no_more_than_its_limits(tmp_path, monkeypatch):
 # Times
 
 
+def test_halves_of_nanoseconds_are_rounded_to_the_even_one():
+    """At 2048 pictures a second the third one is at 976562.5 ns, the seventh at 2929687.5 ns."""
+    times = Timeline.spaced(12, Fraction(2048), 0, "it").t_ns.tolist()
+    assert times[2::4] == [976562, 2929688, 4882812]
+    assert times[1::2] == [488281, 1464844, 2441406, 3417969, 4394531, 5371094]
+
+
 @pytest.mark.parametrize(
     ("seconds", "fps", "times", "words"),
     [
