@@ -45,17 +45,10 @@ def bag1(path: Path, messages: int = 60, size: int = 40_000, compression: str | 
 
 QOS = [
     Qos(
-        QosHistory.KEEP_LAST,
-        10,
-        QosReliability.RELIABLE,
-        QosDurability.TRANSIENT_LOCAL,
-        QosTime(1, 2),
-        QosTime(3, 4),
-        QosLiveliness.AUTOMATIC,
-        QosTime(5, 6),
-        False,
+        QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, QosTime(1, 2),
+        QosTime(3, 4), QosLiveliness.AUTOMATIC, QosTime(5, 6), False,
     )
-]
+]  # fmt: skip
 
 
 def bag2(

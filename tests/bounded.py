@@ -52,13 +52,9 @@ def commands() -> Iterator[Commands]:
     environment = {k: v for k, v in os.environ.items() if not k.startswith("MCAPTRACK_")}
     environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     process = subprocess.Popen(
-        [sys.executable, "-m", "tests.bounded"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        env=environment,
-        cwd=Path(__file__).parent.parent,
-    )
+        [sys.executable, "-m", "tests.bounded"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        env=environment, cwd=Path(__file__).parent.parent,
+    )  # fmt: skip
     try:
         yield Commands(process)
     finally:

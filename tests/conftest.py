@@ -94,16 +94,9 @@ def footage(tmp_path_factory) -> demo.Footage:
 def _ingested(footage, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("ingested") / "walk.mcap"
     done(
-        "ingest",
-        footage.video,
-        "--ground-plane",
-        footage.ground_plane,
-        "--truth",
-        footage.ground_truth,
-        "-o",
-        path,
+        "ingest", footage.video, "--ground-plane", footage.ground_plane, "--truth", footage.ground_truth, "-o", path,
         "-q",
-    )
+    )  # fmt: skip
     return path
 
 

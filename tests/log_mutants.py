@@ -197,19 +197,10 @@ def descriptions(chance: random.Random, records: list[Record]) -> None:
 
 
 KINDS: dict[str, Callable[[random.Random, bytes], bytes]] = {
-    "bits": flipped,
-    "lengths": lengths,
-    "opcodes": opcodes,
-    "fields": fields,
-    "moved": moved,
-    "cut": cut,
-    "appended": appended,
-    "summaries": summaries,
-    "times": inside(times),
-    "payloads": inside(payloads),
-    "heads": inside(heads),
-    "descriptions": inside(descriptions),
-}
+    "bits": flipped, "lengths": lengths, "opcodes": opcodes, "fields": fields, "moved": moved, "cut": cut,
+    "appended": appended, "summaries": summaries, "times": inside(times), "payloads": inside(payloads),
+    "heads": inside(heads), "descriptions": inside(descriptions),
+}  # fmt: skip
 
 
 def mutant(seed: int, whole: bytes) -> tuple[str, bytes]:

@@ -61,14 +61,11 @@ def write_stock(path: Path, messages, **options) -> None:
 
 
 STOCK_OPTIONS = {
-    "zstd": {},
-    "lz4": {"compression": CompressionType.LZ4},
-    "plain": {"compression": CompressionType.NONE, "chunk_size": 64},
-    "no chunks": {"use_chunking": False},
+    "zstd": {}, "lz4": {"compression": CompressionType.LZ4},
+    "plain": {"compression": CompressionType.NONE, "chunk_size": 64}, "no chunks": {"use_chunking": False},
     "no repeated channels": {"repeat_channels": False, "repeat_schemas": False, "chunk_size": 64},
-    "no statistics": {"use_statistics": False},
-    "no message index": {"index_types": IndexType.CHUNK},
-}
+    "no statistics": {"use_statistics": False}, "no message index": {"index_types": IndexType.CHUNK},
+}  # fmt: skip
 
 
 SOME = [("a", 10, 1, b"x"), ("b", 30, 2, b"yy"), ("a", 20, 3, b"zzz" * 30), ("c", 5, 4, b""), ("b", 40, 5, b"w" * 200)]

@@ -28,15 +28,11 @@ class Handler(BaseHTTPRequestHandler):
             self.give(self.path)
             return
         status, data, length = {
-            "/network.onnx": (200, DATA, len(DATA)),
-            "/other.onnx": (200, DATA[:-1] + b"x", len(DATA)),
-            "/short.onnx": (200, DATA[:100], 100),
-            "/broken.onnx": (200, DATA[:100], len(DATA)),
-            "/long.onnx": (200, DATA + bytes(10**6), len(DATA) + 10**6),
-            "/moved.onnx": (302, b"", 0),
-            "/page.onnx": (200, b"<html>", 6),
-            "/many.onnx": (200, gzip.compress(DATA[:4096]), None),
-        }.get(self.path, (404, b"no such file", 12))
+            "/network.onnx": (200, DATA, len(DATA)), "/other.onnx": (200, DATA[:-1] + b"x", len(DATA)),
+            "/short.onnx": (200, DATA[:100], 100), "/broken.onnx": (200, DATA[:100], len(DATA)),
+            "/long.onnx": (200, DATA + bytes(10**6), len(DATA) + 10**6), "/moved.onnx": (302, b"", 0),
+            "/page.onnx": (200, b"<html>", 6), "/many.onnx": (200, gzip.compress(DATA[:4096]), None),
+        }.get(self.path, (404, b"no such file", 12))  # fmt: skip
         self.send_response(status)
         if length is None:
             self.send_header("Content-Encoding", "gzip")
@@ -81,15 +77,9 @@ def stocked(monkeypatch: Any, folder: Path, *urls: str) -> Model:
         monkeypatch.callback = server.shutdown
         urls = (f"{address}/network.onnx",)
     model = Model(
-        name=NAME,
-        urls=urls,
-        sha256=hashlib.sha256(DATA).hexdigest(),
-        size_bytes=len(DATA),
-        licence="Apache-2.0",
-        source="https://example.org",
-        trained_on="blue blocks",
-        good_for="tests",
-    )
+        name=NAME, urls=urls, sha256=hashlib.sha256(DATA).hexdigest(), size_bytes=len(DATA), licence="Apache-2.0",
+        source="https://example.org", trained_on="blue blocks", good_for="tests",
+    )  # fmt: skip
     (folder / "known.onnx").write_bytes(DATA)
     monkeypatch.setattr(session, "CATALOGUE", MappingProxyType({NAME: model}))
     monkeypatch.setenv("MCAPTRACK_MODELS", str(folder / "models"))

@@ -229,13 +229,10 @@ def detector(
         "axis": tensor([1], "axis", INT64),
     }
     nodes += [
-        node("Reshape", ["c", "s"], ["scores"]),
-        node("Cast", ["orig_target_sizes"], ["wide"], to=FLOAT),
-        node("Concat", ["wide", "wide"], ["twice"], axis=1),
-        node("Unsqueeze", ["twice", "axis"], ["factors"]),
-        node("Mul", ["corners", "factors"], ["boxes"]),
-        node("Identity", ["kinds"], ["labels"]),
-    ]
+        node("Reshape", ["c", "s"], ["scores"]), node("Cast", ["orig_target_sizes"], ["wide"], to=FLOAT),
+        node("Concat", ["wide", "wide"], ["twice"], axis=1), node("Unsqueeze", ["twice", "axis"], ["factors"]),
+        node("Mul", ["corners", "factors"], ["boxes"]), node("Identity", ["kinds"], ["labels"]),
+    ]  # fmt: skip
     given = [value("x", shape), value("orig_target_sizes", [1, 2], INT64)]
     return model(nodes, given, [value("labels", None, INT64), value("boxes", None), value("scores", None)], constants)
 

@@ -44,20 +44,14 @@ class Store:
         host, port = self._server.get_host_and_port()
         self.endpoint = f"http://{host}:{port}"
         self.environment = {
-            "AWS_ENDPOINT_URL": self.endpoint,
-            "AWS_ACCESS_KEY_ID": "key-of-the-tests",
-            "AWS_SECRET_ACCESS_KEY": "secret-of-the-tests",
-            "AWS_REGION": "us-east-1",
-            "AWS_SHARED_CREDENTIALS_FILE": "/nowhere",
-            "AWS_CONFIG_FILE": "/nowhere",
-        }
+            "AWS_ENDPOINT_URL": self.endpoint, "AWS_ACCESS_KEY_ID": "key-of-the-tests",
+            "AWS_SECRET_ACCESS_KEY": "secret-of-the-tests", "AWS_REGION": "us-east-1",
+            "AWS_SHARED_CREDENTIALS_FILE": "/nowhere", "AWS_CONFIG_FILE": "/nowhere",
+        }  # fmt: skip
         self.client: Any = boto3.client(
-            "s3",
-            endpoint_url=self.endpoint,
-            region_name="us-east-1",
-            aws_access_key_id="a",
+            "s3", endpoint_url=self.endpoint, region_name="us-east-1", aws_access_key_id="a",
             aws_secret_access_key="b",
-        )
+        )  # fmt: skip
         self.client.create_bucket(Bucket=BUCKET)
         self.requests: list[Request] = []
         self.fault: Callable[[Request], str] = lambda _: ""

@@ -104,12 +104,12 @@ def test_pictures_at_given_times_are_those_shown_at_these_times(tmp_path):
             opened.frames(times=[-5])
 
 
-@pytest.mark.parametrize("times", [[0.5], ["a"], [[0, 1]], 5, [np.nan], [2**64]])
-def test_times_of_pictures_are_whole_nanoseconds(tmp_path, times):
+def test_times_of_pictures_are_whole_nanoseconds(tmp_path):
     path, _ = clip_log(tmp_path)
     with mcaptrack.open(path) as opened:
-        with pytest.raises(McaptrackError, match=r"`times=` needs .*nanoseconds"):
-            opened.frames(times=times)
+        for times in ([0.5], ["a"], [[0, 1]], 5, [np.nan], [2**64]):
+            with pytest.raises(McaptrackError, match=r"`times=` needs .*nanoseconds"):
+                opened.frames(times=times)
         with pytest.raises(McaptrackError, match="`colour=` can't be 'gray'; did you mean grey"):
             opened.frames(colour="gray")
         assert [frame.index for frame in opened.frames(times=np.array([0, 10], "datetime64[s]"))] == [0, 29]
@@ -232,12 +232,6 @@ def test_rows_of_a_log_that_has_changed_are_refused(tmp_path):
             opened.fetch({"t_ns": 5})
 
 
-def test_a_file_that_is_not_a_log_is_refused_in_one_line(tmp_path):
-    (tmp_path / "a.mcap").write_bytes(b"no log")
-    with pytest.raises(mcaptrack.McaptrackError, match="can't be read as an MCAP file"):
-        mcaptrack.open(tmp_path / "a.mcap")
-
-
 def test_the_document_runs_from_top_to_bottom(tmp_path, monkeypatch):
     footage, path = draw(small_scene(12.0), tmp_path / "mcaptrack-demo"), tmp_path / "log.mcap"
     ingest.ingest(
@@ -282,19 +276,10 @@ def test_results_are_shown_in_a_line(tmp_path):
     page = ReportResult(Path("page.html"), 12, {"many": [0] * 1000}, ())
     assert repr(page) == f"ReportResult({str(page.page)!r}, 12 bytes)"
     row = {
-        "sequence": "<a>",
-        "tracks": "/camera/tracks",
-        "similarity": "iou",
-        "gate": 0.5,
-        "HOTA": 0.5,
-        "MOTA": -0.25,
+        "sequence": "<a>", "tracks": "/camera/tracks", "similarity": "iou", "gate": 0.5, "HOTA": 0.5, "MOTA": -0.25,
         "IDF1": 1,
-    }
+    }  # fmt: skip
     scores = Scores((SimpleNamespace(to_json=lambda: row),), (), ())  # type: ignore[arg-type]
     assert repr(scores) == "Scores(1 results; `rows` returns them)"
-    shown = [
-        "".join(
-            f"<td>{cell}</td>" for cell in ("&lt;a&gt;", "/camera/tracks", "iou", 0.5, "0.5000", "-0.2500", "1.0000")
-        )
-    ]
-    assert re.findall(r"<tr>(<td>.*?)</tr>", scores._repr_html_()) == shown
+    shown = ["&lt;a&gt;", "/camera/tracks", "iou", "0.5", "0.5000", "-0.2500", "1.0000"]
+    assert re.findall(r"<td>(.*?)</td>", scores._repr_html_()) == shown

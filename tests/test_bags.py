@@ -17,18 +17,20 @@ from mcap.writer import Writer as McapWriter
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag1 import Writer as Writer1
-from typer.testing import CliRunner
 
 from mcaptrack import log
-from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import collected
 from mcaptrack.schema import GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.sources.ingest import IngestOptions, ingest
-from mcaptrack.sources.ingest.bags import rosbag2
+from mcaptrack.sources.ingest.bags import decompression, rosbag2
+from mcaptrack.sources.ingest.bags.metadata_yaml import is_packed, names_file, read_metadata
+from mcaptrack.sources.ingest.bags.recording import ReadingNotes
+from mcaptrack.sources.ingest.bags.rosbag2 import open_bag, open_files
 from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables
-from tests.bags import MOT, ROS1, ROS2, STRING1, T0, bag1, bag2, camera_bag, database
-from tests.commands import call
+from tests.bags import MOT, ROS1, ROS2, STRING1, T0, bag1, bag2, camera_bag, database, plain
+from tests.commands import call, done
 from tests.worlds import write_clip
 
 
@@ -183,21 +185,18 @@ class TestRos1:
         make(tmp_path / "a.bag", tmp_path / "a.mcap")
         assert channels(tmp_path / "a.mcap")[0][2][2].decode() == "string x # 20 \u00b0\u00b0C"
 
-    @pytest.mark.parametrize(
-        ("data", "words"),
-        [
+    def test_what_is_no_bag_is_refused_in_a_line(self, tmp_path):
+        for data, words in (
             (b"", "is empty"),
             (b"#ROSBAG V1.2\nwhatever", "of version 1.2; 2.0 is read"),
             (b"#ROSBAG V2.0\n", "a record is cut off"),
             (b"#ROSBAG V2.0\n" + b"\xff" * 5000, "a record is cut off or invalid"),
             (b"hello", "does not begin as one does"),
-        ],
-    )
-    def test_what_is_no_bag_is_refused_in_a_line(self, tmp_path, data, words):
-        (tmp_path / "a.bag").write_bytes(data)
-        with pytest.raises(McaptrackError, match=words):
-            make(tmp_path / "a.bag", tmp_path / "a.mcap")
-        assert not (tmp_path / "a.mcap").exists()
+        ):
+            (tmp_path / "a.bag").write_bytes(data)
+            with pytest.raises(McaptrackError, match=words):
+                make(tmp_path / "a.bag", tmp_path / "a.mcap")
+            assert not (tmp_path / "a.mcap").exists()
 
     def test_whatever_is_done_to_a_bag_it_is_read_or_refused(self, tmp_path):
         said = set(bag1(tmp_path / "a.bag", 12, 500))
@@ -233,10 +232,7 @@ class TestRosbag2:
         assert report.messages == {"/talk": 30, "/image": 10, "/silent": 0}
         header, _ = summary(tmp_path / "a.mcap")
         assert header.profile == "ros2"
-        kept = {
-            topic: (encoding, schema, metadata)
-            for topic, encoding, schema, metadata, _ in channels(tmp_path / "a.mcap")
-        }
+        kept = {topic: about for topic, *about, _ in channels(tmp_path / "a.mcap")}
         encoding, schema, _ = kept["/image"]
         definition = ROS2.generate_msgdef("sensor_msgs/msg/CompressedImage", ros_version=2)[0]
         assert (encoding, schema[:2]) == ("cdr", ("sensor_msgs/msg/CompressedImage", "ros2msg"))
@@ -279,11 +275,8 @@ class TestRosbag2:
             (tmp_path / "bag" / "metadata.yaml").write_text("\n".join(text) + "\n")
         report = make(tmp_path / "bag", tmp_path / "a.mcap")
         assert recorded(tmp_path / "a.mcap") == sorted(said)
-        assert [(topic, count) for topic, *_, count in channels(tmp_path / "a.mcap")] == [
-            ("/talk", 330),
-            ("/image", 110),
-            ("/silent", 0),
-        ]
+        counts = {topic: count for topic, *_, count in channels(tmp_path / "a.mcap")}
+        assert [*counts.items()] == [("/talk", 330), ("/image", 110), ("/silent", 0)]
         assert report.lost == []
         (tmp_path / "bag" / names[5]).unlink()
         if with_metadata:
@@ -300,12 +293,8 @@ class TestRosbag2:
         report = make(tmp_path / "a.db3", tmp_path / "a.mcap")
         assert recorded(tmp_path / "a.mcap") == sorted(("abca"[key - 1], t, t, data) for key, t, data in messages)
         found = channels(tmp_path / "a.mcap")
-        assert [(channel[0], channel[2][0], channel[4]) for channel in found] == [
-            ("a", STRING1, 3),
-            ("b", types[1], 2),
-            ("c", types[2], 2),
-            ("a", STRING1, 2),
-        ]
+        wanted = [("a", STRING1, 3), ("b", types[1], 2), ("c", types[2], 2), ("a", STRING1, 2)]
+        assert [(channel[0], channel[2][0], channel[4]) for channel in found] == wanted
         assert found[1][2][1] == "ros2msg"
         assert b"MSG: std_msgs/Header" in found[1][2][2]
         assert found[2][2] == ("robot_msgs/msg/Secret", "", b"")
@@ -342,40 +331,16 @@ class TestRosbag2:
         assert first[2] == (STRING1, "", b"")
         assert second[2][1] == "ros2msg"
 
-    def test_what_a_killed_recorder_left_beside_its_database_is_read(self, tmp_path):
-        database(tmp_path / "a.db3", 3, [], [(1, "/a", STRING1, "cdr", "")])
-        db = sqlite3.connect(tmp_path / "a.db3", isolation_level=None)
-        db.execute("PRAGMA journal_mode=WAL")
-        db.execute("PRAGMA wal_autocheckpoint=0")
-        db.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (1, 5, x'00010000')")
-        (tmp_path / "left").mkdir()
-        for name in ("a.db3", "a.db3-wal"):
-            (tmp_path / "left" / name).write_bytes((tmp_path / name).read_bytes())
-        db.close()
-        make(tmp_path / "left" / "a.db3", tmp_path / "a.mcap")
-        assert recorded(tmp_path / "a.mcap") == [("/a", 5, 5, b"\0\1\0\0")]
-
     def test_messages_of_no_topic_are_missed(self, tmp_path):
         database(tmp_path / "a.db3", 3, [(1, 5, b"a"), (7, 6, b"b")], [(1, "/a", STRING1, "cdr", "")])
         report = make(tmp_path / "a.db3", tmp_path / "a.mcap")
         assert recorded(tmp_path / "a.mcap") == [("/a", 5, 5, b"a")]
         assert "1 messages of topic 7, which is not described" in report.lost[0]
 
-    @pytest.mark.parametrize("storage", ["SQLITE3", "MCAP"])
-    def test_messages_that_metadata_counts_and_the_bag_lacks_are_reported(self, tmp_path, storage):
-        bag2(tmp_path / "bag", storage)
-        text = (tmp_path / "bag" / "metadata.yaml").read_text()
-        (tmp_path / "bag" / "metadata.yaml").write_text(text.replace("message_count: 30", "message_count: 33"))
-        report = make(tmp_path / "bag", tmp_path / "a.mcap")
-        assert report.lost == [f"{tmp_path / 'bag'}: metadata.yaml counts 33 messages of /talk, and 30 are there"]
-
     def test_faults_are_lines(self, tmp_path):
         faults = {
-            "a.db3": b"SQLite format 3\0" + bytes(500),
-            "b.db3": b"x",
-            "c.mcap": b"\x89MCAP0\r\nxx",
-            "d.mcap": b"",
-        }
+            "a.db3": b"SQLite format 3\0" + bytes(500), "b.db3": b"x", "c.mcap": b"\x89MCAP0\r\nxx", "d.mcap": b"",
+        }  # fmt: skip
         for name, data in faults.items():
             (tmp_path / name).write_bytes(data)
             with pytest.raises(McaptrackError, match=rf"{name} (is|can't)[^\n]*$"):
@@ -383,10 +348,6 @@ class TestRosbag2:
         sqlite3.connect(tmp_path / "e.db3").execute("CREATE TABLE cats(name)").connection.close()
         with pytest.raises(McaptrackError, match="is a database, but none of rosbag2"):
             make(tmp_path / "e.db3", tmp_path / "out.mcap")
-        (tmp_path / "f").mkdir()
-        (tmp_path / "f" / "metadata.yaml").write_text("rosbag2_bagfile_information: [1, 2]")
-        with pytest.raises(McaptrackError, match=r"metadata\.yaml is not the metadata of a rosbag2 bag"):
-            make(tmp_path / "f", tmp_path / "out.mcap")
         (tmp_path / "g").mkdir()
         for name in ("one.mcap", "two.mcap"):
             (tmp_path / "g" / name).write_bytes(b"")
@@ -429,8 +390,7 @@ class TestBesideLabels:
     def test_run_finds_people_in_the_pictures_of_a_bag(self, tmp_path, files):
         camera_bag(tmp_path / "a.bag", "/robot/image")
         make(tmp_path / "a.bag", tmp_path / "a.mcap", **files)
-        result = CliRunner().invoke(app, ["run", str(tmp_path / "a.mcap"), "-q"])
-        assert result.exit_code == 0, result.output
+        done("run", tmp_path / "a.mcap", "-q")
         with log.read(tmp_path / "a.mcap") as opened:
             assert opened.channel("/robot/detections").messages == 30
             assert opened.channel("/robot/truth").messages == 30
@@ -449,22 +409,13 @@ class TestBesideLabels:
 
 
 class TestInto:
-    def test_a_bag_is_added_to_a_log_and_replaces_no_channel_of_it(self, tmp_path):
+    def test_a_bag_is_added_to_a_log(self, tmp_path):
         said = bag1(tmp_path / "a.bag", 10, 100)
         camera_bag(tmp_path / "b.bag", "/robot/image", frames=3)
         make(tmp_path / "b.bag", tmp_path / "b.mcap")
         other = recorded(tmp_path / "b.mcap")
-        words = ["ingest", str(tmp_path / "a.bag"), "--into", str(tmp_path / "b.mcap")]
-        assert CliRunner().invoke(app, words).exit_code == 0
+        assert call("ingest", "a.bag", "--into", "b.mcap", folder=tmp_path).code == 0
         assert recorded(tmp_path / "b.mcap") == sorted(said + other)
-        for force in ([], ["--force"]):
-            result = CliRunner().invoke(app, [*words, *force])
-            assert result.exit_code == 1
-            assert (
-                "which other software recorded (std_msgs/String) and which is never replaced; write it to a separate log with -o"
-                in result.stderr
-            )
-            assert recorded(tmp_path / "b.mcap") == sorted(said + other)
 
     @pytest.mark.parametrize("chunks", [True, False])
     def test_an_mcap_file_is_added_with_all_that_is_in_it(self, tmp_path, chunks):
@@ -484,28 +435,21 @@ class TestInto:
         assert report.messages == {"/a": 5}
         with (tmp_path / "b.mcap").open("rb") as stream:
             reader = make_reader(stream)
-            found = [
-                (m.log_time, m.publish_time, m.sequence, c.metadata) for _, c, m in reader.iter_messages(topics=["/a"])
-            ]
-            assert found == [(10 + number, 3, 90 + number, {"k": "v"}) for number in range(5)]
+            found = [(c.metadata, m.log_time, m.publish_time, m.sequence) for _, c, m in reader.iter_messages(["/a"])]
+            assert found == [({"k": "v"}, 10 + number, 3, 90 + number) for number in range(5)]
             assert ("m", {"a": "b"}) in [(m.name, m.metadata) for m in reader.iter_metadata()]
-            assert (1, 2, "file", b"hello") in [
-                (a.create_time, a.log_time, a.name, a.data) for a in reader.iter_attachments()
-            ]
+            attached = [(a.create_time, a.log_time, a.name, a.data) for a in reader.iter_attachments()]
+            assert (1, 2, "file", b"hello") in attached
         with log.read(tmp_path / "b.mcap") as opened, pytest.raises(McaptrackError, match="can't be added to itself"):
             ingest(tmp_path / "b.mcap", tmp_path / "x.mcap", IngestOptions(), into=opened)
 
 
-@pytest.mark.parametrize(
-    ("option", "value"), [("--fps", "10"), ("--start-time", "5"), ("--image-format", "png"), ("--as", "truth")]
-)
-def test_what_makes_no_sense_for_a_log_is_refused_in_a_line(tmp_path, option, value):
+def test_what_makes_no_sense_for_a_log_is_refused_in_a_line(tmp_path):
     bag1(tmp_path / "a.bag", 5, 100)
-    result = CliRunner().invoke(app, ["ingest", str(tmp_path / "a.bag"), "-o", str(tmp_path / "a.mcap"), option, value])
-    assert result.exit_code == 1
-    assert f"leave {option} out" in result.stderr
-    assert result.stderr.count("\n") == 1
-    assert not (tmp_path / "a.mcap").exists()
+    for option, value in (("--fps", "10"), ("--start-time", "5"), ("--image-format", "png"), ("--as", "truth")):
+        code, _, err = call("ingest", "a.bag", option, value, folder=tmp_path)
+        assert (code, err.count("\n"), f"leave {option} out" in err) == (1, 1, True)
+        assert not (tmp_path / "a.mcap").exists()
 
 
 def test_a_camera_is_named_where_something_is_written_below_it(tmp_path):
@@ -531,19 +475,12 @@ def test_results_beside_a_recording_are_left_out_and_that_is_said(tmp_path):
     assert len(recorded(tmp_path / "b.mcap")) == len(recorded(tmp_path / "a.mcap"))
 
 
-def test_a_cut_bag_exits_with_3(tmp_path):
-    bag1(tmp_path / "a.bag", 10, 1000)
-    data = (tmp_path / "a.bag").read_bytes()
-    (tmp_path / "a.bag").write_bytes(data[:-300])
-    result = CliRunner().invoke(app, ["ingest", str(tmp_path / "a.bag"), "-o", str(tmp_path / "a.mcap")])
-    assert result.exit_code == 3
-    assert "lost: " in result.stderr
-
-
-def test_one_cut_bag_of_several_is_enough_for_3(tmp_path):
+def test_a_cut_bag_exits_with_3_alone_and_among_others(tmp_path):
     for name in ("a.bag", "b.bag"):
         bag1(tmp_path / name, 10, 1000)
     (tmp_path / "a.bag").write_bytes((tmp_path / "a.bag").read_bytes()[:-300])
+    alone = call("ingest", "a.bag", folder=tmp_path)
+    assert (alone.code, "lost: " in alone.err) == (3, True)
     assert call("ingest", "b.bag", folder=tmp_path).code == 0
     assert call("ingest", "a.bag", "b.bag", "--force", folder=tmp_path).code == 3
 
@@ -600,3 +537,172 @@ def test_a_database_may_run_nothing_of_its_own(tmp_path, monkeypatch):
     with closing(SqliteTables(tmp_path / "a.db3", ["topics"])) as tables:
         assert tables.count("topics") == 0
     assert told == {1010: True, 1003: False, 1015: False}
+
+
+# Folders of rosbag2, laid out by hand: which files are one recording, what each holds, and what is missing
+
+
+TALK = (1, "/talk", "std_msgs/msg/String", "cdr", "qos")
+SAME = (2, *TALK[1:])
+OTHER = (5, "/other", "std_msgs/msg/String", "cdr", "qos")
+CDR = b"\x00\x01\x00\x00\x02\x00\x00\x00a\x00"
+
+
+def described(*files: str, topics: dict[str, int] | None = None, mode: str = "") -> str:
+    """A metadata.yaml that names these files, and the number of messages of topics."""
+    lines = ["rosbag2_bagfile_information:", "  version: 5", f"  relative_file_paths: [{', '.join(files)}]"]
+    lines += [f"  compression_mode: '{mode}'", f"  compression_format: '{'zstd' if mode else ''}'"]
+    lines += ["  ros_distro: humble", "  topics_with_message_count:"] if topics else ["  topics_with_message_count: []"]
+    for name, count in (topics or {}).items():
+        about = f"name: {name}, type: std_msgs/msg/String, serialization_format: cdr, offered_qos_profiles: 'q'"
+        lines.append(f"    - {{topic_metadata: {{{about}}}, message_count: {count}}}")
+    return "\n".join(lines) + "\n"
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """Two databases, each with two topics of one name."""
+    database(tmp_path / "a.db3", 3, [(1, 10, CDR), (2, 20, CDR), (1, 30, CDR)], [TALK, SAME])
+    database(tmp_path / "b.db3", 3, [(2, 40, CDR), (2, 50, CDR), (5, 60, CDR)], [TALK, SAME, OTHER])
+    (tmp_path / "metadata.yaml").write_text(described("a.db3", "b.db3", topics={"/talk": 5, "/other": 1}))
+    return tmp_path
+
+
+def refused(folder: Path, said: str) -> None:
+    with pytest.raises(McaptrackError) as error:
+        open_bag(folder)
+    assert said in str(error.value)
+    assert len(str(error.value).splitlines()) == 1
+
+
+def test_files_of_a_folder_are_one_recording(folder):
+    with collected() as warnings:
+        bag = open_bag(folder)
+    assert not warnings
+    counts = [(one.topic, count) for one, count in bag.declared_counts.items()]
+    assert counts == [("/talk", 2), ("/talk", 3), ("/other", 1)]
+    assert bag.connections == list(bag.declared_counts)
+    first, second, other = bag.connections
+    found = list(bag.messages(ReadingNotes()))
+    assert [(known, message.t_ns, message.publish_ns) for known, message in found] == [
+        (first, 10, 10), (second, 20, 20), (first, 30, 30), (second, 40, 40), (second, 50, 50), (other, 60, 60),
+    ]  # fmt: skip
+    assert [message.sequence for _, message in found] == [0, 0, 1, 1, 2, 0]
+    assert bag.findings.lost == []
+    (note,) = bag.findings.notes
+    assert note.startswith(f"{folder} does not say what std_msgs/msg/String is; its definition is that of ")
+    bag.close()
+
+
+def test_what_metadata_counts_and_the_files_lack(folder):
+    counts = {"/talk": 6, "/other": 1, "/gone": 2, "/silent": 0}
+    (folder / "metadata.yaml").write_text(described("a.db3", "b.db3", topics=counts))
+    bag = open_bag(folder)
+    assert bag.findings.lost == [
+        f"{folder}: metadata.yaml counts 6 messages of /talk, and 5 are there",
+        f"{folder}: metadata.yaml counts 2 messages of /gone, and 0 are there",
+    ]
+    alone = "(std_msgs/msg/String) is in metadata.yaml alone; its channel has no schema"
+    assert [note for note in bag.findings.notes if alone in note] == [f"/gone {alone}", f"/silent {alone}"]
+    made = {one.topic: (one.schema, one.metadata, count) for one, count in bag.declared_counts.items()}
+    assert made["/gone"] == (("std_msgs/msg/String", "", b""), {"offered_qos_profiles": "q", "topic_type_hash": ""}, 0)
+    bag.close()
+
+
+def test_which_files_are_a_recording(folder):
+    whole = (folder / "metadata.yaml").read_text()
+    (folder / "metadata.yaml").write_text("bag: 1")
+    refused(folder, "is not the metadata of a rosbag2 bag")
+    (folder / "metadata.yaml").write_text(described("a.db3", "d.db3", "e.db3"))
+    refused(folder, f"names {folder / 'd.db3'}, which does not exist; a part of the bag is missing")
+    plain(folder / "f.mcap", "ros2")
+    (folder / "metadata.yaml").write_text(described("a.db3", "f.mcap"))
+    refused(folder, f"{folder} holds both MCAP files and databases; one bag is made of either")
+    (folder / "g.db3").write_bytes(b"no database")
+    (folder / "metadata.yaml").write_text(described("a.db3", "f.mcap", "g.db3"))
+    refused(folder, f"{folder / 'g.db3'} is neither an MCAP file nor a rosbag2 database; it may be damaged")
+    (folder / "metadata.yaml").write_text(whole)
+    (folder / "f.results.mcap").write_bytes(b"")
+    with collected() as warnings:
+        open_bag(folder).close()
+    assert [one.message for one in warnings] == [
+        f"{folder / name} is not named in metadata.yaml; it is left out"
+        for name in ("f.mcap", "f.results.mcap", "g.db3")
+    ]
+
+
+def test_a_compressed_file_is_found_without_its_ending(folder):
+    whole = (folder / "b.db3").read_bytes()
+    (folder / "b.db3.zstd").write_bytes(zstandard.compress(whole))
+    (folder / "b.db3").unlink()
+    bag = open_bag(folder)
+    assert [message.t_ns for _, message in bag.messages(ReadingNotes())] == [10, 20, 30, 40, 50, 60]
+    assert [path.name for path in bag.paths] == ["a.db3", "b.db3"]
+    bag.close()
+    assert not bag.paths[1].exists()  # the decompressed copy
+    (folder / "b.db3.zstd").unlink()
+    refused(folder, f"names {folder / 'b.db3'}, which does not exist")
+
+
+def test_one_file_has_what_metadata_beside_it_says_of_it(folder):
+    for name, distro in (("a.db3", "humble"), ("z.db3", "")):
+        (folder / "metadata.yaml").write_text(described(name, topics={"/talk": 9}, mode="message"))
+        bag = open_files([folder / "a.db3"], folder / "a.db3")
+        assert (bag.bag.distro, bag.bag.packed, bag.bag.topics, bag.bag.text) == (distro, bool(distro), (), b"")
+        assert bag.findings.lost == []
+        bag.close()
+    path = folder / "metadata.yaml"
+    for name, is_its_own in (("z.db3", True), ("a.db3", False)):
+        assert names_file(path, name) == is_packed(path, name) == is_its_own
+    for text, is_named in (("rosbag2_bagfile_information: [", True), ("else: 1", False)):
+        path.write_text(text)
+        assert (names_file(path, "a"), is_packed(path, "a")) == (is_named, False)
+
+
+@pytest.mark.parametrize("kind", ["db3", "mcap"])
+def test_messages_that_are_compressed_one_by_one_share_a_limit(tmp_path, monkeypatch, kind):
+    sizes = [300, 200, 100]
+    packed = [zstandard.compress(bytes(size)) for size in sizes]
+    name = f"a.{kind}"
+    if kind == "db3":
+        database(tmp_path / name, 3, [(1, n, data) for n, data in enumerate(packed)], [TALK])
+    else:
+        with (tmp_path / name).open("wb") as stream:
+            writer = McapWriter(stream)
+            writer.start("ros2", "robot")
+            number = writer.register_channel("/talk", "cdr", 0)
+            for n, data in enumerate(packed):
+                writer.add_message(number, n, data, n)
+            writer.finish()
+    (tmp_path / "metadata.yaml").write_text(described(name, topics={"/talk": 3}, mode="MESSAGE"))
+
+    def read(limit: int) -> list[int]:
+        own = (tmp_path / name).stat().st_size
+        monkeypatch.setattr(decompression, "limit_of", lambda size: limit if size == own else 0)
+        with closing(open_bag(tmp_path)) as bag:
+            return [len(message.payload) for _, message in bag.messages(ReadingNotes())]
+
+    assert read(600) == sizes
+    with pytest.raises(McaptrackError, match=f"{name}: the message at 2 ns can't be decompressed"):
+        read(599)
+    (tmp_path / "metadata.yaml").write_text(described(name, topics={"/talk": 3}))
+    if kind == "mcap":
+        assert read(0) == [len(data) for data in packed]
+
+
+def test_metadata_of_old_and_new_versions(folder):
+    path = folder / "metadata.yaml"
+    text = path.read_text()
+    for old, new in (
+        ("[a.db3, b.db3]", "[bag/a.db3, bag/b.db3]"),
+        ("compression_mode: ''", "compression_mode: NONE"),
+        ("offered_qos_profiles: 'q'", "offered_qos_profiles: [{depth: 3}], type_description_hash: R1"),
+    ):
+        text = text.replace(old, new)
+    path.write_text(text)
+    bag, names = read_metadata(path)
+    assert names == ["a.db3", "b.db3"]
+    assert (bag.distro, bag.packed, bag.text) == ("humble", False, path.read_bytes())
+    ((name, kind, encoding, qos, digest, count), _) = bag.topics
+    assert (name, kind, encoding, digest, count) == ("/talk", "std_msgs/msg/String", "cdr", "R1", 5)
+    assert "depth: 3" in qos

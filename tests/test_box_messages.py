@@ -16,8 +16,8 @@ from mcaptrack.sources.foreign.boxes_3d.box import Message3d
 from mcaptrack.sources.foreign.boxes_3d.recorded import recorded
 from tests.ros_messages import BAR, Ros
 from tests.space_logs import (
+    SEEN,
     START_NS,
-    Seen,
     covered,
     detection_3d_array,
     header,
@@ -29,10 +29,6 @@ from tests.space_logs import (
     scene_update_json,
 )
 
-#: Half a turn to the left of the x axis is y.
-SEEN = Seen(
-    np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]), np.array([4.0, 2.0, 1.5]), number=12
-)
 ENCODINGS = ("ros1", "cdr", "json")
 
 JSK = (
@@ -304,14 +300,11 @@ def test_derived_objects_have_a_shape_and_a_certainty_out_of_255_and_move_if_the
         derived(writer, *stated, number=40 + number)
         for number, stated in enumerate(
             [
-                (1, [4.0, 2.0, 1.5], 6, 204),
-                (3, [1.75, 0.25], 4, 255, 0),
-                (2, [0.5], 0, 0),
-                (0, [], 7, 100),
+                (1, [4.0, 2.0, 1.5], 6, 204), (3, [1.75, 0.25], 4, 255, 0), (2, [0.5], 0, 0), (0, [], 7, 100),
                 (1, [1.0], 7, 1),
             ]
         )
-    ]
+    ]  # fmt: skip
     message = writer.new("derived_object_msgs/ObjectArray", header(writer, START_NS, "map"), objects)
     found = read(writer, message, encoding)
     sizes = [(4, 2, 1.5), (0.5, 0.5, 1.75), (1, 1, 1), *[(np.nan,) * 3] * 2]  # radars know no shape

@@ -26,6 +26,8 @@ from mcaptrack.sources.foreign.boxes_3d.box import Box3d, Message3d
 from mcaptrack.sources.foreign.boxes_3d.recorded import recorded
 from tests.ros_messages import Ros
 from tests.space_logs import (
+    NAMES,
+    SEEN,
     START_NS,
     WAYS,
     Robot,
@@ -48,9 +50,8 @@ def read(path: Path, frame_id: str = "", topic: str = "/lidar/boxes"):
 
 
 def flat(frames: list[Frame]) -> tuple[np.ndarray, np.ndarray]:
-    return np.repeat([frame.t_ns for frame in frames], [len(frame.rows) for frame in frames]), np.concatenate(
-        [frame.rows for frame in frames]
-    )
+    t_ns = np.repeat([frame.t_ns for frame in frames], [len(frame.rows) for frame in frames])
+    return t_ns, np.concatenate([frame.rows for frame in frames])
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -66,9 +67,7 @@ def test_the_same_log_gives_the_same_detections_in_every_form(way, tmp_path):
     np.testing.assert_allclose(rows["score"], [row["score"] for row in wanted], atol=1e-6)
     assert found.frame_id == "map"
     if way == "detections of ros 1":
-        assert rows["class_id"].tolist() == [
-            1 + ("pedestrian", "car", "truck", "bicycle").index(row["class"]) for row in wanted
-        ]
+        assert rows["class_id"].tolist() == [1 + NAMES.index(row["class"]) for row in wanted]
         assert set(rows["source_id"].tolist()) == {-1}
         listed = ", ".join(map(str, sorted(set(rows["class_id"].tolist()))))
         words = "1 counts as people, and others move as objects of unknown class do"
@@ -89,28 +88,17 @@ def test_any_pose_of_sensor_and_box_gives_the_numbers_of_scipy(angles, shifts, l
     """The box stands on any of its sides; the one that is most upright has its height."""
     sensor, robot = (Rotation.from_euler("zyx", angles[n : n + 3]) for n in (0, 3))
     base, mount, centre = (np.array(shifts[n : n + 3]) for n in (0, 3, 6))
-    upright = Rotation.from_euler("zyx", [angles[6], angles[7] / 60, angles[8] / 60]) * Rotation.from_euler(
-        "xyz", lying, degrees=True
-    )
-    world = robot * sensor
-    box = Seen(
-        world.inv().apply(centre - base - robot.apply(mount)),
-        (world.inv() * upright).as_quat(),
-        np.array([4.0, 2.0, 1.5]),
-    )
+    on_side = Rotation.from_euler("xyz", lying, degrees=True)
+    upright = Rotation.from_euler("zyx", [angles[6], angles[7] / 60, angles[8] / 60]) * on_side
+    back, at = (robot * sensor).inv(), np.array([START_NS])
+    box = Seen(back.apply(centre - base - robot.apply(mount)), (back * upright).as_quat(), np.array([4.0, 2.0, 1.5]))
     found = recorded([(START_NS, boxes_3d_decoder(_KIND)(scene_update(START_NS, [box]).SerializeToString()))])
-    tree = TransformTree(
-        [
-            Recorded(
-                parent,
-                child,
-                True,
-                PoseSamples(np.array([START_NS]), np.array([START_NS]), shift[None], turn.as_quat()[None]),
-            )
-            for parent, child, turn, shift in (("map", "base", robot, base), ("base", "lidar", sensor, mount))
-        ]
-    )
-    poses = tree.lookup("map", "lidar", found.stamp_ns)
+    ways = (("map", "base", robot, base), ("base", "lidar", sensor, mount))
+    links = [
+        Recorded(parent, child, True, PoseSamples(at, at, shift[None], turn.as_quat()[None]))
+        for parent, child, turn, shift in ways
+    ]
+    poses = TransformTree(links).lookup("map", "lidar", found.stamp_ns)
     with collected() as warnings:
         (row,) = rows_of_boxes(found, poses.rotation, poses.translation)
     axes = upright.as_matrix()
@@ -140,14 +128,10 @@ def test_tracks_in_another_frame_are_as_boxes_brought_there(monkeypatch):
         vx_m_per_s=[1.0, 0.0, nan], vy_m_per_s=[0.0, -2.0, nan], observed=[True] * 3, source_id=[-1] * 3,
     )  # fmt: skip
     (moved,) = camera_motion.in_frame(None, "/truth", [Frame(START_NS, 0, rows)], "map", "city")
+    turns = [(0.0, 0.0, np.sin(heading / 2), np.cos(heading / 2)) for heading in (0.0, 2.0)]
     boxes = [
         Box3d(START_NS, "city", (row["x_m"], row["y_m"], row["z_m"]), turn, (1.0, 1.0, 1.0), velocity=velocity)
-        for row, turn, velocity in zip(
-            rows[:2],
-            [(0.0, 0.0, np.sin(heading / 2), np.cos(heading / 2)) for heading in (0.0, 2.0)],
-            [(1.0, 0.0, 0.0), (0.0, -2.0, 0.0)],
-            strict=True,
-        )
+        for row, turn, velocity in zip(rows[:2], turns, [(1.0, 0.0, 0.0), (0.0, -2.0, 0.0)], strict=True)
     ]
     found = recorded([(START_NS, Message3d(START_NS, "city", boxes))])
     wanted = rows_of_boxes(found, np.tile(half, (2, 1, 1)), np.tile(shift, (2, 1)))
@@ -166,11 +150,6 @@ _KIND = MessageType("foxglove.SceneUpdate", "protobuf", b"", "protobuf")
 
 def boxes_of(writer: Ros, message) -> Message3d:
     return boxes_3d_decoder(writer.kind)(writer.pack(message))
-
-
-SEEN = Seen(
-    np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]), np.array([4.0, 2.0, 1.5]), number=12
-)
 
 
 def test_markers_that_are_no_cubes_are_counted_and_lists_of_cubes_are_boxes():
@@ -357,35 +336,23 @@ def box(x: float = 0.0, frame_id: str = "lidar", stamp_ns: int = START_NS, **mor
     return Box3d(stamp_ns, frame_id, (x, 0.0, 0.0), UNTURNED, SIZE, **more)
 
 
-def test_velocities_of_zero_are_unknown_if_there_are_no_others():
-    still, moving = box(velocity=(0.0, 0.0, 0.0)), box(velocity=(0.0, 1.0, 0.0))
-    found = recorded([(START_NS, Message3d(START_NS, "lidar", [still, still, box()]))])
-    assert np.isnan(found.velocity).all()
-    assert found.remarks == {"boxes have a velocity of 0, and no box has another: it is unknown": 2}
-    found = recorded([(START_NS, Message3d(START_NS, "lidar", [still, moving, box()]))])
-    np.testing.assert_array_equal(found.velocity[:2], [[0, 0, 0], [0, 1, 0]])
-    assert not found.remarks
-
-
-def test_scores_of_zero_are_unknown_if_there_are_no_others():
-    boxes = [box(score=0.0), box(score=0.0), box()]
+@pytest.mark.parametrize(("name", "zero", "other"), [("velocity", (0.0,) * 3, (0.0, 1.0, 0.0)), ("score", 0.0, 0.1)])
+def test_velocities_and_scores_of_zero_are_unknown_if_there_are_no_others(name, zero, other):
+    boxes = [box(**{name: zero}), box(**{name: zero}), box()]
     found = recorded([(START_NS, Message3d(START_NS, "lidar", boxes))])
-    assert np.isnan(found.score).all()
-    assert found.remarks == {"boxes have a score of 0, and no box has another: it is unknown": 2}
-    found = recorded([(START_NS, Message3d(START_NS, "lidar", [*boxes, box(score=0.1)]))])
-    np.testing.assert_array_equal(found.score, [0, 0, np.nan, 0.1])
+    assert np.isnan(getattr(found, name)).all()
+    assert found.remarks == {f"boxes have a {name} of 0, and no box has another: it is unknown": 2}
+    found = recorded([(START_NS, Message3d(START_NS, "lidar", [*boxes, box(**{name: other})]))])
+    np.testing.assert_array_equal(getattr(found, name), np.array([zero, zero, np.full_like(zero, np.nan), other]))
+    assert not found.remarks
 
 
 def test_boxes_that_are_recorded_twice_count_once():
     nan, late = float("nan"), START_NS + 10**8
     first = [box(1.0, score=nan), box(2.0, class_name="car"), box(1.0, score=0.5), box(2.0)]
-    found = recorded(
-        [
-            (START_NS, Message3d(START_NS, "lidar", first)),
-            (START_NS + 5, Message3d(START_NS, "lidar", [box(1.0, score=nan, source_id=7), box(3.0), box(2.0)])),
-            (late, Message3d(late, "lidar", [box(1.0, stamp_ns=late)])),
-        ]
-    )
+    second = [box(1.0, score=nan, source_id=7), box(3.0), box(2.0)]
+    times = (START_NS, START_NS, first), (START_NS + 5, START_NS, second), (late, late, [box(1.0, stamp_ns=late)])
+    found = recorded([(log_ns, Message3d(stamp_ns, "lidar", boxes)) for log_ns, stamp_ns, boxes in times])
     _, frame, _ = found.frames()
     assert np.flatnonzero(found.is_repeated(frame)).tolist() == [4, 6]
 

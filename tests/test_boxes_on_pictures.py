@@ -165,12 +165,9 @@ def test_forecasts_stay_on_the_ground_while_the_camera_moves():
         assert found[:2, 0] == pytest.approx(path[:-1], abs=PX)
         assert found[:2, 1] == pytest.approx(path[1:], abs=PX)
         ring = found[2:, 0]
-        around = [
-            FAR + [14.0 + dx, 1.0 + dy, 0.0] for dx, dy in ((2.448 * 0.2, 0), (-2.448 * 0.2, 0), (0, 2.448 * 0.1))
-        ]
-        middle = path[-1]
-        far, near, left = by_opencv(np.array(around), number) - middle
-        offsets = ring - middle
+        around = FAR + [14.0, 1.0, 0.0] + 2.448 * np.array([(0.2, 0, 0), (-0.2, 0, 0), (0, 0.1, 0)])
+        far, near, left = by_opencv(around, number) - path[-1]
+        offsets = ring - path[-1]
         assert offsets[:, 1].min() == pytest.approx(far[1], abs=0.3)
         assert offsets[:, 1].max() == pytest.approx(near[1], abs=0.3)
         assert offsets[:, 0].min() == pytest.approx(left[0], abs=1.0)
@@ -187,16 +184,13 @@ def recorded(path: Path, calibrated: bool = True, scene: Floats | None = None) -
         def channel(topic: str, schema: str) -> int:
             return writer.add_channel(topic, foxglove.schema_record(schema), "protobuf", {})
 
-        tf, front, back = (
-            channel("/tf", foxglove.TRANSFORM),
-            *(channel(f"/{n}/image", foxglove.IMAGE) for n in ("front", "back")),
-        )
+        tf = channel("/tf", foxglove.TRANSFORM)
+        front, back = (channel(f"/{name}/image", foxglove.IMAGE) for name in ("front", "back"))
         if calibrated:
             lens = channel("/front/info", "foxglove.CameraCalibration")
             k = [FOCAL, 0, WIDTH / 2, 0, FOCAL, HEIGHT / 2, 0, 0, 1]
-            one = CameraCalibration(
-                frame_id="front_optical", width=WIDTH, height=HEIGHT, distortion_model="plumb_bob", K=k, D=[]
-            )
+            size = {"width": WIDTH, "height": HEIGHT}
+            one = CameraCalibration(frame_id="front_optical", distortion_model="plumb_bob", K=k, D=[], **size)
             writer.add_message(lens, ns(10), 0, one.SerializeToString())
         for number in range(PICTURES):
             t_ns = ns(10 + number / 10)

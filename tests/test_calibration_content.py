@@ -48,18 +48,15 @@ def entry(place: int, value: float) -> list[float]:
 @pytest.mark.parametrize(
     ("values", "turn", "place"),
     [
-        ({"extrinsic": POSE}, TURN, PLACE),
-        ({"RT": [*POSE, [0, 0, 0, 1]]}, TURN, PLACE),
-        ({"T_cam_world": np.ravel(POSE).tolist()}, TURN, PLACE),
-        ({"tvec": [4, 5, 6], "RT": POSE}, TURN, PLACE),
+        ({"extrinsic": POSE}, TURN, PLACE), ({"RT": [*POSE, [0, 0, 0, 1]]}, TURN, PLACE),
+        ({"T_cam_world": np.ravel(POSE).tolist()}, TURN, PLACE), ({"tvec": [4, 5, 6], "RT": POSE}, TURN, PLACE),
         ({"R": TURN, "t": PLACE, "RT": POSE}, TURN, PLACE),
         ({"rotation_matrix": EYE, "translation": [[4], [5], [6]], "RT": POSE}, EYE, [4, 5, 6]),
         ({"rvec": [0, 0, np.pi / 2], "tvec": PLACE, "RT": [*POSE[:2], [0, 0, 1, 9]]}, TURN, PLACE),
         ({"rvec": [0, 0, np.pi / 2], "R": EYE, "tvec": PLACE}, TURN, PLACE),
-        ({"rvec": np.ravel(TURN).tolist(), "tvec": PLACE}, TURN, PLACE),
-        ({"K": K}, None, None),
+        ({"rvec": np.ravel(TURN).tolist(), "tvec": PLACE}, TURN, PLACE), ({"K": K}, None, None),
     ],
-)
+)  # fmt: skip
 def test_poses(read, values, turn, place):
     one = read(values)
     for found, wanted, shape in ((one.rotation, turn, (3, 3)), (one.translation, place, (3,))):
@@ -95,6 +92,14 @@ def test_poses(read, values, turn, place):
         ({"K": entry(1, 0.91)}, "has a skew of 0.91"),
         ({"K": entry(1, -0.91)}, "has a skew of -0.91"),
         ({"K": [*K, 1]}, "yaml: k has 10 numbers, and needs 3 x 3"),
+        ({"K": [900, 0, 960, 0, float("nan"), 540, 0, 0, 1]}, "k holds something else than finite numbers"),
+        ({"K": [0] * 9}, "its focal lengths are 0 and 0 pixels"),
+        ({"D": [0.1] * 12, "K": K}, "with thin prisms or a tilted sensor"),
+        ({"cam0": {"camera_model": "omni", "intrinsics": [1, 2, 3, 4]}}, "of the camera model 'omni'"),
+        (
+            {"cam0": {"camera_model": "pinhole", "intrinsics": [1, 2, 3, 4], "T_cam_imu": [1, 2]}},
+            "T_cam_imu has 2 numbers",
+        ),
         ({"K": ["x", *K[1:]]}, "yaml: k holds something else than finite numbers"),
         ({"K": K, "D1": [1], "M2": K}, "holds two cameras (K, D1, M2), of which m2 is one"),
         ({"rms": 1, "boards": 2}, "holds rms, boards; a calibration has"),
@@ -177,19 +182,14 @@ def test_coefficients_of_distortion(read, given, model, bent):
     ("given", "size"),
     [
         ({"image_width": 640, "image_height": 480}, (640, 480)),
-        ({"image_Width": "640.0", "imageHeight": 480}, (640, 480)),
-        ({"width": 99_999, "height": 1}, (99_999, 1)),
+        ({"image_Width": "640.0", "imageHeight": 480}, (640, 480)), ({"width": 99_999, "height": 1}, (99_999, 1)),
         ({"width": 9, "height": 9, "image_width": 640, "image_height": 480}, (640, 480)),
-        ({"image_size": [640, 480]}, (640, 480)),
-        ({"image_size": "640 480"}, (640, 480)),
+        ({"image_size": [640, 480]}, (640, 480)), ({"image_size": "640 480"}, (640, 480)),
         ({"image_size": [640, 480], "image_width": 1280, "height": 960}, (1280, 960)),
-        ({"image_size": [640, 480, 3]}, None),
-        ({"image_size": "640 480 3"}, None),
-        ({"image_size": [640]}, None),
-        ({"image_width": 640}, None),
-        ({"image_height": 480}, None),
+        ({"image_size": [640, 480, 3]}, None), ({"image_size": "640 480 3"}, None), ({"image_size": [640]}, None),
+        ({"image_width": 640}, None), ({"image_height": 480}, None),
     ],
-)
+)  # fmt: skip
 def test_sizes_of_pictures(read, given, size):
     assert read(given, M1=K).size == size
 

@@ -58,8 +58,7 @@ def untyped(folder: Path, **values) -> Path:
     return path
 
 
-@pytest.mark.parametrize("ending", ["xml", "yml", "json"])
-@pytest.mark.parametrize("is_vector", [True, False])
+@pytest.mark.parametrize(("ending", "is_vector"), [("xml", True), ("yml", False), ("json", True), ("json", False)])
 def test_feet_stand_where_opencv_projects_them_from(tmp_path, ending, is_vector):
     pose = {"rvec": RVEC, "tvec": TVEC} if is_vector else {"R": TURN.as_matrix(), "T": TVEC.reshape(3, 1)}
     path = stored(tmp_path / f"a.{ending}", camera_matrix=K, distortion_coefficients=BENT, **pose)
@@ -167,10 +166,6 @@ def test_a_message_of_ros_that_was_echoed_is_read(tmp_path):
     (tmp_path / "echo.yaml").write_text(text + "---\n")
     message = calibrated(tmp_path / "echo.yaml").message
     assert (K.ravel().tolist(), BENT.tolist()) == (message.K, message.D)
-    roi["width"] = 640
-    (tmp_path / "echo.yaml").write_text(yaml.safe_dump({**lens, **rest, "roi": roi}))
-    with pytest.raises(McaptrackError, match="a region of others"):
-        calibrated(tmp_path / "echo.yaml")
 
 
 CAMCHAIN = """\
@@ -224,7 +219,6 @@ def test_a_camera_of_kalibrs_chain_is_chosen_by_topic_name_or_option(tmp_path):
 
 BILLION = '<!DOCTYPE a [<!ENTITY b "c"><!ENTITY d "&b;&b;">]><opencv_storage><k>&d;</k></opencv_storage>'
 HEAD = "%YAML:1.0\n---\n"
-PINHOLE = "cam0: {camera_model: pinhole, intrinsics: [400, 400, 320, 240], "
 
 
 @pytest.mark.parametrize(
@@ -242,23 +236,8 @@ PINHOLE = "cam0: {camera_model: pinhole, intrinsics: [400, 400, 320, 240], "
         (HEAD + "camera_matrix: !!python/object/apply:os.system [ls]\n", "tags are not read"),
         (HEAD + "a: &b [1, 2]\nc: *b\n", "anchors and aliases are not read"),
         (HEAD + "square_size: 0.1\nboard: 7\n", "holds square_size, board; a calibration has a camera matrix"),
-        (HEAD + "camera_matrix: [1, 2, 3]\n", "cameramatrix has 3 numbers, and needs 3 x 3"),
-        (HEAD + "K: !!opencv-matrix {rows: 2, cols: 3, dt: d, data: [1, 0, 2, 0, 1, 3, 0, 0, 1]}\n", "says that it is 2 x 3"),
-        (HEAD + "K: [900, 0, 960, 0, .nan, 540, 0, 0, 1]\n", "holds something else than finite numbers"),
-        (HEAD + "K: [0, 0, 0, 0, 0, 0, 0, 0, 0]\n", "isn't calibrated: its focal lengths are 0 and 0"),
-        (HEAD + "K: [900, 30, 960, 0, 900, 540, 0, 0, 1]\n", "has a skew of 30"),
-        (HEAD + "K: [900, 0, 960, 0, 900, 540, 0, 0, 1]\nD: [0.1, 0, 0]\n", "has 3 coefficients of distortion"),
-        (HEAD + f"K: [900, 0, 960, 0, 900, 540, 0, 0, 1]\nD: {[0.1] * 12}\n", "with thin prisms or a tilted sensor"),
-        (HEAD + "K: [900, 0, 960, 0, 900, 540, 0, 0, 1]\nrvec: [1, 0, 0]\n", "has a rotation and no translation"),
-        (HEAD + "K: [900, 0, 960, 0, 900, 540, 0, 0, 1]\nR: [1, 0, 0, 0, 2, 0, 0, 0, 1]\nT: [0, 0, 1]\n", "is not a rotation"),
         (HEAD + f"K: [900, 0, 960, 0, 900, 540, 0, 0, 1]\nrvecs: {[0] * 6}\ntvecs: {[0] * 6}\n", "Poses of pictures of a board"),
-        (HEAD + "M1: [900, 0, 960, 0, 900, 540, 0, 0, 1]\nM2: [900, 0, 960, 0, 900, 540, 0, 0, 1]\n", "holds two cameras"),
         (HEAD + "K: [900, 0, 96000, 0, 900, 540, 0, 0, 1]\n", "is for pictures of another one"),
-        ("image_width: 0\nimage_height: 9\ndistortion_model: plumb_bob\nK: [1, 0, 1, 0, 1, 1, 0, 0, 1]\n", "0 x 9 is no size"),
-        ("distortion_model: thin_prism\nK: [1, 0, 1, 0, 1, 1, 0, 0, 1]\nD: [1, 2]\n", "distortion by 'thin_prism'"),
-        (PINHOLE + "distortion_model: fov, distortion_coeffs: [0.9]}\n", "distortion by 'fov'; plumb_bob"),
-        (PINHOLE.replace("pinhole", "omni") + "resolution: [640, 480]}\n", "of the camera model 'omni'"),
-        (PINHOLE + "T_cam_imu: [1, 2]}\n", "T_cam_imu has 2 numbers"),
     ],
 )  # fmt: skip
 def test_what_is_no_calibration_is_refused_in_a_line(tmp_path, text, said):
@@ -317,27 +296,22 @@ def test_a_calibration_goes_into_a_log_and_boxes_get_metres(tmp_path, monkeypatc
         assert read_planes(opened, "/c")[0][1] == plane
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["cam.yml"], "a calibration belongs to a log with pictures or boxes of the camera; name it with --into"),
-        (["cam.yml", "--into", "log.mcap", "--camera", "left"], "log.mcap has no camera left that cam.yml could be of"),
-        (["gt.txt", "--fps", "1", "--calibration", "cam.yml", "--ground-plane", "h.txt"], "are both a ground plane"),
-        (["gt.txt", "--fps", "1", "--calibration", "none.yml"], "none.yml can't be read: No such file"),
-        (["m.txt", "--as", "motion", "--into", "log.mcap", "--calibration", "cam.yml"], "in a call of its own"),
-    ],
-)
-def test_mistakes_with_calibrations_are_one_line(tmp_path, monkeypatch, words, said):
+def test_mistakes_with_calibrations_are_one_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("gt.txt").write_text("1,1,500,500,20,50,1,-1,-1,-1\n")
     Path("h.txt").write_text("1 0 0\n0 1 0\n0 0 1\n")
     Path("m.txt").write_text("0,1,0,0,0,1,0\n")
     stored(Path("cam.yml"), K=K, rvec=RVEC, tvec=TVEC)
     done("ingest", "gt.txt", "--fps", 1, "-o", "log.mcap", "-q")
-    code, _, err = call("ingest", *words)
-    assert code == 1
-    (line,) = [one for one in err.splitlines() if one]
-    assert said in line
+    for words, said in {
+        "cam.yml": "a calibration belongs to a log with pictures or boxes of the camera; name it with --into",
+        "cam.yml --into log.mcap --camera left": "log.mcap has no camera left that cam.yml could be of",
+        "gt.txt --fps 1 --calibration cam.yml --ground-plane h.txt": "are both a ground plane",
+        "gt.txt --fps 1 --calibration none.yml": "none.yml can't be read: No such file",
+        "m.txt --as motion --into log.mcap --calibration cam.yml": "in a call of its own",
+    }.items():
+        code, _, err = call("ingest", *words.split())
+        assert (code, err.count("\n"), said in err) == (1, 1, True), err
 
 
 def test_the_size_is_guessed_from_boxes_with_a_warning_and_unused_options_are_named(tmp_path, monkeypatch):

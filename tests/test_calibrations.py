@@ -20,7 +20,6 @@ from mcaptrack.geometry.plane import GroundPlane, moved_planes, plane_at, scene_
 from mcaptrack.notices import collected
 from mcaptrack.pipeline.planes import planes_to_json, read_planes
 from mcaptrack.schema import TRACKS
-from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
 from mcaptrack.sources.calibrations import find_calibration, is_rectified_topic, read_calibrations, see_ground
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.foreign import MessageType
@@ -106,11 +105,6 @@ def stamped(payload: bytes, s: float) -> bytes:
     return payload[:4] + int(sec).to_bytes(4, "little") + int(nsec).to_bytes(4, "little") + payload[12:]
 
 
-def pose_of_eye() -> tuple[np.ndarray, np.ndarray]:
-    """How points of the robot are turned and moved to the frame of its camera."""
-    return EYE.inv().as_matrix(), -EYE.inv().apply(AHEAD)
-
-
 TF = MessageType(*foxglove.schema_record(foxglove.TRANSFORM), "protobuf")
 
 
@@ -121,16 +115,11 @@ def robot(
     times = np.arange(0, last_s, 0.1)
     found = [(START_NS + round(s * S) + LATE_NS, stamped(boxes(s, model), s)) for s in times]
     kind, calibration = info(model, **changes)
-    channels = [
-        ("/front/boxes", vision("v4", [])[0], found),
-        ("/front/camera_info", kind, [(START_NS + LATE_NS, calibration)]),
-    ]
+    info_at = [(START_NS + LATE_NS, calibration)]
+    channels = [("/front/boxes", vision("v4", [])[0], found), ("/front/camera_info", kind, info_at)]
     if tree:
-        moving = np.arange(-0.1, until_s + 0.05, 0.05)
-        poses = [
-            (START_NS + round(s * S), transform("map", "base_link", START_NS + round(s * S), *robot_at(s)))
-            for s in moving
-        ]
+        times = [(s, START_NS + round(s * S)) for s in np.arange(-0.1, until_s + 0.05, 0.05)]
+        poses = [(t_ns, transform("map", "base_link", t_ns, *robot_at(s))) for s, t_ns in times]
         channels.append(("/tf", TF, poses))
         channels.append(("/tf_static", TF, [(START_NS, transform("base_link", "eye", START_NS, EYE, AHEAD))]))
     return write(path, *channels)
@@ -174,12 +163,9 @@ def test_a_run_ends_in_the_map_and_is_up_to_date(tmp_path):
     assert "ground plane is known" not in first.err
     for topic in ("/front/samples", "/front/retracks", "/front/retracks/full"):
         assert np.nanmedian(errors_m(path, topic)) < 0.3, topic
-    again = mcaptrack.run(path, topic="/front/boxes", tables=False)
-    assert again.stages == ()
+    assert mcaptrack.run(path, topic="/front/boxes", tables=False).stages == ()
     with log.read(path) as opened:
-        made = mcaptrack.open(path)
         assert opened.channels["/front/retracks"].metadata["mcaptrack.frame_id"] == "map"
-        made.close()
 
 
 def test_a_calibration_that_a_user_gives_replaces_the_recorded_one(tmp_path):
@@ -242,28 +228,17 @@ class TestGround:
         assert np.abs(found.planes[0][1].pixels_to_metres(seen(there, 1.2, "")) - points[:, :2]).max() < 0.01
         assert len(found.planes) == 1  # the camera stands still on the robot
 
-    def test_a_map_that_is_somewhere_else(self, tmp_path):
+    def test_a_map_that_is_somewhere_else(self, tmp_path, monkeypatch):
         """The origin of a map may be far below the road: then the robot's own frame is on the ground."""
-        path = tmp_path / "a.mcap"
-        lifted = {"/tf": []}
-        times = np.arange(-0.1, 0.15, 0.05)
-        for s in times:
-            t_ns = START_NS + round(s * S)
-            turn, place = robot_at(s)
-            lifted["/tf"].append((t_ns, transform("map", "base_link", t_ns, turn, place + [0, 0, 67.0])))
-        fixed = [(START_NS, transform("base_link", "eye", START_NS, EYE, AHEAD))]
-        kind, calibration = camera_info("")
-        found = [(START_NS + LATE_NS, stamped(boxes(0, ""), 0))]
-        channels = [
-            ("/front/boxes", vision("v4", [])[0], found),
-            ("/front/camera_info", kind, [(START_NS, calibration)]),
-        ]
-        write(path, *channels, ("/tf", TF, lifted["/tf"]), ("/tf_static", TF, fixed))
-        seen_there, said = ground(path)
+        robot_there, people_there, up = robot_at, people_at, [0, 0, 67.0]
+        monkeypatch.setattr("tests.test_calibrations.robot_at", lambda s: (robot_there(s)[0], robot_there(s)[1] + up))
+        monkeypatch.setattr("tests.test_calibrations.people_at", lambda s: people_there(s) + up)
+        seen_there, said = ground(robot(tmp_path / "a.mcap", "", last_s=0.1))
         assert seen_there.ground_frame == "base_link"
-        assert said == [
+        where = (
             "eye is 68.4 m above z = 0 of map: the ground is taken to be z = 0 of base_link. `ground_frame=` chooses"
-        ]
+        )
+        assert said == [where]
         feet = seen(people_at(0), 0, "")
         assert np.abs(seen_there.planes[0][1].pixels_to_metres(feet) - people_at(0)[:, :2]).max() < 0.01
 
@@ -293,10 +268,10 @@ class TestGround:
         ((_, plane),) = ground(path)[0].planes
         assert (plane.width_px, plane.height_px) == (640, 360)
         # The middle of a pixel of the small picture is between two of the large one.
-        whole = GroundPlane(ground_homography(Lens((700, 700), (640, 360)), *pose_of_eye(), np.eye(3)), *SIZE)
-        assert plane.pixels_to_metres(np.array([[300.0, 300]])) == pytest.approx(
-            whole.pixels_to_metres(np.array([[600.5, 600.5]]))
-        )
+        there = EYE.inv().as_matrix(), -EYE.inv().apply(AHEAD)
+        whole = GroundPlane(ground_homography(Lens((700, 700), (640, 360)), *there, np.eye(3)), *SIZE)
+        wanted = whole.pixels_to_metres(np.array([[600.5, 600.5]]))
+        assert plane.pixels_to_metres(np.array([[300.0, 300]])) == pytest.approx(wanted)
 
     def test_what_is_missing_is_said(self, tmp_path):
         path = robot(tmp_path / "a.mcap", "", tree=False)
@@ -309,9 +284,8 @@ class TestGround:
 
     def test_a_camera_without_a_transform(self, tmp_path):
         path = robot(tmp_path / "a.mcap", "", frame_id="other")
-        with pytest.raises(
-            McaptrackError, match=r"no transform has the frame 'other' of /front/camera_info; .* eye, map"
-        ):
+        words = r"no transform has the frame 'other' of /front/camera_info; .* eye, map"
+        with pytest.raises(McaptrackError, match=words):
             ground(path)
 
     def test_a_frame_with_x_ahead_is_not_that_of_a_camera(self, tmp_path, straight, monkeypatch):
@@ -320,19 +294,11 @@ class TestGround:
         assert [words for words in said if words.startswith("eye looks up: z of a camera's frame points ahead")]
         assert not any("looks up" in words for words in ground(straight)[1])
 
-    @pytest.mark.parametrize(
-        ("topic", "is_rectified"),
-        [
-            ("/front/image_rect", True),
-            ("/front/image_rect_color/compressed", True),
-            ("/front/rectified/image", True),
-            ("/front/image_raw/compressed", False),
-            ("/direct/image", False),
-            ("/rect/front/image", False),
-        ],
-    )
-    def test_rectified_pictures_by_their_topic(self, topic, is_rectified):
-        assert is_rectified_topic(topic) is is_rectified
+    def test_rectified_pictures_by_their_topic(self):
+        for topic in ("/front/image_rect", "/front/image_rect_color/compressed", "/front/rectified/image"):
+            assert is_rectified_topic(topic)
+        for topic in ("/front/image_raw/compressed", "/direct/image", "/rect/front/image"):
+            assert not is_rectified_topic(topic)
 
     def test_a_given_plane_wins(self, straight, tmp_path):
         path = tmp_path / "robot.mcap"
@@ -377,10 +343,8 @@ def test_the_frame_of_the_metres_is_an_option(straight, tmp_path):
         result = mcaptrack.track(path, topic="/front/boxes", to="/front/tracks", frame=frame)
         assert not result.warnings
         with log.read(path) as opened:
-            named = {
-                opened.channels[f"/front/{one}"].metadata["mcaptrack.frame_id"] for one in ("tracks", "ground_plane")
-            }
-        assert named == {frame}
+            for topic in ("/front/tracks", "/front/ground_plane"):
+                assert opened.channels[topic].metadata["mcaptrack.frame_id"] == frame
 
 
 def test_many_planes_are_recorded_by_their_digest():
@@ -390,16 +354,6 @@ def test_many_planes_are_recorded_by_their_digest():
     many, other = (planes_to_json([(number, plane) for number in range(start, 101 + start)]) for start in (0, 1))
     assert many[0] == other[0] == 101
     assert many[1] != other[1]
-
-
-def test_a_lens_is_kept_in_rows():
-    for lens in (Lens((700, 710), (640, 360)), Lens((700, 710), (640, 360), (-0.2, 0.1, 0.01, 0.02))):
-        plane = GroundPlane((1.0, 0, 0, 0, 1, 0, 0, 0, 1), 1280, 720, lens=lens)
-        assert rows_to_plane(plane_to_rows(plane)).lens == lens
-    for count, is_fisheye in ((5, False), (8, False), (4, True)):
-        lens = Lens((700, 710), (640, 360), tuple(0.01 * k for k in range(1, count + 1)), is_fisheye)
-        plane = GroundPlane((1.0, 0, 0, 0, 1, 0, 0, 0, 1), 1280, 720, lens=lens)
-        assert rows_to_plane(plane_to_rows(plane)) == plane
 
 
 class TestCalibrations:

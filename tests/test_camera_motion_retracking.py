@@ -116,32 +116,12 @@ def test_ground_truth_is_in_metres_where_the_pictures_show_it(tmp_path, monkeypa
     write(tmp_path, 60, range(0))
     truth = [f"{n + 1},{k + 1},{x + sway(n):.3f},{y},20,60,1,1,1" for n in range(60) for k, (x, y) in enumerate(PEOPLE)]
     (tmp_path / "gt.txt").write_text("\n".join(truth) + "\n")
-    given = [
-        "--fps",
-        10,
-        "--motion",
-        "motion.txt",
-        "--ground-plane",
-        "plane.txt",
-        "--truth",
-        "gt.txt",
-        "--label-format",
-    ]
-    done("ingest", "det.txt", *given[:-1], "-o", "a.mcap", "-q")
+    given = "--fps 10 --motion motion.txt --ground-plane plane.txt --truth gt.txt"
+    done("ingest", "det.txt", *given.split(), "-o", "a.mcap", "-q")
     summary = json.loads(done("run", "a.mcap", "--no-tables", "-q", "--json").out)["results"][0]
     assert summary["summary"]["scores"]["idf1"][1] > 0.95
     for topic in ("tracks", "retracks"):
-        scored = (
-            "evaluate",
-            "a.mcap",
-            "--topic",
-            f"/camera/{topic}",
-            "--similarity",
-            "metres",
-            "--gate-m",
-            0.1,
-            "--json",
-        )
+        scored = f"evaluate a.mcap --topic /camera/{topic} --similarity metres --gate-m 0.1 --json".split()
         assert json.loads(done(*scored).out)["results"][0]["IDF1"] > 0.9, topic
     with log.read(tmp_path / "a.mcap") as opened:
         kinds = opened.rows("/camera/retracks/events", EVENTS).rows["kind"]

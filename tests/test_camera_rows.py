@@ -92,12 +92,4 @@ def test_a_camera_looks_elsewhere_by_the_size_of_its_pictures():
     moves = [(0, 49, 300), (51, 0, 300), (0, -51, 600), (99, 0, 600), (0, 101, 600)]
     rows = [pose_to_rows(pose(x, y), width, width * 4 // 3) for x, y, width in moves]
     assert [one.is_elsewhere for one in poses(*rows)] == [False, True, False, False, True]
-    # Of a picture that is enlarged or turned, some corner moves most: here the last one, and one of the lower ones.
-    changed = {1.09: False, 1.11: True}
-    for zoom, is_elsewhere in changed.items():
-        row = pose_to_rows(pose()._replace(to_reference=np.array([[zoom, 0, 0], [0, zoom, 0]])), 300, 400)
-        assert poses(row)[0].is_elsewhere == is_elsewhere
-    for shear, is_elsewhere in ((0.12, False), (0.13, True)):
-        row = pose_to_rows(pose()._replace(to_reference=np.array([[1, shear, 0], [0, 1, 0]])), 300, 400)
-        assert poses(row)[0].is_elsewhere == is_elsewhere
     assert rows_to_verdict(np.concatenate(rows[2:4])) == Verdict.STILL

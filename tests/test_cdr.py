@@ -107,12 +107,8 @@ def test_no_part_of_a_message_is_taken_for_one(schema):
         with pytest.raises(ValueError, match=rf"{end} bytes are not a CDR message"):
             cdr_codec(schema).decode_all([payload, payload[:end]])
     assert cdr_codec(schema).decode_all([payload + bytes(7)])[1].tolist() == [3]  # filled up by its writer
-    for odd in (
-        payload + bytes(8),
-        b"\0\x07" + payload[2:],
-        b"\1" + payload[1:],
-        payload[:4] + b"\xff" * 4 + bytes(90),
-    ):
+    wrong = [payload + bytes(8), b"\0\x07" + payload[2:], b"\1" + payload[1:], payload[:4] + b"\xff" * 4 + bytes(90)]
+    for odd in wrong:
         with pytest.raises(ValueError, match="bytes are not a CDR message"):
             cdr_codec(schema).decode_all([odd])
 
@@ -139,19 +135,15 @@ def test_hostile_bytes_are_refused_or_read_as_rosbags_reads_them():
 def test_rows_whose_layout_depends_on_their_place():
     """Nine bytes, then two: each row begins elsewhere, modulo 8."""
     fields = [
-        RosField("kind", "uint32"),
-        RosField("odd", "uint8"),
-        RosField("track_id", "int64"),
-        RosField("b", "uint8"),
-    ]
+        RosField("kind", "uint32"), RosField("odd", "uint8"), RosField("track_id", "int64"), RosField("b", "uint8"),
+    ]  # fmt: skip
     text = "X[] rows\n" + "=" * 80 + "\nMSG: mcaptrack_msgs/X\n" + "\n".join(f"{f.kind} {f.name}" for f in fields)
     store, name = store_of(EVENTS, text)
     rows = [store.types["mcaptrack_msgs/msg/X"](kind=n, odd=n, track_id=-n, b=7) for n in range(40)]
     counts = [0, 1, 2, 13, 24]
     bounds = np.cumsum([0, *counts])
-    messages = [
-        bytes(store.serialize_cdr(store.types[name](rows=rows[a:b]), name)) for a, b in pairwise(bounds.tolist())
-    ]
+    parts = [rows[a:b] for a, b in pairwise(bounds.tolist())]
+    messages = [bytes(store.serialize_cdr(store.types[name](rows=part), name)) for part in parts]
     decoded, found = CdrCodec(EVENTS.codec, fields).decode_all(messages)
     assert found.tolist() == counts
     assert decoded["kind"].tolist() == list(range(40))
@@ -231,6 +223,5 @@ def test_names_of_schemas_and_topics():
     assert schema_name_of("mcaptrack_msgs/msg/Tracks", "ros2msg", "cdr") == "mcaptrack.Tracks"
     for other in (("mcaptrack_msgs/msg/Track", "ros2msg", "cdr"), ("mcaptrack_msgs/msg/Tracks", "ros2msg", "json")):
         assert schema_name_of(*other) == other[0]
-    assert [is_ros_topic(name) for name in ("/a/b_2/_c", "/a", "/a/2b", "a", "/a/", "/a//b", "/a-b", "/" + 250 * "a")] == [
-        True, True, False, False, False, False, False, False,
-    ]  # fmt: skip
+    assert all(map(is_ros_topic, ("/a/b_2/_c", "/a")))
+    assert not any(map(is_ros_topic, ("/a/2b", "a", "/a/", "/a//b", "/a-b", "/" + 250 * "a")))

@@ -26,17 +26,9 @@ CHANNELS = st.dictionaries(st.one_of(st.integers(0, 3), st.just(2**16 - 1)), NUM
 #: How many chunks the log has, and the most that is read ahead of a file.
 CHUNKS, AHEAD = 1500, 300_000
 ENTRIES = st.builds(
-    ChunkIndexRecord,
-    NUMBERS,
-    NUMBERS,
-    st.one_of(st.integers(0, 9), NUMBERS),
-    st.one_of(st.integers(0, 9), NUMBERS),
-    CHANNELS,
-    NUMBERS,
-    st.sampled_from(["", "zstd", "lz4", "other"]),
-    NUMBERS,
-    NUMBERS,
-)
+    ChunkIndexRecord, NUMBERS, NUMBERS, st.one_of(st.integers(0, 9), NUMBERS), st.one_of(st.integers(0, 9), NUMBERS),
+    CHANNELS, NUMBERS, st.sampled_from(["", "zstd", "lz4", "other"]), NUMBERS, NUMBERS,
+)  # fmt: skip
 
 
 @settings(max_examples=60, deadline=None)

@@ -66,9 +66,8 @@ def same_but_for_ids(found, wanted):
 
 
 def both(*parts):
-    return [
-        frames[0]._replace(rows=np.concatenate([frame.rows for frame in frames])) for frames in zip(*parts, strict=True)
-    ]
+    together = zip(*parts, strict=True)
+    return [frames[0]._replace(rows=np.concatenate([frame.rows for frame in frames])) for frames in together]
 
 
 def renamed(frames, places):
@@ -124,9 +123,8 @@ def test_a_track_never_passes_to_an_object_of_another_class(tracker):
         for row in made.rows:
             box = np.abs(frame.rows["x_px"] - row["x_px"]) + np.abs(frame.rows["y_px"] - row["y_px"])
             owners.setdefault(int(row["track_id"]), set()).add((int(row["class_id"]), int(there[box.argmin()] % 2) + 1))
-    assert (
-        sum(len(found) == 1 for found in owners.values()) >= 0.9 * len(owners) > 5
-    )  # boxes move a little by the filter
+    # Boxes move a little by the filter.
+    assert sum(len(found) == 1 for found in owners.values()) >= 0.9 * len(owners) > 5
     assert all(len({one for one, _ in found}) == 1 for found in owners.values())
 
 
@@ -362,30 +360,17 @@ def test_tables_without_a_class_column_are_read_as_before(tmp_path):
     assert tables.table_to_frames(TRACKS, new, places, "/a")[0].rows["class_id"].tolist() == [3]
 
 
-@pytest.mark.parametrize(
-    ("classes", "words"),
-    [
-        ({1: "car"}, "class 1 is a person; give 'car' another number"),
-        ({2: ""}, "the name of class 2 is printable text"),
-        ({2: "a\nb"}, "the name of class 2 is printable text"),
-        ({2: "x" * 201}, "the name of class 2 is printable text of at most 200 characters"),
-        ({2: "\ud800"}, "the name of class 2 is printable text"),
-        ({2: 3}, "the name of class 2 is printable text"),
-        ({-1: "x"}, "a class is a whole number from 0"),
-        ({2**32: "x"}, "a class is a whole number from 0"),
-        ({"2": "x"}, "a class is a whole number from 0"),
-        (["x"], "`classes=` is a mapping"),
-    ],
-)
-def test_names_that_cant_be_are_refused(tmp_path, classes, words):
-    with (
-        mcaptrack.open(tmp_path / "a.mcap", create=True) as opened,
-        pytest.raises(McaptrackError, match=words) as caught,
-    ):
-        opened.write(
-            "/a/detections", [mcaptrack.detections([[1, 2, 3, 4]], t_ns=0, box_format="xywh")], classes=classes
-        )
-    assert "\n" not in str(caught.value)
+def test_names_that_cant_be_are_refused(tmp_path):
+    rows = [mcaptrack.detections([[1, 2, 3, 4]], t_ns=0, box_format="xywh")]
+    cases = [({2: name}, "the name of class 2 is printable text") for name in ("", "a\nb", "\ud800", 3)]
+    cases += [({number: "x"}, "a class is a whole number from 0") for number in (-1, 2**32, "2")]
+    cases += [({1: "car"}, "class 1 is a person; give 'car' another number"), (["x"], "`classes=` is a mapping")]
+    cases += [({2: "x" * 201}, "the name of class 2 is printable text of at most 200 characters")]
+    with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
+        for classes, words in cases:
+            with pytest.raises(McaptrackError, match=words) as caught:
+                opened.write("/a/detections", rows, classes=classes)
+            assert "\n" not in str(caught.value)
 
 
 def test_a_thousand_classes_of_one_name_and_strange_metadata_are_read(tmp_path):

@@ -36,15 +36,9 @@ def walkers(schema, rate_hz, seconds=8):
         x_m = 1.2 * number / rate_hz + noise.normal(0, 0.03, 3)
         y_m = np.array([0.0, 3.0, 6.0]) + noise.normal(0, 0.03, 3)
         columns = {
-            "x_m": x_m,
-            "y_m": y_m,
-            "x_px": 40 * x_m,
-            "y_px": 40 * y_m,
-            "w_px": [20.0] * 3,
-            "h_px": [60.0] * 3,
-            "score": [0.9] * 3,
-            "class_id": [1] * 3,
-        }
+            "x_m": x_m, "y_m": y_m, "x_px": 40 * x_m, "y_px": 40 * y_m, "w_px": [20.0] * 3, "h_px": [60.0] * 3,
+            "score": [0.9] * 3, "class_id": [1] * 3,
+        }  # fmt: skip
         if schema is TRACKS:
             columns |= {"track_id": [1, 2, 3], "source_id": [-1] * 3, "observed": [True] * 3}
         yield Frame(round(number * 10**9 / rate_hz), number, schema.rows(**columns))
@@ -135,10 +129,11 @@ def test_errors_of_forecasts_depend_on_no_jump(jump_ns):
     assert errors(jump_ns) == expected
 
 
+CUTS = st.lists(st.tuples(st.integers(5, 30), st.integers(61 * 10**9, YEARS_NS // 8)), max_size=2)
+
+
 @pytest.mark.parametrize("chunk_size", [1, 10**6])
-@given(
-    cuts=st.lists(st.tuples(st.integers(5, 30), st.integers(61 * 10**9, YEARS_NS // 8)), max_size=2), late=st.booleans()
-)
+@given(cuts=CUTS, late=st.booleans())
 @settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_jumps_are_found_by_the_index_and_by_a_check(tmp_path, chunk_size, cuts, late):
     """Of parts of some messages at 10 Hz, in the order of time or with the last part first: the clock was set back."""
@@ -158,9 +153,8 @@ def test_jumps_are_found_by_the_index_and_by_a_check(tmp_path, chunk_size, cuts,
 
 def test_a_run_and_info_say_where_the_clock_jumps(tmp_path):
     path = tmp_path / "a.mcap"
-    write_stock(
-        path, [("a", t_ns, 0, b"x") for start in (0, 3 * HOUR_NS) for t_ns in range(start, start + 10**9, 10**8)]
-    )
+    times = [start + n * 10**8 for start in (0, 3 * HOUR_NS) for n in range(10)]
+    write_stock(path, [("a", t_ns, 0, b"x") for t_ns in times])
     (warning,) = mcaptrack.info(path).warnings
     assert warning.code == "clock-jump"
     assert "no message for 3.0 hours after 0.900 s" in warning.message

@@ -41,9 +41,8 @@ def large(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("large") / "large.mcap"
     schema = (TRACKS.name, "protobuf", TRACKS.descriptor)
     with log.create(path) as writer:
-        picture = writer.add_channel(
-            "/camera/video", ("foxglove.CompressedVideo", "protobuf", b""), "protobuf", {}, "media"
-        )
+        kind = ("foxglove.CompressedVideo", "protobuf", b"")
+        picture = writer.add_channel("/camera/video", kind, "protobuf", {}, "media")
         for number in range(48):
             writer.add_message(picture, number * 320_000_000, number, os.urandom(2**19))
         for topic in ("/camera/tracks", "/other/tracks"):
@@ -100,9 +99,8 @@ def test_stages_write_the_same_results_beside_an_object_as_beside_a_file(store, 
     assert store.get("night/b.mcap") == bare.read_bytes()
     assert store.get("night/b.results.mcap") == Path("b.results.mcap").read_bytes()
     assert remote["written_to"] == "s3://bucket/night/b.results.mcap"
-    assert {name: remote[name] for name in ("stages", "frames", "events")} == {
-        name: local[name] for name in ("stages", "frames", "events")
-    }
+    for name in ("stages", "frames", "events"):
+        assert remote[name] == local[name]
     assert [r.key for r in requests if r.method not in ("GET", "HEAD")] == ["night/b.results.mcap"]
     assert json.loads(done("run", url, "--json").out)["results"][0]["stages"] == []
     again = mcaptrack.track(url, tracker="bytetrack")
@@ -185,35 +183,34 @@ ABSENT = {
 }
 
 
-@pytest.mark.parametrize("url", ABSENT)
-def test_what_is_no_log_is_named_in_one_line(store, url):
+def test_what_is_no_log_is_named_in_one_line(store):
     for name, content in (("night/a.mcap", b"x"), ("empty.mcap", b""), ("text.mcap", b"text" * 99)):
         store.put(name, content)
-    with pytest.raises(McaptrackError) as raised:
-        mcaptrack.info(url)
-    assert str(raised.value) == f"{url} {ABSENT[url]}"
+    for url, why in ABSENT.items():
+        with pytest.raises(McaptrackError) as raised:
+            mcaptrack.info(url)
+        assert str(raised.value) == f"{url} {why}"
 
 
-@pytest.mark.parametrize("words", [["drop", "/camera/tracks"], ["view"], ["track", "--in-place"]])
-def test_what_needs_a_file_refuses_an_object(store, bare, words):
+def test_what_needs_a_file_refuses_an_object(store, bare):
     url = store.put("b.mcap", bare)
-    code, _, err = call(words[0], url, *words[1:])
-    assert (code, err.count("\n")) == (1, 1)
-    assert url in err
-    assert store.names() == ["b.mcap"]
+    for command, *more in (["drop", "/camera/tracks"], ["view"], ["track", "--in-place"]):
+        code, _, err = call(command, url, *more)
+        assert (code, err.count("\n"), url in err) == (1, 1, True)
+        assert store.names() == ["b.mcap"]
 
 
 def test_prefixes_and_patterns_name_the_logs_below(store, bare):
-    for name in (
-        "b/one.mcap",
-        "b/one.results.mcap",
-        "b/2/two.mcap",
-        "b/.old/x.mcap",
-        "b/notes.txt",
-        "bb/three.mcap",
-        "[4].mcap",
-    ):
-        store.put(name, b"" if name.endswith(".txt") else bare)
+    for name in [
+        "one.mcap",
+        "one.results.mcap",
+        "2/two.mcap",
+        ".old/x.mcap",
+        "notes.txt",
+        "../bb/three.mcap",
+        "../[4].mcap",
+    ]:
+        store.put(os.path.normpath(f"b/{name}"), b"" if name.endswith(".txt") else bare)
 
     def found(*given: str) -> list[tuple[str, str]]:
         return [(str(one.path).removeprefix("s3://bucket/"), str(one.below)) for one in find_logs(given)]

@@ -29,6 +29,12 @@ def clip(path: Path) -> list[np.ndarray]:
         return [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
 
 
+def is_below_title(picture: np.ndarray, panel: np.ndarray) -> bool:
+    """Whether the same picture stands somewhere below the title of a panel."""
+    high, panel = len(picture), panel.astype(int)
+    return min(abs(panel[top : top + high] - picture).mean() for top in range(4, 40)) < 4
+
+
 def test_three_panels_show_the_views_of_their_channels(finished, tmp_path):
     done = mcaptrack.render(finished, tmp_path / "a.mp4", compare=True, width=480, end_s=0.5)
     names = ("tracks", "retracks/full", "truth")
@@ -38,11 +44,7 @@ def test_three_panels_show_the_views_of_their_channels(finished, tmp_path):
     for number, view in enumerate(done.views):
         mcaptrack.render(finished, tmp_path / "one.mp4", topic=view, width=160, end_s=0.5, force=True)
         (single, *_) = clip(tmp_path / "one.mp4")
-        high = single.shape[0]
-        part = frames[0][:, 160 * number + 2 : 160 * (number + 1) - 2].astype(int)
-        # Somewhere below the title stands the same picture.
-        apart = [abs(part[top : top + high] - single[:, 2:158]).mean() for top in range(4, 40)]
-        assert min(apart) < 4
+        assert is_below_title(single[:, 2:158], frames[0][:, 160 * number + 2 : 160 * (number + 1) - 2])
 
 
 def crossing_log(path: Path) -> Path:
@@ -73,11 +75,7 @@ def test_logs_without_pictures_are_compared_from_above(tmp_path):
     frames = clip(done.video)
     assert len(frames) == done.pictures == 11
     single = mcaptrack.render(path, topic=done.views[1], width=200, start_s=1, end_s=2)
-    (first, *_) = clip(single.video)
-    high = first.shape[0]
-    right = frames[0][:, 204:396].astype(int)
-    apart = [abs(right[top : top + high] - first[:, 4:196]).mean() for top in range(4, 40)]
-    assert min(apart) < 4
+    assert is_below_title(clip(single.video)[0][:, 4:196], frames[0][:, 204:396])
     with log.read(path) as opened:
         assert [one.title for one in comparing.find_panels(opened, "/lidar", "/view/scene")][1:] == ["re-tracked"]
 

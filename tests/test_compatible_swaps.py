@@ -14,7 +14,6 @@ from mcaptrack.transforms.retrack import identity_swaps, offline
 from mcaptrack.transforms.retrack.identity_swaps import compatible
 from mcaptrack.transforms.retrack.motion_model import MotionModel
 
-STEPS = 60
 ENCOUNTERS = st.lists(
     st.tuples(
         st.lists(st.integers(0, 5), min_size=2, max_size=2, unique=True),

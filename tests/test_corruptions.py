@@ -34,16 +34,10 @@ def false_tracks(rows: np.ndarray) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("kind", one_in(3, CORRUPTIONS))
-def test_a_seed_gives_the_same_rows_again_and_another_one_others(kind):
-    how = CORRUPTIONS[kind]
-    first = rows_of(how)
-    assert np.array_equal(first, rows_of(how))
-    assert not np.array_equal(first, rows_of(how, seed=4))
-
-
-@pytest.mark.parametrize("kind", CORRUPTIONS)
-def test_rows_are_in_order_and_an_id_is_at_one_place_of_a_step(kind):
+def test_rows_follow_from_a_seed_and_are_in_order_with_an_id_at_one_place_of_a_step(kind):
     rows = rows_of(CORRUPTIONS[kind])
+    assert np.array_equal(rows, rows_of(CORRUPTIONS[kind]))
+    assert not np.array_equal(rows, rows_of(CORRUPTIONS[kind], seed=4))
     assert (np.diff(rows[:, 0]) >= 0).all()
     assert len(np.unique(rows[:, :2], axis=0)) == len(rows)
     assert np.isfinite(rows).all()

@@ -55,13 +55,9 @@ def test_sizes_of_files_have_limits(read, monkeypatch, tmp_path):
     refused(read, "more than 2 tracks; give it in parts", *[track() for _ in range(3)])
     size = len((tmp_path / "a.xml").read_bytes())
     monkeypatch.setattr(cvat, "_MAX_BYTES", size)
-    refused(
-        read,
-        "holds no boxes",
-        *[track() for _ in range(2)],
-        " " * (size - len("<annotations>\n</annotations>") - 2 * len(track())),
-    )
-    refused(read, f"there are more than {size} bytes of XML", " " * (size - len("<annotations>\n</annotations>") + 1))
+    blank = " " * (size - len("<annotations>\n</annotations>"))
+    refused(read, "holds no boxes", *[track() for _ in range(2)], blank[2 * len(track()) :])
+    refused(read, f"there are more than {size} bytes of XML", f"{blank} ")
 
 
 def test_frames_and_classes_have_limits(read, monkeypatch):
@@ -70,10 +66,8 @@ def test_frames_and_classes_have_limits(read, monkeypatch):
     refused(read, "5 boxes would be interpolated; at most 5 are", track(box(0), box(6)))
     assert len(read(track(box(0, more='outside="1"'), box(60))).id) == 1
     monkeypatch.setattr(cvat, "_MAX_CLASSES", 2)
-    assert read(track(box(0), label="a"), track(box(0), label=" b  c "), track(box(0), label="b c")).classes == {
-        2: "a",
-        3: "b c",
-    }
+    named = read(*(track(box(0), label=label) for label in ("a", " b  c ", "b c")))
+    assert named.classes == {2: "a", 3: "b c"}
     refused(read, "more than 2 labels", *[track(box(0), label=name) for name in "abc"])
     monkeypatch.setattr(cvat, "_MAX_DEPTH", 5)
     assert len(read(track(box(0, inner="<a><b></b></a>"))).id) == 1
@@ -92,9 +86,8 @@ def test_boxes_between_two_are_one_a_frame(read, frames, wanted):
     assert found.boxes_px[:, 0].tolist() == [10 * frame for frame in wanted]
     assert found.boxes_px[:, 2].tolist() == [10] * len(wanted)
     count = len(wanted) - len(frames)
-    assert [f"{count} boxes are interpolated between others of their tracks" in one for one in found.remarks] == [
-        True
-    ] * bool(count)
+    words = f"{count} boxes are interpolated between others of their tracks"
+    assert [words in one for one in found.remarks] == [True] * bool(count)
 
 
 STEP = "<frame_filter>step=3</frame_filter>"
@@ -127,10 +120,8 @@ def test_frames_of_a_task(read, meta, boxes, frames, labelled):
     assert (found.frame.tolist(), found.labelled.tolist()) == (frames, frames if labelled is None else labelled)
     said = [words for words, code in found.doubts if code == "clock"]
     assert len(said) == (labelled is None)
-    assert (
-        labelled
-        or "boxes are in frames that its task doesn't have (frames 1 to 9 in steps of 3), as in 2; frames" in said[0]
-    )
+    words = "boxes are in frames that its task doesn't have (frames 1 to 9 in steps of 3), as in 2; frames"
+    assert labelled or words in said[0]
 
 
 def test_the_longest_task_that_is_believed(read, monkeypatch):
@@ -183,12 +174,12 @@ def test_ids_that_are_no_numbers(read):
         refused(read, "the id of a track is a whole number from 0 on, not", track(box(0), more=f'id="{text}"'))
     refused(read, ":3: the frame of a box is a whole number from 0 on, not '1.5'", track(box("1.5")))
     refused(read, ":4: the frame of a box is 2, and that of the box before is 2", track(box(2), box(2)))
+    refused(read, "a.xml:4: ", track(box(0), box(1, width=-3)))
 
 
 def test_boxes_of_images_and_marks(read):
-    boxes = [
-        box(0, more=f'label="car" occluded="{word}"', inner=own(n)) for n, word in enumerate(("1", "True", "0", "yes"))
-    ]
+    words = ("1", "True", "0", "yes")
+    boxes = [box(0, more=f'label="car" occluded="{word}"', inner=own(n)) for n, word in enumerate(words)]
     found = read(*(f'<image id="{3 * n}">{one}</image>' for n, one in enumerate(boxes)), '<image id="20"></image>')
     assert (found.frame.tolist(), found.id.tolist()) == ([0, 3, 6, 9], [0, 1, 2, 3])
     assert found.observed.tolist() == [False, False, True, True]
@@ -205,10 +196,6 @@ def test_classes_are_numbered_by_their_names(read):
     assert found.class_id.tolist() == [3, 1, 0, 0, 2, 1]
     assert {number: found.classes[number] for number in (2, 3)} == {2: "ant", 3: "zebra"}
     assert found.classes[1] in ("Pedestrian", "person")
-
-
-def test_the_line_of_a_box_is_said(read):
-    refused(read, "a.xml:4: ", track(box(0), box(1, width=-3)))
 
 
 def test_the_second_task_of_a_project_is_refused(read):

@@ -54,15 +54,11 @@ def test_joins_are_the_repairs_among_events_and_tracks_are_kept_or_left_out(seed
         kind: [(f.t_ns, row) for f in decisions for row in f.rows if row["kind"] == kind] for kind in DecisionKind
     }
     t_ns, events = lifecycle_of(offline).repairs()
-    wanted = {
-        (at, *(int(row[name]) for name in ("track_id", "previous_id", "source_id")))
-        for at, row in zip(t_ns.tolist(), events, strict=True)
-        if row["kind"] == EventKind.JOINED
-    }
-    found = {
-        (at, *(int(row[name]) for name in ("track_id", "previous_id", "source_id")))
-        for at, row in by_kind[DecisionKind.JOINED]
-    }
+    repairs = [(at, row) for at, row in zip(t_ns.tolist(), events, strict=True) if row["kind"] == EventKind.JOINED]
+    wanted, found = (
+        {(at, *(int(row[name]) for name in ("track_id", "previous_id", "source_id"))) for at, row in some}
+        for some in (repairs, by_kind[DecisionKind.JOINED])
+    )
     assert found == wanted
     kept = {int(row["track_id"]): row for _, row in by_kind[DecisionKind.KEPT]}
     written = rows_of(offline)
@@ -101,11 +97,10 @@ def test_joins_and_cuts_equal_the_reference(seed):
         found.features, np.array([one for *_, one in wanted]).reshape(-1, 15), rtol=1e-6, atol=1e-9
     )
     pieces, wanted_cuts = cut(SLOW, paths, ids, 0.5)
-    shuffled = rng.permutation(len(step))
-    made, cuts = cut_joins(MODEL, *(column[shuffled] for column in (step, track, source, xy)), STEP_S, 0.5)
-    assert made.tolist() == [
-        pieces[name][at] for name, at in zip(track[shuffled].tolist(), step[shuffled].tolist(), strict=True)
-    ]
+    order = rng.permutation(len(step))
+    made, cuts = cut_joins(MODEL, *(column[order] for column in (step, track, source, xy)), STEP_S, 0.5)
+    names = zip(track[order].tolist(), step[order].tolist(), strict=True)
+    assert made.tolist() == [pieces[name][at] for name, at in names]
     np.testing.assert_allclose(np.column_stack(cuts), np.array(wanted_cuts).reshape(-1, 3), rtol=1e-6, atol=1e-9)
 
 
@@ -175,15 +170,10 @@ def test_without_linking_nothing_is_cut_and_profiles_of_the_paper_write_no_decis
 
 def test_the_least_likely_tracks_come_first_and_sure_ones_not_at_all():
     rows = DECISIONS.rows(
-        kind=[1, 2, 2, 3, 3],
-        track_id=[1, 1, 2, -1, -1],
-        previous_id=[5, -1, -1, -1, -1],
-        source_id=[6, 5, 6, 7, 8],
-        probability=[0.1, 0.95, 0.6, 0.55, 0.9],
-        alternative_id=[-1] * 5,
-        duration_s=[0.4, 9.0, 8.0, 7.0, 6.0],
+        kind=[1, 2, 2, 3, 3], track_id=[1, 1, 2, -1, -1], previous_id=[5, -1, -1, -1, -1], source_id=[6, 5, 6, 7, 8],
+        probability=[0.1, 0.95, 0.6, 0.55, 0.9], alternative_id=[-1] * 5, duration_s=[0.4, 9.0, 8.0, 7.0, 6.0],
         frames=[0, 20, 19, 18, 17],
-    )
+    )  # fmt: skip
     found = find_doubtful_tracks([Frame(0, 0, rows)])
     assert [one.text("person") for one in found] == [
         "the tracker's 7 is left out: no person with 55\N{NO-BREAK SPACE}%, 7.0\N{NO-BREAK SPACE}s long",
@@ -191,13 +181,10 @@ def test_the_least_likely_tracks_come_first_and_sure_ones_not_at_all():
     ]
 
 
-@pytest.mark.parametrize(
-    ("alternative", "said"),
-    [(8, "606 goes on as 8"), (606, "606 goes on as it did"), (-1, "606 ended, and another came")],
-)
-def test_what_would_be_otherwise_is_said_of_the_track_before(alternative, said):
+def test_what_would_be_otherwise_is_said_of_the_track_before():
     event = IdentityEvent(0, {"previous_id": 606}, 1.0, "track 3 joins the tracker's 606 and 605")
-    assert Doubt(event, 0.0, "", None, 0.02, alternative).text().endswith(f"; otherwise {said}.")
+    for other, said in ((8, "606 goes on as 8"), (606, "606 goes on as it did"), (-1, "606 ended, and another came")):
+        assert Doubt(event, 0.0, "", None, 0.02, other).text().endswith(f"; otherwise {said}.")
 
 
 def test_decisions_do_not_outlive_the_method_that_made_them(template, tmp_path):

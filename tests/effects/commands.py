@@ -32,16 +32,10 @@ def stage(command: str, **others: str | tuple[str, str]) -> dict[str, Case]:
     """The options of a stage that its transform doesn't declare."""
     base = f"{command} a.mcap"
     return common(
-        base,
-        topic="--topic /other/detections" if command == "track" else "--topic /none",
-        to="--to /camera/others",
-        camera="--camera other",
-        output="-o b.mcap",
-        sidecar="--sidecar",
-        force=(f"{base} -o fresh.mcap", "--force"),
-        **({"frame": "--frame map"} if command == "track" else {}),
-        **others,
-    )
+        base, topic="--topic /other/detections" if command == "track" else "--topic /none", to="--to /camera/others",
+        camera="--camera other", output="-o b.mcap", sidecar="--sidecar", force=(f"{base} -o fresh.mcap", "--force"),
+        **({"frame": "--frame map"} if command == "track" else {}), **others,
+    )  # fmt: skip
 
 
 SCORED = "evaluate tall.txt --truth truth.txt"

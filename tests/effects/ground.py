@@ -44,93 +44,53 @@ def scored(*scores: float) -> list[Frame]:
 
 
 case(
-    "max_age_s",
-    "a car is not detected for 2.1 s",
-    GroundTracker(class_names=NAMES, link_s=0.0),
-    missed(range(10, 30), 40),
-    people,
-    {1.0: 2, 2.0: 2, 2.5: 1},
-)
+    "max_age_s", "a car is not detected for 2.1 s", GroundTracker(class_names=NAMES, link_s=0.0),
+    missed(range(10, 30), 40), people, {1.0: 2, 2.0: 2, 2.5: 1},
+)  # fmt: skip
 case(
-    "link_s",
-    "a car is not detected for 5 s; two detections confirm it, 0.1 s later",
-    GroundTracker(class_names=NAMES),
-    missed(range(10, 59), 70),
-    people,
-    {0.0: 2, 5.0: 2, 5.2: 1},
-)
+    "link_s", "a car is not detected for 5 s; two detections confirm it, 0.1 s later",
+    GroundTracker(class_names=NAMES), missed(range(10, 59), 70), people, {0.0: 2, 5.0: 2, 5.2: 1},
+)  # fmt: skip
 case(
-    "delay_s",
-    "two detections confirm a track; then a car is not detected in three frames",
-    GroundTracker(class_names=NAMES),
-    missed(range(9, 12), 20),
-    rows,
-    {0.0: 16, 0.1: 18, 1.0: 20},
-)
+    "delay_s", "two detections confirm a track; then a car is not detected in three frames",
+    GroundTracker(class_names=NAMES), missed(range(9, 12), 20), rows, {0.0: 16, 0.1: 18, 1.0: 20},
+)  # fmt: skip
 case(
-    "confirm_score",
-    "three detections of 0.4",
-    GroundTracker(class_names=NAMES),
-    boxes(lambda n: [(5.0, 5.0, {"score": 0.4})] if n < 3 else [], 10),
-    rows,
-    {0.3: 3, 1.1: 3, 1.3: 0},
-)
+    "confirm_score", "three detections of 0.4", GroundTracker(class_names=NAMES),
+    boxes(lambda n: [(5.0, 5.0, {"score": 0.4})] if n < 3 else [], 10), rows, {0.3: 3, 1.1: 3, 1.3: 0},
+)  # fmt: skip
 case(
-    "birth_score",
-    "detections of 0.3 beside those of 0.9",
-    GroundTracker(class_names=NAMES),
-    scored(0.9, 0.3),
-    people,
-    {0.2: 2, 0.4: 1, 1.0: 0},
-)
+    "birth_score", "detections of 0.3 beside those of 0.9", GroundTracker(class_names=NAMES), scored(0.9, 0.3),
+    people, {0.2: 2, 0.4: 1, 1.0: 0},
+)  # fmt: skip
 case(
-    "cost",
-    "a car is 2.2 m aside in its second frame, which is more than its width",
-    GroundTracker(class_names=NAMES),
-    boxes(lambda n: [(0.0, 2.2 * (n > 0))], 10),
-    rows,
-    {"metres": 10, "iou": 9},
-)
+    "cost", "a car is 2.2 m aside in its second frame, which is more than its width",
+    GroundTracker(class_names=NAMES), boxes(lambda n: [(0.0, 2.2 * (n > 0))], 10), rows, {"metres": 10, "iou": 9},
+)  # fmt: skip
 case(
-    "min_iou",
-    "a car goes 2 m a frame: a third of both boxes together is in common",
-    GroundTracker(class_names=NAMES, cost="iou"),
-    boxes(lambda n: [(2.0 * n, 0.0)], 2),
-    rows,
+    "min_iou", "a car goes 2 m a frame: a third of both boxes together is in common",
+    GroundTracker(class_names=NAMES, cost="iou"), boxes(lambda n: [(2.0 * n, 0.0)], 2), rows,
     {0.05: 2, 0.3: 2, 0.35: 0},
-)
+)  # fmt: skip
 case(
-    "min_score",
-    "cars of scores 0.9 and 0.7",
-    GroundTracker(class_names=NAMES),
-    scored(0.9, 0.7),
-    people,
+    "min_score", "cars of scores 0.9 and 0.7", GroundTracker(class_names=NAMES), scored(0.9, 0.7), people,
     {None: 2, 0.6: 2, 0.8: 1, 0.95: 0},
-)
+)  # fmt: skip
 case(
-    "class_id",
-    "a car, and a pedestrian",
-    GroundTracker(class_names=NAMES),
-    boxes(lambda n: [(0.0, 0.0), (20.0, 0.0, {"class_id": 1})], 10),
-    people,
-    {None: 2, 1: 1, 3: 1, 4: 0},
-)
+    "class_id", "a car, and a pedestrian", GroundTracker(class_names=NAMES),
+    boxes(lambda n: [(0.0, 0.0), (20.0, 0.0, {"class_id": 1})], 10), people, {None: 2, 1: 1, 3: 1, 4: 0},
+)  # fmt: skip
 case(
     "across_classes",
     "a car is a pedestrian from its second frame on; a track of one detection doesn't continue with another class",
-    GroundTracker(class_names=NAMES),
-    boxes(lambda n: [(0.0, 0.0, {"class_id": 1 if n else 3})], 10),
-    rows,
+    GroundTracker(class_names=NAMES), boxes(lambda n: [(0.0, 0.0, {"class_id": 1 if n else 3})], 10), rows,
     {False: 9, True: 10},
-)
+)  # fmt: skip
 case(
-    "class_limits",
-    "a car jumps by 1 m",
-    GroundTracker(class_names=NAMES, link_s=0.0),
-    boxes(lambda n: [(1.0 * (n >= 10), 0.0)], 20),
-    people,
+    "class_limits", "a car jumps by 1 m", GroundTracker(class_names=NAMES, link_s=0.0),
+    boxes(lambda n: [(1.0 * (n >= 10), 0.0)], 20), people,
     {"": 1, "car=60:3:0.25:0.8": 2, "pedestrian=6:0.8:0.2:0.8": 1},
-)
+)  # fmt: skip
 
 
 def driven(xs_m: Sequence[float | None]) -> list[Frame]:
@@ -139,16 +99,9 @@ def driven(xs_m: Sequence[float | None]) -> list[Frame]:
     for tick, x_m in enumerate(xs_m):
         name += tick > 0 and x_m is not None and xs_m[tick - 1] is None
         rows = TRACKS.rows(
-            track_id=[name],
-            x_m=[x_m or 0.0],
-            y_m=[0.0],
-            vx_m_per_s=[0.0],
-            vy_m_per_s=[0.0],
-            score=[0.8],
-            class_id=[3],
-            observed=[True],
-            source_id=[name],
-        )
+            track_id=[name], x_m=[x_m or 0.0], y_m=[0.0], vx_m_per_s=[0.0], vy_m_per_s=[0.0], score=[0.8],
+            class_id=[3], observed=[True], source_id=[name],
+        )  # fmt: skip
         out.append(Frame(ns(tick / 2.5), tick, rows if x_m is not None else TRACKS.empty()))
     return out
 
@@ -159,16 +112,10 @@ def width(outputs: Outputs) -> float:
 
 
 CASES["retrack", "class_limits"] = Case(
-    "a car stands, and after 4 s stands 1.5 m further on",
-    Retrack(class_names=NAMES),
-    driven([0.0] * 20 + [None] * 9 + [1.5] * 20),
-    people,
-    {"": 1, "car=1": 2, "pedestrian=1": 1},
-)
+    "a car stands, and after 4 s stands 1.5 m further on", Retrack(class_names=NAMES),
+    driven([0.0] * 20 + [None] * 9 + [1.5] * 20), people, {"": 1, "car=1": 2, "pedestrian=1": 1},
+)  # fmt: skip
 CASES["predict", "class_limits"] = Case(
-    "a car goes 5 m/s",
-    Predict(predictor="kalman", class_names=NAMES),
-    driven([2.0 * n for n in range(12)]),
-    width,
+    "a car goes 5 m/s", Predict(predictor="kalman", class_names=NAMES), driven([2.0 * n for n in range(12)]), width,
     {"": "most", "car=4": "more", "car=2": "least"},
-)
+)  # fmt: skip

@@ -24,41 +24,21 @@ def first_forecast(outputs: Outputs) -> int:
 
 
 case(
-    "predict",
-    "predictor",
-    "a person walks on, seen with noise",
-    Predict(),
-    shaky(),
-    change_of_forecasts,
+    "predict", "predictor", "a person walks on, seen with noise", Predict(), shaky(), change_of_forecasts,
     {"cv": "more", "kalman": "least"},
-)
+)  # fmt: skip
 case(
-    "predict",
-    "horizon_s",
-    "2.5 steps a second",
-    Predict(predictor="cv"),
-    line(0.5, 9, 9),
-    forecast_steps,
+    "predict", "horizon_s", "2.5 steps a second", Predict(predictor="cv"), line(0.5, 9, 9), forecast_steps,
     {0.4: 1, 2.0: 5, 4.8: 12},
-)
+)  # fmt: skip
 case(
-    "predict",
-    "min_history",
-    "a person is seen from tick 0 on",
-    Predict(predictor="cv"),
-    line(0.5, 9, 9),
-    first_forecast,
-    {1: 0, 2: 1, 4: 3},
-)
+    "predict", "min_history", "a person is seen from tick 0 on", Predict(predictor="cv"), line(0.5, 9, 9),
+    first_forecast, {1: 0, 2: 1, 4: 3},
+)  # fmt: skip
 case(
-    "predict",
-    "adapt",
-    "a person walks straight on, which is predicted better than most walks",
-    Predict(predictor="cv"),
-    line(0.5, 40, 40),
-    spread_of_last,
-    {True: "least", False: "more"},
-)
+    "predict", "adapt", "a person walks straight on, which is predicted better than most walks",
+    Predict(predictor="cv"), line(0.5, 40, 40), spread_of_last, {True: "least", False: "more"},
+)  # fmt: skip
 
 
 def tenths(seen: list[int]) -> list[Frame]:
@@ -67,23 +47,14 @@ def tenths(seen: list[int]) -> list[Frame]:
 
 
 case(
-    "sample",
-    "rate_hz",
-    "three seconds, both ends included",
-    Sample(),
-    tenths(list(range(31))),
-    rows,
+    "sample", "rate_hz", "three seconds, both ends included", Sample(), tenths(list(range(31))), rows,
     {1.0: 4, 2.5: 8, 5.0: 16},
-)
+)  # fmt: skip
 case(
-    "sample",
-    "max_gap_s",
-    "a person is seen until 0.5 s and from 2 s on: ticks at 0.8, 1.2 and 1.6 s are in the hole of 1.5 s",
-    Sample(),
-    tenths([n for n in range(31) if n <= 5 or n >= 20]),
-    rows,
-    {0.0: 5, 1.4: 5, 1.5: 8, 3.0: 8},
-)
+    "sample", "max_gap_s",
+    "a person is seen until 0.5 s and from 2 s on: ticks at 0.8, 1.2 and 1.6 s are in the hole of 1.5 s", Sample(),
+    tenths([n for n in range(31) if n <= 5 or n >= 20]), rows, {0.0: 5, 1.4: 5, 1.5: 8, 3.0: 8},
+)  # fmt: skip
 
 
 def film(draw, count: int = 30) -> list[Frame]:
@@ -127,24 +98,13 @@ def shaken() -> list[Frame]:
 STEADY = KnnDetector(stabilise=False)
 STOPS = film(stops, 60)
 case(
-    "detect",
-    "threshold",
-    pale.__doc__,
-    KnnDetector(stabilise=False),
-    film(pale),
-    last_boxes,
-    {100.0: 1, 800.0: 0},
-)
+    "detect", "threshold", pale.__doc__, KnnDetector(stabilise=False), film(pale), last_boxes, {100.0: 1, 800.0: 0},
+)  # fmt: skip
 case("detect", "history_s", stops.__doc__, STEADY, STOPS, all_boxes, {0.5: "least", 2.0: "more", 60.0: "most"})
 case(
-    "detect",
-    "max_pixels",
-    stops.__doc__,
-    STEADY,
-    STOPS,
-    lambda o: float(o[0][-1].rows["x_px"][0]),
+    "detect", "max_pixels", stops.__doc__, STEADY, STOPS, lambda o: float(o[0][-1].rows["x_px"][0]),
     {1_000_000: 51.0, 10_000: 50.0},
-)
+)  # fmt: skip
 case("detect", "stabilise", shaken.__doc__, KnnDetector(), shaken(), all_boxes, {False: "more", True: "least"})
 
 
@@ -208,11 +168,6 @@ def motion(outputs: Outputs) -> float:
 LORRY = lorry()
 BOXES = {frame.t_ns: np.array([[28.0, 18.0, 264.0, 204.0]]) for frame in LORRY}
 case(
-    "motion",
-    "mask_boxes",
-    lorry.__doc__,
-    EstimateMotion(known_boxes=BOXES),
-    LORRY,
-    motion,
+    "motion", "mask_boxes", lorry.__doc__, EstimateMotion(known_boxes=BOXES), LORRY, motion,
     {True: "least", False: "more"},
-)
+)  # fmt: skip

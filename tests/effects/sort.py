@@ -63,86 +63,43 @@ def shared(kind: str, tracker: type[Sort]) -> None:
     moved = tracker(max_age_frames=3, min_hits_frames=0, camera_path=path)
     case(kind, "camera_motion", panned.__doc__, moved, frames, people, {"off": 6, "auto": 1, "on": 1})
     case(
-        kind,
-        "max_age_s",
-        "missed in 4 frames: in the last of them the last box is 0.4 s ago",
-        tracker(min_hits_s=0.0),
-        missed(range(10, 14)),
-        people,
-        {0.3: 2, 0.4: 1, 1.0: 1},
-    )
+        kind, "max_age_s", "missed in 4 frames: in the last of them the last box is 0.4 s ago",
+        tracker(min_hits_s=0.0), missed(range(10, 14)), people, {0.3: 2, 0.4: 1, 1.0: 1},
+    )  # fmt: skip
     case(
-        kind,
-        "max_age_frames",
-        "missed in 4 frames",
-        base,
-        missed(range(10, 14)),
-        people,
-        {3: 2, 4: 1, 6: 1},
-    )
+        kind, "max_age_frames", "missed in 4 frames", base, missed(range(10, 14)), people, {3: 2, 4: 1, 6: 1},
+    )  # fmt: skip
     case(
-        kind,
-        "min_hits_s",
-        "a person comes into a running log at 1 s",
-        tracker(),
-        detections(lambda n: [(50, 50)] if n >= 10 else [], 30),
-        lambda o: 30 - rows(o),
+        kind, "min_hits_s", "a person comes into a running log at 1 s", tracker(),
+        detections(lambda n: [(50, 50)] if n >= 10 else [], 30), lambda o: 30 - rows(o),
         {0.0: 10, 0.3: 13, 0.5: 15},
-    )
+    )  # fmt: skip
     case(
-        kind,
-        "min_hits_frames",
-        "a person comes into a running log in frame 10",
-        base,
-        detections(lambda n: [(50, 50)] if n >= 10 else [], 30),
-        lambda o: 30 - rows(o),
-        {0: 10, 3: 13, 5: 15},
-    )
+        kind, "min_hits_frames", "a person comes into a running log in frame 10", base,
+        detections(lambda n: [(50, 50)] if n >= 10 else [], 30), lambda o: 30 - rows(o), {0: 10, 3: 13, 5: 15},
+    )  # fmt: skip
     case(
-        kind,
-        "cost",
-        "small boxes that move by more than their size, 1 m, a frame",
+        kind, "cost", "small boxes that move by more than their size, 1 m, a frame",
         tracker(**FRAMES, ground_planes=PLANE, max_distance_m=0.9),
-        [Frame(ns(n / 10), n, boxes_at([(20 + 20 * n, 50)], (8, 8))) for n in range(10)],
-        people,
+        [Frame(ns(n / 10), n, boxes_at([(20 + 20 * n, 50)], (8, 8))) for n in range(10)], people,
         {"iou": 10, "pixels": 1, "metres": 10},
-    )
+    )  # fmt: skip
     case(
-        kind,
-        "min_iou",
-        "a jump by half the width: a third of both boxes together is in common",
-        base,
-        jump(10.0),
-        people,
-        {0.2: 1, 0.32: 1, 0.34: 2},
-    )
+        kind, "min_iou", "a jump by half the width: a third of both boxes together is in common", base, jump(10.0),
+        people, {0.2: 1, 0.32: 1, 0.34: 2},
+    )  # fmt: skip
     case(
-        kind,
-        "max_distance_px",
-        "a jump by 30 px",
-        tracker(**FRAMES, cost="pixels"),
-        jump(30.0),
-        people,
+        kind, "max_distance_px", "a jump by 30 px", tracker(**FRAMES, cost="pixels"), jump(30.0), people,
         {29.0: 2, 31.0: 1},
-    )
+    )  # fmt: skip
     case(
-        kind,
-        "max_distance_m",
-        "a jump by 30 px, which are 1.5 m",
-        tracker(**FRAMES, cost="metres", ground_planes=PLANE),
-        jump(30.0),
-        people,
-        {1.4: 2, 1.6: 1},
-    )
+        kind, "max_distance_m", "a jump by 30 px, which are 1.5 m",
+        tracker(**FRAMES, cost="metres", ground_planes=PLANE), jump(30.0), people, {1.4: 2, 1.6: 1},
+    )  # fmt: skip
     case(
-        kind,
-        "min_score",
-        "boxes of scores 0.9 and 0.7",
-        base,
-        said(score=[0.9, 0.7]),
-        people,
+        kind, "min_score", "boxes of scores 0.9 and 0.7", base, said(score=[0.9, 0.7]), people,
         {None: 2, 0.7: 2, 0.8: 1, 0.95: 0},
-    )
+    )  # fmt: skip
     case(kind, "class_id", "boxes of classes 1 and 2", base, said(class_id=[1, 2]), people, {None: 2, 2: 1, 3: 0})
     changing = jump(0.0)
     for frame in changing[10:]:
@@ -156,38 +113,27 @@ shared("bytetrack", ByteTrack)
 shared("ocsort", OcSort)
 
 case(
-    "bytetrack",
-    "high_score",
-    "a box scores 0.9 and then 0.4, and overlaps its track by a third as it jumps",
+    "bytetrack", "high_score", "a box scores 0.9 and then 0.4, and overlaps its track by a third as it jumps",
     ByteTrack(**FRAMES, low_min_iou=0.5),
     [
         f._replace(rows=boxes_at([(100 + 10 * (n >= 10), 50)], score=0.9 if n < 10 else 0.4))
         for n, f in enumerate(jump(0.0))
     ],
-    rows,
-    {0.3: 20, 0.5: 10},
-)
+    rows, {0.3: 20, 0.5: 10},
+)  # fmt: skip
 case(
-    "bytetrack",
-    "new_score",
-    "beside a person with a high score, a box that always scores 0.55",
-    ByteTrack(**FRAMES),
-    second_scores([0.55] * 10),
-    people,
-    {0.5: 2, 0.6: 1},
-)
+    "bytetrack", "new_score", "beside a person with a high score, a box that always scores 0.55",
+    ByteTrack(**FRAMES), second_scores([0.55] * 10), people, {0.5: 2, 0.6: 1},
+)  # fmt: skip
 case(
-    "bytetrack",
-    "low_min_iou",
-    "a box scores 0.9 and then 0.4, and overlaps its track by a third as it jumps",
+    "bytetrack", "low_min_iou", "a box scores 0.9 and then 0.4, and overlaps its track by a third as it jumps",
     ByteTrack(**FRAMES),
     [
         f._replace(rows=boxes_at([(100 + 10 * (n >= 10), 50)], score=0.9 if n < 10 else 0.4))
         for n, f in enumerate(jump(0.0))
     ],
-    rows,
-    {0.2: 20, 0.5: 10},
-)
+    rows, {0.2: 20, 0.5: 10},
+)  # fmt: skip
 
 
 def fork() -> list[Frame]:
@@ -197,14 +143,9 @@ def fork() -> list[Frame]:
 
 
 case(
-    "ocsort",
-    "inertia",
-    fork.__doc__,
-    OcSort(**FRAMES, direction_frames=2),
-    fork(),
-    lambda o: float(o[0][12].rows["y_px"][0]) < 85,
-    {0.0: False, 1.0: True},
-)
+    "ocsort", "inertia", fork.__doc__, OcSort(**FRAMES, direction_frames=2), fork(),
+    lambda o: float(o[0][12].rows["y_px"][0]) < 85, {0.0: False, 1.0: True},
+)  # fmt: skip
 
 
 def bend() -> list[Frame]:
@@ -215,14 +156,9 @@ def bend() -> list[Frame]:
 
 
 case(
-    "ocsort",
-    "direction_frames",
-    bend.__doc__,
-    OcSort(**FRAMES, inertia=9.0),
-    bend(),
-    lambda o: float(o[0][14].rows["x_px"][o[0][14].rows["track_id"] == 1][0]) > 182,
-    {2: False, 12: True},
-)
+    "ocsort", "direction_frames", bend.__doc__, OcSort(**FRAMES, inertia=9.0), bend(),
+    lambda o: float(o[0][14].rows["x_px"][o[0][14].rows["track_id"] == 1][0]) > 182, {2: False, 12: True},
+)  # fmt: skip
 
 
 def behind() -> list[Frame]:
@@ -231,14 +167,9 @@ def behind() -> list[Frame]:
 
 
 case(
-    "ocsort",
-    "recover",
-    behind.__doc__,
-    OcSort(**FRAMES | {"max_age_frames": 30}),
-    behind(),
-    people,
+    "ocsort", "recover", behind.__doc__, OcSort(**FRAMES | {"max_age_frames": 30}), behind(), people,
     {False: 2, True: 1},
-)
+)  # fmt: skip
 
 
 def off_the_line(outputs: Outputs) -> float:
@@ -257,11 +188,6 @@ def grown() -> list[Frame]:
 
 
 case(
-    "ocsort",
-    "reupdate",
-    grown.__doc__,
-    OcSort(**FRAMES | {"max_age_frames": 30}, min_iou=0.05),
-    grown(),
-    off_the_line,
-    {False: "more", True: "least"},
-)
+    "ocsort", "reupdate", grown.__doc__, OcSort(**FRAMES | {"max_age_frames": 30}, min_iou=0.05), grown(),
+    off_the_line, {False: "more", True: "least"},
+)  # fmt: skip

@@ -91,14 +91,8 @@ def odds_of(
         if is_cut:
             joins = [log(likely / (1 - likely)) for likely in (after.get(a, (0, 0.5))[1], before.get(b, 0.5))]
             found = [
-                *plain,
-                is_own,
-                joins[0] * is_own,
-                is_same,
-                *((0, 0) if is_own else joins),
-                a in after,
-                b in before,
-            ]
+                *plain, is_own, joins[0] * is_own, is_same, *((0, 0) if is_own else joins), a in after, b in before,
+            ]  # fmt: skip
             found += [log(len(paths[a])), log(len(paths[b])), gap == 1, gap_s < SHORT_S]
             odds = sum(WEIGHTS[one] * value for one, value in zip(NAMES, found, strict=True)) + BIAS
         out[a, b] = odds, is_cut, gap_s

@@ -115,14 +115,10 @@ def link_features(motion: Motion, before: State, after: State, gap_s: float) -> 
     speed = max(hypot(*left), hypot(*came))
     variance = link_spread(motion, before, after, gap_s)
     return [
-        log(miss + NEAR_M),
-        log(1 + misfit**2 / (2 * variance)),
-        gap_s,
-        log(min(misfit, stay) + NEAR_M) * log(gap_s + 0.4),
-        log(hypot(*(came - left)) + SPEED_M_PER_S),
-        log(stay + NEAR_M) * log(speed + SPEED_M_PER_S),
-        log(misfit + NEAR_M) * log(speed + SPEED_M_PER_S),
-    ]
+        log(miss + NEAR_M), log(1 + misfit**2 / (2 * variance)), gap_s,
+        log(min(misfit, stay) + NEAR_M) * log(gap_s + 0.4), log(hypot(*(came - left)) + SPEED_M_PER_S),
+        log(stay + NEAR_M) * log(speed + SPEED_M_PER_S), log(misfit + NEAR_M) * log(speed + SPEED_M_PER_S),
+    ]  # fmt: skip
 
 
 def links(motion: Motion, paths: dict[int, Path], max_gap_s: float, least: float) -> dict[int, int]:
