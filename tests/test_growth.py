@@ -23,6 +23,7 @@ from mcaptrack.evaluation.metrics.clear import clear
 from mcaptrack.evaluation.people import person_scores
 from mcaptrack.geometry import assignment, boxes, neighbours
 from mcaptrack.geometry.neighbours import near_pairs, touching_pairs
+from mcaptrack.geometry.plane_from_boxes import whole_people
 from mcaptrack.log import chunks
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.transforms import Retrack
@@ -122,7 +123,13 @@ def all_scores(count: int) -> Callable[[], object]:
     return lambda: scores(truth, tracks, "iou")
 
 
+def whole(count: int) -> Callable[[], object]:
+    boxes_px = np.random.default_rng(0).uniform([0, 0, 15, 40], [4000, 3000, 25, 60], (count, 4))
+    return lambda: whole_people(boxes_px, np.zeros(count, np.int64), np.ones(count), 4000, 3000)
+
+
 LARGE = {
+    "whole people": whole,
     **{
         f"{type(one).__name__} {one.cost}": (lambda count, one=one: lambda: transformed(one, crowd(count, 3)[0]))
         for one in TRACKERS

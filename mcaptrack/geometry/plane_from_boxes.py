@@ -19,6 +19,7 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Indices, Ints
+from mcaptrack.geometry.neighbours import touching_pairs
 from mcaptrack.geometry.plane import PERSON_HEIGHT_M, GroundPlane
 
 # Boxes that count: whole people, away from the borders of the picture (a share of its size, and pixels), not hidden by
@@ -251,13 +252,15 @@ def whole_people(boxes: Floats, frame: Ints, score: Floats, width_px: int, heigh
     has_score = np.isfinite(score)
     if has_score.any():
         use &= ~has_score | (score >= _LEAST_OF_SCORES * np.quantile(score[has_score], 0.95))
-    order = np.argsort(frame, kind="stable")
-    for at in np.split(order, np.flatnonzero(np.diff(frame[order])) + 1):
-        some, bottom = boxes[at], top[at] + height[at]
-        low = np.maximum(some[:, None, :2], some[None, :, :2])
-        high = np.minimum(some[:, None, :2] + some[:, None, 2:], some[None, :, :2] + some[None, :, 2:])
-        shared = np.nan_to_num(np.clip(high - low, 0, None).prod(axis=2)) * (bottom[None, :] > bottom[:, None])
-        use[at] &= shared.max(axis=1, initial=0.0) <= _MOST_HIDDEN * width[at] * height[at]
+    finite = np.flatnonzero(np.isfinite(boxes).all(axis=1))
+    corners = np.concatenate([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], axis=1)
+    own, other = (finite[pair] for pair in touching_pairs(*[corners[finite]] * 2, *[frame[finite]] * 2))
+    nearer = corners[other, 3] > corners[own, 3]
+    own, other = own[nearer], other[nearer]
+    low, high = np.maximum(corners[own, :2], corners[other, :2]), np.minimum(corners[own, 2:], corners[other, 2:])
+    hidden = np.zeros(len(boxes))
+    np.maximum.at(hidden, own, np.clip(high - low, 0, None).prod(axis=1))
+    use &= hidden <= _MOST_HIDDEN * width * height
     return use
 
 
