@@ -10,7 +10,8 @@ from typing import Any, Final, get_type_hints
 
 from mcaptrack.cli.command import is_on_command_line, settings_of
 from mcaptrack.cli.flags import RUNNING
-from mcaptrack.cli.text import say
+from mcaptrack.cli.settings import found_of
+from mcaptrack.cli.text import refuse_usage, say
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS
 from mcaptrack.transforms import STAGES, Stage, Transform
@@ -44,40 +45,43 @@ def has_flag(field: Field[Any]) -> bool:
     return bool(field.metadata.get("flag", True))
 
 
-def values_set(texts: Sequence[str] | None, kinds: Mapping[str, type[Transform]]) -> dict[str, Any]:
+def values_set(command: str, texts: Sequence[str] | None, kinds: Mapping[str, type[Transform]]) -> dict[str, Any]:
     """Return the values of ``--set name=value`` by parameter of the transforms ``kinds``, which have names.
 
-    Raises
-    ------
-    McaptrackError
-        For a text without a value, a parameter that no transform has, or a value that isn't of its type.
+    A text without a value, a parameter that no transform has, or a value that isn't of its type ends the command with
+    exit code 2; the line says where the text was set.
     """
     owners = {option: kind for kind in reversed(list(kinds.values())) for option in options_of(kind)}
-    out: dict[str, Any] = {}
+    in_file = found_of(command).get("set")
+    where = f"{in_file[1].where}:" if in_file and not is_on_command_line("set") else "--set"
+    values: dict[str, Any] = {}
     for text in texts or ():
         written, equals, value = text.partition("=")
         name = written.strip().lstrip("-").replace("-", "_")
         if not equals:
-            raise McaptrackError(f"--set needs name=value, as in --set {name}=0.5, not {text!r}")
+            refuse_usage(f"{where} needs name=value, as in --set {name}=0.5, not {text!r}")
         if name not in owners:
             alike = difflib.get_close_matches(name, owners, 1)
             hint = f"; did you mean {alike[0]}?" if alike else f"; there are {listed(sorted(owners))}"
-            raise McaptrackError(f"--set {text}: there is no parameter {name}{hint}")
-        if name in out:
-            raise McaptrackError(f"--set gives {name} twice")
-        out[name] = _read_value(text, value.strip(), get_type_hints(owners[name])[name])
-    return out
+            refuse_usage(f"{where} {text}: there is no parameter {name}{hint}")
+        if name in values:
+            refuse_usage(f"{where} gives {name} twice")
+        try:
+            values[name] = _read_value(value.strip(), get_type_hints(owners[name])[name])
+        except ValueError as error:
+            refuse_usage(f"{where} {text}: {value.strip()!r} is not {error}")
+    return values
 
 
-def _read_value(text: str, value: str, hint: Any) -> Any:
-    """The value that a text of ``--set`` gives a parameter of this type."""
+def _read_value(value: str, hint: Any) -> Any:
+    """The value that a text gives a parameter of this type. Raises ValueError that says what it should be."""
     if value.lower() == "none" and bare_type(hint) is not hint:
         return None
     kind, is_tuple = member_type(hint)
     try:
         members = [_read_member(member.strip(), kind) for member in (value.split(",") if is_tuple else [value])]
     except ValueError:
-        raise McaptrackError(f"--set {text}: {value!r} is not {_KIND_WORDS[kind]}") from None
+        raise ValueError(_KIND_WORDS[kind]) from None
     return tuple(members) if is_tuple else members[0]
 
 
@@ -199,7 +203,7 @@ def configured(chosen: Mapping[str, str] = MappingProxyType({})) -> dict[str, Tr
         wanted = {option: value for option, value in settings.items() if value is not None}
         chosen_plugin = settings.get(stage.kind) if stage.kind else None
         kinds = dict(stage.built_in()) | ({chosen_plugin: stage.find(chosen_plugin).cls} if chosen_plugin else {})
-        wanted |= values_set(wanted.pop("set", None), kinds)
+        wanted |= values_set(stage.name, wanted.pop("set", None), kinds)
         if wanted.keys() & {*own, stage.option, "profile"}:
             out[stage.name] = make_transform(stage, settings, wanted)
     return out

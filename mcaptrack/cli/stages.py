@@ -197,7 +197,7 @@ def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = Mapping
 
     def run(values: Mapping[str, Any]) -> None:
         wanted = {option: values[option] for option in owners if values.get(option) is not None}
-        for option, value in values_set(values.get("set"), kinds).items():
+        for option, value in values_set(stage.name, values.get("set"), kinds).items():
             if option in wanted and is_on_command_line(option):
                 raise McaptrackError(f"--set {option} and the option of this name are both given; give one of them")
             wanted[option] = value
