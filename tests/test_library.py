@@ -408,7 +408,7 @@ class TestWordsOfTheCommandLine:
                 documents |= {
                     id(part)
                     for node in ast.walk(tree)
-                    if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "option"
+                    if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("option", "setting")
                     for part in ast.walk(node)
                 }
             texts = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]

@@ -143,11 +143,11 @@ def _check(server: Any, folder: Path, line: str, log: Path | None) -> None:
         assert not list(folder.glob("*.journal")) + list(folder.glob(".*.part")), which
 
 
-@pytest.mark.parametrize("line", one_in(3, LINES))
+@pytest.mark.parametrize("line", one_in(9, LINES))
 def test_an_answer_that_is_lost_is_said(server, tmp_path, log, line):
     _check(server, tmp_path, line, log)
 
 
-@pytest.mark.parametrize("line", one_in(9, EVERY))
+@pytest.mark.parametrize("line", one_in(24, EVERY))
 def test_of_every_command(server, tmp_path, line):
     _check(server, tmp_path, line, None)
