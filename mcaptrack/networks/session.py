@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from importlib.util import find_spec
 from threading import Lock
 from typing import Any, Final, Literal, TypedDict
@@ -79,7 +80,8 @@ class Session:
         )
         arena = onnxruntime.OrtArenaCfg({"max_mem": memory_bytes, "arena_extend_strategy": 1})
         with _OPENING:  # the next session takes the allocator that was registered last
-            onnxruntime.create_and_register_allocator(info, arena)
+            with suppress(RuntimeError):  # ONNX Runtime 1.19 keeps the first one that a process has registered
+                onnxruntime.create_and_register_allocator(info, arena)
             try:
                 self._session = onnxruntime.InferenceSession(data, options, providers=providers)
             except Exception as error:  # ONNX Runtime has no common base class of its errors
