@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 from importlib.util import find_spec
 from threading import Lock
 from typing import Any, Final, Literal, TypedDict
@@ -80,8 +79,11 @@ class Session:
         )
         arena = onnxruntime.OrtArenaCfg({"max_mem": memory_bytes, "arena_extend_strategy": 1})
         with _OPENING:  # the next session takes the allocator that was registered last
-            with suppress(RuntimeError):  # ONNX Runtime 1.19 keeps the first one that a process has registered
+            try:
                 onnxruntime.create_and_register_allocator(info, arena)
+            except RuntimeError as error:  # ONNX Runtime 1.19 keeps the first one that a process has registered
+                if "already been registered" not in str(error):
+                    raise
             try:
                 self._session = onnxruntime.InferenceSession(data, options, providers=providers)
             except Exception as error:  # ONNX Runtime has no common base class of its errors
