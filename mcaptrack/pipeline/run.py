@@ -148,7 +148,7 @@ class Report:
 
 
 #: The stages with results in metres: all except those that read pictures.
-_IN_METRES: Final = {name for name, stage in STAGES.items() if stage.default.reads is not VIDEO}
+_IN_METRES: Final = {name for name, stage in STAGES.items() if stage.reads is not VIDEO}
 #: The memory that a run needs, in bytes: whatever its length, and for each second that a person is seen (re-tracking
 #: has all samples in memory).
 _BASE, _A_PERSON_SECOND = 400_000_000, 3_000

@@ -86,7 +86,7 @@ _FIRST_TRACKER: Final = next(iter(_TRACKERS))
 def tracker_name(provenance: Provenance | None) -> str:
     """Return the name of the tracker of a channel, by how it was made."""
     stage = STAGES.get(provenance.transform) if provenance else None
-    if provenance is None or stage is None or stage.default.reads is not DETECTIONS:
+    if provenance is None or stage is None or stage.reads is not DETECTIONS:
         return "tracks as given"
     return _TRACKERS.get(str(provenance.parameters.get(stage.option, _FIRST_TRACKER)), "tracker")
 
