@@ -70,12 +70,6 @@ def test_a_link_leads_to_the_log_afterwards(path, tmp_path):
     assert sorted(our_messages(path)) == ["a", "c", "new"]
 
 
-def test_rights_stay(path):
-    path.chmod(0o640)
-    add(path)
-    assert path.stat().st_mode & 0o7777 == 0o640
-
-
 @pytest.mark.skipif(not AS_ROOT, reason="only root gives files away")
 def test_owner_and_group_stay(path):
     os.chown(path, 1001, 1002)
