@@ -160,10 +160,6 @@ def test_every_guarantee_of_the_map_names_test_files_that_exist():
         assert all((ROOT / "tests" / f"{name}.py").exists() for name in files), guarantee
 
 
-def test_no_line_of_the_map_is_too_long():
-    assert max(map(len, ARCHITECTURE.read_text().splitlines())) <= 125
-
-
 def test_the_floors_on_the_map_are_those_that_are_held():
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
     layers = {name.strip().rpartition(".")[2] for layer in contracts[0]["layers"] for name in layer.split("|")}

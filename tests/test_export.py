@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 
 import duckdb
@@ -122,22 +121,6 @@ def test_units_meaning_and_provenance_are_in_the_file(tmp_path):
     assert schema.metadata[b"mcaptrack.recording"] == b"a.mcap"
 
 
-def test_tables_without_writing_them_are_those_of_the_folder(tmp_path):
-    path = some_log(tmp_path / "a.mcap")
-    exported(path, tmp_path / "tables")
-    with log.read(path) as opened:
-        contents = LogTables(opened)
-        for name in tables.TABLES:
-            (file,) = (tmp_path / "tables" / name).rglob("*.parquet")
-            made = contents.table(name)
-            assert made.schema.equals(pq.read_schema(file), check_metadata=False)
-            with file.open("rb") as stream:  # a file alone: what its folders are called is no column
-                assert made.to_pylist() == pq.read_table(stream).to_pylist()
-            assert [f.metadata[b"description"] for f in made.schema] == [
-                f.metadata[b"description"] for f in pq.read_schema(file)
-            ]
-
-
 # Again
 
 
@@ -170,15 +153,6 @@ def test_exporting_again_writes_what_changed_and_touches_nothing_else(tmp_path):
     assert pl.read_parquet(f"{folder}/tracks/*/*.parquet", hive_partitioning=True).filter(
         recording="a", topic="/camera/tracks"
     )["x_m"].to_list() == [7.0]
-
-
-def test_a_log_that_was_written_again_with_the_same_rows_changes_no_table_of_rows(tmp_path):
-    path, folder = some_log(tmp_path / "a.mcap"), tmp_path / "tables"
-    exported(path, folder)
-    with log.read(path) as opened, log.extend(opened, drop=["/imu"]):
-        pass
-    done = exported(path, folder)
-    assert set(done.written) == {"frames", "channels", "recordings"}
 
 
 def test_a_table_that_was_damaged_or_lost_is_made_again(tmp_path):
@@ -270,19 +244,6 @@ def test_a_topic_with_an_evil_name_is_exported_inside_of_the_folder(tmp_path):
     assert {path.name for path in (tmp_path / "in").iterdir()} == {"tables"}
 
 
-def test_two_logs_of_one_name_are_not_mixed_up(tmp_path):
-    one, other = some_log(tmp_path / "a b.mcap"), some_log(tmp_path / "a_b.mcap")
-    exported(one, tmp_path / "tables")
-    with pytest.raises(McaptrackError, match=r"holds the tables of \S+/a b.mcap, not of \S+/a_b.mcap"):
-        exported(other, tmp_path / "tables")
-    (tmp_path / "day").mkdir()
-    again = some_log(tmp_path / "day" / "a_b.mcap")
-    outcome = CliRunner().invoke(app, ["export", str(other), str(again), "-o", str(tmp_path / "both")])
-    assert outcome.exit_code == 1
-    assert "would both be a_b in the tables" in outcome.stderr
-    assert not (tmp_path / "both").exists()
-
-
 # Channels of others
 
 
@@ -346,38 +307,3 @@ def test_results_beside_a_log_are_in_its_tables(tmp_path):
     query = "select topic, file from '@/frames/*/*.parquet' where topic like '%tracks' group by all order by all"
     assert ask(query, tmp_path / "t") == [("/camera/retracks", "a.results.mcap"), ("/camera/tracks", "a.mcap")]
     assert ask("select results_file from '@/recordings/*/*.parquet'", tmp_path / "t") == [("a.results.mcap",)]
-
-
-def test_cut_off_at_any_table_the_next_export_completes_it(tmp_path, monkeypatch):
-    path, folder = some_log(tmp_path / "a.mcap"), tmp_path / "tables"
-    exported(path, folder)
-    with log.read(path) as opened, log.extend(opened, drop=["/camera/tracks"]) as writer:
-        add_rows(writer, "/camera/tracks", TRACKS, [Frame(0, 0, tracks_at({4: (7.0, 7.0)}))])
-    old = {file: file.read_bytes() for file in folder.rglob("*.parquet")}
-    with log.read(path) as opened:
-        digest = opened.fingerprint()
-    real, calls = os.replace, []
-    for at in range(1, 8):
-        for file, data in old.items():
-            file.write_bytes(data)
-        calls.clear()
-
-        def replace(*args, at=at):
-            calls.append(args)
-            if len(calls) == at:
-                raise KeyboardInterrupt
-            return real(*args)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(os, "replace", replace)
-            try:
-                exported(path, folder)
-            except KeyboardInterrupt:
-                assert ask("select digest from '@/recordings/*/*.parquet'", folder) != [(digest,)]
-            else:
-                break
-        exported(path, folder)
-        assert ask("select digest from '@/recordings/*/*.parquet'", folder) == [(digest,)]
-        assert ask("select x_m from '@/tracks/*/*.parquet' where topic = '/camera/tracks'", folder) == [(7.0,)]
-        assert not [file for file in folder.rglob("*") if file.name.endswith(".part")]
-    assert at == 7

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -15,13 +14,11 @@ from pathlib import Path
 
 import pytest
 
-import mcaptrack
 from mcaptrack import environment, fleet
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import child, claims, digests
 from mcaptrack.fleet.claims import Claims, claim_name
 from mcaptrack.fleet.ledger import Ledger
-from mcaptrack.log import read
 from tests import fleet_tasks
 from tests.awaiting import until
 
@@ -400,14 +397,3 @@ def test_workers_share_the_cores(monkeypatch):
         monkeypatch.setenv("OMP_NUM_THREADS", said)
         assert environment.threads() == wanted
         assert child.environment_of_worker(2)["OMP_NUM_THREADS"] == said
-
-
-def test_a_log_that_another_process_writes_is_named(template, tmp_path):
-    log = Path(shutil.copyfile(template, tmp_path / "a.mcap"))
-    before = log.read_bytes()
-    with read(log) as opened:
-        opened.lock()
-        (outcome,) = fleet.run(mcaptrack.run, tmp_path, {"force": True, "tables": False}).outcomes
-    assert outcome.state == "failed"
-    assert "another process" in outcome.error or "is being written" in outcome.error, outcome.error
-    assert log.read_bytes() == before

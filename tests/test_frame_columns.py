@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,6 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.foxglove.views import people
-from mcaptrack.log import in_place, writer
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, frame_columns, framing
 from mcaptrack.schema.frame_columns import FrameCollector, collect
 from mcaptrack.schema.framing import filtered_rows, join_frames, joined_parts, mapped_rows, thinned, unique_values
@@ -138,27 +136,6 @@ def test_a_log_is_the_same_whatever_the_size_of_blocks_and_parts(tmp_path, reque
     }
     assert tables
     assert all((tmp_path / "parts" / name).read_bytes() == path.read_bytes() for name, path in tables.items())
-
-
-@thorough
-def test_a_log_four_times_as_long_takes_hardly_more_memory(monkeypatch, tmp_path):
-    monkeypatch.setattr(frame_columns, "BLOCK_BYTES", 2**14)
-    monkeypatch.setattr(framing, "PART_ROWS", 1000)
-    monkeypatch.setattr(people, "_PART_ROWS", 1000)
-    monkeypatch.setattr(people, "_PART_STEPS", 1000)
-    peaks = []
-    monkeypatch.setattr(writer, "_CHUNK_BYTES", dict.fromkeys(("media", "rows", "views"), 2**14))
-    monkeypatch.setattr(in_place, "_PIECE", 2**14)
-    for seconds in (5.0, 30.0, 120.0):  # the first one imports
-        path = write_boxes(tmp_path / f"{seconds:g}.mcap", seconds)
-        tracemalloc.start()
-        try:
-            mcaptrack.predict(path, predictor="cv")
-            peaks.append(tracemalloc.get_traced_memory()[1])
-        finally:
-            tracemalloc.stop()
-    of_a_channel = 10 * 90 * 6 * TRACKS.dtype.itemsize
-    assert peaks[2] - peaks[1] < 3 * of_a_channel, "with all rows as objects it is ten times those of a channel"
 
 
 @pytest.mark.parametrize("way", ["append", "extend"])

@@ -319,6 +319,8 @@ def test_a_forecast_may_be_of_any_numbers(kind):
         ({"past": 10_001}, "past=10001; all have to be above 0, steps and past at most 10000"),
         ({"steps": 10_001}, "steps=10001, step_s=0.5, past=1; all have to be above 0, steps and past at most 10000"),
         ({"past": "two"}, "needs the numbers steps, step_s and past: ValueError"),
+        ({"predict": None}, "has no method predict"),
+        ({"__init__": lambda self, steps: None}, "could not be made with steps, step_s: TypeError"),
     ],
 )  # fmt: skip
 def test_a_predictor_that_goes_wrong_is_named(attributes, said):

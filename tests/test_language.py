@@ -7,8 +7,6 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parent.parent
 SOURCES = sorted((ROOT / "mcaptrack").rglob("*.py"))
 PAGES = [
@@ -64,25 +62,3 @@ def test_the_documentation_holds_no_riddles():
     assert len(PAGES) > 20
     found = {str(path.relative_to(ROOT)): words_of(path.read_text(encoding="utf-8")) for path in PAGES}
     assert {path: lines for path, lines in found.items() if lines} == {}
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "# Boxes of nobody.",
-        "'Somebody, whose box'",
-        "def f():\n    '''What it does.'''",
-        "class A:\n    '''How it came.'''",
-        "async def f():\n    '''Who is seen.'''",
-        "def how_it_came(): ...",
-        "class A:\n    what: int = 1",
-        "self._said = []",
-    ],
-)
-def test_riddles_are_found(text):
-    assert riddles(text)
-
-
-@pytest.mark.parametrize("text", ["# However, whatever", "def show(): '''Whether it shows.'''", "whole = 1"])
-def test_other_words_are_not(text):
-    assert riddles(text) == []

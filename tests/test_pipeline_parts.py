@@ -18,12 +18,11 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.pipeline import drawing
 from mcaptrack.pipeline import write as writing
-from mcaptrack.pipeline.checks import _lacks
 from mcaptrack.pipeline.plan import check_spaces
 from mcaptrack.schema import DECISIONS, DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, INGEST, VIEW, Provenance, digest
-from mcaptrack.transforms import STAGES, KnnDetector, OcSort, Predict, Retrack, Sample, Sort, Transform
+from mcaptrack.transforms import STAGES, OcSort, Predict, Retrack, Sample, Sort, Transform
 from tests.worlds import boxes_at, ns, tracks_at, walk
 
 run = sys.modules["mcaptrack.pipeline.run"]  # the package has a function of this name
@@ -444,19 +443,6 @@ def test_tracks_that_are_only_linked_or_passed_on_are_said(tmp_path, parameters,
     assert [(one.message, one.code) for one in said] == [(words, "held-back")] * bool(done)
 
 
-def test_little_memory_is_said_in_numbers(monkeypatch):
-    monkeypatch.setattr(run, "free_memory", lambda: 160_000_000)
-    with notices.listening(lambda _: None), notices.collected() as said:
-        run.warn_memory([Frame(n * 40_000_000, n, DETECTIONS.empty(10)) for n in range(50_000)])
-    assert [(one.message, one.code) for one in said] == [
-        (
-            "500,000 boxes, of people who are seen for 6 hours together, take about 0.5 GB of memory, and 0.2 GB are "
-            "free: re-tracking has all samples in memory",
-            "memory",
-        )
-    ]
-
-
 @pytest.mark.parametrize(
     ("files", "free"),
     [
@@ -763,29 +749,6 @@ def test_boxes_are_those_that_tracks_were_made_from(tmp_path):
             assert pipeline.summarise(opened, "/camera").boxes == count
 
 
-def test_a_loss_by_re_tracking_is_said_with_its_scores(tmp_path):
-    truth = walk(lambda n: {1: (n * 0.4, 0.0), 2: (n * 0.4, 5.0)}, 10)
-    swapped = walk(lambda n: {1 + n // 5: (n * 0.4, 0.0), 2 - n // 5: (n * 0.4, 5.0)}, 10)
-    channels = {
-        f"/camera/{name}": (TRACKS, Provenance(how, {}), frames)
-        for name, how, frames in (
-            ("truth", INGEST, truth),
-            ("samples", "sample", truth),
-            ("retracks", "retrack", swapped),
-        )
-    }
-    with (
-        log.read(written(tmp_path / "a.mcap", channels)) as opened,
-        notices.listening(lambda _: None),
-        notices.collected() as said,
-    ):
-        scores = pipeline.summarise(opened, "/camera").scores
-    assert scores is not None
-    assert scores.by == "within 1 m"
-    words = "re-tracking made it worse: IDF1 100.0% before, 50.0% after, against /camera/truth, within 1 m"
-    assert [(one.message, one.code) for one in said] == [(words, "worse")]
-
-
 def test_an_error_of_a_stage_names_log_and_channel_once(tmp_path, monkeypatch):
     frames = walk(lambda n: {1: (n * 0.1, 0.0)}, 5, 10.0)
     path = written(tmp_path / "a.mcap", {"/camera/tracks": (TRACKS, Provenance(INGEST, {}, digest="x"), frames)})
@@ -807,22 +770,3 @@ def test_a_frame_without_boxes_in_space_has_no_effect(tmp_path, frame_id, is_sai
         check_spaces(opened, "/camera", [], frame_id)
     wanted = "`frame=` has no effect: only recorded 3D boxes are brought to a frame"
     assert [(one.code, one.message) for one in said] == ([("option-not-used", wanted)] if is_said else [])
-
-
-@pytest.mark.parametrize(
-    ("stage", "transform", "source", "is_ingest_proposed"),
-    [
-        ("detect", KnnDetector(), "/camera/video", True),
-        ("detect", KnnDetector(), "/door/video", False),
-        ("sample", Sample(), "/camera/none", False),
-    ],
-)
-def test_a_missing_input_is_named_with_what_there_is_and_what_helps(
-    tmp_path, stage, transform, source, is_ingest_proposed
-):
-    channels = {"/camera/tracks": (TRACKS, Provenance(INGEST, {}), paced(2.5))}
-    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
-        words = _lacks(opened, "/camera", pipeline.Job(stage, transform, source, "/camera/x"))
-    assert words.startswith(f"{tmp_path / 'a.mcap'} has no channel {source} for {stage}; it has /camera/tracks. ")
-    assert ("add pictures with" in words) is is_ingest_proposed
-    assert words.endswith("shows more") is not is_ingest_proposed

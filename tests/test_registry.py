@@ -20,10 +20,10 @@ from tests.distributions import package
 
 PLUGIN = """
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
-from mcaptrack.schema import DETECTIONS, TRACKS
+from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO
 from mcaptrack.transforms.protocol import option
 
 
@@ -322,6 +322,26 @@ WRONG_CLASSES = [
     ("    reads:", "    keeps_unseen: ClassVar = 1\n    reads:", "has keeps_unseen = 1; it is True or False"),
     ("gain: float", "tracker: float", "a parameter can't have the name of the option `tracker=`"),
     (' = option(2.0, "how much", least=0.0)', "", "Nearest.gain has no default"),
+    ("option(2.0,", "option(-2.0,", "gain has to be from 0 to 1000000, not -2"),
+    (
+        'option(2.0, "how much", least=0.0)',
+        'option(float("inf"), "how much")',
+        "gain has to be finite, which inf is not",
+    ),
+    ('option(2.0, "how much", least=0.0)', 'option(float("nan"), "how much")', "gain has to be a number, not nan"),
+    ('{"": TRACKS}', '{"": TRACKS, "debug": "x"}', "has writes with 'debug': 'x'; it maps ends of topics to schemas"),
+    ('{"": TRACKS}', '{"": TRACKS, "debug": VIDEO}', r"has writes with 'debug': Schema\('foxglove.CompressedVideo'\)"),
+    ('{"": TRACKS}', '{"": TRACKS, 3: TRACKS}', r"has writes with 3: Schema\('mcaptrack.Tracks'\)"),
+    (
+        'option(2.0, "how much", least=0.0)',
+        "field(init=False, default=2.0)",
+        r"Nearest.gain can't be given \(init=False\)",
+    ),
+    (
+        "    def __call__",
+        "    def __post_init__(self): raise SystemExit(0)\n\n    def __call__",
+        "could not be made: SystemExit: 0",
+    ),
 ]
 
 
@@ -329,7 +349,7 @@ WRONG_CLASSES = [
 def test_a_class_that_cannot_track_is_refused_in_one_line(installed, part, instead, said):
     (installed / "own_trackers" / "__init__.py").write_text(PLUGIN.replace(part, instead))
     with pytest.raises(McaptrackError, match=said) as refused:
-        STAGES["track"].find("nearest")
+        STAGES["track"].make("nearest")
     assert "\n" not in str(refused.value)
     assert "nearest (own-trackers 1.5)" in str(refused.value)
 

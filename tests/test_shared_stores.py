@@ -148,18 +148,3 @@ def test_a_whole_run_whose_credentials_expire_is_one_line_and_can_be_run_again(s
     assert store.names() == ["night/b.mcap"]
     mcaptrack.run(url)
     assert store.get("night/b.results.mcap") == expected
-
-
-def test_a_log_that_is_replaced_during_a_run_is_one_line(store, bare):
-    url, number = store.put("night/b.mcap", bare), count()
-
-    def replace(_: object) -> str:
-        if next(number) == 1:
-            store.client.put_object(Bucket="bucket", Key="night/b.mcap", Body=bare.read_bytes() + b" ")
-        return ""
-
-    with store.failing(replace):
-        code, _, err = call("run", url, "-q")
-    lines = [line for line in err.splitlines() if not line.startswith("warning: ")]
-    assert (code, len(lines), store.names()) == (1, 1, ["night/b.mcap"])
-    assert "was replaced by another version while it was being read; try again" in lines[0]
