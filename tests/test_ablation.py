@@ -2,44 +2,10 @@
 
 from __future__ import annotations
 
-import shlex
-from dataclasses import fields, replace
+from dataclasses import fields
 
 from mcaptrack.transforms import PROFILES
-from tools.ablation import PARTS, STEPS, TABLES, cell
-
-
-def parsed(flags: str, before):
-    """Options of `mcaptrack retrack` as a re-tracker; "..." stands for those of the row before."""
-    words = shlex.split(flags)
-    made = PROFILES["default"]
-    if words[:1] == ["--profile"]:
-        made, words = PROFILES[words[1]], words[2:]
-    elif words[:1] == ["..."]:
-        made, words = before, words[1:]
-    while words:
-        name = words.pop(0).removeprefix("--").replace("-", "_")
-        if name == "set":
-            name, text = words.pop(0).split("=")
-            kind = type(getattr(made, name))
-            value = text if kind is str else text == "true" if kind is bool else float(text)
-            made = replace(made, **{name: int(value) if kind is int else value})
-            continue
-        if name.startswith("no_") and name[3:] in {one.name for one in fields(made)}:
-            made = replace(made, **{name[3:]: False})
-        else:
-            text = words.pop(0)
-            kind = type(getattr(made, name))
-            made = replace(made, **{name: text if kind is str else int(text) if kind is int else float(text)})
-    return made
-
-
-def test_options_of_a_row_make_its_re_tracker():
-    for rows in TABLES.values():
-        before = None
-        for name, (flags, options) in rows.items():
-            before = parsed(flags, before)
-            assert before == options, name
+from tools.ablation import PARTS, STEPS, cell
 
 
 def test_each_part_is_left_out_once_and_the_steps_end_at_the_default():

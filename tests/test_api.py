@@ -138,19 +138,6 @@ def test_a_log_that_was_closed_says_so(tmp_path):
     opened.close()
 
 
-def test_a_log_stays_the_same_one_wherever_the_working_folder_moves(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    some_log(tmp_path / "a.mcap")
-    (tmp_path / "below").mkdir()
-    other = some_log(tmp_path / "below" / "a.mcap").read_bytes()
-    with mcaptrack.open("a.mcap") as opened:
-        monkeypatch.chdir("below")
-        opened.write("/own/tracks", [])
-        assert "/own/tracks" in opened.topics
-    assert "/own/tracks" in {one.topic for one in mcaptrack.info(tmp_path / "a.mcap").channels}
-    assert (tmp_path / "below" / "a.mcap").read_bytes() == other
-
-
 def test_threads_may_share_a_log(tmp_path):
     with mcaptrack.open(some_log(tmp_path / "a.mcap")) as opened, ThreadPoolExecutor(8) as pool:
         found = list(pool.map(lambda name: opened.table(name).num_rows, [*opened.tables] * 3))

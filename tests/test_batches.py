@@ -82,9 +82,3 @@ def test_a_command_that_combines_inputs_needs_all_of_them(folder):
         assert (outcome.code, outcome.out) == (1, "")
         assert "broken.mcap" in outcome.err
         assert sorted(folder.rglob("*")) == before
-
-
-def test_one_output_for_several_inputs_is_refused_at_once(folder):
-    before = {path: path.read_bytes() for path in folder.iterdir()}
-    assert call("run", "a.mcap", "z.mcap", "-o", "b.mcap").code == 1
-    assert {path: path.read_bytes() for path in folder.iterdir()} == before

@@ -15,7 +15,6 @@ from mcap.reader import make_reader
 
 from mcaptrack import log
 from mcaptrack.log.chunk_list import ChunkList
-from mcaptrack.log.messages import Checksums, fingerprint
 from mcaptrack.log.records import ChunkIndexRecord
 from mcaptrack.log.writer import LogWriter
 from tests.memory import held
@@ -103,20 +102,6 @@ def test_a_log_of_many_chunks_takes_few_bytes_a_chunk(many_chunks):
         alive, most = held(lambda: sum(len(message.payload) for message in reading.messages("/a")))
         assert most < AHEAD + 120 * CHUNKS
         assert alive < AHEAD + 20 * CHUNKS
-
-
-def test_fingerprints_keep_eight_bytes_a_chunk(many_chunks):
-    """A checksum each; a dictionary of them takes 150."""
-    content = memoryview(many_chunks.read_bytes())
-    with log.read(many_chunks) as opened:
-        index, whole = opened.index, opened.fingerprint()
-
-    def kept() -> Checksums:
-        checksums = Checksums()
-        assert fingerprint(content, index, None, checksums) == fingerprint(content, index, None, checksums) == whole
-        return checksums
-
-    assert 8 * CHUNKS <= held(kept)[0] < 20 * CHUNKS
 
 
 def test_the_summary_is_written_in_parts(many_chunks):

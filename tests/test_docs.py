@@ -108,13 +108,6 @@ def test_every_command_is_shown_on_a_page():
     assert {line.split()[1] for line in lines if line.startswith("mcaptrack ")} >= set(COMMANDS)
 
 
-def test_a_page_shows_other_numbers_than_are_printed_but_no_other_words():
-    assert_same_words("1,200 boxes\n...\nend", " 7 boxes\nand more\nend\n")
-    for shown in ("7 tracks", "7 boxes", "7 boxes ... stop"):
-        with pytest.raises(AssertionError):
-            assert_same_words(shown, "7 boxes end")
-
-
 @pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="mkdocs isn't installed")
 def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path):
     words = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]

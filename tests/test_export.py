@@ -128,13 +128,6 @@ def stamps(folder):
     return {str(path.relative_to(folder)): path.stat().st_mtime_ns for path in folder.rglob("part-0.*")}
 
 
-def test_the_same_log_gives_the_same_tables(tmp_path):
-    for name in ("x", "y"):
-        exported(some_log(tmp_path / "a.mcap"), tmp_path / name)
-    for file in (tmp_path / "x").rglob("*.parquet"):
-        assert file.read_bytes() == (tmp_path / "y" / file.relative_to(tmp_path / "x")).read_bytes()
-
-
 def test_exporting_again_writes_what_changed_and_touches_nothing_else(tmp_path):
     path, folder = some_log(tmp_path / "a.mcap"), tmp_path / "tables"
     exported(path, folder, topics=["/imu"])
@@ -295,15 +288,3 @@ def test_an_unreadable_message_is_reported_with_its_time(tmp_path):
     assert (outcome.exit_code, "with --topic" in outcome.stderr) == (1, True)
     with pytest.raises(McaptrackError, match="has no channel /y"):
         exported(tmp_path / "a.mcap", tmp_path / "t", topics=["/y"])
-
-
-def test_results_beside_a_log_are_in_its_tables(tmp_path):
-    path = some_log(tmp_path / "a.mcap")
-    raw = path.read_bytes()
-    with log.read(path, sidecar=True) as opened, log.extend(opened) as writer:
-        add_rows(writer, "/camera/retracks", TRACKS, [Frame(0, 0, tracks_at({1: (1.0, 2.0)}))], "retrack")
-    assert path.read_bytes() == raw
-    exported(path, tmp_path / "t")
-    query = "select topic, file from '@/frames/*/*.parquet' where topic like '%tracks' group by all order by all"
-    assert ask(query, tmp_path / "t") == [("/camera/retracks", "a.results.mcap"), ("/camera/tracks", "a.mcap")]
-    assert ask("select results_file from '@/recordings/*/*.parquet'", tmp_path / "t") == [("a.results.mcap",)]

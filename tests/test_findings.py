@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import re
 import shutil
 from collections.abc import Iterable
 from dataclasses import asdict
@@ -19,7 +18,7 @@ from mcaptrack.pipeline.planes import make_plane
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import TRANSFORMS, KnnDetector
-from tests.commands import call, done
+from tests.commands import done
 from tests.worlds import assert_same_rows, ns, tracks_at, walk
 
 run = importlib.import_module("mcaptrack.pipeline.run")  # the package has a function of that name
@@ -90,25 +89,6 @@ def test_summary_scores_samples_and_retracks_and_warns_of_a_loss(tmp_path, is_wo
     assert [(notice.message, notice.code) for notice in said] == [(words, "worse")] * is_worse
 
 
-def test_warnings_of_the_summary_are_counted_with_those_of_stages(path, monkeypatch):
-    """The summary is made after all stages."""
-    summarise = pipeline.summarise
-
-    def odd(*given):
-        notices.warn("re-tracking made it worse", "worse")
-        return summarise(*given)
-
-    before = done("run", path, "--no-tables", "--force").err
-    monkeypatch.setattr(pipeline, "summarise", odd)
-    after = done("run", path, "--no-tables", "--force").err
-
-    def counted(said):
-        (words,) = re.findall(r"^  warnings +(\d+), see above: (.*)$", said, re.MULTILINE) or [("0", "")]
-        return int(words[0]), {*words[1].split(", ")} - {""}
-
-    assert counted(after) == (counted(before)[0] + 1, counted(before)[1] | {"worse"})
-
-
 def test_run_ends_with_a_summary_as_text_and_json(path):
     said = done("run", path, "--force", "--no-tables").err
     data = json.loads(done("run", path, "--no-tables", "--json", "-q").out)["results"][0]
@@ -148,13 +128,6 @@ def test_every_run_repeats_the_warnings_even_with_quiet(path):
     assert f"{len(codes)}, see above: {', '.join(codes)}" in lines
     assert "the scale of the ground, from the heights of boxes" in lines
     assert made_by(Path("b.mcap"), "/camera/tracks").warnings == []
-
-
-def test_a_missing_channel_is_reported_once(path):
-    done("drop", path, "/camera/[!t]*", "/camera/tracks", "-q")
-    outcome = call("run", path)
-    (line,) = outcome.err.splitlines()
-    assert (outcome.code, "/camera/video" in line, "mcaptrack ingest VIDEO --into" in line) == (1, True, True)
 
 
 def test_run_warns_of_too_little_memory(path, monkeypatch):

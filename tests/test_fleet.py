@@ -133,12 +133,6 @@ def test_logs_that_harm_their_worker_are_named_and_the_others_are_done(folder):
     assert not list(folder.glob(".*"))
 
 
-def test_workers_stay_warm_and_are_shared(folder):
-    done = fleet.run(fleet_tasks.touch, folder, jobs=2)
-    assert len({seen.process for seen in done.results.values()}) <= 2
-    assert os.getpid() not in {seen.process for seen in done.results.values()}
-
-
 def test_logs_that_exceed_a_limit_are_ended_and_named(folder):
     """What exceeds a limit never ends; the log that does is the only one with a limit of time, which others may miss."""
     (folder / "eat.mcap").write_text("eat")
@@ -165,13 +159,6 @@ class TestASecondTime:
         (folder / "b.mcap").write_text("other")
         assert run().counts == {"skipped": 2, "done": 1, "failed": 1}
         assert run(add="-").counts == {"done": 3, "failed": 1}
-
-    def test_an_output_that_is_gone_is_made_again(self, folder):
-        given = {"ledger": folder / "l.jsonl", "output_dir": folder / "out"}
-        logs = sorted(folder.glob("*.mcap"))
-        fleet.run(fleet_tasks.touch, logs, {"add": "+"}, **given)
-        (folder / "out" / "b.mcap").unlink()
-        assert states(fleet.run(fleet_tasks.touch, logs, {"add": "+"}, **given))["b.mcap"] == "done"
 
     def test_without_a_ledger_the_function_says_what_is_up_to_date(self, folder):
         for state in ("done", "up-to-date"):

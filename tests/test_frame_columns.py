@@ -160,9 +160,3 @@ def test_rows_with_their_columns_in_another_order_are_taken_and_others_refused(w
         assert collected(made)["x_px"].tolist() == [5.0, 6.0]
     with pytest.raises(ValueError, match="columns"):
         collected(np.zeros(2, [("a", float)]))
-
-
-def test_a_frame_keeps_no_array_that_it_is_a_part_of():
-    collector, many = FrameCollector(TRACKS), TRACKS.empty(1000)
-    collector.append(Frame(ns(1), 0, many[:1]))
-    assert all(not np.shares_memory(many, kept) for kept in collector._open)

@@ -127,22 +127,11 @@ def test_every_command_keeps_them_or_refuses_in_a_line(command, ours, tmp_path, 
         assert not [made for made in tmp_path.iterdir() if made.suffix == ".mcap"]
 
 
-@pytest.mark.parametrize(
-    ("text", "number"),
-    [
-        ("0", 0),
-        ("-5", -5),
-        (str(MAX_NS), MAX_NS),
-        (str(MAX_NS + 1), None),
-        ("9" * 5000, None),
-        ("", None),
-        ("1.5", None),
-        ("٣", None),
-        (" 1", None),
-    ],
-)
-def test_a_clock_start_that_can_t_be_computed_with_is_none(text, number):
-    assert parse_ns(text) == number
+def test_a_clock_start_that_can_t_be_computed_with_is_none():
+    wanted = {"0": 0, "-5": -5, str(MAX_NS): MAX_NS} | dict.fromkeys(
+        (str(MAX_NS + 1), "9" * 5000, "", "1.5", "٣", " 1")
+    )
+    assert {text: parse_ns(text) for text in wanted} == wanted
 
 
 def test_boxes_of_others_at_such_times_are_not_tracked(tmp_path):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import ast
 
-import pytest
-
 from tools import lines_kept
 from tools.mutations import find, mutants_of, sample
 
@@ -39,28 +37,13 @@ def test_every_change_is_python_and_differs_in_one_place():
         assert changed[len(changed) - kept :] == SOURCE[mutant.end :]
 
 
-@pytest.mark.parametrize(
-    "wanted",
-    [
-        (4, "constant", "4"),
-        (4, "constant", "2"),
-        (6, "constant", "False"),
-        (8, "compared", "<="),
-        (8, "compared", ">="),
-        (8, "and/or", "(a < b or not a)"),
-        (8, "negated", "(not (a < b and (not a)))"),
-        (8, "unary", "(a)"),
-        (9, "operator", "+"),
-        (9, "name", "min"),
-        (9, "deleted", "pass"),
-        (10, "swapped", "b, a"),
-        (11, "swapped", "2, b"),
-        (13, "deleted", "pass"),
-        (14, "unary", "(a[1:])"),
-    ],
-)
-def test_what_is_changed(wanted):
-    assert wanted in changes(SOURCE)
+def test_what_is_changed():
+    assert changes(SOURCE) >= {
+        (4, "constant", "4"), (4, "constant", "2"), (6, "constant", "False"), (8, "compared", "<="),
+        (8, "compared", ">="), (8, "and/or", "(a < b or not a)"), (8, "negated", "(not (a < b and (not a)))"),
+        (8, "unary", "(a)"), (9, "operator", "+"), (9, "name", "min"), (9, "deleted", "pass"), (10, "swapped", "b, a"),
+        (11, "swapped", "2, b"), (13, "deleted", "pass"), (14, "unary", "(a[1:])"),
+    }  # fmt: skip
 
 
 def test_what_is_not_changed():
@@ -99,17 +82,3 @@ def test_a_mutant_is_tried_on_the_tests_that_run_its_line_also_after_the_code_ha
     assert records.tests_of(mutants[b"-"], [file]) == [("second", 1.0), ("first", 2.0)]
     limit = records.tests_of(mutants[b"4"], [file])
     assert [name for name, _ in limit] == ["third", "second", "first", "beside"]
-
-
-def test_a_default_is_tried_on_the_tests_that_run_the_function_not_on_those_that_import_it(tmp_path, monkeypatch):
-    body = "def f(x=5):\n    return x\n"
-    monkeypatch.setattr(lines_kept, "_package", lambda: {"mcaptrack/a.py": body})
-    tests = {
-        "imports": {"took_s": 0.5, "lines": {"mcaptrack/a.py": [1]}},
-        "runs": {"took_s": 1.0, "lines": {"mcaptrack/a.py": [2]}},
-    }
-    file = "tests/test_mutations.py"
-    records = lines_kept.Records(tmp_path)
-    records.write(file, {"collected": {file: [1]}, "tests": tests, "failed": []})
-    mutant = next(m for m in mutants_of("mcaptrack/a.py", body.encode()) if m.new == b"6")
-    assert records.tests_of(mutant, [file]) == [("runs", 1.0)]

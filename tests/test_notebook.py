@@ -177,14 +177,6 @@ class TestPlayer:
                 assert not any(name.startswith("on") for name in attributes)
                 assert attributes.get("src", "data:").startswith("data:image/jpeg;base64,") or "src" not in attributes
 
-    def test_a_still_remains_where_frames_are_taken_out(self, player):
-        outside = Elements(player.html)
-        (image,) = outside.of("img")
-        still = decoded(image["src"].partition(",")[2])
-        assert still.shape == (180, 320, 3)
-        assert np.array_equal(still, cv2.imdecode(np.frombuffer(player.still, np.uint8), cv2.IMREAD_COLOR))
-        assert player.caption in re.sub(r"<iframe.*</iframe>", "", player.html)
-
     def test_notebooks_get_html_a_picture_and_text(self, player):
         bundle = player._repr_mimebundle_(include=None, exclude=None)
         assert bundle == {"text/html": player.html, "image/jpeg": player.still, "text/plain": repr(player)}

@@ -26,7 +26,6 @@ from mcaptrack.transforms import (
     PROFILES,
     STAGES,
     KnnDetector,
-    Predict,
     Retrack,
     Sample,
     Sort,
@@ -141,13 +140,6 @@ def test_stages_read_and_write_the_given_topics(fresh):
         assert "/camera/tracks" not in opened.channels
 
 
-def test_outputs_that_are_not_kept_are_not_written(fresh):
-    run_stage(fresh, "retrack", Retrack(), keep=("online", "predictions"))
-    with log.read(fresh) as opened:
-        assert "/camera/retracks/online" in opened.channels
-        assert "/camera/retracks" not in opened.channels
-
-
 def test_writing_to_another_file_leaves_the_log_unchanged(fresh, tmp_path):
     before = fresh.read_bytes()
     run_stage(fresh, "detect", KnnDetector(), output=tmp_path / "b.mcap")
@@ -171,32 +163,6 @@ def test_a_missing_input_error_lists_channels_and_a_remedy(fresh, tmp_path):
         McaptrackError, match=r"/camera/video holds foxglove\.CompressedVideo; track reads mcaptrack\.Detections"
     ):
         run_stage(fresh, "track", Sort(), source="/camera/video")
-
-
-def test_a_failing_stage_leaves_the_log_unchanged(fresh, monkeypatch):
-    before = fresh.read_bytes()
-
-    def tired(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Predict, "__call__", tired)
-    with pytest.raises(KeyboardInterrupt):
-        run_all(fresh)
-    assert fresh.read_bytes() == before
-    assert list(fresh.parent.iterdir()) == [fresh]
-
-
-def test_labels_alone_are_sampled_predicted_and_retracked(tmp_path):
-    lines = [f"{12 * n} {who} {0.4 * n + who} {who * 5.0}" for n in range(20) for who in (1, 2)]
-    (tmp_path / "world.txt").write_text("\n".join(lines))
-    path = tmp_path / "a.mcap"
-    ingest(tmp_path / "world.txt", path, IngestOptions())
-    report, _ = run_all(path)
-    assert report.stages == ["sample", "predict", "retrack"]
-    with log.read(path) as opened:
-        samples, tracks = opened.frames("/camera/samples", TRACKS), opened.frames("/camera/tracks", TRACKS)
-        assert [f.t_ns for f in samples] == [f.t_ns for f in tracks]
-        assert not any(topic.endswith("/view/image") for topic in opened.channels)
 
 
 def test_two_cameras_share_a_log(footage, fresh):

@@ -303,17 +303,6 @@ def test_the_rate_of_other_inputs_is_known_and_a_high_one_is_said(tmp_path, rate
             assert [(one.message, one.code) for one in said] == [(words, "clock")] * (is_said and source is not None)
 
 
-def test_frames_that_share_a_time_have_no_part_in_the_rate(tmp_path):
-    at = [0.0, 0.0, 0.4, 0.4, 0.4, 0.8]
-    frames = [Frame(ns(t), n, tracks_at({1: (t, 0.0)})) for n, t in enumerate(at)]
-    path = written(tmp_path / "a.mcap", {"/camera/samples": (TRACKS, Provenance(INGEST, {}), frames)})
-    with log.read(path) as opened:
-        assert pipeline.input_of(opened, "/camera", "predict", Predict())[1]["rate_hz"] == 2.5
-    path = written(tmp_path / "b.mcap", {"/camera/samples": (TRACKS, Provenance(INGEST, {}), frames[:2])})
-    with log.read(path) as opened:
-        assert pipeline.input_of(opened, "/camera", "predict", Predict(rate_hz=4.0))[1]["rate_hz"] == 4.0
-
-
 @pytest.mark.parametrize(("clock", "start_ns"), [("70", 70), ("0", 0), ("", None), ("soon", None)])
 def test_the_clock_begins_as_the_log_says(tmp_path, clock, start_ns):
     channels = {"/camera/tracks": (TRACKS, Provenance(INGEST, {}), paced(10.0))}
@@ -324,39 +313,6 @@ def test_the_clock_begins_as_the_log_says(tmp_path, clock, start_ns):
 
 def plane_at(t_ns: int, plane: GroundPlane = PLANE) -> Frame:
     return Frame(t_ns, 0, plane_to_rows(plane))
-
-
-def test_planes_are_known_with_their_times_and_a_guessed_one_is_doubted(tmp_path):
-    for assumed in (False, True):
-        plane = replace(PLANE, assumed=assumed)
-        channels = {
-            "/camera/samples": (TRACKS, Provenance(INGEST, {}), paced(2.5)),
-            "/camera/ground_plane": (
-                GROUND_PLANE,
-                Provenance("assume-ground-plane", {}),
-                [plane_at(5, plane), plane_at(9, plane)],
-            ),
-        }
-        with log.read(written(tmp_path / "a.mcap", channels)) as opened:
-            assert pipeline.read_planes(opened, "/camera") == [(5, plane), (9, plane)]
-            known = pipeline.input_of(opened, "/camera", "retrack", Retrack())[1]
-        assert known["ground_planes"] == ((5, plane), (9, plane))
-
-
-def test_what_stages_made_is_counted_and_progress_is_told(tmp_path):
-    frames = walk(lambda n: {1: (n * 0.1, 0.0), 2: (n * 0.1, 3.0)} if n > 1 else {1: (n * 0.1, 0.0)}, 30, 10.0)
-    path = written(tmp_path / "a.mcap", {"/camera/tracks": (TRACKS, Provenance(INGEST, {}, digest="x"), frames)})
-    told: list[tuple[str, int, int]] = []
-    with log.read(path) as opened:
-        jobs = pipeline.plan_stage(opened, "/camera", "sample", Sample())
-        report = pipeline.run(opened, "/camera", jobs, progress=lambda *some: told.append(some))
-    with log.read(path) as opened:
-        samples = opened.frames("/camera/samples", TRACKS)
-    assert told == [("sample", n + 1, 30) for n in range(30)]
-    assert (report.stages, report.frames) == (["sample"], {"/camera/samples": len(samples)})
-    assert report.rows == {"/camera/samples": sum(len(frame.rows) for frame in samples)}
-    assert report.tracks == {"/camera/samples": 2}
-    assert report.stale == []
 
 
 def test_re_tracked_people_are_carried_to_the_rate_of_the_tracks_they_come_from(tmp_path):
@@ -487,103 +443,6 @@ def scored(*errors: float) -> list[Frame]:
     for row, error in zip(rows, errors, strict=True):
         row["ade_m"] = error
     return [Frame(ns(n), n, row) for n, row in enumerate(rows)]
-
-
-def test_people_are_where_the_best_tracks_say(tmp_path):
-    """Re-tracked, tracked, true or sampled: the first that knows a place."""
-    names = ("retracks", "tracks", "truth", "samples")
-    channels = {f"/camera/{name}": (TRACKS, Provenance(INGEST, {}), at(float(n))) for n, name in enumerate(names)}
-    for number, name in enumerate(names):
-        with log.read(written(tmp_path / "a.mcap", channels)) as opened:
-            assert writing._positions(opened, "/camera", {})[:, 0].tolist() == pytest.approx(
-                [number, np.nan] * 2, nan_ok=True
-            )
-            shown = {"/camera/retracks": drawing.ChannelToDraw(TRACKS, at(9.0, 1), "", "")}
-            assert writing._positions(opened, "/camera", shown)[0].tolist() == [9.0, 0.0]
-        nowhere = [Frame(0, 0, tracks_at({1: (float("nan"), 1.0)}))] * (number % 2)
-        wrong = (DETECTIONS, Provenance(INGEST, {}), [Frame(0, 0, boxes_at([(1, 1)]))])
-        channels[f"/camera/{name}"] = (TRACKS, Provenance(INGEST, {}), nowhere) if number < 2 else wrong
-    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
-        assert writing._positions(opened, "/camera", {}).shape == (0, 2)
-
-
-def test_forecasts_of_re_tracked_people_come_first(tmp_path):
-    def known(of_retracks: list[Frame], of_samples: list[Frame]) -> int:
-        channels = {
-            "/camera/retracks/predictions": (PREDICTIONS, None, of_retracks),
-            "/camera/predictions": (PREDICTIONS, None, of_samples),
-        }
-        with log.read(written(tmp_path / "a.mcap", channels)) as opened:
-            return writing._last_step(opened, "/camera", {})
-
-    assert [known(forecast(1, 3, 2), forecast(1, 9)), known(forecast(), forecast(1, 9)), known([], [])] == [3, 9, 0]
-    nan = float("nan")
-    for first, second, is_known in (
-        ([nan, 1.0], [], True),
-        ([nan, nan], [nan, 2.0], True),
-        ([nan], [nan], False),
-        ([], [], False),
-    ):
-        channels = {
-            "/camera/retracks/predictions/scores": (FORECAST_SCORES, None, scored(*first)),
-            "/camera/predictions/scores": (FORECAST_SCORES, None, scored(*second)),
-        }
-        with log.read(written(tmp_path / "b.mcap", channels)) as opened:
-            assert writing._is_truth_known(opened, "/camera", {}) is is_known
-
-
-def test_a_camera_starts_with_its_first_picture_or_row(tmp_path):
-    ingested = Provenance(INGEST, {})
-    frames = [Frame(ns(n), n, tracks_at({1: (0.0, 0.0)})) for n in (5, 6)]
-    early = [Frame(ns(2), 0, tracks_at({1: (0.0, 0.0)}))]
-    path = written(
-        tmp_path / "a.mcap", {"/camera/tracks": (TRACKS, ingested, frames), "/other/tracks": (TRACKS, ingested, early)}
-    )
-    with log.read(path) as opened:
-        camera = pipeline.camera_at(opened, "/camera")
-        shown = {
-            "/camera/x": drawing.ChannelToDraw(TRACKS, early, "", ""),
-            "/camera/y": drawing.ChannelToDraw(TRACKS, [], "", ""),
-        }
-        none = np.empty(0, np.int64)
-        assert writing._start_ns(opened, camera, {}, none) == ns(5)
-        assert writing._start_ns(opened, camera, shown, none) == ns(2)
-        assert writing._start_ns(opened, camera, shown, np.array([ns(1), ns(9)])) == ns(1)
-    with log.read(written(tmp_path / "b.mcap", {})) as opened:
-        assert writing._start_ns(opened, camera, {}, none) == 0
-
-
-def test_what_was_ingested_is_drawn_once_and_again_when_it_is_new(tmp_path):
-    ingested = Provenance(INGEST, {}, digest="x")
-    for suffix, schema, frames in (
-        ("scene", TRACKS, at(0.0)),
-        ("image", DETECTIONS, [Frame(0, 0, boxes_at([(1, 1)]))]),
-    ):
-        other = "image" if suffix == "scene" else "scene"
-        for view, drawn_from, is_shown in (
-            (suffix, "x", False),
-            (suffix, "y", True),
-            (other, "x", True),
-            ("", "", True),
-        ):
-            channels = {
-                "/camera/labels": (schema, ingested, frames),
-                "/camera/made": (schema, replace(ingested, transform="track"), frames),
-                "/camera/recorded": (schema, None, frames),
-                "/other/labels": (schema, ingested, frames),
-                "/camera/scores": (FORECAST_SCORES, ingested, scored(1.0)),
-            }  # fmt: skip
-            if view:
-                channels[f"/camera/labels/view/{view}"] = (
-                    TRACKS,
-                    Provenance(VIEW, {}, "/camera/labels", drawn_from),
-                    [],
-                )
-            with log.read(written(tmp_path / "a.mcap", channels)) as opened:
-                shown = writing._channels_to_draw(opened, pipeline.camera_at(opened, "/camera"), {})
-            assert list(shown) == ["/camera/labels"] * is_shown
-            for one in shown.values():
-                assert (one.schema, one.digest, one.made_by, len(one.frames)) == (schema, "x", "", len(frames))
 
 
 def views_of(

@@ -310,15 +310,6 @@ def test_a_log_is_known_by_what_was_recorded_wherever_it_is_and_whatever_was_add
         mcaptrack.export(log_of(path, 3.0), folder)
 
 
-def test_run_beside_a_log_of_the_same_stem_is_refused_before_anything_is_written(tmp_path):
-    one, other = log_of(tmp_path / "l.mcap"), log_of(tmp_path / "l.MCAP", 1.0)
-    mcaptrack.run(one)
-    before = contents(tmp_path)
-    with pytest.raises(McaptrackError, match="holds the tables of"):
-        mcaptrack.run(other)
-    assert contents(tmp_path) == before
-
-
 def test_scores_of_two_logs_of_one_name_are_not_mixed(finished, tmp_path):
     logs = [tmp_path / name / "l.mcap" for name in "xy"]
     for log in logs:

@@ -13,9 +13,8 @@ from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from scipy.spatial.transform import Rotation
 
-from mcaptrack import foxglove, log
+from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
-from mcaptrack.pipeline import find_views
 from mcaptrack.sources.video import write_clip
 from mcaptrack.sources.video.decode import EncodedPicture, decode_bgr
 from mcaptrack.sources.video.encode import encode_image
@@ -76,13 +75,6 @@ def test_lines_fade_as_their_points_say():
     wanted = np.array([blue, green, red]) * 255
     assert abs(image[50, 35] - (0.2 * wanted + 0.8 * 100)).max() <= 2
     assert abs(image[50, 85] - (0.8 * wanted + 0.2 * 100)).max() <= 2
-
-
-def test_what_is_drawn_is_scaled_with_the_picture():
-    large, small = np.zeros((200, 400, 3), np.uint8), np.zeros((100, 200, 3), np.uint8)
-    both = draw(large, annotations([[40, 60, 120, 80]])), draw(small, annotations([[40, 60, 120, 80]]), 0.5)
-    spans = [[np.flatnonzero(image.any(axis=2).any(axis=axis))[[0, -1]] for axis in (0, 1)] for image in both]
-    assert abs(np.array(spans[0]) / 2 - np.array(spans[1])).max() <= 2
 
 
 def test_lines_of_a_list_are_drawn_one_by_one_and_leave_gaps():
@@ -236,10 +228,3 @@ def test_nothing_is_left_of_a_clip_that_fails(tmp_path):
         with pytest.raises(McaptrackError, match="half way"):
             write_clip(tmp_path / f"a{suffix}", broken(), Fraction(10))
     assert not list(tmp_path.iterdir())
-
-
-def test_re_tracked_people_are_drawn_at_the_rate_of_the_video(finished):
-    with log.read(finished) as opened:
-        assert find_views(opened, "/camera", ["/camera/retracks"]).views == ["/camera/retracks/full/view/image"]
-        with pytest.raises(McaptrackError, match="has no channel /camera/unknown/view/image"):
-            find_views(opened, "/camera", ["/camera/unknown"])

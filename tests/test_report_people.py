@@ -24,7 +24,6 @@ from mcaptrack.evaluation.people import LEAST_PEOPLE, PersonScores, intervals, p
 from mcaptrack.schema import Frame
 from mcaptrack.viewing.links import is_about, with_links
 from mcaptrack.viewing.report import LogReport, gather, page
-from mcaptrack.viewing.report import _comparison as comparison
 from mcaptrack.viewing.report.charts import Line
 from mcaptrack.viewing.report.contents import TrackSet
 from mcaptrack.viewing.report.doubts import find_doubts
@@ -232,12 +231,6 @@ def test_mean_numbers_are_of_the_time_that_both_have(first, last, words):
     tracker = Line("tracker", "tracks", np.arange(10.0), np.repeat([0.0, 8.0], 5))
     truth = Line("ground truth", "truth", np.arange(first, last + 1.0), np.full(last + 1 - first, 8.0))
     assert mean_numbers([tracker, truth], "seconds") == words
-
-
-def test_all_logs_together_have_the_people_of_all(told):
-    rows = comparison([told, replace(told, file="other.mcap")])["rows"]
-    assert [row["cells"][1] for row in rows] == ["unknown: 2 people", "unknown: 2 people", "unknown: 4 people"]
-    assert [row["cells"][2] for row in rows] == ["2 → 1", "2 → 1", "4 → 2"]
 
 
 def test_those_who_stay_longest_have_a_bar(told, monkeypatch):

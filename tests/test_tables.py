@@ -20,7 +20,6 @@ import numpy as np
 import pandas as pd
 import polars as pl
 import pyarrow as pa
-import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import example, given, settings
@@ -232,28 +231,6 @@ def test_the_page_of_the_tables_has_every_column_with_unit_and_meaning():
 
 
 # Columns that are added later
-
-
-def test_old_files_and_new_ones_are_read_together(tmp_path):
-    new = some_tracks([{1: (0.5, 1.5)}, {1: (1.0, 2.0)}])
-    old = new.drop_columns(["row", "source_id"])
-    for name, table in (("new", new), ("old", old)):
-        tables.write(tmp_path / "tracks" / f"recording={name}" / "part-0.parquet", table, {})
-    files = f"{tmp_path}/tracks/*/*.parquet"
-    wanted = [("new", 1), ("new", 1), ("old", 1), ("old", 1)]
-
-    found = duckdb.sql(f"from read_parquet('{files}', union_by_name=true) order by recording")
-    assert found.select("recording, track_id").fetchall() == wanted
-    assert found.select("source_id").fetchall() == [(-1,), (-1,), (None,), (None,)]
-
-    polars = pl.scan_parquet(files, hive_partitioning=True, missing_columns="insert").collect().sort("recording")
-    assert polars.select("recording", "track_id").rows() == wanted
-    assert polars["source_id"].to_list() == [-1, -1, None, None]
-
-    paths = sorted((tmp_path / "tracks").rglob("*.parquet"))
-    schema = pa.unify_schemas([pq.read_schema(path) for path in paths])
-    arrow = ds.dataset(paths, schema=schema).to_table()
-    assert arrow.column("source_id").to_pylist() == [-1, -1, None, None]
 
 
 # Text
