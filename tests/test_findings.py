@@ -19,6 +19,7 @@ from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import TRANSFORMS, KnnDetector
 from tests.commands import done
+from tests.logs import write_channels
 from tests.worlds import assert_same_rows, ns, tracks_at, walk
 
 run = importlib.import_module("mcaptrack.pipeline.run")  # the package has a function of that name
@@ -39,15 +40,8 @@ def made_by(path: Path, topic: str) -> Provenance:
 
 def written(path: Path, **tracks: list[Frame]) -> Path:
     """Write a log with only these channels of tracks of a camera, by name."""
-    with log.create(path) as writer:
-        for name, frames in tracks.items():
-            how = Provenance("retrack" if name == "retracks" else "track", {}).to_metadata()
-            number = writer.add_channel(
-                f"/camera/{name}", (TRACKS.name, "protobuf", TRACKS.descriptor), "protobuf", how
-            )
-            for frame in frames:
-                writer.add_message(number, frame.t_ns, frame.index, TRACKS.codec.encode(frame.rows))
-    return path
+    made = {name: Provenance("retrack" if name == "retracks" else "track", {}) for name in tracks}
+    return write_channels(path, {f"/camera/{name}": (TRACKS, made[name], frames) for name, frames in tracks.items()})
 
 
 # The summary

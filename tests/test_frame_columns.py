@@ -15,9 +15,19 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.foxglove.views import people
+from mcaptrack.geometry.ragged import cross_pairs
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, frame_columns, framing
 from mcaptrack.schema.frame_columns import FrameCollector, collect
-from mcaptrack.schema.framing import filtered_rows, join_frames, joined_parts, mapped_rows, thinned, unique_values
+from mcaptrack.schema.framing import (
+    filtered_rows,
+    frame_times,
+    join_frames,
+    joined_parts,
+    mapped_rows,
+    split_rows,
+    thinned,
+    unique_values,
+)
 from mcaptrack.schema.provenance import INGEST, Provenance, digest
 from tests.tiers import thorough
 from tests.worlds import ns
@@ -160,3 +170,31 @@ def test_rows_with_their_columns_in_another_order_are_taken_and_others_refused(w
         assert collected(made)["x_px"].tolist() == [5.0, 6.0]
     with pytest.raises(ValueError, match="columns"):
         collected(np.zeros(2, [("a", float)]))
+
+
+# Frames as flat rows and back, and all pairs within groups.
+
+
+COUNTS = st.lists(st.integers(0, 4), max_size=8)
+
+
+@given(COUNTS)
+def test_joined_frames_are_split_into_the_same_frames(counts):
+    frames = frames_of(counts)
+    joined = join_frames(TRACKS, frames)
+    assert joined.t_ns.tolist() == frame_times(frames).tolist() == [frame.t_ns for frame in frames]
+    assert joined.row_ns.tolist() == [frame.t_ns for frame in frames for _ in frame.rows]
+    assert joined.rows["track_id"].tolist() == list(range(sum(counts)))
+    again = split_rows(joined.t_ns, [frame.index for frame in frames], joined.rows, joined.ends[1:])
+    assert [(f.t_ns, f.index, f.rows.tobytes()) for f in again] == [(f.t_ns, f.index, f.rows.tobytes()) for f in frames]
+    assert all(type(frame.t_ns) is int and type(frame.index) is int for frame in again)
+
+
+@given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), max_size=8))
+def test_cross_pairs_are_those_of_nested_loops(counts):
+    wanted, first, second = [], 0, 0
+    for group, (a, b) in enumerate(counts):
+        wanted += [(group, i, j) for i in range(first, first + a) for j in range(second, second + b)]
+        first, second = first + a, second + b
+    found = cross_pairs(*np.array(counts, np.int64).reshape(-1, 2).T)
+    assert list(zip(*(part.tolist() for part in found), strict=True)) == wanted

@@ -21,26 +21,14 @@ from mcaptrack.pipeline import write as writing
 from mcaptrack.pipeline.plan import check_spaces
 from mcaptrack.schema import DECISIONS, DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.ground_plane import plane_to_rows
-from mcaptrack.schema.provenance import CLOCK, INGEST, VIEW, Provenance, digest
+from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, digest
 from mcaptrack.transforms import STAGES, OcSort, Predict, Retrack, Sample, Sort, Transform
+from tests.logs import write_channels
 from tests.worlds import boxes_at, ns, tracks_at, walk
 
 run = sys.modules["mcaptrack.pipeline.run"]  # the package has a function of this name
 PLANE = GroundPlane((0.1, 0, 0, 0, 0.1, 0, 0, 0, 1), 640, 480)
 Channels = Mapping[str, tuple[Schema, Provenance | None, Sequence[Frame]]]
-
-
-def written(path: Path, channels: Channels, clock: str = "") -> Path:
-    """A log of these channels, each with how it was made, and its frames."""
-    with log.create(path) as writer:
-        for topic, (schema, made, frames) in channels.items():
-            metadata = made.to_metadata() if made else {}
-            number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", metadata)
-            for frame in frames:
-                writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
-        if clock:
-            writer.add_metadata(CLOCK, {"start_ns": clock})
-    return path
 
 
 def parameters_of(stage: str, transform: Transform) -> dict[str, Any]:
@@ -78,7 +66,11 @@ def planned(
 ) -> tuple[list[pipeline.Job], list[str], list[tuple[str, str]]]:
     """The jobs that everything takes, what is said of them, and warnings with their codes."""
     said: list[str] = []
-    with log.read(written(path, channels)) as opened, notices.listening(lambda _: None), notices.collected() as warned:
+    with (
+        log.read(write_channels(path, channels)) as opened,
+        notices.listening(lambda _: None),
+        notices.collected() as warned,
+    ):
         jobs = pipeline.plan_all(opened, "/camera", said.append, **options)
     return jobs, said, [(one.message, one.code) for one in warned]
 
@@ -238,7 +230,7 @@ def test_an_output_that_is_missing_is_made_as_the_others_beside_it(tmp_path):
     )
     del channels["/camera/retracks/online"]
     said: list[str] = []
-    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+    with log.read(write_channels(tmp_path / "a.mcap", channels)) as opened:
         jobs = pipeline.plan_stage(
             opened, "/camera", "predict", Predict(), "/camera/retracks/online", "/camera/more", say=said.append
         )
@@ -259,7 +251,7 @@ def test_channels_made_from_what_was_replaced_are_stale(tmp_path):
         ),
         "/camera/tracks/view/image": (TRACKS, Provenance(VIEW, {}, "/camera/tracks", "t"), []),
     }
-    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+    with log.read(write_channels(tmp_path / "a.mcap", channels)) as opened:
         assert pipeline.outdated_by(opened, {"/camera/tracks": "t"}) == []
         assert pipeline.outdated_by(opened, {"/camera/tracks": "T"}) == ["/camera/samples", "/camera/tracks/events"]
         assert pipeline.outdated_by(opened, {"/camera/tracks": "T", "/camera/samples": "s"}) == [
@@ -287,7 +279,7 @@ def test_the_rate_of_other_inputs_is_known_and_a_high_one_is_said(tmp_path, rate
         "/camera/tracks has 6.25 frames a second, and retrack takes steps at that rate; /camera/samples has 2.5 unless it "
         "was made otherwise"
     )
-    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+    with log.read(write_channels(tmp_path / "a.mcap", channels)) as opened:
         for source in ("/camera/tracks", None):
             with notices.listening(lambda _: None), notices.collected() as said:
                 frames, known = pipeline.input_of(opened, "/camera", "retrack", Retrack(), source)
@@ -306,7 +298,7 @@ def test_the_rate_of_other_inputs_is_known_and_a_high_one_is_said(tmp_path, rate
 @pytest.mark.parametrize(("clock", "start_ns"), [("70", 70), ("0", 0), ("", None), ("soon", None)])
 def test_the_clock_begins_as_the_log_says(tmp_path, clock, start_ns):
     channels = {"/camera/tracks": (TRACKS, Provenance(INGEST, {}), paced(10.0))}
-    with log.read(written(tmp_path / "a.mcap", channels, clock)) as opened:
+    with log.read(write_channels(tmp_path / "a.mcap", channels, clock)) as opened:
         known = pipeline.input_of(opened, "/camera", "sample", Sample())[1]
     assert known == {"start_ns": start_ns, "ground_planes": ()}
 
@@ -318,7 +310,7 @@ def plane_at(t_ns: int, plane: GroundPlane = PLANE) -> Frame:
 def test_re_tracked_people_are_carried_to_the_rate_of_the_tracks_they_come_from(tmp_path):
     tracks = walk(lambda n: {1: (n * 0.05, 0.0), 2: (n * 0.05, 6.0)}, 60, 10.0)
     ingested = Provenance(INGEST, {}, digest="x")
-    with log.read(written(tmp_path / "a.mcap", {"/camera/tracks": (TRACKS, ingested, tracks)})) as opened:
+    with log.read(write_channels(tmp_path / "a.mcap", {"/camera/tracks": (TRACKS, ingested, tracks)})) as opened:
         pipeline.run(opened, "/camera", pipeline.plan_all(opened, "/camera"))
     with log.read(tmp_path / "a.mcap") as opened:
         assert [f.t_ns for f in opened.frames("/camera/retracks/full", TRACKS)] == [f.t_ns for f in tracks]
@@ -327,7 +319,7 @@ def test_re_tracked_people_are_carried_to_the_rate_of_the_tracks_they_come_from(
         made = Provenance.from_metadata(opened.channel("/camera/samples").metadata)
     for how, is_known in ((made, True), (ingested, False)):  # samples that stand, and others of unknown tracks
         there = {"/camera/samples": (TRACKS, how, samples), "/camera/tracks": (TRACKS, ingested, tracks)}
-        with log.read(written(tmp_path / "b.mcap", there)) as opened:
+        with log.read(write_channels(tmp_path / "b.mcap", there)) as opened:
             pipeline.run(opened, "/camera", pipeline.plan_stage(opened, "/camera", "retrack", Retrack()))
         with log.read(tmp_path / "b.mcap") as opened:
             assert ("/camera/retracks/full" in opened.channels) is is_known
@@ -341,7 +333,7 @@ def test_what_was_odd_when_a_channel_was_made_is_said_for_what_runs_and_what_it_
         name: {"warnings": [("clock", f"odd {name}")]}
         for name in ("detections", "tracks", "samples", "predictions", "retracks")
     }
-    with log.read(written(tmp_path / "a.mcap", finished(**odd))) as opened:
+    with log.read(write_channels(tmp_path / "a.mcap", finished(**odd))) as opened:
 
         def said(made: dict[str, Provenance], is_all: bool) -> list[tuple[str, str]]:
             with notices.listening(lambda _: None), notices.collected() as heard:
@@ -370,7 +362,7 @@ GUESSED = (
 def test_a_guessed_scale_is_said_of_what_is_in_metres(tmp_path, stage, assumed, is_said):
     plane = GroundPlane((0.05, 0, 0, 0, 0.05, 0, 0, 0, 1), 64, 48, assumed=assumed)
     with (
-        log.read(written(tmp_path / "a.mcap", finished())) as opened,
+        log.read(write_channels(tmp_path / "a.mcap", finished())) as opened,
         notices.listening(lambda _: None),
         notices.collected() as said,
     ):
@@ -389,7 +381,7 @@ def test_a_guessed_scale_is_said_of_what_is_in_metres(tmp_path, stage, assumed, 
     ],
 )
 def test_tracks_that_are_only_linked_or_passed_on_are_said(tmp_path, parameters, done):
-    path = written(tmp_path / "a.mcap", finished())
+    path = write_channels(tmp_path / "a.mcap", finished())
     words = (
         f"tracks were {done}: without a measured ground plane, more needs a camera that looks down, and this one looks "
         f"along the ground. To insist: `mcaptrack.retrack('{path}', side_view=True)`"
@@ -516,7 +508,7 @@ def test_each_channel_has_its_views(tmp_path):
 def test_a_view_that_others_recorded_stays_and_that_is_said(tmp_path):
     ingested = Provenance(INGEST, {}, digest="x")
     channels = {"/camera/truth": (TRACKS, ingested, at(1.0)), "/camera/truth/view/scene": (TRACKS, None, at(2.0))}
-    path = written(tmp_path / "a.mcap", channels)
+    path = write_channels(tmp_path / "a.mcap", channels)
     with log.read(path) as opened:
         before = [message.payload for message in opened.messages("/camera/truth/view/scene")]
         report = pipeline.run(opened, "/camera", [], tmp_path / "b.mcap")
@@ -559,14 +551,14 @@ def test_views_are_found_by_what_is_best_or_by_name(tmp_path):
     names += ["camera/tracks/view/scene"]
     with pytest.raises(McaptrackError, match="views on /camera/video, scenes can't be drawn in one video; name those"):
         found(names, "/camera/tracks", "/camera/tracks/view/scene")
-    with log.read(written(path, {f"/{name}": (TRACKS, None, []) for name in names})) as opened:
+    with log.read(write_channels(path, {f"/{name}": (TRACKS, None, []) for name in names})) as opened:
         assert pipeline.find_views(opened, "/camera") == (["/camera/tracks/view/scene"], "")
 
 
 def test_a_digest_is_of_the_messages_whether_or_not_it_was_kept(tmp_path):
     made = writing.Made.of(TRACKS, at(1.0), Provenance(INGEST, {}))
     channels = {"/a": (TRACKS, made.provenance, at(2.0)), "/b": (TRACKS, None, at(1.0))}
-    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+    with log.read(write_channels(tmp_path / "a.mcap", channels)) as opened:
         assert writing.digest_of(opened, "/a") == writing.digest_of(opened, "/b") == made.provenance.digest
     wanted = digest((frame.t_ns, frame.index, TRACKS.codec.encode(frame.rows)) for frame in at(1.0))
     assert (made.provenance.digest, made.size()) == (wanted, 2)
@@ -578,7 +570,7 @@ def test_a_digest_is_of_the_messages_whether_or_not_it_was_kept(tmp_path):
 
 def test_forecasts_and_planes_are_counted(tmp_path):
     def summary(channels: Channels) -> pipeline.Summary:
-        with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+        with log.read(write_channels(tmp_path / "a.mcap", channels)) as opened:
             return pipeline.summarise(opened, "/camera")
 
     ingested = Provenance(INGEST, {})
@@ -604,13 +596,13 @@ def test_boxes_are_those_that_tracks_were_made_from(tmp_path):
     }
     for source, count in (("/camera/detections", 6), ("/camera/other", 2), ("/camera/gone", 6), (None, 6)):
         tracks = {"/camera/tracks": (TRACKS, Provenance("track", {}, source), at(1.0))} if source else {}
-        with log.read(written(tmp_path / "a.mcap", channels | tracks)) as opened:
+        with log.read(write_channels(tmp_path / "a.mcap", channels | tracks)) as opened:
             assert pipeline.summarise(opened, "/camera").boxes == count
 
 
 def test_an_error_of_a_stage_names_log_and_channel_once(tmp_path, monkeypatch):
     frames = walk(lambda n: {1: (n * 0.1, 0.0)}, 5, 10.0)
-    path = written(tmp_path / "a.mcap", {"/camera/tracks": (TRACKS, Provenance(INGEST, {}, digest="x"), frames)})
+    path = write_channels(tmp_path / "a.mcap", {"/camera/tracks": (TRACKS, Provenance(INGEST, {}, digest="x"), frames)})
     for words, shown in (("no", f"{path}: /camera/tracks: no"), (f"{path} is odd", f"{path} is odd")):
 
         def fail(*_, words=words):
@@ -625,7 +617,7 @@ def test_an_error_of_a_stage_names_log_and_channel_once(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("frame_id", "is_said"), [("map", True), ("", False)])
 def test_a_frame_without_boxes_in_space_has_no_effect(tmp_path, frame_id, is_said):
     channels = {"/camera/tracks": (TRACKS, Provenance(INGEST, {}), paced(2.5))}
-    with log.read(written(tmp_path / "a.mcap", channels)) as opened, notices.collected() as said:
+    with log.read(write_channels(tmp_path / "a.mcap", channels)) as opened, notices.collected() as said:
         check_spaces(opened, "/camera", [], frame_id)
     wanted = "`frame=` has no effect: only recorded 3D boxes are brought to a frame"
     assert [(one.code, one.message) for one in said] == ([("option-not-used", wanted)] if is_said else [])

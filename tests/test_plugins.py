@@ -45,7 +45,7 @@ class Corner:
         for frame in frames:
             x = [20.0 + frame.index]
             rows = DETECTIONS.rows(x_px=x, y_px=x, w_px=[self.size_px], h_px=[self.size_px], class_id=[1])
-            yield (frame._replace(rows=rows),)
+            yield (frame._replace(rows=rows),) * len(self.writes)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +66,7 @@ class Single:
             rows = TRACKS.rows(
                 track_id=[self.track_id] * count, observed=[True] * count, source_id=[-1] * count, **boxes
             )
-            yield (frame._replace(rows=rows),)
+            yield (frame._replace(rows=rows),) * len(self.writes)
 
 
 @dataclass(frozen=True)
@@ -328,7 +328,7 @@ def test_tune_names_a_tracker_that_fails(place):
     start = text.index("class Single")
     for old, new, said, more in (
         ("count = len(first)", "count = 1 / 0", "failed at frame 0 (0 ns): ZeroDivisionError", ()),
-        ("yield (frame._replace(rows=rows),)", "yield rows", "gave a ndarray at frame 0 (0 ns)", ()),
+        ("yield (frame._replace(rows=rows),) * len(self.writes)", "yield rows", "gave a ndarray at frame 0 (0 ns)", ()),
         ("    def __call__", fails, "could not be made with {'track_id': ", ()),
         (
             "    def __call__",

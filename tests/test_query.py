@@ -29,6 +29,7 @@ from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.tables.export import default_folder, export
 from mcaptrack.tables.sql import Database
 from tests.commands import GROUP, Outcome, Terminal, call
+from tests.logs import write_channels
 from tests.worlds import ns, tracks_at
 
 PAGE = (Path(__file__).parent.parent / "docs" / "sql.md").read_text()
@@ -85,7 +86,7 @@ def square(tmp_path_factory) -> Path:
         made = Provenance.from_metadata(opened.channel("/camera/truth").metadata)
     # Labels alone say their frame rate; those of the demonstration stand beside a video.
     made = replace(made, parameters={key: value for key, value in made.parameters.items() if key != "fps"})
-    write_log(folder / "demo.mcap", {"/camera/truth": (TRACKS, made, frames)})
+    write_channels(folder / "demo.mcap", {"/camera/truth": (TRACKS, made, frames)})
     with log.read(folder / "demo.mcap") as opened:
         export(opened, folder / "demo.tables")
     return folder
@@ -142,16 +143,6 @@ def test_answers_of_the_page_are_correct():
 # Examples: a log with known answers
 
 
-def write_log(path, channels):
-    with log.create(path) as writer:
-        for topic, (schema, made, frames) in channels.items():
-            described = (schema.name, "protobuf", schema.descriptor)
-            number = writer.add_channel(topic, described, "protobuf", made.to_metadata(), group=topic)
-            for frame in frames:
-                writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
-    return path
-
-
 def forecasts(rows):
     who, step, x_m, y_m = (list(column) for column in zip(*rows, strict=True))
     return PREDICTIONS.rows(track_id=who, step=step, ahead_s=[0.4 * n for n in step], x_m=x_m, y_m=y_m)
@@ -174,10 +165,11 @@ def known_log(path, tracked=(7, 8)):
     seen = [tracks_at({3: (0.0, 0.0)}, observed=n <= 10 or n >= 30) for n in range(40)]
     whole = [Frame(ns(0.1 * n), n, rows) for n, rows in enumerate(seen)]
     ahead = [(7, 1, 0.4, 0.3), (7, 2, 0.8, 0.0), (8, 1, 0.0, 10.5), (8, 2, 0.4, 10.8)]
+    predicted = Provenance("predict", {}, "/camera/samples")
     told = [
         Frame(ns(2.4), 6, happened([(4, 1, 7, 9, 0.4), (2, 1, 7, -1, 0.8), (2, 2, 8, -1, 0.4), (2, 1, 9, -1, 1.2)]))
     ]
-    return write_log(
+    return write_channels(
         path,
         {
             "/camera/truth": (TRACKS, Provenance("ingest", {}, ""), people),
@@ -185,11 +177,7 @@ def known_log(path, tracked=(7, 8)):
             "/camera/samples": (TRACKS, Provenance("sample", {}, "/camera/tracks"), samples),
             "/camera/retracks": (TRACKS, Provenance("retrack", {}, "/camera/samples"), samples),
             "/camera/retracks/full": (TRACKS, Provenance("carry", {}, "/camera/retracks"), whole),
-            "/camera/predictions": (
-                PREDICTIONS,
-                Provenance("predict", {}, "/camera/samples"),
-                [Frame(0, 0, forecasts(ahead))],
-            ),
+            "/camera/predictions": (PREDICTIONS, predicted, [Frame(0, 0, forecasts(ahead))]),
             "/camera/tracks/events": (EVENTS, Provenance("events", {}, "/camera/tracks"), told),
         },
     )

@@ -30,7 +30,7 @@ from mcaptrack.viewing.report.identity_events import SIDE_PX, add_thumbnails, mo
 from mcaptrack.viewing.report.scene_map import SceneBackground, TrackPath, ground_map, heat_map, picture_map, simplified
 from mcaptrack.viewing.report.summary import change_text, verdict
 from tests.commands import call, done, printed
-from tests.logs import add_rows
+from tests.logs import add_rows, write_channels
 from tests.worlds import ns, tracks_at, walk
 
 
@@ -48,16 +48,20 @@ class Reader(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.elements.append((tag, dict(attrs)))
-        if tag not in ("meta", "link", "br"):
+        if tag not in ("meta", "link", "br", "img", "input"):
             self.open.append(tag)
+        if tag == "script":
+            self.scripts.append("")
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        where = self.scripts if self.open and self.open[-1] == "script" else self.text
-        if not self.open or self.open[-1] != "style":
-            where.append(data)
+        inside = self.open[-1] if self.open else ""
+        if inside == "script":
+            self.scripts[-1] += data
+        elif inside != "style":
+            self.text.append(data)
 
     def of(self, name):
         return [attributes for element, attributes in self.elements if element == name]
@@ -81,10 +85,7 @@ INGESTED = Provenance("ingest", {})
 
 
 def write(path: Path, channels: dict[str, list[Frame]], made: Provenance = INGESTED, schema=TRACKS) -> Path:
-    with log.create(path) as writer:
-        for topic, frames in channels.items():
-            add_rows(writer, topic, schema, frames, made=made)
-    return path
+    return write_channels(path, {topic: (schema, made, frames) for topic, frames in channels.items()})
 
 
 # Numbers
@@ -132,18 +133,10 @@ def predicted(tmp_path_factory) -> Path:
 
     samples = walk(lambda tick: path(tick, 1), 60)
     tracks = {"/camera/truth": walk(lambda tick: path(tick, 0), 60), "/camera/samples": samples}
-    file = tmp_path_factory.mktemp("predicted") / "predicted.mcap"
-    with log.create(file) as writer:
-        for topic, frames in tracks.items():
-            add_rows(writer, topic, TRACKS, frames, made=INGESTED)
-        add_rows(
-            writer,
-            "/camera/predictions",
-            PREDICTIONS,
-            [f for (f,) in Predict(predictor="kalman")(samples)],
-            made=INGESTED,
-        )
-    return file
+    ahead = [f for (f,) in Predict(predictor="kalman")(samples)]
+    channels = {topic: (TRACKS, INGESTED, frames) for topic, frames in tracks.items()}
+    channels |= {"/camera/predictions": (PREDICTIONS, INGESTED, ahead)}
+    return write_channels(tmp_path_factory.mktemp("predicted") / "predicted.mcap", channels)
 
 
 def test_the_curve_and_the_errors_by_horizon_are_those_of_the_scores(predicted):
