@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import heapq
-import io
 import struct
-import zlib
-from typing import ClassVar
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
 
 from mcaptrack import log
 from mcaptrack.log.chunk_list import ChunkList
 from mcaptrack.log.records import ChunkIndexRecord
-from mcaptrack.log.writer import LogWriter
 from tests.memory import held
 from tests.tiers import thorough
 
@@ -102,38 +97,6 @@ def test_a_log_of_many_chunks_takes_few_bytes_a_chunk(many_chunks):
         alive, most = held(lambda: sum(len(message.payload) for message in reading.messages("/a")))
         assert most < AHEAD + 120 * CHUNKS
         assert alive < AHEAD + 20 * CHUNKS
-
-
-def test_the_summary_is_written_in_parts(many_chunks):
-    """Of hundreds of thousands of chunks it takes tens of megabytes, which were in memory four times."""
-
-    class Sink:
-        sizes: ClassVar[list[int]] = []
-        data = bytearray()
-
-        def write(self, data: bytes) -> None:
-            self.sizes.append(len(data))
-            self.data += data
-
-    sink = Sink()
-    writer = LogWriter(sink)
-    writer.header()
-    with log.read(many_chunks) as opened:
-        for number, channel in opened.index.channels.items():
-            writer.channels[number] = channel
-        for chunk in opened.index.chunks:
-            source = opened.snapshot.source
-            indexes = {number: bytes(16) for number in chunk.message_index_offsets}
-            writer.copy_chunk(bytes(source[chunk.offset : chunk.offset + chunk.length]), chunk, indexes)
-        start = len(sink.sizes)
-        assert writer.finish() == CHUNKS
-    assert max(sink.sizes[start:]) < 70_000 < sum(sink.sizes[start:])
-    with io.BytesIO(bytes(sink.data)) as stream:
-        found = make_reader(stream).get_summary()
-    assert len(found.chunk_indexes) == CHUNKS
-    (crc,) = struct.unpack_from("<I", sink.data, len(sink.data) - 12)
-    (summary_start,) = struct.unpack_from("<Q", sink.data, len(sink.data) - 28)
-    assert crc == zlib.crc32(sink.data[summary_start:-12])
 
 
 def test_chunks_that_stay_open_for_other_channels_are_counted_once_each(many_chunks, tmp_path, monkeypatch):

@@ -108,6 +108,7 @@ def test_every_command_is_shown_on_a_page():
     assert {line.split()[1] for line in lines if line.startswith("mcaptrack ")} >= set(COMMANDS)
 
 
+@thorough
 @pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="mkdocs isn't installed")
 def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path):
     words = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]

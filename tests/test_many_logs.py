@@ -67,7 +67,7 @@ def test_results_for_stdout_come_in_the_order_of_the_logs_and_list_on_stdin(fold
 
 
 def test_outputs_go_to_a_folder_under_the_names_of_the_logs(folder):
-    done("sample", "logs", "--output-dir", "out", "--rate-hz", "2.5", "--jobs", "2")
+    done("sample", "logs", "--output-dir", "out", "--rate-hz", "2.5", "--jobs", "1")
     assert sorted(map(str, Path("out").rglob("*.mcap"))) == ["out/a.mcap", "out/deep/b.mcap"]
     done("drop", "out", "/camera/video", "--output-dir", "small", "--jobs", "1")
     assert Path("small/deep/b.mcap").stat().st_size < Path("out/deep/b.mcap").stat().st_size
@@ -146,7 +146,7 @@ def test_many_inputs_are_ingested_by_workers_and_once(folder, monkeypatch):
     Path("labels").mkdir()
     for name in ("x", "y"):
         Path(f"labels/{name}.txt").write_text("1,1,5,5,9,9\n2,1,6,5,9,9\n")
-    words = ("--as", "truth", "--fps", "10", "--jobs", "2", "--ledger", "ingest.jsonl", "--output-dir", "made")
+    words = ("--as", "truth", "--fps", "10", "--jobs", "1", "--ledger", "ingest.jsonl", "--output-dir", "made")
     first = json.loads(done("ingest", "labels/*.txt", *words, "--json").out)
     assert [one["log"] for one in first["results"]] == ["made/x.mcap", "made/y.mcap"]
     assert first["fleet"]["done"] == 2

@@ -27,7 +27,6 @@ from mcaptrack.transforms import (
     STAGES,
     KnnDetector,
     Retrack,
-    Sample,
     Sort,
 )
 from tests.worlds import small_scene
@@ -130,14 +129,6 @@ def test_outdated_channels_are_reported_and_made_again_with_their_parameters(fre
         assert made["/camera/tracks"].parameters["max_age_s"] == 0.7
         assert made["/camera/detections"].parameters["detector"] == "knn"
         assert [topic for topic in opened.channels if pipeline.is_stale(opened, topic)] == []
-
-
-def test_stages_read_and_write_the_given_topics(fresh):
-    run_stage(fresh, "track", Sort(), target="/camera/tracks/strict")
-    run_stage(fresh, "sample", Sample(), source="/camera/tracks/strict", target="/camera/other")
-    with log.read(fresh) as opened:
-        assert Provenance.from_metadata(opened.channel("/camera/other").metadata).input == "/camera/tracks/strict"
-        assert "/camera/tracks" not in opened.channels
 
 
 def test_writing_to_another_file_leaves_the_log_unchanged(fresh, tmp_path):

@@ -17,11 +17,10 @@ from mcaptrack import foxglove, log, notices, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.pipeline import drawing
-from mcaptrack.pipeline import write as writing
 from mcaptrack.pipeline.plan import check_spaces
 from mcaptrack.schema import DECISIONS, DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.ground_plane import plane_to_rows
-from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, digest
+from mcaptrack.schema.provenance import INGEST, VIEW, Provenance
 from mcaptrack.transforms import STAGES, OcSort, Predict, Retrack, Sample, Sort, Transform
 from tests.logs import write_channels
 from tests.worlds import boxes_at, ns, tracks_at, walk
@@ -162,17 +161,13 @@ PLANS = {
     "a parameter that is gone, and another setting": other_settings(
         f"predictions: {WITHOUT('Predict')}", predict=Predict()
     )._replace(changed={"predictions": {"parameters": {"strange": 1}}}),
-    "compared with something that is gone": Plan(
-        {"predictions": {"references": {"/camera/truth": "x"}}}, {}, ["predict"], AGAIN[2:3]
-    ),
+    "compared with something that is gone": Plan({"predictions": {"references": {"/camera/truth": "x"}}}, {}, ["predict"], AGAIN[2:3]),
     "compared with nothing, as now": Plan({"predictions": {"references": {"/camera/truth": ""}}}),
-    "compared with something else": Plan(
-        {"predictions": {"references": {"/camera/tracks": "T"}}}, {}, ["predict"], AGAIN[2:3]
-    ),
+    "compared with something else": Plan({"predictions": {"references": {"/camera/tracks": "T"}}}, {}, ["predict"], AGAIN[2:3]),
     "a plane that is gone": Plan(
         {"tracks": {"parameters": parameters_of("track", Sort(ground_planes=((0, PLANE),)))}}, {}, STAGES_OF_ALL, AGAIN
     ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)
@@ -553,16 +548,6 @@ def test_views_are_found_by_what_is_best_or_by_name(tmp_path):
         found(names, "/camera/tracks", "/camera/tracks/view/scene")
     with log.read(write_channels(path, {f"/{name}": (TRACKS, None, []) for name in names})) as opened:
         assert pipeline.find_views(opened, "/camera") == (["/camera/tracks/view/scene"], "")
-
-
-def test_a_digest_is_of_the_messages_whether_or_not_it_was_kept(tmp_path):
-    made = writing.Made.of(TRACKS, at(1.0), Provenance(INGEST, {}))
-    channels = {"/a": (TRACKS, made.provenance, at(2.0)), "/b": (TRACKS, None, at(1.0))}
-    with log.read(write_channels(tmp_path / "a.mcap", channels)) as opened:
-        assert writing.digest_of(opened, "/a") == writing.digest_of(opened, "/b") == made.provenance.digest
-    wanted = digest((frame.t_ns, frame.index, TRACKS.codec.encode(frame.rows)) for frame in at(1.0))
-    assert (made.provenance.digest, made.size()) == (wanted, 2)
-    assert made._replace(encoded=[(1, 2, b"x")]).size() == 1
 
 
 # What a log holds, in numbers

@@ -29,6 +29,7 @@ from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.stages import FULL, RESERVED
 from tests.commands import call, done, made_log
 from tests.test_plugins import MODULE
+from tests.tiers import thorough
 
 KINDS = (
     MODULE
@@ -107,17 +108,17 @@ def is_current() -> bool:
     return not found["results"][0]["stages"] and "out of date" not in done("info", "a.mcap").out
 
 
-@pytest.mark.parametrize("begin", ["fresh", "full"])
+KINDS_TRIED = [
+    *(("detector", "CornerAndMore"), ("tracker", "SingleAndMore"), ("tracker", "Nothing")),
+    *(("retracker", "Same"), ("retracker", "SameAndMore"), ("predictor", "Standing")),
+]
+#: Of half of the classes each beginning runs by default.
+BEGINNINGS = [(("fresh", "full")[(n + m) % 2], *one) for m in (0, 1) for n, one in enumerate(KINDS_TRIED)]
+
+
 @pytest.mark.parametrize(
-    ("kind", "name"),
-    [
-        ("detector", "CornerAndMore"),
-        ("tracker", "SingleAndMore"),
-        ("tracker", "Nothing"),
-        ("retracker", "Same"),
-        ("retracker", "SameAndMore"),
-        ("predictor", "Standing"),
-    ],
+    ("begin", "kind", "name"),
+    [*BEGINNINGS[:6], *(pytest.param(*one, marks=thorough) for one in BEGINNINGS[6:])],
 )
 def test_outputs_may_be_missing_or_more_and_go_with_their_class(logs, place, begin, kind, name):
     """Each command takes the log, a second run has nothing to do, and the built-in class gives the usual log again."""

@@ -330,13 +330,8 @@ def test_tune_names_a_tracker_that_fails(place):
         ("count = len(first)", "count = 1 / 0", "failed at frame 0 (0 ns): ZeroDivisionError", ()),
         ("yield (frame._replace(rows=rows),) * len(self.writes)", "yield rows", "gave a ndarray at frame 0 (0 ns)", ()),
         ("    def __call__", fails, "could not be made with {'track_id': ", ()),
-        (
-            "    def __call__",
-            fails,
-            "could not be made with the ends of --search: RuntimeError",
-            ("--search", "track-id=1:2"),
-        ),
-    ):
+        ("    def __call__", fails, "could not be made with the ends of --search: RuntimeError", ("--search", "track-id=1:2")),
+    ):  # fmt: skip
         install(text=text[:start] + text[start:].replace(old, new, 1))
         refused = call(*words, "--force", *more)
         assert (refused.code, refused.err.count("\n")) == (1, 1), refused.err
@@ -366,30 +361,11 @@ class TestOptionsOfPredictors:
         done("run", "a.mcap", "--no-tables", "-q", "--predictor", "cv")
         assert "sigma_m" not in made("/camera/predictions").parameters
 
-    def test_files_the_environment_and_python_set_them(self, place, monkeypatch):
-        (place / "mcaptrack.toml").write_text('[predict]\npredictor = "spread"\nsigma-m = 4\nshift = "east"\n')
-        done("run", "a.mcap", "--no-tables", "--force", "-q")
-        assert (self.variances(), made("/camera/predictions").parameters["shift"]) == ({16.0}, "east")
-        done("predict", "a.mcap", "--predictor", "cv", "-q")  # the options of the other one are left out
-        assert "sigma_m" not in made("/camera/predictions").parameters
-        monkeypatch.setenv("MCAPTRACK_PREDICT_SIGMA_M", "5")
-        done("predict", "a.mcap", "--predictor=own:Spread", "-q")
-        assert self.variances() == {25.0}
-        mcaptrack.predict("a.mcap", predictor="spread-function", sigma_m=0.5)
-        assert self.variances() == {0.25}
-        assert made("/camera/predictions").parameters["predictor"] == "spread-function"
-
     def test_a_parameter_of_predict_is_refused(self, place):
         install(text=MODULE.replace("sigma_m", "horizon_s"))
         refused = call("predict", "a.mcap", "--predictor", "spread")
         assert refused.code == 1
         assert "predictor spread (own 1.5) can't have a parameter horizon_s: that is one of predict" in refused.err
-
-    def test_an_option_that_another_version_lacks_is_named(self, place):
-        done("predict", "a.mcap", "--predictor", "spread", "--sigma-m", "3", "-q")
-        install("2.0", MODULE.replace("sigma_m", "error_m"))
-        said = call("run", "a.mcap", "--no-tables", "--force").err
-        assert "it was made with sigma_m, which Predict with spread does not have" in said
 
     def test_a_log_that_hides_its_predictor_has_no_module_imported(self, place):
         (place / "beside_the_log.py").write_text(MODULE)
@@ -449,23 +425,15 @@ def test_the_help_lists_the_options_of_the_one_that_is_named(place, monkeypatch)
         ("track --tracker single --name c", 2, "invalid value for '--name'"),
         ("track --tracker sort --track-id 1", 2, "no such option: --track-id"),
         ("track --tracker corner", 1, "no tracker is called corner"),
-        (
-            "track --tracker own:Corner",
-            1,
-            "tracker own:Corner (own 1.5) reads foxglove.CompressedVideo; a tracker reads",
-        ),
-        (
-            "track --tracker single --min-iou 0.1",
-            1,
-            "--min-iou is an option of sort, bytetrack, ocsort and ground, not",
-        ),
+        ("track --tracker own:Corner", 1, "tracker own:Corner (own 1.5) reads foxglove.CompressedVideo; a tracker reads"),
+        ("track --tracker single --min-iou 0.1", 1, "--min-iou is an option of sort, bytetrack, ocsort and ground, not"),
         ("predict --predictor spread --sigma-m 0", 1, "--sigma-m has to be from 0.1 to 1000000, not 0"),
         ("predict --predictor spread --shift west", 2, "invalid value for '--shift'"),
         ("predict --predictor cv --sigma-m 1", 2, "no such option: --sigma-m"),
         ("predict --predictor spread --predictor cv --sigma-m 1", 1, "--sigma-m is an option of spread, not of cv"),
         ("predict --predictor nearest", 1, "no predictor is called nearest"),
     ],
-)
+)  # fmt: skip
 def test_wrong_options_are_refused_in_one_line(place, line, code, said):
     command, *words = line.split()
     refused = call(command, "a.mcap", *words)
@@ -482,13 +450,6 @@ def test_a_parameter_with_the_name_of_an_option_is_refused_by_name(place, name):
         refused = call(command, "a.mcap", "--tracker", "single")
         assert (refused.code, refused.err.count("\n")) == (1, 1), refused.err
         assert f"single can't have a parameter {name}: that is the name of an option of track" in refused.err
-
-
-@pytest.mark.parametrize("name", ["profile", "mode", "method"])
-def test_a_parameter_may_have_the_name_of_an_option_of_another_stage(place, name):
-    install(text=MODULE.replace("track_id: int =", f"{name}: int = 1\n    track_id: int ="))
-    done("track", "a.mcap", "--tracker", "single", f"--{name}", "3", "-q")
-    assert made("/camera/tracks").parameters[name] == 3
 
 
 def test_what_plugins_and_their_programs_print_is_kept_apart_from_results(place, capfd):

@@ -96,23 +96,9 @@ def test_installed_modules_are_searched_before_the_working_folder(installed, tmp
     assert (entry.cls().gain, entry.distribution, entry.version) == (2.0, "own-trackers", "1.5")
 
 
-def test_the_first_of_two_copies_of_a_package_is_the_one_that_is_imported(installed, tmp_path, monkeypatch):
-    (tmp_path / "later").mkdir()
-    package(tmp_path / "later", "own_trackers", "1.0", "mcaptrack.trackers", {"nearest": "own_trackers:Nearest"})
-    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path / "later")])
-    assert find("tracker", "nearest").version == "1.5"
-
-
-def test_a_package_that_is_installed_later_is_known(installed):
-    (installed / "fresh.py").write_text(PLUGIN)
-    assert registry.distribution_of("fresh") == ("", "")
-    package(installed, "fresh", "3", "mcaptrack.trackers", {})
-    assert registry.distribution_of("fresh.part") == ("fresh", "3")
-
-
 def test_modules_of_installed_packages_are_of_what_importlib_says():
     wanted = {top: owners for top, owners in packages_distributions().items() if top.isidentifier()}
-    some = sorted(wanted)[::7]
+    some = sorted(wanted)[::40]
     assert {top: registry.distribution_of(f"{top}.part") for top in some} == {
         top: (wanted[top][0], version(wanted[top][0])) for top in some
     }
@@ -267,26 +253,14 @@ WRONG_CLASSES = [
     ("gain: float", "tracker: float", "a parameter can't have the name of the option `tracker=`"),
     (' = option(2.0, "how much", least=0.0)', "", "Nearest.gain has no default"),
     ("option(2.0,", "option(-2.0,", "gain has to be from 0 to 1000000, not -2"),
-    (
-        'option(2.0, "how much", least=0.0)',
-        'option(float("inf"), "how much")',
-        "gain has to be finite, which inf is not",
-    ),
+    ('option(2.0, "how much", least=0.0)', 'option(float("inf"), "how much")', "gain has to be finite, which inf is not"),
     ('option(2.0, "how much", least=0.0)', 'option(float("nan"), "how much")', "gain has to be a number, not nan"),
     ('{"": TRACKS}', '{"": TRACKS, "debug": "x"}', "has writes with 'debug': 'x'; it maps ends of topics to schemas"),
     ('{"": TRACKS}', '{"": TRACKS, "debug": VIDEO}', r"has writes with 'debug': Schema\('foxglove.CompressedVideo'\)"),
     ('{"": TRACKS}', '{"": TRACKS, 3: TRACKS}', r"has writes with 3: Schema\('mcaptrack.Tracks'\)"),
-    (
-        'option(2.0, "how much", least=0.0)',
-        "field(init=False, default=2.0)",
-        r"Nearest.gain can't be given \(init=False\)",
-    ),
-    (
-        "    def __call__",
-        "    def __post_init__(self): raise SystemExit(0)\n\n    def __call__",
-        "could not be made: SystemExit: 0",
-    ),
-]
+    ('option(2.0, "how much", least=0.0)', "field(init=False, default=2.0)", r"Nearest.gain can't be given \(init=False\)"),
+    ("    def __call__", "    def __post_init__(self): raise SystemExit(0)\n\n    def __call__", "could not be made: SystemExit: 0"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("part", "instead", "said"), WRONG_CLASSES)

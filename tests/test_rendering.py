@@ -16,9 +16,6 @@ from scipy.spatial.transform import Rotation
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.video import write_clip
-from mcaptrack.sources.video.decode import EncodedPicture, decode_bgr
-from mcaptrack.sources.video.encode import encode_image
-from mcaptrack.sources.video.raw_pixels import PixelLayout
 from mcaptrack.viewing import from_above
 from mcaptrack.viewing.from_above import Sight
 from mcaptrack.viewing.rendering import draw
@@ -114,22 +111,6 @@ def test_a_clip_keeps_the_times_and_colours_of_its_pictures(tmp_path, suffix):
     assert [t for t, _ in found] == pytest.approx([0, 0.1, 0.3, 0.4], abs=0.011)
     for (_, image), shade in zip(found, shades, strict=True):
         assert abs(image.astype(int).mean(axis=(0, 1)) - shade).max() < 8
-
-
-def test_pictures_of_every_kind_are_read_in_colour():
-    image = np.zeros((16, 16, 3), np.uint8)
-    image[:, :8], image[:, 8:] = (250, 20, 20), (20, 20, 250)
-    rgb = image[:, :, ::-1].tobytes()
-    grey = np.full((16, 16), 77, np.uint8)
-    pictures = [
-        EncodedPicture(0, 0, "png", encode_image(image, "png")),
-        EncodedPicture(1, 1, "bgr8", image.tobytes(), PixelLayout(16, 16)),
-        EncodedPicture(2, 2, "rgb8", rgb, PixelLayout(16, 16)),
-        EncodedPicture(3, 3, "mono8", grey.tobytes(), PixelLayout(16, 16)),
-    ]
-    found = [frame.rows for frame in decode_bgr(pictures)]
-    assert all(np.array_equal(rows, image) for rows in found[:3])
-    assert np.array_equal(found[3], np.repeat(grey[..., None], 3, axis=2))
 
 
 def test_a_log_becomes_a_video_of_its_pictures(finished, tmp_path):

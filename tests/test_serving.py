@@ -236,13 +236,13 @@ def connections(server: Server) -> int:
 
 
 def test_idle_connections_are_closed_for_new_ones(path):
-    """Of 300 idle connections as many as the limit allows stay open, and a viewer gets its answer."""
+    """Of 100 idle connections as many as the limit allows stay open, and a viewer gets its answer."""
     with serving({path.name: path}, connections=8) as server:
-        idle = [connect(server) for _ in range(300)]
+        idle = [connect(server) for _ in range(100)]
         assert ask(server.address(path.name))[2] == path.read_bytes()
         assert connections(server) <= 8
-        ended = [connection for connection in idle[:290] if rest(connection) == b""]
-        assert len(ended) == 290
+        ended = [connection for connection in idle[:90] if rest(connection) == b""]
+        assert len(ended) == 90
         assert sum(thread.name.startswith("Thread") for thread in threading.enumerate()) < 30
         for connection in idle:
             connection.close()

@@ -263,14 +263,8 @@ class TestWriting:
             (table(t_ns=[5, 5], track_id=[1, 1]), "in row 1 track_id 1 stands in 2 rows of one frame"),
             (table(track_id=[1, -1]), "at 5 ns: in row 0 track_id is -1; ids are"),
             (table(track_id=[1, 2], x_m=[1, 2]), "in row 0 there is only a part of x_m, y_m"),
-            (
-                table(track_id=[1, 2], w_px=[1, np.nan]),
-                "at 5 ns: in row 0 there is only a part of x_px, y_px, w_px, h_px",
-            ),
-            (
-                table(track_id=[1, 2], **dict.fromkeys(("y_px", "w_px", "h_px"), [np.nan] * 2)),
-                "in row 0 there is only a part of x_px",
-            ),
+            (table(track_id=[1, 2], w_px=[1, np.nan]), "at 5 ns: in row 0 there is only a part of x_px, y_px, w_px, h_px"),
+            (table(track_id=[1, 2], **dict.fromkeys(("y_px", "w_px", "h_px"), [np.nan] * 2)), "in row 0 there is only a part of x_px"),
             (np.array([(0, 1)], [("t_ns", int), ("track_id", int)]), "in row 0 there is neither a box nor a position"),
         ],
         **dict.fromkeys(("/camera/", "/camera//detections", "/camera/\n/detections"), (([], "is no topic"),)),
@@ -282,7 +276,7 @@ class TestWriting:
             (([], "is a name of what stages make"),),
         ),
         "/camera/other": [([], "whether these are detections or tracks")],
-    }
+    }  # fmt: skip
 
     def test_rows_that_do_not_fit_change_nothing(self, tmp_path):
         path = tmp_path / "a.mcap"
