@@ -29,7 +29,7 @@ from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.stages import FULL, RESERVED
 from tests.commands import call, done, made_log
 from tests.test_plugins import MODULE
-from tests.tiers import thorough
+from tests.tiers import one_in
 
 KINDS = (
     MODULE
@@ -108,18 +108,20 @@ def is_current() -> bool:
     return not found["results"][0]["stages"] and "out of date" not in done("info", "a.mcap").out
 
 
-KINDS_TRIED = [
-    *(("detector", "CornerAndMore"), ("tracker", "SingleAndMore"), ("tracker", "Nothing")),
-    *(("retracker", "Same"), ("retracker", "SameAndMore"), ("predictor", "Standing")),
+#: What a class replaces: nothing, or results of the built-in one; by default in turns.
+REPLACED = [
+    (begin, *one)
+    for number, one in enumerate(
+        [
+            *(("detector", "CornerAndMore"), ("tracker", "SingleAndMore"), ("tracker", "Nothing")),
+            *(("retracker", "Same"), ("retracker", "SameAndMore"), ("predictor", "Standing")),
+        ]
+    )
+    for begin in (("fresh", "full"), ("full", "fresh"))[number % 2]
 ]
-#: Of half of the classes each beginning runs by default.
-BEGINNINGS = [(("fresh", "full")[(n + m) % 2], *one) for m in (0, 1) for n, one in enumerate(KINDS_TRIED)]
 
 
-@pytest.mark.parametrize(
-    ("begin", "kind", "name"),
-    [*BEGINNINGS[:6], *(pytest.param(*one, marks=thorough) for one in BEGINNINGS[6:])],
-)
+@pytest.mark.parametrize(("begin", "kind", "name"), one_in(2, REPLACED))
 def test_outputs_may_be_missing_or_more_and_go_with_their_class(logs, place, begin, kind, name):
     """Each command takes the log, a second run has nothing to do, and the built-in class gives the usual log again."""
     command, main, built_in = COMMANDS[kind]

@@ -6,6 +6,7 @@ import os
 import shlex
 import shutil
 import stat
+from itertools import product
 from pathlib import Path
 
 import pytest
