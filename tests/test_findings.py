@@ -209,12 +209,6 @@ def test_tracks_of_a_side_view_are_passed_on_with_a_warning(tmp_path):
     assert made_by(path, "/camera/retracks").parameters["side_view"] is True
 
 
-def test_tracks_of_a_view_from_above_are_re_tracked(tmp_path):
-    path = ingested(tmp_path / "a.mcap", downwards())
-    data = json.loads(done("run", path, "--no-tables", "--json", "-q").out)
-    assert [one["code"] for one in data["warnings"]] == ["assumed-ground-plane"]
-
-
 def test_a_given_ground_plane_gives_no_warning(tmp_path):
     (tmp_path / "plane.txt").write_text("0.05,0,0\n0,0.05,0\n0,0,1\n")
     path = ingested(tmp_path / "a.mcap", side_by_side(), "--ground-plane", tmp_path / "plane.txt")

@@ -77,14 +77,6 @@ def test_outputs_go_to_a_folder_under_the_names_of_the_logs(folder):
     assert (code, err) == (1, "mcaptrack: --output and --output-dir are two places for the same results; give one\n")
 
 
-def test_one_log_is_processed_as_ever_unless_an_option_for_many_is_given(folder):
-    plain = done("info", "logs/a.mcap", "--json").out
-    assert "fleet" not in json.loads(plain)
-    fleet = json.loads(done("info", "logs/a.mcap", "--json", "--timeout", "1h").out)
-    assert fleet.pop("fleet")["done"] == 1
-    assert fleet == json.loads(plain)
-
-
 def test_commands_that_combine_logs_take_folders_and_lists(folder, monkeypatch):
     done("report", "logs", "-o", "page.html")
     data = json.loads(done("evaluate", "logs", "--json").out)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import threading
@@ -14,7 +13,7 @@ import pyarrow as pa
 import pytest
 
 import mcaptrack
-from mcaptrack import environment, log, notices, tables
+from mcaptrack import log, notices, tables
 from mcaptrack.errors import McaptrackError
 from mcaptrack.pipeline.pictures import Ahead, KeptPictures
 from mcaptrack.pipeline.plan import spaces_of_boxes
@@ -218,16 +217,6 @@ def test_time_counts_for_the_innermost_part(monkeypatch):
 
 
 # Allocators
-
-
-@pytest.mark.parametrize(("given", "wanted"), [(None, "system"), ("jemalloc", "jemalloc")])
-def test_arrow_shares_the_allocator_of_all_others_unless_the_user_chose_one(given, wanted, monkeypatch):
-    """Arrow's own pool kept 22 MB of an export of 100,000 chunks for itself."""
-    monkeypatch.setenv("ARROW_DEFAULT_MEMORY_POOL", given or "")
-    if given is None:
-        monkeypatch.delenv("ARROW_DEFAULT_MEMORY_POOL")
-    environment.share_allocator()
-    assert os.environ["ARROW_DEFAULT_MEMORY_POOL"] == wanted
 
 
 def test_arrow_is_loaded_after_its_allocator_was_chosen():

@@ -175,7 +175,11 @@ class TestCompleteRun:
             pictures = opened.times("/camera/video").tolist()
             for name in ROWS:
                 assert f"/camera/{name}" in opened.channels
-            for name in ("detections", "tracks", "predictions", "retracks/full", "retracks/predictions", "truth"):
+            on_pictures = ("tracks", "predictions", "retracks/full", "retracks/predictions", "truth")
+            drawn = {"detections/view/image", "ground_plane/view/scene", "view/tf"}
+            drawn |= {f"{name}/view/{kind}" for name in on_pictures for kind in ("image", "scene")}
+            assert {topic for topic in opened.channels if "/view/" in topic} == {f"/camera/{name}" for name in drawn}
+            for name in ("detections", *on_pictures):
                 assert opened.times(f"/camera/{name}/view/image").tolist() == pictures
             assert [f.t_ns for f in opened.frames("/camera/detections", DETECTIONS)] == pictures
             ticks = opened.times("/camera/samples").tolist()

@@ -10,15 +10,13 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import pytest
 
 from mcaptrack import foxglove, log, notices, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
-from mcaptrack.pipeline import drawing
 from mcaptrack.pipeline.plan import check_spaces
-from mcaptrack.schema import DECISIONS, DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
+from mcaptrack.schema import DECISIONS, DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance
 from mcaptrack.transforms import STAGES, OcSort, Predict, Retrack, Sample, Sort, Transform
@@ -323,27 +321,6 @@ def test_re_tracked_people_are_carried_to_the_rate_of_the_tracks_they_come_from(
 # What is odd
 
 
-def test_what_was_odd_when_a_channel_was_made_is_said_for_what_runs_and_what_it_was_made_from(tmp_path):
-    odd = {
-        name: {"warnings": [("clock", f"odd {name}")]}
-        for name in ("detections", "tracks", "samples", "predictions", "retracks")
-    }
-    with log.read(write_channels(tmp_path / "a.mcap", finished(**odd))) as opened:
-
-        def said(made: dict[str, Provenance], is_all: bool) -> list[tuple[str, str]]:
-            with notices.listening(lambda _: None), notices.collected() as heard:
-                run.warn_findings(opened, "/camera", made, (), is_all)
-            return [(one.message, one.code) for one in heard]
-
-        now = Provenance("predict", {}, "/camera/samples", warnings=[("strange", "odd now")])
-        chain = [("odd samples", "clock"), ("odd tracks", "clock"), ("odd detections", "clock")]
-        assert said({"/camera/predictions": now}, is_all=False) == [("odd now", "other"), *chain]
-        assert said({}, is_all=False) == []
-        every = [f"odd {name}" for name in sorted(odd)]
-        assert sorted(message for message, _ in said({}, is_all=True)) == every
-        assert next(message for message, _ in said({"/camera/predictions": now}, is_all=True)) == "odd now"
-
-
 GUESSED = (
     "no ground plane is known: taking 20 px for a metre, since people are 1.7 m high; distances, speeds and re-tracking "
     "go by it. Give one with `mcaptrack.ingest('INPUT', ground_plane='HOMOGRAPHY')`"
@@ -423,81 +400,6 @@ def forecast(*steps: int) -> list[Frame]:
             rows[name] = some if name == "step" else 0
         frames.append(Frame(ns(number), number, rows))
     return frames
-
-
-def scored(*errors: float) -> list[Frame]:
-    rows = [FORECAST_SCORES.empty(1) for _ in errors]
-    for row, error in zip(rows, errors, strict=True):
-        row["ade_m"] = error
-    return [Frame(ns(n), n, row) for n, row in enumerate(rows)]
-
-
-def views_of(
-    names: Mapping[str, tuple[Schema, str]], pictures: Sequence[int] = ()
-) -> list[tuple[str, str, str, str, list[int]]]:
-    """Topic, schema, source, group and times of each view."""
-    ns_ = np.array(pictures, np.int64)
-    frames = {
-        TRACKS: at(1.0),
-        DETECTIONS: [Frame(0, 0, boxes_at([(9, 9)]))],
-        PREDICTIONS: forecast(1, 2),
-        GROUND_PLANE: [plane_at(0)],
-        FORECAST_SCORES: scored(1.0),
-    }
-    shown = {
-        f"/camera/{name}": drawing.ChannelToDraw(schema, frames[schema], f"of {name}", made_by)
-        for name, (schema, made_by) in names.items()
-    }
-    drawn = drawing.ViewFactory("/camera", ns_, ns_, [(0, PLANE)])
-    found = [*drawn.views(shown, 3), *drawn.views(shown, 3)]
-    kinds = {"foxglove.ImageAnnotations": "image", "foxglove.SceneUpdate": "scene", "foxglove.FrameTransform": "frame"}
-    twice = [view.topic for view in found].count("/camera/view/tf")
-    assert twice <= 1  # the frame is named once
-    found = found[: (len(found) + twice) // 2]
-    assert all(
-        view.provenance.transform == VIEW and view.provenance.input_digest == f"of {view.provenance.input[8:]}"
-        for view in found
-    )
-    return [
-        (view.topic[8:], kinds[view.schema_name], view.provenance.input[8:], view.group, [t for t, *_ in view.messages])
-        for view in found
-    ]
-
-
-def test_each_channel_has_its_views(tmp_path):
-    own, seen = [0, ns(1)], [7, 8, 9]
-    tf = ("view/tf", "frame", "tracks", "", [3])
-    assert views_of({"tracks": (TRACKS, "track")}) == [("tracks/view/scene", "scene", "tracks", "track", own), tf]
-    assert views_of({"tracks": (TRACKS, "track")}, seen) == [
-        ("tracks/view/image", "image", "tracks", "track", seen),
-        ("tracks/view/scene", "scene", "tracks", "track", seen),
-        tf,
-    ]
-    assert views_of({"detections": (DETECTIONS, "detect")}) == []
-    assert views_of({"detections": (DETECTIONS, "detect")}, seen) == [
-        ("detections/view/image", "image", "detections", "detect", seen)
-    ]
-    assert [one[:4] for one in views_of({"predictions": (PREDICTIONS, "predict")}, seen)] == [
-        ("predictions/view/image", "image", "predictions", "predict"),
-        ("predictions/view/scene", "scene", "predictions", "predict"),
-        ("view/tf", "frame", "predictions", ""),
-    ]
-    assert views_of({"ground_plane": (GROUND_PLANE, "")}) == [
-        ("ground_plane/view/scene", "scene", "ground_plane", "", [3]),
-        ("view/tf", "frame", "ground_plane", "", [3]),
-    ]
-    assert views_of({"scores": (FORECAST_SCORES, "events")}, seen) == []
-    names = {
-        "samples": (TRACKS, "sample"),
-        "retracks": (TRACKS, "retrack"),
-        "retracks/online": (TRACKS, "retrack"),
-        "retracks/full": (TRACKS, "retrack"),
-    }
-    assert [one[0] for one in views_of(names, seen)] == [
-        "retracks/full/view/image",
-        "retracks/full/view/scene",
-        "view/tf",
-    ]
 
 
 def test_a_view_that_others_recorded_stays_and_that_is_said(tmp_path):

@@ -20,7 +20,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mcaptrack import log, tables
-from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import EVENTS, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import demo
@@ -326,19 +325,6 @@ def test_the_channels_of_a_folder_are_tables_too(known, tmp_path):
             assert "/imu" in database.channels
 
 
-def test_old_tables_have_new_columns_as_null(square, tmp_path):
-    old = tmp_path / "old" / "tracks" / "recording=old" / "part-0.parquet"
-    old.parent.mkdir(parents=True)
-    written = pq.ParquetFile(square / "demo.tables/tracks/recording=demo/part-0.parquet").read()
-    pq.write_table(written.drop_columns(["source_id"]), old)
-    with Database([tmp_path / "old", square / "demo.tables"]) as database:
-        found = database.ask(
-            "select recording, count(*) as n, count(source_id) as known from tracks group by all order by all"
-        )
-        assert rows_of(found)[1] == [["demo", 3171, 3171], ["old", 3171, 0]]
-        assert rows_of(database.ask("select count(*) from events"))[1] == [[0]]
-
-
 # Nothing else
 
 
@@ -381,14 +367,6 @@ def test_queries_read_only_the_logs(known, tmp_path, monkeypatch, query):
     assert outcome.code == 1
     assert "hush" not in outcome.out + outcome.err
     assert sorted(tmp_path.rglob("*")) == there
-
-
-def test_tables_made_by_a_query_are_temporary(known):
-    with Database([known]) as database:
-        query = "create macro twice(a) as 2 * a; create view two as select twice(21) as n; from two"
-        assert rows_of(database.ask(query)) == (["n"], [[42]])
-    with Database([known]) as database, pytest.raises(McaptrackError, match="no table two"):
-        database.ask("from two")
 
 
 def test_all_kinds_of_statements_load_tables(known):

@@ -5,9 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
-from dataclasses import replace
 from html import escape, unescape
-from importlib import import_module
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 from urllib.request import urlopen
@@ -128,18 +126,6 @@ def test_the_page_has_one_number_of_switches_for_each_kind_of_tracks(told, text)
     assert all(len(one.events) == count for one, count in zip(told.channel_events, values, strict=True))
 
 
-def test_with_samples_the_headline_and_the_events_are_at_the_prediction_rate(finished):
-    with log.read(finished) as opened:
-        report = gather(opened, None)
-    assert report.compared_roles == ("samples", "offline")
-    assert [one.topic for one in report.channel_events] == ["/camera/samples", "/camera/retracks"]
-    assert [len(one.events) for one in report.channel_events] == report.headline.values("IDSW")
-    shown = page([report])
-    first_table = shown.partition("<h2>Scores</h2>")[2].partition("</table>")[0]
-    assert "/camera/samples" in first_table
-    assert "/camera/tracks<" not in first_table
-
-
 # Identities over time
 
 
@@ -231,20 +217,6 @@ def test_mean_numbers_are_of_the_time_that_both_have(first, last, words):
     tracker = Line("tracker", "tracks", np.arange(10.0), np.repeat([0.0, 8.0], 5))
     truth = Line("ground truth", "truth", np.arange(first, last + 1.0), np.full(last + 1 - first, 8.0))
     assert mean_numbers([tracker, truth], "seconds") == words
-
-
-def test_those_who_stay_longest_have_a_bar(told, monkeypatch):
-    """Person 50 leaves half way; there is room for one."""
-    monkeypatch.setattr(import_module("mcaptrack.viewing.report.identity_timeline"), "_MOST", 1)
-    truth = told.track_sets["truth"]
-    half = truth.frames[len(truth.frames) // 2].t_ns
-    kept = [
-        Frame(one.t_ns, one.index, one.rows[(one.rows["track_id"] != 50) | (one.t_ns < half)]) for one in truth.frames
-    ]
-    sets = told.track_sets | {"truth": TrackSet(truth.topic, truth.role, truth.name, kept)}
-    found = identity_timeline(replace(told, track_sets=sets))
-    assert [int(row["name"]) for row in found["rows"]] == [90]
-    assert found["left_out"] == 1
 
 
 # Maps and doubts

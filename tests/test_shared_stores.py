@@ -128,13 +128,27 @@ def expected(bare, tmp_path) -> bytes:
     return (tmp_path / "b.results.mcap").read_bytes()
 
 
-@pytest.mark.parametrize("fault", one_in(2, ["error", "slow", "cut", "lost"]))
+@pytest.mark.parametrize("fault", one_in(2, ["error", "slow", "lost", "cut"]))
 def test_a_whole_run_is_right_though_one_request_in_twenty_fails(store, bare, expected, fault):
     url, number = store.put("night/b.mcap", bare), count(17)
     with store.failing(lambda _: fault if next(number) % 20 == 19 else ""), store.counted() as requests:
         mcaptrack.run(url)
     assert len(requests) >= 3
     assert store.get("night/b.results.mcap") == expected
+
+
+def test_a_log_that_is_replaced_during_a_run_is_one_line(store, bare):
+    url, number = store.put("night/b.mcap", bare), count()
+
+    def replace(_: object) -> str:
+        if next(number) == 1:
+            store.put("night/b.mcap", bare.read_bytes() + b" ")
+        return ""
+
+    with store.failing(replace):
+        code, _, err = call("run", url, "-q")
+    assert (code, store.names()) == (1, ["night/b.mcap"])
+    assert "was replaced by another version while it was being read; try again" in err.splitlines()[-1]
 
 
 def test_a_whole_run_whose_credentials_expire_is_one_line_and_can_be_run_again(store, bare, expected):
