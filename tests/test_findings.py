@@ -83,29 +83,6 @@ def test_summary_scores_samples_and_retracks_and_warns_of_a_loss(tmp_path, is_wo
     assert [(notice.message, notice.code) for notice in said] == [(words, "worse")] * is_worse
 
 
-def test_run_ends_with_a_summary_as_text_and_json(path):
-    said = done("run", path, "--force", "--no-tables").err
-    data = json.loads(done("run", path, "--no-tables", "--json", "-q").out)["results"][0]
-    lines = dict(line.strip().split("  ", 1) for line in said.splitlines() if line.startswith("  "))
-    summary = data["summary"]
-    with log.read(path) as opened:
-        boxes = opened.rows("/camera/detections", DETECTIONS).rows
-        retracked = opened.rows("/camera/retracks", TRACKS).rows
-    assert (summary["boxes"], summary["pictures"]) == (len(boxes), 30)
-    assert summary["repair"]["tracks"] == len(np.unique(retracked["track_id"]))
-    assert lines["boxes"].split() == [f"{summary['boxes']}", "in", "30", "pictures"]
-    assert lines["tracks"].strip() == str(summary["tracks"])
-    assert lines["re-tracked"].split()[0] == str(summary["repair"]["tracks"])
-    was, now = summary["scores"]["idf1"]
-    assert f"IDF1 {was:.1%} before re-tracking, {now:.1%} after" in lines["ground truth"]
-    assert lines["forecasts"].split(",")[0].strip() == str(summary["forecasts"])
-    assert (
-        lines["next"].strip().split("    ") == data["next"] == [f"mcaptrack {w} {path}" for w in ("view", "evaluate")]
-    )
-    assert "detect, track, sample, predict, retrack, events in " in said
-    assert data["seconds"] > 0
-
-
 def test_every_run_repeats_the_warnings_even_with_quiet(path):
     """This holds for runs with nothing to do, and includes warnings of inputs."""
     done("ingest", path.with_name("a.mcap"), "-o", "b.mcap", "-q")
@@ -207,12 +184,6 @@ def test_tracks_of_a_side_view_are_passed_on_with_a_warning(tmp_path):
     insisted = json.loads(done("retrack", path, "--side-view", "--json", "-q").out)
     assert "held-back" not in {one["code"] for one in insisted["warnings"]}
     assert made_by(path, "/camera/retracks").parameters["side_view"] is True
-
-
-def test_a_given_ground_plane_gives_no_warning(tmp_path):
-    (tmp_path / "plane.txt").write_text("0.05,0,0\n0,0.05,0\n0,0,1\n")
-    path = ingested(tmp_path / "a.mcap", side_by_side(), "--ground-plane", tmp_path / "plane.txt")
-    assert json.loads(done("run", path, "--no-tables", "--json", "-q").out)["warnings"] == []
 
 
 def test_a_sequence_that_is_too_short_gives_a_warning(tmp_path):

@@ -163,10 +163,6 @@ class TestASecondTime:
         assert run().counts == {"skipped": 2, "done": 1, "failed": 1}
         assert run(add="-").counts == {"done": 3, "failed": 1}
 
-    def test_without_a_ledger_the_function_says_what_is_up_to_date(self, folder):
-        for state in ("done", "up-to-date"):
-            assert fleet.run(fleet_tasks.touch, folder, {"add": "+"}).counts == {state: 3}
-
     def test_a_ledger_that_was_cut_or_is_of_another_command_does_no_harm(self, folder):
         ledger = folder / "ledger.jsonl"
         fleet.run(fleet_tasks.touch, folder, {"add": "+"}, ledger=ledger)

@@ -134,20 +134,6 @@ def test_a_clock_start_that_can_t_be_computed_with_is_none():
     assert {text: parse_ns(text) for text in wanted} == wanted
 
 
-def test_boxes_of_others_at_such_times_are_not_tracked(tmp_path):
-    path = tmp_path / "robot.mcap"
-    boxes = {"header": {"stamp": {"sec": 1, "nanosec": 0}, "frame_id": ""}, "detections": []}
-    with log.create(path) as writer:
-        number = writer.add_channel("/boxes", ("vision_msgs/Detection2DArray", "jsonschema", b"{}"), "json", {})
-        for t_ns in (MAX_NS, MAX_NS + 1):
-            writer.add_message(number, t_ns, 0, json.dumps(boxes).encode())
-    before = everything(tmp_path)
-    outcome = call("track", path, "--topic", "/boxes")
-    assert outcome.code == 1
-    assert "/boxes has 1 messages later than the year 2262, the first at 9223372036854775808 ns" in outcome.err
-    assert everything(tmp_path) == before
-
-
 @pytest.mark.parametrize("shared", [3, 1000], ids=["some share a time", "all share a time"])
 def test_messages_may_share_a_time(early, tmp_path, monkeypatch, shared):
     monkeypatch.chdir(tmp_path)

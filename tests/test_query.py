@@ -213,17 +213,6 @@ def test_examples_of_the_page_give_known_answers(known, part):
         assert one == pytest.approx(other)
 
 
-def test_two_runs_are_compared(tmp_path):
-    (query,) = re.findall(r"```sql\n([^`]*from metrics before join[^`]*)```", PAGE)
-    known_log(tmp_path / "before.mcap")
-    known_log(tmp_path / "after.mcap", tracked=(7,))
-    outcome = run(tmp_path / "*.mcap", query, "--format", "jsonl")
-    assert outcome.code == 0, outcome.out + outcome.err
-    rows = {row["topic"]: row for row in map(json.loads, outcome.out.splitlines())}
-    # Of 22 true rows 11 are found: MOTA is a half, IDF1 is 2 * 11 / (11 + 22).
-    assert rows["/camera/samples"] == {"topic": "/camera/samples", "IDF1": -0.33, "MOTA": -0.5, "IDSW": 0}
-
-
 @pytest.mark.parametrize("library", ["polars", "pandas"])
 def test_other_libraries_give_the_same_answers(square, monkeypatch, library):
     (block,) = re.findall(rf"```python\n(import {library} as .*?)```", PAGE, re.S)

@@ -306,17 +306,6 @@ def test_an_empty_log_says_so_in_every_section(tmp_path):
     assert not reader.of("svg")
 
 
-def test_without_ground_truth_it_says_how_to_add_it(tmp_path):
-    frames = walk(lambda tick: {1: (tick * 0.4, 0.0), 2: (0.0, tick * 0.4)}, 20)
-    path = write(tmp_path / "two.mcap", {"/camera/tracks": frames})
-    _, numbers, reader = report_on(path)
-    words = "".join(reader.text)
-    assert "found 2 tracks" in words
-    assert "mcaptrack ingest LABELS --as truth --into two.mcap" in words
-    assert "no pictures" in words
-    assert numbers["logs"][0]["speed_m_per_s"]["series"][0]["median"] == pytest.approx(1.0)
-
-
 def test_without_metres_it_says_that_speeds_are_not_known(tmp_path):
     frames = [Frame(ns(t / 10), t, boxes({1: (40 + t, 60)})) for t in range(30)]
     _, numbers, reader = report_on(write(tmp_path / "pixels.mcap", {"/camera/tracks": frames}))

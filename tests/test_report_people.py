@@ -23,7 +23,6 @@ from mcaptrack.schema import Frame
 from mcaptrack.viewing.links import is_about, with_links
 from mcaptrack.viewing.report import LogReport, gather, page
 from mcaptrack.viewing.report.charts import Line
-from mcaptrack.viewing.report.contents import TrackSet
 from mcaptrack.viewing.report.doubts import find_doubts
 from mcaptrack.viewing.report.identity_events import summarize_events
 from mcaptrack.viewing.report.identity_timeline import counts_over_time, identity_timeline, mean_numbers, pieces
@@ -152,33 +151,6 @@ def test_each_person_has_a_lane_for_the_tracker_above_one_for_the_re_tracked(tol
     assert found["90"][1:] == [[("90", "0.0", "24.0")]] * 2
 
 
-def test_without_ground_truth_bars_are_re_tracked_tracks_with_the_ids_of_the_tracker(told):
-    report = LogReport("a.mcap", "a", "/camera", told.start_ns, told.end_ns)
-    tracks = told.track_sets["offline"]
-    report.track_sets["offline"] = TrackSet(tracks.topic, "offline", "re-tracked", tracks.frames)
-    found = bars(identity_timeline(report))
-    assert found["1"] == [[("1", "0.0", "8.0"), ("2", "8.0", "16.0")]]
-    assert found["3"] == [[("3", "16.0", "24.0")]]
-    # interpolated rows have no id of the tracker, which is no change of identity
-    report.track_sets["offline"].frames = without_sources(tracks.frames, {0, 1, 7, 8, 9})
-    found = bars(identity_timeline(report))
-    assert [[(one, last) for one, _, last in lane] for lane in found["1"]] == [[("1", "8.8"), ("2", "16.0")]]
-    assert found["3"] == [[("3", "16.0", "24.0")]]
-    report.track_sets["offline"].frames = without_sources(tracks.frames, set(range(20)))
-    assert bars(identity_timeline(report))["1"] == [[("1", "0.0", "16.0")]]
-
-
-def without_sources(frames: list[Frame], ticks: set[int]) -> list[Frame]:
-    """Frames without ids of the tracker at these ticks of every twenty."""
-    out = []
-    for frame in frames:
-        rows = frame.rows.copy()
-        if frame.index % 20 in ticks:
-            rows["source_id"] = -1
-        out.append(Frame(frame.t_ns, frame.index, rows))
-    return out
-
-
 @given(st.lists(st.integers(0, 2), max_size=40), st.lists(st.integers(1, 4), min_size=40, max_size=40))
 def test_pieces_cover_their_rows_and_nothing_twice(identity, steps):
     t_ns = np.cumsum(np.array(steps[: len(identity)], np.int64)) * 10**9
@@ -273,19 +245,6 @@ def test_the_farthest_repair_is_the_first_whenever_it_happened():
     told = summarize_events("/a", found.events, None, both, None, (0, ns(16)))
     doubts = find_doubts(told, both, None)
     assert [(int(one.event.row["track_id"]), round(one.away_m, 1)) for one in doubts] == [(8, 2.5), (7, 1.5)]
-
-
-def test_every_row_of_a_table_hides_the_same_columns_on_a_phone(text):
-    tables = re.findall(r"<table>(.*?)</table>", text, re.DOTALL)
-    assert len(tables) >= 3
-    for table in tables:
-        head, *rows = re.findall(r"<tr>(.*?)</tr>", table, re.DOTALL)
-        wanted = ["opt" in one for one in re.findall(r"<th\b([^>]*)>", head)]
-        for row in rows:
-            cells = re.findall(r"<t[hd]\b([^>]*)>", row)
-            if "colspan" not in cells[0]:
-                assert ["opt" in one for one in cells] == wanted, row
-    assert sum('class="opt"' in one for one in tables) >= 2
 
 
 # Links

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,6 @@ from mcap.writer import Writer
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import TRACKS, Frame
-from tests.commands import printed
 from tests.worlds import tracks_at
 
 #: Definitions that decode alike, and one that doesn't.
@@ -102,25 +100,3 @@ def test_rows_of_several_channels_come_by_time(tmp_path):
     in_order = sorted(frames, key=lambda frame: frame.t_ns)
     encode = TRACKS.codec.encode
     assert [encode(frame.rows) for frame in found] == [encode(frame.rows) for frame in in_order]
-
-
-def test_counts_add_up_to_the_statistics(tmp_path):
-    """Those of `info`, in words and as data, also where results beside the log replace channels of it."""
-    path = tmp_path / "a.mcap"
-    write(path, [("/tf", ALIKE[0], "ros1", [1, 2]), ("/talk", OTHER, "ros1", [3]), ("/tf", OTHER, "cdr", [4, 5, 6])])
-    with log.read(path, sidecar=True) as opened, log.extend(opened) as writer:
-        channel = writer.add_channel("/talk", ("", "", b""), "json", {})
-        for t_ns in range(7, 11):
-            writer.add_message(channel, t_ns, 0, b"{}")
-    parts = {"log": path, "results": tmp_path / "a.results.mcap"}
-    total = sum(stock(part)[0] for part in parts.values())
-    data = json.loads(printed("info", path, "--json")[0])["results"][0]
-    assert data["messages"] == sum(channel["messages"] for channel in data["channels"]) == total == 10
-    said = [(channel["part"], channel["topic"], channel["messages"]) for channel in data["channels"]]
-    assert sorted(said) == sorted((name, *channel) for name, part in parts.items() for channel in stock(part)[1])
-    assert [(c["part"], c["topic"]) for c in data["channels"] if c["replaced"]] == [("log", "/talk")]
-    out, _ = printed("info", path)
-    rows = [line.split() for line in out.splitlines() if line.startswith(("/tf", "/talk"))]
-    counts = [(row[0], int(row[-2] if "." in row[-1] else row[-1])) for row in rows]  # some have a rate behind
-    assert sorted(counts) == sorted(channel[1:] for channel in said)
-    assert "/talk  (replaced by the results)" in out
