@@ -137,7 +137,9 @@ def test_times_that_ros_does_not_have_are_refused():
 
 def test_messages_that_are_written_in_another_way_are_converted_field_by_field():
     scene = foxglove.message_class(SCENE)()
-    scene.entities.add(id="a").cubes.add().size.x = 2.0
+    entity = scene.entities.add(id="a")
+    entity.cubes.add().size.x = 2.0
+    entity.triangles.add().indices.extend([3, 1, 2])
     payload = scene.SerializeToString()
     assert payload[0] == 0x12
     twice = payload + payload  # in order, and two fields of a message in one part: the last one counts
@@ -149,3 +151,4 @@ def test_messages_that_are_written_in_another_way_are_converted_field_by_field()
     found = [store.deserialize_cdr(one, name) for *_, one in foxglove.messages_in(SCENE, sent, "cdr")]
     assert [[entity.id for entity in one.entities] for one in found] == [["a"], ["a", "a"], ["b"]]
     assert [one.entities[0].cubes[0].size.x for one in found] == [2.0, 2.0, 2.0]
+    assert [one.entities[0].triangles[0].indices.tolist() for one in found] == [[3, 1, 2]] * 3

@@ -207,6 +207,13 @@ class TestWriting:
             if hasattr(made, "merge"):
                 assert len(made.merge([found for _, found in opened.supervision("tracks")])) == 4
 
+    def test_tracks_without_boxes_have_none_in_supervision(self, tmp_path, made):
+        rows = np.array([(0, 1, 2.0, 3.0)], [("t_ns", int), ("track_id", int), ("x_m", float), ("y_m", float)])
+        with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
+            opened.write("/own/tracks", rows)
+            ((t_ns, found),) = opened.supervision("/own/tracks")
+        assert (t_ns, len(found.xyxy)) == (0, 0)
+
     def test_unconfirmed_tracks_are_left_out_with_a_warning(self, tmp_path, made):
         with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
             with pytest.warns(mcaptrack.McaptrackWarning, match="boxes without a tracker id"):
