@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 
 import duckdb
 import numpy as np
@@ -171,18 +172,9 @@ def test_tables_of_channels_that_are_gone_go(tmp_path):
 # Names
 
 
-@pytest.mark.parametrize(
-    ("name", "recording"),
-    [
-        ("../../etc/x.mcap", "x"),
-        ("a=b c.mcap", "a_b_c"),
-        ("...mcap", "log"),
-        ("ü.1.mcap", "ü.1"),
-        ("0001.mcap", "log-0001"),
-    ],
-)
-def test_names_of_logs_never_climb_out_of_the_folder(tmp_path, name, recording):
-    assert recording_name(tmp_path / name) == recording
+def test_names_of_logs_never_climb_out_of_the_folder():
+    names = {"../../etc/x": "x", "a=b c": "a_b_c", "..": "log", "ü.1": "ü.1", "0001": "log-0001"}
+    assert {name: recording_name(Path(f"logs/{name}.mcap")) for name in names} == names
 
 
 @pytest.mark.parametrize(
@@ -199,22 +191,9 @@ def test_no_reader_takes_the_name_of_a_log_for_something_else(tmp_path, stem):
 
 
 EVIL = [
-    "/../../etc/x",
-    "..",
-    "/",
-    "",
-    "/a/b",
-    "/a.b",
-    "a/b",
-    "/a/../b",
-    "/a\\b",
-    "/a\0b",
-    "/ü",
-    "/a=b",
-    "//a",
-    "/.",
+    "/../../etc/x", "..", "/", "", "/a/b", "/a.b", "a/b", "/a/../b", "/a\\b", "/a\0b", "/ü", "/a=b", "//a", "/.",
     "/" + "x/" * 300,
-]
+]  # fmt: skip
 
 
 def test_topics_become_folders_of_their_own_that_stay_where_they_belong(tmp_path):

@@ -21,7 +21,7 @@ from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance
 from mcaptrack.transforms import STAGES, OcSort, Predict, Retrack, Sample, Sort, Transform
 from tests.logs import write_channels
-from tests.worlds import boxes_at, ns, tracks_at, walk
+from tests.worlds import ns, tracks_at, walk
 
 run = sys.modules["mcaptrack.pipeline.run"]  # the package has a function of this name
 PLANE = GroundPlane((0.1, 0, 0, 0, 0.1, 0, 0, 0, 1), 640, 480)
@@ -473,32 +473,6 @@ def test_forecasts_and_planes_are_counted(tmp_path):
     for assumed, word in (((True, True), "assumed"), ((True, False), "given"), ((), None)):
         planes = [plane_at(n, replace(PLANE, assumed=one)) for n, one in enumerate(assumed)]
         assert summary({"/camera/ground_plane": (GROUND_PLANE, ingested, planes)}).ground_plane == word
-
-
-def test_boxes_are_those_that_tracks_were_made_from(tmp_path):
-    boxes = [Frame(ns(n), n, boxes_at([(5, 5), (9, 9)])) for n in range(3)]
-    channels = {
-        "/camera/detections": (DETECTIONS, Provenance(INGEST, {}), boxes),
-        "/camera/other": (DETECTIONS, Provenance(INGEST, {}), boxes[:1]),
-    }
-    for source, count in (("/camera/detections", 6), ("/camera/other", 2), ("/camera/gone", 6), (None, 6)):
-        tracks = {"/camera/tracks": (TRACKS, Provenance("track", {}, source), at(1.0))} if source else {}
-        with log.read(write_channels(tmp_path / "a.mcap", channels | tracks)) as opened:
-            assert pipeline.summarise(opened, "/camera").boxes == count
-
-
-def test_an_error_of_a_stage_names_log_and_channel_once(tmp_path, monkeypatch):
-    frames = walk(lambda n: {1: (n * 0.1, 0.0)}, 5, 10.0)
-    path = write_channels(tmp_path / "a.mcap", {"/camera/tracks": (TRACKS, Provenance(INGEST, {}, digest="x"), frames)})
-    for words, shown in (("no", f"{path}: /camera/tracks: no"), (f"{path} is odd", f"{path} is odd")):
-
-        def fail(*_, words=words):
-            raise McaptrackError(words)
-
-        monkeypatch.setattr(Sample, "__call__", fail)
-        with log.read(path) as opened, pytest.raises(McaptrackError) as error:
-            pipeline.run(opened, "/camera", pipeline.plan_stage(opened, "/camera", "sample", Sample()))
-        assert str(error.value) == shown
 
 
 @pytest.mark.parametrize(("frame_id", "is_said"), [("map", True), ("", False)])

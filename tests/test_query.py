@@ -16,8 +16,6 @@ import duckdb
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from mcaptrack import log, tables
 from mcaptrack.schema import EVENTS, PREDICTIONS, TRACKS, Frame
@@ -509,28 +507,6 @@ def test_answers_are_exact_in_every_form(known, tmp_path):
         table = pq.read_table(target) if form == "parquet" else pa.ipc.open_file(target).read_all()
         assert table.column("t_ns").to_pylist() == [700_000_000]
         assert table.column("t").cast(pa.int64()).to_pylist()[0] in (700_000_000, 700_000)
-
-
-@given(
-    st.lists(
-        st.tuples(st.integers(-(2**63), 2**63 - 1), st.floats(allow_nan=False, allow_infinity=False), st.text()),
-        max_size=20,
-    )
-)
-def test_json_round_trips_numbers_and_text(rows):
-    columns = [list(column) for column in zip(*rows, strict=True)] or [[], [], []]
-    try:
-        table = pa.table(
-            {
-                "a": pa.array(columns[0], pa.int64()),
-                "b": pa.array(columns[1], pa.float64()),
-                "c": pa.array(columns[2], pa.string()),
-            }
-        )
-    except UnicodeEncodeError:  # half of a pair of surrogates is no text
-        return
-    text = b"".join(tables.pieces(table, "json"))
-    assert [tuple(row.values()) for row in json.loads(text)] == rows
 
 
 def test_an_answer_is_written_to_a_file_without_loss(known, tmp_path):

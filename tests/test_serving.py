@@ -26,7 +26,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mcaptrack import log
-from mcaptrack.api.viewing import LogServer
 from mcaptrack.errors import McaptrackError
 from mcaptrack.viewing.serving import Limits, Server, requested_range
 from tests.awaiting import until
@@ -434,32 +433,6 @@ def test_layout_files_are_served_as_they_were_edited(tmp_path):
             OPENED,
             "serving until Ctrl-C ...",
         ]
-
-
-def test_links_are_printed_for_people_as_the_server_has_them(tmp_path, monkeypatch):
-    """Names stand in a column, two spaces wider than the longest; what they name is beside them."""
-    served = []
-
-    def stopped(server: LogServer) -> None:
-        served.append(server)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(LogServer, "serve_forever", stopped)
-    plain = tmp_path / "b.mcap"
-    write_log(plain, SOME)
-    for path, layouts in ((extended(tmp_path / "a.mcap"), [", tracking", ", comparing"]), (plain, [""])):
-        code, out, err = call("view", path)
-        server = served.pop()
-        assert (code, err) == (0, f"{OPENED}\nserving until Ctrl-C ...\ndone\n")
-        names = [*(f"Lichtblick{name}" for name in layouts), "Foxglove", "log", *(f"layout{name}" for name in layouts)]
-        wanted = [
-            *(server.lichtblick.values() or [server.links["Lichtblick"]]),
-            server.links["Foxglove"],
-            *server.logs,
-            *(server.layouts.values() or [f"none yet: `mcaptrack run {path}` makes one"]),
-        ]
-        width = max(map(len, names)) + 2
-        assert out.splitlines() == [name.ljust(width) + one for name, one in zip(names, wanted, strict=True)]
 
 
 def test_errors_are_one_line(tmp_path):
