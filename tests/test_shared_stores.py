@@ -5,20 +5,16 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections import Counter
 from itertools import count
-from threading import Thread
 
 import pytest
 
 import mcaptrack
-from mcaptrack import fleet, objects
+from mcaptrack import objects
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import parse
-from tests import fleet_tasks
-from tests.awaiting import until
 from tests.commands import call, done
-from tests.tiers import one_in, thorough
+from tests.tiers import one_in
 
 NIGHT = parse("s3://bucket/night")
 
@@ -36,30 +32,6 @@ def test_of_two_writers_one_succeeds(store):
     objects.delete(url)
     assert objects.put_if_unchanged(url, b"five", second) is None
     assert objects.find(url) is None
-
-
-@thorough
-@pytest.mark.usefixtures("never_waits")
-def test_two_fleets_over_one_bucket_with_one_ledger_do_no_log_twice(store, tmp_path):
-    for number in range(5):
-        store.put(f"night/{number}.mcap", b"x")
-    found = []
-
-    def work() -> None:
-        found.append(fleet.run(fleet_tasks.mark, "s3://bucket/night", ledger=tmp_path / "night.jsonl"))
-
-    fleets = [Thread(target=work) for _ in range(2)]
-    for each in fleets:
-        each.start()
-    until(lambda: len([*tmp_path.glob(".*.claim")]) >= 2)
-    store.put("night/go", b"go")
-    for each in fleets:
-        each.join()
-    times = Counter(name.split(".")[0] for name in store.names() if len(name.rpartition(".")[2]) == 32)
-    assert times == {f"night/{number}": 1 for number in range(5)}
-    states = [one.state for result in found for one in result.outcomes]
-    assert Counter(states) == {"done": 5, "skipped": 5}
-    assert not [*tmp_path.glob(".*.claim")]
 
 
 class TestDoctor:
