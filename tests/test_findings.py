@@ -113,11 +113,11 @@ def test_the_memory_warning_begins_at_the_estimated_need(monkeypatch):
     needed = 400_000_000 + 2_000 * 3_000
     for free, is_little in ((needed, False), (needed - 1, True), (None, False)):
         monkeypatch.setattr(run, "free_memory", lambda free=free: free)
-        with notices.listening(lambda _: None), notices.collected() as said:
+        with notices.collected() as said:
             run.warn_memory(frames)
         assert [one.code for one in said] == ["memory"] * is_little
     monkeypatch.setattr(run, "free_memory", lambda: 160_000_000)
-    with notices.listening(lambda _: None), notices.collected() as said:
+    with notices.collected() as said:
         run.warn_memory([Frame(n * 40_000_000, n, DETECTIONS.empty(10)) for n in range(50_000)])
     words = (
         "500,000 boxes, of people who are seen for 6 hours together, take about 0.5 GB of memory, and 0.2 GB are "
@@ -132,10 +132,10 @@ def test_empty_results_are_explained_by_the_input_or_the_transform():
         ([none, none], "/camera/tracks holds nothing, so nothing was made of it"),
         ([none, some], "no samples of /camera/tracks: "),
     ):
-        with notices.listening(lambda _: None), notices.collected() as said:
+        with notices.collected() as said:
             run.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), given, [none])
         assert [one.message.startswith(words) for one in said] == [True]
-    with notices.listening(lambda _: None), notices.collected() as said:
+    with notices.collected() as said:
         run.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), [none, some], [none, some])
     assert said == []
 

@@ -147,7 +147,7 @@ def test_what_a_new_file_can_t_be_given_is_said(tmp_path, monkeypatch, refused):
     call = {"permissions": (Path, "chmod"), "extended attributes": ("mcaptrack.files", "_keep_extended")}
     at = call.get(refused, (os, "chown"))
     monkeypatch.setattr(*at, fail) if not isinstance(at[0], str) else monkeypatch.setattr(".".join(at), fail)
-    with notices.listening(lambda _: None), notices.collected() as said:
+    with notices.collected() as said:
         publish_bytes(path, b"new")
     assert path.read_bytes() == b"new"
     expected = f"{path} is a new file now, without the {refused} of the old one"

@@ -63,11 +63,7 @@ def planned(
 ) -> tuple[list[pipeline.Job], list[str], list[tuple[str, str]]]:
     """The jobs that everything takes, what is said of them, and warnings with their codes."""
     said: list[str] = []
-    with (
-        log.read(write_channels(path, channels)) as opened,
-        notices.listening(lambda _: None),
-        notices.collected() as warned,
-    ):
+    with log.read(write_channels(path, channels)) as opened, notices.collected() as warned:
         jobs = pipeline.plan_all(opened, "/camera", said.append, **options)
     return jobs, said, [(one.message, one.code) for one in warned]
 
@@ -274,7 +270,7 @@ def test_the_rate_of_other_inputs_is_known_and_a_high_one_is_said(tmp_path, rate
     )
     with log.read(write_channels(tmp_path / "a.mcap", channels)) as opened:
         for source in ("/camera/tracks", None):
-            with notices.listening(lambda _: None), notices.collected() as said:
+            with notices.collected() as said:
                 frames, known = pipeline.input_of(opened, "/camera", "retrack", Retrack(), source)
             people = {"class_names": ((1, "person"),), "fixed_ids": ()}
             assert known == {
@@ -333,11 +329,7 @@ GUESSED = (
 )
 def test_a_guessed_scale_is_said_of_what_is_in_metres(tmp_path, stage, assumed, is_said):
     plane = GroundPlane((0.05, 0, 0, 0, 0.05, 0, 0, 0, 1), 64, 48, assumed=assumed)
-    with (
-        log.read(write_channels(tmp_path / "a.mcap", finished())) as opened,
-        notices.listening(lambda _: None),
-        notices.collected() as said,
-    ):
+    with log.read(write_channels(tmp_path / "a.mcap", finished())) as opened, notices.collected() as said:
         run.warn_findings(opened, "/camera", {"/camera/other": Provenance(stage, {})}, [(0, plane)], is_all=False)
     assert [(one.message, one.code) for one in said] == [(GUESSED, "assumed-ground-plane")] * is_said
 
@@ -358,7 +350,7 @@ def test_tracks_that_are_only_linked_or_passed_on_are_said(tmp_path, parameters,
         f"tracks were {done}: without a measured ground plane, more needs a camera that looks down, and this one looks "
         f"along the ground. To insist: `mcaptrack.retrack('{path}', side_view=True)`"
     )
-    with log.read(path) as opened, notices.listening(lambda _: None), notices.collected() as said:
+    with log.read(path) as opened, notices.collected() as said:
         run.warn_findings(opened, "/camera", {"/camera/x": Provenance("retrack", parameters)}, (), is_all=False)
     assert [(one.message, one.code) for one in said] == [(words, "held-back")] * bool(done)
 
