@@ -8,9 +8,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from uuid import uuid4
 
-from mcaptrack import objects
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 
@@ -72,21 +70,6 @@ def touch(log, *, output=None, add="", progress=None) -> Seen:
     if add and not text.endswith(add):
         target.write_text(text + add)
     return Seen(text, os.getpid(), bool(add) and text.endswith(add))
-
-
-def mark(log, *, progress=None) -> Seen:
-    """Write objects beside a log in a store: one for this call, and one that says that it is done.
-
-    Waits for an object with the name "go" in between.
-    """
-    done, go = log.with_suffix(".done"), log.parent / "go"
-    if objects.find(done) is not None:
-        return Seen("", os.getpid(), is_up_to_date=True)
-    while objects.find(go) is None:
-        time.sleep(0.02)
-    for url in (log.with_suffix(f".{uuid4().hex}"), done):
-        assert objects.put_if_unchanged(url, uuid4().bytes, None)
-    return Seen("", os.getpid())
 
 
 def parity(log, *, progress=None) -> str:

@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from mcaptrack import log
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
-from mcaptrack.schema.provenance import Provenance
+from mcaptrack.schema.provenance import CLOCK, Provenance
 from tests.commands import zones_file
 from tests.worlds import boxes_at, ns, tracks_at
 
@@ -88,6 +88,19 @@ def add_rows(writer, topic, schema, frames, transform="track", source="/camera/d
     number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", made, group=topic)
     for frame in frames:
         writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
+
+
+def write_channels(path: Path, channels, clock: str = "") -> Path:
+    """A log of channels by topic, each with its schema, its provenance (or None) and its frames, in chunks of its own."""
+    with log.create(path) as writer:
+        for topic, (schema, made, frames) in channels.items():
+            record, metadata = (schema.name, "protobuf", schema.descriptor), made.to_metadata() if made else {}
+            number = writer.add_channel(topic, record, "protobuf", metadata, group=topic)
+            for frame in frames:
+                writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
+        if clock:
+            writer.add_metadata(CLOCK, {"start_ns": clock})
+    return path
 
 
 def some_log(path, **more):

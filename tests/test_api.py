@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import subprocess
 import sys
@@ -11,20 +10,16 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-import pandas as pd
 import pytest
-from typer.testing import CliRunner
 
 import mcaptrack
-from mcaptrack import log, pipeline, tables
+from mcaptrack import log, tables
 from mcaptrack.api.outputs import ReportResult
 from mcaptrack.api.scoring import Scores
-from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources import ingest
-from mcaptrack.sources.demo import draw
 from tests.logs import some_log
-from tests.worlds import small_scene, write_clip
+from tests.worlds import write_clip
 
 ROOT = Path(__file__).parent.parent
 
@@ -138,19 +133,6 @@ def test_a_log_that_was_closed_says_so(tmp_path):
     opened.close()
 
 
-def test_a_log_stays_the_same_one_wherever_the_working_folder_moves(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    some_log(tmp_path / "a.mcap")
-    (tmp_path / "below").mkdir()
-    other = some_log(tmp_path / "below" / "a.mcap").read_bytes()
-    with mcaptrack.open("a.mcap") as opened:
-        monkeypatch.chdir("below")
-        opened.write("/own/tracks", [])
-        assert "/own/tracks" in opened.topics
-    assert "/own/tracks" in {one.topic for one in mcaptrack.info(tmp_path / "a.mcap").channels}
-    assert (tmp_path / "below" / "a.mcap").read_bytes() == other
-
-
 def test_threads_may_share_a_log(tmp_path):
     with mcaptrack.open(some_log(tmp_path / "a.mcap")) as opened, ThreadPoolExecutor(8) as pool:
         found = list(pool.map(lambda name: opened.table(name).num_rows, [*opened.tables] * 3))
@@ -230,35 +212,6 @@ def test_rows_of_a_log_that_has_changed_are_refused(tmp_path):
             opened.fetch(rows[0] | {"file": "b.mcap"})
         with pytest.raises(McaptrackError, match="does not say where its message is"):
             opened.fetch({"t_ns": 5})
-
-
-def test_the_document_runs_from_top_to_bottom(tmp_path, monkeypatch):
-    footage, path = draw(small_scene(12.0), tmp_path / "mcaptrack-demo"), tmp_path / "log.mcap"
-    ingest.ingest(
-        footage.video,
-        path,
-        ingest.IngestOptions(ground_plane=footage.ground_plane, labels={"truth": footage.ground_truth}),
-    )
-    with log.read(path) as opened:
-        pipeline.run(opened, "/camera", pipeline.plan_all(opened, "/camera"))
-    monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.S)
-    names: dict[str, object] = {}
-    exec(compile("\n".join(blocks), "docs/python.md", "exec", dont_inherit=True), names)
-    assert isinstance(names["frame"], pd.DataFrame)
-    assert names["picture"].rows.ndim == 3
-    assert names["message"].topic == "/camera/video"
-    results = json.loads(CliRunner().invoke(app, ["evaluate", "log.mcap", "--json"]).stdout)["results"]
-    rows = {(row["topic"], row["similarity"], row["gate"]): row for row in names["scores"]}
-    assert len(rows) == len(results) > 3
-    assert any("displacement" in result for result in results)
-    for result in results:
-        row = rows[result["tracks"], result["similarity"], result["gate"]]
-        said = result | result.get("displacement", {})
-        assert {name: said.get(name) for name in row if name in said} == {
-            name: row[name] for name in row if name in said
-        }
-        assert (row["recall"] is None) == ("displacement" not in result)
 
 
 def test_topics_and_names_are_text(tmp_path):

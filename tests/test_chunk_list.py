@@ -1,30 +1,19 @@
-"""Index entries of chunks as columns: they are as in a list of records, and take a tenth of its memory."""
+"""Index entries of chunks as columns: they are as in a list of records."""
 
 from __future__ import annotations
 
 import heapq
-import io
 import struct
-import zlib
-from typing import ClassVar
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
 
 from mcaptrack import log
 from mcaptrack.log.chunk_list import ChunkList
-from mcaptrack.log.messages import Checksums, fingerprint
 from mcaptrack.log.records import ChunkIndexRecord
-from mcaptrack.log.writer import LogWriter
-from tests.memory import held
-from tests.tiers import thorough
 
 NUMBERS = st.integers(0, 2**64 - 1)
 CHANNELS = st.dictionaries(st.one_of(st.integers(0, 3), st.just(2**16 - 1)), NUMBERS, max_size=3)
-#: How many chunks the log has, and the most that is read ahead of a file.
-CHUNKS, AHEAD = 1500, 300_000
 ENTRIES = st.builds(
     ChunkIndexRecord, NUMBERS, NUMBERS, st.one_of(st.integers(0, 9), NUMBERS), st.one_of(st.integers(0, 9), NUMBERS),
     CHANNELS, NUMBERS, st.sampled_from(["", "zstd", "lz4", "other"]), NUMBERS, NUMBERS,
@@ -73,85 +62,7 @@ def test_columns_are_equal_if_the_lists_are(one, other, change):
         assert ChunkList([*one[:number], changed, *one[number + 1 :]]) != ChunkList(one)
 
 
-@pytest.fixture(scope="module")
-def many_chunks(tmp_path_factory):
-    """A log with a chunk for each of many messages."""
-    path = tmp_path_factory.mktemp("chunks") / "a.mcap"
-    with log.create(path) as writer:
-        channel = writer.add_channel("/a", ("", "", b""), "raw", {})
-        writer.write_description(channel)
-        for number in range(CHUNKS):
-            head = struct.pack("<BQHIQQ", 5, 23, channel, number, number, number)
-            writer.write_kept_records("media", [(channel, number, memoryview(head + b"x"))])
-    return path
-
-
-@thorough
-def test_a_log_of_many_chunks_takes_few_bytes_a_chunk(many_chunks):
-    """80 for its entry, and 8 for its checksum; objects take a kilobyte. Of a message 16 are held, and its time."""
-
-    def opened() -> log.Log:
-        return log.read(many_chunks)
-
-    opened()
-    alive, most = held(opened)
-    assert alive < 110 * CHUNKS
-    assert most < AHEAD + 250 * CHUNKS  # the summary itself has 100
-    with opened() as reading:
-        reading.times("/a")
-        assert held(lambda: reading.times("/a"))[1] < AHEAD + 120 * CHUNKS
-        alive, most = held(lambda: sum(len(message.payload) for message in reading.messages("/a")))
-        assert most < AHEAD + 120 * CHUNKS
-        assert alive < AHEAD + 20 * CHUNKS
-
-
-def test_fingerprints_keep_eight_bytes_a_chunk(many_chunks):
-    """A checksum each; a dictionary of them takes 150."""
-    content = memoryview(many_chunks.read_bytes())
-    with log.read(many_chunks) as opened:
-        index, whole = opened.index, opened.fingerprint()
-
-    def kept() -> Checksums:
-        checksums = Checksums()
-        assert fingerprint(content, index, None, checksums) == fingerprint(content, index, None, checksums) == whole
-        return checksums
-
-    assert 8 * CHUNKS <= held(kept)[0] < 20 * CHUNKS
-
-
-def test_the_summary_is_written_in_parts(many_chunks):
-    """Of hundreds of thousands of chunks it takes tens of megabytes, which were in memory four times."""
-
-    class Sink:
-        sizes: ClassVar[list[int]] = []
-        data = bytearray()
-
-        def write(self, data: bytes) -> None:
-            self.sizes.append(len(data))
-            self.data += data
-
-    sink = Sink()
-    writer = LogWriter(sink)
-    writer.header()
-    with log.read(many_chunks) as opened:
-        for number, channel in opened.index.channels.items():
-            writer.channels[number] = channel
-        for chunk in opened.index.chunks:
-            source = opened.snapshot.source
-            indexes = {number: bytes(16) for number in chunk.message_index_offsets}
-            writer.copy_chunk(bytes(source[chunk.offset : chunk.offset + chunk.length]), chunk, indexes)
-        start = len(sink.sizes)
-        assert writer.finish() == CHUNKS
-    assert max(sink.sizes[start:]) < 70_000 < sum(sink.sizes[start:])
-    with io.BytesIO(bytes(sink.data)) as stream:
-        found = make_reader(stream).get_summary()
-    assert len(found.chunk_indexes) == CHUNKS
-    (crc,) = struct.unpack_from("<I", sink.data, len(sink.data) - 12)
-    (summary_start,) = struct.unpack_from("<Q", sink.data, len(sink.data) - 28)
-    assert crc == zlib.crc32(sink.data[summary_start:-12])
-
-
-def test_chunks_that_stay_open_for_other_channels_are_counted_once_each(many_chunks, tmp_path, monkeypatch):
+def test_chunks_that_stay_open_for_other_channels_are_counted_once_each(tmp_path, monkeypatch):
     """Their number doesn't matter for the time that the next takes, and their size is limited."""
     from mcaptrack.log import messages
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from itertools import chain
 
 import numpy as np
@@ -65,15 +64,6 @@ def results(transform, frames, after_ns):
     return outputs, ids
 
 
-def peak_bytes(transform, frames, after_ns):
-    tracemalloc.start()
-    try:
-        results(transform, frames, after_ns)
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-
-
 @pytest.mark.parametrize("name", TRANSFORMS)
 @settings(max_examples=2, deadline=None)
 @example(YEARS_NS)
@@ -102,15 +92,6 @@ def test_before_a_jump_results_are_those_of_this_part_alone(name, jump_ns):
         for number in settled:
             assert one[number][:2] == whole[number][:2]
             assert repr(one[number].rows.tolist()) == repr(whole[number].rows.tolist())
-
-
-@pytest.mark.parametrize("name", TRANSFORMS)
-def test_memory_is_independent_of_the_jump(name):
-    stage, chosen = TRANSFORMS[name]
-    transform = stage.make(chosen if stage.kind else "")
-    peak_bytes(transform, *recording(stage, HOUR_NS))  # what is imported, and made once
-    short, long = (peak_bytes(transform, *recording(stage, jump_ns)) for jump_ns in (HOUR_NS, YEARS_NS))
-    assert long < 1.2 * short
 
 
 @settings(max_examples=2, deadline=None)

@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import sys
-from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -113,18 +112,6 @@ def test_stages_write_the_same_results_beside_an_object_as_beside_a_file(store, 
         assert "/mine/detections" in opened.topics
     assert store.get("night/b.mcap") == bare.read_bytes()
     assert sorted(store.names()) == ["night/b.mcap", "night/b.results.mcap"]
-
-
-@pytest.mark.parametrize("fault", ["error", "slow", "cut", "lost"])
-def test_requests_that_fail_now_and_then_change_nothing(store, bare, fault):
-    url = store.put("b.mcap", bare)
-    number = count()
-    with store.failing(lambda _: fault if next(number) % 3 == 1 else ""):
-        result = mcaptrack.track(url)
-    assert next(number) >= 4
-    expected = mcaptrack.track(shutil.copy(bare, "b.mcap"), sidecar=True)
-    assert result.rows == expected.rows
-    assert store.get("b.results.mcap") == Path("b.results.mcap").read_bytes()
 
 
 @pytest.mark.parametrize("fault", ["error", "cut"])

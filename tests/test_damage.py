@@ -151,24 +151,6 @@ def test_damage_is_found_by_name_and_what_is_whole_is_saved(chunked, tmp_path):
         assert chunked.read_bytes() == damaged
 
 
-def test_what_is_lost_is_named(chunked, tmp_path):
-    with log.read(chunked) as opened:
-        chunk = opened.index.chunks[1]
-        channels = chunk.message_index_offsets
-        held = [m for m in FORTY if chunk.start_ns <= m[1] <= chunk.end_ns]
-    raw = bytearray(chunked.read_bytes())
-    raw[chunk.offset + 80 : chunk.offset + 90] = bytes(10)
-    chunked.write_bytes(raw)
-    report = log.recover(chunked, tmp_path / "saved.mcap")
-    assert len(channels) == 3
-    assert report.messages == 40 - len(held)
-    assert f"byte {chunk.offset} to " in report.lost[0]
-    assert "it held messages of a, b, c from 0.000 to 0.000 s" in report.lost[0]
-    lost = Counter(topic for topic, *_ in held)
-    total = Counter(topic for topic, *_ in FORTY)
-    assert report.lost[1:] == [f"{t}: {total[t] - lost[t]} of {total[t]} messages are recovered" for t in "abc"]
-
-
 def test_a_log_that_is_cut_off_keeps_every_chunk_that_is_complete(chunked, tmp_path):
     path, saved = tmp_path / "cut.mcap", tmp_path / "saved.mcap"
     whole = chunked.read_bytes()

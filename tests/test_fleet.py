@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
-import shutil
+import pickle
 import signal
 import subprocess
 import sys
@@ -15,13 +15,13 @@ from pathlib import Path
 
 import pytest
 
-import mcaptrack
 from mcaptrack import environment, fleet
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import child, claims, digests
+from mcaptrack.fleet.child import Child, WorkerLimits
 from mcaptrack.fleet.claims import Claims, claim_name
 from mcaptrack.fleet.ledger import Ledger
-from mcaptrack.log import read
+from mcaptrack.fleet.worker import Reply, Request
 from tests import fleet_tasks
 from tests.awaiting import until
 
@@ -136,12 +136,6 @@ def test_logs_that_harm_their_worker_are_named_and_the_others_are_done(folder):
     assert not list(folder.glob(".*"))
 
 
-def test_workers_stay_warm_and_are_shared(folder):
-    done = fleet.run(fleet_tasks.touch, folder, jobs=2)
-    assert len({seen.process for seen in done.results.values()}) <= 2
-    assert os.getpid() not in {seen.process for seen in done.results.values()}
-
-
 def test_logs_that_exceed_a_limit_are_ended_and_named(folder):
     """What exceeds a limit never ends; the log that does is the only one with a limit of time, which others may miss."""
     (folder / "eat.mcap").write_text("eat")
@@ -168,17 +162,6 @@ class TestASecondTime:
         (folder / "b.mcap").write_text("other")
         assert run().counts == {"skipped": 2, "done": 1, "failed": 1}
         assert run(add="-").counts == {"done": 3, "failed": 1}
-
-    def test_an_output_that_is_gone_is_made_again(self, folder):
-        given = {"ledger": folder / "l.jsonl", "output_dir": folder / "out"}
-        logs = sorted(folder.glob("*.mcap"))
-        fleet.run(fleet_tasks.touch, logs, {"add": "+"}, **given)
-        (folder / "out" / "b.mcap").unlink()
-        assert states(fleet.run(fleet_tasks.touch, logs, {"add": "+"}, **given))["b.mcap"] == "done"
-
-    def test_without_a_ledger_the_function_says_what_is_up_to_date(self, folder):
-        for state in ("done", "up-to-date"):
-            assert fleet.run(fleet_tasks.touch, folder, {"add": "+"}).counts == {state: 3}
 
     def test_a_ledger_that_was_cut_or_is_of_another_command_does_no_harm(self, folder):
         ledger = folder / "ledger.jsonl"
@@ -402,12 +385,63 @@ def test_workers_share_the_cores(monkeypatch):
         assert child.environment_of_worker(2)["OMP_NUM_THREADS"] == said
 
 
-def test_a_log_that_another_process_writes_is_named(template, tmp_path):
-    log = Path(shutil.copyfile(template, tmp_path / "a.mcap"))
-    before = log.read_bytes()
-    with read(log) as opened:
-        opened.lock()
-        (outcome,) = fleet.run(mcaptrack.run, tmp_path, {"force": True, "tables": False}).outcomes
-    assert outcome.state == "failed"
-    assert "another process" in outcome.error or "is being written" in outcome.error, outcome.error
-    assert log.read_bytes() == before
+# Workers that end while they wait, that don't start, and that can't be started.
+
+
+#: A worker that answers each request in the same way, without the packages that others import.
+LIGHT = """
+import json, os, sys
+from multiprocessing.connection import Connection
+connection = Connection(json.loads(sys.argv[1])[0])
+connection.send(None)
+while True:
+    connection.recv_bytes()
+    connection.send_bytes(bytes.fromhex({!r}))
+"""
+
+
+def test_a_worker_that_was_ended_while_it_waited_is_replaced(monkeypatch):
+    """The system may end it for its memory. That was a broken pipe, which ended the whole command."""
+    answer = pickle.dumps(Reply("done", seconds=7.0)).hex()
+    monkeypatch.setattr(child, "_CODE", LIGHT.format(answer))
+    worker, request = Child(WorkerLimits()), Request(Path("a.mcap"), b"", {})
+    try:
+        for number in range(3):
+            assert worker.do(request, lambda: False) == Reply("done", seconds=7.0), number
+            process = worker._process
+            assert process is not None
+            os.kill(process.pid, signal.SIGKILL)
+            os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+    finally:
+        worker.close(0.0)
+
+
+def test_a_worker_that_does_not_start_is_named_as_that(monkeypatch):
+    """Not as a log that took long."""
+    monkeypatch.setattr(child, "_CODE", "import signal; signal.pause()")
+    monkeypatch.setattr(child, "_START_S", 0.3)
+    monkeypatch.setattr(child, "_GRACE_S", 0.2)
+    worker = Child(WorkerLimits(timeout_s=3600))
+    try:
+        reply = worker.do(Request(Path("a.mcap"), b"", {}), lambda: False)
+    finally:
+        worker.close(0.0)
+    assert reply.state == "timed-out"
+    assert reply.error == (
+        "a.mcap: its worker process did not start within 0.3 s (the machine may be too busy), and was ended"
+    )
+
+
+def test_logs_are_named_where_workers_cannot_be_started(tmp_path, monkeypatch):
+    def no_folder(*_: object, **__: object) -> None:
+        raise FileNotFoundError(2, "No usable temporary directory found in ['/tmp']")
+
+    (tmp_path / "a.mcap").touch()
+    monkeypatch.setattr("mcaptrack.fleet.child.tempfile.TemporaryFile", no_folder)
+    done = fleet.run(fleet_tasks.touch, tmp_path)
+    assert [(one.state, one.error) for one in done.failed] == [
+        (
+            "failed",
+            f"{tmp_path}/a.mcap: no worker process can be started (No usable temporary directory found in ['/tmp'])",
+        )
+    ]

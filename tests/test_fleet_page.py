@@ -18,7 +18,6 @@ from mcaptrack.viewing.report import ELEMENT, fleet, fleet_data, fleet_page
 from tests.commands import call, done
 from tests.logs import some_log
 from tests.test_report import _ELEMENTS, _NASTY, Reader
-from tests.tiers import thorough
 
 #: 2026-11-01, midnight.
 FIRST_S = 1_793_491_200
@@ -151,16 +150,6 @@ def test_names_are_only_text_and_links_only_lead_to_files():
     assert json.loads(reader.scripts[0]) == json.loads(json.dumps(data))
     assert len(reader.of("svg")) == 5
     assert not reader.open
-
-
-@thorough
-def test_a_page_about_five_thousand_logs_is_light():
-    rows = [
-        row(f"log{n:05}", start_t_ns=(FIRST_S + 3600 * n) * 10**9, IDF1=(n % 97) / 97, tracks=1 + n % 50)
-        for n in range(5000)
-    ]
-    _, text, _ = page_of(rows)
-    assert len(text) < 200_000
 
 
 def test_an_empty_page_says_so():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +15,19 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.foxglove.views import people
-from mcaptrack.log import in_place, writer
+from mcaptrack.geometry.ragged import cross_pairs
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, frame_columns, framing
 from mcaptrack.schema.frame_columns import FrameCollector, collect
-from mcaptrack.schema.framing import filtered_rows, join_frames, joined_parts, mapped_rows, thinned, unique_values
+from mcaptrack.schema.framing import (
+    filtered_rows,
+    frame_times,
+    join_frames,
+    joined_parts,
+    mapped_rows,
+    split_rows,
+    thinned,
+    unique_values,
+)
 from mcaptrack.schema.provenance import INGEST, Provenance, digest
 from tests.tiers import thorough
 from tests.worlds import ns
@@ -140,27 +148,6 @@ def test_a_log_is_the_same_whatever_the_size_of_blocks_and_parts(tmp_path, reque
     assert all((tmp_path / "parts" / name).read_bytes() == path.read_bytes() for name, path in tables.items())
 
 
-@thorough
-def test_a_log_four_times_as_long_takes_hardly_more_memory(monkeypatch, tmp_path):
-    monkeypatch.setattr(frame_columns, "BLOCK_BYTES", 2**14)
-    monkeypatch.setattr(framing, "PART_ROWS", 1000)
-    monkeypatch.setattr(people, "_PART_ROWS", 1000)
-    monkeypatch.setattr(people, "_PART_STEPS", 1000)
-    peaks = []
-    monkeypatch.setattr(writer, "_CHUNK_BYTES", dict.fromkeys(("media", "rows", "views"), 2**14))
-    monkeypatch.setattr(in_place, "_PIECE", 2**14)
-    for seconds in (5.0, 30.0, 120.0):  # the first one imports
-        path = write_boxes(tmp_path / f"{seconds:g}.mcap", seconds)
-        tracemalloc.start()
-        try:
-            mcaptrack.predict(path, predictor="cv")
-            peaks.append(tracemalloc.get_traced_memory()[1])
-        finally:
-            tracemalloc.stop()
-    of_a_channel = 10 * 90 * 6 * TRACKS.dtype.itemsize
-    assert peaks[2] - peaks[1] < 3 * of_a_channel, "with all rows as objects it is ten times those of a channel"
-
-
 @pytest.mark.parametrize("way", ["append", "extend"])
 def test_rows_with_their_columns_in_another_order_are_taken_and_others_refused(way):
     def collected(rows) -> np.ndarray:
@@ -185,7 +172,29 @@ def test_rows_with_their_columns_in_another_order_are_taken_and_others_refused(w
         collected(np.zeros(2, [("a", float)]))
 
 
-def test_a_frame_keeps_no_array_that_it_is_a_part_of():
-    collector, many = FrameCollector(TRACKS), TRACKS.empty(1000)
-    collector.append(Frame(ns(1), 0, many[:1]))
-    assert all(not np.shares_memory(many, kept) for kept in collector._open)
+# Frames as flat rows and back, and all pairs within groups.
+
+
+COUNTS = st.lists(st.integers(0, 4), max_size=8)
+
+
+@given(COUNTS)
+def test_joined_frames_are_split_into_the_same_frames(counts):
+    frames = frames_of(counts)
+    joined = join_frames(TRACKS, frames)
+    assert joined.t_ns.tolist() == frame_times(frames).tolist() == [frame.t_ns for frame in frames]
+    assert joined.row_ns.tolist() == [frame.t_ns for frame in frames for _ in frame.rows]
+    assert joined.rows["track_id"].tolist() == list(range(sum(counts)))
+    again = split_rows(joined.t_ns, [frame.index for frame in frames], joined.rows, joined.ends[1:])
+    assert [(f.t_ns, f.index, f.rows.tobytes()) for f in again] == [(f.t_ns, f.index, f.rows.tobytes()) for f in frames]
+    assert all(type(frame.t_ns) is int and type(frame.index) is int for frame in again)
+
+
+@given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), max_size=8))
+def test_cross_pairs_are_those_of_nested_loops(counts):
+    wanted, first, second = [], 0, 0
+    for group, (a, b) in enumerate(counts):
+        wanted += [(group, i, j) for i in range(first, first + a) for j in range(second, second + b)]
+        first, second = first + a, second + b
+    found = cross_pairs(*np.array(counts, np.int64).reshape(-1, 2).T)
+    assert list(zip(*(part.tolist() for part in found), strict=True)) == wanted

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
-import subprocess
-import sys
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
@@ -16,10 +13,8 @@ from mcap.writer import CompressionType
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import byte_source
-from mcaptrack.schema import TRACKS
 from tests.logs import write_stock
-from tests.tiers import one_in, thorough
-from tests.worlds import tracks_at
+from tests.tiers import one_in
 
 KINDS = {
     "chunks": {"chunk_size": 150},
@@ -147,71 +142,3 @@ def test_a_log_that_is_open_is_read_on_when_something_is_added_to_it(tmp_path):
         assert len(list(opened.messages("a"))) == len(opened.times("a")) == 200
         assert opened.fingerprint("a") == before
         assert "new" not in opened.channels
-
-
-_READER = """
-import sys
-from pathlib import Path
-import mcaptrack
-from mcaptrack import errors, log
-from mcaptrack.schema import TRACKS
-path = Path(sys.argv[1])
-print("go", flush=True)
-seen = set()
-while sys.stdin.readline() != "stop\\n":
-    for _ in range(5):
-        try:
-            with mcaptrack.open(path) as opened:
-                rows = opened._log.rows("/t", TRACKS).rows
-                again = opened.array("tracks")
-                payloads = [m.payload for m in opened._log.messages("/t")]
-            assert len(set(rows["x_m"])) == 1, set(rows["x_m"])
-            assert len(rows) == len(again) == 2 * len(payloads) == 400
-            seen.add(rows["x_m"][0])
-        except errors.McaptrackError as error:
-            assert "\\n" not in str(error)
-    print("more", flush=True)
-assert len(seen) > 1, seen
-"""
-
-
-@thorough
-def test_a_process_that_reads_outlives_whatever_happens_to_the_file(tmp_path):
-    """A second process reads while this one shortens, overwrites, replaces and extends the log."""
-    path = tmp_path / "a.mcap"
-    chance = random.Random(5)
-
-    def whole(value: float) -> bytes:
-        with log.create(path) as writer:
-            number = writer.add_channel("/t", (TRACKS.name, "protobuf", TRACKS.descriptor), "protobuf", {}, "media")
-            for n in range(200):
-                rows = tracks_at({1: (value, 2), 2: (value, 4)})
-                writer.add_message(number, n, n, TRACKS.codec.encode(rows))
-        return path.read_bytes()
-
-    contents = [whole(value) for value in (1.0, 2.0, 3.0)]
-
-    def extend(_: Path, __: bytes) -> None:
-        with log.read(path) as opened, log.extend(opened, drop=["new"]) as writer:
-            writer.add_message(writer.add_channel("new", ("", "", b""), "json", {}), 5, 1, bytes(1000))
-
-    changes = [*(CHANGES[name] for name in ("overwritten", "replaced", "shortened", "emptied")), extend]
-    command = [sys.executable, "-c", _READER, path]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as reader:
-        assert reader.stdin is not None
-        assert reader.stdout is not None
-        assert reader.stdout.readline() == "go\n"
-        for _ in range(40):
-            reader.stdin.write("read\n")
-            reader.stdin.flush()
-            for _ in range(chance.randrange(1, 30)):
-                change = chance.choice(changes)
-                try:
-                    change(path, chance.choice(contents))
-                except McaptrackError:
-                    overwrite(path, contents[0])
-            overwrite(path, chance.choice(contents))
-            assert reader.stdout.readline() == "more\n"
-        reader.stdin.write("stop\n")
-        reader.stdin.close()
-        assert reader.wait(600) == 0

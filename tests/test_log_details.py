@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import re
 import struct
 import sys
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -19,9 +20,9 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource, OpenFile
-from mcaptrack.log.index import read_index
+from mcaptrack.log.index import Index, read_index
 from mcaptrack.log.records import Opcode
-from mcaptrack.log.writer import _free_id
+from mcaptrack.log.writer import LogWriter
 from mcaptrack.schema.provenance import Provenance
 from tests.commands import done
 from tests.logs import FORTY, SCHEMA, SOME, STOCK_OPTIONS, our_messages, write_stock
@@ -283,18 +284,19 @@ def test_indexes_that_list_another_number_of_messages_than_was_counted_are_notic
                 assert len(list(opened.messages(topic, *span))) == 13
 
 
-@pytest.mark.parametrize(
-    ("taken", "last", "free"),
-    [((), 0, 1), ((1,), 1, 2), ((1, 3), 2, 4), ((2, 3), 1, 4), ((), 2**16 - 2, 2**16 - 1), ((), 2**16 - 1, 1)]
-    + [((1, 2, 2**16 - 1), 2**16 - 2, 3), (range(2, 2**16), 5, 1)],
-)
-def test_a_new_channel_gets_the_next_number_and_then_the_lowest_that_is_free(taken, last, free):
-    assert _free_id(dict.fromkeys(taken), last, "channels") == free
+def test_a_new_channel_gets_the_next_number_and_then_the_lowest_that_is_free():
+    def added(taken: Iterable[int]) -> int:
+        channels = {number: records.ChannelRecord(number, 0, f"/{number}", "json", {}) for number in taken}
+        return LogWriter(io.BytesIO(), index=Index(channels=channels)).add_channel("new", ("", "", b""), "json", {})
 
-
-def test_a_log_has_65535_numbers():
-    with pytest.raises(McaptrackError, match=r"^there are 65535 schemas already; a log holds no more$"):
-        _free_id(dict.fromkeys(range(1, 2**16)), 7, "schemas")
+    last = 2**16 - 1
+    for taken, number in (
+        ((), 1), ((1,), 2), ((1, 3), 4), ((2, 3), 4), ((last - 1,), last), ((last,), 1), ((1, 2, last), 3),
+        (range(2, last + 1), 1),
+    ):  # fmt: skip
+        assert added(taken) == number
+    with pytest.raises(McaptrackError, match=r"^there are 65535 channels already; a log holds no more$"):
+        added(range(1, last + 1))
 
 
 @pytest.mark.parametrize("options", STOCK_OPTIONS.values(), ids=STOCK_OPTIONS)

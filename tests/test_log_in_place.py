@@ -77,18 +77,6 @@ def test_results_are_replaced_in_place_and_leave_nothing_behind(tmp_path):
     assert path.read_bytes() == once.read_bytes()
 
 
-def test_a_copy_elsewhere_is_the_same_as_the_change_in_place(tmp_path):
-    path, copy = tmp_path / "a.mcap", tmp_path / "copy.mcap"
-    recorded(path)
-    add_results(path, 1)
-    with log.read(path) as opened, log.extend(opened, copy, drop=["/result/a"]):
-        pass
-    with log.read(path) as opened, log.extend(opened, drop=["/result/a"]):
-        pass
-    assert sorted(contents(copy)) == ["/result/b", "/video", "layout"]
-    assert contents(copy) == contents(path)
-
-
 def test_a_log_that_may_not_be_written_to_says_what_to_do(tmp_path, monkeypatch):
     path = tmp_path / "a.mcap"
     recorded(path)

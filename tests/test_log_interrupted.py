@@ -155,16 +155,15 @@ def look(path: Path, change: Change) -> str:
     """What is seen of a log after a kill, and left of it: "old" or "new"; and that looking changes nothing."""
     before = photo(path.parent)
     is_beside = journal_of(path).exists()
-    with notices.collected() as said, notices.listening(said.append):
+    with notices.collected() as said:
         found = seen(path)
     assert photo(path.parent) == before
     assert [(notice.code, "\n" in notice.message) for notice in said] == [("journal", False)] * is_beside
     half = is_beside and "left half written" in said[0].message
-    with notices.collected() as again, notices.listening(again.append):
-        checked = log.check(path)
+    checked = log.check(path)
     assert [f.kind for f in checked.findings if f.level == "error"] == ["half-written"] * half
     assert photo(path.parent) == before
-    with notices.collected() as mended, notices.listening(mended.append):
+    with notices.collected() as mended:
         mend(path)
     assert sum("its state before that has been restored" in notice.message for notice in mended) == half
     assert not journal_of(path).exists()
@@ -202,7 +201,7 @@ def test_a_full_disk_or_an_interruption_leaves_the_old_log_or_the_new_one(path, 
     for at in range(1, 300):
         reset(path, change.old)
         raised = None
-        with monkeypatch.context() as patch, notices.collected() as said, notices.listening(said.append):
+        with monkeypatch.context() as patch, notices.collected() as said:
             for name in CALLS:
                 patch.setattr(os, name, getattr(os, name))  # put back at the end
             done = sabotage(at, fail)
@@ -217,7 +216,7 @@ def test_a_full_disk_or_an_interruption_leaves_the_old_log_or_the_new_one(path, 
         outcomes.append("old" if left == change.old else "new")
         assert outcomes[-1] == "new" or raised is not None
         assert left == change.old or (left == change.new and (said or raised is error or done[at - 1] == "chmod"))
-        with notices.collected() as said, notices.listening(said.append):
+        with notices.collected() as said:
             mend(path)
         assert path.read_bytes() == left
         assert not journal_of(path).exists()
@@ -260,17 +259,15 @@ def test_a_newer_log_that_takes_the_place_of_a_half_written_one_is_never_rolled_
                 stream.write(content)
                 stream.truncate(len(content))
             before, wanted = photo(path.parent), contents(path)
-            with notices.collected() as said, notices.listening(said.append):
-                found = seen(path)
-                assert log.check(path).is_sound
+            found = seen(path)
+            assert log.check(path).is_sound
             assert counts(found) == counts(wanted)
             assert photo(path.parent) == before
-            with notices.collected() as said, notices.listening(said.append):
-                try:
-                    mend(path)
-                except McaptrackError as error:
-                    assert "has been changed since" in str(error)
-                    assert f"`rm {journal_of(path)}`" in str(error)
+            try:
+                mend(path)
+            except McaptrackError as error:
+                assert "has been changed since" in str(error)
+                assert f"`rm {journal_of(path)}`" in str(error)
             assert path.read_bytes() == content
 
 
@@ -284,7 +281,7 @@ def test_a_writer_that_is_at_work_is_seen_beside(path, change):
             out = real(*args, **kwargs)
             if journal_of(path).exists() and name in ("pwrite", "replace", "ftruncate"):
                 steps.append(name)
-                with notices.collected() as heard, notices.listening(heard.append):
+                with notices.collected() as heard:
                     assert seen(path) == old
                     with pytest.raises(McaptrackError, match="is being written to by another process"):
                         log.check(path)
@@ -334,11 +331,10 @@ def test_a_log_that_was_moved_away_with_its_journal_can_be_saved(path, kills, tm
         shutil.copyfile(path, moved)
         shutil.copyfile(journal_of(path), journal_of(moved))
         before = photo(folder)
-        with notices.collected() as said, notices.listening(said.append):
+        with notices.collected() as said:
             report = log.recover(moved, tmp_path / "saved.mcap")
         assert photo(folder) == before
         assert report.lost == []
         assert len(said) == 1
-        with notices.collected(), notices.listening(lambda _: None):
-            assert counts(contents(tmp_path / "saved.mcap")) == counts(seen(path))
+        assert counts(contents(tmp_path / "saved.mcap")) == counts(seen(path))
         shutil.rmtree(folder)

@@ -127,36 +127,11 @@ def test_every_command_keeps_them_or_refuses_in_a_line(command, ours, tmp_path, 
         assert not [made for made in tmp_path.iterdir() if made.suffix == ".mcap"]
 
 
-@pytest.mark.parametrize(
-    ("text", "number"),
-    [
-        ("0", 0),
-        ("-5", -5),
-        (str(MAX_NS), MAX_NS),
-        (str(MAX_NS + 1), None),
-        ("9" * 5000, None),
-        ("", None),
-        ("1.5", None),
-        ("٣", None),
-        (" 1", None),
-    ],
-)
-def test_a_clock_start_that_can_t_be_computed_with_is_none(text, number):
-    assert parse_ns(text) == number
-
-
-def test_boxes_of_others_at_such_times_are_not_tracked(tmp_path):
-    path = tmp_path / "robot.mcap"
-    boxes = {"header": {"stamp": {"sec": 1, "nanosec": 0}, "frame_id": ""}, "detections": []}
-    with log.create(path) as writer:
-        number = writer.add_channel("/boxes", ("vision_msgs/Detection2DArray", "jsonschema", b"{}"), "json", {})
-        for t_ns in (MAX_NS, MAX_NS + 1):
-            writer.add_message(number, t_ns, 0, json.dumps(boxes).encode())
-    before = everything(tmp_path)
-    outcome = call("track", path, "--topic", "/boxes")
-    assert outcome.code == 1
-    assert "/boxes has 1 messages later than the year 2262, the first at 9223372036854775808 ns" in outcome.err
-    assert everything(tmp_path) == before
+def test_a_clock_start_that_can_t_be_computed_with_is_none():
+    wanted = {"0": 0, "-5": -5, str(MAX_NS): MAX_NS} | dict.fromkeys(
+        (str(MAX_NS + 1), "9" * 5000, "", "1.5", "٣", " 1")
+    )
+    assert {text: parse_ns(text) for text in wanted} == wanted
 
 
 @pytest.mark.parametrize("shared", [3, 1000], ids=["some share a time", "all share a time"])

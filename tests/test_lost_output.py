@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from tests.commands import GROUP, made_log
+from tests.commands import GROUP
 from tests.tiers import one_in
 
 #: Forks a process for each line of JSON on stdin, and prints its exit code. What streams become is as a shell does it.
@@ -86,11 +86,6 @@ EVERY = [f"{command} {words}" for command in GROUP.commands for words in ("--hel
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory) -> Path:
-    return made_log(tmp_path_factory.mktemp("lost"))
-
-
-@pytest.fixture(scope="module")
 def server() -> Iterator[Any]:
     with subprocess.Popen(
         [sys.executable, "-c", _SERVER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -144,10 +139,10 @@ def _check(server: Any, folder: Path, line: str, log: Path | None) -> None:
 
 
 @pytest.mark.parametrize("line", one_in(9, LINES))
-def test_an_answer_that_is_lost_is_said(server, tmp_path, log, line):
-    _check(server, tmp_path, line, log)
+def test_an_answer_that_is_lost_is_said(server, tmp_path, template, line):
+    _check(server, tmp_path, line, template)
 
 
-@pytest.mark.parametrize("line", one_in(24, EVERY))
+@pytest.mark.parametrize("line", one_in(len(EVERY), EVERY))
 def test_of_every_command(server, tmp_path, line):
     _check(server, tmp_path, line, None)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import threading
@@ -14,7 +13,7 @@ import pyarrow as pa
 import pytest
 
 import mcaptrack
-from mcaptrack import environment, log, notices, tables
+from mcaptrack import log, notices, tables
 from mcaptrack.errors import McaptrackError
 from mcaptrack.pipeline.pictures import Ahead, KeptPictures
 from mcaptrack.pipeline.plan import spaces_of_boxes
@@ -78,23 +77,6 @@ def test_online_retracking_holds_numbers_of_each_sample_and_no_rows():
     assert (long - short) / (96 * PEOPLE) < 130
 
 
-@pytest.mark.usefixtures("small_blocks")
-def test_online_retracking_of_crowds_is_done_in_parts(monkeypatch):
-    """Some frames are read at once, and their tracks predicted: of 200 people these would take 2 to 10 kB each."""
-    monkeypatch.setattr(likelihood, "_STEPS", 10_000)
-
-    def online(frames: int) -> None:
-        run = LikelihoodPass(Retrack())
-        for frame in walks(frames, 200):
-            run.step(frame)
-        for _ in run.outputs():
-            pass
-
-    online(10)
-    short, long = (held(lambda frames=frames: online(frames))[1] for frames in (30, 60))
-    assert (long - short) / (30 * 200) < 400
-
-
 @pytest.mark.parametrize("name", ["default", "authors"])
 @pytest.mark.usefixtures("small_blocks")
 def test_retracking_is_the_same_whatever_the_size_of_blocks(name, monkeypatch):
@@ -150,21 +132,6 @@ def test_rows_that_were_divided_are_ordered_by_track_and_time():
     assert np.concatenate([part.rows["x_m"] for part in parts]).tolist() == all_rows["x_m"][order].tolist()
     of_row = np.repeat(np.arange(len(frames)), [len(frame.rows) for frame in frames])
     assert np.concatenate([part.frame for part in parts]).tolist() == of_row[order].tolist()
-
-
-@pytest.mark.usefixtures("small_blocks")
-def test_rows_are_taken_from_blocks_in_any_order():
-    columns = collect(TRACKS, walks(200))
-    places = np.random.default_rng(0).integers(0, 200 * PEOPLE, 500)
-    assert repr(columns.take(places)) == repr(columns.rows()[places])
-    assert len(columns.take(places[:0])) == 0
-
-
-@pytest.mark.usefixtures("small_blocks")
-def test_every_fifth_frame_holds_no_rows_of_the_others():
-    columns = collect(TRACKS, walks(400))
-    assert repr([frame.rows for frame in columns[::5]]) == repr([frame.rows for frame in walks(400)][::5])
-    assert held(lambda: columns[::5])[0] < 0.5 * sum(frame.rows.nbytes for frame in columns)
 
 
 @pytest.mark.usefixtures("small_blocks")
@@ -250,16 +217,6 @@ def test_time_counts_for_the_innermost_part(monkeypatch):
 
 
 # Allocators
-
-
-@pytest.mark.parametrize(("given", "wanted"), [(None, "system"), ("jemalloc", "jemalloc")])
-def test_arrow_shares_the_allocator_of_all_others_unless_the_user_chose_one(given, wanted, monkeypatch):
-    """Arrow's own pool kept 22 MB of an export of 100,000 chunks for itself."""
-    monkeypatch.setenv("ARROW_DEFAULT_MEMORY_POOL", given or "")
-    if given is None:
-        monkeypatch.delenv("ARROW_DEFAULT_MEMORY_POOL")
-    environment.share_allocator()
-    assert os.environ["ARROW_DEFAULT_MEMORY_POOL"] == wanted
 
 
 def test_arrow_is_loaded_after_its_allocator_was_chosen():

@@ -7,7 +7,6 @@ import json
 import re
 import shutil
 import zlib
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,39 +21,15 @@ import mcaptrack
 from mcaptrack.errors import McaptrackError
 from mcaptrack.viewing.links import LinkedEvent
 from tests.commands import done
+from tests.test_report import Reader
 
 CLOSED, PAIRS = 0, 2
-
-
-class Elements(HTMLParser):
-    """The elements of a page with their attributes, and the text in each element with an id."""
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.found: list[tuple[str, dict[str, str]]] = []
-        self.texts: dict[str, str] = {}
-        self._id = ""
-        self.feed(html)
-
-    def handle_starttag(self, tag, attrs):
-        self.found.append((tag, {name: value or "" for name, value in attrs}))
-        self._id = self.found[-1][1].get("id", "")
-
-    def handle_endtag(self, tag):
-        self._id = ""
-
-    def handle_data(self, data):
-        if self._id:
-            self.texts[self._id] = self.texts.get(self._id, "") + data
-
-    def of(self, tag: str) -> list[dict[str, str]]:
-        return [attributes for name, attributes in self.found if name == tag]
 
 
 class Shown(NamedTuple):
     """What is in a player: the page in its frame, its data, and its pictures (height, width, 3)."""
 
-    page: Elements
+    page: Reader
     data: dict[str, Any]
     pictures: list[np.ndarray]
 
@@ -64,11 +39,12 @@ def decoded(text: str) -> np.ndarray:
 
 
 def shown(player: mcaptrack.Player) -> Shown:
-    (frame,) = Elements(player.html).of("iframe")
+    (frame,) = Reader(player.html).of("iframe")
     assert frame["sandbox"] == "allow-scripts"
-    page = Elements(frame["srcdoc"])
-    data = json.loads(zlib.decompress(base64.b64decode(page.texts["data"])))
-    return Shown(page, data, [decoded(one) for one in page.texts.get("pictures", "").split()])
+    page = Reader(frame["srcdoc"])
+    texts = {one.get("id"): text for one, text in zip(page.of("script"), page.scripts, strict=True)}
+    data = json.loads(zlib.decompress(base64.b64decode(texts["data"])))
+    return Shown(page, data, [decoded(one) for one in texts.get("pictures", "").split()])
 
 
 def stored(path: Path, topic: str) -> dict[int, Any]:
@@ -172,18 +148,10 @@ class TestPlayer:
         assert [f"'nonce-{one['nonce']}'" for one in scripts] == [rules["script-src"]]
         assert "http:" not in player.html
         assert "https:" not in player.html
-        for part in (Elements(player.html), page):
-            for _, attributes in part.found:
+        for part in (Reader(player.html), page):
+            for _, attributes in part.elements:
                 assert not any(name.startswith("on") for name in attributes)
                 assert attributes.get("src", "data:").startswith("data:image/jpeg;base64,") or "src" not in attributes
-
-    def test_a_still_remains_where_frames_are_taken_out(self, player):
-        outside = Elements(player.html)
-        (image,) = outside.of("img")
-        still = decoded(image["src"].partition(",")[2])
-        assert still.shape == (180, 320, 3)
-        assert np.array_equal(still, cv2.imdecode(np.frombuffer(player.still, np.uint8), cv2.IMREAD_COLOR))
-        assert player.caption in re.sub(r"<iframe.*</iframe>", "", player.html)
 
     def test_notebooks_get_html_a_picture_and_text(self, player):
         bundle = player._repr_mimebundle_(include=None, exclude=None)
@@ -225,7 +193,7 @@ class TestStill:
             still = log.show(2.04, width=320)
             (plain,) = log.frames("video", times=[start_of(finished) + 2_000_000_000])
         assert (still.pictures, still.first_s) == (1, 2.0)
-        assert Elements(still.html).of("iframe") == []
+        assert Reader(still.html).of("iframe") == []
         image = cv2.imdecode(np.frombuffer(still.still, np.uint8), cv2.IMREAD_COLOR)
         (message,) = [m for t, m in stored(finished, "/camera/retracks/full").items() if t - start_of(finished) == 2e9]
         changed = np.abs(image.astype(int) - plain.rows).max(axis=2)
@@ -330,7 +298,7 @@ class TestTables:
     def test_a_table_shows_units_rows_and_what_it_leaves_out(self, finished, shell):
         with mcaptrack.open(finished) as log:
             table = log.table("tracks", "/camera/tracks")
-        html = Elements(shell.format(table)[0]["text/html"])
+        html = Reader(shell.format(table)[0]["text/html"])
         text = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", shell.format(table)[0]["text/html"]))
         assert len(html.of("th")) == len(table.column_names)
         titles = {title["title"] for title in html.of("th")}
@@ -364,20 +332,21 @@ class TestTables:
         mcaptrack.open(finished).close()
         about = {"unit": "<u>", "description": '"><script>'}
         table = pa.table([["<img src=x>" + 80 * "a"]], pa.schema([pa.field("<b>", pa.string(), metadata=about)]))
-        html = Elements(shell.format(table)[0]["text/html"])
-        assert {tag for tag, _ in html.found} <= {"div", "table", "thead", "tbody", "tr", "th", "td", "br", "span", "p"}
+        html = Reader(shell.format(table)[0]["text/html"])
+        known = {"div", "table", "thead", "tbody", "tr", "th", "td", "br", "span", "p"}
+        assert {tag for tag, _ in html.elements} <= known
 
 
 class TestReport:
     def test_a_report_is_shown_as_it_is_without_scripts(self, finished, tmp_path):
         made = mcaptrack.report(finished, tmp_path / "page.html")
-        (frame,) = Elements(made._repr_html_()).of("iframe")
+        (frame,) = Reader(made._repr_html_()).of("iframe")
         assert frame["srcdoc"] == made.page.read_text(encoding="utf-8")
         assert "allow-scripts" not in frame["sandbox"]
         made.page.write_bytes(b" " * 8_000_001)
         assert "too large to show here" in made._repr_html_()
         made.page.unlink()
-        assert Elements(made._repr_html_()).of("iframe") == []
+        assert Reader(made._repr_html_()).of("iframe") == []
         assert "can&#39;t be read: No such file" in made._repr_html_()
 
 

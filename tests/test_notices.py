@@ -48,11 +48,6 @@ def test_a_warning_is_shown_even_when_quiet_and_stands_in_the_json(boxes):
     assert line == f"warning: {boxes}: {said['message']}"
 
 
-def test_a_command_starts_without_the_warnings_of_the_one_before(boxes):
-    call("track", boxes)
-    assert json.loads(call("info", boxes, "--json").stdout)["warnings"] == []
-
-
 def test_the_same_warning_is_shown_once(capsys):
     @common.one_line
     def command() -> None:

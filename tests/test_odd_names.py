@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from mcaptrack.location import sibling
 from mcaptrack.log import results_path
 from mcaptrack.log.journal import journal_of
-from tests.commands import call, made_log
+from tests.commands import call
 from tests.tiers import one_in
 
 NAMES = {
@@ -32,16 +32,11 @@ NAMES = {
 }
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory) -> Path:
-    return made_log(tmp_path_factory.mktemp("odd"))
-
-
 @pytest.mark.skipif(sys.platform == "darwin", reason="names of files are UTF-8 there")
 @pytest.mark.parametrize("name", one_in(3, NAMES.values()), ids=NAMES)
-def test_logs_of_all_names_are_used_as_others_are(log, tmp_path, monkeypatch, name):
+def test_logs_of_all_names_are_used_as_others_are(template, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
-    shutil.copy(log, name)
+    shutil.copy(template, name)
     for line in (
         ["info", "--json"],
         ["track", "--force"],

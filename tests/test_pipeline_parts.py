@@ -10,38 +10,22 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import pytest
 
 from mcaptrack import foxglove, log, notices, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
-from mcaptrack.pipeline import drawing
-from mcaptrack.pipeline import write as writing
-from mcaptrack.pipeline.checks import _lacks
 from mcaptrack.pipeline.plan import check_spaces
-from mcaptrack.schema import DECISIONS, DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
+from mcaptrack.schema import DECISIONS, DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.ground_plane import plane_to_rows
-from mcaptrack.schema.provenance import CLOCK, INGEST, VIEW, Provenance, digest
-from mcaptrack.transforms import STAGES, KnnDetector, OcSort, Predict, Retrack, Sample, Sort, Transform
-from tests.worlds import boxes_at, ns, tracks_at, walk
+from mcaptrack.schema.provenance import INGEST, VIEW, Provenance
+from mcaptrack.transforms import STAGES, OcSort, Predict, Retrack, Sample, Sort, Transform
+from tests.logs import write_channels
+from tests.worlds import ns, tracks_at, walk
 
 run = sys.modules["mcaptrack.pipeline.run"]  # the package has a function of this name
 PLANE = GroundPlane((0.1, 0, 0, 0, 0.1, 0, 0, 0, 1), 640, 480)
 Channels = Mapping[str, tuple[Schema, Provenance | None, Sequence[Frame]]]
-
-
-def written(path: Path, channels: Channels, clock: str = "") -> Path:
-    """A log of these channels, each with how it was made, and its frames."""
-    with log.create(path) as writer:
-        for topic, (schema, made, frames) in channels.items():
-            metadata = made.to_metadata() if made else {}
-            number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", metadata)
-            for frame in frames:
-                writer.add_message(number, frame.t_ns, frame.index, schema.codec.encode(frame.rows))
-        if clock:
-            writer.add_metadata(CLOCK, {"start_ns": clock})
-    return path
 
 
 def parameters_of(stage: str, transform: Transform) -> dict[str, Any]:
@@ -79,7 +63,7 @@ def planned(
 ) -> tuple[list[pipeline.Job], list[str], list[tuple[str, str]]]:
     """The jobs that everything takes, what is said of them, and warnings with their codes."""
     said: list[str] = []
-    with log.read(written(path, channels)) as opened, notices.listening(lambda _: None), notices.collected() as warned:
+    with log.read(write_channels(path, channels)) as opened, notices.collected() as warned:
         jobs = pipeline.plan_all(opened, "/camera", said.append, **options)
     return jobs, said, [(one.message, one.code) for one in warned]
 
@@ -171,17 +155,13 @@ PLANS = {
     "a parameter that is gone, and another setting": other_settings(
         f"predictions: {WITHOUT('Predict')}", predict=Predict()
     )._replace(changed={"predictions": {"parameters": {"strange": 1}}}),
-    "compared with something that is gone": Plan(
-        {"predictions": {"references": {"/camera/truth": "x"}}}, {}, ["predict"], AGAIN[2:3]
-    ),
+    "compared with something that is gone": Plan({"predictions": {"references": {"/camera/truth": "x"}}}, {}, ["predict"], AGAIN[2:3]),
     "compared with nothing, as now": Plan({"predictions": {"references": {"/camera/truth": ""}}}),
-    "compared with something else": Plan(
-        {"predictions": {"references": {"/camera/tracks": "T"}}}, {}, ["predict"], AGAIN[2:3]
-    ),
+    "compared with something else": Plan({"predictions": {"references": {"/camera/tracks": "T"}}}, {}, ["predict"], AGAIN[2:3]),
     "a plane that is gone": Plan(
         {"tracks": {"parameters": parameters_of("track", Sort(ground_planes=((0, PLANE),)))}}, {}, STAGES_OF_ALL, AGAIN
     ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)
@@ -239,7 +219,7 @@ def test_an_output_that_is_missing_is_made_as_the_others_beside_it(tmp_path):
     )
     del channels["/camera/retracks/online"]
     said: list[str] = []
-    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+    with log.read(write_channels(tmp_path / "a.mcap", channels)) as opened:
         jobs = pipeline.plan_stage(
             opened, "/camera", "predict", Predict(), "/camera/retracks/online", "/camera/more", say=said.append
         )
@@ -260,7 +240,7 @@ def test_channels_made_from_what_was_replaced_are_stale(tmp_path):
         ),
         "/camera/tracks/view/image": (TRACKS, Provenance(VIEW, {}, "/camera/tracks", "t"), []),
     }
-    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+    with log.read(write_channels(tmp_path / "a.mcap", channels)) as opened:
         assert pipeline.outdated_by(opened, {"/camera/tracks": "t"}) == []
         assert pipeline.outdated_by(opened, {"/camera/tracks": "T"}) == ["/camera/samples", "/camera/tracks/events"]
         assert pipeline.outdated_by(opened, {"/camera/tracks": "T", "/camera/samples": "s"}) == [
@@ -288,9 +268,9 @@ def test_the_rate_of_other_inputs_is_known_and_a_high_one_is_said(tmp_path, rate
         "/camera/tracks has 6.25 frames a second, and retrack takes steps at that rate; /camera/samples has 2.5 unless it "
         "was made otherwise"
     )
-    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+    with log.read(write_channels(tmp_path / "a.mcap", channels)) as opened:
         for source in ("/camera/tracks", None):
-            with notices.listening(lambda _: None), notices.collected() as said:
+            with notices.collected() as said:
                 frames, known = pipeline.input_of(opened, "/camera", "retrack", Retrack(), source)
             people = {"class_names": ((1, "person"),), "fixed_ids": ()}
             assert known == {
@@ -304,21 +284,10 @@ def test_the_rate_of_other_inputs_is_known_and_a_high_one_is_said(tmp_path, rate
             assert [(one.message, one.code) for one in said] == [(words, "clock")] * (is_said and source is not None)
 
 
-def test_frames_that_share_a_time_have_no_part_in_the_rate(tmp_path):
-    at = [0.0, 0.0, 0.4, 0.4, 0.4, 0.8]
-    frames = [Frame(ns(t), n, tracks_at({1: (t, 0.0)})) for n, t in enumerate(at)]
-    path = written(tmp_path / "a.mcap", {"/camera/samples": (TRACKS, Provenance(INGEST, {}), frames)})
-    with log.read(path) as opened:
-        assert pipeline.input_of(opened, "/camera", "predict", Predict())[1]["rate_hz"] == 2.5
-    path = written(tmp_path / "b.mcap", {"/camera/samples": (TRACKS, Provenance(INGEST, {}), frames[:2])})
-    with log.read(path) as opened:
-        assert pipeline.input_of(opened, "/camera", "predict", Predict(rate_hz=4.0))[1]["rate_hz"] == 4.0
-
-
 @pytest.mark.parametrize(("clock", "start_ns"), [("70", 70), ("0", 0), ("", None), ("soon", None)])
 def test_the_clock_begins_as_the_log_says(tmp_path, clock, start_ns):
     channels = {"/camera/tracks": (TRACKS, Provenance(INGEST, {}), paced(10.0))}
-    with log.read(written(tmp_path / "a.mcap", channels, clock)) as opened:
+    with log.read(write_channels(tmp_path / "a.mcap", channels, clock)) as opened:
         known = pipeline.input_of(opened, "/camera", "sample", Sample())[1]
     assert known == {"start_ns": start_ns, "ground_planes": ()}
 
@@ -327,43 +296,10 @@ def plane_at(t_ns: int, plane: GroundPlane = PLANE) -> Frame:
     return Frame(t_ns, 0, plane_to_rows(plane))
 
 
-def test_planes_are_known_with_their_times_and_a_guessed_one_is_doubted(tmp_path):
-    for assumed in (False, True):
-        plane = replace(PLANE, assumed=assumed)
-        channels = {
-            "/camera/samples": (TRACKS, Provenance(INGEST, {}), paced(2.5)),
-            "/camera/ground_plane": (
-                GROUND_PLANE,
-                Provenance("assume-ground-plane", {}),
-                [plane_at(5, plane), plane_at(9, plane)],
-            ),
-        }
-        with log.read(written(tmp_path / "a.mcap", channels)) as opened:
-            assert pipeline.read_planes(opened, "/camera") == [(5, plane), (9, plane)]
-            known = pipeline.input_of(opened, "/camera", "retrack", Retrack())[1]
-        assert known["ground_planes"] == ((5, plane), (9, plane))
-
-
-def test_what_stages_made_is_counted_and_progress_is_told(tmp_path):
-    frames = walk(lambda n: {1: (n * 0.1, 0.0), 2: (n * 0.1, 3.0)} if n > 1 else {1: (n * 0.1, 0.0)}, 30, 10.0)
-    path = written(tmp_path / "a.mcap", {"/camera/tracks": (TRACKS, Provenance(INGEST, {}, digest="x"), frames)})
-    told: list[tuple[str, int, int]] = []
-    with log.read(path) as opened:
-        jobs = pipeline.plan_stage(opened, "/camera", "sample", Sample())
-        report = pipeline.run(opened, "/camera", jobs, progress=lambda *some: told.append(some))
-    with log.read(path) as opened:
-        samples = opened.frames("/camera/samples", TRACKS)
-    assert told == [("sample", n + 1, 30) for n in range(30)]
-    assert (report.stages, report.frames) == (["sample"], {"/camera/samples": len(samples)})
-    assert report.rows == {"/camera/samples": sum(len(frame.rows) for frame in samples)}
-    assert report.tracks == {"/camera/samples": 2}
-    assert report.stale == []
-
-
 def test_re_tracked_people_are_carried_to_the_rate_of_the_tracks_they_come_from(tmp_path):
     tracks = walk(lambda n: {1: (n * 0.05, 0.0), 2: (n * 0.05, 6.0)}, 60, 10.0)
     ingested = Provenance(INGEST, {}, digest="x")
-    with log.read(written(tmp_path / "a.mcap", {"/camera/tracks": (TRACKS, ingested, tracks)})) as opened:
+    with log.read(write_channels(tmp_path / "a.mcap", {"/camera/tracks": (TRACKS, ingested, tracks)})) as opened:
         pipeline.run(opened, "/camera", pipeline.plan_all(opened, "/camera"))
     with log.read(tmp_path / "a.mcap") as opened:
         assert [f.t_ns for f in opened.frames("/camera/retracks/full", TRACKS)] == [f.t_ns for f in tracks]
@@ -372,34 +308,13 @@ def test_re_tracked_people_are_carried_to_the_rate_of_the_tracks_they_come_from(
         made = Provenance.from_metadata(opened.channel("/camera/samples").metadata)
     for how, is_known in ((made, True), (ingested, False)):  # samples that stand, and others of unknown tracks
         there = {"/camera/samples": (TRACKS, how, samples), "/camera/tracks": (TRACKS, ingested, tracks)}
-        with log.read(written(tmp_path / "b.mcap", there)) as opened:
+        with log.read(write_channels(tmp_path / "b.mcap", there)) as opened:
             pipeline.run(opened, "/camera", pipeline.plan_stage(opened, "/camera", "retrack", Retrack()))
         with log.read(tmp_path / "b.mcap") as opened:
             assert ("/camera/retracks/full" in opened.channels) is is_known
 
 
 # What is odd
-
-
-def test_what_was_odd_when_a_channel_was_made_is_said_for_what_runs_and_what_it_was_made_from(tmp_path):
-    odd = {
-        name: {"warnings": [("clock", f"odd {name}")]}
-        for name in ("detections", "tracks", "samples", "predictions", "retracks")
-    }
-    with log.read(written(tmp_path / "a.mcap", finished(**odd))) as opened:
-
-        def said(made: dict[str, Provenance], is_all: bool) -> list[tuple[str, str]]:
-            with notices.listening(lambda _: None), notices.collected() as heard:
-                run.warn_findings(opened, "/camera", made, (), is_all)
-            return [(one.message, one.code) for one in heard]
-
-        now = Provenance("predict", {}, "/camera/samples", warnings=[("strange", "odd now")])
-        chain = [("odd samples", "clock"), ("odd tracks", "clock"), ("odd detections", "clock")]
-        assert said({"/camera/predictions": now}, is_all=False) == [("odd now", "other"), *chain]
-        assert said({}, is_all=False) == []
-        every = [f"odd {name}" for name in sorted(odd)]
-        assert sorted(message for message, _ in said({}, is_all=True)) == every
-        assert next(message for message, _ in said({"/camera/predictions": now}, is_all=True)) == "odd now"
 
 
 GUESSED = (
@@ -414,11 +329,7 @@ GUESSED = (
 )
 def test_a_guessed_scale_is_said_of_what_is_in_metres(tmp_path, stage, assumed, is_said):
     plane = GroundPlane((0.05, 0, 0, 0, 0.05, 0, 0, 0, 1), 64, 48, assumed=assumed)
-    with (
-        log.read(written(tmp_path / "a.mcap", finished())) as opened,
-        notices.listening(lambda _: None),
-        notices.collected() as said,
-    ):
+    with log.read(write_channels(tmp_path / "a.mcap", finished())) as opened, notices.collected() as said:
         run.warn_findings(opened, "/camera", {"/camera/other": Provenance(stage, {})}, [(0, plane)], is_all=False)
     assert [(one.message, one.code) for one in said] == [(GUESSED, "assumed-ground-plane")] * is_said
 
@@ -434,27 +345,14 @@ def test_a_guessed_scale_is_said_of_what_is_in_metres(tmp_path, stage, assumed, 
     ],
 )
 def test_tracks_that_are_only_linked_or_passed_on_are_said(tmp_path, parameters, done):
-    path = written(tmp_path / "a.mcap", finished())
+    path = write_channels(tmp_path / "a.mcap", finished())
     words = (
         f"tracks were {done}: without a measured ground plane, more needs a camera that looks down, and this one looks "
         f"along the ground. To insist: `mcaptrack.retrack('{path}', side_view=True)`"
     )
-    with log.read(path) as opened, notices.listening(lambda _: None), notices.collected() as said:
+    with log.read(path) as opened, notices.collected() as said:
         run.warn_findings(opened, "/camera", {"/camera/x": Provenance("retrack", parameters)}, (), is_all=False)
     assert [(one.message, one.code) for one in said] == [(words, "held-back")] * bool(done)
-
-
-def test_little_memory_is_said_in_numbers(monkeypatch):
-    monkeypatch.setattr(run, "free_memory", lambda: 160_000_000)
-    with notices.listening(lambda _: None), notices.collected() as said:
-        run.warn_memory([Frame(n * 40_000_000, n, DETECTIONS.empty(10)) for n in range(50_000)])
-    assert [(one.message, one.code) for one in said] == [
-        (
-            "500,000 boxes, of people who are seen for 6 hours together, take about 0.5 GB of memory, and 0.2 GB are "
-            "free: re-tracking has all samples in memory",
-            "memory",
-        )
-    ]
 
 
 @pytest.mark.parametrize(
@@ -496,182 +394,10 @@ def forecast(*steps: int) -> list[Frame]:
     return frames
 
 
-def scored(*errors: float) -> list[Frame]:
-    rows = [FORECAST_SCORES.empty(1) for _ in errors]
-    for row, error in zip(rows, errors, strict=True):
-        row["ade_m"] = error
-    return [Frame(ns(n), n, row) for n, row in enumerate(rows)]
-
-
-def test_people_are_where_the_best_tracks_say(tmp_path):
-    """Re-tracked, tracked, true or sampled: the first that knows a place."""
-    names = ("retracks", "tracks", "truth", "samples")
-    channels = {f"/camera/{name}": (TRACKS, Provenance(INGEST, {}), at(float(n))) for n, name in enumerate(names)}
-    for number, name in enumerate(names):
-        with log.read(written(tmp_path / "a.mcap", channels)) as opened:
-            assert writing._positions(opened, "/camera", {})[:, 0].tolist() == pytest.approx(
-                [number, np.nan] * 2, nan_ok=True
-            )
-            shown = {"/camera/retracks": drawing.ChannelToDraw(TRACKS, at(9.0, 1), "", "")}
-            assert writing._positions(opened, "/camera", shown)[0].tolist() == [9.0, 0.0]
-        nowhere = [Frame(0, 0, tracks_at({1: (float("nan"), 1.0)}))] * (number % 2)
-        wrong = (DETECTIONS, Provenance(INGEST, {}), [Frame(0, 0, boxes_at([(1, 1)]))])
-        channels[f"/camera/{name}"] = (TRACKS, Provenance(INGEST, {}), nowhere) if number < 2 else wrong
-    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
-        assert writing._positions(opened, "/camera", {}).shape == (0, 2)
-
-
-def test_forecasts_of_re_tracked_people_come_first(tmp_path):
-    def known(of_retracks: list[Frame], of_samples: list[Frame]) -> int:
-        channels = {
-            "/camera/retracks/predictions": (PREDICTIONS, None, of_retracks),
-            "/camera/predictions": (PREDICTIONS, None, of_samples),
-        }
-        with log.read(written(tmp_path / "a.mcap", channels)) as opened:
-            return writing._last_step(opened, "/camera", {})
-
-    assert [known(forecast(1, 3, 2), forecast(1, 9)), known(forecast(), forecast(1, 9)), known([], [])] == [3, 9, 0]
-    nan = float("nan")
-    for first, second, is_known in (
-        ([nan, 1.0], [], True),
-        ([nan, nan], [nan, 2.0], True),
-        ([nan], [nan], False),
-        ([], [], False),
-    ):
-        channels = {
-            "/camera/retracks/predictions/scores": (FORECAST_SCORES, None, scored(*first)),
-            "/camera/predictions/scores": (FORECAST_SCORES, None, scored(*second)),
-        }
-        with log.read(written(tmp_path / "b.mcap", channels)) as opened:
-            assert writing._is_truth_known(opened, "/camera", {}) is is_known
-
-
-def test_a_camera_starts_with_its_first_picture_or_row(tmp_path):
-    ingested = Provenance(INGEST, {})
-    frames = [Frame(ns(n), n, tracks_at({1: (0.0, 0.0)})) for n in (5, 6)]
-    early = [Frame(ns(2), 0, tracks_at({1: (0.0, 0.0)}))]
-    path = written(
-        tmp_path / "a.mcap", {"/camera/tracks": (TRACKS, ingested, frames), "/other/tracks": (TRACKS, ingested, early)}
-    )
-    with log.read(path) as opened:
-        camera = pipeline.camera_at(opened, "/camera")
-        shown = {
-            "/camera/x": drawing.ChannelToDraw(TRACKS, early, "", ""),
-            "/camera/y": drawing.ChannelToDraw(TRACKS, [], "", ""),
-        }
-        none = np.empty(0, np.int64)
-        assert writing._start_ns(opened, camera, {}, none) == ns(5)
-        assert writing._start_ns(opened, camera, shown, none) == ns(2)
-        assert writing._start_ns(opened, camera, shown, np.array([ns(1), ns(9)])) == ns(1)
-    with log.read(written(tmp_path / "b.mcap", {})) as opened:
-        assert writing._start_ns(opened, camera, {}, none) == 0
-
-
-def test_what_was_ingested_is_drawn_once_and_again_when_it_is_new(tmp_path):
-    ingested = Provenance(INGEST, {}, digest="x")
-    for suffix, schema, frames in (
-        ("scene", TRACKS, at(0.0)),
-        ("image", DETECTIONS, [Frame(0, 0, boxes_at([(1, 1)]))]),
-    ):
-        other = "image" if suffix == "scene" else "scene"
-        for view, drawn_from, is_shown in (
-            (suffix, "x", False),
-            (suffix, "y", True),
-            (other, "x", True),
-            ("", "", True),
-        ):
-            channels = {
-                "/camera/labels": (schema, ingested, frames),
-                "/camera/made": (schema, replace(ingested, transform="track"), frames),
-                "/camera/recorded": (schema, None, frames),
-                "/other/labels": (schema, ingested, frames),
-                "/camera/scores": (FORECAST_SCORES, ingested, scored(1.0)),
-            }  # fmt: skip
-            if view:
-                channels[f"/camera/labels/view/{view}"] = (
-                    TRACKS,
-                    Provenance(VIEW, {}, "/camera/labels", drawn_from),
-                    [],
-                )
-            with log.read(written(tmp_path / "a.mcap", channels)) as opened:
-                shown = writing._channels_to_draw(opened, pipeline.camera_at(opened, "/camera"), {})
-            assert list(shown) == ["/camera/labels"] * is_shown
-            for one in shown.values():
-                assert (one.schema, one.digest, one.made_by, len(one.frames)) == (schema, "x", "", len(frames))
-
-
-def views_of(
-    names: Mapping[str, tuple[Schema, str]], pictures: Sequence[int] = ()
-) -> list[tuple[str, str, str, str, list[int]]]:
-    """Topic, schema, source, group and times of each view."""
-    ns_ = np.array(pictures, np.int64)
-    frames = {
-        TRACKS: at(1.0),
-        DETECTIONS: [Frame(0, 0, boxes_at([(9, 9)]))],
-        PREDICTIONS: forecast(1, 2),
-        GROUND_PLANE: [plane_at(0)],
-        FORECAST_SCORES: scored(1.0),
-    }
-    shown = {
-        f"/camera/{name}": drawing.ChannelToDraw(schema, frames[schema], f"of {name}", made_by)
-        for name, (schema, made_by) in names.items()
-    }
-    drawn = drawing.ViewFactory("/camera", ns_, ns_, [(0, PLANE)])
-    found = [*drawn.views(shown, 3), *drawn.views(shown, 3)]
-    kinds = {"foxglove.ImageAnnotations": "image", "foxglove.SceneUpdate": "scene", "foxglove.FrameTransform": "frame"}
-    twice = [view.topic for view in found].count("/camera/view/tf")
-    assert twice <= 1  # the frame is named once
-    found = found[: (len(found) + twice) // 2]
-    assert all(
-        view.provenance.transform == VIEW and view.provenance.input_digest == f"of {view.provenance.input[8:]}"
-        for view in found
-    )
-    return [
-        (view.topic[8:], kinds[view.schema_name], view.provenance.input[8:], view.group, [t for t, *_ in view.messages])
-        for view in found
-    ]
-
-
-def test_each_channel_has_its_views(tmp_path):
-    own, seen = [0, ns(1)], [7, 8, 9]
-    tf = ("view/tf", "frame", "tracks", "", [3])
-    assert views_of({"tracks": (TRACKS, "track")}) == [("tracks/view/scene", "scene", "tracks", "track", own), tf]
-    assert views_of({"tracks": (TRACKS, "track")}, seen) == [
-        ("tracks/view/image", "image", "tracks", "track", seen),
-        ("tracks/view/scene", "scene", "tracks", "track", seen),
-        tf,
-    ]
-    assert views_of({"detections": (DETECTIONS, "detect")}) == []
-    assert views_of({"detections": (DETECTIONS, "detect")}, seen) == [
-        ("detections/view/image", "image", "detections", "detect", seen)
-    ]
-    assert [one[:4] for one in views_of({"predictions": (PREDICTIONS, "predict")}, seen)] == [
-        ("predictions/view/image", "image", "predictions", "predict"),
-        ("predictions/view/scene", "scene", "predictions", "predict"),
-        ("view/tf", "frame", "predictions", ""),
-    ]
-    assert views_of({"ground_plane": (GROUND_PLANE, "")}) == [
-        ("ground_plane/view/scene", "scene", "ground_plane", "", [3]),
-        ("view/tf", "frame", "ground_plane", "", [3]),
-    ]
-    assert views_of({"scores": (FORECAST_SCORES, "events")}, seen) == []
-    names = {
-        "samples": (TRACKS, "sample"),
-        "retracks": (TRACKS, "retrack"),
-        "retracks/online": (TRACKS, "retrack"),
-        "retracks/full": (TRACKS, "retrack"),
-    }
-    assert [one[0] for one in views_of(names, seen)] == [
-        "retracks/full/view/image",
-        "retracks/full/view/scene",
-        "view/tf",
-    ]
-
-
 def test_a_view_that_others_recorded_stays_and_that_is_said(tmp_path):
     ingested = Provenance(INGEST, {}, digest="x")
     channels = {"/camera/truth": (TRACKS, ingested, at(1.0)), "/camera/truth/view/scene": (TRACKS, None, at(2.0))}
-    path = written(tmp_path / "a.mcap", channels)
+    path = write_channels(tmp_path / "a.mcap", channels)
     with log.read(path) as opened:
         before = [message.payload for message in opened.messages("/camera/truth/view/scene")]
         report = pipeline.run(opened, "/camera", [], tmp_path / "b.mcap")
@@ -714,18 +440,8 @@ def test_views_are_found_by_what_is_best_or_by_name(tmp_path):
     names += ["camera/tracks/view/scene"]
     with pytest.raises(McaptrackError, match="views on /camera/video, scenes can't be drawn in one video; name those"):
         found(names, "/camera/tracks", "/camera/tracks/view/scene")
-    with log.read(written(path, {f"/{name}": (TRACKS, None, []) for name in names})) as opened:
+    with log.read(write_channels(path, {f"/{name}": (TRACKS, None, []) for name in names})) as opened:
         assert pipeline.find_views(opened, "/camera") == (["/camera/tracks/view/scene"], "")
-
-
-def test_a_digest_is_of_the_messages_whether_or_not_it_was_kept(tmp_path):
-    made = writing.Made.of(TRACKS, at(1.0), Provenance(INGEST, {}))
-    channels = {"/a": (TRACKS, made.provenance, at(2.0)), "/b": (TRACKS, None, at(1.0))}
-    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
-        assert writing.digest_of(opened, "/a") == writing.digest_of(opened, "/b") == made.provenance.digest
-    wanted = digest((frame.t_ns, frame.index, TRACKS.codec.encode(frame.rows)) for frame in at(1.0))
-    assert (made.provenance.digest, made.size()) == (wanted, 2)
-    assert made._replace(encoded=[(1, 2, b"x")]).size() == 1
 
 
 # What a log holds, in numbers
@@ -733,7 +449,7 @@ def test_a_digest_is_of_the_messages_whether_or_not_it_was_kept(tmp_path):
 
 def test_forecasts_and_planes_are_counted(tmp_path):
     def summary(channels: Channels) -> pipeline.Summary:
-        with log.read(written(tmp_path / "a.mcap", channels)) as opened:
+        with log.read(write_channels(tmp_path / "a.mcap", channels)) as opened:
             return pipeline.summarise(opened, "/camera")
 
     ingested = Provenance(INGEST, {})
@@ -751,78 +467,10 @@ def test_forecasts_and_planes_are_counted(tmp_path):
         assert summary({"/camera/ground_plane": (GROUND_PLANE, ingested, planes)}).ground_plane == word
 
 
-def test_boxes_are_those_that_tracks_were_made_from(tmp_path):
-    boxes = [Frame(ns(n), n, boxes_at([(5, 5), (9, 9)])) for n in range(3)]
-    channels = {
-        "/camera/detections": (DETECTIONS, Provenance(INGEST, {}), boxes),
-        "/camera/other": (DETECTIONS, Provenance(INGEST, {}), boxes[:1]),
-    }
-    for source, count in (("/camera/detections", 6), ("/camera/other", 2), ("/camera/gone", 6), (None, 6)):
-        tracks = {"/camera/tracks": (TRACKS, Provenance("track", {}, source), at(1.0))} if source else {}
-        with log.read(written(tmp_path / "a.mcap", channels | tracks)) as opened:
-            assert pipeline.summarise(opened, "/camera").boxes == count
-
-
-def test_a_loss_by_re_tracking_is_said_with_its_scores(tmp_path):
-    truth = walk(lambda n: {1: (n * 0.4, 0.0), 2: (n * 0.4, 5.0)}, 10)
-    swapped = walk(lambda n: {1 + n // 5: (n * 0.4, 0.0), 2 - n // 5: (n * 0.4, 5.0)}, 10)
-    channels = {
-        f"/camera/{name}": (TRACKS, Provenance(how, {}), frames)
-        for name, how, frames in (
-            ("truth", INGEST, truth),
-            ("samples", "sample", truth),
-            ("retracks", "retrack", swapped),
-        )
-    }
-    with (
-        log.read(written(tmp_path / "a.mcap", channels)) as opened,
-        notices.listening(lambda _: None),
-        notices.collected() as said,
-    ):
-        scores = pipeline.summarise(opened, "/camera").scores
-    assert scores is not None
-    assert scores.by == "within 1 m"
-    words = "re-tracking made it worse: IDF1 100.0% before, 50.0% after, against /camera/truth, within 1 m"
-    assert [(one.message, one.code) for one in said] == [(words, "worse")]
-
-
-def test_an_error_of_a_stage_names_log_and_channel_once(tmp_path, monkeypatch):
-    frames = walk(lambda n: {1: (n * 0.1, 0.0)}, 5, 10.0)
-    path = written(tmp_path / "a.mcap", {"/camera/tracks": (TRACKS, Provenance(INGEST, {}, digest="x"), frames)})
-    for words, shown in (("no", f"{path}: /camera/tracks: no"), (f"{path} is odd", f"{path} is odd")):
-
-        def fail(*_, words=words):
-            raise McaptrackError(words)
-
-        monkeypatch.setattr(Sample, "__call__", fail)
-        with log.read(path) as opened, pytest.raises(McaptrackError) as error:
-            pipeline.run(opened, "/camera", pipeline.plan_stage(opened, "/camera", "sample", Sample()))
-        assert str(error.value) == shown
-
-
 @pytest.mark.parametrize(("frame_id", "is_said"), [("map", True), ("", False)])
 def test_a_frame_without_boxes_in_space_has_no_effect(tmp_path, frame_id, is_said):
     channels = {"/camera/tracks": (TRACKS, Provenance(INGEST, {}), paced(2.5))}
-    with log.read(written(tmp_path / "a.mcap", channels)) as opened, notices.collected() as said:
+    with log.read(write_channels(tmp_path / "a.mcap", channels)) as opened, notices.collected() as said:
         check_spaces(opened, "/camera", [], frame_id)
     wanted = "`frame=` has no effect: only recorded 3D boxes are brought to a frame"
     assert [(one.code, one.message) for one in said] == ([("option-not-used", wanted)] if is_said else [])
-
-
-@pytest.mark.parametrize(
-    ("stage", "transform", "source", "is_ingest_proposed"),
-    [
-        ("detect", KnnDetector(), "/camera/video", True),
-        ("detect", KnnDetector(), "/door/video", False),
-        ("sample", Sample(), "/camera/none", False),
-    ],
-)
-def test_a_missing_input_is_named_with_what_there_is_and_what_helps(
-    tmp_path, stage, transform, source, is_ingest_proposed
-):
-    channels = {"/camera/tracks": (TRACKS, Provenance(INGEST, {}), paced(2.5))}
-    with log.read(written(tmp_path / "a.mcap", channels)) as opened:
-        words = _lacks(opened, "/camera", pipeline.Job(stage, transform, source, "/camera/x"))
-    assert words.startswith(f"{tmp_path / 'a.mcap'} has no channel {source} for {stage}; it has /camera/tracks. ")
-    assert ("add pictures with" in words) is is_ingest_proposed
-    assert words.endswith("shows more") is not is_ingest_proposed

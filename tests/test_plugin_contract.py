@@ -28,53 +28,21 @@ from mcaptrack.testing import LawError, check_predictor, check_transform, sample
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.stages import FULL, RESERVED
 from tests.commands import call, done, made_log
+from tests.test_plugins import MODULE
+from tests.tiers import one_in
 
-KINDS = """
-from dataclasses import dataclass
-from typing import ClassVar
-
-import numpy as np
-
-from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO
-
-
-@dataclass(frozen=True, kw_only=True)
-class Corner:
-    reads: ClassVar = VIDEO
-    writes: ClassVar = {"": DETECTIONS}
-    latency_s: ClassVar = {"": 0.0}
-
-    def __call__(self, frames):
-        for frame in frames:
-            x = [20.0 + frame.index]
-            rows = DETECTIONS.rows(x_px=x, y_px=x, w_px=[8], h_px=[8], class_id=[1])
-            yield (frame._replace(rows=rows),) * len(self.writes)
-
-
+KINDS = (
+    MODULE
+    + """
 class CornerAndMore(Corner):
     writes: ClassVar = {"": DETECTIONS, "debug": DETECTIONS}
 
 
-@dataclass(frozen=True, kw_only=True)
-class First:
-    reads: ClassVar = DETECTIONS
-    writes: ClassVar = {"": TRACKS}
-    latency_s: ClassVar = {"": 0.0}
-
-    def __call__(self, frames):
-        for frame in frames:
-            box = frame.rows[:1]
-            place = {name: box[name] for name in ("x_px", "y_px", "w_px", "h_px")}
-            n = len(box)
-            rows = TRACKS.rows(track_id=[1] * n, observed=[True] * n, source_id=[-1] * n, **place)
-            yield (frame._replace(rows=rows),) * len(self.writes)
-
-
-class FirstAndMore(First):
+class SingleAndMore(Single):
     writes: ClassVar = {"": TRACKS, "debug": TRACKS}
 
 
-class Nothing(First):
+class Nothing(Single):
     def __call__(self, frames):
         for frame in frames:
             yield (frame._replace(rows=TRACKS.empty()),)
@@ -101,15 +69,8 @@ class Full(Same):
 
 class Wrong(Same):
     writes: ClassVar = {"": TRACKS, "online": DETECTIONS}
-
-
-class Standing:
-    def __init__(self, steps, step_s):
-        self.steps, self.step_s, self.past = steps, step_s, 1
-
-    def predict(self, xy_m, valid):
-        return np.repeat(xy_m[:, -1:], self.steps, axis=1), np.tile(np.eye(2), (len(xy_m), self.steps, 1, 1))
 """
+)
 COMMANDS = {
     "detector": ("detect", "detections", "median"),
     "tracker": ("track", "tracks", "sort"),
@@ -147,18 +108,20 @@ def is_current() -> bool:
     return not found["results"][0]["stages"] and "out of date" not in done("info", "a.mcap").out
 
 
-@pytest.mark.parametrize("begin", ["fresh", "full"])
-@pytest.mark.parametrize(
-    ("kind", "name"),
-    [
-        ("detector", "CornerAndMore"),
-        ("tracker", "FirstAndMore"),
-        ("tracker", "Nothing"),
-        ("retracker", "Same"),
-        ("retracker", "SameAndMore"),
-        ("predictor", "Standing"),
-    ],
-)
+#: What a class replaces: nothing, or results of the built-in one; by default in turns.
+REPLACED = [
+    (begin, *one)
+    for number, one in enumerate(
+        [
+            *(("detector", "CornerAndMore"), ("tracker", "SingleAndMore"), ("tracker", "Nothing")),
+            *(("retracker", "Same"), ("retracker", "SameAndMore"), ("predictor", "Standing")),
+        ]
+    )
+    for begin in (("fresh", "full"), ("full", "fresh"))[number % 2]
+]
+
+
+@pytest.mark.parametrize(("begin", "kind", "name"), one_in(2, REPLACED))
 def test_outputs_may_be_missing_or_more_and_go_with_their_class(logs, place, begin, kind, name):
     """Each command takes the log, a second run has nothing to do, and the built-in class gives the usual log again."""
     command, main, built_in = COMMANDS[kind]

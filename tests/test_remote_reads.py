@@ -86,14 +86,6 @@ def test_reads_that_follow_one_another_grow_and_others_do_not(monkeypatch):
     assert len(store.asked) == 5
 
 
-def test_reads_ahead_have_a_limit(monkeypatch):
-    monkeypatch.setattr(remote, "_MAX_AHEAD", 48 * KIB)
-    file, store = opened(monkeypatch)
-    for at in (0, 16, 48, 96):
-        reads(file, at * KIB, 1)
-    assert [(high - low) // KIB for ((low, high),) in store.asked] == [16, 32, 48, 48]
-
-
 def test_announced_ranges_come_in_one_request_and_near_ones_as_one(monkeypatch):
     file, store = opened(monkeypatch)
     # The third begins where the second ends with its margin and the gap, the fourth a byte further.
@@ -115,18 +107,6 @@ def test_announced_ranges_come_in_one_request_and_near_ones_as_one(monkeypatch):
     file.expect([])
     reads(file, 90 * KIB, 1)
     assert store.asked[3:] == [[(90 * KIB, 106 * KIB)]]
-
-
-def test_a_range_is_read_from_its_start_or_from_what_is_there(monkeypatch):
-    file, store = opened(monkeypatch)
-    file.expect([(64 * KIB, 512 * KIB)])
-    reads(file, 60 * KIB, 8 * KIB)
-    assert store.asked.pop() == [(60 * KIB, 76 * KIB)]
-    reads(file, 200 * KIB, 600 * KIB)
-    assert store.asked.pop() == [(76 * KIB, 800 * KIB)]
-    file.expect([(900 * KIB, 1200 * KIB), (3000 * KIB, 3001 * KIB)], 0)
-    reads(file, 1000 * KIB, 400 * KIB)  # beyond the end of what was announced
-    assert store.asked.pop() == [(900 * KIB, 1400 * KIB), (3000 * KIB, 3001 * KIB + MARGIN)]
 
 
 def test_announced_ranges_are_read_up_to_a_limit(monkeypatch):

@@ -17,11 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.pipeline import find_views
 from mcaptrack.sources.video import write_clip
-from mcaptrack.sources.video.decode import EncodedPicture, decode_bgr
-from mcaptrack.sources.video.encode import encode_image
-from mcaptrack.sources.video.raw_pixels import PixelLayout
 from mcaptrack.viewing import from_above
 from mcaptrack.viewing.from_above import Sight
 from mcaptrack.viewing.rendering import draw
@@ -81,13 +77,6 @@ def test_lines_fade_as_their_points_say():
     assert abs(image[50, 85] - (0.8 * wanted + 0.2 * 100)).max() <= 2
 
 
-def test_what_is_drawn_is_scaled_with_the_picture():
-    large, small = np.zeros((200, 400, 3), np.uint8), np.zeros((100, 200, 3), np.uint8)
-    both = draw(large, annotations([[40, 60, 120, 80]])), draw(small, annotations([[40, 60, 120, 80]]), 0.5)
-    spans = [[np.flatnonzero(image.any(axis=2).any(axis=axis))[[0, -1]] for axis in (0, 1)] for image in both]
-    assert abs(np.array(spans[0]) / 2 - np.array(spans[1])).max() <= 2
-
-
 def test_lines_of_a_list_are_drawn_one_by_one_and_leave_gaps():
     message = ImageAnnotations()
     part = message.points.add(type=4, thickness=2)
@@ -125,22 +114,6 @@ def test_a_clip_keeps_the_times_and_colours_of_its_pictures(tmp_path, suffix):
     assert [t for t, _ in found] == pytest.approx([0, 0.1, 0.3, 0.4], abs=0.011)
     for (_, image), shade in zip(found, shades, strict=True):
         assert abs(image.astype(int).mean(axis=(0, 1)) - shade).max() < 8
-
-
-def test_pictures_of_every_kind_are_read_in_colour():
-    image = np.zeros((16, 16, 3), np.uint8)
-    image[:, :8], image[:, 8:] = (250, 20, 20), (20, 20, 250)
-    rgb = image[:, :, ::-1].tobytes()
-    grey = np.full((16, 16), 77, np.uint8)
-    pictures = [
-        EncodedPicture(0, 0, "png", encode_image(image, "png")),
-        EncodedPicture(1, 1, "bgr8", image.tobytes(), PixelLayout(16, 16)),
-        EncodedPicture(2, 2, "rgb8", rgb, PixelLayout(16, 16)),
-        EncodedPicture(3, 3, "mono8", grey.tobytes(), PixelLayout(16, 16)),
-    ]
-    found = [frame.rows for frame in decode_bgr(pictures)]
-    assert all(np.array_equal(rows, image) for rows in found[:3])
-    assert np.array_equal(found[3], np.repeat(grey[..., None], 3, axis=2))
 
 
 def test_a_log_becomes_a_video_of_its_pictures(finished, tmp_path):
@@ -239,13 +212,6 @@ def test_nothing_is_left_of_a_clip_that_fails(tmp_path):
         with pytest.raises(McaptrackError, match="half way"):
             write_clip(tmp_path / f"a{suffix}", broken(), Fraction(10))
     assert not list(tmp_path.iterdir())
-
-
-def test_re_tracked_people_are_drawn_at_the_rate_of_the_video(finished):
-    with log.read(finished) as opened:
-        assert find_views(opened, "/camera", ["/camera/retracks"]).views == ["/camera/retracks/full/view/image"]
-        with pytest.raises(McaptrackError, match="has no channel /camera/unknown/view/image"):
-            find_views(opened, "/camera", ["/camera/unknown"])
 
 
 def test_a_log_with_pictures_that_cannot_be_decoded_is_processed_and_drawn_without_them(tmp_path):

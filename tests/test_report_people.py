@@ -5,9 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
-from dataclasses import replace
 from html import escape, unescape
-from importlib import import_module
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 from urllib.request import urlopen
@@ -24,9 +22,7 @@ from mcaptrack.evaluation.people import LEAST_PEOPLE, PersonScores, intervals, p
 from mcaptrack.schema import Frame
 from mcaptrack.viewing.links import is_about, with_links
 from mcaptrack.viewing.report import LogReport, gather, page
-from mcaptrack.viewing.report import _comparison as comparison
 from mcaptrack.viewing.report.charts import Line
-from mcaptrack.viewing.report.contents import TrackSet
 from mcaptrack.viewing.report.doubts import find_doubts
 from mcaptrack.viewing.report.identity_events import summarize_events
 from mcaptrack.viewing.report.identity_timeline import counts_over_time, identity_timeline, mean_numbers, pieces
@@ -129,18 +125,6 @@ def test_the_page_has_one_number_of_switches_for_each_kind_of_tracks(told, text)
     assert all(len(one.events) == count for one, count in zip(told.channel_events, values, strict=True))
 
 
-def test_with_samples_the_headline_and_the_events_are_at_the_prediction_rate(finished):
-    with log.read(finished) as opened:
-        report = gather(opened, None)
-    assert report.compared_roles == ("samples", "offline")
-    assert [one.topic for one in report.channel_events] == ["/camera/samples", "/camera/retracks"]
-    assert [len(one.events) for one in report.channel_events] == report.headline.values("IDSW")
-    shown = page([report])
-    first_table = shown.partition("<h2>Scores</h2>")[2].partition("</table>")[0]
-    assert "/camera/samples" in first_table
-    assert "/camera/tracks<" not in first_table
-
-
 # Identities over time
 
 
@@ -165,33 +149,6 @@ def test_each_person_has_a_lane_for_the_tracker_above_one_for_the_re_tracked(tol
         [("1", "0.0", "16.0"), ("3", "16.0", "24.0")],
     ]
     assert found["90"][1:] == [[("90", "0.0", "24.0")]] * 2
-
-
-def test_without_ground_truth_bars_are_re_tracked_tracks_with_the_ids_of_the_tracker(told):
-    report = LogReport("a.mcap", "a", "/camera", told.start_ns, told.end_ns)
-    tracks = told.track_sets["offline"]
-    report.track_sets["offline"] = TrackSet(tracks.topic, "offline", "re-tracked", tracks.frames)
-    found = bars(identity_timeline(report))
-    assert found["1"] == [[("1", "0.0", "8.0"), ("2", "8.0", "16.0")]]
-    assert found["3"] == [[("3", "16.0", "24.0")]]
-    # interpolated rows have no id of the tracker, which is no change of identity
-    report.track_sets["offline"].frames = without_sources(tracks.frames, {0, 1, 7, 8, 9})
-    found = bars(identity_timeline(report))
-    assert [[(one, last) for one, _, last in lane] for lane in found["1"]] == [[("1", "8.8"), ("2", "16.0")]]
-    assert found["3"] == [[("3", "16.0", "24.0")]]
-    report.track_sets["offline"].frames = without_sources(tracks.frames, set(range(20)))
-    assert bars(identity_timeline(report))["1"] == [[("1", "0.0", "16.0")]]
-
-
-def without_sources(frames: list[Frame], ticks: set[int]) -> list[Frame]:
-    """Frames without ids of the tracker at these ticks of every twenty."""
-    out = []
-    for frame in frames:
-        rows = frame.rows.copy()
-        if frame.index % 20 in ticks:
-            rows["source_id"] = -1
-        out.append(Frame(frame.t_ns, frame.index, rows))
-    return out
 
 
 @given(st.lists(st.integers(0, 2), max_size=40), st.lists(st.integers(1, 4), min_size=40, max_size=40))
@@ -232,26 +189,6 @@ def test_mean_numbers_are_of_the_time_that_both_have(first, last, words):
     tracker = Line("tracker", "tracks", np.arange(10.0), np.repeat([0.0, 8.0], 5))
     truth = Line("ground truth", "truth", np.arange(first, last + 1.0), np.full(last + 1 - first, 8.0))
     assert mean_numbers([tracker, truth], "seconds") == words
-
-
-def test_all_logs_together_have_the_people_of_all(told):
-    rows = comparison([told, replace(told, file="other.mcap")])["rows"]
-    assert [row["cells"][1] for row in rows] == ["unknown: 2 people", "unknown: 2 people", "unknown: 4 people"]
-    assert [row["cells"][2] for row in rows] == ["2 → 1", "2 → 1", "4 → 2"]
-
-
-def test_those_who_stay_longest_have_a_bar(told, monkeypatch):
-    """Person 50 leaves half way; there is room for one."""
-    monkeypatch.setattr(import_module("mcaptrack.viewing.report.identity_timeline"), "_MOST", 1)
-    truth = told.track_sets["truth"]
-    half = truth.frames[len(truth.frames) // 2].t_ns
-    kept = [
-        Frame(one.t_ns, one.index, one.rows[(one.rows["track_id"] != 50) | (one.t_ns < half)]) for one in truth.frames
-    ]
-    sets = told.track_sets | {"truth": TrackSet(truth.topic, truth.role, truth.name, kept)}
-    found = identity_timeline(replace(told, track_sets=sets))
-    assert [int(row["name"]) for row in found["rows"]] == [90]
-    assert found["left_out"] == 1
 
 
 # Maps and doubts
@@ -308,19 +245,6 @@ def test_the_farthest_repair_is_the_first_whenever_it_happened():
     told = summarize_events("/a", found.events, None, both, None, (0, ns(16)))
     doubts = find_doubts(told, both, None)
     assert [(int(one.event.row["track_id"]), round(one.away_m, 1)) for one in doubts] == [(8, 2.5), (7, 1.5)]
-
-
-def test_every_row_of_a_table_hides_the_same_columns_on_a_phone(text):
-    tables = re.findall(r"<table>(.*?)</table>", text, re.DOTALL)
-    assert len(tables) >= 3
-    for table in tables:
-        head, *rows = re.findall(r"<tr>(.*?)</tr>", table, re.DOTALL)
-        wanted = ["opt" in one for one in re.findall(r"<th\b([^>]*)>", head)]
-        for row in rows:
-            cells = re.findall(r"<t[hd]\b([^>]*)>", row)
-            if "colspan" not in cells[0]:
-                assert ["opt" in one for one in cells] == wanted, row
-    assert sum('class="opt"' in one for one in tables) >= 2
 
 
 # Links

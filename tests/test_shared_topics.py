@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import json
 from pathlib import Path
 
 import pytest
@@ -15,7 +13,6 @@ from mcap.writer import Writer
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import TRACKS, Frame
-from tests.commands import printed
 from tests.worlds import tracks_at
 
 #: Definitions that decode alike, and one that doesn't.
@@ -103,53 +100,3 @@ def test_rows_of_several_channels_come_by_time(tmp_path):
     in_order = sorted(frames, key=lambda frame: frame.t_ns)
     encode = TRACKS.codec.encode
     assert [encode(frame.rows) for frame in found] == [encode(frame.rows) for frame in in_order]
-
-
-def test_a_change_in_any_of_the_channels_is_another_fingerprint(tmp_path):
-    prints = set()
-    for number, times in enumerate([[1], [2]]):
-        path = tmp_path / f"{number}.mcap"
-        write(path, [("/tf", ALIKE[0], "ros1", [5]), ("/tf", ALIKE[0], "ros1", times)], chunk_size=1)
-        with log.read(path) as opened:
-            prints.add(opened.fingerprint("/tf"))
-    assert len(prints) == 2
-
-
-def test_counts_add_up_to_the_statistics(tmp_path):
-    """Those of `info`, in words and as data, also where results beside the log replace channels of it."""
-    path = tmp_path / "a.mcap"
-    write(path, [("/tf", ALIKE[0], "ros1", [1, 2]), ("/talk", OTHER, "ros1", [3]), ("/tf", OTHER, "cdr", [4, 5, 6])])
-    with log.read(path, sidecar=True) as opened, log.extend(opened) as writer:
-        channel = writer.add_channel("/talk", ("", "", b""), "json", {})
-        for t_ns in range(7, 11):
-            writer.add_message(channel, t_ns, 0, b"{}")
-    parts = {"log": path, "results": tmp_path / "a.results.mcap"}
-    total = sum(stock(part)[0] for part in parts.values())
-    data = json.loads(printed("info", path, "--json")[0])["results"][0]
-    assert data["messages"] == sum(channel["messages"] for channel in data["channels"]) == total == 10
-    said = [(channel["part"], channel["topic"], channel["messages"]) for channel in data["channels"]]
-    assert sorted(said) == sorted((name, *channel) for name, part in parts.items() for channel in stock(part)[1])
-    assert [(c["part"], c["topic"]) for c in data["channels"] if c["replaced"]] == [("log", "/talk")]
-    out, _ = printed("info", path)
-    rows = [line.split() for line in out.splitlines() if line.startswith(("/tf", "/talk"))]
-    counts = [(row[0], int(row[-2] if "." in row[-1] else row[-1])) for row in rows]  # some have a rate behind
-    assert sorted(counts) == sorted(channel[1:] for channel in said)
-    assert "/talk  (replaced by the results)" in out
-
-
-def test_a_table_of_a_topic_has_the_messages_of_all_its_channels(tmp_path):
-    path = tmp_path / "a.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        channels = [writer.register_channel("/pose", "json", 0, {"who": str(number)}) for number in range(3)]
-        for t_ns in range(12):
-            writer.add_message(channels[t_ns % 3], t_ns, b'{"x": %d}' % t_ns, t_ns)
-        writer.finish()
-    printed("export", path, "--topic", "/pose", "--format", "csv", "-o", tmp_path / "tables")
-    (table,) = (tmp_path / "tables" / "topics").rglob("*.csv")
-    assert [row["x"] for row in csv.DictReader(table.read_text().splitlines())] == [str(number) for number in range(12)]
-    (table,) = (tmp_path / "tables" / "channels").rglob("*.csv")
-    assert [(row["topic"], row["messages"]) for row in csv.DictReader(table.read_text().splitlines())] == [
-        ("/pose", "12")
-    ]

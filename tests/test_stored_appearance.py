@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +13,12 @@ import pytest
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.colour_histograms import LENGTH
 from mcaptrack.notices import collected
 from mcaptrack.pipeline.pictures import with_descriptors
 from mcaptrack.schema import APPEARANCE, TRACKS
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.transforms import Retrack
-from mcaptrack.transforms.retrack.appearance import Descriptors
 from tests.commands import call, done
-from tests.test_following import CUTS, FRAMES, part
 
 TOPIC = "/camera/retracks/appearance"
 
@@ -130,29 +125,3 @@ def test_pictures_of_which_many_in_a_row_are_damaged_are_not_tried_to_the_end(th
         assert with_descriptors(Retrack(), opened, "/camera", samples).descriptors is None
     assert len(tried) == 3
     assert [one.code for one in warnings] == ["option-not-used"]
-
-
-def seen_everywhere(transform, opened, prefix, frames, *_):
-    """A re-tracker that sees all observed samples well, each in the same colours."""
-    if not getattr(transform, "store_appearance", False):
-        return transform
-    seen = [(frame.t_ns, one) for frame in frames for one in np.sort(frame.rows["track_id"][frame.rows["observed"]])]
-    t_ns, ids = np.array(seen, np.int64).T
-    nothing = np.zeros(len(seen), bool)
-    return replace(
-        transform, descriptors=Descriptors(t_ns, ids, np.full((len(ids), LENGTH), 9, np.uint8), ~nothing, nothing)
-    )
-
-
-def test_stored_colours_have_the_ids_and_classes_of_tracks_that_go_on_from_another_log(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys.modules["mcaptrack.pipeline.run"], "with_descriptors", seen_everywhere)
-    ends = (*CUTS[1:], FRAMES)
-    paths = [part(tmp_path / f"{n}.mcap", *span) for n, span in enumerate(zip(CUTS, ends, strict=True))][:2]
-    for path in paths:
-        mcaptrack.run(path, follows=paths, tables=False, stages={"retrack": Retrack(store_appearance=True)})
-        with mcaptrack.open(path) as opened:
-            rows, tracks = opened.table("appearances"), opened.table("tracks").to_pandas()
-        assert set(rows["class"].to_pylist()) == {"person"}
-        there = set(tracks[tracks["topic"] == "/camera/retracks"]["track_id"])
-        assert set(rows["track_id"].to_pylist()) == there
-    assert max(there) > len(there)  # ids go on

@@ -159,11 +159,6 @@ class TestDetections:
         frame = mcaptrack.detections(np.ones((1, 4), np.float16), None, np.ones(1, np.float32), time, box_format="xywh")
         assert (frame.t_ns, frame.rows["class_id"].tolist()) == (1_700_000_000_000_000_001, [1])
 
-    def test_masked_scores_are_missing_and_a_mask_of_nothing_changes_nothing(self):
-        boxes, scores = np.ma.masked_equal([[1, 2, 3, 4], [5, 6, 7, 8]], 0), np.ma.masked_greater([0.5, 0.9], 0.8)
-        rows = mcaptrack.detections(boxes, scores, box_format="xywh").rows
-        assert (rows["x_px"].tolist(), rows["score"][0], np.isnan(rows["score"][1])) == ([1, 5], 0.5, True)
-
 
 class TestWriting:
     def test_own_detections_are_tracked_as_any_others(self, tmp_path):
@@ -211,6 +206,13 @@ class TestWriting:
             assert np.isnan(first.confidence).all()
             if hasattr(made, "merge"):
                 assert len(made.merge([found for _, found in opened.supervision("tracks")])) == 4
+
+    def test_tracks_without_boxes_have_none_in_supervision(self, tmp_path, made):
+        rows = np.array([(0, 1, 2.0, 3.0)], [("t_ns", int), ("track_id", int), ("x_m", float), ("y_m", float)])
+        with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
+            opened.write("/own/tracks", rows)
+            ((t_ns, found),) = opened.supervision("/own/tracks")
+        assert (t_ns, len(found.xyxy)) == (0, 0)
 
     def test_unconfirmed_tracks_are_left_out_with_a_warning(self, tmp_path, made):
         with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
@@ -268,14 +270,8 @@ class TestWriting:
             (table(t_ns=[5, 5], track_id=[1, 1]), "in row 1 track_id 1 stands in 2 rows of one frame"),
             (table(track_id=[1, -1]), "at 5 ns: in row 0 track_id is -1; ids are"),
             (table(track_id=[1, 2], x_m=[1, 2]), "in row 0 there is only a part of x_m, y_m"),
-            (
-                table(track_id=[1, 2], w_px=[1, np.nan]),
-                "at 5 ns: in row 0 there is only a part of x_px, y_px, w_px, h_px",
-            ),
-            (
-                table(track_id=[1, 2], **dict.fromkeys(("y_px", "w_px", "h_px"), [np.nan] * 2)),
-                "in row 0 there is only a part of x_px",
-            ),
+            (table(track_id=[1, 2], w_px=[1, np.nan]), "at 5 ns: in row 0 there is only a part of x_px, y_px, w_px, h_px"),
+            (table(track_id=[1, 2], **dict.fromkeys(("y_px", "w_px", "h_px"), [np.nan] * 2)), "in row 0 there is only a part of x_px"),
             (np.array([(0, 1)], [("t_ns", int), ("track_id", int)]), "in row 0 there is neither a box nor a position"),
         ],
         **dict.fromkeys(("/camera/", "/camera//detections", "/camera/\n/detections"), (([], "is no topic"),)),
@@ -287,7 +283,7 @@ class TestWriting:
             (([], "is a name of what stages make"),),
         ),
         "/camera/other": [([], "whether these are detections or tracks")],
-    }
+    }  # fmt: skip
 
     def test_rows_that_do_not_fit_change_nothing(self, tmp_path):
         path = tmp_path / "a.mcap"
@@ -374,28 +370,6 @@ class TestWriting:
         np.testing.assert_allclose([rows["x_m"], rows["y_m"]], [[0.3, 7.0], [0.9, 8.0]])
         assert (rows["observed"].tolist(), rows["source_id"].tolist()) == ([True, True], [-1, -1])
         assert rows["frame"].tolist() == [2, 0]
-
-    def test_frames_without_a_number_are_counted_where_there_are_no_pictures(self, tmp_path):
-        with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
-            opened.write("/own/detections", table(frame=[5, np.nan]))
-            assert opened.array("detections")["frame"].tolist() == [5, 1]
-
-    def test_rows_go_beside_the_log_where_that_is_asked_for(self, tmp_path):
-        path = tmp_path / "a.mcap"
-        with mcaptrack.open(path, create=True) as opened:
-            before = path.read_bytes()
-            assert opened.write("/own/detections", table(), sidecar=True) == 2
-            assert len(opened.array("detections")) == 2
-        assert path.read_bytes() == before
-        assert (tmp_path / "a.results.mcap").exists()
-
-    def test_tracks_without_boxes_have_none_in_supervision(self, tmp_path, made):
-        names = ("t_ns", "track_id", "x_m", "y_m")
-        rows = np.array([(0, 1, 2.0, 3.0)], [(name, float if name.endswith("m") else int) for name in names])
-        with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
-            opened.write("/own/tracks", rows)
-            ((t_ns, found),) = opened.supervision("/own/tracks")
-        assert (t_ns, len(found.xyxy)) == (0, 0)
 
     def test_scores_beyond_one_are_said(self, tmp_path):
         with (
