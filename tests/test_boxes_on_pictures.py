@@ -118,13 +118,6 @@ def test_a_box_has_its_edges_where_opencv_projects_its_corners(distortion):
         assert (shade.r, shade.g, shade.b) == class_colour(3, "car")
 
 
-def test_boxes_outside_of_the_picture_and_behind_the_camera_are_not_drawn():
-    there = [(1, 3, 14.0, 2.0, 0.0), (2, 1, -14.0, 2.0, 0.0), (3, 1, 10.0, 40.0, 0.0)]
-    for message in drawn(TRACKS, still(*there)):
-        assert len(lines(message)) == 12
-        assert [text.text for text in message.texts] == ["1 car"]
-
-
 def test_labels_of_3d_boxes_that_overlap_stand_one_above_the_other():
     """Two boxes of one size behind each other: both labels were at about one place."""
     there = [(1, 3, 14.0, 2.0, 0.0), (2, 3, 14.3, 2.05, 0.0)]

@@ -336,17 +336,6 @@ def test_planes_of_each_picture_hold_where_tracks_are_compensated(straight, tmp_
                 assert found.metres_to_pixels(plane.boxes_to_metres(points)) == pytest.approx(here[:, :2], abs=1e-2)
 
 
-def test_the_frame_of_the_metres_is_an_option(straight, tmp_path):
-    path = tmp_path / "robot.mcap"
-    path.write_bytes(straight.read_bytes())
-    for frame in ("base_link", "map"):
-        result = mcaptrack.track(path, topic="/front/boxes", to="/front/tracks", frame=frame)
-        assert not result.warnings
-        with log.read(path) as opened:
-            for topic in ("/front/tracks", "/front/ground_plane"):
-                assert opened.channels[topic].metadata["mcaptrack.frame_id"] == frame
-
-
 def test_many_planes_are_recorded_by_their_digest():
     plane = GroundPlane((1.0, 0, 0, 0, 1, 0, 0, 0, 1), 1280, 720)
     few = planes_to_json([(number, plane) for number in range(100)])

@@ -233,24 +233,16 @@ class TestCvat:
         [
             (BOMB, ":1: a document type, which CVAT doesn't write"),
             (OUTER, ":1: a document type"),
-            ("<annotations>" + "<a>" * 40, ":1: nested deeper"),
             ("<annotation><object/></annotation>", ":1: XML that begins with <annotation>"),
             ("<annotations>\n<track>", ":2: not valid XML: no element found"),
             ("<annotations></annotations>", " holds no boxes"),
             ('<annotations><image id="0"><points label="a" points="1,2"/></image></annotations>', "only 1 of <points>"),
-            (f"<annotations>{track(0, box(3, 1), box(3, 2))}</annotations>", "the frame of a box is 3"),
-            (f"<annotations>{track(0, box(0, 1), box(2**40, 2))}</annotations>", "boxes would be interpolated"),
-            ('<annotations><track id="x"></track></annotations>', "the id of a track is a whole number"),
             ('<annotations><track><box frame="1" xtl="1"/></track></annotations>', "a box without 'ytl'"),
             (ONE.replace('"30"', '"z"'), "corners that aren't numbers"),
             (ONE.replace('"30"', '"nan"'), "not finite"),
             (ONE.replace('"30"', '"3"'), "can't be 10 wide and -7 high"),
             (f'<?xml version="1.0" encoding="foo"?>{ONE}', "unknown encoding: foo"),
             ('<annotations><image id="4"/><image id="4"/></annotations>', "image 4 is there before"),
-            (
-                '<annotations><track task_id="1"/><track task_id="2"/></annotations>',
-                "tasks 1 and 2 of a project; export each task",
-            ),
         ],
     )  # fmt: skip
     def test_what_it_would_not_write_is_refused_in_one_line(self, text, words, tmp_path):
@@ -379,14 +371,6 @@ class TestCommand:
         with pytest.raises(McaptrackError, match=words):
             mcaptrack.export(template, **{"output": "x.txt", "form": "mot", **given})
         assert [path.name for path in tmp_path.iterdir()] == ["there"]
-
-    def test_a_file_is_replaced_only_when_told(self, template, tmp_path):
-        mcaptrack.export(template, tmp_path / "a.txt", form="mot")
-        with pytest.raises(McaptrackError, match="exists; give another name"):
-            mcaptrack.export(template, tmp_path / "a.txt", form="mot")
-        first = (tmp_path / "a.txt").read_bytes()
-        mcaptrack.export(template, tmp_path / "a.txt", form="mot", force=True)
-        assert (tmp_path / "a.txt").read_bytes() == first
 
     def test_what_a_format_has_no_place_for_is_said_once(self, template, tmp_path):
         said = [one.message for one in mcaptrack.export(template, tmp_path / "a.xml", form="cvat").warnings]

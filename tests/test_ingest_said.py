@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as BagWriter
-from rosbags.typesys import Stores, get_typestore
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
@@ -25,7 +24,6 @@ from mcaptrack.sources.ingest import IngestOptions, IngestReport, ingest, label_
 from mcaptrack.sources.ingest.bags import decompression, plain_yaml
 from mcaptrack.sources.ingest.bags.metadata_yaml import read_metadata
 from mcaptrack.sources.ingest.bags.plain_yaml import UnsupportedYamlError
-from mcaptrack.sources.ingest.bags.rosbag2 import known_definition
 from mcaptrack.sources.ingest.labels.camera import (
     CameraTopics,
     camera_prefix,
@@ -422,22 +420,6 @@ def test_decompression_ends_at_its_limit():
     assert decompression.decompress_steps(bz2.BZ2Decompressor(), bz2.compress(data)[:-9], 10**6) in (b"", data)
 
 
-LOADED = {
-    "a": "a",
-    "[a, [], {}]": ["a", [], {}],
-    "a: 1\nb: [x, {c: d}]\ne: ''": {"a": "1", "b": ["x", {"c": "d"}], "e": ""},
-    "- - a\n  - b\n- c": [["a", "b"], "c"],
-    "\ufeffa: b": {"a": "b"},
-}
-
-
-@pytest.mark.parametrize(("text", "value"), LOADED.items())
-def test_yaml_is_read_as_text_lists_and_maps(text, value):
-    loaded = plain_yaml.load(text.encode())
-    assert loaded == value
-    assert plain_yaml.load(plain_yaml.dump(loaded).encode()) == value
-
-
 def test_yaml_has_limits(monkeypatch):
     plain_yaml.load(b"[" * 31 + b"]" * 31)
     with pytest.raises(UnsupportedYamlError, match="line 2: it is nested more than 32 deep"):
@@ -480,17 +462,6 @@ def test_what_metadata_leaves_out_has_its_usual_value(tmp_path):
             continue
         found, _ = read_metadata(path)
         assert (found.packed, found.distro) == (is_packed, "jazzy")
-
-
-def test_a_definition_has_the_hash_that_a_recording_says():
-    kind = "std_msgs/msg/Empty"
-    known = known_definition(kind, "humble", "")
-    assert known == ("", "ROS 2 Humble")
-    digest = get_typestore(Stores.ROS2_HUMBLE).hash_rihs01(kind)
-    assert known_definition(kind, "humble", digest) == known
-    assert known_definition(kind, "humble", digest[:-1] + "x") == ("", "")
-    assert known_definition(kind, "humble", "another kind of hash") == known
-    assert known_definition("a/msg/B", "humble", "") == ("", "")
 
 
 def test_labels_take_the_plane_of_their_camera_if_it_was_measured_and_stays(tmp_path):

@@ -467,17 +467,6 @@ def kitti(*lines: str, folder: Path) -> Path:
 CAR = "3 7 Car 0 0 -10 1 2 3 4 1.5 2 4 3 1.25 9 0.5"
 
 
-def test_a_line_of_kitti_by_hand(tmp_path):
-    walker = "1 2 Pedestrian 0 0 -10 1 2 3 4 1.8 0.5 0.6 -3 1 9 -0.5 0.75"
-    rows = read_boxes_3d(kitti(CAR, walker, folder=tmp_path), "detections", "kitti-3d")
-    half = math.pi / 2
-    np.testing.assert_allclose(
-        rows.boxes, [[9, -3, -0.5, 4, 2, 1.5, -0.5 - half], [9, 3, -0.1, 0.6, 0.5, 1.8, 0.5 - half]], atol=1e-12
-    )
-    np.testing.assert_equal(rows.score, [np.nan, 0.75])
-    assert (rows.frame.tolist(), rows.track_id.tolist(), rows.labelled.tolist()) == ([3, 1], [7, 2], [1, 3])
-
-
 @pytest.mark.parametrize(
     ("line", "words"),
     [

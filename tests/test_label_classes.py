@@ -113,19 +113,6 @@ def test_detections_keep_all_classes_also_where_none_is_a_person(tmp_path, peopl
         assert sorted(row["class"] for row in log.table("detections").to_pylist()) == ["car"] * 3 + ["person"] * people
 
 
-def test_tracks_without_people_are_refused_with_a_remedy(tmp_path):
-    rows = "".join(f"{t},1,{10 * t},20,30,60,car\n" for t in range(3)).encode()
-    with pytest.raises(McaptrackError, match=r"a.csv holds no people, only 3 car; `classes=` takes others"):
-        ingest(tmp_path, "a.csv", b"frame,id,x,y,w,h,class\n" + rows)
-
-
-def test_classes_have_an_effect_where_ids_tell_that_a_file_has_tracks(tmp_path):
-    made = ingest(tmp_path, "gt.csv", CSV.encode(), classes="all")
-    assert not [one for one in made.warnings if one.code == "option-not-used"]
-    with mcaptrack.open(tmp_path / "a.mcap") as log:
-        assert {row["class"] for row in log.table("tracks").to_pylist()} == {"human", "vélo", "Cat"}
-
-
 def test_of_many_classes_some_are_listed(tmp_path):
     rows = "".join(f"{t},{10 * t},20,30,60,kind{t}\n" for t in range(30))
     made = ingest(tmp_path, "a.csv", b"frame,x,y,w,h,class\n" + rows.encode())

@@ -70,20 +70,6 @@ def test_three_who_stand_side_by_side_get_three_boxes_and_one_region_without_sep
     assert all(hits(seen, [(93.6, 40, 32.8, 40)]) == 1 for seen in joined)
 
 
-def test_a_belt_in_the_colour_of_the_floor_divides_nobody():
-    """It is 4 px high, a tenth of the person: less than the fifth over which parts are joined."""
-
-    def paint(image, number):
-        floor = image[128:132].copy()
-        walk(image, number)
-        image[128:132] = floor
-
-    found = boxes_of(film(paint), MedianDetector(stabilise=False, separate=False))
-    whole = [hits(seen, [(13.6 + 7.5 * (n % 28), 110, 12.8, 40)]) for n, seen in enumerate(found)]
-    assert sum(whole) > 55
-    assert sum(map(len, found)) < 65
-
-
 def test_boxes_of_several_people_carry_how_many_they_are():
     frames = film(three_side_by_side)
     for separate, wanted in ((True, [1, 1, 1, 1]), (False, [1, 3])):
@@ -176,20 +162,6 @@ def test_each_block_of_time_has_its_own_background():
     for history_s, there in ((30.0, 0), (600.0, 50)):
         found = boxes_of(frames, MedianDetector(stabilise=False, history_s=history_s, separate=False))
         assert sum(hits(seen, van) for seen in found[70:]) == there
-
-
-def test_people_of_a_shaking_camera_are_boxed_where_they_are_in_each_picture():
-    scene = small_scene(shake_px=2.5, contrast=6.0)
-    shots = list(scene.shots())
-    frames = [Frame(ns(shot.seconds), n, shot.image) for n, shot in enumerate(shots)]
-    right = {
-        is_on: sum(
-            hits(seen, shot.boxes)
-            for seen, shot in zip(boxes_of(frames, MedianDetector(stabilise=is_on)), shots, strict=True)
-        )
-        for is_on in (True, False)
-    }
-    assert right[True] > 0.6 * sum(len(shot.boxes) for shot in shots)
 
 
 def test_large_pictures_are_halved_and_their_boxes_are_in_full_pixels():

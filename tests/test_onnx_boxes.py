@@ -47,12 +47,6 @@ def test_suppression_keeps_what_the_textbook_keeps(seed, count, most):
     assert suppress(boxes, most).xyxy.tolist() == boxes.xyxy[greedy(boxes, most)].tolist()
 
 
-def test_a_box_that_is_suppressed_suppresses_nothing():
-    xyxy = np.array([[0, 0, 10, 10], [4, 0, 14, 10], [8, 0, 18, 10]], float)  # each overlaps the next by 6 of 14
-    boxes = Boxes(xyxy, np.array([0.9, 0.8, 0.7]), np.zeros(3, int))
-    assert suppress(boxes, 0.4).score.tolist() == [0.9, 0.7]
-
-
 def bilinear(image: np.ndarray, width: int, height: int) -> np.ndarray:
     """A picture at another size: between the four nearest pixels, whose centres are at halves."""
     out = np.zeros((height, width, 3))
