@@ -30,8 +30,6 @@ from mcaptrack.sources.ingest.bags.recording import ReadingNotes
 from mcaptrack.sources.ingest.bags.rosbag2 import open_bag, open_files
 from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables
 from tests.bags import MOT, ROS1, ROS2, STRING1, T0, bag1, bag2, camera_bag, database, plain
-from tests.commands import call
-from tests.worlds import write_clip
 
 
 def recorded(path: Path) -> list[tuple[str, int, int, bytes]]:
@@ -306,6 +304,12 @@ class TestRosbag2:
         assert first[2] == (STRING1, "", b"")
         assert second[2][1] == "ros2msg"
 
+    def test_messages_of_no_topic_are_missed(self, tmp_path):
+        database(tmp_path / "a.db3", 3, [(1, 5, b"a"), (7, 6, b"b")], [(1, "/a", STRING1, "cdr", "")])
+        report = make(tmp_path / "a.db3", tmp_path / "a.mcap")
+        assert recorded(tmp_path / "a.mcap") == [("/a", 5, 5, b"a")]
+        assert "1 messages of topic 7, which is not described" in report.lost[0]
+
     def test_faults_are_lines(self, tmp_path):
         faults = {
             "a.db3": b"SQLite format 3\0" + bytes(500), "b.db3": b"x", "c.mcap": b"\x89MCAP0\r\nxx", "d.mcap": b"",
@@ -395,18 +399,6 @@ class TestInto:
             assert (1, 2, "file", b"hello") in attached
         with log.read(tmp_path / "b.mcap") as opened, pytest.raises(McaptrackError, match="can't be added to itself"):
             ingest(tmp_path / "b.mcap", tmp_path / "x.mcap", IngestOptions(), into=opened)
-
-
-def test_a_camera_is_named_where_something_is_written_below_it(tmp_path):
-    """The channels of a recording keep their names; those of a video stand below it."""
-    bag1(tmp_path / "a.bag", 2, 100)
-    write_clip(tmp_path / "a.mp4", 2)
-    for name, is_used in (("a.bag", False), ("a.mp4", True)):
-        made = call("ingest", tmp_path / name, "--camera", "gate", "-o", tmp_path / "out.mcap", "--force")
-        assert made.code == 0, made.err
-        assert ("--camera changes nothing here: the channels of a recording keep their names" in made.err) != is_used
-        with log.read(tmp_path / "out.mcap") as opened:
-            assert any(topic.startswith("/gate/") for topic in opened.channels) == is_used
 
 
 def test_results_beside_a_recording_are_left_out_and_that_is_said(tmp_path):

@@ -197,19 +197,6 @@ def test_eight_classes_without_a_name_are_listed(tmp_path):
         assert labels.class_id.tolist() == [0] * count + [1]
 
 
-@pytest.mark.parametrize("count", [8, 9])
-def test_eight_classes_with_another_number_are_listed(count, tmp_path):
-    """People are 1; the names of 0 and 1 get the next numbers after the largest."""
-    kinds = [{"id": n, "name": f"n{n}"} for n in (0, 1)] + [{"id": 2 + n, "name": "Person "} for n in range(count - 2)]
-    labels = read(tmp_path, coco([0], [box(0, category_id=one["id"]) for one in kinds], categories=kinds))
-    last = count - 1
-    moved = [f"n0 (0) is {last + 1}", f"n1 (1) is {last + 2}", *(f"Person ({n}) is 1" for n in range(2, count))]
-    words = ", ".join(moved[:8]) + (", ..." if count > 8 else "")
-    assert labels.remarks[-1] == f"{tmp_path / 'a'}: in class_id 1 is a person: {words}"
-    assert labels.class_id.tolist() == [last + 1, last + 2, *[1] * (count - 2)]
-    assert labels.classes == {last + 1: "n0", last + 2: "n1", 1: "Person"}
-
-
 def test_boxes_that_are_there_before_are_counted(tmp_path):
     same = [box(0), box(0), box(0), box(0, (1, 2, 3, 5)), box(0, category_id=None), box(0, track_id=1), box(1)]
     images = [{"id": 0, "frame_id": 0}, {"id": 1, "frame_id": 1}]

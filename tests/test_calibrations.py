@@ -157,17 +157,6 @@ def test_boxes_become_positions_in_the_map(model, tmp_path):
         assert np.abs(plane.metres_to_pixels(people_at(s)[:, :2]) - feet).max() < 0.5
 
 
-def test_a_run_ends_in_the_map_and_is_up_to_date(tmp_path):
-    path = robot(tmp_path / "robot.mcap", "plumb_bob", until_s=4, last_s=4)
-    first = done("run", path, "--topic", "/front/boxes", "--no-tables", "--in-place")
-    assert "ground plane is known" not in first.err
-    for topic in ("/front/samples", "/front/retracks", "/front/retracks/full"):
-        assert np.nanmedian(errors_m(path, topic)) < 0.3, topic
-    assert mcaptrack.run(path, topic="/front/boxes", tables=False).stages == ()
-    with log.read(path) as opened:
-        assert opened.channels["/front/retracks"].metadata["mcaptrack.frame_id"] == "map"
-
-
 def test_a_calibration_that_a_user_gives_replaces_the_recorded_one(tmp_path):
     """Recorded is a focal length that is off; planes follow from it until a better one is given, and from that then."""
     wrong = np.array([[400.0, 0, 640], [0, 400, 360], [0, 0, 1]])

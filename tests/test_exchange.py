@@ -199,14 +199,6 @@ class TestCvat:
         assert labels.observed.tolist() == [True, True, False, False]
         assert (labels.labelled[0], labels.labelled[-1]) == (0, 30083)
 
-    def test_boxes_between_keyframes_are_interpolated_and_none_after_the_object_left(self, tmp_path):
-        boxes = [box(2, 100), box(6, 140), box(8, 180, outside=1), box(12, 50)]
-        labels = read(tmp_path, f"<annotations>{track(3, *boxes)}</annotations>")
-        assert labels.frame.tolist() == [2, 3, 4, 5, 6, 7, 12]
-        assert labels.boxes_px[:, 0].tolist() == [100, 110, 120, 130, 140, 160, 50]
-        assert labels.id.tolist() == [3] * 7
-        assert any("4 boxes are interpolated" in words for words in labels.remarks)
-
     def test_a_zip_file_of_cvat(self, tmp_path):
         with zipfile.ZipFile(tmp_path / "task.zip", "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("images/frame_000000.png", b"\0")
@@ -294,12 +286,6 @@ def test_coco_of_polygons_and_of_numbers_with_a_point(tmp_path):
     shape["segmentation"] = {"counts": "abc", "size": [80, 100]}
     with pytest.raises(McaptrackError, match=r"annotation 0 has a mask \(RLE\) and no bbox"):
         read(tmp_path, json.dumps(content), "a.json")
-
-
-def test_a_header_of_motchallenge_names_the_box_not_the_place(tmp_path):
-    head = "frame,id,bb_left,bb_top,bb_width,bb_height,conf,x,y,z"
-    labels = read(tmp_path, f"{head}\n1,3,10,20,30,40,0.5,-1,-1,-1\n", "a.csv")
-    assert (labels.boxes_px.tolist(), labels.id.tolist()) == ([[10, 20, 30, 40]], [3])
 
 
 def test_classes_that_a_file_cannot_tell_apart_are_said():

@@ -20,7 +20,7 @@ from mcaptrack.foxglove.views import SUFFIX
 from mcaptrack.notices import McaptrackWarning
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.transforms import KnnDetector, Sort
+from mcaptrack.transforms import KnnDetector
 from tests.commands import GROUP, call
 from tests.robots import START_NS, stamp_of, write_log
 from tests.ros_messages import pixels, ros_writer, vision
@@ -127,25 +127,6 @@ def test_several_cameras_need_a_choice(tmp_path):
         assert "/right/retracks" not in opened.channels
 
 
-def test_recorded_detections_are_tracked(tmp_path):
-    path = tmp_path / "boxes.mcap"
-    shots = write_log(path, "/eye/image", boxes="/eye/detections")
-    before = content(path)
-    mcaptrack("track", path, "-q", "--topic", "/eye/detections")
-    after = content(path)
-    assert {topic: after[topic] for topic in before} == before
-    with log.read(path) as opened:
-        tracks = opened.frames("/eye/tracks", TRACKS)
-        assert [f.t_ns for f in tracks] == [row[3] for row in before["/eye/detections"]]
-        seen = [int(f.rows["observed"].sum()) for f in tracks]
-        assert sum(seen) > 0.7 * sum(len(shot.boxes) for shot in shots)
-    for number, (_, message) in enumerate(annotations(path, "/eye/tracks")):
-        assert stamped(message) == stamp_of(number)
-    mcaptrack("run", path, "-q", "--topic", "/eye/detections", "--no-tables")
-    with log.read(path) as opened:
-        assert "/eye/retracks" in opened.channels
-
-
 def test_recorded_channels_are_never_replaced(tmp_path):
     path = tmp_path / "boxes.mcap"
     write_log(path, "/eye/image", boxes="/eye/detections")
@@ -167,22 +148,6 @@ def test_recorded_channels_are_never_replaced(tmp_path):
 def content_of(data: bytes, folder: Path) -> dict[str, list]:
     (folder / "before.mcap").write_bytes(data)
     return content(folder / "before.mcap")
-
-
-def test_channels_of_the_wrong_schema_are_refused_by_name(robot, tmp_path):
-    path = tmp_path / "boxes.mcap"
-    write_log(path, "/eye/image", boxes="/eye/boxes")
-    with log.read(path) as opened:
-        with pytest.raises(
-            McaptrackError,
-            match=r"/eye/boxes holds vision_msgs/msg/Detection2DArray; detect reads foxglove\.CompressedVideo or .* or sensor_msgs/Image$",
-        ):
-            pipeline.plan_stage(opened, "/eye", "detect", KnnDetector(), "/eye/boxes")
-        with pytest.raises(
-            McaptrackError,
-            match=r"/eye/image holds sensor_msgs/msg/CompressedImage; track reads mcaptrack\.Detections or vision_msgs/Detection2DArray",
-        ):
-            pipeline.plan_stage(opened, "/eye", "track", Sort(), "/eye/image")
 
 
 @pytest.mark.parametrize("payload", [b"", b"\0\1\0\0garbage", None])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from fractions import Fraction
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from mcaptrack import log
@@ -49,6 +48,9 @@ class TestLabels:
             read_labels(tmp_path / "a.txt")
         with pytest.raises(McaptrackError, match="can't be read"):
             read_labels(tmp_path / "none.txt")
+        (tmp_path / "a.csv").write_text("frame,x,y,w,h\n1,1,2,3,4\n", encoding="utf-16")
+        with pytest.raises(McaptrackError, match="UTF-16; save it as UTF-8"):
+            ingest(tmp_path / "a.csv", tmp_path / "a.mcap", options(fps=Fraction(1)))
 
     @pytest.mark.parametrize("text", ["1,0,0\n0,1,0\n0,0,1\n", "1 0 0\n0 1 0\n0 0 1", "1.0e0\t0\t0\n0,1,0\n0 0 1\n"])
     def test_homographies_by_comma_or_blank(self, tmp_path, text):
@@ -70,23 +72,6 @@ def options(**given) -> IngestOptions:
 
 
 class TestIngest:
-    @pytest.mark.parametrize("role", ["truth", "tracks"])
-    def test_labels_get_metres_by_the_ground_plane_that_the_log_has(self, tmp_path, clip, role):
-        labels = write(tmp_path / "gt.txt", MOT15)
-        plane = write(tmp_path / "h.txt", "0.1,0,0\n0,0.2,0\n0,0,1\n")
-        ingest(clip, tmp_path / "whole.mcap", options(ground_plane=plane, labels={role: labels}))
-        ingest(clip, tmp_path / "added.mcap", options(ground_plane=plane))
-        with log.read(tmp_path / "added.mcap") as opened:
-            ingest(labels, tmp_path / "added.mcap", options(role=role), into=opened)
-        seen = []
-        for name in ("whole", "added"):
-            with log.read(tmp_path / f"{name}.mcap") as opened:
-                seen.append([message.payload for message in opened.messages(f"/camera/{role}")])
-                first = next(frame.rows for frame in opened.frames(f"/camera/{role}", TRACKS) if len(frame.rows))
-        assert seen[0] == seen[1]
-        foot = [(first["x_px"] + first["w_px"] / 2) * 0.1, (first["y_px"] + first["h_px"]) * 0.2]
-        assert np.allclose([first["x_m"], first["y_m"]], foot)
-
     def test_label_files_of_one_log_share_a_clock(self, tmp_path):
         """Boxes at every frame that begin at frame 8, truth at every twelfth: frame 1 of these is frame 0 of those."""
         found = write(tmp_path / "det.txt", "".join(f"{n},-1,10,20,4,8,1,-1,-1,-1\n" for n in range(8, 30)))

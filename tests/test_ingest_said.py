@@ -20,7 +20,7 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
 from mcaptrack.schema.provenance import CLOCK, Provenance
-from mcaptrack.sources.ingest import IngestOptions, IngestReport, ingest, label_frames
+from mcaptrack.sources.ingest import IngestOptions, IngestReport, ingest
 from mcaptrack.sources.ingest.bags import decompression, plain_yaml
 from mcaptrack.sources.ingest.bags.metadata_yaml import read_metadata
 from mcaptrack.sources.ingest.bags.plain_yaml import UnsupportedYamlError
@@ -79,32 +79,6 @@ def test_classes_of_detections_are_listed_and_their_names_kept(tmp_path):
     assert rows["class_id"].tolist() == [3, 1, 3, 8]
     assert [rows[name][0] for name in ("x_px", "y_px", "w_px", "h_px")] == [10, 20, 4, 8]
     assert (report.messages, report.has_labels, report.uses_camera) == ({"/camera/detections": 2}, True, True)
-
-
-def test_classes_without_names_are_listed_by_number_and_one_alone_is_not(tmp_path):
-    rows = "1,-1,1,1,2,2,0.5,{}\n1,-1,5,1,2,2,0.5,7\n2,-1,5,1,2,2,0.5,7\n"
-    found = write(tmp_path / "found.txt", rows.format(2))
-    report, path = made(found, role="detections", fps=Fraction(10))
-    assert report.remarks[0] == f"{found} has several classes; class_id is 2 (1), 7 (2)"
-    with log.read(path) as opened:
-        assert "mcaptrack.classes" not in opened.channel("/camera/detections").metadata
-    report, _ = made(write(found, rows.format(7)), role="detections", fps=Fraction(10))
-    assert report.remarks == [f"{found}: 2 frames (by the last label) from 1 on, 10 a second (by `fps=`)"]
-
-
-def test_tracks_are_of_people_and_what_is_left_out_of_them_is_said(tmp_path):
-    found = write(tmp_path / "found.txt", KITTI)
-    report, path = made(found, role="truth", fps=Fraction(10), first_frame=0)
-    assert said(report) == [(f"{found} also holds 2 Car, 1 Misc; left out of truth", "left-out")]
-    assert report.remarks == [f"{found}: 2 frames (by the last label) from 0 on, 10 a second (by `fps=`)"]
-    assert parameters_of(path, "/camera/truth") == {
-        "file": "found.txt",
-        "format": "kitti",
-        "first_frame": 0,
-        "fps": "10",
-    }
-    with log.read(path) as opened:
-        assert json.loads(opened.channel("/camera/truth").metadata["mcaptrack.classes"]) == {"1": "Pedestrian"}
 
 
 @pytest.mark.parametrize(
@@ -251,19 +225,6 @@ def test_a_free_name_is_proposed_for_topics_that_are_there(tmp_path):
                 )
         with log.read(out) as opened, pytest.raises(McaptrackError, match=f"`camera='{free}'` puts these beside them"):
             ingest(number, out, IngestOptions(fps=Fraction(10)), into=opened, force=True)
-
-
-def test_files_that_are_compared_say_what_is_assumed_of_them(tmp_path):
-    labels = write(tmp_path / "a.txt", "1,1,1,1,2,2\n3,1,1,1,2,2\n")
-    with pytest.warns(
-        UserWarning, match=r"a\.txt: 3 frames \(by the last label\) from 1 on, 1 a second \(by assumption\)"
-    ):
-        frames = label_frames({"tracks": labels}, None, None, "foot")
-    assert [(frame.t_ns, frame.index, len(frame.rows)) for frame in frames["tracks"]] == [
-        (0, 0, 1),
-        (ns(1), 1, 0),
-        (ns(2), 2, 1),
-    ]
 
 
 # Which camera

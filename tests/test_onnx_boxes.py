@@ -192,15 +192,3 @@ def test_people_who_hide_one_another_at_a_seam_are_kept():
     counts = [lost_and_added(people, join_tiles(seen_in_tiles(people, tiles), tiles, 0.45).xyxy) for people in scenes]
     assert sum(map(len, scenes)) > 200
     assert np.sum(counts, axis=0).tolist() == [0, 0]
-
-
-@pytest.mark.parametrize("across", [0, 1])
-def test_tiles_that_share_nothing_are_joined_where_they_meet(across):
-    tiles = [(0, 0, 100, 100), (100, 0, 200, 100), (200, 0, 300, 100)]
-    parts = [[70, 10, 100, 40], [100, 10, 130, 41], [260, 10, 290, 40]]
-    if across:
-        tiles, parts = ([[one[k] for k in (1, 0, 3, 2)] for one in some] for some in (tiles, parts))
-    boxes = [Boxes(np.array([part], float), np.array([0.5]), np.zeros(1, int)) for part in parts]
-    found = join_tiles(boxes, [tuple(tile) for tile in tiles], 0.45).xyxy.tolist()
-    expected = [[70, 10, 130, 41], [260, 10, 290, 40]]
-    assert sorted(found) == sorted([one[k] for k in ((1, 0, 3, 2) if across else range(4))] for one in expected)

@@ -354,3 +354,8 @@ class TestPositionsInMetres:
     def test_what_is_none_is_one_line(self, given, words):
         with pytest.raises(McaptrackError, match=words):
             mcaptrack.detections(**given)
+
+
+def test_shares_of_the_picture_need_its_size(tmp_path):
+    with pytest.raises(McaptrackError, match="`size='WIDTHxHEIGHT'`"):
+        mcaptrack.ingest(as_yolo(tmp_path, [(0, 8.0, 16.0, 32.0, 64.0, 0.5, "person", 7)]), tmp_path / "a.mcap", fps=10)
