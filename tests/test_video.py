@@ -29,7 +29,6 @@ from tests.tiers import thorough
 from tests.worlds import write_clip
 
 NO_B = {"bf": "0", "g": "10"}
-WITH_B = {"bf": "2", "g": "10"}
 
 
 def pictures(path, image_format="auto", start_ns=0, **keep):
