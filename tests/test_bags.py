@@ -25,13 +25,11 @@ from mcaptrack.schema import GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.sources.ingest.bags import decompression, rosbag2
-from mcaptrack.sources.ingest.bags.metadata_yaml import is_packed, names_file, read_metadata
+from mcaptrack.sources.ingest.bags.metadata_yaml import is_packed, names_file
 from mcaptrack.sources.ingest.bags.recording import ReadingNotes
 from mcaptrack.sources.ingest.bags.rosbag2 import open_bag, open_files
 from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables
 from tests.bags import MOT, ROS1, ROS2, STRING1, T0, bag1, bag2, camera_bag, database, plain
-from tests.commands import call, done
-from tests.worlds import write_clip
 
 
 def recorded(path: Path) -> list[tuple[str, int, int, bytes]]:
@@ -87,12 +85,6 @@ class TestRos1:
         assert b"MSG: std_msgs/Header" in silent[2][2]
         assert silent[4] == 0
 
-    def test_an_empty_bag(self, tmp_path):
-        with Writer1(tmp_path / "a.bag"):
-            pass
-        assert make(tmp_path / "a.bag", tmp_path / "a.mcap").messages == {}
-        assert recorded(tmp_path / "a.mcap") == []
-
     @pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
     def test_of_a_cut_bag_what_is_complete_is_read(self, tmp_path, compression):
         whole = tmp_path / "whole.bag"
@@ -131,25 +123,6 @@ class TestRos1:
         assert recorded(tmp_path / "b.mcap") == sorted(said)
         assert report.lost == []
         assert "was never closed" in report.notes[0]
-
-    def test_a_record_is_cut_off_at_any_byte_of_its_head(self, tmp_path):
-        """A bag without an index ends in one to eight bytes of a record: all before it is read, and that is said."""
-        said = bag1(tmp_path / "a.bag", 4, 100)
-        data = bytearray((tmp_path / "a.bag").read_bytes())
-        index = data.index(b"index_pos=") + 10
-        at = struct.unpack("<Q", data[index : index + 8])[0]
-        data[index : index + 8] = bytes(8)
-        for more in range(1, 9):
-            (tmp_path / "b.bag").write_bytes(data[: at + more])
-            report = make(tmp_path / "b.bag", tmp_path / f"{more}.mcap")
-            assert recorded(tmp_path / f"{more}.mcap") == sorted(said)
-            (lost,) = report.lost
-            assert f"byte {at} and what follows: a record is cut off" in lost
-            assert lost.endswith("invalid") == (more >= 4)  # from then on there is a size
-        head = struct.unpack("<I", data[at : at + 4])[0]
-        (tmp_path / "b.bag").write_bytes(data[: at + 8 + head + 3])  # all of the head, and three bytes of the data
-        (lost,) = make(tmp_path / "b.bag", tmp_path / "c.mcap").lost
-        assert lost.endswith(f"byte {at} and what follows: a record is cut off")
 
     def test_of_a_damaged_chunk_the_others_are_read(self, tmp_path):
         said = bag1(tmp_path / "a.bag", 60, 20_000, "BZ2")
@@ -387,14 +360,6 @@ class TestBesideLabels:
                 assert (plane.width_px, plane.height_px) == (64, 48)
                 assert opened.channel("/robot/front/image/compressed").messages == 30
 
-    def test_run_finds_people_in_the_pictures_of_a_bag(self, tmp_path, files):
-        camera_bag(tmp_path / "a.bag", "/robot/image")
-        make(tmp_path / "a.bag", tmp_path / "a.mcap", **files)
-        done("run", tmp_path / "a.mcap", "-q")
-        with log.read(tmp_path / "a.mcap") as opened:
-            assert opened.channel("/robot/detections").messages == 30
-            assert opened.channel("/robot/truth").messages == 30
-
     def test_of_several_cameras_one_is_chosen(self, tmp_path, files):
         camera_bag(tmp_path / "a.bag", "/left/image", "/right/image")
         with pytest.raises(McaptrackError, match=r"/left/image, /right/image; .* choose with `camera='left'`"):
@@ -409,14 +374,6 @@ class TestBesideLabels:
 
 
 class TestInto:
-    def test_a_bag_is_added_to_a_log(self, tmp_path):
-        said = bag1(tmp_path / "a.bag", 10, 100)
-        camera_bag(tmp_path / "b.bag", "/robot/image", frames=3)
-        make(tmp_path / "b.bag", tmp_path / "b.mcap")
-        other = recorded(tmp_path / "b.mcap")
-        assert call("ingest", "a.bag", "--into", "b.mcap", folder=tmp_path).code == 0
-        assert recorded(tmp_path / "b.mcap") == sorted(said + other)
-
     @pytest.mark.parametrize("chunks", [True, False])
     def test_an_mcap_file_is_added_with_all_that_is_in_it(self, tmp_path, chunks):
         with (tmp_path / "a.mcap").open("wb") as stream:
@@ -444,26 +401,6 @@ class TestInto:
             ingest(tmp_path / "b.mcap", tmp_path / "x.mcap", IngestOptions(), into=opened)
 
 
-def test_what_makes_no_sense_for_a_log_is_refused_in_a_line(tmp_path):
-    bag1(tmp_path / "a.bag", 5, 100)
-    for option, value in (("--fps", "10"), ("--start-time", "5"), ("--image-format", "png"), ("--as", "truth")):
-        code, _, err = call("ingest", "a.bag", option, value, folder=tmp_path)
-        assert (code, err.count("\n"), f"leave {option} out" in err) == (1, 1, True)
-        assert not (tmp_path / "a.mcap").exists()
-
-
-def test_a_camera_is_named_where_something_is_written_below_it(tmp_path):
-    """The channels of a recording keep their names; those of a video stand below it."""
-    bag1(tmp_path / "a.bag", 2, 100)
-    write_clip(tmp_path / "a.mp4", 2)
-    for name, is_used in (("a.bag", False), ("a.mp4", True)):
-        made = call("ingest", tmp_path / name, "--camera", "gate", "-o", tmp_path / "out.mcap", "--force")
-        assert made.code == 0, made.err
-        assert ("--camera changes nothing here: the channels of a recording keep their names" in made.err) != is_used
-        with log.read(tmp_path / "out.mcap") as opened:
-            assert any(topic.startswith("/gate/") for topic in opened.channels) == is_used
-
-
 def test_results_beside_a_recording_are_left_out_and_that_is_said(tmp_path):
     bag1(tmp_path / "a.bag", 2, 100)
     make(tmp_path / "a.bag", tmp_path / "a.mcap")
@@ -473,16 +410,6 @@ def test_results_beside_a_recording_are_left_out_and_that_is_said(tmp_path):
     words = f"{beside} holds results of a.mcap; they are left out"
     assert [(one.message, one.code) for one in report.warnings] == [(words, "left-out")]
     assert len(recorded(tmp_path / "b.mcap")) == len(recorded(tmp_path / "a.mcap"))
-
-
-def test_a_cut_bag_exits_with_3_alone_and_among_others(tmp_path):
-    for name in ("a.bag", "b.bag"):
-        bag1(tmp_path / name, 10, 1000)
-    (tmp_path / "a.bag").write_bytes((tmp_path / "a.bag").read_bytes()[:-300])
-    alone = call("ingest", "a.bag", folder=tmp_path)
-    assert (alone.code, "lost: " in alone.err) == (3, True)
-    assert call("ingest", "b.bag", folder=tmp_path).code == 0
-    assert call("ingest", "a.bag", "b.bag", "--force", folder=tmp_path).code == 3
 
 
 def test_real_recordings_are_kept_whole(data, tmp_path):
@@ -688,21 +615,3 @@ def test_messages_that_are_compressed_one_by_one_share_a_limit(tmp_path, monkeyp
     (tmp_path / "metadata.yaml").write_text(described(name, topics={"/talk": 3}))
     if kind == "mcap":
         assert read(0) == [len(data) for data in packed]
-
-
-def test_metadata_of_old_and_new_versions(folder):
-    path = folder / "metadata.yaml"
-    text = path.read_text()
-    for old, new in (
-        ("[a.db3, b.db3]", "[bag/a.db3, bag/b.db3]"),
-        ("compression_mode: ''", "compression_mode: NONE"),
-        ("offered_qos_profiles: 'q'", "offered_qos_profiles: [{depth: 3}], type_description_hash: R1"),
-    ):
-        text = text.replace(old, new)
-    path.write_text(text)
-    bag, names = read_metadata(path)
-    assert names == ["a.db3", "b.db3"]
-    assert (bag.distro, bag.packed, bag.text) == ("humble", False, path.read_bytes())
-    ((name, kind, encoding, qos, digest, count), _) = bag.topics
-    assert (name, kind, encoding, digest, count) == ("/talk", "std_msgs/msg/String", "cdr", "R1", 5)
-    assert "depth: 3" in qos

@@ -20,7 +20,6 @@ from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.sources import camera_motion
 from mcaptrack.sources.fixed_frame import named_detections, rows_of_boxes
 from mcaptrack.sources.foreign import MessageType
-from mcaptrack.sources.foreign.boxes import Classes
 from mcaptrack.sources.foreign.boxes_3d import boxes_3d_decoder
 from mcaptrack.sources.foreign.boxes_3d.box import Box3d, Message3d
 from mcaptrack.sources.foreign.boxes_3d.recorded import recorded
@@ -274,14 +273,6 @@ def test_a_box_without_z_stands_where_x_and_y_say():
     np.testing.assert_allclose(rows["x_m"], [x, x])
     np.testing.assert_allclose(rows["y_m"], [y, y])
     np.testing.assert_allclose(rows["z_m"], [z, nan])
-
-
-def test_numbers_of_classes_that_have_no_name():
-    classes = Classes()
-    used = [classes.class_id(name) for name in ("7", "0", "car", "?", "1")]
-    assert classes.nameless({classes.numbers().get(one, one) for one in used}) == [1, 7]
-    assert classes.class_id("pedestrian") == 1
-    assert classes.nameless([0, 1, 7, 8]) == [7]
 
 
 # Times

@@ -118,31 +118,6 @@ def test_a_box_has_its_edges_where_opencv_projects_its_corners(distortion):
         assert (shade.r, shade.g, shade.b) == class_colour(3, "car")
 
 
-def test_boxes_outside_of_the_picture_and_behind_the_camera_are_not_drawn():
-    there = [(1, 3, 14.0, 2.0, 0.0), (2, 1, -14.0, 2.0, 0.0), (3, 1, 10.0, 40.0, 0.0)]
-    for message in drawn(TRACKS, still(*there)):
-        assert len(lines(message)) == 12
-        assert [text.text for text in message.texts] == ["1 car"]
-
-
-def test_labels_of_3d_boxes_that_overlap_stand_one_above_the_other():
-    """Two boxes of one size behind each other: both labels were at about one place."""
-    there = [(1, 3, 14.0, 2.0, 0.0), (2, 3, 14.3, 2.05, 0.0)]
-    for message in drawn(TRACKS, still(*there)):
-        first, second = sorted(message.texts, key=lambda text: text.text)
-        alone = [drawn(TRACKS, still(one))[0].texts[0].position.y for one in there]
-        assert abs(alone[0] - alone[1]) < 10
-        assert first.position.y - second.position.y == pytest.approx(1.5 * 12, abs=0.5)
-
-
-def test_lines_end_before_the_camera():
-    """A box beside the camera, half of it behind: all is finite, and every end is on an edge."""
-    for message in drawn(TRACKS, still((1, 3, 1.5, 2.5, -1.0))):
-        found = lines(message)
-        assert np.isfinite(found).all()
-        assert len(found) < 12
-
-
 def test_boxes_move_between_their_times():
     """The rows are half as often as the pictures; the car drives 1 m between two pictures."""
     frames = [Frame(ns(10 + n / 10), n, rows((7, 3, 12.0 + n, 2.0, 0.0))) for n in range(0, PICTURES + 1, 2)]
@@ -256,14 +231,6 @@ def test_a_video_of_3d_boxes_is_on_the_pictures_of_a_calibrated_camera_or_from_a
         assert mcaptrack.render(path, tmp_path / "b.mp4", topic=topic, camera="lidar", force=True).views == result.views
     above = mcaptrack.render(path, tmp_path / "c.mp4", topic="/lidar/retracks/view/scene", camera="lidar", end_s=0.1)
     assert (above.pictures, above.views) == (2, ("/lidar/retracks/view/scene",))
-
-
-def test_without_any_calibration_nothing_is_said_and_older_drawings_go(tmp_path):
-    path = recorded(tmp_path / "drive.mcap", calibrated=False)
-    _, said = with_tracks(path)
-    assert said == []
-    with log.read(path) as opened:
-        assert not [topic for topic in opened.channels if "/view/image" in topic]
 
 
 # People who are hidden

@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import yaml
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -130,93 +129,6 @@ def test_intrinsics_and_pose_are_two_files_without_a_unit(tmp_path):
         calibrated(inner, inner)
 
 
-def ros_info(folder: Path, **changes) -> Path:
-    """A file as camera_calibration writes it."""
-
-    def matrix(values: np.ndarray) -> dict:
-        return {"rows": values.shape[0], "cols": values.shape[1], "data": values.ravel().tolist()}
-
-    values = {
-        "image_width": 960, "image_height": 540, "camera_name": "front", "camera_matrix": matrix(K / [[2], [2], [1]]),
-        "distortion_model": "plumb_bob", "distortion_coefficients": matrix(BENT[None]),
-        "rectification_matrix": matrix(np.eye(3)), "projection_matrix": matrix(np.eye(3, 4) * 800),
-    } | changes  # fmt: skip
-    path = folder / "ost.yaml"
-    path.write_text(yaml.safe_dump({name: one for name, one in values.items() if one is not None}))
-    return path
-
-
-def test_a_calibration_of_smaller_pictures_is_scaled(tmp_path):
-    found = calibrated(ros_info(tmp_path), untyped(tmp_path, rvec=RVEC, tvec=TVEC))
-    half = K / [[2], [2], [1]]
-    small = cv2.projectPoints(GROUND, RVEC, TVEC, half, BENT)[0][:, 0]
-    # The corner of the first pixel is at -0.5, whatever the size of pixels.
-    assert np.abs(found.plane.pixels_to_metres((small + 0.5) * 2 - 0.5) - GROUND[:, :2]).max() < 1e-6
-    assert "for pictures of 960 x 540, and these are 1920 x 1080: its focal lengths and centre are" in found.remarks[0]
-    assert (found.message.width, found.message.K[0]) == (1920, pytest.approx(K[0, 0]))
-    with pytest.raises(McaptrackError, match="960 x 540, and these are 1920 x 1440: they are of another shape"):
-        calibrated(ros_info(tmp_path), size=(1920, 1440))
-
-
-def test_a_message_of_ros_that_was_echoed_is_read(tmp_path):
-    lens = {"height": 1080, "width": 1920, "distortion_model": "plumb_bob", "d": BENT.tolist(), "k": K.ravel().tolist()}
-    rest = {"r": np.eye(3).ravel().tolist(), "p": np.eye(3, 4).ravel().tolist(), "binning_x": 0, "binning_y": 0}
-    roi = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
-    text = yaml.safe_dump({"header": {"frame_id": "eye"}, **lens, **rest, "roi": roi})
-    (tmp_path / "echo.yaml").write_text(text + "---\n")
-    message = calibrated(tmp_path / "echo.yaml").message
-    assert (K.ravel().tolist(), BENT.tolist()) == (message.K, message.D)
-
-
-CAMCHAIN = """\
-cam0:
-  T_cam_imu:
-  - [0.0, -1.0, 0.0, 0.1]
-  - [1.0, 0.0, 0.0, 0.0]
-  - [0.0, 0.0, 1.0, 0.0]
-  - [0.0, 0.0, 0.0, 1.0]
-  cam_overlaps: [1]
-  camera_model: pinhole
-  distortion_coeffs: [-0.2, 0.05, 0.001, 0.002]
-  distortion_model: radtan
-  intrinsics: [458.6, 457.3, 367.2, 248.4]
-  resolution: [752, 480]
-  rostopic: /front/image_raw
-  timeshift_cam_imu: 0.003
-cam1:
-  T_cn_cnm1: [[1.0, 0.0, 0.0, -0.11], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-  camera_model: pinhole
-  distortion_coeffs: [-0.01, 0.02, 0.003, -0.004]
-  distortion_model: equidistant
-  intrinsics: [457.6, 456.1, 379.9, 255.2]
-  resolution: [752, 480]
-  rostopic: /back/image_raw
-"""
-
-
-def test_a_camera_of_kalibrs_chain_is_chosen_by_topic_name_or_option(tmp_path):
-    path, size = tmp_path / "camchain.yaml", (752, 480)
-    path.write_text(CAMCHAIN)
-    with collected() as warnings:
-        front = calibrated(path, size=size, camera="front", pictures="/front/image_raw")
-    (notice,) = warnings
-    assert "the pose in it is relative to the IMU (T_cam_imu), so that no ground plane follows" in notice.message
-    assert (front.message.distortion_model, front.message.D) == ("plumb_bob", [-0.2, 0.05, 0.001, 0.002, 0])
-    assert front.message.K == [458.6, 0, 367.2, 0, 457.3, 248.4, 0, 0, 1]
-    for back in (
-        calibrated(path, size=size, camera="back"),
-        calibrated(path, size=size, camera="cam1"),
-        calibrated(path, size=size, name="cam1"),
-    ):
-        assert (back.message.distortion_model, back.message.D) == ("kannala_brandt", [-0.01, 0.02, 0.003, -0.004])
-    posed = calibrated(path, untyped(tmp_path, rvec=RVEC, tvec=TVEC), size=size, name="cam1")
-    assert posed.plane is not None
-    with pytest.raises(McaptrackError, match=r"has cam0 \(/front/image_raw\), cam1 .*none is of left; choose one"):
-        calibrated(path, size=size, camera="left")
-    with pytest.raises(McaptrackError, match="has no camera 'cam7'; it has cam0"):
-        calibrated(path, size=size, name="cam7")
-
-
 BILLION = '<!DOCTYPE a [<!ENTITY b "c"><!ENTITY d "&b;&b;">]><opencv_storage><k>&d;</k></opencv_storage>'
 HEAD = "%YAML:1.0\n---\n"
 
@@ -248,20 +160,6 @@ def test_what_is_no_calibration_is_refused_in_a_line(tmp_path, text, said):
     assert said in str(refused.value)
     assert str(path) in str(refused.value)
     assert len(str(refused.value).splitlines()) == 1
-
-
-def test_cameras_that_see_no_ground_are_refused_and_z_down_is_named(tmp_path):
-    up = Rotation.from_euler("x", -100, degrees=True) * TURN
-    path = stored(tmp_path / "a.yml", K=K, rvec=up.as_rotvec(), tvec=-up.apply(PLACE))
-    with pytest.raises(McaptrackError, match=r"the camera sees no ground: it is 2.90 m from z = 0 and looks away"):
-        calibrated(path)
-    mirrored = TURN * Rotation.from_euler("x", 180, degrees=True)  # y and z of the world point the other way
-    path = stored(tmp_path / "b.yml", K=K, rvec=mirrored.as_rotvec(), tvec=TVEC)
-    with collected() as warnings:
-        found = calibrated(path)
-    assert "the camera is at z = -2.90 m, so that z of the world points down" in warnings[0].message
-    pixels = cv2.projectPoints(GROUND, RVEC, TVEC, K, None)[0][:, 0]
-    assert np.abs(found.plane.pixels_to_metres(pixels) - GROUND[:, :2] * [1, -1]).max() < 1e-6
 
 
 def test_a_calibration_goes_into_a_log_and_boxes_get_metres(tmp_path, monkeypatch):
@@ -312,21 +210,6 @@ def test_mistakes_with_calibrations_are_one_line(tmp_path, monkeypatch):
     }.items():
         code, _, err = call("ingest", *words.split())
         assert (code, err.count("\n"), said in err) == (1, 1, True), err
-
-
-def test_the_size_is_guessed_from_boxes_with_a_warning_and_unused_options_are_named(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("gt.txt").write_text("1,1,1800,900,20,50,1,-1,-1,-1\n")
-    stored(Path("cam.yml"), K=K, rvec=RVEC, tvec=TVEC)
-    done("ingest", "gt.txt", "--fps", 1, "--calibration", "cam.yml", "-o", "a.mcap")
-    found = mcaptrack.ingest("gt.txt", "b.mcap", fps=1, calibration="cam.yml", calibration_name="x")
-    said = [notice.message for notice in found.warnings]
-    assert "`calibration_name='x'` changes nothing here: no file has several cameras" in said
-    assert any("1820 x 950 is taken, the extent of boxes" in one for one in said)
-    found = mcaptrack.ingest("gt.txt", "c.mcap", fps=1, calibration_unit="cm")
-    assert [one.message for one in found.warnings if one.code == "option-not-used"] == [
-        "`calibration_unit=` changes nothing here: there is no calibration"
-    ]
 
 
 def test_a_recording_gets_a_calibration_in_the_frame_of_its_pictures(tmp_path, monkeypatch):

@@ -157,17 +157,6 @@ def test_boxes_become_positions_in_the_map(model, tmp_path):
         assert np.abs(plane.metres_to_pixels(people_at(s)[:, :2]) - feet).max() < 0.5
 
 
-def test_a_run_ends_in_the_map_and_is_up_to_date(tmp_path):
-    path = robot(tmp_path / "robot.mcap", "plumb_bob", until_s=4, last_s=4)
-    first = done("run", path, "--topic", "/front/boxes", "--no-tables", "--in-place")
-    assert "ground plane is known" not in first.err
-    for topic in ("/front/samples", "/front/retracks", "/front/retracks/full"):
-        assert np.nanmedian(errors_m(path, topic)) < 0.3, topic
-    assert mcaptrack.run(path, topic="/front/boxes", tables=False).stages == ()
-    with log.read(path) as opened:
-        assert opened.channels["/front/retracks"].metadata["mcaptrack.frame_id"] == "map"
-
-
 def test_a_calibration_that_a_user_gives_replaces_the_recorded_one(tmp_path):
     """Recorded is a focal length that is off; planes follow from it until a better one is given, and from that then."""
     wrong = np.array([[400.0, 0, 640], [0, 400, 360], [0, 0, 1]])
@@ -334,17 +323,6 @@ def test_planes_of_each_picture_hold_where_tracks_are_compensated(straight, tmp_
                 found = plane_at(moved, since_ns)
                 assert found.boxes_to_metres(here) == pytest.approx(plane.boxes_to_metres(points), abs=1e-5)
                 assert found.metres_to_pixels(plane.boxes_to_metres(points)) == pytest.approx(here[:, :2], abs=1e-2)
-
-
-def test_the_frame_of_the_metres_is_an_option(straight, tmp_path):
-    path = tmp_path / "robot.mcap"
-    path.write_bytes(straight.read_bytes())
-    for frame in ("base_link", "map"):
-        result = mcaptrack.track(path, topic="/front/boxes", to="/front/tracks", frame=frame)
-        assert not result.warnings
-        with log.read(path) as opened:
-            for topic in ("/front/tracks", "/front/ground_plane"):
-                assert opened.channels[topic].metadata["mcaptrack.frame_id"] == frame
 
 
 def test_many_planes_are_recorded_by_their_digest():

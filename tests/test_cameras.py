@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import mcaptrack
-from mcaptrack import log, pipeline
+from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance, digest
@@ -87,19 +87,6 @@ def test_outputs_belong_to_the_camera_of_their_source(path, stage, target):
                 assert made.input == target
 
 
-def test_a_channel_at_another_topic_is_made_again_with_its_input(path):
-    done("track", path, "--to", "/elsewhere", "--max-age-s", 3, "-q")
-    done("sample", path, "--topic", "/elsewhere", "-q")
-    done("detect", path, "--detector", "knn", "-q")
-    said = done("run", path, "--no-tables").err
-    assert "/elsewhere was made from an earlier /camera/detections: running track again, as before" in said
-    with log.read(path) as opened:
-        made = Provenance.from_metadata(opened.channel("/elsewhere").metadata)
-        assert made is not None
-        assert made.parameters["max_age_s"] == 3
-        assert not [topic for topic in opened.channels if pipeline.is_stale(opened, topic)]
-
-
 def outputs(path: Path, topic: str) -> dict[str, Any]:
     """Return the outputs of re-tracking below a topic, with the parameters of each."""
     with log.read(path) as opened:
@@ -146,17 +133,6 @@ def test_stages_do_not_replace_channels_of_other_stages(path):
             outcome = call(stage, path, "--to", f"/camera/{name}")
             assert (outcome.code, "another --to" in outcome.err) == (1, True), outcome.err
     assert path.read_bytes() == before
-
-
-def test_stages_do_not_replace_ingested_detections(template, tmp_path):
-    rows = "".join(f"{n},-1,{10 + 2 * n},20,10,34,1,-1,-1,-1\n" for n in range(1, 30))
-    (tmp_path / "det.txt").write_text(rows)
-    path = tmp_path / "boxes.mcap"
-    done("ingest", template.with_name("clip.mp4"), "--detections", tmp_path / "det.txt", "-o", path, "-q")
-    before = path.read_bytes()
-    outcome = call("detect", path)
-    assert (outcome.code, path.read_bytes()) == (1, before)
-    assert "detect would replace /camera/detections, which was ingested; write to another channel" in outcome.err
 
 
 LAYOUTS = [
@@ -229,15 +205,6 @@ def test_two_cameras_keep_their_detections_and_results_apart(tmp_path):
         assert find_camera(opened, "front") == find_camera(opened, "front/yolo") == "/front/yolo"
     outcome = call("run", path, "--topic", "/front/yolo/boxes", "--camera", "rear")
     assert (outcome.code, "belongs to the camera front/yolo, not to rear" in outcome.err) == (1, True)
-
-
-def test_detections_without_pictures_are_tracked(tmp_path):
-    path = tmp_path / "boxes.mcap"
-    write_log(path, boxes="/lidar/boxes")
-    said = done("run", path, "--no-tables").err
-    assert "/lidar/detections is missing: taking the boxes of /lidar/boxes" in said
-    with log.read(path) as opened:
-        assert "/lidar/retracks" in opened.channels
 
 
 def test_a_circular_chain_of_inputs_ends(tmp_path):

@@ -191,15 +191,3 @@ def test_label_files_are_scored_by_class(separator, tmp_path):
     found = mcaptrack.evaluate(tracks, truth=truth, classes="person,car").results
     counts = {row.of_class: tuple(row.to_json()[name] for name in ("GT", "FN", "FP")) for row in found}
     assert counts == {None: (2, 10, 0), "person": (1, 0, 0), "car": (1, 10, 0)}
-
-
-def test_frames_and_names_of_other_formats_are_scored_by_class(tmp_path):
-    """COCO beside a table: their frames are compared, and their classes by name."""
-    truth = table(tmp_path, "t.csv", ["person", "car"])
-    images = [{"id": t, "file_name": f"{t}.jpg"} for t in range(10)]
-    both = [(t, k) for t in range(10) for k in (0, 1)]
-    boxes = [{"image_id": t, "category_id": 9 - k, "bbox": [90 * k, t, 40, 80], "track_id": k} for t, k in both]
-    names = [{"id": 9, "name": "person"}, {"id": 8, "name": "car"}]
-    (tmp_path / "k.json").write_text(json.dumps({"images": images, "annotations": boxes, "categories": names}))
-    found = mcaptrack.evaluate(tmp_path / "k.json", truth=truth, classes="all").results
-    assert {row.of_class: row.to_json()["MOTA"] for row in found} == {None: 1.0, "person": 1.0, "car": 1.0}

@@ -17,8 +17,6 @@ from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
 from mcaptrack.transforms import PROFILES, ByteTrack, OcSort, Sort
 from mcaptrack.transforms.retrack.offline_rows import settle_classes
-from mcaptrack.transforms.sort.state import CandidatePairs, associate
-from mcaptrack.transforms.to_video_rate import to_video_rate
 from tests.worlds import assert_same_rows, noisy_tracks, ns
 
 TRACKERS = {"sort": Sort(), "metres apart": Sort(cost="pixels"), "bytetrack": ByteTrack(), "ocsort": OcSort()}
@@ -93,15 +91,6 @@ def test_each_class_is_tracked_as_if_it_were_alone(tracker):
             frame.rows["track_id"] += 1000
         same_but_for_ids(together, both(alone[0], apart))
         assert {1, 2} == {int(one) for frame in together for one in frame.rows["class_id"]}
-
-
-def test_competition_in_one_class_does_not_change_another():
-    """Alone, class 1 has one pair above 0.2. Together with others below, two pairs of 0.19 would outweigh it."""
-    detection, track = (np.array(some) for some in ([0, 0, 1, 2, 2, 3], [0, 1, 0, 2, 3, 2]))
-    pairs = CandidatePairs(detection, track, np.array([0.21, 0.19, 0.19, 0.5, 0.4, 0.4]), (4, 4))
-    together = associate(pairs._replace(class_id=np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])), 0.2)
-    assert set(zip(*(some.tolist() for some in together), strict=True)) == {(0, 0), (2, 3), (3, 2)}
-    assert set(zip(*(some.tolist() for some in associate(pairs, 0.2)), strict=True)) == {(2, 3), (3, 2)}
 
 
 @every_tracker
@@ -211,17 +200,6 @@ def test_links_join_no_two_classes_but_across_classes():
     assert {one for _, one in ids(walk_in_two_pieces(2))} == {1, 2}
     assert len(ids(walk_in_two_pieces(1))) == 1
     assert ids(walk_in_two_pieces(2), across_classes=True) == {(1, 2)}  # 14 of 24 samples
-
-
-def test_boxes_at_video_rate_have_the_class_of_their_retracked_track():
-    frames = walk_in_two_pieces(2)
-    method = replace(PROFILES["default"], track_confidence=0.0, across_classes=True)
-    full = to_video_rate(frames, [found for found, *_ in method(frames)], ())
-    assert {int(one) for frame in full for one in frame.rows["class_id"]} == {2}
-    assert sum(len(frame.rows) for frame in full) == len(frames)
-    retracked = [found for found, *_ in method(frames)]
-    early = to_video_rate(frames, retracked[1:], ())  # the first box has no sample at its time
-    assert [frame.rows["class_id"].tolist() for frame in early[:2]] == [[2], [2]]
 
 
 # Logs and tables

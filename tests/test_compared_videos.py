@@ -16,7 +16,7 @@ from mcaptrack.foxglove import ANNOTATIONS
 from mcaptrack.foxglove.messages import message_class
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.pipeline.write import Made, write
-from mcaptrack.schema import EVENTS, TRACKS, Frame
+from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.viewing import comparing, from_above, heat_map
 from mcaptrack.viewing.heat_map import Occupancy
@@ -105,48 +105,6 @@ def test_labels_from_above_never_overlap():
             hits = [b for b in boxes[:n] if a[0] < b[2] and b[0] < a[2] and a[1] < b[3] - 0.1 and b[1] < a[3] - 0.1]
             assert not hits or abs(before[f"{n + 1} car"]) < 1e-9  # too far away: it stays where it is
     assert moved > 60
-
-
-def test_a_label_from_above_that_moved_up_comes_back_by_small_steps():
-    """Two stand at one place, then the first one is gone."""
-    places, heights = from_above.LabelPlaces(), []
-    for names in (("4", "7"), *[("7",)] * 14):
-        places.next_picture()
-        drawn = message_class(ANNOTATIONS)()
-        for name in names:
-            text = drawn.texts.add(text=name, font_size=12.0)
-            text.position.x, text.position.y = 5.0, 50.0
-        heights.append({text.text: text.position.y for text in places.spread(drawn).texts})
-    assert heights[0]["4"] == 50.0
-    own = np.array([one["7"] for one in heights])
-    assert 50 - own[0] > 12
-    assert (np.diff(own) >= 0).all()
-    assert np.diff(own).max() < 3
-    assert own[-1] == 50.0
-
-
-def test_counters_are_those_of_the_events_and_captions_tell_the_last_ones(finished):
-    with log.read(finished) as opened:
-        panels = comparing.find_panels(opened, "/camera")
-        start = int(opened.times("/camera/video")[0])
-        last = int(opened.times("/camera/video")[-1])
-        happened = [comparing._happened(opened, panel, start) for panel in panels]
-        for panel, one in zip(panels[:2], happened, strict=False):
-            rows = [(f.t_ns, int(r["kind"])) for f in opened.frames(panel.events, EVENTS) for r in f.rows]
-            ids = {int(i) for f in opened.frames(panel.topic, TRACKS) for i in f.rows["track_id"]}
-            switches = sum(kind == 4 for _, kind in rows)
-            said = comparing._counter(panel, one, last)
-            assert said.startswith(f"{switches} identity switch")
-            assert f" {len(ids)} track" in said
-        assert comparing._counter(panels[2], happened[2], last) == "3 people so far"
-    made = comparing._Happened(np.array([1, 2, 9]) * 10**9, ["a", "b", "c"], [True, False, True], np.array([0]), True)
-    panel = comparing.Panel("SORT", "/t", "/v", "/e")
-    assert comparing._counter(panel, made, 2 * 10**9) == "1 identity switch, 1 track, 1 repair"
-    assert comparing._counter(panel, made, 9 * 10**9) == "2 identity switches, 1 track, 1 repair"
-    assert comparing._counter(panel, made._replace(is_compared=False), 0) == "1 track"
-    assert comparing._captions([panel], [made], 3 * 10**9) == ["SORT: b", "SORT: a"]
-    assert comparing._captions([panel], [made], 8 * 10**9) == []
-    assert [comparing._clock(seconds) for seconds in (0.0, 59.97, 61.24)] == ["0:00.0", "1:00.0", "1:01.2"]
 
 
 def test_heat_stands_where_people_stood_in_the_picture_and_nowhere_beyond_the_horizon():

@@ -124,15 +124,6 @@ def test_frames_of_a_task(read, meta, boxes, frames, labelled):
     assert labelled or words in said[0]
 
 
-def test_the_longest_task_that_is_believed(read, monkeypatch):
-    monkeypatch.setattr(cvat, "_MAX_FRAMES", 10)
-    task = "<start_frame>5</start_frame><stop_frame>{}</stop_frame>"
-    assert read(track(box(6)), meta=task.format(14)).labelled.tolist() == list(range(5, 15))
-    assert read(track(box(6)), meta=task.format(15)).labelled.tolist() == [6]
-    far = read(track(box(6)), track(box(30)), meta=task.format(15))
-    assert far.labelled.tolist() == [*range(6, 17), 30]
-
-
 def test_ids_of_tracks(read):
     numbered = [track(box(0), more=f'id="{n}"') for n in (7, 0, 3)]
     found = read(*numbered)
@@ -155,13 +146,6 @@ def test_ids_of_tracks(read):
     assert any("1 tracks change their track_id; the first of each is taken" in one for one in changed.remarks)
     same = read(track(box(0, inner=own(4)), box(1, inner=own(4))))
     assert not any("change their track_id" in one for one in same.remarks)
-
-
-@pytest.mark.parametrize("count", [8, 9])
-def test_eight_ids_that_several_tracks_state_are_named(read, count):
-    found = read(*(track(box(k % 2, inner=own(k // 2)), more=f'id="{k}"') for k in range(2 * count)))
-    names = "0, 1, 2, 3, 4, 5, 6, 7" + ", ..." * (count > 8)
-    assert any(f"state one track_id ({names}): {count} of them" in one for one in found.remarks)
 
 
 def test_ids_that_are_no_numbers(read):

@@ -199,14 +199,6 @@ class TestCvat:
         assert labels.observed.tolist() == [True, True, False, False]
         assert (labels.labelled[0], labels.labelled[-1]) == (0, 30083)
 
-    def test_boxes_between_keyframes_are_interpolated_and_none_after_the_object_left(self, tmp_path):
-        boxes = [box(2, 100), box(6, 140), box(8, 180, outside=1), box(12, 50)]
-        labels = read(tmp_path, f"<annotations>{track(3, *boxes)}</annotations>")
-        assert labels.frame.tolist() == [2, 3, 4, 5, 6, 7, 12]
-        assert labels.boxes_px[:, 0].tolist() == [100, 110, 120, 130, 140, 160, 50]
-        assert labels.id.tolist() == [3] * 7
-        assert any("4 boxes are interpolated" in words for words in labels.remarks)
-
     def test_a_zip_file_of_cvat(self, tmp_path):
         with zipfile.ZipFile(tmp_path / "task.zip", "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("images/frame_000000.png", b"\0")
@@ -233,24 +225,16 @@ class TestCvat:
         [
             (BOMB, ":1: a document type, which CVAT doesn't write"),
             (OUTER, ":1: a document type"),
-            ("<annotations>" + "<a>" * 40, ":1: nested deeper"),
             ("<annotation><object/></annotation>", ":1: XML that begins with <annotation>"),
             ("<annotations>\n<track>", ":2: not valid XML: no element found"),
             ("<annotations></annotations>", " holds no boxes"),
             ('<annotations><image id="0"><points label="a" points="1,2"/></image></annotations>', "only 1 of <points>"),
-            (f"<annotations>{track(0, box(3, 1), box(3, 2))}</annotations>", "the frame of a box is 3"),
-            (f"<annotations>{track(0, box(0, 1), box(2**40, 2))}</annotations>", "boxes would be interpolated"),
-            ('<annotations><track id="x"></track></annotations>', "the id of a track is a whole number"),
             ('<annotations><track><box frame="1" xtl="1"/></track></annotations>', "a box without 'ytl'"),
             (ONE.replace('"30"', '"z"'), "corners that aren't numbers"),
             (ONE.replace('"30"', '"nan"'), "not finite"),
             (ONE.replace('"30"', '"3"'), "can't be 10 wide and -7 high"),
             (f'<?xml version="1.0" encoding="foo"?>{ONE}', "unknown encoding: foo"),
             ('<annotations><image id="4"/><image id="4"/></annotations>', "image 4 is there before"),
-            (
-                '<annotations><track task_id="1"/><track task_id="2"/></annotations>',
-                "tasks 1 and 2 of a project; export each task",
-            ),
         ],
     )  # fmt: skip
     def test_what_it_would_not_write_is_refused_in_one_line(self, text, words, tmp_path):
@@ -302,12 +286,6 @@ def test_coco_of_polygons_and_of_numbers_with_a_point(tmp_path):
     shape["segmentation"] = {"counts": "abc", "size": [80, 100]}
     with pytest.raises(McaptrackError, match=r"annotation 0 has a mask \(RLE\) and no bbox"):
         read(tmp_path, json.dumps(content), "a.json")
-
-
-def test_a_header_of_motchallenge_names_the_box_not_the_place(tmp_path):
-    head = "frame,id,bb_left,bb_top,bb_width,bb_height,conf,x,y,z"
-    labels = read(tmp_path, f"{head}\n1,3,10,20,30,40,0.5,-1,-1,-1\n", "a.csv")
-    assert (labels.boxes_px.tolist(), labels.id.tolist()) == ([[10, 20, 30, 40]], [3])
 
 
 def test_classes_that_a_file_cannot_tell_apart_are_said():
@@ -379,14 +357,6 @@ class TestCommand:
         with pytest.raises(McaptrackError, match=words):
             mcaptrack.export(template, **{"output": "x.txt", "form": "mot", **given})
         assert [path.name for path in tmp_path.iterdir()] == ["there"]
-
-    def test_a_file_is_replaced_only_when_told(self, template, tmp_path):
-        mcaptrack.export(template, tmp_path / "a.txt", form="mot")
-        with pytest.raises(McaptrackError, match="exists; give another name"):
-            mcaptrack.export(template, tmp_path / "a.txt", form="mot")
-        first = (tmp_path / "a.txt").read_bytes()
-        mcaptrack.export(template, tmp_path / "a.txt", form="mot", force=True)
-        assert (tmp_path / "a.txt").read_bytes() == first
 
     def test_what_a_format_has_no_place_for_is_said_once(self, template, tmp_path):
         said = [one.message for one in mcaptrack.export(template, tmp_path / "a.xml", form="cvat").warnings]

@@ -7,7 +7,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from mcap.reader import make_reader
@@ -21,12 +20,12 @@ from mcaptrack.foxglove.views import SUFFIX
 from mcaptrack.notices import McaptrackWarning
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.transforms import KnnDetector, Sort
+from mcaptrack.transforms import KnnDetector
 from tests.commands import GROUP, call
 from tests.robots import START_NS, stamp_of, write_log
 from tests.ros_messages import pixels, ros_writer, vision
 from tests.tiers import thorough
-from tests.worlds import ns, small_scene
+from tests.worlds import ns
 
 IMAGES = "/robot/front/image"
 
@@ -101,34 +100,6 @@ def test_stages_in_place_keep_all_channels_and_draw_at_capture_times(robot):
     assert layout["configById"]["Image!picture"]["imageMode"]["imageTopic"] == IMAGES
 
 
-def test_detected_positions_match_the_ground_truth(robot):
-    shots = list(small_scene(5.0).shots())
-    mcaptrack("detect", robot, "-q", "--topic", IMAGES)
-    with log.read(robot) as opened:
-        frames = opened.frames("/robot/front/detections", DETECTIONS)
-    near = total = 0
-    for shot, frame in list(zip(shots, frames, strict=True))[20:]:
-        for row in frame.rows:
-            x, y = row["x_px"] + row["w_px"] / 2, row["y_px"] + row["h_px"] / 2
-            centres = shot.boxes[:, :2] + shot.boxes[:, 2:] / 2
-            near += bool(len(centres) and np.hypot(*(centres - [x, y]).T).min() < 15)
-            total += 1
-    assert total > 20
-    assert near / total > 0.7
-
-
-def test_run_takes_the_only_pictures_and_reports_it(robot, capsys):
-    mcaptrack("run", robot, "--no-tables")
-    said = capsys.readouterr().err
-    assert f"/robot/front/video is missing: taking the pictures of {IMAGES}" in said
-    with log.read(robot) as opened:
-        assert "/robot/front/retracks/predictions" in opened.channels
-    before = robot.read_bytes()
-    mcaptrack("run", robot, "--no-tables")
-    assert "nothing to do" in capsys.readouterr().err
-    assert robot.read_bytes() == before
-
-
 @thorough
 def test_run_with_the_only_topic_equals_run_without_a_topic(robot, tmp_path):
     shutil.copy(robot, tmp_path / "b.mcap")
@@ -156,25 +127,6 @@ def test_several_cameras_need_a_choice(tmp_path):
         assert "/right/retracks" not in opened.channels
 
 
-def test_recorded_detections_are_tracked(tmp_path):
-    path = tmp_path / "boxes.mcap"
-    shots = write_log(path, "/eye/image", boxes="/eye/detections")
-    before = content(path)
-    mcaptrack("track", path, "-q", "--topic", "/eye/detections")
-    after = content(path)
-    assert {topic: after[topic] for topic in before} == before
-    with log.read(path) as opened:
-        tracks = opened.frames("/eye/tracks", TRACKS)
-        assert [f.t_ns for f in tracks] == [row[3] for row in before["/eye/detections"]]
-        seen = [int(f.rows["observed"].sum()) for f in tracks]
-        assert sum(seen) > 0.7 * sum(len(shot.boxes) for shot in shots)
-    for number, (_, message) in enumerate(annotations(path, "/eye/tracks")):
-        assert stamped(message) == stamp_of(number)
-    mcaptrack("run", path, "-q", "--topic", "/eye/detections", "--no-tables")
-    with log.read(path) as opened:
-        assert "/eye/retracks" in opened.channels
-
-
 def test_recorded_channels_are_never_replaced(tmp_path):
     path = tmp_path / "boxes.mcap"
     write_log(path, "/eye/image", boxes="/eye/detections")
@@ -196,33 +148,6 @@ def test_recorded_channels_are_never_replaced(tmp_path):
 def content_of(data: bytes, folder: Path) -> dict[str, list]:
     (folder / "before.mcap").write_bytes(data)
     return content(folder / "before.mcap")
-
-
-def test_detections_are_made_again_from_other_pictures(tmp_path, capsys):
-    path = tmp_path / "two.mcap"
-    write_log(path, "/eye/left", "/eye/right")
-    mcaptrack("run", path, "-q", "--no-tables", "--topic", "/eye/left")
-    mcaptrack("run", path, "--no-tables", "--topic", "/eye/right")
-    assert "/eye/detections was made from /eye/left: running detect again, from /eye/right" in capsys.readouterr().err
-    with log.read(path) as opened:
-        assert Provenance.from_metadata(opened.channel("/eye/detections").metadata).input == "/eye/right"
-        assert not [topic for topic in opened.channels if pipeline.is_stale(opened, topic)]
-
-
-def test_channels_of_the_wrong_schema_are_refused_by_name(robot, tmp_path):
-    path = tmp_path / "boxes.mcap"
-    write_log(path, "/eye/image", boxes="/eye/boxes")
-    with log.read(path) as opened:
-        with pytest.raises(
-            McaptrackError,
-            match=r"/eye/boxes holds vision_msgs/msg/Detection2DArray; detect reads foxglove\.CompressedVideo or .* or sensor_msgs/Image$",
-        ):
-            pipeline.plan_stage(opened, "/eye", "detect", KnnDetector(), "/eye/boxes")
-        with pytest.raises(
-            McaptrackError,
-            match=r"/eye/image holds sensor_msgs/msg/CompressedImage; track reads mcaptrack\.Detections or vision_msgs/Detection2DArray",
-        ):
-            pipeline.plan_stage(opened, "/eye", "track", Sort(), "/eye/image")
 
 
 @pytest.mark.parametrize("payload", [b"", b"\0\1\0\0garbage", None])
@@ -306,11 +231,3 @@ def test_unreadable_recorded_detections_leave_other_tables_complete(tmp_path):
     (warning,) = data["warnings"]
     assert (warning["code"], "not a vision_msgs" in warning["message"]) == ("left-out", True)
     assert "no boxes of /lidar/boxes are in the table" in warning["message"]
-
-
-def test_tracking_detections_of_named_classes_reports_their_numbers(tmp_path, capsys):
-    path = tmp_path / "a.mcap"
-    boxes_log(path, "person", "car", "bicycle")
-    mcaptrack("track", path, "--topic", "/lidar/boxes")
-    assert "warning: " in (err := capsys.readouterr().err)
-    assert "classes of /lidar/boxes are names; in class_id 1 is a person, 2 is 'bicycle', 3 is 'car'" in err

@@ -224,3 +224,5 @@ def test_the_camera_of_a_chain(given):
     ]  # fmt: skip
     with pytest.raises(McaptrackError, match=r"9.yaml and .*10.yaml both hold poses; give the files of one camera"):
         given(above(3), above(3))
+    with pytest.raises(McaptrackError, match="has no camera 'cam7'; it has cam0"):
+        given(chain, prefix="/left", name="cam7")

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import runpy
-import shlex
 import shutil
 import subprocess
 import sys
@@ -64,26 +62,6 @@ def test_what_is_copied_is_there_and_gives_the_wheel_of_the_repository(tmp_path)
         "one": ROOT, "other": tmp_path}.items()]  # fmt: skip
     one, other = (Path(next(iter(each))).read_bytes() for each in made)
     assert one == other
-
-
-def test_the_installation_is_one_that_the_tool_tries_and_needs_no_torch():
-    (line,) = [words for words in named("RUN") if "pip install" in words]
-    words = shlex.split(line)
-    assert words[:-1] == [
-        "/opt/mcaptrack/bin/python",
-        "-m",
-        "pip",
-        "install",
-        "--no-cache-dir",
-        "-c",
-        "constraints.txt",
-    ]
-    extras = set(re.fullmatch(r"\.\[([\w,]+)\]", words[-1])[1].split(","))
-    assert {"cloud", "fleet"} <= extras
-    assert "train" not in extras
-    tool = (ROOT / "tools" / "installs.py").read_text()
-    assert "pip_line(text)" in tool
-    assert 'partial(image, found, built, folder / "image")' in tool
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a shell")

@@ -7,15 +7,13 @@ from pathlib import Path
 import pytest
 
 from mcaptrack import log
-from mcaptrack.cli.common import expand, only_one_output
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.sources.ingest.job import IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.camera import boxes_extent
 from mcaptrack.sources.ingest.labels.content import WantedClasses
-from mcaptrack.tables.compared import pair_files
-from tests.logs import add_rows, some_log
+from tests.logs import add_rows
 from tests.worlds import boxes_at, tracks_at
 
 MOT = "".join(
@@ -105,26 +103,3 @@ def test_pictures_are_as_large_as_what_their_boxes_reach(place):
 
 
 # Other places where an input is taken, paired or refused
-
-
-def test_a_log_is_no_file_of_labels(place):
-    some_log(place / "a.mcap")
-    for truths, words in ((["gt.txt"], "'gt.txt'"), (["gt.txt", "zero.txt"], "'LABELS'")):
-        with pytest.raises(McaptrackError, match=rf"a.mcap is a log, not a file of labels; .* add it with .*{words}"):
-            pair_files([Path("a.mcap")], [Path(name) for name in truths])
-    assert pair_files([Path("zero.txt")], [Path("gt.txt")]) == ([("zero", Path("zero.txt"), Path("gt.txt"))], "")
-
-
-def test_folders_are_taken_as_logs_or_as_a_whole(place):
-    Path("logs").mkdir()
-    for name in "ba":
-        some_log(Path("logs") / f"{name}.mcap")
-    assert [str(one) for one in expand([Path("logs")])] == ["logs"]
-    assert [str(one) for one in expand([Path("logs")], folders=True)] == ["logs/a.mcap", "logs/b.mcap"]
-    Path("logs/a.results.mcap").write_bytes(Path("logs/b.mcap").read_bytes())
-    assert [str(one) for one in expand([Path("logs/*.mcap")])] == ["logs/a.mcap", "logs/b.mcap"]
-    assert len(expand([Path("logs/*.mcap")], each=True)) == 3
-    only_one_output([Path("a")], Path("b"))
-    only_one_output([Path("a"), Path("b")], None)
-    with pytest.raises(McaptrackError, match=r"2 inputs can't all be written to b; give one input, or no name"):
-        only_one_output([Path("a"), Path("c")], Path("b"))

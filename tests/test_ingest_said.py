@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as BagWriter
-from rosbags.typesys import Stores, get_typestore
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
@@ -21,11 +20,10 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
 from mcaptrack.schema.provenance import CLOCK, Provenance
-from mcaptrack.sources.ingest import IngestOptions, IngestReport, ingest, label_frames
+from mcaptrack.sources.ingest import IngestOptions, IngestReport, ingest
 from mcaptrack.sources.ingest.bags import decompression, plain_yaml
 from mcaptrack.sources.ingest.bags.metadata_yaml import read_metadata
 from mcaptrack.sources.ingest.bags.plain_yaml import UnsupportedYamlError
-from mcaptrack.sources.ingest.bags.rosbag2 import known_definition
 from mcaptrack.sources.ingest.labels.camera import (
     CameraTopics,
     camera_prefix,
@@ -81,32 +79,6 @@ def test_classes_of_detections_are_listed_and_their_names_kept(tmp_path):
     assert rows["class_id"].tolist() == [3, 1, 3, 8]
     assert [rows[name][0] for name in ("x_px", "y_px", "w_px", "h_px")] == [10, 20, 4, 8]
     assert (report.messages, report.has_labels, report.uses_camera) == ({"/camera/detections": 2}, True, True)
-
-
-def test_classes_without_names_are_listed_by_number_and_one_alone_is_not(tmp_path):
-    rows = "1,-1,1,1,2,2,0.5,{}\n1,-1,5,1,2,2,0.5,7\n2,-1,5,1,2,2,0.5,7\n"
-    found = write(tmp_path / "found.txt", rows.format(2))
-    report, path = made(found, role="detections", fps=Fraction(10))
-    assert report.remarks[0] == f"{found} has several classes; class_id is 2 (1), 7 (2)"
-    with log.read(path) as opened:
-        assert "mcaptrack.classes" not in opened.channel("/camera/detections").metadata
-    report, _ = made(write(found, rows.format(7)), role="detections", fps=Fraction(10))
-    assert report.remarks == [f"{found}: 2 frames (by the last label) from 1 on, 10 a second (by `fps=`)"]
-
-
-def test_tracks_are_of_people_and_what_is_left_out_of_them_is_said(tmp_path):
-    found = write(tmp_path / "found.txt", KITTI)
-    report, path = made(found, role="truth", fps=Fraction(10), first_frame=0)
-    assert said(report) == [(f"{found} also holds 2 Car, 1 Misc; left out of truth", "left-out")]
-    assert report.remarks == [f"{found}: 2 frames (by the last label) from 0 on, 10 a second (by `fps=`)"]
-    assert parameters_of(path, "/camera/truth") == {
-        "file": "found.txt",
-        "format": "kitti",
-        "first_frame": 0,
-        "fps": "10",
-    }
-    with log.read(path) as opened:
-        assert json.loads(opened.channel("/camera/truth").metadata["mcaptrack.classes"]) == {"1": "Pedestrian"}
 
 
 @pytest.mark.parametrize(
@@ -253,19 +225,6 @@ def test_a_free_name_is_proposed_for_topics_that_are_there(tmp_path):
                 )
         with log.read(out) as opened, pytest.raises(McaptrackError, match=f"`camera='{free}'` puts these beside them"):
             ingest(number, out, IngestOptions(fps=Fraction(10)), into=opened, force=True)
-
-
-def test_files_that_are_compared_say_what_is_assumed_of_them(tmp_path):
-    labels = write(tmp_path / "a.txt", "1,1,1,1,2,2\n3,1,1,1,2,2\n")
-    with pytest.warns(
-        UserWarning, match=r"a\.txt: 3 frames \(by the last label\) from 1 on, 1 a second \(by assumption\)"
-    ):
-        frames = label_frames({"tracks": labels}, None, None, "foot")
-    assert [(frame.t_ns, frame.index, len(frame.rows)) for frame in frames["tracks"]] == [
-        (0, 0, 1),
-        (ns(1), 1, 0),
-        (ns(2), 2, 1),
-    ]
 
 
 # Which camera
@@ -422,22 +381,6 @@ def test_decompression_ends_at_its_limit():
     assert decompression.decompress_steps(bz2.BZ2Decompressor(), bz2.compress(data)[:-9], 10**6) in (b"", data)
 
 
-LOADED = {
-    "a": "a",
-    "[a, [], {}]": ["a", [], {}],
-    "a: 1\nb: [x, {c: d}]\ne: ''": {"a": "1", "b": ["x", {"c": "d"}], "e": ""},
-    "- - a\n  - b\n- c": [["a", "b"], "c"],
-    "\ufeffa: b": {"a": "b"},
-}
-
-
-@pytest.mark.parametrize(("text", "value"), LOADED.items())
-def test_yaml_is_read_as_text_lists_and_maps(text, value):
-    loaded = plain_yaml.load(text.encode())
-    assert loaded == value
-    assert plain_yaml.load(plain_yaml.dump(loaded).encode()) == value
-
-
 def test_yaml_has_limits(monkeypatch):
     plain_yaml.load(b"[" * 31 + b"]" * 31)
     with pytest.raises(UnsupportedYamlError, match="line 2: it is nested more than 32 deep"):
@@ -480,17 +423,6 @@ def test_what_metadata_leaves_out_has_its_usual_value(tmp_path):
             continue
         found, _ = read_metadata(path)
         assert (found.packed, found.distro) == (is_packed, "jazzy")
-
-
-def test_a_definition_has_the_hash_that_a_recording_says():
-    kind = "std_msgs/msg/Empty"
-    known = known_definition(kind, "humble", "")
-    assert known == ("", "ROS 2 Humble")
-    digest = get_typestore(Stores.ROS2_HUMBLE).hash_rihs01(kind)
-    assert known_definition(kind, "humble", digest) == known
-    assert known_definition(kind, "humble", digest[:-1] + "x") == ("", "")
-    assert known_definition(kind, "humble", "another kind of hash") == known
-    assert known_definition("a/msg/B", "humble", "") == ("", "")
 
 
 def test_labels_take_the_plane_of_their_camera_if_it_was_measured_and_stays(tmp_path):

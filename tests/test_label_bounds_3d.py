@@ -237,14 +237,6 @@ def test_objects_that_move_across_their_heading_are_doubted(speed, heading, coun
     assert [one.partition(";")[0] for one in doubts] == ([words] if across else [])
 
 
-@pytest.mark.parametrize(("turned", "is_odd"), [(20, False), (21, True)])
-def test_half_of_the_moving_objects_may_move_across_their_heading(turned, is_odd, tmp_path):
-    """Their headings count at the beginning of each step."""
-    rows = [usual(t_ns=n * 10**9, x_m=5 * n, heading_rad=1.5 * (n < turned)) for n in range(41)]
-    doubts = read_boxes_3d(table(tmp_path, *rows), "truth").doubts
-    assert ["21 of 40 boxes" in one for one, _ in doubts] == [True] * is_odd
-
-
 # Classes
 
 
@@ -274,20 +266,6 @@ def test_a_table_without_classes_says_so(tmp_path):
     rows = read_boxes_3d(table(tmp_path, usual(**{"class": None})), "truth")
     assert timed(rows).class_id.tolist() == [0]
     assert f"{rows.path} states no classes; class_id is 0" in rows.remarks
-
-
-@pytest.mark.parametrize("kinds", [8, 9, 11])
-def test_eight_classes_that_are_left_out_are_listed(kinds, tmp_path):
-    others = [usual(id=100 * k + n, **{"class": f"k{k:02}"}) for k in range(kinds) for n in range(20 - k)]
-    path = table(tmp_path, *others, usual(id=9999, **{"class": "person"}))
-    rows = read_boxes_3d(path, "truth")
-    assert timed(rows, classes="person").track_id.tolist() == [9999]
-    listed = ", ".join(f"{20 - k} k{k:02}" for k in range(8))
-    more = sum(20 - k for k in range(8, kinds))
-    assert rows.left_out == listed + (f", {more} of other classes" if more else "")
-    rows = read_boxes_3d(path, "detections")
-    assert len(timed(rows, "detections", "person").t_ns) == 1
-    assert not rows.left_out
 
 
 # Quaternions
@@ -571,16 +549,6 @@ def test_tables_of_nuscenes_are_refused_with_their_name(changed, words, tmp_path
     assert words in str(refused.value)
 
 
-@pytest.mark.parametrize("count", [10, 11, 13])
-def test_ten_scenes_are_listed(count, tmp_path):
-    scenes = [{"token": f"t{n}", "name": f"s{n:02}"} for n in range(count)]
-    with pytest.raises(McaptrackError) as refused:
-        read_boxes_3d(nuscenes(tmp_path, scene=scenes), "truth")
-    more = f" and {count - 10} more" if count > 10 else ""
-    words = f"{tmp_path} has {count} scenes; choose one with `scene=`: {', '.join(f's{n:02}' for n in range(10))}{more}"
-    assert str(refused.value) == words
-
-
 def test_the_folder_of_nuscenes_holds_one_set_of_tables(tmp_path):
     for name in ("v1.0-mini", "v1.0-test"):
         (tmp_path / name).mkdir()
@@ -735,14 +703,6 @@ def test_labels_are_at_most_a_minute_from_their_log(first_s, is_taken, tmp_path)
         return
     with pytest.raises(McaptrackError, match=r"from 100\.000 to 110\.000 s; give the time of the first labels with"):
         ingested(labels, tmp_path, tmp_path / "log.mcap", **options)
-
-
-def test_all_classes_are_counted_in_a_remark(tmp_path):
-    kinds = ("car", "van", "car", "person")
-    path = table(tmp_path, *(usual(id=n, **{"class": kind}) for n, kind in enumerate(kinds)))
-    _, remarks, warnings = ingested(path, tmp_path / "log.mcap")
-    assert f"{path}: class_id is 1 person (1), 2 car (2), 3 van (1)" in remarks
-    assert f"{path}: boxes are taken as those of the frame 'map' (assumed); `frame=` names another" in warnings
 
 
 @pytest.mark.parametrize(

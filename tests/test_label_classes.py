@@ -105,43 +105,6 @@ def ingest(folder: Path, name: str, content: bytes, **options):
     return mcaptrack.ingest(folder / name, folder / "a.mcap", fps=10, force=True, **options)
 
 
-@pytest.mark.parametrize("people", [0, 1], ids=["without people", "with people"])
-def test_detections_keep_all_classes_also_where_none_is_a_person(tmp_path, people):
-    rows = [f"{t},{10 * t},20,30,60,car" for t in range(3)] + ["1,200,20,30,60,person"] * people
-    ingest(tmp_path, "a.csv", ("frame,x,y,w,h,class\n" + "\n".join(rows) + "\n").encode())
-    with mcaptrack.open(tmp_path / "a.mcap") as log:
-        assert sorted(row["class"] for row in log.table("detections").to_pylist()) == ["car"] * 3 + ["person"] * people
-
-
-def test_tracks_without_people_are_refused_with_a_remedy(tmp_path):
-    rows = "".join(f"{t},1,{10 * t},20,30,60,car\n" for t in range(3)).encode()
-    with pytest.raises(McaptrackError, match=r"a.csv holds no people, only 3 car; `classes=` takes others"):
-        ingest(tmp_path, "a.csv", b"frame,id,x,y,w,h,class\n" + rows)
-
-
-def test_classes_have_an_effect_where_ids_tell_that_a_file_has_tracks(tmp_path):
-    made = ingest(tmp_path, "gt.csv", CSV.encode(), classes="all")
-    assert not [one for one in made.warnings if one.code == "option-not-used"]
-    with mcaptrack.open(tmp_path / "a.mcap") as log:
-        assert {row["class"] for row in log.table("tracks").to_pylist()} == {"human", "vélo", "Cat"}
-
-
-def test_of_many_classes_some_are_listed(tmp_path):
-    rows = "".join(f"{t},{10 * t},20,30,60,kind{t}\n" for t in range(30))
-    made = ingest(tmp_path, "a.csv", b"frame,x,y,w,h,class\n" + rows.encode())
-    (words,) = [note for note in made.notes if "has several classes" in note]
-    assert (words.count("kind"), words[-12:]) == (20, " and 10 more")
-
-
-@pytest.mark.parametrize(
-    ("encoding", "words"), [("utf-16", "UTF-16; save it as UTF-8"), ("latin-1", "not text in UTF-8")]
-)
-def test_text_in_other_encodings_is_refused_by_name(tmp_path, encoding, words):
-    rows = "".join(f"{t},{10 * t},20,30,60,Fußgänger\n" for t in range(30))
-    with pytest.raises(McaptrackError, match=words):
-        ingest(tmp_path, "a.csv", ("frame,x,y,w,h,class\n" + rows).encode(encoding))
-
-
 @pytest.mark.parametrize(
     ("form", "numbers"),
     [
@@ -200,3 +163,17 @@ def test_people_of_kitti_that_are_hidden_or_cut_off_are_ignored_if_all_classes_c
     every = read_labels(tmp_path / "a.txt", "kitti", "truth", wanted=WantedClasses("all"))
     assert (every.id.tolist(), every.left_out) == ([10, 50], "1 DontCare and 2 boxes, hidden or cut off")
     assert every.ignored.boxes_px[:, 0].tolist() == [20, 30, 60]
+
+
+def test_tracks_without_people_are_refused_with_a_remedy(tmp_path):
+    rows = "".join(f"{t},1,{10 * t},20,30,60,car\n" for t in range(3)).encode()
+    with pytest.raises(McaptrackError, match=r"a.csv holds no people, only 3 car; `classes=` takes others"):
+        ingest(tmp_path, "a.csv", b"frame,id,x,y,w,h,class\n" + rows)
+
+
+@pytest.mark.parametrize("people", [0, 1], ids=["without people", "with people"])
+def test_detections_keep_all_classes_also_where_none_is_a_person(tmp_path, people):
+    rows = [f"{t},{10 * t},20,30,60,car" for t in range(3)] + ["1,200,20,30,60,person"] * people
+    ingest(tmp_path, "a.csv", ("frame,x,y,w,h,class\n" + "\n".join(rows) + "\n").encode())
+    with mcaptrack.open(tmp_path / "a.mcap") as log:
+        assert sorted(row["class"] for row in log.table("detections").to_pylist()) == ["car"] * 3 + ["person"] * people

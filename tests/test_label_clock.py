@@ -285,21 +285,6 @@ def test_files_that_are_compared_or_tuned_have_the_same_frames(tmp_path, name, r
         assert [(f.t_ns, f.index, len(f.rows)) for f in frames] == world.expected(CLIP_NS)
 
 
-def test_a_file_that_counts_from_elsewhere_can_say_so(tmp_path, stock):
-    """Labels of a part that was cut out of a longer video, in the numbers of the longer one."""
-    found = tmp_path / "gt.txt"
-    found.write_text("".join(f"{1000 + k},7,{k},1,2,2\n" for k in range(5, PICTURES)))
-    options = {"labels": {"truth": found}, "first_frame": 1000}
-    ingest(stock / "clip.mp4", tmp_path / "a.mcap", IngestOptions(**options))
-    with log.read(tmp_path / "a.mcap") as opened:
-        frames = opened.frames("/camera/truth", TRACKS)
-        assert [(f.t_ns, f.index, f.rows["x_px"].tolist()) for f in frames] == [
-            (CLIP_NS[k], k, [k] if k > 4 else []) for k in range(PICTURES)
-        ]
-        made = Provenance.from_metadata(opened.channel("/camera/truth").metadata)
-        assert (made.parameters["first_frame"], made.input) == (1000, "/camera/video")
-
-
 INTO_REFUSED = {
     "another rate": (
         "clip",

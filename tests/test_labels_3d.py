@@ -455,21 +455,3 @@ def test_frames_of_labels_have_the_stamps_of_recorded_boxes(tmp_path):
     assert list(result.messages) == ["/lidar/truth"]
     with mcaptrack.open(log) as opened:
         assert [one["t_ns"] for one in opened.table("tracks").to_pylist()] == [100 * 10**9 + 7, 102 * 10**9 + 7]
-
-
-def said(path: Path, **options) -> str:
-    result, _, _ = ingested(path, **options)
-    return " ".join([*(one.message for one in result.warnings), *result.notes])
-
-
-def test_what_is_usual_is_not_warned_about(tmp_path):
-    header = "t,frame,id,x_m,y_m,z_m,length_m,width_m,height_m,heading_rad"
-    standing = [f"{n / 10 + k / 100},{n},{k},{5 * k},{40 * k},0,4,2,1.5,0" for n in range(20) for k in range(3)]
-    words = said(table(tmp_path, *standing, header=header))
-    assert "move across" not in words
-    assert "not read: frame" in words
-    hill = [f"{n},{n},1,{5 * n},{5 * n},{5 * n},4,2,1.5,{math.pi / 4}" for n in range(20)]
-    lane = [f"{n},{n},1,{5 * n},{n / 100},0,4,2,1.5,0" for n in range(20)]
-    wall = [f"{n},{n},1,{n % 3},{n / 100},{5 * n},4,2,1.5,0" for n in range(20)]
-    for rows, is_odd in ((hill, False), (lane, False), (wall, True)):
-        assert ("vertical axis" in said(table(tmp_path, *rows, header=header))) == is_odd

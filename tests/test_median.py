@@ -15,7 +15,7 @@ from mcaptrack.geometry.assignment import assign
 from mcaptrack.geometry.boxes import columns_to_boxes, iou
 from mcaptrack.notices import collected
 from mcaptrack.schema import Frame
-from mcaptrack.transforms import STAGES, KnnDetector, MedianDetector
+from mcaptrack.transforms import KnnDetector, MedianDetector
 from mcaptrack.transforms.detect.median_background import Background
 from mcaptrack.transforms.detect.people import Separator
 from mcaptrack.transforms.detect.person_model import Learner, Person, closed
@@ -70,20 +70,6 @@ def test_three_who_stand_side_by_side_get_three_boxes_and_one_region_without_sep
     assert all(hits(seen, [(93.6, 40, 32.8, 40)]) == 1 for seen in joined)
 
 
-def test_a_belt_in_the_colour_of_the_floor_divides_nobody():
-    """It is 4 px high, a tenth of the person: less than the fifth over which parts are joined."""
-
-    def paint(image, number):
-        floor = image[128:132].copy()
-        walk(image, number)
-        image[128:132] = floor
-
-    found = boxes_of(film(paint), MedianDetector(stabilise=False, separate=False))
-    whole = [hits(seen, [(13.6 + 7.5 * (n % 28), 110, 12.8, 40)]) for n, seen in enumerate(found)]
-    assert sum(whole) > 55
-    assert sum(map(len, found)) < 65
-
-
 def test_boxes_of_several_people_carry_how_many_they_are():
     frames = film(three_side_by_side)
     for separate, wanted in ((True, [1, 1, 1, 1]), (False, [1, 3])):
@@ -106,19 +92,6 @@ def test_one_behind_another_gets_a_box_of_a_whole_person_if_enough_of_them_is_se
     assert [hits(seen, true) for seen in boxes_of(frames)[::3]] == [2] * 20
     strict = MedianDetector(stabilise=False, least_visible=0.95)
     assert sum(hits(seen, true) for seen in boxes_of(frames, strict)[::3]) < 40
-
-
-def test_a_person_behind_a_pole_is_one_box():
-    def paint(image, number):
-        figure(image, 20 + 7.5 * (number % 28), 150)
-        figure(image, 20 + 7.5 * (number % 28), 70)
-        image[44:56, 100:140] = (200, 210, 90)  # a sign before the upper path
-
-    found = boxes_of(film(paint))
-    for number in (12, 13, 14, 40, 41, 42):
-        x = 20 + 7.5 * (number % 28)
-        assert hits(found[number], [(x - 6.4, 30, 12.8, 40), (x - 6.4, 110, 12.8, 40)]) == 2
-        assert len(found[number]) == 2
 
 
 def test_shadows_are_left_out_of_boxes_unless_they_are_kept():
@@ -176,20 +149,6 @@ def test_each_block_of_time_has_its_own_background():
     for history_s, there in ((30.0, 0), (600.0, 50)):
         found = boxes_of(frames, MedianDetector(stabilise=False, history_s=history_s, separate=False))
         assert sum(hits(seen, van) for seen in found[70:]) == there
-
-
-def test_people_of_a_shaking_camera_are_boxed_where_they_are_in_each_picture():
-    scene = small_scene(shake_px=2.5, contrast=6.0)
-    shots = list(scene.shots())
-    frames = [Frame(ns(shot.seconds), n, shot.image) for n, shot in enumerate(shots)]
-    right = {
-        is_on: sum(
-            hits(seen, shot.boxes)
-            for seen, shot in zip(boxes_of(frames, MedianDetector(stabilise=is_on)), shots, strict=True)
-        )
-        for is_on in (True, False)
-    }
-    assert right[True] > 0.6 * sum(len(shot.boxes) for shot in shots)
 
 
 def test_large_pictures_are_halved_and_their_boxes_are_in_full_pixels():
@@ -256,16 +215,6 @@ def test_after_a_cut_people_are_found_at_once_and_nothing_else_is():
     assert sum(map(len, found)) <= 1.1 * sum(right)
 
 
-def test_people_of_little_contrast_are_found_in_much_noise():
-    rng = np.random.default_rng(9)
-    frames = film(lambda image, number: figure(image, 20 + 7.5 * (number % 28), 150, (100, 105, 180)))
-    noisy = [f._replace(rows=(f.rows + rng.normal(0, 14, f.rows.shape)).clip(0, 255).astype(np.uint8)) for f in frames]
-    found = boxes_of(noisy)
-    right = sum(hits(seen, [(13.6 + 7.5 * (n % 28), 110, 12.8, 40)]) for n, seen in enumerate(found))
-    assert right >= 55
-    assert sum(map(len, found)) <= 66
-
-
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (5, 1), (9, 1), (3, 3), (41, 1)])
 def test_gaps_are_closed_as_if_the_mask_went_on_beyond_its_edges(height, width):
     rng = np.random.default_rng(height)
@@ -273,25 +222,6 @@ def test_gaps_are_closed_as_if_the_mask_went_on_beyond_its_edges(height, width):
         mask = rng.random(rng.integers(3, 30, 2)) < 0.2
         wanted = ndimage.binary_closing(np.pad(mask, 50), np.ones((height, width)))[50:-50, 50:-50]
         np.testing.assert_array_equal(closed(mask.astype(np.uint8) * 255, height, width) > 0, wanted)
-
-
-def test_a_log_is_read_twice_and_its_detections_are_those_of_the_pictures(tmp_path):
-    folder = tmp_path / "pictures"
-    folder.mkdir()
-    for frame in film(walk):
-        cv2.imwrite(str(folder / f"{frame.index:03}.png"), frame.rows)
-    path = tmp_path / "log.mcap"
-    mcaptrack.ingest(folder, output=path, fps=2)
-    steps = []
-    report = mcaptrack.detect(path, detector="median", progress=lambda stage, done, total: steps.append((done, total)))
-    assert steps[-1] == (120, 120)
-    assert sorted(steps) == steps
-    with mcaptrack.open(path) as recording:
-        table = recording.table("detections")
-    assert 50 <= len(table) <= 70
-    assert report is not None
-    known = STAGES["detect"].built_in()
-    assert known["median"] is MedianDetector
 
 
 def test_the_background_is_the_median_of_each_channel_and_the_noise_its_deviation():

@@ -7,11 +7,9 @@ from unittest.mock import patch
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaptrack import log
 from mcaptrack.tables import build, files, messages
 from mcaptrack.tables.build import TablePieces
 from tests.memory import held
@@ -98,27 +96,3 @@ def test_a_channel_of_pictures_is_exported_without_holding_them(tmp_path):
         for blobs in (False, True):
             few, many = export(40, blobs), export(140, blobs)
             assert sum(many) - sum(few) < 0.2 * 100 * 40_000
-
-
-@pytest.mark.parametrize("rows", [0, 7, 8, 16, 17])
-def test_a_table_may_end_where_a_piece_ends(rows):
-    """There was a fault of the program if nothing was left for the next piece."""
-    table = pa.table({"a": np.arange(float(rows)), "b": pa.array(["x"] * rows, pa.string()).dictionary_encode()})
-    with patch.object(build, "PIECE_ROWS", 8):
-        parts = TablePieces(table.schema, rows, lambda: [table.slice(at, 4) for at in range(0, rows, 4)])
-        assert pa.concat_tables(list(parts)).equals(table)
-
-
-def test_a_log_gives_the_same_table_at_once(tmp_path):
-    with log.create(tmp_path / "a.mcap") as writer:
-        number = writer.add_channel("/x", ("", "", b""), "json", {})
-        for n in range(9):
-            writer.add_message(number, n, n, b'{"a": %d, "b": [%d.5]}' % (n, n))
-    from mcaptrack.tables.export import LogTables
-
-    with log.read(tmp_path / "a.mcap") as opened:
-        contents = LogTables(opened)
-        whole = contents.messages("/x")[0]
-        with patch.object(messages, "_PART_MESSAGES", 4):
-            assert contents.messages("/x")[0].equals(whole)
-    assert (whole["a"].to_pylist(), whole["b"].to_pylist()[8]) == (list(range(9)), [8.5])

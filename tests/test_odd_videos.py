@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from fractions import Fraction
 from itertools import product
@@ -18,7 +17,6 @@ from mcaptrack.notices import collected
 from mcaptrack.sources.video import VideoOptions, open_video
 from mcaptrack.sources.video.passthrough import Holes, transport_faults
 from mcaptrack.sources.video.reader import Clock, orientation_of
-from tests.commands import call
 from tests.worlds import write_clip
 
 NO_B = {"bf": "0", "g": "10"}
@@ -293,14 +291,3 @@ def test_gaps_between_regular_pictures_are_said():
 def test_times_that_do_not_increase_are_said():
     (one,) = said_of([0, 40, 40, 80, 120, 110, 160])
     assert one.startswith("a.mp4: 2 of 7 pictures are not later than the one before, number 2 first; ")
-
-
-def test_the_command_says_it_in_lines_and_as_json(folder):
-    at, size = samples(folder / "a.mp4")[20]
-    path = changed(folder / "a.mp4", "said.mp4", zeros(at + size // 2, 700))
-    outcome = call("ingest", path, "-o", folder / "said.mcap", "--json")
-    assert outcome.code == 3
-    (said,) = json.loads(outcome.out)["warnings"]
-    assert said["code"] == "lost"
-    assert said["message"].endswith("1 of 30 frames are damaged; they are kept as far as they decode")
-    assert said["message"] in outcome.err

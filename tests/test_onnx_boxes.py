@@ -47,12 +47,6 @@ def test_suppression_keeps_what_the_textbook_keeps(seed, count, most):
     assert suppress(boxes, most).xyxy.tolist() == boxes.xyxy[greedy(boxes, most)].tolist()
 
 
-def test_a_box_that_is_suppressed_suppresses_nothing():
-    xyxy = np.array([[0, 0, 10, 10], [4, 0, 14, 10], [8, 0, 18, 10]], float)  # each overlaps the next by 6 of 14
-    boxes = Boxes(xyxy, np.array([0.9, 0.8, 0.7]), np.zeros(3, int))
-    assert suppress(boxes, 0.4).score.tolist() == [0.9, 0.7]
-
-
 def bilinear(image: np.ndarray, width: int, height: int) -> np.ndarray:
     """A picture at another size: between the four nearest pixels, whose centres are at halves."""
     out = np.zeros((height, width, 3))
@@ -198,15 +192,3 @@ def test_people_who_hide_one_another_at_a_seam_are_kept():
     counts = [lost_and_added(people, join_tiles(seen_in_tiles(people, tiles), tiles, 0.45).xyxy) for people in scenes]
     assert sum(map(len, scenes)) > 200
     assert np.sum(counts, axis=0).tolist() == [0, 0]
-
-
-@pytest.mark.parametrize("across", [0, 1])
-def test_tiles_that_share_nothing_are_joined_where_they_meet(across):
-    tiles = [(0, 0, 100, 100), (100, 0, 200, 100), (200, 0, 300, 100)]
-    parts = [[70, 10, 100, 40], [100, 10, 130, 41], [260, 10, 290, 40]]
-    if across:
-        tiles, parts = ([[one[k] for k in (1, 0, 3, 2)] for one in some] for some in (tiles, parts))
-    boxes = [Boxes(np.array([part], float), np.array([0.5]), np.zeros(1, int)) for part in parts]
-    found = join_tiles(boxes, [tuple(tile) for tile in tiles], 0.45).xyxy.tolist()
-    expected = [[70, 10, 130, 41], [260, 10, 290, 40]]
-    assert sorted(found) == sorted([one[k] for k in ((1, 0, 3, 2) if across else range(4))] for one in expected)

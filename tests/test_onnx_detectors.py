@@ -26,13 +26,11 @@ from mcaptrack.transforms.detect.onnx.layouts import LAYOUTS
 from tests import onnx_graphs
 from tests.commands import call, done
 from tests.onnx_graphs import (
-    FLOAT,
     INPUTS,
     INT64,
     REACH,
     blue_blocks,
     detector,
-    field,
     giving,
     model,
     node,
@@ -214,21 +212,6 @@ def constant(shape: tuple[int, ...] = ROWS, number: float = 0.0, inputs: Sequenc
     return model([node("Identity", ["rows"], ["output"])], given, [value("output", None)], values)
 
 
-def gigabyte() -> bytes:
-    """A network that adds the picture's mean to 400 million numbers."""
-    nodes = [
-        node("ReduceMean", ["x"], ["mean"], keepdims=0),
-        node("Cast", ["mean"], ["whole"], to=INT64),
-        node("Mul", ["whole", "none"], ["zero"]),
-        node("Add", ["count", "zero"], ["shape"]),
-        node("ConstantOfShape", ["shape"], ["many"]),
-        node("ReduceMean", ["many"], ["output"], keepdims=0),
-    ]
-    constants = {"count": tensor([400_000_000], "count", INT64), "none": tensor([0], "none", INT64)}
-    return model(nodes, [value("x", [1, 3, 128, 160])], [value("output", None)], constants)
-
-
-ELSEWHERE = field(13, field(1, "location") + field(2, "/etc/passwd"))
 OTHERS = {
     "a classifier": (constant((1, 1000)), "as no detector of a known layout does"),
     "no picture": (constant(inputs=[value("x", [1, 8, 2])]), "is no detector of pictures: it takes x 1 x 8 x 2"),
@@ -238,19 +221,11 @@ OTHERS = {
     "four pictures": (constant((4, 420, 85), inputs=[value("x", [4, 3, 128, 160])]), "takes 4 pictures at a time"),
     "not a number": (constant(number=float("nan")), "not finite at 0 ns (frame 0)"),
     "infinite": (constant(number=float("inf")), "not finite at 0 ns (frame 0)"),
-    "a gigabyte": (
-        gigabyte(),
-        "needs more than 1,000 MB of memory; `max_memory_mb=` allows more; a smaller `input_size=` takes less",
-    ),
     "text": (b"no network at all", "is no ONNX file, or is damaged or incomplete"),
     "nothing": (b"", "is no ONNX file"),
     "an unknown node": (
         model([node("Dream", ["x"], ["output"])], [value("x", [1, 3, 128, 160])], [value("output", None)]),
         "can't be run by ONNX Runtime",
-    ),
-    "weights elsewhere": (
-        detector("yolox") + field(7, field(5, field(8, "far") + field(2, FLOAT) + ELSEWHERE + field(14, 1))),
-        "keeps weights in other files (external data)",
     ),
 }
 
@@ -445,16 +420,6 @@ class TestInLogs:
         assert f"onnx:{path} holds other weights than those it was made with" in outcome.err
         done("run", log, "--detector", f"onnx:{path}", "--force", "--no-tables", "--quiet")
         assert "other weights" not in call("run", log, "--force", "--no-tables").err
-
-    def test_run_tracks_in_metres_where_a_ground_plane_is_given(self, network, log, recorded, tmp_path):
-        path, pictures = network(), recorded.parent / "pictures"
-        assert "track by bytetrack, which" in call("run", log, "--no-tables", "--detector", f"onnx:{path}").err
-        (tmp_path / "plane.txt").write_text("0.05 0 0\n0 0.05 0\n0 0 1\n")
-        plane, other = tmp_path / "plane.txt", tmp_path / "other.mcap"
-        done("ingest", pictures, "--fps", "10", "--ground-plane", plane, "-o", other)
-        assert "bytetrack (cost metres), which" in call("run", other, "--no-tables", "--detector", f"onnx:{path}").err
-        made = [Provenance.from_metadata(metadata_of(one, "/camera/tracks")).parameters for one in (log, other)]
-        assert [(one["tracker"], one["cost"]) for one in made] == [("bytetrack", "iou"), ("bytetrack", "metres")]
 
     def test_another_file_is_another_detector(self, network, log):
         first, second = network(name="a.onnx"), network("ultralytics", name="b.onnx")

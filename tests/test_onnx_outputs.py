@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mcaptrack import notices
+from mcaptrack import networks, notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import OnnxDetector
 from mcaptrack.transforms.detect.onnx import outputs
-from mcaptrack.transforms.detect.onnx.detector import names_of, numbers_of
 from tests.onnx_graphs import INT64, cells, giving, value
 
 SIZE = (160, 128)
@@ -111,6 +110,12 @@ REFUSED = {
     "score and class exchanged": (suppressed()[..., [0, 1, 2, 3, 5, 4]], "no likelihoods from 0 to 1"),
     "fractions of classes": (suppressed(labels=[0.5, 2]), "classes are not whole numbers"),
 }
+
+
+@pytest.fixture(autouse=True)
+def _here(monkeypatch):
+    """Networks run in this process, which takes less time; tests/test_strange_networks.py has the other one."""
+    monkeypatch.setattr(networks, "_runs_apart", lambda is_trusted: False)
 
 
 def detect(data: bytes, folder: Any, **options: Any) -> tuple[list[tuple[int, ...]], str]:
@@ -215,13 +220,6 @@ def test_boxes_of_classes_without_a_name_are_counted(labels, tmp_path):
 def test_two_classes_of_one_name_are_both_detected(tmp_path):
     data = giving({"output0": transposed(grid(2))}, metadata={"names": "['person', 'person']"})
     assert detect(data, tmp_path, classes="Person,")[0] == [(*box[:4], 1) for box in EXPECTED]
-
-
-def test_number_1_is_a_person_and_nothing_else():
-    assert numbers_of({0: "hat", 1: "glove"}) == {0: 3, 1: 2}
-    assert numbers_of({1: "hat", 2: "glove"}) == {1: 3, 2: 2}
-    assert numbers_of({0: "hat", 1: "human", 2: "Human"}) == {0: 2, 1: 1, 2: 1}
-    assert numbers_of(names_of({}, 2)) == {0: 3, 1: 2}
 
 
 def test_classes_that_name_nothing_are_refused_and_all_may_be_written_large(tmp_path):

@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 
 from mcaptrack.geometry.oriented_boxes import (
-    COLUMNS,
     bev_corners,
     bev_intersection_of_pairs,
     bev_iou_of_pairs,
-    columns_to_oriented_boxes,
     iou_3d_of_pairs,
 )
-from mcaptrack.schema import TRACKS
 
 COUNT = 400
 
@@ -66,18 +63,6 @@ def test_shared_areas_are_those_of_clipped_polygons_and_of_opencv():
     np.testing.assert_allclose(found, [opencv(p, r) for p, r in zip(a, b, strict=True)], atol=2e-3)
 
 
-def test_numbers_by_hand():
-    # A square in one that is turned by 45 degrees: the corners are cut off, an octagon is left.
-    square, turned = box(length=2, width=2), box(length=2, width=2, heading=math.pi / 4)
-    assert bev_intersection_of_pairs(square, turned)[0] == pytest.approx(8 * (math.sqrt(2) - 1))
-    # 4 x 2 across 4 x 2: 2 x 2 is shared.
-    assert bev_iou_of_pairs(box(), box(heading=math.pi / 2))[0] == pytest.approx(4 / 12)
-    # 3 of 4 m along the heading, half of the height.
-    moved = box(x=math.cos(0.3), y=math.sin(0.3), z=0.75, heading=0.3)
-    assert bev_iou_of_pairs(box(heading=0.3), moved)[0] == pytest.approx(6 / 10)
-    assert iou_3d_of_pairs(box(heading=0.3), moved)[0] == pytest.approx(4.5 / (12 + 12 - 4.5))
-
-
 @pytest.mark.parametrize("iou", [bev_iou_of_pairs, iou_3d_of_pairs])
 def test_laws(iou):
     a, b = drawn(3), drawn(4)
@@ -116,12 +101,3 @@ def test_boxes_that_touch_are_empty_or_have_missing_columns_share_nothing(iou):
     assert iou(np.empty((0, 7)), np.empty((0, 7))).shape == (0,)
     assert iou_3d_of_pairs(box(), box(z=1.5))[0] == 0
     assert bev_iou_of_pairs(box(), box(z=1.5))[0] == 1
-
-
-def test_columns_are_those_of_tracks():
-    names = [column.name for column in TRACKS.columns]
-    if not set(COLUMNS) <= set(names):
-        pytest.skip("tracks have no boxes in metres")
-    columns = dict(zip(COLUMNS, [[1.0], [2.0], [3.0], [4.0], [5.0], [6.0], [0.5]], strict=True))
-    rows = TRACKS.rows(track_id=[1], observed=[True], source_id=[-1], **columns)
-    assert columns_to_oriented_boxes(rows).tolist() == [[1, 2, 3, 4, 5, 6, 0.5]]

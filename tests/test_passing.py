@@ -149,33 +149,17 @@ TRAPS = {
     "another size on the way": (another_size, "it changes its size or its parameters on the way", 40),
     "interlaced": (made("a.mp4", options=X264 | {"x264-params": "interlaced=1"}), "it is interlaced", 20),
     "4:2:2": (made("a.mkv", options=X264, pixels="yuv422p"), "its pixels are yuv422p, not 8-bit 4:2:0", 20),
-    "vp9 of 4:4:4": (
-        made("a.webm", codec="libvpx-vp9", options={"g": "10"}, pixels="yuv444p"),
-        "its pixels are yuv444p",
-        20,
-    ),
-    "av1 of 10 bit": (
-        made("a.mkv", codec="libsvtav1", options=SVT, size=(96, 80), pixels="yuv420p10le"),
-        "its pixels are yuv420p10le",
-        20,
-    ),
-    "vp9 with key frames far apart": (
-        made("a.webm", codec="libvpx-vp9", options={"g": "99"}, frames=30),
-        "its key frames are more than 2 s apart",
-        30,
-    ),
-    "open groups with B-frames": (
-        made("a.mp4", options={"bf": "2", "g": "10", "x264-params": "open-gop=1"}, frames=30),
-        "it has B-frames",
-        30,
-    ),
+    "10 bit": (made("a.mkv", options=X264, pixels="yuv420p10le"), "its pixels are yuv420p10le", 20),
+    "motion jpeg": (made("a.avi", codec="mjpeg", pixels="yuvj420p"), "it is mjpeg, which viewers don't play", 20),
+    "vp9 of 4:4:4": (made("a.webm", codec="libvpx-vp9", options={"g": "10"}, pixels="yuv444p"), "its pixels are yuv444p", 20),
+    "av1 of 10 bit": (made("a.mkv", codec="libsvtav1", options=SVT, size=(96, 80), pixels="yuv420p10le"), "its pixels are yuv420p10le", 20),
+    "vp9 with key frames far apart": (made("a.webm", codec="libvpx-vp9", options={"g": "99"}, frames=30), "its key frames are more than 2 s apart", 30),
+    "open groups": (made("a.mp4", options=X264 | {"x264-params": "open-gop=1:intra-refresh=1"}, frames=40), "open groups of pictures", 40),
+    "open groups with B-frames": (made("a.mp4", options={"bf": "2", "g": "10", "x264-params": "open-gop=1"}, frames=30), "it has B-frames", 30),
+    "B-frames in avi, which has no times": (made("a.avi", options={"bf": "2", "g": "10"}), "it has B-frames", 20),
     "h265": (made("a.mp4", codec="libx265", options=X265), "it is H.265, which viewers play only where", 20),
-    "h265 with B-frames": (
-        made("a.mp4", codec="libx265", options={"x265-params": "keyint=10:bframes=2:log-level=none"}),
-        "it has B-frames",
-        20,
-    ),
-}
+    "h265 with B-frames": (made("a.mp4", codec="libx265", options={"x265-params": "keyint=10:bframes=2:log-level=none"}), "it has B-frames", 20),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("make", "words", "count"), one_in(2, TRAPS.values()), ids=TRAPS)

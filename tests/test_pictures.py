@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaptrack import foxglove, log
+from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.sources.pictures import Pictures
@@ -229,12 +229,3 @@ def test_a_late_part_is_rendered_without_decoding_what_is_before_it(tmp_path, mo
     assert len(found) == 6
     for one, other in zip(found, wanted, strict=True):
         assert np.abs(one.astype(int) - other).mean() < 2
-
-
-def test_a_log_of_ours_is_what_foxglove_names(made):
-    path, _, _, name = made
-    with log.read(path) as opened:
-        schema = opened.channel(TOPIC).schema_name
-        assert schema == (foxglove.IMAGE if name in ("jpeg", "png") else foxglove.VIDEO)
-        payload = next(opened.messages(TOPIC)).payload
-        assert foxglove.unpack(schema, payload).format == name

@@ -332,7 +332,7 @@ def words_of(line: str) -> list[str]:
     return shown.decode().split("\0")[:-1]
 
 
-@pytest.mark.parametrize("where", one_in(4, SCENES))
+@pytest.mark.parametrize("where", one_in(6, SCENES))
 def test_a_proposed_command_works(where, template, tmp_path, monkeypatch, request):
     if where.startswith("cli/train"):
         pytest.importorskip("torch", reason="training needs torch")

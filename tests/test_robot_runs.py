@@ -16,7 +16,6 @@ from mcaptrack.evaluation import sequence_of_log
 from mcaptrack.evaluation.forecasts import score_forecasts
 from mcaptrack.foxglove import class_colour
 from mcaptrack.pipeline import summary
-from mcaptrack.schema import TRACKS
 from mcaptrack.sources import fixed_frame
 from tests.commands import done
 from tests.robot_runs import OBJECTS, passing_robot, place, write_passing
@@ -138,28 +137,6 @@ def test_without_a_robot_all_places_are_in_the_video(tmp_path):
     assert image.shape == (240, 320, 3)
     assert (bright < 60).any()
     assert (bright > 260).any()
-
-
-def test_a_run_across_classes_tracks_and_retracks_so_until_told_otherwise(passed, tmp_path):
-    path = tmp_path / "a.mcap"
-    path.write_bytes(passed.read_bytes())
-
-    def parameters() -> list[object]:
-        found = {channel.topic: channel.parameters for channel in mcaptrack.info(path).channels}
-        return [found[f"/lidar/{name}"]["across_classes"] for name in ("tracks", "retracks")]
-
-    quick = {"events": False, "tables": False, "sidecar": False}
-    assert parameters() == [False, False]
-    result = mcaptrack.run(path, across_classes=True, **quick)
-    assert {"track", "retrack"} <= set(result.stages)
-    assert any("with another `across_classes=` or `frame=`" in note for note in result.notes)
-    assert parameters() == [True, True]
-    assert mcaptrack.run(path, **quick).stages == ()
-    assert "--across-classes" in done("run", "--help-all").out
-    done("run", path, "--within-classes", "--no-events", "--no-tables", "--in-place", "-q")
-    assert parameters() == [False, False]
-    with log.read(path) as opened:
-        assert len(opened.rows("/lidar/tracks", TRACKS).rows) > 10 * len(OBJECTS)
 
 
 def test_rows_about_tracks_have_their_classes_in_tables(passed):

@@ -30,7 +30,6 @@ from tests.bags import MOT, T0, bag1, bag2
 from tests.commands import call, done
 from tests.space_logs import WAYS, Robot, write
 from tests.test_ros_recordings import record
-from tests.worlds import write_clip
 
 Raw = tuple[str, int, bytes]
 
@@ -192,30 +191,6 @@ def test_drop_gives_the_recording_back(ran, tmp_path):
     check_whole(path, ran["recorded"])
 
 
-def test_views_are_rendered(ran, tmp_path):
-    frames = {}
-    for one in (ran["path"], ran["beside"]):
-        done("render", one, "-o", tmp_path / "a.gif", "--width", "200", "--force")
-        frames[one] = (tmp_path / "a.gif").read_bytes()
-    assert frames[ran["path"]] == frames[ran["beside"]]
-
-
-def test_a_copy_holds_ros_messages_too(ran, tmp_path):
-    out = tmp_path / "copy.mcap"
-    shutil.copytree(ran["path"].parent, tmp_path / "drive")
-    path = tmp_path / "drive" / ran["path"].name
-    done("drop", path, *ours(path))
-    before = path.read_bytes()
-    source = "/lidar/boxes" if ran["words"][0] == "--topic" else "/robot/front/image"
-    stage = ["track", "--topic", source] if "boxes" in source else ["detect", "--detector", "knn"]
-    done(stage[0], path, *stage[1:], "-o", out)
-    assert path.read_bytes() == before
-    with out.open("rb") as stream:
-        assert {one.message_encoding for one in make_reader(stream).get_summary().channels.values()} == {"cdr"}
-    assert Counter(topic for topic, *_ in by_rosbags(out)[0]) == by_mcap_ros2(out)
-    assert [one for one in raw(out) if one[0] not in ours(out)] == ran["recorded"]
-
-
 @pytest.fixture(scope="module")
 def tracked(tmp_path_factory) -> Path:
     """A recording of two files with tracks in the first one. Not to be changed."""
@@ -337,17 +312,6 @@ def test_rows_of_a_user_are_counted(copied):
     assert metadata(copied)["duration"]["nanoseconds"] == max(one[1] for one in messages) - first_ns + 5
 
 
-def test_a_video_in_a_recording_is_one_of_ros_messages(copied, tmp_path):
-    write_clip(tmp_path / "clip.mp4", 5)
-    done("ingest", tmp_path / "clip.mp4", "--into", copied, "--in-place", "--camera", "eye")
-    done("ingest", tmp_path / "clip.mp4", "-o", tmp_path / "eye.mcap", "--camera", "eye")
-    assert Counter(topic for topic, *_ in by_rosbags(copied)[0])["/eye/video"] == 5
-    assert by_mcap_ros2(copied)["/eye/video"] == 5
-    with mcaptrack.open(copied) as one, mcaptrack.open(tmp_path / "eye.mcap") as other:
-        pictures = [[frame.rows for frame in opened.frames("/eye/video")] for opened in (one, other)]
-    assert all(map(np.array_equal, *pictures))
-
-
 def test_results_that_stand_twice_are_said(copied):
     other = copied.with_name("other")
     shutil.copytree(copied.parent, other)
@@ -445,26 +409,6 @@ def test_a_bag_of_ros_1_in_a_recording_of_ros_2_is_said(copied):
     assert f"{copied} gets messages that are not of ROS 2 (encoding: ros1); ROS tools may stumble" in result.err
     assert "/talk" not in {one["topic_metadata"]["name"] for one in metadata(copied)["topics_with_message_count"]}
     (copied.parent / "a.bag").unlink()
-
-
-def test_a_bag_of_ros_2_in_a_recording_is_counted(copied, tmp_path):
-    bag2(tmp_path / "more", "MCAP")
-    result = done("ingest", tmp_path / "more", "--into", copied, "--in-place")
-    assert "not of ROS 2" not in result.err
-    counts = {
-        one["topic_metadata"]["name"]: one["message_count"] for one in metadata(copied)["topics_with_message_count"]
-    }
-    assert (counts["/talk"], counts["/image"]) == (30, 10)
-    assert metadata(copied)["message_count"] == sum(counts.values())
-
-
-def test_labels_in_a_copy_of_a_recording_are_ros_messages(tmp_path):
-    path = record(tmp_path / "drive")
-    (tmp_path / "gt.txt").write_text(MOT)
-    words = ["--truth", tmp_path / "gt.txt", "--camera", "robot/front", "-o", tmp_path / "labelled.mcap"]
-    done("ingest", path, *words)
-    assert by_mcap_ros2(tmp_path / "labelled.mcap")["/robot/front/truth"]
-    assert [one for one in raw(tmp_path / "labelled.mcap") if one[0] == "/robot/front/image"] == raw(path)
 
 
 def test_a_recording_with_compressed_messages_is_not_mixed_with_others(tmp_path):

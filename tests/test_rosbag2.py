@@ -218,7 +218,3 @@ class TestFolders:
             with pytest.raises(McaptrackError, match=words):
                 mcaptrack.export(path, tmp_path / "bag", form="rosbag2")
         assert sorted(one.name for one in tmp_path.iterdir()) == ["early.mcap", "empty.mcap"]
-
-    def test_parameters_of_tables_change_nothing(self, path, tmp_path):
-        result = mcaptrack.export(path, tmp_path / "bag", form="rosbag2", topic="/lidar/tracks")
-        assert [one.code for one in result.warnings] == ["option-not-used"]

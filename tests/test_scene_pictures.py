@@ -18,7 +18,7 @@ from mcaptrack.api import demonstration
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
 from mcaptrack.pipeline.scene_views import PictureClock, SceneCamera, SceneOnPictures
-from mcaptrack.schema import DETECTIONS, PREDICTIONS, SIGHTINGS, TRACKS, Frame
+from mcaptrack.schema import DETECTIONS, SIGHTINGS, TRACKS, Frame
 from mcaptrack.sources.demo import PLACES, three_cameras
 from mcaptrack.sources.synthetic import Pedestrian, Pose, SyntheticScene
 from mcaptrack.sources.video import write_mp4
@@ -149,13 +149,6 @@ def test_places_before_a_camera_are_placed_back(
     assert np.allclose(Pose(*pose).placed(Pose(*pose).seen(at)), at, atol=1e-9)
 
 
-def test_a_camera_looks_along_its_bearing() -> None:
-    # 3 m to the east of a camera at (1, 2) that looks to the east (90 degrees clockwise from north)
-    assert np.allclose(
-        Pose(1.0, 2.0, 90.0).seen(np.array([[4.0, 2.0, 1.5], [1.0, 1.0, 0.0]])), [[0, 3, 1.5], [1, 0, 0]]
-    )
-
-
 def test_the_demonstration_of_three_cameras_draws_and_ingests_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -280,13 +273,6 @@ class TestOnOnePicture:
                 ]
                 px = np.array([frame.rows[name] for name in ("x_px", "y_px", "w_px", "h_px")]).T
                 np.testing.assert_allclose(px, [box for *_, box in rows], atol=1e-4)
-
-    def test_forecasts_are_at_the_times_of_its_pictures(self) -> None:
-        _, scene, camera = self.scene(0)
-        frames, planes = scene.on_camera(camera, PREDICTIONS, [Frame(5, 2, PREDICTIONS.empty())], is_true=False)
-        assert [(frame.t_ns, frame.index) for frame in frames] == [(40_000_005, 2)]
-        assert planes == self.VIEW.planes
-        assert camera.pictures == "/b/video"
 
     def test_without_heights_nobody_is_drawn_where_the_camera_has_no_box(self) -> None:
         tracks, scene, camera = self.scene(1)

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import os
 from pathlib import Path
 
 import pytest
-from mcap.reader import make_reader
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from tests.commands import call, printed
 from tests.logs import FORTY, SCHEMA, SOME, our_messages, write_log, write_stock
 
 
@@ -100,33 +96,3 @@ def test_results_of_an_earlier_log_are_not_taken_for_those_of_a_new_one(path, tm
     ):
         pass
     assert sorted(our_messages(path)) == ["a", "b", "c", "new"]
-
-
-def test_all_stages_run_beside_a_log_that_is_read_only(fresh, tmp_path):
-    before = fresh.read_bytes()
-    os.chmod(fresh, 0o444)
-    if not os.access(fresh, os.W_OK):  # whoever is root may write to anything
-        code, _, err = call("detect", fresh)
-        assert code == 1
-        assert (
-            "can't be written to: Permission denied; write to another file with -o, or beside it with --sidecar" in err
-        )
-    printed("detect", fresh, "--sidecar")
-    printed("run", fresh)
-    assert fresh.read_bytes() == before
-    data = json.loads(printed("info", fresh, "--json")[0])["results"][0]
-    assert data["results"] == str(fresh.with_name("walk.results.mcap"))
-    topics = {channel["topic"]: channel for channel in data["channels"]}
-    assert not any(channel["stale"] for channel in topics.values())
-    with fresh.with_name("walk.results.mcap").open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    theirs = {channel.topic for channel in summary.channels.values()}
-    assert {"/camera/video", "/camera/truth"} & theirs == set()
-    assert {"/camera/detections", "/camera/retracks", "/camera/retracks/full/view/image"} <= theirs <= set(topics)
-    assert (tmp_path / "walk.tables").is_dir()
-    out, _ = printed("evaluate", fresh, "--json")
-    assert json.loads(out)["results"]
-    code, _, err = call("track", fresh, "--sidecar", "-o", tmp_path / "b.mcap")
-    assert (code, "are two places for the same results" in err) == (1, True)
-    code, _, err = call("track", fresh, "-o", tmp_path / "b.mcap")
-    assert (code, "they can't also go to" in err) == (1, True)

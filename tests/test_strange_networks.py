@@ -310,7 +310,7 @@ def refuses_to_start() -> None:
     gc.collect()
 
 
-@pytest.mark.parametrize("use", USES)
+@pytest.mark.parametrize("use", one_in(2, USES))
 def test_a_network_that_breaks_its_process_is_named(use):
     def kill() -> None:
         os.kill(at_work(os.getpid()), signal.SIGSEGV)
