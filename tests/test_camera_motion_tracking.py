@@ -16,8 +16,6 @@ from mcaptrack.geometry.camera_path import CameraPath, Verdict, poses_of
 from mcaptrack.geometry.plane import GroundPlane, moved_planes, plane_at
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.transforms import TRACKERS
-from mcaptrack.transforms.sort.ocsort import _CENTRES, _LAST_BOX, _LAST_STATE, OcSort
-from mcaptrack.transforms.sort.state import Measurements
 from tests.worlds import detections, ids, ns
 
 every_tracker = pytest.mark.parametrize("kind", TRACKERS.values(), ids=TRACKERS)
@@ -69,19 +67,6 @@ def test_a_still_camera_changes_nothing_to_the_bit(kind):
 
 
 @every_tracker
-def test_a_camera_that_zooms_and_rolls_keeps_its_tracks(kind):
-    still = crowd(4)
-    turn = np.deg2rad(2.0)
-    motion = 1.03 * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    motions = np.array([np.column_stack([motion, [4.0, -30.0]])] * 20)
-    seen, path = moved(still[:20], motions)
-    names = [ids(frame) for (frame,) in kind(min_hits_s=0.0)(still[:20])]
-    found = [ids(frame) for (frame,) in kind(min_hits_s=0.0, camera_path=path)(seen)]
-    assert path.verdict is Verdict.MOVING
-    assert len({one for name in found for one in name}) <= len({one for name in names for one in name}) + 1
-
-
-@every_tracker
 def test_tracks_end_at_a_cut(kind):
     frames = detections(lambda n: [(100, 100)], 20)
     poses = poses_of(np.array([IDENTITY] * 20), *SIZE)
@@ -117,27 +102,6 @@ def test_states_of_filters_move_as_boxes_do():
     assert state[4:7] == pytest.approx(np.stack([-2 * speed[1], 2 * speed[0], 4 * before[6]]))
     variances = np.array([4.0, 16.0, 1.0] * 3)[:, None]  # of centre, area and ratio: place, covariance, rate
     assert state[8:] == pytest.approx(variances * before[8:])
-
-
-def test_all_places_that_ocsort_remembers_move_with_the_camera():
-    tracker, rng = OcSort(direction_frames=4), np.random.default_rng(6)
-    tracks, motion = tracker._empty_tracks(), np.array([[0.5, 0.0, 5.0], [0.0, 0.5, 7.0]])
-    boxes = np.concatenate([rng.uniform(0, 300, (2, 3)), rng.uniform(10, 90, (2, 3))])
-    columns = np.concatenate([boxes[:2], boxes[:2] + boxes[2:], kalman.measure(boxes), np.ones((2, 3))])
-    tracker._initiate(tracks, 1, Measurements(columns))
-    centres = rng.uniform(0, 300, (10, 3))
-    centres[4:6, 1] = np.nan
-    tracks.table[_CENTRES:] = centres
-    before = tracks.table.copy()
-    tracker._move(tracks, motion)
-    after = tracks.table
-    np.testing.assert_allclose(after[_CENTRES::2], 0.5 * centres[::2] + 5)
-    np.testing.assert_allclose(after[_CENTRES + 1 :: 2], 0.5 * centres[1::2] + 7)
-    np.testing.assert_allclose(after[_LAST_BOX][::2], 0.5 * before[_LAST_BOX][::2] + 5)
-    np.testing.assert_allclose(after[_LAST_BOX][1::2], 0.5 * before[_LAST_BOX][1::2] + 7)
-    np.testing.assert_allclose(after[_LAST_STATE], tracks.state)
-    rest = slice(kalman.STATE_ROWS, _LAST_BOX.start)
-    assert after[rest].tolist() == before[rest].tolist()
 
 
 DATA = os.environ.get("MCAPTRACK_DATA", "")

@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcaptrack.notices import collected
-from mcaptrack.transforms.retrack import identity_swaps, offline
+from mcaptrack.transforms.retrack import identity_swaps
 from mcaptrack.transforms.retrack.identity_swaps import compatible
-from mcaptrack.transforms.retrack.motion_model import MotionModel
 
 ENCOUNTERS = st.lists(
     st.tuples(
@@ -52,16 +51,6 @@ def test_no_other_set_of_encounters_gains_more(met):
     assert sum(met[k][3] for k in found) == pytest.approx(most, abs=1e-5)
 
 
-def test_two_that_gain_more_together_win_over_a_better_one_between_them():
-    """1 meets 2, 2 meets 3 and 3 meets 4: one after another, by gain, the middle one would keep both others away."""
-    met = [([1, 2], 0, 9, 4.0), ([2, 3], 5, 9, 5.0), ([3, 4], 10, 9, 4.0)]
-    assert chosen(met) == [0, 2]
-
-
-def test_encounters_of_one_track_at_different_times_are_all_changed():
-    assert chosen([([1, other], 10 * other, 9, 2.0) for other in range(2, 12)]) == list(range(10))
-
-
 def test_where_the_solver_gives_up_encounters_are_decided_one_after_another_and_that_is_said(monkeypatch):
     """A ring of three: three tracks, each of which meets the other two at once."""
     ring = [([1, 2], 0, 9, 3.0), ([2, 3], 0, 9, 5.0), ([1, 3], 0, 9, 4.0), ([4, 5], 0, 9, 1.0)]
@@ -89,28 +78,6 @@ def test_the_solver_is_limited_by_nodes_which_are_the_same_on_every_machine(monk
     assert allowed(rows, list(range(len(rows))))
     assert len(said) == 1
     assert met[3][found].sum() < met[3][best].sum()
-
-
-def test_who_meets_six_others_in_a_row_keeps_one_identity():
-    """One walks by six who stand; at each the tracker exchanges the two ids, so that every track is of several people."""
-    rng = np.random.default_rng(3)
-    count, gap_steps, noise_m = 6, 40, 0.05
-    steps = np.arange((count + 1) * gap_steps)
-    walker = np.column_stack([0.4 * 0.5 * steps, np.zeros(len(steps))])
-    stands = [np.tile([0.4 * 0.5 * gap_steps * (k + 1), 0.7], (len(steps), 1)) for k in range(count)]
-    people = np.stack([walker, *stands])  # (7, T, 2)
-    name = np.tile(np.arange(count + 1)[:, None], len(steps))
-    for other in range(1, count + 1):
-        since = steps >= gap_steps * other
-        now = name[:, gap_steps * other]
-        mine, theirs = now[0], now[other]
-        name[0, since], name[other, since] = theirs, mine
-    xy = people + rng.normal(0, noise_m, people.shape)
-    step = np.tile(steps, count + 1)
-    track = name.ravel()
-    model = MotionModel(noise_m, 1.0, 0.1, 0.1)
-    found = offline._without_swaps(model, step, track, track, xy.reshape(-1, 2), 0.4).reshape(name.shape)
-    assert all(len(set(one.tolist())) == 1 for one in found)
 
 
 def test_more_encounters_than_a_solver_should_get_at_once_are_decided_one_after_another(monkeypatch):

@@ -114,17 +114,6 @@ def test_joins_below_70_percent_are_cut_or_below_what_links_need(monkeypatch, le
     assert [int(track[at]) for at in (9, 10, 20, 30)] == [5, 6, 6 if len(wanted) == 1 else 7, 5 + len(wanted)]
 
 
-def test_a_person_who_walks_straight_on_under_another_id_is_surely_the_same():
-    _, decisions = decided(walking(lambda tick: {3 if tick < 30 else 9: (0.5 * tick, 0.0)}))
-    (join,) = (row for row in rows_of(decisions) if row["kind"] == DecisionKind.JOINED)
-    assert (join["previous_id"], join["source_id"], join["alternative_id"]) == (3, 9, -1)
-    assert join["probability"] > 0.9
-    assert join["duration_s"] == pytest.approx(STEP_S)
-    (kept,) = (row for row in rows_of(decisions) if row["kind"] == DecisionKind.KEPT)
-    assert (kept["frames"], kept["source_id"]) == (60, 3)
-    assert kept["probability"] > 0.9
-
-
 def test_the_alternative_is_the_neighbour_and_a_join_in_a_crowd_is_less_certain():
     def beside(tick: int, apart_m: float) -> dict:
         people = {1 if tick < 30 else 4: (0.5 * tick, 0.0), 2 if tick < 30 else 5: (0.5 * tick, apart_m)}

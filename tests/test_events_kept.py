@@ -12,9 +12,9 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.events import EventOptions
 from mcaptrack.pipeline import events
 from mcaptrack.pipeline.checks import describe_origin
-from mcaptrack.pipeline.write import Made, _floor_m
+from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind, Frame
-from mcaptrack.schema.provenance import INGEST, VIEW, Provenance
+from mcaptrack.schema.provenance import INGEST, Provenance
 from tests.worlds import walk
 
 WALK = walk(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 4.0)}, 10, 10)
@@ -54,15 +54,6 @@ def test_events_that_would_replace_something_are_left_out_with_a_warning_or_refu
     assert str(error.value) == f"{path}: events {taken}"
 
 
-def test_tracks_without_heights_stand_on_a_floor_at_zero(tmp_path):
-    high = [frame._replace(rows=frame.rows.copy()) for frame in WALK]
-    for frame in high:
-        frame.rows["z_m"], frame.rows["height_m"] = 3.0, 1.5
-    for number, (frames, floor_m) in enumerate([(WALK, 0.0), (high, 2.2)]):
-        with log.read(written(tmp_path / f"{number}.mcap", (*TRACKED[:2], frames))) as opened:
-            assert _floor_m(opened, "/camera", {}) == floor_m
-
-
 def test_of_two_channels_of_a_topic_the_recorded_one_is_named(tmp_path):
     ours, theirs = (("/camera/retracks", made, WALK) for made in (TRACKED[1], None))
     for number, channels in enumerate([(ours, theirs), (theirs, ours)]):
@@ -84,17 +75,9 @@ def test_the_usual_tracks_and_those_with_events_are_watched(tmp_path):
         ("/camera/third/events", None, []),
         ("/camera/gone/events", made, []),
     ]
-    with log.read(written(tmp_path / "a.mcap", *some, *beside)) as opened:
-        usual = ["/camera/tracks", "/camera/retracks"]
-        assert events._default_topics(opened, "/camera", {}) == [*usual, "/camera/other", "/camera/zebra"]
-        wrong = Made(COUNTS, [], Provenance("x", {}))
-        assert events._default_topics(opened, "/camera", {"/camera/tracks": wrong}) == [
-            "/camera/retracks",
-            "/camera/other",
-            "/camera/zebra",
-        ]
-    with log.read(written(tmp_path / "b.mcap", some[-1], encoding="json")) as opened:
-        assert events._default_topics(opened, "/camera", {}) == []
+    report = watched(written(tmp_path / "a.mcap", *some, *beside))
+    assert [*report.events] == ["/camera/tracks", "/camera/retracks", "/camera/other", "/camera/zebra"]
+    assert watched(written(tmp_path / "b.mcap", some[-1], encoding="json")).events == {}
 
 
 #: What the provenance of events says, and the options that they are made again with.
@@ -113,14 +96,18 @@ ASKED: list[tuple[Any, tuple[Any, Any, Any]]] = [
 
 @pytest.mark.parametrize(("asked", "wanted"), ASKED)
 def test_events_are_made_again_as_they_were_asked_for_unless_something_else_is(tmp_path, asked, wanted):
-    for stage, is_read in (("events", True), (VIEW, False)):
+    names = ("similarity", "gate_m", "min_iou")
+    for stage, options, asked_now in (
+        ("events", EventOptions(), wanted),
+        ("events", EventOptions("iou"), ("iou", None, None)),
+    ):
         made = Provenance(stage, {"asked": asked})
-        with log.read(written(tmp_path / "a.mcap", TRACKED, ("/camera/tracks/events", made, []))) as opened:
-            assert events._options_for(opened, "/camera/tracks", EventOptions()) == (
-                EventOptions(*wanted) if is_read else EventOptions()
-            )
-            assert events._options_for(opened, "/camera/tracks", EventOptions("iou")) == EventOptions("iou")
-            assert events._options_for(opened, "/camera/other", EventOptions()) == EventOptions()
+        path = written(tmp_path / "a.mcap", TRACKED, ("/camera/tracks/events", made, []))
+        watched(path, options=options)
+        with log.read(path) as opened:
+            found = Provenance.from_metadata(opened.channel("/camera/tracks/events").metadata)
+        assert found is not None
+        assert found.parameters["asked"] == dict(zip(names, asked_now, strict=True))
 
 
 def test_events_are_tallied_by_kind_for_each_channel():

@@ -72,11 +72,6 @@ class TestAssociation:
             (gain,) = apart.gain(which, np.array([i]), np.array([j]))
             assert gain == pytest.approx(30 - squared / spread[i] - 2 * np.log(spread[i]))
 
-    def test_nothing_is_associated_with_nothing(self):
-        table, rows = np.zeros((len(state.no_tracks()), 2)), np.zeros((state.DETECTION_ROWS, 3))
-        for pair in ((table[:, :0], rows), (table, rows[:, :0])):
-            assert [len(part) for part in associate(*pair, "metres", 0.1, across_classes=False)] == [0, 0, 0]
-
 
 #: Noise, velocity's variance, the gate, time without a detection, hits, class of the detection (the track's is 2), its x
 #: in metres; whether they are associated.

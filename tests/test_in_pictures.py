@@ -157,12 +157,6 @@ def test_pictures_of_any_size_give_the_same_tracks(factor):
         assert a.rows["track_id"].tolist() == b.rows["track_id"].tolist()
 
 
-def test_predictions_and_online_tracks_stay_those_of_the_input():
-    frames = crowd(np.random.default_rng(1))
-    for one, (_, online, *_) in zip(frames, PICTURES(frames), strict=True):
-        assert_same_rows(online.rows, one.rows)
-
-
 @pytest.mark.parametrize(
     "retrack",
     [replace(PICTURES, link_s=0.0), *(replace(PROFILES[name], poor_scale=True) for name in ("paper", "authors"))],

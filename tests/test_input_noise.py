@@ -45,22 +45,6 @@ def test_the_limit_is_that_of_the_reference_however_many_steps_come_at_once(seed
     assert found == pytest.approx(wanted)
 
 
-@pytest.mark.parametrize("noise_m", [0.3, 0.6])
-def test_noise_may_be_half_as_large_again_as_tracks_of_people_who_stand_bend(noise_m):
-    rng = np.random.default_rng(5)
-    place, source = np.divmod(np.arange(4000), 10)
-    at = 5.0 * source[:, None] + rng.normal(0, noise_m, (4000, 2))
-    found = InputNoise(STEP_S).most_m(np.ones(400, int), np.arange(400), place, source, at)
-    assert found[-1] == pytest.approx(1.5 * noise_m, rel=0.1)
-
-
-def test_without_tracks_noise_has_no_limit():
-    """Detections that have an id each show no bends."""
-    place, source = np.arange(200), np.arange(200)
-    found = InputNoise(STEP_S).most_m(np.ones(200, int), place, place, source, np.zeros((200, 2)))
-    assert set(found) == {np.inf}
-
-
 @thorough
 def test_people_merged_into_one_detection_are_not_taken_for_noise():
     """In this synthetic crowd positions are off by 0.17 m; the estimate went to its highest value, 0.8 m."""

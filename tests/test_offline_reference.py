@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaptrack.transforms.retrack import linking, offline
+from mcaptrack.geometry.assignment import assign_by_gain, assign_pairs_by_gain
+from mcaptrack.transforms.retrack import linking
 from mcaptrack.transforms.retrack.cut_links import CutTracks, find_candidates, link_pieces
-from mcaptrack.transforms.retrack.identity_swaps import find_swaps, resolve_swaps
+from mcaptrack.transforms.retrack.identity_swaps import find_swaps, resolve_swaps, swapped_by_pace
 from mcaptrack.transforms.retrack.joins import Cuts
 from mcaptrack.transforms.retrack.linking import link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
 from tests.memory import held
 from tests.references import cut_links
-from tests.references.offline import DRIFTS, Motion, course_of, exchanged, links
+from tests.references.offline import DRIFTS, Motion, by_pace, course_of, exchanged, links
 
 SEEDS = st.integers(0, 2**32 - 1)
 Paths = dict[int, dict[int, tuple[float, float]]]
@@ -136,23 +139,6 @@ def straight(first: int, aside_m: float) -> dict[int, tuple[float, float]]:
     return {step: (0.4 * step, aside_m) for step in range(first, first + 15)}
 
 
-def test_many_cuts_do_not_make_other_gaps_look_crossed():
-    """A track ends, and 4 s later another begins aside of where it would be; 30 others were cut in between, far away."""
-    others = {10 + k: straight(15 * (k % 2), 500.0 * (1 + k // 2)) for k in range(60)}
-    cuts = [(10 + k, 11 + k, 0.65) for k in range(0, 60, 2)]
-
-    def are_linked(aside_m: float, beside: Paths, given_cuts: list) -> bool:
-        *given_all, pieces = cut_at({1: straight(0, 0.0), 2: straight(25, aside_m)} | beside, {}, given_cuts)
-        found = link_pieces(*given_all, 20.0, 0.5, pieces)
-        assert (found[2::2] == np.arange(3, len(found), 2)).all()
-        return found[0] == 1
-
-    places = np.linspace(0.0, 4.0, 40).tolist()
-    alone = [are_linked(aside_m, {}, []) for aside_m in places]
-    assert {True, False} == set(alone)
-    assert [are_linked(aside_m, others, cuts) for aside_m in places] == alone
-
-
 @pytest.mark.parametrize(
     ("since", "source", "may_be"), [(28, 5, True), (28, 6, False), (29, 5, False)], ids=["5.6 s", "another id", "6 s"]
 )
@@ -258,21 +244,35 @@ def test_decisions_at_encounters_equal_the_reference(seed):
 
 
 @given(seed=SEEDS)
-@settings(max_examples=10)
-def test_encounters_of_tracks_that_did_not_change_need_no_second_look(seed):
-    """Rounds over all encounters decide the same as rounds over those of the tracks that the last one changed."""
+@settings(max_examples=25)
+def test_paces_equal_the_reference_and_exchanging_the_tracks_changes_nothing(seed):
     rng = np.random.default_rng(seed)
-    model, _ = models(rng)
-    steps, people = 60, 5
-    paths = [walk_of(rng, rng.uniform(-2, 2, 2), rng.normal(0, 0.3, 2), steps, model.noise_m) for _ in range(people)]
-    for _ in range(4):
-        (a, b), when = rng.choice(people, 2, replace=False), int(rng.integers(5, 55))
-        paths[a][when:], paths[b][when:] = paths[b][when:].copy(), paths[a][when:].copy()
-    step, first = np.tile(np.arange(steps), people), np.repeat(np.arange(people), steps)
-    xy = np.concatenate(paths)
-    track = first
-    for _ in range(offline._ROUNDS):
-        ids, row, out = to_trajectories(step, track, xy, model.noise_m)
-        owner, _ = resolve_swaps(model, out, row, first, 0.4)
-        track = ids[owner[row]]
-    assert offline._without_swaps(model, step, first, first, xy, 0.4).tolist() == track.tolist()
+    model, motion = models(rng)
+    walk = np.cumsum(rng.normal(0, 1, (2, 1, 2)) * rng.uniform(0, 0.6) + rng.normal(0, 0.3, (2, 60, 2)), axis=1)
+    starts = rng.integers(0, 25, 2).tolist()
+    paths = {name: with_gaps(rng, start, places) for name, start, places in zip((3, 8), starts, walk, strict=True)}
+    met, parted = np.sort(rng.integers(20, 60, 2)).tolist()
+    out, _ = laid_out(paths, model.noise_m)
+    given_all = np.array([met]), np.array([parted]), 0.4, model.noise_m
+    found = swapped_by_pace(out, np.array([[0], [1]]), *given_all)
+    assert found.tolist() == swapped_by_pace(out, np.array([[1], [0]]), *given_all).tolist()
+    assert found[0] == pytest.approx(by_pace(motion, paths[3], paths[8], met, parted), abs=1e-9)
+
+
+@given(seed=SEEDS)
+@settings(max_examples=40)
+def test_the_assignment_is_optimal(seed):
+    """Compare with all assignments of up to four rows to up to four columns."""
+    rng = np.random.default_rng(seed)
+    gain = rng.normal(0, 1, rng.integers(1, 5, 2))
+    rows, columns = assign_by_gain(gain)
+    assert len(set(columns.tolist())) == len(columns)
+    wide = np.maximum(gain if gain.shape[0] <= gain.shape[1] else gain.T, 0)
+    best = max(sum(wide[k, c] for k, c in enumerate(order)) for order in permutations(range(wide.shape[1]), len(wide)))
+    assert gain[rows, columns].sum() == pytest.approx(best)
+    assert (gain[rows, columns] > 0).all()
+    candidates = np.nonzero(gain > 0)
+    pairs, gained = assign_pairs_by_gain(candidates, gain[candidates], gain.shape)
+    assert gained.sum() == pytest.approx(best)
+    assert gained.tolist() == pytest.approx(gain[pairs].tolist())
+    assert (gained > 0).all()
