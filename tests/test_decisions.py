@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mcaptrack import log
 from mcaptrack.evaluation.events import lifecycle_of
 from mcaptrack.schema import DECISIONS, DecisionKind, EventKind, Frame
-from mcaptrack.transforms import PROFILES, Retrack
+from mcaptrack.transforms import Retrack
 from mcaptrack.transforms.retrack import joins as join_steps
 from mcaptrack.transforms.retrack.joins import cut_joins, find_joins, tracked_of
 from mcaptrack.transforms.retrack.motion_model import MotionModel
@@ -145,16 +145,6 @@ def test_what_is_left_out_is_a_row_with_its_place_and_the_input_id():
     assert (row["source_id"], row["frames"], row["x_m"], row["y_m"]) == (7, 7, 22.0, 30.0)
     assert row["duration_s"] == pytest.approx(6 * STEP_S)
     assert row["probability"] > 0.5  # that it is no person
-
-
-def test_without_linking_nothing_is_cut_and_profiles_of_the_paper_write_no_decisions():
-    """A person steps aside under another input id: online the track goes on, and a cut takes more confidence than there is."""
-    assert [*PROFILES["paper"].writes] == [*PROFILES["authors"].writes] == ["", "online", "predictions"]
-    frames = walking(lambda tick: {3 if tick < 30 else 9: (0.5 * tick, 0.0 if tick < 30 else 0.9)})
-    unlinked = {int(row["track_id"]) for row in rows_of(decided(frames, Retrack(link_s=0.0))[0])}
-    sure = {int(row["track_id"]) for row in rows_of(decided(frames, Retrack(link_confidence=0.99))[0])}
-    assert len(unlinked) == 1
-    assert len(sure) == 2
 
 
 def test_the_least_likely_tracks_come_first_and_sure_ones_not_at_all():

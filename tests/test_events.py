@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log as LogMessage
 from hypothesis import given
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
 from mcaptrack import log, notices, pipeline
-from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate, sequence_of_log
 from mcaptrack.evaluation.event_text import describe, log_messages
 from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events, lifecycle_of
-from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, EventKind, Frame
+from mcaptrack.pipeline import events
+from mcaptrack.pipeline.checks import describe_origin
+from mcaptrack.pipeline.write import Made
+from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind, Frame
 from mcaptrack.schema.proto import parse
-from mcaptrack.schema.provenance import Provenance
+from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.transforms import PROFILES
 from tests.worlds import boxed, ns, replace_channel, tracks_at, walk, write_channels
 
@@ -477,26 +477,6 @@ def test_a_log_of_tracks_without_rows(tmp_path):
     assert log.check(path).is_sound
 
 
-def test_the_command_drop_and_tables_handle_events(place):
-    def call(*words):
-        result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
-        assert result.exit_code == 0, result.output
-        return result
-
-    data = json.loads(call("events", place, "--json", "--similarity", "metres", "--gate-m", "0.5").stdout)
-    (result,) = data["results"]
-    assert (result["stages"], result["events"]["/camera/tracks"]["identity switch"]) == (["events"], 2)
-    call("export", place, "-o", place.parent / "tables")
-    table = pq.read_table(place.parent / "tables" / "events" / "recording=a" / "part-0.parquet").to_pylist()
-    assert [(row["topic"], row["kind"], row["truth_id"]) for row in table if row["kind"] == SWITCH] == [
-        ("/camera/tracks/events", 4, 2),
-        ("/camera/tracks/events", 4, 1),
-    ]
-    call("drop", place, "/camera/tracks")
-    with log.read(place) as opened:
-        assert without_views(opened) == {"/camera/truth"}
-
-
 def test_of_the_life_of_tracks_only_ends_of_tracks_and_of_sources_are_kept():
     def rows(n: int):
         found = tracks_at({1: (n, 0.0), 2: (n, 5.0)})
@@ -522,3 +502,112 @@ def test_of_the_life_of_tracks_only_ends_of_tracks_and_of_sources_are_kept():
 def test_events_as_text_that_no_scene_shows(values, text):
     event = {"track_id": 7, "previous_id": 0, "truth_id": 9, "source_id": 3, "frames": 0, "duration_s": 0.0} | values
     assert describe(event, "here", 0.1) == text
+
+
+# Which channels of tracks get events, by which options, and what is said where they get none
+
+
+WALK = walk(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 4.0)}, 10, 10)
+
+
+def written(path: Path, *channels: tuple[str, Provenance | None, list[Frame]], encoding: str = "protobuf") -> Path:
+    """A log of channels of tracks."""
+    with log.create(path) as writer:
+        for topic, made, frames in channels:
+            metadata = made.to_metadata() if made else {}
+            kind = (TRACKS.name, "protobuf", TRACKS.descriptor)
+            number = writer.add_channel(topic, kind, encoding, metadata, another=True)
+            for frame in frames:
+                writer.add_message(number, frame.t_ns, frame.index, TRACKS.codec.encode(frame.rows))
+    return path
+
+
+def run_watch(path: Path, **options: Any) -> pipeline.Report:
+    with log.read(path) as opened, notices.listening(lambda _: None):
+        return pipeline.run(opened, "/camera", [], watch=pipeline.Watch(**options))
+
+
+TRACKED = ("/camera/tracks", Provenance(INGEST, {}, digest="y"), WALK)
+
+
+@pytest.mark.parametrize("end", ["events", "events/view/log", "counts"])
+def test_events_that_would_replace_something_are_left_out_with_a_warning_or_refused_if_asked_for(tmp_path, end):
+    path = written(tmp_path / "a.mcap", TRACKED, (f"/camera/tracks/{end}", None, WALK))
+    taken = f"would replace /camera/tracks/{end}, which was recorded by others (mcaptrack.Tracks)"
+    report = run_watch(path)
+    assert [(one.message, one.code) for one in report.warnings] == [
+        (f"no events of /camera/tracks: they {taken}", "left-out")
+    ]
+    assert (report.stages, report.events, report.frames) == ([], {}, {})
+    with pytest.raises(McaptrackError) as error:
+        run_watch(path, topics=("/camera/tracks",), again=True)
+    assert str(error.value) == f"{path}: events {taken}"
+
+
+def test_of_two_channels_of_a_topic_the_recorded_one_is_named(tmp_path):
+    ours, theirs = (("/camera/retracks", made, WALK) for made in (TRACKED[1], None))
+    for number, channels in enumerate([(ours, theirs), (theirs, ours)]):
+        path = written(tmp_path / f"{number}.mcap", TRACKED, *channels)
+        with log.read(path) as opened:
+            assert describe_origin(opened, "/camera/retracks") == "was recorded by others (mcaptrack.Tracks)"
+            assert describe_origin(opened, "/camera/tracks") == "was ingested"
+
+
+def test_the_usual_tracks_and_those_with_events_are_watched(tmp_path):
+    made = Provenance("events", {}, "/camera/other")
+    some = [
+        (f"/camera/{name}", Provenance(INGEST, {}), WALK[:1])
+        for name in ("zebra", "retracks", "other", "third", "tracks")
+    ]
+    beside = [
+        ("/camera/zebra/events", made, []),
+        ("/camera/other/events", made, []),
+        ("/camera/third/events", None, []),
+        ("/camera/gone/events", made, []),
+    ]
+    report = run_watch(written(tmp_path / "a.mcap", *some, *beside))
+    assert [*report.events] == ["/camera/tracks", "/camera/retracks", "/camera/other", "/camera/zebra"]
+    assert run_watch(written(tmp_path / "b.mcap", some[-1], encoding="json")).events == {}
+
+
+#: What the provenance of events says, and the options that they are made again with.
+ASKED: list[tuple[Any, tuple[Any, Any, Any]]] = [
+    ({"similarity": "iou", "min_iou": 0.4}, ("iou", None, 0.4)),
+    ({"similarity": "metres", "gate_m": 2, "min_iou": 0.5}, ("metres", 2, 0.5)),
+    ({"similarity": "iou", "min_iou": 0.4}, ("iou", None, 0.4)),
+    ({"similarity": "strange", "gate_m": 2.0}, (None, 2.0, None)),
+    ({"gate_m": True, "min_iou": 0}, (None, None, None)),
+    ({"gate_m": 0.001, "min_iou": -1.0}, (None, 0.001, None)),
+    ({"gate_m": "1"}, (None, None, None)),
+    (["iou"], (None, None, None)),
+    (None, (None, None, None)),
+]
+
+
+@pytest.mark.parametrize(("asked", "wanted"), ASKED)
+def test_events_are_made_again_as_they_were_asked_for_unless_something_else_is(tmp_path, asked, wanted):
+    names = ("similarity", "gate_m", "min_iou")
+    for stage, options, asked_now in (
+        ("events", EventOptions(), wanted),
+        ("events", EventOptions("iou"), ("iou", None, None)),
+    ):
+        made = Provenance(stage, {"asked": asked})
+        path = written(tmp_path / "a.mcap", TRACKED, ("/camera/tracks/events", made, []))
+        run_watch(path, options=options)
+        with log.read(path) as opened:
+            found = Provenance.from_metadata(opened.channel("/camera/tracks/events").metadata)
+        assert found is not None
+        assert found.parameters["asked"] == dict(zip(names, asked_now, strict=True))
+
+
+def test_events_are_tallied_by_kind_for_each_channel():
+    kinds = [EventKind.BIRTH, EventKind.BIRTH, EventKind.MISS, EventKind.PARTED]
+    rows = EVENTS.empty(len(kinds))
+    rows["kind"] = kinds
+    made = Made(EVENTS, [Frame(0, 0, rows[:1]), Frame(1, 1, rows[1:])], Provenance("events", {}))
+    text = made._replace(drawn="foxglove.Log")
+    found = events.tally(
+        {"/a/events": made, "/a/events/view/log": text, "/a/counts": Made(COUNTS, [], made.provenance)}
+    )
+    counted = {"birth": 2, "miss": 1, "parted": 1}
+    assert found == {"/a": dict.fromkeys(EVENT_KINDS.values(), 0) | counted}

@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.predictors import make
-from mcaptrack.schema import DecisionKind, Frame, Rows
+from mcaptrack.schema import Frame, Rows
 from mcaptrack.transforms import PROFILES, Predict, Retrack, RetrackByConsistency
 from mcaptrack.transforms.retrack import Retracking, likelihood
 from tests.references.algorithm1 import Algorithm1
 from tests.references.online import OnlineTracker
 from tests.references.retracking import Undecided, constant_velocity
 from tests.tiers import one_in
-from tests.worlds import assert_same_rows, crossing_tracks, ids, noisy_tracks, ns, places, walk
+from tests.worlds import assert_same_rows, crossing_tracks, ids, noisy_tracks, places, walk
 
 SEEDS = st.integers(0, 2**32 - 1)
 #: Offline, gaps are interpolated and short tracks are left out; nothing else.
@@ -304,60 +304,6 @@ every_method = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 def outputs(method: Retracking, frames: list[Frame]) -> list[Rows]:
     """The rows of offline tracks, online tracks, predictions and decisions."""
     return [np.concatenate([frame.rows for frame in part]) for part in zip(*method(frames), strict=True)]
-
-
-def same(found: Rows, wanted: Rows, **changed: np.ndarray) -> None:
-    """Compare rows: equal but for the columns ``changed``, positions to a micrometre."""
-    for name in found.dtype.names:
-        values = changed.get(name, wanted[name])
-        np.testing.assert_allclose(found[name], values, rtol=1e-6, atol=1e-6, err_msg=name)
-
-
-def moved(frames: list[Frame], turn: np.ndarray, shift: np.ndarray) -> list[Frame]:
-    out = []
-    for frame in frames:
-        rows = frame.rows.copy()
-        xy = np.stack([rows["x_m"], rows["y_m"]], axis=-1) @ turn.T + shift
-        rows["x_m"], rows["y_m"] = xy.T
-        out.append(frame._replace(rows=rows))
-    return out
-
-
-@every_method
-@given(seed=SEEDS, angle=st.floats(0, 7))
-@settings(max_examples=2)
-def test_tracks_move_and_turn_with_the_world(method, seed, angle):
-    rng = np.random.default_rng(seed)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    shift = rng.uniform(-100, 100, 2)
-    method = replace(method, track_confidence=0.0)  # the extent of a path is measured along the axes
-    frames = noisy_tracks(rng, ticks=40, hidden=0.03)
-    for found, wanted in zip(outputs(method, moved(frames, turn, shift)), outputs(method, frames), strict=True):
-        x_m, y_m = (np.stack([wanted["x_m"], wanted["y_m"]], axis=-1) @ turn.T + shift).T
-        changed = {"x_m": x_m, "y_m": y_m}
-        if "cov_xx_m2" in wanted.dtype.names:  # linear predictors have round ellipses
-            np.testing.assert_array_equal(wanted["cov_xy_m2"], 0)
-        if "probability" in wanted.dtype.names:
-            joined = wanted["kind"] == DecisionKind.JOINED
-            changed["probability"] = np.where(joined, wanted["probability"], found["probability"])
-        same(found, wanted, **changed)
-
-
-@every_method
-@given(seed=SEEDS)
-@settings(max_examples=2)
-def test_later_times_and_larger_ids_give_the_same_tracks(method, seed):
-    frames = noisy_tracks(np.random.default_rng(seed), ticks=40, hidden=0.03)
-    later = []
-    for frame in frames:
-        rows = frame.rows.copy()
-        rows["track_id"] += 1000
-        later.append(Frame(frame.t_ns + ns(86400.0), frame.index + 7, rows))
-    for found, wanted in zip(outputs(method, later), outputs(method, frames), strict=True):
-        changed = {}
-        for name in {"source_id", "previous_id", "alternative_id"} & set(wanted.dtype.names):
-            changed[name] = np.where(wanted[name] >= 0, wanted[name] + 1000, -1)
-        same(found, wanted, **changed)
 
 
 def standing(first: list[tuple[float, float]], then: list[tuple[float, float]], gap: range, ticks: int) -> list[Frame]:
