@@ -287,7 +287,7 @@ def write_eventful(path: Path) -> Path:
     return path
 
 
-def _add_messages(writer: log.Writer, topic: str, frames: Sequence[Frame], made_by: str) -> None:
+def _add_messages(writer: log.LogWriter, topic: str, frames: Sequence[Frame], made_by: str) -> None:
     schema = PREDICTIONS if topic.endswith("/predictions") else TRACKS
     messages = [(frame.t_ns, frame.index, schema.codec.encode(frame.rows)) for frame in frames]
     how = Provenance(made_by, {"of": topic}, digest=digest(messages)).to_metadata() if made_by else {}
