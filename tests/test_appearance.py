@@ -13,7 +13,7 @@ from mcaptrack.cli.running import _lines_of_summary
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.colour_histograms import BINS, LENGTH, at_border, describe, is_clear, mean_shares
 from mcaptrack.notices import collected
-from mcaptrack.pipeline.pictures import _nearest, with_descriptors
+from mcaptrack.pipeline.pictures import with_descriptors
 from mcaptrack.pipeline.summary import summarise
 from mcaptrack.schema import APPEARANCE, TRACKS, Frame
 from mcaptrack.sources.cameras import provenance_of
@@ -77,31 +77,6 @@ def test_people_in_the_same_clothes_are_judged_by_motion_alone():
     assert float(facts["separation"]) < 0.75
 
 
-def test_the_order_of_samples_changes_no_identity_and_the_future_nothing_online():
-    frames, descriptors = two_who_turn_back(RED, BLUE)
-    turned = [frame._replace(rows=frame.rows[::-1]) for frame in frames]
-    assert identities(Retrack(descriptors=descriptors), turned) == TURNED
-    whole, part = (list(Retrack(descriptors=descriptors)(given)) for given in (frames, frames[:50]))
-    for one, other in zip(whole, part, strict=False):
-        assert_same(one[1], other[1])
-        assert_same(one[2], other[2])
-
-
-def test_decisions_are_as_likely_as_motion_and_colours_say():
-    frames, descriptors = two_who_turn_back(RED, BLUE)
-
-    def joined(transform: Retrack) -> dict[tuple[int, int], float]:
-        rows = np.concatenate([decisions.rows for *_, decisions in transform(frames)])
-        rows = rows[rows["previous_id"] >= 0]
-        pairs = zip(rows["previous_id"].tolist(), rows["source_id"].tolist(), strict=True)
-        return dict(zip(pairs, rows["probability"].tolist(), strict=True))
-
-    by_looks = joined(Retrack(descriptors=descriptors))
-    assert set(joined(Retrack())) == {(1, 12), (2, 11)}
-    assert set(by_looks) == {(1, 11), (2, 12)}
-    assert min(by_looks.values()) > 0.5  # though not by motion
-
-
 def sides(transform: Retrack, frames) -> list[list[int]]:
     """The tracks from left to right some time before and some time after they met."""
     tracks = [offline.rows for offline, *_ in transform(frames) if len(offline.rows) == 2]
@@ -135,15 +110,6 @@ def test_a_histogram_of_one_colour_by_hand():
     light[3:5], axis[4:6] = (1 - 0.516, 0.516), 0.5
     wanted = np.concatenate([light, axis, axis] * 2)
     np.testing.assert_allclose(found, np.rint(255 * np.sqrt(wanted / 6)), atol=1)
-
-
-def test_histograms_tell_upper_body_from_legs_and_look_the_same_near_and_far():
-    both = describe(np.hstack([patch(RED, BLUE), patch(BLUE, RED)]), WHOLE + [[0, 0, 0, 0], [40, 0, 0, 0]]) / 255
-    assert np.square(both[0] - both[1]).sum() > 0.5
-    np.testing.assert_allclose(both[0], np.roll(both[1], LENGTH // 2), atol=0.15)  # the parts are not equally tall
-    large = np.kron(patch(RED, BLUE), np.ones((3, 3, 1), np.uint8))
-    np.testing.assert_allclose(describe(large, 3 * WHOLE)[0] / 255, both[0], atol=0.01)
-    assert describe(large, np.empty((0, 4))).shape == (0, LENGTH)
 
 
 def test_boxes_are_clear_by_hand():
@@ -255,14 +221,6 @@ def test_pictures_that_cannot_be_decoded_are_a_warning(log_of_run, monkeypatch):
     assert [(one.code, "can't be decoded" in one.message) for one in warnings] == [("option-not-used", True)]
 
 
-def test_the_picture_of_a_sample_is_the_nearest_one_within_a_tenth_of_a_second():
-    pictures = np.array([0, 100, 240, 1000]) * 1_000_000
-    samples = np.array([-150, -99, 49, 51, 169, 171, 341, 899, 901, 1100, 1101]) * 1_000_000
-    assert _nearest(pictures, samples).tolist() == [-1, 0, 0, 1, 1, 2, -1, -1, 3, 3, -1]
-    assert _nearest(pictures[:1], samples[:3]).tolist() == [-1, 0, 0]
-    assert _nearest(pictures[:0], samples[:2]).tolist() == [-1, -1]
-
-
 def stored(transform: Retrack, frames) -> list[tuple[int, np.ndarray]]:
     """The times and rows of what is stored of the appearance of tracks, where there are any."""
     return [(looks.t_ns, looks.rows) for *_, looks in transform(frames) if len(looks.rows)]
@@ -309,14 +267,6 @@ def test_the_bins_of_stored_colours_are_where_the_schema_says():
             own = {name: share for name, share in shares.items() if name.startswith(axis)}
             assert max(own, key=own.get) == column.name, own
             assert own[column.name] > 0.7
-
-
-def test_stored_colours_need_no_comparison_and_leave_out_who_is_never_seen():
-    frames, descriptors = two_who_turn_back(RED, BLUE)
-    unseen = descriptors._replace(is_clear=descriptors.is_clear & ~np.isin(descriptors.track_id, (2, 11)))
-    found = stored(Retrack(descriptors=unseen, store_appearance=True, appearance=False), frames)
-    assert {one for _, rows in found for one in rows["track_id"].tolist()} == {1}  # by motion 1 goes on as 12
-    assert sum(len(rows) for _, rows in found) == 2
 
 
 def exchanged(descriptors: Descriptors, one: int, other: int) -> Descriptors:

@@ -240,18 +240,6 @@ class TestLogs:
             (line,) = said(mcaptrack.fuse(path), "cameras-disagree")  # type: ignore[arg-type]
             assert line.endswith(f"is not right; `mcaptrack.calibrate('{path}')` corrects it")
 
-    def test_labels_that_are_added_stand_where_the_corrected_plane_has_them(
-        self, right: tuple[Path, mcaptrack.CalibrateResult], tmp_path: Path
-    ) -> None:
-        path, labels = Path(shutil.copy(right[0], tmp_path / "log.mcap")), tmp_path / "labels.txt"
-        labels.write_text("1,1,450,300,100,100,1,-1,-1,-1\n")
-        with collected():
-            mcaptrack.ingest(labels, fps=2, role="truth", camera="east", into=path)
-        with mcaptrack.open(path) as opened:
-            row = opened.array("tracks", "/east/truth")[0]
-        there = homography(path, "/east/ground_plane/refined") @ [499.0, 399.0, 1.0]  # labels count pixels from 1
-        assert (row["x_m"], row["y_m"]) == pytest.approx(there[:2] / there[2], abs=0.05)
-
     def test_a_new_plane_ends_a_correction(self, right: tuple[Path, mcaptrack.CalibrateResult], tmp_path: Path) -> None:
         path = Path(shutil.copy(right[0], tmp_path / "log.mcap"))
         labels, plane = tmp_path / "labels.txt", tmp_path / "plane.txt"
@@ -265,16 +253,6 @@ class TestLogs:
             assert "/east/ground_plane/refined" not in opened.channels
         with collected():
             assert not said(mcaptrack.fuse(path), "cameras-disagree")  # type: ignore[arg-type]
-
-    def test_a_dry_run_says_all_and_writes_nothing(
-        self, wrong: Path, right: tuple[Path, mcaptrack.CalibrateResult]
-    ) -> None:
-        before = wrong.read_bytes()
-        told = done("calibrate", wrong, "--dry-run").err
-        assert wrong.read_bytes() == before
-        assert "1 of 4 cameras would be corrected: east" in told
-        assert "east   corrected by a shift, which moves feet by 0.8" in told
-        assert "north  as it was: it agrees with the others" in told
 
     def test_what_can_not_be_is_one_line(self, wrong: Path) -> None:
         before = wrong.read_bytes()

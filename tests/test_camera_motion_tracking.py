@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mcaptrack.evaluation.metrics import Matchup, score, summary
+from mcaptrack import log
+from mcaptrack.evaluation.aligned import make_matchup
+from mcaptrack.evaluation.metrics import score, summary
 from mcaptrack.geometry import kalman
 from mcaptrack.geometry.affine import IDENTITY, move_boxes, move_points
-from mcaptrack.geometry.boxes import columns_to_boxes, iou
+from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.camera_path import CameraPath, Verdict, poses_of
-from mcaptrack.geometry.plane import GroundPlane, moved_planes, plane_at
-from mcaptrack.schema import DETECTIONS, Frame
+from mcaptrack.geometry.plane import GroundPlane, moved_planes, plane_at, scene_planes
+from mcaptrack.schema import DETECTIONS, EVENT_KINDS, EVENTS, TRACKS, Frame
+from mcaptrack.sources.camera_motion import read_ground_truth
 from mcaptrack.transforms import TRACKERS
-from mcaptrack.transforms.sort.ocsort import _CENTRES, _LAST_BOX, _LAST_STATE, OcSort
-from mcaptrack.transforms.sort.state import Measurements
+from tests.commands import done
 from tests.worlds import detections, ids, ns
 
 every_tracker = pytest.mark.parametrize("kind", TRACKERS.values(), ids=TRACKERS)
@@ -61,27 +64,6 @@ def test_tracks_are_the_same_whichever_way_the_camera_shakes(kind):
 
 
 @every_tracker
-def test_a_still_camera_changes_nothing_to_the_bit(kind):
-    frames = crowd(3)
-    path = CameraPath(np.array([frame.t_ns for frame in frames]), poses_of(np.array([IDENTITY] * len(frames)), *SIZE))
-    with_path = [frame.rows.tobytes() for (frame,) in kind(camera_motion="on", camera_path=path)(frames)]
-    assert with_path == [frame.rows.tobytes() for (frame,) in kind()(frames)]
-
-
-@every_tracker
-def test_a_camera_that_zooms_and_rolls_keeps_its_tracks(kind):
-    still = crowd(4)
-    turn = np.deg2rad(2.0)
-    motion = 1.03 * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    motions = np.array([np.column_stack([motion, [4.0, -30.0]])] * 20)
-    seen, path = moved(still[:20], motions)
-    names = [ids(frame) for (frame,) in kind(min_hits_s=0.0)(still[:20])]
-    found = [ids(frame) for (frame,) in kind(min_hits_s=0.0, camera_path=path)(seen)]
-    assert path.verdict is Verdict.MOVING
-    assert len({one for name in found for one in name}) <= len({one for name in names for one in name}) + 1
-
-
-@every_tracker
 def test_tracks_end_at_a_cut(kind):
     frames = detections(lambda n: [(100, 100)], 20)
     poses = poses_of(np.array([IDENTITY] * 20), *SIZE)
@@ -119,27 +101,6 @@ def test_states_of_filters_move_as_boxes_do():
     assert state[8:] == pytest.approx(variances * before[8:])
 
 
-def test_all_places_that_ocsort_remembers_move_with_the_camera():
-    tracker, rng = OcSort(direction_frames=4), np.random.default_rng(6)
-    tracks, motion = tracker._empty_tracks(), np.array([[0.5, 0.0, 5.0], [0.0, 0.5, 7.0]])
-    boxes = np.concatenate([rng.uniform(0, 300, (2, 3)), rng.uniform(10, 90, (2, 3))])
-    columns = np.concatenate([boxes[:2], boxes[:2] + boxes[2:], kalman.measure(boxes), np.ones((2, 3))])
-    tracker._initiate(tracks, 1, Measurements(columns))
-    centres = rng.uniform(0, 300, (10, 3))
-    centres[4:6, 1] = np.nan
-    tracks.table[_CENTRES:] = centres
-    before = tracks.table.copy()
-    tracker._move(tracks, motion)
-    after = tracks.table
-    np.testing.assert_allclose(after[_CENTRES::2], 0.5 * centres[::2] + 5)
-    np.testing.assert_allclose(after[_CENTRES + 1 :: 2], 0.5 * centres[1::2] + 7)
-    np.testing.assert_allclose(after[_LAST_BOX][::2], 0.5 * before[_LAST_BOX][::2] + 5)
-    np.testing.assert_allclose(after[_LAST_BOX][1::2], 0.5 * before[_LAST_BOX][1::2] + 7)
-    np.testing.assert_allclose(after[_LAST_STATE], tracks.state)
-    rest = slice(kalman.STATE_ROWS, _LAST_BOX.start)
-    assert after[rest].tolist() == before[rest].tolist()
-
-
 DATA = os.environ.get("MCAPTRACK_DATA", "")
 
 
@@ -159,32 +120,23 @@ def test_published_motions_of_cameras_keep_identities(name, size, least_idf1, mo
     boxes[:, :2] += boxes[:, 2:] * (0.5 + rng.normal(0, 0.04, (len(truth), 2)))
     boxes[:, 2:] *= np.exp(rng.normal(0, 0.04, (len(truth), 2)))
     boxes[:, :2] -= boxes[:, 2:] / 2
-    frames = []
+    frames, people = [], []
     for k in range(0, int(truth[:, 0].max()), 3):
+        ids, *true = truth[truth[:, 0] == k + 1, 1:6].T
+        box = dict(zip(("x_px", "y_px", "w_px", "h_px"), true, strict=True))
+        people.append(Frame(ns(k / 30), k, TRACKS.rows(track_id=ids, observed=ids > 0, source_id=ids * 0 - 1, **box)))
         x, y, w, h = boxes[kept & (truth[:, 0] == k + 1)].T
         frames.append(Frame(ns(k / 30), k, DETECTIONS.rows(x_px=x, y_px=y, w_px=w, h_px=h, class_id=[1] * len(x))))
     found = {}
     for use in ("off", "auto"):
         tracks = [frame for (frame,) in TRACKERS["sort"](camera_motion=use, camera_path=path)(frames)]
-        found[use] = _scores(truth, tracks)
+        scores = summary(score(make_matchup(people, tracks, "iou", 0.5)))
+        found[use] = scores["IDF1"], scores["IDSW"]
     if least_idf1 is None:
         assert found["auto"] == found["off"]
     else:
         assert found["auto"][0] >= max(least_idf1, found["off"][0] + 0.05)
         assert found["auto"][1] <= min(most_switches, found["off"][1] / 2)
-
-
-def _scores(truth: np.ndarray, tracks: list[Frame]) -> tuple[float, int]:
-    """IDF1 and identity switches, matched by an overlap of 0.5."""
-    people, there, given, alike = np.unique(truth[:, 1]), [], [], []
-    names = np.unique(np.concatenate([frame.rows["track_id"] for frame in tracks]))
-    for frame in tracks:
-        rows = truth[truth[:, 0] == frame.index + 1]
-        there.append(np.searchsorted(people, rows[:, 1]))
-        given.append(np.searchsorted(names, frame.rows["track_id"]))
-        alike.append(iou(rows[:, 2:6], columns_to_boxes(frame.rows)))
-    found = summary(score(Matchup(tuple(there), tuple(given), tuple(alike), 0.5, len(people), len(names))))
-    return found["IDF1"], found["IDSW"]
 
 
 def plane(*shift: float) -> GroundPlane:
@@ -235,3 +187,111 @@ def test_people_who_stand_before_a_camera_that_moves_stand_in_metres(kind):
         spread[use] = np.ptp(rows["x_m"][rows["track_id"] == 1])
     assert spread["auto"] < 0.2
     assert spread["off"] > 5.0
+
+
+# Re-tracking before a camera that moves: boxes in gaps stand on the people
+
+
+#: Left edges and tops of people who stand, 20 px wide and 60 px high, in the first picture.
+PEOPLE = [(500.0, 60.0), (700.0, 300.0), (950.0, 520.0)]
+PICTURE_PX = (1280, 720)
+
+
+def sway(frame: int) -> float:
+    """By how much the scene has moved to the right in a frame, in pixels."""
+    return 170 * float(np.sin(frame / 3.5) - np.sin(0))
+
+
+def write(folder: Path, frames: int, gap: range) -> None:
+    """Detections at 10 frames a second, in which the second person is missed for a while, and the motion."""
+    rows, motions = [], []
+    for n in range(frames):
+        seen = [one for number, one in enumerate(PEOPLE) if number != 1 or n not in gap]
+        rows += [f"{n + 1},-1,{x + sway(n):.3f},{y},20,60,1,-1,-1,-1" for x, y in seen]
+        motions.append(f"{n} 1 0 {sway(n) - sway(n - 1) if n else 0:.6f} 0 1 0")
+    (folder / "det.txt").write_text("\n".join(rows) + "\n")
+    (folder / "motion.txt").write_text("\n".join(motions) + "\n")
+    (folder / "plane.txt").write_text("0.02 0.004 -9\n0 0.03 -8\n0 0.0004 1\n")
+
+
+def run(folder: Path, *options: object) -> list:
+    given = ["--ground-plane", "plane.txt"] if "plane" in options else []
+    done("ingest", "det.txt", "--fps", 10, "--motion", "motion.txt", *given, "-o", "a.mcap", "-q", "--force")
+    done("run", "a.mcap", "--no-tables", "-q", *[one for one in options if one != "plane"])
+    with log.read(folder / "a.mcap") as opened:
+        return {name: opened.frames(f"/camera/{name}", TRACKS) for name in ("samples", "retracks", "retracks/full")}
+
+
+@pytest.mark.parametrize("given", [("plane",), ()], ids=["plane", "no plane"])
+def test_boxes_in_gaps_stand_on_people_while_the_camera_sways(tmp_path, monkeypatch, given):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path, 60, range(25, 34))
+    found = run(tmp_path, *given)
+    between = 0
+    for frame in found["retracks/full"]:
+        for row in frame.rows:
+            away = [np.hypot(row["x_px"] - x - sway(frame.index), row["y_px"] - y) for x, y in PEOPLE]
+            assert min(away) < 4, (frame.index, row["track_id"])
+        between += int((~frame.rows["observed"]).sum()) if frame.index in range(26, 33) else 0
+    assert between == 7
+    for name in ("samples", "retracks"):
+        for frame in found[name]:
+            for row in frame.rows:
+                assert min(abs(float(row["y_px"]) - y) for _, y in PEOPLE) < 4
+                now = sway(round(frame.t_ns / 1e8))  # samples are at 2.5 Hz, so at times of pictures
+                assert min(abs(float(row["x_px"]) - x - now) for x, _ in PEOPLE) < 4
+
+
+def test_boxes_go_to_the_scene_and_back():
+    """What stands is at one place of the scene, also between pictures, where the camera turns evenly."""
+    rng, motions, boxes = np.random.default_rng(3), [IDENTITY], [np.array([300.0, 200.0, 20.0, 60.0])]
+    for _ in range(9):
+        turn, scale = np.deg2rad(rng.normal(0, 3)), np.exp(rng.normal(0, 0.04))
+        linear = scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        motions.append(np.column_stack([linear, rng.uniform(-40, 40, 2)]))
+        boxes.append(move_boxes(motions[-1], boxes[-1][None])[0])
+    times = 100 * np.arange(10)
+    path = CameraPath(times, poses_of(np.array(motions), *PICTURE_PX))
+    assert path.to_scene(np.array(boxes), times) == pytest.approx(np.tile(boxes[0], (10, 1)))
+    assert path.to_pictures(np.tile(boxes[0], (10, 1)), times) == pytest.approx(np.array(boxes))
+    pan = CameraPath(times, poses_of(np.array([[[1.0, 0, -6], [0, 1, 0]]] * 10), *PICTURE_PX))
+    assert pan.to_pictures(boxes[0][None], np.array([250]))[0].tolist() == [285, 200, 20, 60]
+    assert pan.to_scene(np.array([[285.0, 200, 20, 60]]), np.array([250]))[0].tolist() == [300, 200, 20, 60]
+    assert pan.to_pictures(boxes[0][None], np.array([5000]))[0].tolist() == [246, 200, 20, 60]  # it stands after that
+
+
+def test_planes_stand_in_the_scene():
+    path = CameraPath(10 * np.arange(8), poses_of(np.array([[[1.0, 0, -6], [0, 1, 0]]] * 8), *PICTURE_PX))
+    first, later = (GroundPlane((0.1, 0, x, 0, 0.1, 0, 0, 0, 1), *PICTURE_PX) for x in (0.0, 5.0))
+    planes = [(0, first), (40, later)]
+    assert scene_planes(planes, None) is planes
+    assert scene_planes([(30, first)], path) == [(30, first)]  # the first plane is that of the first picture
+    (_, one), (since, other) = scene_planes(planes, path)
+    assert (one, since) == (first, 40)
+    seen = np.array([[100.0, 50.0]])  # in the fifth picture, to which the scene has moved by 24 px
+    assert other.pixels_to_metres(seen + [24, 0]) == pytest.approx(later.pixels_to_metres(seen))
+
+
+def test_ground_truth_is_in_metres_where_the_pictures_show_it(tmp_path, monkeypatch):
+    """People who stand: a plane that holds for the first picture would let their ground truth sway with the camera."""
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path, 60, range(0))
+    truth = [f"{n + 1},{k + 1},{x + sway(n):.3f},{y},20,60,1,1,1" for n in range(60) for k, (x, y) in enumerate(PEOPLE)]
+    (tmp_path / "gt.txt").write_text("\n".join(truth) + "\n")
+    given = "--fps 10 --motion motion.txt --ground-plane plane.txt --truth gt.txt"
+    done("ingest", "det.txt", *given.split(), "-o", "a.mcap", "-q")
+    summary = json.loads(done("run", "a.mcap", "--no-tables", "-q", "--json").out)["results"][0]
+    assert summary["summary"]["scores"]["idf1"][1] > 0.95
+    for topic in ("tracks", "retracks"):
+        scored = f"evaluate a.mcap --topic /camera/{topic} --similarity metres --gate-m 0.1 --json".split()
+        assert json.loads(done(*scored).out)["results"][0]["IDF1"] > 0.9, topic
+    with log.read(tmp_path / "a.mcap") as opened:
+        kinds = opened.rows("/camera/retracks/events", EVENTS).rows["kind"]
+        assert not {"identity switch", "false track"} & {EVENT_KINDS[kind] for kind in kinds.tolist()}
+        frames = read_ground_truth(opened, "/camera")
+    places = np.array([np.stack([frame.rows["x_m"], frame.rows["y_m"]], axis=1) for frame in frames])
+    assert np.ptp(places, axis=0).max() < 0.02
+    done("run", "a.mcap", "--camera-motion", "off", "--no-tables", "-q")
+    with log.read(tmp_path / "a.mcap") as opened:  # tracks and ground truth are in the same metres
+        places = [frame.rows["x_m"][0] for frame in read_ground_truth(opened, "/camera")]
+    assert np.ptp(places) > 2.0

@@ -50,12 +50,6 @@ class TestFixTracks:
         track = np.array([5, 5, 5, 5, 6, 6, 6, 6])
         assert fix_tracks(step, track, source, [9]).tolist() == [5] * 8
 
-    def test_two_that_were_joined_are_two(self):
-        step, source = np.arange(6), np.array([8, 8, 8, 9, 9, 9])
-        found = fix_tracks(step, np.full(6, 5), source, [8, 9])
-        assert len(set(found[:3].tolist())) == len(set(found[3:].tolist())) == 1
-        assert found[0] != found[5]
-
     def test_all_else_stays_as_it_is(self):
         step, source = np.array([0, 0, 1, 1]), np.array([1, 2, 1, 2])
         track = np.array([5, 6, 5, 6])
@@ -136,11 +130,6 @@ class TestRetrack:
         assert tracks_of(plain, 2) == tracks_of(plain, 3)
         assert [len(tracks_of(fixed, source)) for source in (1, 2, 3)] == [1, 1, 1]
         assert len(set.union(*(tracks_of(fixed, source) for source in (1, 2, 3)))) == 3
-
-    def test_a_short_track_of_a_person_is_no_false_one(self):
-        frames = [frame(k, {1: (k * 0.5, 0.0), **({2: (5.0, 40.0)} if 8 <= k < 11 else {})}) for k in range(20)]
-        sources = {int(one) for rows, *_ in Retrack(fixed_ids=(2,))(frames) for one in rows.rows["source_id"]}
-        assert 2 in sources
 
 
 class TestCompare:

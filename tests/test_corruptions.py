@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import mcaptrack
+from mcaptrack.predictors.weights import load
+from mcaptrack.transforms.retrack import cut_links, false_tracks, joins, linking
+from mcaptrack.transforms.retrack.weights import WEIGHTS, weights_of
 from tests.tiers import one_in
 from tools.corruptions import CORRUPTIONS, STEP_S, Corruption, corrupt
+from tools.fit_retrack import (
+    logistic,
+)
 
 #: Nothing goes wrong.
 NONE = Corruption(noise_m=0.0, seen_s=1e9, new_id=0.0, swap=0.0, flicker=0.0)
@@ -28,11 +37,6 @@ def person_of(rows: np.ndarray) -> np.ndarray:
     return np.where(there, lane, -1)
 
 
-def false_tracks(rows: np.ndarray) -> list[np.ndarray]:
-    false = rows[person_of(rows) < 0]
-    return [false[false[:, 1] == one] for one in np.unique(false[:, 1])]
-
-
 @pytest.mark.parametrize("kind", one_in(3, CORRUPTIONS))
 def test_rows_follow_from_a_seed_and_are_in_order_with_an_id_at_one_place_of_a_step(kind):
     rows = rows_of(CORRUPTIONS[kind])
@@ -49,57 +53,6 @@ def test_without_errors_the_truth_comes_back():
     assert len(np.unique(rows[:, 1])) == 5
 
 
-def test_a_place_gives_false_tracks_again_and_again_for_minutes():
-    tracks = false_tracks(rows_of(replace(NONE, lit=0.2)))
-    assert 0.2 * len(APART) <= sum(map(len, tracks)) < 0.2 * len(APART) + 75
-    middle = np.array([track[:, 2:].mean(axis=0) for track in tracks])
-    for track, place in zip(tracks, middle, strict=True):
-        assert np.array_equal(np.diff(track[:, 0]), np.ones(len(track) - 1))  # lit without a gap
-        assert len(track) * STEP_S <= 30.5
-        assert np.abs(track[:, 2:] - place).max() < 0.6
-    near = np.hypot(*(middle[:, None] - middle[None]).transpose(2, 0, 1)) < 0.5
-    again = max(near, key=np.sum)
-    assert again.sum() >= 3
-    steps = np.sort(np.concatenate([track[:, 0] for track, one in zip(tracks, again, strict=True) if one]))
-    assert (steps[-1] - steps[0]) * STEP_S > 60
-    assert 2 <= np.diff(steps).max() <= 39  # dark for .8 to 15 s
-
-
-def test_doubles_stay_at_one_offset_and_are_never_alone():
-    how = replace(NONE, beside=0.2, seen_s=4.0, hidden_s=(0.8, 2.0))
-    rows = rows_of(how)
-    tracks = false_tracks(rows)
-    people = rows[person_of(rows) >= 0]
-    assert sum(map(len, tracks)) >= 0.2 * len(people)
-    for track in tracks:
-        lane = round(float(track[:, 3].mean()) / 20)
-        own = people[np.round(people[:, 3] / 20) == lane]
-        at = np.searchsorted(own[:, 0], track[:, 0])
-        assert np.array_equal(own[at, 0], track[:, 0])
-        offset = track[:, 2:] - own[at, 2:]
-        assert np.abs(offset - offset.mean(axis=0)).max() < 0.3
-        assert 0.4 < np.hypot(*offset.mean(axis=0)) < 1.3
-        assert len(track) * STEP_S <= 60.5
-
-
-def test_two_people_who_meet_are_one_detection_for_ten_seconds():
-    """They stand 1 m apart throughout: one for 25 steps, two for 25, and so on."""
-    truth = np.array([(step, person, float(person), 0.0) for step in range(150) for person in (0, 1)], float)
-    rows = rows_of(replace(NONE, merge_m=1.2, merge_s=10.0), truth)
-    count = np.bincount(rows[:, 0].astype(int), minlength=150)
-    assert count.tolist() == ([1] * 25 + [2] * 25) * 3
-    assert (rows[count[rows[:, 0].astype(int)] == 1, 2] == 0.5).all()
-    assert len(np.unique(rows[:, 1])) in (4, 5)  # one more id after each time
-
-
-def test_people_who_part_are_no_longer_one_detection():
-    """One stands and the other passes at 1 m/s: they are one detection from 1.2 m apart to 3 m."""
-    truth = np.array([(s, p, 0.4 * (s - 50) * p, 0.0) for s in range(100) for p in (0, 1)], float)
-    rows = rows_of(replace(NONE, merge_m=1.2, merge_s=10.0), truth)
-    merged = np.flatnonzero(np.bincount(rows[:, 0].astype(int)) == 1)
-    assert merged.tolist() == list(range(48, 58))
-
-
 def test_gaps_last_up_to_eight_seconds():
     how = CORRUPTIONS["long gaps"]
     rows = rows_of(replace(NONE, seen_s=how.seen_s, hidden_s=how.hidden_s, new_id=how.new_id))
@@ -110,14 +63,6 @@ def test_gaps_last_up_to_eight_seconds():
     assert gaps.min() < 2
 
 
-def test_tracks_break_every_second_without_a_gap():
-    how = CORRUPTIONS["broken every second"]
-    rows = rows_of(replace(NONE, breaks_per_min=how.breaks_per_min, new_id=how.new_id))
-    assert len(rows) == len(APART)
-    assert len(rows) * STEP_S / len(np.unique(rows[:, 1])) == pytest.approx(1.0, abs=0.1)
-    assert all(len(np.unique(person_of(rows[rows[:, 1] == one]))) == 1 for one in np.unique(rows[:, 1]))
-
-
 @pytest.mark.parametrize("false", [{"lit": 0.2}, {"beside": 0.2}])
 def test_false_tracks_leave_the_rows_of_people_alone(false):
     """So kinds that were measured before a new kind of false track was added are drawn as they were."""
@@ -125,3 +70,37 @@ def test_false_tracks_leave_the_rows_of_people_alone(false):
     rows, alone = rows_of(replace(how, **false)), rows_of(how)
     assert len(rows) > 1.19 * len(alone)
     assert set(map(tuple, alone.tolist())) <= set(map(tuple, rows.tolist()))
+
+
+# The weights of links and of false tracks: what they were fitted on, and the fit itself
+
+
+PACKAGE = Path(mcaptrack.__file__).parent
+
+
+def test_everything_that_was_fitted_says_that_it_was_fitted_on_synthetic_data():
+    cards = {
+        path: json.loads(path.read_text())["card"] for path in (WEIGHTS, PACKAGE / "predictors/trained/tails.json")
+    }
+    cards |= {path: load(path).card for path in (PACKAGE / "predictors/trained").glob("*.safetensors")}
+    assert len(cards) == 5
+    for path, card in cards.items():
+        assert "synthetic" in card["data"], path
+        assert card["licence"] == "Apache-2.0", path
+
+
+def test_weights_go_by_the_names_of_features_in_any_order():
+    names = ("gap", "miss")
+    found = json.loads(WEIGHTS.read_text())["links"]["weights"]
+    assert weights_of("links", names)[0].tolist() == [found["gap"], found["miss"]]
+    models = {"links": linking, "people": false_tracks, "cuts": joins, "relinks": cut_links, "joins": joins}
+    for model, features in ((name, module.FEATURES) for name, module in models.items()):
+        assert set(json.loads(WEIGHTS.read_text())[model]["weights"]) == set(features)
+
+
+def test_the_fit_finds_the_weights_that_drew_the_data():
+    rng = np.random.default_rng(1)
+    features = rng.normal([1.0, -2.0], [1.0, 3.0], (40_000, 2))
+    odds = features @ [1.5, -0.4] + 0.7
+    right = rng.random(len(odds)) < 1 / (1 + np.exp(-odds))
+    assert logistic(features, right * 1.0, np.ones(len(odds))) == pytest.approx([1.5, -0.4, 0.7], abs=0.06)

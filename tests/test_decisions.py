@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mcaptrack import log
 from mcaptrack.evaluation.events import lifecycle_of
 from mcaptrack.schema import DECISIONS, DecisionKind, EventKind, Frame
-from mcaptrack.transforms import PROFILES, Retrack
+from mcaptrack.transforms import Retrack
 from mcaptrack.transforms.retrack import joins as join_steps
 from mcaptrack.transforms.retrack.joins import cut_joins, find_joins, tracked_of
 from mcaptrack.transforms.retrack.motion_model import MotionModel
@@ -114,17 +114,6 @@ def test_joins_below_70_percent_are_cut_or_below_what_links_need(monkeypatch, le
     assert [int(track[at]) for at in (9, 10, 20, 30)] == [5, 6, 6 if len(wanted) == 1 else 7, 5 + len(wanted)]
 
 
-def test_a_person_who_walks_straight_on_under_another_id_is_surely_the_same():
-    _, decisions = decided(walking(lambda tick: {3 if tick < 30 else 9: (0.5 * tick, 0.0)}))
-    (join,) = (row for row in rows_of(decisions) if row["kind"] == DecisionKind.JOINED)
-    assert (join["previous_id"], join["source_id"], join["alternative_id"]) == (3, 9, -1)
-    assert join["probability"] > 0.9
-    assert join["duration_s"] == pytest.approx(STEP_S)
-    (kept,) = (row for row in rows_of(decisions) if row["kind"] == DecisionKind.KEPT)
-    assert (kept["frames"], kept["source_id"]) == (60, 3)
-    assert kept["probability"] > 0.9
-
-
 def test_the_alternative_is_the_neighbour_and_a_join_in_a_crowd_is_less_certain():
     def beside(tick: int, apart_m: float) -> dict:
         people = {1 if tick < 30 else 4: (0.5 * tick, 0.0), 2 if tick < 30 else 5: (0.5 * tick, apart_m)}
@@ -156,16 +145,6 @@ def test_what_is_left_out_is_a_row_with_its_place_and_the_input_id():
     assert (row["source_id"], row["frames"], row["x_m"], row["y_m"]) == (7, 7, 22.0, 30.0)
     assert row["duration_s"] == pytest.approx(6 * STEP_S)
     assert row["probability"] > 0.5  # that it is no person
-
-
-def test_without_linking_nothing_is_cut_and_profiles_of_the_paper_write_no_decisions():
-    """A person steps aside under another input id: online the track goes on, and a cut takes more confidence than there is."""
-    assert [*PROFILES["paper"].writes] == [*PROFILES["authors"].writes] == ["", "online", "predictions"]
-    frames = walking(lambda tick: {3 if tick < 30 else 9: (0.5 * tick, 0.0 if tick < 30 else 0.9)})
-    unlinked = {int(row["track_id"]) for row in rows_of(decided(frames, Retrack(link_s=0.0))[0])}
-    sure = {int(row["track_id"]) for row in rows_of(decided(frames, Retrack(link_confidence=0.99))[0])}
-    assert len(unlinked) == 1
-    assert len(sure) == 2
 
 
 def test_the_least_likely_tracks_come_first_and_sure_ones_not_at_all():

@@ -1,31 +1,30 @@
-"""Events of tracks: small scenes counted by hand, laws, and the channels in a log."""
+"""Events of tracks: what is said of them, what they are compared with, and the channels in a log."""
 
 from __future__ import annotations
 
-import json
 import re
-from contextvars import copy_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log as LogMessage
 from hypothesis import given
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
 from mcaptrack import log, notices, pipeline
-from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate, sequence_of_log
 from mcaptrack.evaluation.event_text import describe, log_messages
 from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events, lifecycle_of
+from mcaptrack.pipeline import events
+from mcaptrack.pipeline.checks import describe_origin
+from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind, Frame
 from mcaptrack.schema.proto import parse
-from mcaptrack.schema.provenance import Provenance, digest
+from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.transforms import PROFILES
-from tests.worlds import boxed, ns, tracks_at, walk
+from tests.worlds import boxed, ns, replace_channel, tracks_at, walk, write_channels
 
 BIRTH, END, MISS, FALSE, SWITCH = (
     EventKind.BIRTH,
@@ -34,11 +33,10 @@ BIRTH, END, MISS, FALSE, SWITCH = (
     EventKind.FALSE_TRACK,
     EventKind.SWITCH,
 )
-OWN = {BIRTH, END}
 
 
-def happened(found, *but) -> list[tuple]:
-    """(seconds, kind, track, person, previous) of all events, but those of some kinds."""
+def happened(found) -> list[tuple]:
+    """(seconds, kind, track, person, previous) of all events."""
     return [
         (
             frame.t_ns / 1e9,
@@ -47,7 +45,6 @@ def happened(found, *but) -> list[tuple]:
         )
         for frame in found.events
         for row in frame.rows
-        if row["kind"] not in but
     ]
 
 
@@ -81,145 +78,114 @@ def follow(path, source, ticks, rate_hz=10.0) -> list[Frame]:
     return frames
 
 
-# Scenes
+# What is said; that events and counts are the right ones is tested in ``test_events_reference``
 
 
-def test_two_people_swap_their_tracks():
-    truth = walk(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 4.0)}, 30, 10)
-    tracks = walk(lambda n: {(7 if n < 10 else 8): (n / 10, 0.0), (8 if n < 10 else 7): (n / 10, 4.0)}, 30, 10)
-    found = find_events(tracks, truth)
-    assert found.rule == MatchRule("metres", 1.0)
-    assert happened(found) == [
-        (0.0, BIRTH, 7, -1, -1),
-        (0.0, BIRTH, 8, -1, -1),
-        (1.0, SWITCH, 7, 2, 8),
-        (1.0, SWITCH, 8, 1, 7),
-    ]
-    assert said(found)[2:] == [
-        ("ERROR", "person 2: track 8 became track 7 at 1.00 s, (1.0, 4.0) m"),
-        ("ERROR", "person 1: track 7 became track 8 at 1.00 s, (1.0, 0.0) m"),
-    ]
-    assert counted(found, "switches") == [0] * 10 + [2] * 20
-    assert counted(found, "mota")[9:11] == [1.0, (22 - 2) / 22]
+TWO = walk(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 4.0)}, 60, 10)
+ONE = walk(lambda n: {4: (n / 10, 2.0)}, 80, 10)
 
 
-def test_a_person_is_missed_for_three_seconds():
-    truth = walk(lambda n: {4: (n / 10, 2.0)}, 80, 10)
-    tracks = walk(lambda n: {} if 20 <= n < 50 else {1: (n / 10, 2.0)}, 80, 10)
-    found = find_events(tracks, truth)
-    assert happened(found, *OWN) == [(2.0, MISS, -1, 4, 1)]
-    (row,) = rows_of(found, MISS)
-    assert (row["duration_s"], row["frames"], row["x_m"], row["y_m"]) == (3.0, 30, 2.0, 2.0)
-    assert said(found)[-1] == ("WARNING", "person 4 is missed for 3.0 s at 2.00 s, (2.0, 2.0) m, last tracked as 1")
-    assert counted(found, "misses") == [0] * 20 + [1] * 30 + [0] * 30
+def seen(*gone: int) -> list[Frame]:
+    """Track 1 of person 4, but in some frames."""
+    return walk(lambda n: {} if n in gone else {1: (n / 10, 2.0)}, 80, 10)
 
 
-def test_a_track_matches_no_person_for_two_seconds():
-    truth = walk(lambda n: {4: (n / 10, 2.0)}, 50, 10)
-    tracks = walk(lambda n: {1: (n / 10, 2.0)} | ({9: (3.0, 30.0)} if 10 <= n < 30 else {}), 50, 10)
-    found = find_events(tracks, truth)
-    assert happened(found) == [
-        (0.0, BIRTH, 1, -1, -1),
-        (1.0, FALSE, 9, -1, -1),
-        (1.0, BIRTH, 9, -1, -1),
-        (2.9, END, 9, -1, -1),
-    ]
-    for row in (*rows_of(found, FALSE), *rows_of(found, END)):
-        assert (row["duration_s"], row["frames"]) == (2.0, 20)
-    assert said(found) == [  # its beginning and its end go without saying
-        ("INFO", "track 1 begins at 0.00 s, (0.0, 2.0) m"),
-        ("WARNING", "track 9 matches no person while it exists, for 2.0 s at 1.00 s, (3.0, 30.0) m"),
-    ]
-    assert counted(found, "born") == [1] * 10 + [2] * 40
-    assert counted(found, "ended") == [0] * 29 + [1] * 21
-    assert counted(found, "false_tracks") == [0] * 10 + [1] * 20 + [0] * 20
+def in_place(source) -> list[Frame]:
+    """Tracks 1 and 2, 2 m apart."""
+    return follow(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 2.0)}, source, 60)
 
 
-def test_a_track_that_drifts_off_is_one_message_and_comes_back():
-    truth = walk(lambda n: {4: (n / 10, 2.0)}, 60, 10)
-    tracks = walk(lambda n: {1: (n / 10, 2.0 + 5 * (20 <= n < 40))}, 60, 10)
-    found = find_events(tracks, truth)
-    assert happened(found, *OWN) == [(2.0, MISS, -1, 4, 1), (2.0, FALSE, 1, -1, 4)]
-    assert said(found)[1:] == [("WARNING", "person 4 and track 1 are apart for 2.0 s at 2.00 s, (2.0, 2.0) m")]
-
-
-def test_a_short_interruption_does_not_split_an_event():
-    gone = {20, 21, 22, 26, 27, 28, 50}
-    truth = walk(lambda n: {4: (n / 10, 2.0)}, 80, 10)
-    tracks = walk(lambda n: {} if n in gone else {1: (n / 10, 2.0)}, 80, 10)
-    found = find_events(tracks, truth)
-    assert happened(found, *OWN) == [(2.0, MISS, -1, 4, 1), (5.0, MISS, -1, 4, 1)]
-    assert rows_of(found, MISS)["frames"].tolist() == [6, 1]
-    assert rows_of(found, MISS)["duration_s"].tolist() == pytest.approx([0.9, 0.1])
-    assert said(found)[1:] == [
-        ("DEBUG", "person 4 is missed in 6 of 9 frames over 0.9 s at 2.00 s, (2.0, 2.0) m, last tracked as 1"),
-        ("DEBUG", "person 4 is missed for 0.1 s at 5.00 s, (5.0, 2.0) m, last tracked as 1"),
-    ]
-
-
-@pytest.mark.parametrize(("frames", "level"), [(9, "DEBUG"), (10, "WARNING")])
-def test_what_lasts_a_whole_second_is_not_brief(frames, level):
-    truth = walk(lambda n: {4: (n / 10, 2.0)}, 80, 10)
-    missed = find_events(walk(lambda n: {1: (n / 10, 2.0)} if not 20 <= n < 20 + frames else {}, 80, 10), truth)
-    assert rows_of(missed, MISS)["duration_s"].tolist() == [pytest.approx(frames / 10)]
-    assert said(missed)[1:] == [
-        (level, f"person 4 is missed for {frames / 10} s at 2.00 s, (2.0, 2.0) m, last tracked as 1")
-    ]
-    alone = find_events(walk(lambda n: {1: (n / 10, 2.0)} if 20 <= n < 20 + frames else {}, 80, 10), None)
-    assert said(alone) == (
-        [("DEBUG", "track 1 exists for 0.9 s at 2.00 s, (2.0, 2.0) m")]
-        if frames < 10
-        else [
-            ("INFO", "track 1 begins at 2.00 s, (2.0, 2.0) m"),
-            ("INFO", "track 1 ends at 2.90 s, (2.9, 2.0) m, after 1.0 s"),
-        ]
-    )
-
-
-def test_without_ground_truth_there_are_births_and_ends_and_missing_counts():
-    tracks = walk(lambda n: {1: (n / 10, 0.0)} if n < 25 else {2: (0.0, n / 10)}, 40, 10)
-    found = find_events(tracks, None)
-    assert (found.rule, found.notes) == (None, [])
-    assert happened(found) == [(0.0, BIRTH, 1, -1, -1), (2.4, END, 1, -1, -1), (2.5, BIRTH, 2, -1, -1)]
-    for name in ("people", "matches", "misses", "false_tracks", "switches", "mota"):
-        assert np.isnan(counted(found, name)).all()
-    assert counted(found, "tracked") == [1] * 40
-
-
-def test_events_of_boxes_have_positions_in_pixels():
-    found = find_events([Frame(0, 0, boxed({3: (20.0, 40.0)})), Frame(ns(2), 1, boxed({}))], None)
-    assert said(found, start_ns=0)[0] == ("INFO", "track 3 begins at 0.00 s, (25, 50) px")
-
-
-def test_repairs_join_and_part_tracks():
+def joined_and_parted() -> list[Frame]:
     """Track 1 continues from source 5 to 8 after a gap of 0.5 s; source 5 continues as the new track 2."""
     path = lambda n: {1: (n / 10, 0.0)} | ({2: (n / 10, 6.0)} if n >= 40 else {})  # noqa: E731
-    source = lambda n: {1: 5 if n < 20 else -1 if n < 25 else 8, 2: 5}  # noqa: E731
-    found = find_events(follow(path, source, 60), None)
-    assert happened(found, *OWN) == [(2.5, EventKind.JOINED, 1, -1, 5), (4.0, EventKind.PARTED, 2, -1, 1)]
-    assert rows_of(found, EventKind.JOINED)["source_id"].tolist() == [8]
-    assert rows_of(found, EventKind.JOINED)["duration_s"].tolist() == [0.5]
-    assert said(found)[1:] == [
-        ("WARNING", "track 1 joins the tracker's 5 and 8 at 2.50 s, (2.5, 0.0) m, 0.5 s unseen"),
-        ("INFO", "track 2 begins at 4.00 s, (4.0, 6.0) m"),
-        ("WARNING", "track 2 takes over the tracker's 5, which was track 1, at 4.00 s, (4.0, 6.0) m"),
-    ]
-    assert counted(found, "repaired") == [0] * 25 + [1] * 15 + [2] * 20
+    return follow(path, lambda n: {1: 5 if n < 20 else -1 if n < 25 else 8, 2: 5}, 60)
 
 
-def test_a_short_change_of_source_is_no_repair():
-    flicker = lambda n: {1: 8 if n in (20, 21, 24, 25, 26) else 5}  # noqa: E731
-    assert happened(find_events(follow(lambda n: {1: (n / 10, 0.0)}, flicker, 60), None), *OWN) == []
-    lasting = lambda n: {1: 8 if n in (20, 21) or n >= 24 else 5}  # noqa: E731
-    found = find_events(follow(lambda n: {1: (n / 10, 0.0)}, lasting, 60), None)
-    assert happened(found, *OWN) == [(2.4, EventKind.JOINED, 1, -1, 5)]
+BEGINS = ("INFO", "track 1 begins at 0.00 s, (0.0, 2.0) m")
+#: Ground truth, tracks, and all messages about them.
+SAID = {
+    "two people swap their tracks": (
+        TWO,
+        walk(lambda n: {(7 if n < 10 else 8): (n / 10, 0.0), (8 if n < 10 else 7): (n / 10, 4.0)}, 60, 10),
+        [
+            ("INFO", "track 7 begins at 0.00 s, (0.0, 0.0) m"),
+            ("INFO", "track 8 begins at 0.00 s, (0.0, 4.0) m"),
+            ("ERROR", "person 2: track 8 became track 7 at 1.00 s, (1.0, 4.0) m"),
+            ("ERROR", "person 1: track 7 became track 8 at 1.00 s, (1.0, 0.0) m"),
+        ],
+    ),
+    "a second is not brief": (
+        ONE,
+        seen(*range(20, 30)),
+        [BEGINS, ("WARNING", "person 4 is missed for 1.0 s at 2.00 s, (2.0, 2.0) m, last tracked as 1")],
+    ),
+    "nine frames are": (
+        ONE,
+        seen(*range(20, 29)),
+        [BEGINS, ("DEBUG", "person 4 is missed for 0.9 s at 2.00 s, (2.0, 2.0) m, last tracked as 1")],
+    ),
+    "a short interruption does not split a miss": (
+        ONE,
+        seen(20, 21, 22, 26, 27, 28, 50),
+        [
+            BEGINS,
+            ("DEBUG", "person 4 is missed in 6 of 9 frames over 0.9 s at 2.00 s, (2.0, 2.0) m, last tracked as 1"),
+            ("DEBUG", "person 4 is missed for 0.1 s at 5.00 s, (5.0, 2.0) m, last tracked as 1"),
+        ],
+    ),
+    "a false track begins and ends without saying": (
+        ONE,
+        walk(lambda n: {1: (n / 10, 2.0)} | ({9: (3.0, 30.0)} if 10 <= n < 30 else {}), 80, 10),
+        [BEGINS, ("WARNING", "track 9 matches no person while it exists, for 2.0 s at 1.00 s, (3.0, 30.0) m")],
+    ),
+    "a track that drifts off and comes back": (
+        ONE,
+        walk(lambda n: {1: (n / 10, 2.0 + 5 * (20 <= n < 40))}, 80, 10),
+        [BEGINS, ("WARNING", "person 4 and track 1 are apart for 2.0 s at 2.00 s, (2.0, 2.0) m")],
+    ),
+    "a track alone": (
+        None,
+        walk(lambda n: {1: (n / 10, 2.0)} if 20 <= n < 30 else {}, 80, 10),
+        [
+            ("INFO", "track 1 begins at 2.00 s, (2.0, 2.0) m"),
+            ("INFO", "track 1 ends at 2.90 s, (2.9, 2.0) m, after 1.0 s"),
+        ],
+    ),
+    "a brief one": (
+        None,
+        walk(lambda n: {1: (n / 10, 2.0)} if 20 <= n < 29 else {}, 80, 10),
+        [("DEBUG", "track 1 exists for 0.9 s at 2.00 s, (2.0, 2.0) m")],
+    ),
+    "boxes have positions in pixels": (
+        None,
+        [Frame(0, 0, boxed({3: (20.0, 40.0)})), Frame(ns(2), 1, boxed({3: (20.0, 40.0)}))],
+        [("INFO", "track 3 begins at 0.00 s, (25, 50) px")],
+    ),
+    "repairs join and part tracks": (
+        None,
+        joined_and_parted(),
+        [
+            ("INFO", "track 1 begins at 0.00 s, (0.0, 0.0) m"),
+            ("WARNING", "track 1 joins the tracker's 5 and 8 at 2.50 s, (2.5, 0.0) m, 0.5 s unseen"),
+            ("INFO", "track 2 begins at 4.00 s, (4.0, 6.0) m"),
+            ("WARNING", "track 2 takes over the tracker's 5, which was track 1, at 4.00 s, (4.0, 6.0) m"),
+        ],
+    ),
+    "an undone swap is one message": (
+        None,
+        in_place(lambda n: {1: 5 if n < 30 else 6, 2: 6 if n < 30 else 5}),
+        [
+            ("INFO", "track 1 begins at 0.00 s, (0.0, 0.0) m"),
+            ("INFO", "track 2 begins at 0.00 s, (0.0, 2.0) m"),
+            ("WARNING", "tracks 1 and 2: the tracker swapped its 5 and 6 at 3.00 s, (3.0, 0.0) m"),
+        ],
+    ),
+}
 
 
-def test_an_undone_swap_is_two_joins_and_one_message():
-    source = lambda n: {1: 5 if n < 30 else 6, 2: 6 if n < 30 else 5}  # noqa: E731
-    found = find_events(follow(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 2.0)}, source, 60), None)
-    assert happened(found, *OWN) == [(3.0, EventKind.JOINED, 1, -1, 5), (3.0, EventKind.JOINED, 2, -1, 6)]
-    assert said(found)[2:] == [("WARNING", "tracks 1 and 2: the tracker swapped its 5 and 6 at 3.00 s, (3.0, 0.0) m")]
+@pytest.mark.parametrize(("truth", "tracks", "messages"), SAID.values(), ids=SAID)
+def test_what_is_said(truth, tracks, messages):
+    assert said(find_events(tracks, truth)) == messages
 
 
 # What is compared with what
@@ -240,14 +206,6 @@ def test_boxes_at_video_rate_match_by_overlap_and_others_by_metres():
     assert find_events(both, both, EventOptions("metres", 0.3)).rule == MatchRule("metres", 0.3)
 
 
-def test_ground_truth_at_other_times_is_resampled_to_the_tracks():
-    truth = [Frame(ns(n / 7), n, tracks_at({1: (n / 7, 0.0)})) for n in range(71)]
-    tracks = walk(lambda n: {(3 if n < 10 else 4): (n / 2.5, 0.0)}, 25)
-    found = find_events(tracks, truth)
-    assert happened(found, *OWN) == [(4.0, SWITCH, 4, 1, 3)]
-    assert [frame.t_ns for frame in found.counts] == [frame.t_ns for frame in tracks]
-
-
 def test_tracks_at_more_times_than_the_truth_have_counts_there_and_no_scores():
     truth = walk(lambda n: {1: (float(n), 0.0)}, 10)
     tracks = [Frame(ns(n / 30), n, tracks_at({5: (n / 12, 0.0)})) for n in range(9 * 12 + 1)]
@@ -256,13 +214,6 @@ def test_tracks_at_more_times_than_the_truth_have_counts_there_and_no_scores():
     assert len(found.counts) == len(tracks)
     assert [n for n, value in enumerate(counted(found, "mota")) if not np.isnan(value)] == list(range(0, 109, 12))
     assert counted(found, "tracked") == [1] * 109
-
-
-def test_labelled_frames_without_tracks_have_counts():
-    truth = walk(lambda n: {1: (n / 10, 0.0)}, 30, 10)
-    found = find_events(truth[:20], truth)
-    assert happened(found, *OWN) == [(2.0, MISS, -1, 1, 1)]
-    assert counted(found, "tracked") == [1] * 20 + [0] * 10
 
 
 @pytest.mark.parametrize(
@@ -366,38 +317,7 @@ def test_events_and_counts_add_up_to_the_scores(similarity, scene):
     assert len(said(found)) <= len(np.concatenate([frame.rows for frame in found.events]))
 
 
-@given(scene=scenes(), seed=st.integers(0, 99))
-def test_the_order_of_rows_does_not_matter(scene, seed):
-    rng = np.random.default_rng(seed)
-
-    def shuffled(frames):
-        return [Frame(f.t_ns, f.index, f.rows[rng.permutation(len(f.rows))]) for f in frames]
-
-    truth, tracks = scene
-    truth = [Frame(f.t_ns, f.index, f.rows.copy()) for f in truth]
-    for frame in truth:  # no two distances are equal
-        frame.rows["x_m"] += rng.uniform(0, 0.2, len(frame.rows))
-        frame.rows["y_m"] += rng.uniform(0, 0.2, len(frame.rows))
-    once = find_events(tracks, truth, EventOptions("metres"))
-    again = find_events(shuffled(tracks), shuffled(truth), EventOptions("metres"))
-    assert happened(once) == happened(again)
-    assert [f.rows.tobytes() for f in once.counts] == [f.rows.tobytes() for f in again.counts]
-
-
 # In a log
-
-
-def written(path: Path, made_by: str = "ingest", **channels: list[Frame]) -> Path:
-    """A log without pictures: channels of /camera, made by a stage; without provenance if that is empty."""
-    with log.create(path) as writer:
-        for name, frames in channels.items():
-            messages = [(f.t_ns, f.index, TRACKS.codec.encode(f.rows)) for f in frames]
-            how = Provenance(made_by, {}, digest=digest(messages)).to_metadata() if made_by else {}
-            topic = "/camera/" + name.replace("_", "/")
-            number = writer.add_channel(topic, (TRACKS.name, "protobuf", TRACKS.descriptor), "protobuf", how)
-            for t_ns, index, payload in messages:
-                writer.add_message(number, t_ns, index, payload)
-    return path
 
 
 def watched(path: Path, *topics: str, again: bool = False, output: Path | None = None, **options):
@@ -418,7 +338,7 @@ TOPICS = {"/camera/tracks/events", "/camera/tracks/events/view/log", "/camera/tr
 
 @pytest.fixture
 def place(tmp_path) -> Path:
-    return written(tmp_path / "a.mcap", tracks=SWAPPED, truth=TRUTH)
+    return write_channels(tmp_path / "a.mcap", tracks=SWAPPED, truth=TRUTH)
 
 
 def without_views(opened) -> set[str]:
@@ -479,19 +399,10 @@ def test_options_of_events_are_kept_until_changed(place):
     assert rule() == ("metres", 1.0)
 
 
-def replaced(path: Path, topic: str, frames: list[Frame]) -> None:
-    messages = [(f.t_ns, f.index, TRACKS.codec.encode(f.rows)) for f in frames]
-    how = Provenance("ingest", {}, digest=digest(messages)).to_metadata()
-    with log.read(path) as opened, log.extend(opened, drop=[topic]) as writer:
-        number = writer.add_channel(topic, (TRACKS.name, "protobuf", TRACKS.descriptor), "protobuf", how)
-        for t_ns, index, payload in messages:
-            writer.add_message(number, t_ns, index, payload)
-
-
 @pytest.mark.parametrize("topic", ["/camera/tracks", "/camera/truth"])
 def test_changed_tracks_or_ground_truth_make_events_out_of_date(place, topic):
     watched(place)
-    replaced(place, topic, walk(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 4.0)}, 50, 10))
+    replace_channel(place, topic, walk(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 4.0)}, 50, 10))
     with log.read(place) as opened:
         assert {name for name in without_views(opened) if pipeline.is_stale(opened, name)} == TOPICS - {
             "/camera/tracks/events/view/log"
@@ -501,11 +412,11 @@ def test_changed_tracks_or_ground_truth_make_events_out_of_date(place, topic):
 
 
 def test_added_or_removed_ground_truth_remakes_events(tmp_path):
-    path = written(tmp_path / "a.mcap", tracks=SWAPPED)
+    path = write_channels(tmp_path / "a.mcap", tracks=SWAPPED)
     report, notes = watched(path)
     assert (report.events["/camera/tracks"]["identity switch"], notes) == (0, [])
     assert watched(path)[0].stages == []
-    replaced(path, "/camera/truth", TRUTH)
+    replace_channel(path, "/camera/truth", TRUTH)
     assert watched(path)[0].events["/camera/tracks"]["identity switch"] == 2
     with log.read(path) as opened, log.extend(opened, drop=["/camera/truth"]):
         pass
@@ -515,7 +426,7 @@ def test_added_or_removed_ground_truth_remakes_events(tmp_path):
 
 def test_ground_truth_that_cannot_be_compared_is_reported_once(tmp_path):
     late = [Frame(frame.t_ns + ns(900), frame.index, frame.rows) for frame in TRUTH]
-    path = written(tmp_path / "a.mcap", tracks=SWAPPED, truth=late)
+    path = write_channels(tmp_path / "a.mcap", tracks=SWAPPED, truth=late)
     report, notes = watched(path)
     assert report.events["/camera/tracks"]["birth"] == 2
     assert ["never overlap in time" in note for note in notes] == [True]
@@ -524,26 +435,26 @@ def test_ground_truth_that_cannot_be_compared_is_reported_once(tmp_path):
 
 
 def test_foreign_tracks_are_watched_and_never_replaced(tmp_path):
-    path = written(tmp_path / "a.mcap", made_by="", tracks=SWAPPED, truth=TRUTH)
+    path = write_channels(tmp_path / "a.mcap", made_by="", tracks=SWAPPED, truth=TRUTH)
     assert watched(path)[0].events["/camera/tracks"]["identity switch"] == 2
     assert watched(path)[0].stages == []
 
 
 def test_named_channels_stay_watched(tmp_path):
-    path = written(tmp_path / "a.mcap", retracks_online=SWAPPED, truth=TRUTH)
+    path = write_channels(tmp_path / "a.mcap", retracks_online=SWAPPED, truth=TRUTH)
     with pytest.raises(McaptrackError, match=r"has no tracks of /camera; `mcaptrack\.run\('.*a\.mcap'\)` makes them"):
         watched(path, again=True)
     with log.read(path) as opened:
         assert pipeline.find_camera(opened, None, "/camera/retracks/online") == "/camera"
     assert watched(path)[0].stages == []
     watched(path, "/camera/retracks/online", again=True)
-    replaced(path, "/camera/retracks/online", TRUTH)
+    replace_channel(path, "/camera/retracks/online", TRUTH)
     assert watched(path)[0].events["/camera/retracks/online"]["identity switch"] == 0
 
 
 def test_remade_tracks_make_events_out_of_date_until_run(tmp_path):
     """The samples of true tracks, re-tracked in two ways."""
-    path = written(tmp_path / "a.mcap", samples=walk(lambda n: {5 + n // 40: (n / 4, 0.0)}, 80), truth=[])
+    path = write_channels(tmp_path / "a.mcap", samples=walk(lambda n: {5 + n // 40: (n / 4, 0.0)}, 80), truth=[])
 
     def retrack(profile, watch=None):
         with log.read(path) as opened:
@@ -559,39 +470,11 @@ def test_remade_tracks_make_events_out_of_date_until_run(tmp_path):
 
 
 def test_a_log_of_tracks_without_rows(tmp_path):
-    path = written(tmp_path / "a.mcap", tracks=[], truth=TRUTH)
+    path = write_channels(tmp_path / "a.mcap", tracks=[], truth=TRUTH)
     report, _ = watched(path)
     assert report.events == {"/camera/tracks": dict.fromkeys(EVENT_KINDS.values(), 0)}
     assert watched(path)[0].stages == []
     assert log.check(path).is_sound
-
-
-def test_the_command_drop_and_tables_handle_events(place):
-    def call(*words):
-        result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
-        assert result.exit_code == 0, result.output
-        return result
-
-    data = json.loads(call("events", place, "--json", "--similarity", "metres", "--gate-m", "0.5").stdout)
-    (result,) = data["results"]
-    assert (result["stages"], result["events"]["/camera/tracks"]["identity switch"]) == (["events"], 2)
-    call("events", place, "--topic", "/camera/tracks")
-    assert CliRunner().invoke(app, ["events", str(place), "--gate-m", "0"]).exit_code == 1
-    assert CliRunner().invoke(app, ["events", str(place), "--min-iou", "1.5", "--similarity", "iou"]).exit_code == 1
-    (place.parent / "odd.toml").write_text('[events]\nsimilarity = "iou"\nmin-iou = "much"\n')
-    words = ["run", str(place), "--config", str(place.parent / "odd.toml")]
-    odd = copy_context().run(CliRunner().invoke, app, words)  # what the file says is for this command alone
-    assert odd.exit_code == 2
-    assert "[events] min-iou needs a number, not 'much'" in odd.output
-    call("export", place, "-o", place.parent / "tables")
-    table = pq.read_table(place.parent / "tables" / "events" / "recording=a" / "part-0.parquet").to_pylist()
-    assert [(row["topic"], row["kind"], row["truth_id"]) for row in table if row["kind"] == SWITCH] == [
-        ("/camera/tracks/events", 4, 2),
-        ("/camera/tracks/events", 4, 1),
-    ]
-    call("drop", place, "/camera/tracks")
-    with log.read(place) as opened:
-        assert without_views(opened) == {"/camera/truth"}
 
 
 def test_of_the_life_of_tracks_only_ends_of_tracks_and_of_sources_are_kept():
@@ -619,3 +502,112 @@ def test_of_the_life_of_tracks_only_ends_of_tracks_and_of_sources_are_kept():
 def test_events_as_text_that_no_scene_shows(values, text):
     event = {"track_id": 7, "previous_id": 0, "truth_id": 9, "source_id": 3, "frames": 0, "duration_s": 0.0} | values
     assert describe(event, "here", 0.1) == text
+
+
+# Which channels of tracks get events, by which options, and what is said where they get none
+
+
+WALK = walk(lambda n: {1: (n / 10, 0.0), 2: (n / 10, 4.0)}, 10, 10)
+
+
+def written(path: Path, *channels: tuple[str, Provenance | None, list[Frame]], encoding: str = "protobuf") -> Path:
+    """A log of channels of tracks."""
+    with log.create(path) as writer:
+        for topic, made, frames in channels:
+            metadata = made.to_metadata() if made else {}
+            kind = (TRACKS.name, "protobuf", TRACKS.descriptor)
+            number = writer.add_channel(topic, kind, encoding, metadata, another=True)
+            for frame in frames:
+                writer.add_message(number, frame.t_ns, frame.index, TRACKS.codec.encode(frame.rows))
+    return path
+
+
+def run_watch(path: Path, **options: Any) -> pipeline.Report:
+    with log.read(path) as opened, notices.listening(lambda _: None):
+        return pipeline.run(opened, "/camera", [], watch=pipeline.Watch(**options))
+
+
+TRACKED = ("/camera/tracks", Provenance(INGEST, {}, digest="y"), WALK)
+
+
+@pytest.mark.parametrize("end", ["events", "events/view/log", "counts"])
+def test_events_that_would_replace_something_are_left_out_with_a_warning_or_refused_if_asked_for(tmp_path, end):
+    path = written(tmp_path / "a.mcap", TRACKED, (f"/camera/tracks/{end}", None, WALK))
+    taken = f"would replace /camera/tracks/{end}, which was recorded by others (mcaptrack.Tracks)"
+    report = run_watch(path)
+    assert [(one.message, one.code) for one in report.warnings] == [
+        (f"no events of /camera/tracks: they {taken}", "left-out")
+    ]
+    assert (report.stages, report.events, report.frames) == ([], {}, {})
+    with pytest.raises(McaptrackError) as error:
+        run_watch(path, topics=("/camera/tracks",), again=True)
+    assert str(error.value) == f"{path}: events {taken}"
+
+
+def test_of_two_channels_of_a_topic_the_recorded_one_is_named(tmp_path):
+    ours, theirs = (("/camera/retracks", made, WALK) for made in (TRACKED[1], None))
+    for number, channels in enumerate([(ours, theirs), (theirs, ours)]):
+        path = written(tmp_path / f"{number}.mcap", TRACKED, *channels)
+        with log.read(path) as opened:
+            assert describe_origin(opened, "/camera/retracks") == "was recorded by others (mcaptrack.Tracks)"
+            assert describe_origin(opened, "/camera/tracks") == "was ingested"
+
+
+def test_the_usual_tracks_and_those_with_events_are_watched(tmp_path):
+    made = Provenance("events", {}, "/camera/other")
+    some = [
+        (f"/camera/{name}", Provenance(INGEST, {}), WALK[:1])
+        for name in ("zebra", "retracks", "other", "third", "tracks")
+    ]
+    beside = [
+        ("/camera/zebra/events", made, []),
+        ("/camera/other/events", made, []),
+        ("/camera/third/events", None, []),
+        ("/camera/gone/events", made, []),
+    ]
+    report = run_watch(written(tmp_path / "a.mcap", *some, *beside))
+    assert [*report.events] == ["/camera/tracks", "/camera/retracks", "/camera/other", "/camera/zebra"]
+    assert run_watch(written(tmp_path / "b.mcap", some[-1], encoding="json")).events == {}
+
+
+#: What the provenance of events says, and the options that they are made again with.
+ASKED: list[tuple[Any, tuple[Any, Any, Any]]] = [
+    ({"similarity": "iou", "min_iou": 0.4}, ("iou", None, 0.4)),
+    ({"similarity": "metres", "gate_m": 2, "min_iou": 0.5}, ("metres", 2, 0.5)),
+    ({"similarity": "iou", "min_iou": 0.4}, ("iou", None, 0.4)),
+    ({"similarity": "strange", "gate_m": 2.0}, (None, 2.0, None)),
+    ({"gate_m": True, "min_iou": 0}, (None, None, None)),
+    ({"gate_m": 0.001, "min_iou": -1.0}, (None, 0.001, None)),
+    ({"gate_m": "1"}, (None, None, None)),
+    (["iou"], (None, None, None)),
+    (None, (None, None, None)),
+]
+
+
+@pytest.mark.parametrize(("asked", "wanted"), ASKED)
+def test_events_are_made_again_as_they_were_asked_for_unless_something_else_is(tmp_path, asked, wanted):
+    names = ("similarity", "gate_m", "min_iou")
+    for stage, options, asked_now in (
+        ("events", EventOptions(), wanted),
+        ("events", EventOptions("iou"), ("iou", None, None)),
+    ):
+        made = Provenance(stage, {"asked": asked})
+        path = written(tmp_path / "a.mcap", TRACKED, ("/camera/tracks/events", made, []))
+        run_watch(path, options=options)
+        with log.read(path) as opened:
+            found = Provenance.from_metadata(opened.channel("/camera/tracks/events").metadata)
+        assert found is not None
+        assert found.parameters["asked"] == dict(zip(names, asked_now, strict=True))
+
+
+def test_events_are_tallied_by_kind_for_each_channel():
+    kinds = [EventKind.BIRTH, EventKind.BIRTH, EventKind.MISS, EventKind.PARTED]
+    rows = EVENTS.empty(len(kinds))
+    rows["kind"] = kinds
+    made = Made(EVENTS, [Frame(0, 0, rows[:1]), Frame(1, 1, rows[1:])], Provenance("events", {}))
+    text = made._replace(drawn="foxglove.Log")
+    found = events.tally(
+        {"/a/events": made, "/a/events/view/log": text, "/a/counts": Made(COUNTS, [], made.provenance)}
+    )
+    counted = {"birth": 2, "miss": 1, "parted": 1}
+    assert found == {"/a": dict.fromkeys(EVENT_KINDS.values(), 0) | counted}

@@ -38,8 +38,10 @@ def random_world(rng: np.random.Generator) -> tuple[list[Frame], list[Frame]]:
                 found[names[who]] = tuple(here + rng.normal(0, 0.35, 2))
         if rng.random() < 0.3:
             found[int(rng.integers(90, 93))] = tuple(rng.uniform(-20, 20, 2))
-        truth.append(Frame(ns(now), number, tracks_at(people)))
-        tracks.append(Frame(ns(now), number, tracks_at(found)))
+        for frames, places in ((truth, people), (tracks, found)):  # in any order
+            frames.append(
+                Frame(ns(now), number, tracks_at({who: places[who] for who in rng.permutation(list(places))}))
+            )
     return truth, tracks
 
 

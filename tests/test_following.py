@@ -220,24 +220,6 @@ def test_over_a_missing_recording_no_id_is_taken_over_and_none_is_used_twice(par
         assert ids.min() > (known if name == "tracks" else largest)
 
 
-def test_an_id_of_a_log_further_back_is_not_used_again(tmp_path):
-    """Of four people one is in all recordings, two leave in the first, and one comes in the third."""
-    there = np.full((150, 4, 2), np.nan)
-    there[:, 0] = np.column_stack([np.linspace(100, 500, 150), np.full(150, 200.0)])
-    there[5:40, 1] = np.column_stack([np.linspace(500, 300, 35), np.full(35, 300.0)])
-    there[7:40, 3] = np.column_stack([np.linspace(200, 300, 33), np.full(33, 460.0)])
-    there[110:, 2] = np.column_stack([np.linspace(100, 300, 40), np.full(40, 400.0)])
-    paths = [part(tmp_path / f"{n}.mcap", 50 * n, 50 * n + 50, places=there) for n in range(3)]
-    ids = []
-    for path in paths:
-        mcaptrack.run(path, follows=paths, tables=False, events=False)
-        with log.read(path) as opened:
-            ids.append(set(opened.rows("/camera/tracks", TRACKS).rows["track_id"].tolist()))
-    assert [len(one) for one in ids] == [3, 1, 2]
-    assert ids[0] & ids[1] & ids[2] == ids[1]
-    assert not (ids[2] - ids[1]) & ids[0]
-
-
 @pytest.fixture
 def several(tmp_path) -> list[Path]:
     """Two recordings of three cameras, one after the other, made of one."""
@@ -291,24 +273,6 @@ def test_a_camera_that_the_log_before_lacks_begins_and_others_go_on(several):
     assert line == f"{several[0]} has no camera south: its ids begin with {several[1]}"
 
 
-def test_what_went_on_is_said_of_all_cameras():
-    one = following.Continued("a.mcap", 0.25, {"/left/tracks": 3}, {"/left/tracks": 2})
-    two = following.Continued("a.mcap", 1.5, {"/right/tracks": 4}, {"/right/tracks": 0})
-    both = following.Continued.joined([one, two])
-    assert both.to_json() == {
-        "log": "a.mcap",
-        "gap_s": 1.5,
-        "at_cut": {"/left/tracks": 3, "/right/tracks": 4},
-        "kept": {"/left/tracks": 2, "/right/tracks": 0},
-    }
-    assert both.words() == [
-        "/left/tracks goes on from a.mcap: 2 of 3 people at the cut keep their ids",
-        "/right/tracks goes on from a.mcap: 0 of 4 people at the cut keep their ids",
-    ]
-    assert following.Continued("a.mcap", 1 / 3).words() == ["ids go on from a.mcap, as before"]
-    assert following.Continued("a.mcap", 1 / 3).to_json()["gap_s"] == 0.333333
-
-
 def rows_at(places: dict[int, tuple[float, float]], high: float = 100.0, metres: tuple[float, float] | None = None):
     """Tracks with boxes around these middles, or without boxes at these places in metres."""
     x, y = np.array(list(places.values()), float).reshape(-1, 2).T
@@ -318,22 +282,6 @@ def rows_at(places: dict[int, tuple[float, float]], high: float = 100.0, metres:
         track_id=list(places), observed=[True] * count, source_id=[-1] * count, **boxes,
         x_m=x * metres[0] if metres else [9.0] * count, y_m=y * metres[1] if metres else [8.0] * count,
     )  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("mine", "theirs", "pairs"),
-    [
-        ({1: (100, 100)}, {7: (135, 100)}, [(1, 7)]),  # 0.35 heights
-        ({1: (100, 100)}, {7: (100, 136)}, []),
-        ({1: (100, 100), 2: (110, 100)}, {7: (112, 100)}, [(2, 7)]),  # the nearest of each other
-        ({1: (100, 100), 2: (150, 100)}, {8: (152, 100), 7: (99, 100)}, [(1, 7), (2, 8)]),
-        ({1: (100, 100)}, {7: (120, 100), 8: (108, 100)}, [(1, 8)]),
-        ({}, {7: (100, 100)}, []),
-        ({1: (100, 100)}, {}, []),
-    ],
-)
-def test_rows_of_one_time_are_the_same_person_near_each_other(mine, theirs, pairs):
-    assert following._pairs(rows_at(mine), rows_at(theirs)) == pairs
 
 
 def test_a_lead_is_brought_to_other_planes():

@@ -91,17 +91,6 @@ class TestInterpolation:
         assert tree.root_of("eye") == "map"
         assert tree.lookup("robot", "robot", at(99)).is_known.all()
 
-    def test_names_of_ros1_have_a_slash(self):
-        tree = TransformTree([drive("/map", "/base_link"), moves("base_link", "lidar", [0], [0, 0, 1], latched=True)])
-        assert tree.frames() == ["base_link", "lidar", "map"]
-        assert x_of(tree, 1.01, target="/map", source="/lidar") == pytest.approx(10.1)
-
-    def test_times_of_no_message(self):
-        tree = TransformTree([drive()])
-        poses = tree.lookup("map", "base_link", np.empty(0, np.int64))
-        assert poses.rotation.shape == (0, 3, 3)
-        assert not poses.unknown
-
 
 class TestWhereItIsKnown:
     def test_ends(self):
@@ -143,13 +132,6 @@ class TestWhereItIsKnown:
         assert poses.translation[:, 1].tolist() == pytest.approx([0, 0, offset, offset, offset, offset])
         assert f"it jumps 1 time, farthest by {offset:.2g} m at 1700000005.000 s" in said(tree)
 
-    def test_a_jump_in_a_gap_is_a_gap(self):
-        seconds = np.concatenate([np.arange(0, 2, 0.025), np.arange(4, 6, 0.025)])
-        places = np.stack([10 * seconds + 500 * (seconds > 3), 0 * seconds, 0 * seconds], axis=1)
-        tree = TransformTree([moves("map", "base_link", seconds, places)])
-        assert "jumps" not in said(tree)
-        assert tree.lookup("map", "base_link", at(1.99, 3)).is_known.tolist() == [True, False]
-
     def test_a_pose_between_two_jumps_holds(self):
         seconds = np.arange(0, 1, 0.1)
         places = np.stack([seconds, np.array([0, 0, 0, 0, 30, 60, 60, 60, 60, 60]), 0 * seconds], axis=1)
@@ -185,20 +167,8 @@ class TestWhereItIsKnown:
             tree = TransformTree([moves("map", "car", seconds, np.stack([x, 0 * x, 0 * x], 1), turned, stamps=stamps)])
             assert said(tree) == ""
 
-    def test_two_poses_are_enough(self):
-        tree = TransformTree([moves("map", "robot", [0, 0.1], [[0, 0, 0], [3, 0, 0]])])
-        assert x_of(tree, 0.05, source="robot") == pytest.approx(1.5)
-
 
 class TestOddRecordings:
-    def test_several_roots(self):
-        tree = TransformTree([drive(), moves("world", "tower", [0], [0, 0, 9], latched=True)])
-        assert tree.roots() == ["map", "world"]
-        poses = tree.lookup("map", "tower", at(1, 2))
-        assert not poses.is_known.any()
-        assert poses.unknown == {"no transform connects tower with map": 2}
-        assert tree.root_of("unheard") == "unheard"
-
     def test_two_parents(self):
         tree = TransformTree([drive(), drive("odom", seconds=np.arange(0, 10, 0.5))])
         assert tree.root_of("base_link") == "map"
@@ -257,14 +227,6 @@ class TestOddRecordings:
         assert "100 stamps have several poses, of which the last is taken" in said(tree)
         assert tree.lookup("map", "robot", at(1.05)).translation[0] == pytest.approx([1.05, 0.1, 0])
 
-    def test_late_messages_are_put_in_order(self):
-        seconds = np.arange(0, 10, 0.025)
-        order = np.insert(np.delete(np.arange(400), 100), 200, 100)
-        order[300:302] = [301, 300]
-        tree = TransformTree([drive(seconds=seconds[order])])
-        assert x_of(tree, 2.51, 5.01, 7.51) == pytest.approx([25.1, 50.1, 75.1])
-        assert said(tree) == ""
-
     def test_time_travel(self):
         """A recording that was played twice, the second time half of it: the longer part is taken."""
         once = np.arange(0, 10, 0.025)
@@ -294,12 +256,6 @@ class TestOddRecordings:
         assert x_of(tree, 3, 5, target="a", source="b").tolist() == [0, 0]
         assert tree.lookup("a", "b", at(3)).translation[0].tolist() == [0, 2, 0]
         assert "one message, which is taken for all times" in said(TransformTree([moves("a", "b", [0], [1, 0, 0])]))
-
-    def test_static_and_moving(self):
-        often = np.arange(0, 10, 0.01)
-        tree = TransformTree([drive(), moves("map", "base_link", often, np.full((1000, 3), 7.0), latched=True)])
-        assert x_of(tree, 1.0) == pytest.approx(10)
-        assert "base_link is both static and not" in said(tree)
 
     def test_clocks(self):
         """Stamps of 0, and stamps of another clock than those of other transforms, give way to the log time."""
@@ -486,29 +442,6 @@ class TestInfo:
             "        ├── arm\\x1b  static",
             "        └── lidar  static",
         ]
-
-    def test_the_same_in_json(self, robot):
-        (one,) = data("info", robot, "--frames")
-        names = [frame["frame"] for frame in one["frames"]]
-        assert names == ["map", "base_link", "arm\x1b", "lidar"]
-        root, base, _, lidar = one["frames"]
-        assert root == {
-            "frame": "map",
-            "parent": None,
-            "static": None,
-            "messages": 0,
-            "rate_hz": None,
-            "start_ns": None,
-            "end_ns": None,
-            "gaps": [],
-            "jumps": [],
-        }
-        assert (base["parent"], base["static"], base["messages"], base["rate_hz"]) == ("map", False, 82, 10.0)
-        assert (base["start_ns"], base["end_ns"]) == (START_NS, START_NS + 10 * S)
-        assert base["gaps"] == [{"start_ns": START_NS + 2 * S, "end_ns": START_NS + 4 * S}]
-        assert base["jumps"] == [{"t_ns": START_NS + 6 * S, "distance_m": 5.1, "angle_deg": 0.0}]
-        assert (lidar["static"], lidar["rate_hz"], lidar["messages"]) == (True, None, 1)
-        assert data("info", robot)[0]["frames"] is None
 
     def test_a_log_without_transforms(self, tmp_path):
         kind, _ = MESSAGES["FrameTransform"]

@@ -5,6 +5,7 @@ The scene is projected by the pinhole cameras of ``tests/places.py``; where peop
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
@@ -18,11 +19,14 @@ import mcaptrack
 from mcaptrack import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
+from mcaptrack.registry import names
 from mcaptrack.schema import SIGHTINGS, Frame
 from mcaptrack.testing import check_transform
+from mcaptrack.transforms import FUSION
 from mcaptrack.transforms.fuse import CameraView, FootFuser, agreement
-from mcaptrack.transforms.fuse.grouping import Places, group, means
+from mcaptrack.transforms.fuse.grouping import group
 from mcaptrack.transforms.fuse.view import places_of
+from tests.commands import call
 from tests.places import CAMERAS, HEIGHT, NS, PEOPLE, SECONDS, WIDTH, errors, fused, said, write_log
 from tests.references.joining import joined
 
@@ -42,16 +46,6 @@ class TestScene:
         assert np.median(away) < 0.12
         assert away.max() < 0.8
 
-    def test_each_box_is_in_one_detection_and_each_camera_once(self, scene: Path) -> None:
-        detections = fused(scene)
-        for t_ns, rows in fused(scene, "/world/detections/sightings").items():
-            used = rows[rows["detection"] >= 0]
-            pairs = list(zip(used["detection"], used["camera"], strict=True))
-            assert len(set(pairs)) == len(pairs)
-            counts = np.bincount(used["detection"], minlength=len(detections[t_ns]))
-            assert counts.tolist() == detections[t_ns]["seen_by"].tolist()
-            assert (detections[t_ns]["expected_by"] >= counts).all()
-
     def test_pointers_lead_to_the_boxes_of_each_camera(self, scene: Path) -> None:
         boxes = {camera.name: fused(scene, f"/{camera.name}/detections") for camera in CAMERAS}
         (channel,) = (one for one in mcaptrack.info(scene).channels if one.topic == "/world/detections/sightings")
@@ -67,35 +61,6 @@ class TestScene:
     def test_the_scene_is_tracked_like_a_camera(self, scene: Path, tmp_path: Path) -> None:
         result = mcaptrack.track(scene, camera="world", output=tmp_path / "tracked.mcap")
         assert result.tracks == {"/world/tracks": PEOPLE}
-
-    def test_one_camera_gives_what_it_gives_alone(self, tmp_path: Path) -> None:
-        path = write_log(tmp_path / "one.mcap", CAMERAS[:1])
-        mcaptrack.fuse(path)
-        own = fused(path, "/north/detections")
-        for t_ns, rows in fused(path).items():
-            foot = np.stack([own[t_ns]["x_px"] + own[t_ns]["w_px"] / 2, own[t_ns]["y_px"] + own[t_ns]["h_px"]])
-            x, y, w = CAMERAS[0].homography() @ np.vstack([foot, np.ones(PEOPLE)])
-            alone = sorted(zip(x / w, y / w, strict=True))
-            assert np.allclose(sorted(zip(rows["x_m"], rows["y_m"], strict=True)), alone, atol=1e-6)
-
-    def test_boxes_that_no_other_camera_confirms_are_left_out(self, tmp_path: Path) -> None:
-        path = write_log(tmp_path / "scene.mcap")
-        with mcaptrack.open(path) as log:
-            rows = log.array("detections", "/north/detections")
-            ghost = CAMERAS[0].boxes(np.array([[6.0, 5.0]]))[0]  # in the middle, where all others see nobody
-            frames = []
-            for t_ns in np.unique(rows["t_ns"]):
-                part = rows[rows["t_ns"] == t_ns]
-                boxes = np.stack([part[name] for name in ("x_px", "y_px", "w_px", "h_px")], axis=-1)
-                boxes = np.vstack([boxes, ghost])
-                frames.append(
-                    mcaptrack.detections(boxes, [0.9] * len(boxes), [1] * len(boxes), int(t_ns), box_format="xywh")
-                )
-            log.write("/north/detections", frames, replace=True)
-        mcaptrack.fuse(path)
-        away, count, people = errors(fused(path))
-        assert count <= people * 1.02
-        assert (away < 1.0).all()
 
 
 class TestFaults:
@@ -131,14 +96,6 @@ class TestFaults:
         away, count, people = errors(found)
         assert abs(count - people) <= 0.03 * people
         assert np.median(away) < 0.15
-
-    @pytest.mark.parametrize("dropped", [camera.name for camera in CAMERAS])
-    def test_any_camera_may_be_missing(self, tmp_path: Path, dropped: str) -> None:
-        kept = [camera for camera in CAMERAS if camera.name != dropped]
-        path = write_log(tmp_path / "three.mcap", kept, people=0.9)
-        mcaptrack.fuse(path)
-        _, count, people = errors(fused(path))
-        assert abs(count - people) <= 0.06 * people
 
 
 class TestInput:
@@ -198,14 +155,6 @@ class TestInput:
             topic: count for topic, count in again.rows.items() if "detections" in topic
         }
 
-    def test_cameras_are_fused_again_after_one_of_them_changed(self, tmp_path: Path) -> None:
-        path = write_log(tmp_path / "scene.mcap", CAMERAS[:2])
-        first, second = mcaptrack.fuse(path), mcaptrack.fuse(path)
-        assert first.rows == second.rows
-        with mcaptrack.open(path) as log:
-            log.write("/north/detections", [mcaptrack.detections([], t_ns=NS, box_format="xywh")], replace=True)
-        assert mcaptrack.fuse(path).rows != first.rows
-
 
 places = st.lists(
     st.tuples(
@@ -225,30 +174,6 @@ def sightings(drawn: Sequence[tuple[int, float, float, float, float, float]]) ->
         x_m=x, y_m=y, cov_xx_m2=sx**2, cov_xy_m2=r * sx * sy, cov_yy_m2=sy**2,
         class_id=np.ones(len(x), np.int64),
     )  # fmt: skip
-
-
-@settings(max_examples=30, deadline=None)
-@given(places)
-def test_groups_have_each_camera_once_and_can_not_be_joined_further(
-    drawn: list[tuple[int, float, float, float, float, float]],
-) -> None:
-    rows = sightings(drawn)
-    where = Places(
-        np.stack([rows["x_m"], rows["y_m"]], axis=-1),
-        np.stack([rows[name] for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2")], axis=-1),
-    )
-    of = group(rows["camera"].astype(np.int64), where, 9.0, 1.2)
-    count = int(of.max()) + 1 if len(of) else 0
-    for one in range(count):
-        cameras = rows["camera"][of == one].tolist()
-        assert len(set(cameras)) == len(cameras)
-    centre = means(where, of, count)
-    for one in range(count):  # the mean and covariance of a group, by matrices
-        inverse = [np.linalg.inv([[a, b], [b, c]]) for a, b, c in where.cov[of == one]]
-        total = np.linalg.inv(sum(inverse))
-        mean = total @ sum(part @ at for part, at in zip(inverse, where.xy_m[of == one], strict=True))
-        assert centre.xy_m[one] == pytest.approx(mean, abs=1e-6)
-        assert centre.cov[one] == pytest.approx([total[0, 0], total[0, 1], total[1, 1]], abs=1e-6)
 
 
 @settings(max_examples=40, deadline=None)
@@ -294,14 +219,6 @@ def test_what_is_kept_of_comparing_changes_nothing(tmp_path: Path, monkeypatch: 
     for t_ns, rows in fused(path).items():
         for name in ("x_m", "y_m", "cov_xx_m2", "score", "seen_by", "expected_by"):
             assert rows[name] == pytest.approx(kept[t_ns][name], rel=1e-9)
-
-
-def test_a_person_made_of_boxes_of_two_others_is_dissolved() -> None:
-    """Cameras 0 and 1 see two people 0.8 m apart. Cameras 2 and 3 see both, too, and place one of them between."""
-    drawn = [(0, 0.0), (1, 0.02), (2, 0.04), (0, 0.8), (1, 0.78), (3, 0.76), (2, 0.42), (3, 0.38)]
-    rows = sightings([(camera, x, 0.0, 0.25, 0.25, 0.0) for camera, x in drawn])
-    where = Places(np.stack([rows["x_m"], rows["y_m"]], axis=-1), np.tile([0.0625, 0.0, 0.0625], (len(rows), 1)))
-    assert group(rows["camera"].astype(np.int64), where, 9.0, 1.2).tolist() == [0, 0, 0, 1, 1, 1, 1, 0]
 
 
 def camera_of(matrix: Sequence[Sequence[float]], **others: object) -> CameraView:
@@ -575,3 +492,125 @@ def mutual(some: Sequence[np.ndarray], others: Sequence[np.ndarray]) -> list[tup
         for i, j in np.ndindex(*away.shape)
         if away[i, j] < 1.5 and away[i].argmin() == j and away[:, j].argmin() == i
     ]
+
+
+# Fusers of other packages: found, checked, recorded and used again like detectors and trackers
+
+
+CELLS = '''
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from mcaptrack.schema import DETECTIONS, SIGHTINGS
+from mcaptrack.transforms.protocol import option
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellFuser:
+    """Join boxes that stand in one cell of a grid."""
+
+    cell_m: float = option(1.0, "size of the cells in metres", least=0.1)
+
+    reads: ClassVar = SIGHTINGS
+    writes: ClassVar = {"": DETECTIONS, "sightings": SIGHTINGS}
+    latency_s: ClassVar = {"": 0.0, "sightings": 0.0}
+
+    def __call__(self, frames):
+        for frame in frames:
+            rows = frame.rows[np.lexsort((frame.rows["box_row"], frame.rows["camera"]))]
+            xy_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
+            cells, of = np.unique(np.floor(xy_m / self.cell_m), axis=0, return_inverse=True)
+            rows["detection"] = of
+            x_m, y_m = (cells.T + 0.5) * self.cell_m
+            found = DETECTIONS.rows(x_m=x_m, y_m=y_m, class_id=[1] * len(cells))
+            yield frame._replace(rows=found), frame._replace(rows=rows)
+
+
+class Silent(CellFuser):
+    writes: ClassVar = {"": DETECTIONS}
+
+
+class Tracker(CellFuser):
+    reads: ClassVar = DETECTIONS
+
+
+class Broken(CellFuser):
+    def __call__(self, frames):
+        yield from ()
+        raise ValueError("no cells")
+'''
+NAME = "cells_of_a_test:CellFuser"
+
+
+@pytest.fixture(scope="module")
+def boxes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_log(tmp_path_factory.mktemp("fusers") / "boxes.mcap", CAMERAS[:2])
+
+
+@pytest.fixture
+def path(boxes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cells_of_a_test.py").write_text(CELLS)
+    return Path(shutil.copy(boxes, tmp_path / "log.mcap"))
+
+
+def test_a_fuser_of_a_module_makes_the_scene_and_is_recorded(path: Path) -> None:
+    mcaptrack.fuse(path, fuser=NAME)
+    for t_ns, rows in fused(path).items():
+        seen = fused(path, "/world/detections/sightings")[t_ns] if t_ns < 3_000_000_000 else None
+        if seen is not None:  # boxes of one cell are one detection, in its middle
+            cells = {(np.floor(x), np.floor(y)) for x, y in zip(seen["x_m"], seen["y_m"], strict=True)}
+            assert {(x - 0.5, y - 0.5) for x, y in zip(rows["x_m"], rows["y_m"], strict=True)} == cells
+    (channel,) = (one for one in mcaptrack.info(path).channels if one.topic == "/world/detections")
+    assert channel.parameters is not None
+    assert (channel.parameters["fuser"], channel.parameters["cell_m"]) == (NAME, 1.0)
+    assert channel.plugins is not None
+    assert channel.plugins["transform"]["implementation"] == NAME
+
+
+def test_a_later_run_uses_the_same_fuser_if_it_may(path: Path) -> None:
+    made = FUSION.make(NAME, cell_m=2.0)
+    mcaptrack.fuse(path, fuser=made)
+    with mcaptrack.open(path) as log:
+        frames = [mcaptrack.detections([], [], [], t_ns, box_format="xywh") for t_ns in (1_000_000_000, 2_000_000_000)]
+        log.write("/north/detections", frames, replace=True)
+    options = {"camera": "world", "tables": False, "events": False, "predictor": "cv"}
+    with collected(), pytest.raises(McaptrackError, match="is imported only if you name it"):
+        mcaptrack.run(path, **options)
+    with collected():
+        again = mcaptrack.run(path, fuser=NAME, **options)
+        assert any(note.endswith("fusing east, north again, as before") for note in again.notes) or any(
+            note.endswith("fusing north, east again, as before") for note in again.notes
+        )
+        other = mcaptrack.run(path, fuser="feet", **options)
+    assert any(note.endswith("again, by the fuser feet") for note in other.notes)
+    (channel,) = (one for one in mcaptrack.info(path).channels if one.topic == "/world/detections")
+    assert channel.parameters is not None
+    assert channel.parameters["fuser"] == "feet"
+    assert channel.parameters["max_sigma"] == 3.0
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--fuser", "cells_of_a_test:Silent"), "has no output 'sightings'; a fuser also writes which boxes it joined"),
+        (("--fuser", "cells_of_a_test:Tracker"), "reads mcaptrack.Detections; a fuser reads mcaptrack.Sightings"),
+        (("--fuser", "cells_of_a_test:Broken"), "ValueError: no cells (cells_of_a_test.py, line"),
+        (("--fuser", "feets"), "no fuser is called feets; did you mean feet?"),
+        (("--fuser", NAME, "--max-sigma", "2"), "has no parameter max_sigma; there are cell_m"),
+    ],
+)
+def test_a_fuser_that_can_not_be_used_is_refused_in_one_line(path: Path, options: tuple[str, ...], words: str) -> None:
+    before = path.read_bytes()
+    outcome = call("fuse", path, *options)
+    assert (outcome.code, path.read_bytes()) == (1, before)
+    assert words in outcome.err
+    assert len(outcome.err.splitlines()) == 1
+
+
+def test_the_laws_of_transforms_are_those_of_fusers(path: Path) -> None:
+    assert names("fuser")[0] == "feet"
+    check_transform(FUSION.make(NAME))
+    check_transform(FUSION.make())

@@ -6,7 +6,6 @@ That its rows are those of a slow tracker, whatever detectors do, is tested in `
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ from mcaptrack.transforms.to_video_rate import to_video_rate
 from tests.commands import call
 from tests.references.ground import transition
 from tests.tiers import one_in
-from tools.traffic import CLASSES, Faults, draw_traffic
+from tools.traffic import CLASSES, draw_traffic
 
 NAMES = tuple(CLASSES.items())
 PEDESTRIAN, CAR = 1, 3
@@ -48,11 +47,6 @@ def frames_of(*tracks: dict[int, dict[str, float]], count: int = 0, rate_hz: flo
         rows = DETECTIONS.rows(**columns) if found else DETECTIONS.empty()
         out.append(Frame(round(number / rate_hz * 1e9), number, rows))
     return out
-
-
-def drive(count: int, speed: float = 10.0, missing: tuple[int, ...] = (), **more: float) -> dict[int, dict[str, float]]:
-    """A track along x at 10 frames a second."""
-    return {t: {"x_m": speed * t / 10, "y_m": 0.0, **more} for t in range(count) if t not in missing}
 
 
 def tracked(frames: list[Frame], **options: object) -> list[Frame]:
@@ -121,30 +115,6 @@ def seen(places: list[tuple[float, float, float]], cov: tuple[float, float, floa
     )
 
 
-def kept_by(first: list[tuple[float, float, float]], then: Frame) -> list[int]:
-    """The tracks of people in the first frame, 1 and so on, to which the detections of the next frame belong."""
-    begun = seen(first, (0.01, 0.0, 0.01))._replace(t_ns=0, index=0)
-    table = GroundTracker(confirm_score=0.0, birth_score=0.0, link_s=0.0)([begun, then])
-    (frame,) = list(table)[-1]
-    ids = dict(zip(frame.rows["source_id"].tolist(), frame.rows["track_id"].tolist(), strict=True))
-    return [ids[number] for number in range(len(then.rows))]
-
-
-def test_what_is_uncertain_along_a_line_of_sight_belongs_to_the_track_on_it():
-    first = [(0.0, 0.0, 0.9), (0.75, 0.6, 0.9)]
-    assert kept_by(first, seen([(0.7, 0.0, 0.9)], (4.0, 0.0, 0.001))) == [1]
-    assert kept_by(first, seen([(0.7, 0.0, 0.9)], (0.01, 0.0, 0.01))) == [2]  # the nearer one
-    first = [(0.0, 0.0, 0.9), (0.9, 0.0, 0.9)]
-    assert kept_by(first, seen([(0.5, 0.5, 0.9)], (2.0, 1.99, 2.0))) == [1]  # a line between the axes
-    assert kept_by(first, seen([(0.5, 0.5, 0.9)], (2.0, -1.99, 2.0))) == [2]
-
-
-def test_of_two_detections_the_more_probable_one_continues_a_track():
-    near, probable = (0.15, 0.0), (0.3, 0.1)
-    assert kept_by([(0.0, 0.0, 0.9)], seen([(*near, 0.9), (*probable, 0.9)], (0.01, 0.0, 0.01)))[0] == 1
-    assert kept_by([(0.0, 0.0, 0.9)], seen([(*near, 0.1), (*probable, 0.98)], (0.01, 0.0, 0.01)))[1] == 1
-
-
 @pytest.mark.parametrize("cov", [(-1.0, 0.0, 1.0), (1.0, 2.0, 1.0), (0.0, 0.0, 0.0), (np.inf, 0.0, 1.0)])
 def test_covariances_that_are_none_count_as_missing(cov: tuple[float, float, float]):
     first = [(0.0, 0.0, 0.9), (0.75, 0.6, 0.9)]
@@ -153,37 +123,6 @@ def test_covariances_that_are_none_count_as_missing(cov: tuple[float, float, flo
     options = {"confirm_score": 0.0, "link_s": 0.0}
     for (one,), (other,) in zip(GroundTracker(**options)(odd), GroundTracker(**options)(frames), strict=True):
         assert one.rows.tobytes() == other.rows.tobytes()
-
-
-def turning(count: int, missing: tuple[int, ...] = ()) -> dict[int, dict[str, float]]:
-    """A car that goes 8 m/s on a circle of 10 m, with its heading."""
-    angle = 0.08 * np.arange(count)
-    path = 10 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=-1)
-    return {
-        t: {"x_m": path[t, 0], "y_m": path[t, 1], "heading_rad": (angle[t] + np.pi) % (2 * np.pi) - np.pi}
-        for t in range(count)
-        if t not in missing
-    }
-
-
-def test_a_gap_in_a_turn_is_closed_under_the_same_id():
-    car = turning(60, missing=tuple(range(30, 42)))
-    assert {one for frame in ids(tracked(frames_of(car))) for one in frame} == {1}
-
-
-def test_a_limit_of_speed_keeps_two_cars_apart():
-    """3 m from one frame to the next are 30 m/s: a car can do that, and a car that goes 5 m/s at most can't."""
-    first, second = {t: {"x_m": 0.0, "y_m": 0.0} for t in range(3)}, {t: {"x_m": 2.5, "y_m": 0.0} for t in range(3, 9)}
-    assert ids(tracked(frames_of(first, second), class_limits="car=5:0.5:0.1:1"))[-1] == [2]
-
-
-@pytest.mark.parametrize("rate_hz", [2.0, 5.0, 20.0])
-def test_other_rates_of_boxes(rate_hz: float):
-    truth, frames = scene(8, seconds=10.0, rate_hz=rate_hz, density=0.5)
-    switches, found, wrong = compared(truth, tracked(frames))
-    assert found > 0.78
-    assert wrong < 0.12
-    assert switches <= 15
 
 
 CAR_BOX = {"z_m": 0.8, "length_m": 4.5, "width_m": 1.9, "height_m": 1.6, "heading_rad": 0.0}
@@ -196,19 +135,6 @@ def test_cars_of_any_speed_have_tracks(speed: float, rate_hz: float, box: dict[s
     frames = tracked(frames_of(found, rate_hz=rate_hz))
     assert ids(frames)[1:] == [[1]] * 11
     assert frames[-1].rows["vx_m_per_s"] == pytest.approx(speed, rel=0.02)
-
-
-def test_cars_behind_one_another_are_not_taken_for_each_other():
-    """At two frames a second each is as near to where the one ahead was as to where it was itself."""
-    cars = [{t: {**CAR_BOX, "x_m": 15.0 * k + 7.5 * t, "y_m": 0.0} for t in range(8)} for k in range(4)]
-    ahead = frames_of(*cars, rate_hz=2.0)
-    oncoming = [
-        {t: {**CAR_BOX, "x_m": 15.0 * k - 7.5 * t, "y_m": 3.5, "heading_rad": 3.1} for t in range(8)} for k in range(4)
-    ]
-    for frames in (ahead, frames_of(*cars, *oncoming, rate_hz=2.0)):
-        speeds = np.concatenate([np.abs(frame.rows["vx_m_per_s"]) for frame in tracked(frames)[2:]])
-        assert len(speeds) == 6 * len(frames[0].rows)
-        assert speeds == pytest.approx(15.0, rel=0.02)
 
 
 def test_a_detection_belongs_rather_to_the_car_behind_it_than_to_the_nearer_one_ahead():
@@ -258,14 +184,6 @@ def test_any_speed_is_a_wider_filter_from_the_beginning(has_covariances: bool):
             tracks.allow_speed(np.array([0]))
         tables.append(tracks.table[14:20, 0] if tracks.covariances is None else tracks.covariances.values[0])
     assert tables[0] == pytest.approx(tables[1])
-
-
-def test_boxes_are_compared_by_overlap_on_request():
-    sizes = {"z_m": 1.0, "length_m": 4.0, "width_m": 2.0, "height_m": 1.5, "heading_rad": 0.0}
-    near, beside = drive(12, 5.0, **sizes), {t: {"x_m": 0.5 * t, "y_m": 2.4, **sizes} for t in range(12)}
-    assert ids(tracked(frames_of(near, beside), cost="iou")) == [[1, 2]] * 12
-    jump = {t: box | {"x_m": box["x_m"] + (4.2 if t >= 6 else 0)} for t, box in drive(12, 0.0, **sizes).items()}
-    assert ids(tracked(frames_of(jump), cost="iou"))[-1] == [2]
 
 
 def test_detections_without_a_position_are_left_out_aloud():
@@ -447,14 +365,6 @@ def test_forecasts_of_retracked_cars_are_those_of_predict():
         np.testing.assert_allclose(own[name], wanted.rows[name], rtol=1e-6, err_msg=name)
     for name in ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2"):  # online tracks begin later, so they were compared less often
         np.testing.assert_allclose(own[name], wanted.rows[name], rtol=1e-2, err_msg=name)
-
-
-def test_the_faults_of_the_detector_are_what_they_are_set_to():
-    """The scenes that choose the settings have the faults that they say."""
-    none = replace(Faults(), miss_near=0.0, miss_far=0.0, occlusions_per_s=0.0, false_boxes=0.0, clutter=0)
-    truth, frames = scene(2, seconds=3.0, faults=none)
-    assert sum(len(frame.rows) for frame in frames) == len(truth["frame"])
-    assert sum(len(frame.rows) for frame in scene(2, seconds=3.0)[1]) < 0.9 * len(truth["frame"])
 
 
 #: Mean length, width and height in metres of boxes of the public data set nuScenes (its training split).

@@ -60,47 +60,6 @@ def with_gap(tall: float, gap: range, then: float | None = None, aside: float = 
     return [frame(n, boxes(n)) for n in range(20)]
 
 
-@pytest.mark.parametrize("tall", [20.0, 80.0, 400.0])
-@pytest.mark.parametrize(
-    ("gap", "then", "aside", "count"),
-    [
-        (range(8, 10), 1.0, 0.0, 1),
-        (range(8, 13), 1.0, 0.0, 1),
-        (range(8, 10), 1.0, 0.3, 1),
-        (range(8, 10), 1.0, 3.0, 2),  # another place
-        (range(8, 10), 2.5, 0.0, 2),  # another height: somewhere else along the view
-        (range(2, 18), 1.0, 0.0, 2),  # too long
-    ],
-)
-def test_near_and_far_people_are_linked_alike(tall, gap, then, aside, count):
-    assert len(ids_of(linked(with_gap(tall, gap, then * tall, aside)))) == count
-
-
-def test_gaps_are_interpolated_by_hand():
-    frames = with_gap(100.0, range(8, 10))
-    found = linked(frames)
-    for n, one in enumerate(found):
-        (row,) = one.rows
-        x, y, h = walking(n, 100.0)
-        assert (row["track_id"], row["observed"]) == (1, n not in (8, 9))
-        assert row["source_id"] == (1 if n < 8 else -1 if n < 10 else 2)
-        got = (row["x_px"], row["y_px"], row["w_px"], row["h_px"], row["x_m"])
-        assert got == pytest.approx((x - 0.2 * h, y - h, 0.4 * h, h, x / 100), rel=1e-5)
-
-
-def test_of_two_who_come_back_each_goes_on_as_itself():
-    """They walk towards each other and are missed while they pass."""
-
-    def boxes(n: int) -> dict[int, Box]:
-        right, left = walking(n, 100.0), walking(n, 105.0, -0.6, (700.0, 403.0))
-        return {} if 7 <= n <= 9 else {1: right, 2: left} if n < 7 else {3: left, 4: right}
-
-    found = linked([frame(n, boxes(n)) for n in range(20)])
-    assert ids_of(found) == {1, 2}
-    feet = {one["track_id"]: one["x_px"] for one in found[-1].rows}
-    assert feet[1] > feet[2]
-
-
 def crowd(rng: np.random.Generator, count: int = 12, steps: int = 40) -> list[Frame]:
     """People of all sizes who are missed now and then, sometimes with a new id after it."""
     tall = rng.uniform(30, 200, count)
@@ -143,26 +102,6 @@ def test_tracks_are_only_joined(seed):
     assert len(ids_of(found)) < len(ids_of(frames))
 
 
-@pytest.mark.parametrize("factor", [0.25, 3.0])
-def test_pictures_of_any_size_give_the_same_tracks(factor):
-    """A law of heights: pixels have no scale of their own."""
-    frames = crowd(np.random.default_rng(7))
-    scaled = []
-    for one in frames:
-        rows = one.rows.copy()
-        for name in ("x_px", "y_px", "w_px", "h_px"):
-            rows[name] *= factor
-        scaled.append(one._replace(rows=rows))
-    for a, b in zip(linked(frames), linked(scaled), strict=True):
-        assert a.rows["track_id"].tolist() == b.rows["track_id"].tolist()
-
-
-def test_predictions_and_online_tracks_stay_those_of_the_input():
-    frames = crowd(np.random.default_rng(1))
-    for one, (_, online, *_) in zip(frames, PICTURES(frames), strict=True):
-        assert_same_rows(online.rows, one.rows)
-
-
 @pytest.mark.parametrize(
     "retrack",
     [replace(PICTURES, link_s=0.0), *(replace(PROFILES[name], poor_scale=True) for name in ("paper", "authors"))],
@@ -180,19 +119,6 @@ def test_classes_are_not_joined_unless_asked():
         one.rows["class_id"] = 2
     assert len(ids_of(linked(frames))) == 2
     assert len(ids_of(linked(frames, replace(PICTURES, across_classes=True)))) == 1
-
-
-def test_links_are_more_certain_where_few_tracks_begin():
-    """The same gap, 0.3 heights aside, with and without forty others who come and go."""
-
-    def boxes(n: int, others: int) -> dict[int, Box]:
-        own = with_gap(100.0, range(8, 11), aside=0.3)[n].rows
-        out = {int(one["track_id"]): (one["x_px"] + 20, one["y_px"] + one["h_px"], 100.0) for one in own}
-        return out | {100 + 20 * k + n: (40.0 * k, 900.0 + 300 * (k % 2), 100.0) for k in range(others)}
-
-    found = [ids_of(linked([frame(n, boxes(n, others)) for n in range(20)])) for others in (0, 40)]
-    assert 2 not in found[0]
-    assert 2 in found[1]
 
 
 def test_at_the_rate_of_the_video_gaps_are_filled_and_short_tracks_come_out():

@@ -52,30 +52,9 @@ def test_a_new_track_continues_the_lost_one_that_it_fits(after: Box, speed: floa
     assert last_id(tracked(occluded(after, speed))) == (1 if is_same else 2)
 
 
-def test_what_stands_is_found_again_after_long():
-    assert last_id(tracked(occluded((0.3, 0.0), gap=range(20, 95)), 110)) == 1
-
-
-def test_a_lost_track_is_continued_once():
-    """A car comes back, drives off, and another one stands where it stood."""
-
-    def found(n: int) -> list[Box]:
-        first = [] if n in GAP else [(max(0.0, n - 55.0), 0.0)]
-        return first + ([(0.0, 0.0)] if n >= 70 else [])
-
-    first, second = tracked(found, 80)[-1].rows["track_id"].tolist()
-    assert first == 1 != second
-
-
 def test_a_continued_track_keeps_its_size():
     frames = tracked(occluded((0.3, 0.0, {"length_m": 8.0})), 52)
     assert frames[-1].rows["length_m"][0] < 5.0
-
-
-def test_no_track_is_faster_than_its_class():
-    rows = np.concatenate([frame.rows for frame in tracked(lambda n: [(0.6 * n, 0.0)], 20, class_limits="car=5")])
-    assert len(rows) > 10
-    assert np.hypot(rows["vx_m_per_s"], rows["vy_m_per_s"]).max() <= 5.0 + 1e-5
 
 
 def odds(lost: np.ndarray, new: np.ndarray) -> float:

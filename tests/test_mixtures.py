@@ -14,7 +14,7 @@ from mcaptrack.foxglove.views.people import ellipses, forecasts
 from mcaptrack.geometry.mixtures import Tails, half_radius, mass_within, normal_tails, squared_radius
 from mcaptrack.predictors import Forecast
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
-from mcaptrack.schema.cdr import CdrCodec, fields_of, read_definition, ros_definition
+from mcaptrack.schema.cdr import CdrCodec, fields_of
 from mcaptrack.schema.predictions import forecast_to_rows, tails_of
 
 WEIGHTS = st.floats(0.01, 0.9)
@@ -96,28 +96,6 @@ class TestColumns:
         assert counts.tolist() == [3, 3]
         for back in (PREDICTIONS.codec.decode(PREDICTIONS.codec.encode(rows)), from_ros):
             assert [part.tolist() for part in tails_of(back, 3)] == [part.tolist() for part in mixture()]
-
-    def test_a_ros_recording_without_these_columns_is_read(self):
-        """As an earlier version wrote it: by its own definition."""
-        lines = ros_definition(PREDICTIONS.definition).splitlines()
-        older = "\n".join(line for line in lines if not any(name in line.split("#")[0] for name in Tails._fields))
-        fields = read_definition(older.encode(), PREDICTIONS.definition)
-        assert [field.name for field in fields] == list(PREDICTIONS.dtype.names)[: -len(Tails._fields)]
-        codec = CdrCodec(PREDICTIONS.codec, fields)
-        rows = forecast_to_rows(IDS, forecast(), 0.4, mixture())
-        back, _ = codec.decode_all(codec.encode_all(rows, np.array([6])))
-        assert back["cov_xx_m2"].tolist() == rows["cov_xx_m2"].tolist()
-        assert all(np.isnan(part).all() for part in tails_of(back))
-
-    def test_messages_of_normal_distributions_are_as_they_were(self):
-        plain = forecast_to_rows(IDS, forecast(), 0.4)
-        payload = PREDICTIONS.codec.encode(plain)
-        older = [name for name in PREDICTIONS.dtype.names if name not in Tails._fields]
-        width = sum(PREDICTIONS.dtype[name].itemsize + 1 for name in older) + 2  # a tag before each, and before the row
-        assert len(payload) == width * len(plain)
-        assert len(PREDICTIONS.codec.encode(forecast_to_rows(IDS, forecast(), 0.4, mixture()))) > len(payload)
-        back = PREDICTIONS.codec.decode(payload)
-        assert all(np.isnan(part).all() for part in tails_of(back))
 
     def test_tables_have_null_where_there_is_no_mixture(self):
         assert all(PREDICTIONS.arrow.field(name).nullable for name in Tails._fields)

@@ -7,47 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from mcaptrack.viewing.heat_map import occupancy
 
 S = 10**9
-
-
-def test_times_by_hand():
-    """Two people: one stands for 2 s, one walks 2 m along x in 1 s, and is gone for 3 s before one more second."""
-    t_ns = np.array([0, 2, 0, 1, 4, 5]) * S
-    ids = np.array([7, 7, 9, 9, 9, 9])
-    xy = np.array([[0.5, 0.5], [0.5, 0.5], [0.5, 1.5], [2.5, 1.5], [1.5, 1.5], [1.5, 1.5]])
-    heat = occupancy(t_ns, ids, xy, cell_m=1.0, span_m=(0.0, 3.0, 0.0, 2.0))
-    np.testing.assert_allclose(heat.person_s, [[2.0, 0.0, 0.0], [0.25, 1.5, 0.25]])
-    back = occupancy(t_ns[2:4], ids[2:4], np.array([[2.0, 0.5], [0.0, 0.5]]), cell_m=1.0, span_m=(0.0, 3.0, 0.0, 1.0))
-    np.testing.assert_allclose(back.person_s, [[0.5, 0.5, 0.0]])
-    assert (heat.low_m, heat.high_m, heat.cell_m, heat.outside_s) == ((0.0, 0.0), (3.0, 2.0), 1.0, 0.0)
-
-
-tracks = st.lists(
-    st.tuples(st.integers(0, 8 * S), st.integers(1, 3), st.floats(-40, 40, width=32), st.floats(-40, 40, width=32)),
-    max_size=30,
-    unique_by=lambda row: row[:2],
-)
-
-
-@given(tracks, st.sampled_from([0.5, 1.0, 3.0]), st.booleans())
-@settings(max_examples=40, deadline=None)
-def test_all_cells_together_are_the_time_that_tracks_last_and_order_does_not_matter(rows, cell_m, is_cut):
-    data = np.array(rows, float).reshape(-1, 4)
-    t_ns, ids, xy = data[:, 0].astype(np.int64), data[:, 1].astype(int), data[:, 2:]
-    given_m = (-10.0, 10.0, -10.0, 10.0) if is_cut else None
-    heat = occupancy(t_ns, ids, xy, cell_m=cell_m, span_m=given_m)
-    lasting = 0.0
-    for one in set(ids.tolist()):
-        steps = np.diff(np.sort(t_ns[ids == one])) / S
-        lasting += steps[steps <= 2.0].sum()
-    assert heat.person_s.sum() + heat.outside_s == pytest.approx(lasting, abs=1e-6)
-    again = occupancy(t_ns[::-1], ids[::-1], xy[::-1], cell_m=cell_m, span_m=given_m)
-    np.testing.assert_array_equal(again.person_s, heat.person_s)
 
 
 def test_nothing_is_an_empty_grid():

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -14,19 +12,25 @@ from scipy.spatial import ConvexHull
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.schema import DECISIONS, PREDICTIONS, TRACKS, Frame, framing
+from mcaptrack.schema import DECISIONS, PREDICTIONS, TRACKS, Frame, Rows, framing
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import PROFILES, Retrack
 from mcaptrack.transforms.retrack.assignments import PEOPLE, Movers, join_classes, movers_of, split_classes, usual_score
+from mcaptrack.transforms.retrack.false_tracks import FEATURES, features, log_odds_in_log, stand_throughout
+from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
 from mcaptrack.transforms.retrack.methods import KeptIds
+from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories, smooth
 from mcaptrack.transforms.retrack.shown_tracks import GrowingHull
 from tests.commands import call
+from tests.references.false_tracks import log_odds_in_log as in_log
+from tests.references.false_tracks import person_features
+from tests.references.offline import Motion
+from tests.test_offline_reference import Paths, laid_out, models, scattered, walk_of
 from tests.tiers import one_in
-from tests.worlds import assert_same_rows, ids, ns, places, tracks_at, walk
+from tests.worlds import assert_same_rows, ids, ns, places, walk
 
 PAPER, AUTHORS, DEFAULT = PROFILES["paper"], PROFILES["authors"], PROFILES["default"]
-every_profile = pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
 
 
 def run(profile, frames):
@@ -51,18 +55,6 @@ def along(path: dict[int, tuple[float, float]], truth: dict[int, tuple[float, fl
 class TestHorizon:
     """Horizons of prediction, on people who walk along the first axis."""
 
-    @pytest.mark.parametrize(
-        ("profile", "horizon_s", "steps"),
-        [(DEFAULT, 0.1, 1), *((profile, 1.01, 3) for profile in PROFILES.values())],
-        ids=["one", *PROFILES],
-    )
-    def test_there_is_one_step_at_least_and_as_many_as_fit_best(self, profile, horizon_s, steps):
-        """At 2.5 steps a second."""
-        frames = walk(lambda n: {7: (0.5 * n, 0.0)}, 12)
-        _, _, predictions, *_ = run(replace(profile, horizon_s=horizon_s, predictor="cv"), frames)
-        assert predictions[-1].rows["step"].tolist() == list(range(1, steps + 1))
-        assert predictions[-1].rows["ahead_s"].max() == pytest.approx(0.4 * steps)
-
     @pytest.mark.parametrize("distance", ["mean", "max", "first"])
     def test_predictions_of_one_step_are_refused_where_two_predictions_of_one_time_are_compared(self, distance):
         frames = walk(lambda n: {7: (0.5 * n, 0.0)}, 12)
@@ -76,23 +68,6 @@ class TestHorizon:
 
 class TestFailuresOfThePaper:
     """Section IV-B of the paper: errors of tracking that re-tracking repairs."""
-
-    @every_profile
-    def test_missed_target(self, profile):
-        """Merged into another detection for a second, then under a new id: one track, with the gap interpolated."""
-
-        def crowd(n):
-            people = {1: (0.5 * n, 0.0)}
-            if n < 10:
-                people[2] = (0.5 * n, 3.0 - 0.25 * n)
-            elif n >= 13:
-                people[3] = (0.5 * n, 3.0 - 0.25 * n)
-            return people
-
-        offline, *_ = run(profile, walk(crowd, 30))
-        truth = {tick: (0.5 * tick, 3.0 - 0.25 * tick) for tick in range(30)}
-        assert any(along(path, truth) for path in paths(offline).values())
-        assert len(paths(offline)) == 2
 
     @pytest.mark.parametrize("profile", [AUTHORS, DEFAULT], ids=["authors", "default"])
     def test_identity_switch_at_meet_and_separate(self, profile):
@@ -133,27 +108,14 @@ class TestFailuresOfThePaper:
             assert any(along(path, walker) for path in found)
         assert kept <= (0 if profile == DEFAULT else 0.5 * 20 * 6)
 
-    def test_noisy_track(self):
-        """A shaking camera: predictions from the re-tracked path jump less from step to step than those from the raw one."""
-        rng = np.random.default_rng(4)
-        noise = rng.normal(0, 0.25, (60, 2))
-        frames = walk(lambda n: {1: (0.5 * n + noise[n, 0], noise[n, 1])}, 60)
 
-        def drift(profile) -> float:
-            _, _, predictions, *_ = run(profile, frames)
-            futures = [np.stack([f.rows["x_m"], f.rows["y_m"]], -1) for f in predictions if len(f.rows) == 12]
-            steps = [np.hypot(*(a[1:] - b[:-1]).T).mean() for a, b in pairwise(futures)]
-            return float(np.mean(steps))
-
-        raw = replace(PAPER, alpha=1.0, beta=0.0)
-        assert drift(PAPER) < 0.8 * drift(raw)
-        assert drift(DEFAULT) < 0.8 * drift(raw)
-
-
-def test_a_log_without_people_gives_frames_without_rows():
-    offline, online, predictions, *_ = run(DEFAULT, walk(lambda n: {}, 5))
-    assert [len(f.rows) for f in (*offline, *online, *predictions)] == [0] * 15
-    assert len(tracks_at({})) == 0
+@pytest.mark.parametrize(("spread_m", "found_m"), [(0.0, 0.03), (4.0, 0.8)])
+def test_the_estimated_noise_has_limits(spread_m, found_m):
+    rng = np.random.default_rng(2)
+    run = LikelihoodPass(DEFAULT)
+    for frame in walk(lambda n: {k: tuple([0.0, 900.0 * k] + rng.normal(0, spread_m, 2)) for k in range(9)}, 250):
+        run.step(frame)
+    assert run.noise_m == pytest.approx(found_m)
 
 
 # The two methods of re-tracking as entries of the registry
@@ -329,105 +291,6 @@ def test_tracks_in_metres_keep_what_they_are_under_numbers_of_their_own(part_row
 # Which online tracks are written: what the log said so far of how long tracks last, and where they were seen
 
 
-#: Positions of people by their input ids, at each tick.
-People = Callable[[int], Mapping[int, tuple[float, float]]]
-NS_PER_TICK = 400_000_000
-
-
-def online(path: People, ticks: int, **options: object) -> list[dict[int, tuple[float, float]]]:
-    """The places of online tracks at each tick."""
-    return [places(result[1]) for result in replace(PROFILES["default"], **options)(walk(path, ticks))]
-
-
-def written(found: list[dict[int, tuple[float, float]]], along: Callable[[float, float], bool]) -> list[int]:
-    """The ticks at which a track is written at one of the places that ``along`` names."""
-    return [tick for tick, here in enumerate(found) if any(along(*place) for place in here.values())]
-
-
-def flickers(ticks: range, lasting: int) -> People:
-    """Every third tick there is another false detection, far from all others, for so many ticks."""
-
-    def path(n: int) -> dict[int, tuple[float, float]]:
-        first = [tick for tick in ticks if tick % 3 == 0 and tick <= n < tick + lasting]
-        return {1000 + tick: (100.0 * (tick + 1), -500.0) for tick in first}
-
-    return path
-
-
-def walker(name: int, ticks: range, y_m: float, speed: float = 0.4) -> People:
-    return lambda n: {name: (speed * n, y_m)} if n in ticks else {}
-
-
-def together(*paths: People) -> People:
-    return lambda n: {name: place for path in paths for name, place in path(n).items()}
-
-
-@pytest.mark.parametrize(("lasting", "first"), [(1, 41), (2, 42), (3, 43), (30, 40)])
-def test_a_new_track_waits_where_most_tracks_of_the_log_were_soon_over(lasting, first):
-    """One that was observed more often than those is taken for a person; it is confirmed by its fourth observation."""
-    found = online(together(flickers(range(30), lasting), walker(1, range(40, 60), 0.0)), 60)
-    assert written(found, lambda x, y: y > -1)[0] == first
-
-
-def test_what_a_gap_of_the_log_ends_was_not_short():
-    """Ten people are there for two ticks before each gap, which ends their tracks."""
-    frames = walk(lambda n: {100 * n + k: (10.0 * k, 0.0) for k in range(10)} if n < 8 else {1: (50.0, 50.0)}, 9)
-    times = [(n + 50 * (n // 2)) * NS_PER_TICK for n in range(9)]
-    named = [frame.rows.copy() for frame in frames]
-    for n, rows in enumerate(named[:8]):
-        rows["track_id"] = 100 * (n // 2) + np.arange(10)
-    apart = [Frame(t, n, rows) for n, (t, rows) in enumerate(zip(times, named, strict=True))]
-    assert [len(result[1].rows) for result in PROFILES["default"](apart)] == [10] * 8 + [1]
-
-
-def crossing(last: int, ticks: int) -> list[int]:
-    """The ticks at which the last one is written of some who walk through a square of 20 m, one after another.
-
-    Four stand at its corners. All leave it at its right side, but the last one, who is seen until tick ``last``.
-    """
-
-    def path(n: int) -> dict[int, tuple[float, float]]:
-        out = {corner: (20.0 * (corner % 2), 20.0 * (corner // 2)) for corner in range(4)}
-        number, tick = divmod(n, 40)
-        if tick <= (20 if number < 3 else last):
-            out[10 + number] = (1.0 * tick, 10.0)
-        return out
-
-    found = online(path, 160)
-    return [n - 120 for n in written(found, lambda x, y: abs(y - 10) < 2) if n >= 120][:ticks]
-
-
-@pytest.mark.parametrize(("last", "shown"), [(12, 3), (20, 0)])
-def test_lost_tracks_are_written_inside_of_the_area_that_was_seen_and_not_outside(last, shown):
-    """One is lost in the middle; the other at the edge, where those before have left."""
-    assert crossing(last, 40) == list(range(last + 1 + shown))
-
-
-def test_until_the_first_have_left_lost_tracks_are_written_outside():
-    found = online(lambda n: {7: (0.5 * n, 0.0)} if n < 20 else {}, 40)
-    assert written(found, lambda x, y: True) == list(range(23))
-
-
-def test_long_ages_and_confirmation_take_no_memory():
-    """Every step counted by itself would take tables of a gigabyte."""
-    options = {"max_age_s": 1e6, "confirm_s": 1e5, "coast_s": 1e6}
-    assert len(online(walker(1, range(20), 0.0), 20, **options)[-1]) == 1
-
-
-def test_who_comes_back_from_outside_is_written_there():
-    """One walks round a square, twice as large each time, and is missed for a tick at each third step."""
-
-    def path(n: int) -> dict[int, tuple[float, float]]:
-        if n > 8 and n % 3 == 0:
-            return {}
-        angle = n / 8
-        return {7: (0.15 * n * np.cos(angle), 0.15 * n * np.sin(angle))}
-
-    found = online(path, 90)
-    missed = [n for n in range(60, 90) if n % 3 == 0]
-    assert all(len(found[n]) == 1 for n in missed)
-
-
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=20)
 def test_a_growing_hull_is_the_hull_of_all_points(seed):
@@ -455,3 +318,143 @@ def test_a_hull_leaves_out_what_is_no_place():
     hull.add(np.array([[0.0, 1.0, 0.0, np.nan], [0.0, 0.0, 1.0, 5.0]]))
     assert len(hull.vertices) == 3
     assert hull.holds(np.array([[0.2, np.nan], [0.2, 0.2]])).tolist() == [True, False]
+
+
+# Which tracks are people, and which follow nobody: by what is known of the whole log
+
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def with_companions(rng: np.random.Generator, count: int) -> Paths:
+    """Scattered tracks, some with another at a constant offset, with or without the same noise, for some of the time."""
+    paths = scattered(rng, count)
+    for name, path in list(paths.items()):
+        if rng.random() < 0.5:
+            offset, noise_m = rng.uniform(-1.2, 1.2, 2), rng.choice([0.0, 0.15])
+            kept = {s: at for s, at in path.items() if rng.random() < 0.9} or path
+            moved = {s: np.array(at) + offset + rng.normal(0, noise_m, 2) for s, at in kept.items()}
+            paths[name + 1] = {s: tuple(at.tolist()) for s, at in moved.items()}
+    return paths
+
+
+def drawn(seed: int, most: int) -> tuple[Paths, Motion, tuple[MotionModel, Trajectories, State, float]]:
+    """Up to so many tracks and more beside them, the reference's model of motion, and all that the package is given."""
+    rng = np.random.default_rng(seed)
+    model, motion = models(rng)
+    paths = with_companions(rng, int(rng.integers(1, most + 1)))
+    out, _ = laid_out(paths, model.noise_m)
+    return paths, motion, (model, out, smooth(model, out, 0.4)[2], 0.4)
+
+
+@given(seed=SEEDS)
+@settings(max_examples=25)
+def test_features_equal_the_reference(seed):
+    paths, motion, given_all = drawn(seed, 7)
+    wanted = person_features(motion, paths)
+    for name, row in zip(sorted(paths), features(*given_all), strict=True):
+        assert dict(zip(FEATURES, row.tolist(), strict=True)) == pytest.approx(wanted[name], abs=1e-9)
+
+
+@given(seed=SEEDS)
+@settings(max_examples=10)
+def test_weights_follow_the_log_to_where_few_tracks_are_doubtful(seed):
+    paths, motion, given_all = drawn(seed, 12)
+    first, last = min(min(path) for path in paths.values()), max(max(path) for path in paths.values())
+    log = first - int(seed % 4), last + int(seed % 3)
+    wanted = in_log(motion, paths, log)
+    np.testing.assert_allclose(log_odds_in_log(*given_all, log), [wanted[k] for k in sorted(paths)], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("begins", "ends", "wide_m", "missed", "stands"),
+    [
+        (0, 39, 0.0, 0, True),
+        (4, 35, 0.0, 0, False),  # of 39 steps, a tenth is 3.9
+        (3, 36, 0.0, 0, True),
+        (0, 35, 0.0, 0, False),
+        (4, 39, 0.0, 0, False),
+        (0, 39, 1.45, 0, True),
+        (0, 39, 1.55, 0, False),
+        (0, 39, 0.0, 5, True),  # 2 s
+        (0, 39, 0.0, 6, False),
+    ],
+)
+def test_who_stands_for_the_whole_log_by_hand(begins, ends, wide_m, missed, stands):
+    """In a log of 40 steps; the track is seen at two places by turns, from one corner of its box to the other."""
+    side = wide_m / np.sqrt(2)
+    steps = [step for step in range(begins, ends + 1) if not 10 < step <= 10 + missed]
+    paths = {1: {s: (side, side) if s % 4 > 1 else (0.0, 0.0) for s in steps}}
+    out, _ = laid_out(paths, 1e-3)
+    smoothed = smooth(MotionModel(1e-3, 1.0, 100.0, 0.0), out, 0.4)[2]  # it follows the positions
+    assert stand_throughout(out, smoothed, np.zeros((1, len(FEATURES))), (0, 39), 0.4).tolist() == [stands]
+
+
+@pytest.mark.parametrize(
+    ("begins", "last", "in_step", "stands"),
+    [(5, 399, 0.0, True), (6, 399, 0.0, False), (0, 25, 0.0, True), (0, 24, 0.0, False), (0, 399, 1.0, False)],
+)
+def test_two_seconds_of_a_long_log_ten_of_a_short_one_and_doubles(begins, last, in_step, stands):
+    out, _ = laid_out({1: dict.fromkeys(range(begins, last + 1), (0.0, 0.0))}, 0.1)
+    smoothed = smooth(MotionModel(0.1, 1.0, 0.1, 0.1), out, 0.4)[2]
+    found = np.where(np.array(FEATURES) == "in step", in_step, 0.0)[None]
+    assert stand_throughout(out, smoothed, found, (0, last), 0.4).tolist() == [stands]
+
+
+def frames_of(paths: Paths) -> list[Frame]:
+    """Samples of tracks at each step."""
+
+    def rows(step: int) -> Rows:
+        here = {name: path[step] for name, path in paths.items() if step in path}
+        x, y = np.array(list(here.values())).reshape(-1, 2).T
+        count = len(here)
+        seen = {"observed": np.ones(count, bool), "source_id": np.full(count, -1)}
+        return TRACKS.rows(track_id=list(here), x_m=x, y_m=y, **seen)
+
+    return [Frame(round(step * 4e8), step, rows(step)) for step in range(max(max(path) for path in paths.values()) + 1)]
+
+
+def tracked(paths: Paths) -> dict[int, int]:
+    """How many rows the tracks of each input id have after re-tracking."""
+    count: dict[int, int] = {}
+    for found, *_ in PROFILES["default"](frames_of(paths)):
+        for name in found.rows["source_id"].tolist():
+            count[name] = count.get(name, 0) + 1
+    return count
+
+
+def walkers(rng: np.random.Generator, count: int, steps: int = 60) -> Paths:
+    """People who walk on lanes that are 4 m apart."""
+    places = [walk_of(rng, np.array([0.0, 4.0 * k]), np.array([1.2, 0.0]), steps, 0.1) for k in range(count)]
+    return {k + 1: dict(enumerate(map(tuple, place.tolist()))) for k, place in enumerate(places)}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_double_that_shares_the_errors_of_a_person_is_left_out_and_a_companion_is_not(seed):
+    rng = np.random.default_rng(seed)
+    paths = walkers(rng, 6)
+    part = range(10, 60)
+    paths[11] = {s: (paths[1][s][0] + 0.3, paths[1][s][1] + 0.7) for s in part}
+    companion = walk_of(rng, np.array([0.3, 4.7]), np.array([1.2, 0.0]), 60, 0.1)
+    paths[12] = {s: tuple(companion[s].tolist()) for s in part}
+    found = tracked(paths)
+    assert 11 not in found
+    assert found[12] == len(part)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_who_stands_for_the_whole_of_a_short_log_is_left_in_though_seen_now_and_then(seed):
+    """Three stand among people who walk, in 16 s; flicker wanders for a second or two at other places."""
+    rng = np.random.default_rng(seed)
+    paths = walkers(rng, 4, 40)
+    for name in (11, 12, 13):
+        place = rng.normal(0, 0.2, (40, 2)) + [3.0 * (name - 10), -5.0]
+        seen = {0, 39, *np.flatnonzero(rng.random(40) < 0.75).tolist()}
+        paths[name] = {s: tuple(place[s].tolist()) for s in sorted(seen)}
+    for name in range(20, 28):
+        begins, lasts = int(rng.integers(0, 34)), int(rng.integers(2, 6))
+        place = rng.uniform(-30, 60, 2) + np.cumsum(rng.normal(0, 0.3, (lasts, 2)), axis=0) - [0, 100]
+        paths[name] = {begins + k: tuple(place[k].tolist()) for k in range(lasts)}
+    found = tracked(paths)
+    assert {11, 12, 13} < set(found)
+    assert not {*range(20, 28)} & set(found)

@@ -142,22 +142,6 @@ def test_the_largest_sideways_distance_of_a_link(speed, gap, others, least):
         assert not ours(0.0)
 
 
-@pytest.mark.parametrize("gap", [2, 6])
-def test_the_highest_speed_of_a_link(gap):
-    """No link is longer than 1 m plus 2.5 m for each second of the gap, however well it fits."""
-
-    def paths(speed: float) -> dict[int, Path]:
-        later = 20 + gap
-        return {1: line(0, 21, (0.0, 0.0), (speed, 0.0)), 2: line(later, 20, (speed * 0.4 * later, 0.0), (speed, 0.0))}
-
-    def ours(speed: float) -> bool:
-        out, _ = laid_out(paths(speed))
-        forward, backward, _ = smooth(MODEL, out, 0.4)
-        return link_tracks(MODEL, out, forward, backward, 0.4, 20.0, 0.05)[0] == 1
-
-    compare(ours, lambda speed: links(MOTION, paths(speed), 20.0, 0.05).get(1) == 2, 1.0, 9.0)
-
-
 def feature(name: str, paths: dict[int, Path]) -> tuple[float, float]:
     """A feature of the second of two tracks: of the package, and of the reference."""
     out, _ = laid_out(paths)

@@ -259,27 +259,6 @@ class TestAFinishedLog:
                 assert {"Image", "3D", "Plot"} <= kinds
 
 
-def test_labels_without_pictures_have_scenes_too(footage, tmp_path):
-    path = tmp_path / "labels.mcap"
-    plane = ("--ground-plane", footage.ground_plane)
-    printed("ingest", footage.ground_truth, "--as", "tracks", "--fps", 10, *plane, "-o", path)
-    printed("run", path)
-    with log.read(path) as opened:
-        for name in ("tracks", "predictions", "retracks/full"):
-            times = opened.times(f"/camera/{name}").tolist()
-            assert opened.times(f"/camera/{name}/view/scene").tolist() == times
-            assert len(times) > 10
-        first = SceneUpdate.FromString(next(iter(opened.messages("/camera/tracks/view/scene"))).payload)
-        assert first.entities[0].lifetime.ToNanoseconds() == pytest.approx(1.5e8, rel=0.02)
-        assert not any(topic.endswith("/view/image") for topic in opened.channels)
-        assert opened.times("/camera/view/tf")[0] == min(opened.times("/camera/tracks"))
-        layout = json.loads(opened.attachment("mcaptrack.layout.json"))
-        assert topics_in(layout) <= set(opened.channels)
-        assert {"3D!ground", "Plot!people"} <= set(layout["configById"])
-        curves = [curve["label"] for curve in layout["configById"]["Plot!people"]["paths"]]
-        assert curves == ["tracker", "re-tracked"]
-
-
 def test_a_stage_that_is_run_again_replaces_its_views(finished, tmp_path):
     """In place and more than once: what is read of a log is read before its end is written anew."""
     path = tmp_path / "walk.mcap"

@@ -15,8 +15,8 @@ from scipy.special import expit, softmax
 from mcaptrack.errors import McaptrackError
 from mcaptrack.predictors import NAMES, Forecast, PeopleSeen, make, predict_among, predict_together, social
 from mcaptrack.predictors.weights import SHIPPED, Weights, load
-from mcaptrack.schema import TRACKS, Frame
-from mcaptrack.testing import LAWS, LawError, check_predictor, sample_frames
+from mcaptrack.schema import Frame
+from mcaptrack.testing import LawError, check_predictor
 from mcaptrack.transforms import PROFILES, Predict
 from mcaptrack.transforms.retrack import likelihood
 from tests.worlds import ns, tracks_at
@@ -174,9 +174,6 @@ class TestLaws:
         with pytest.raises(LawError, match=said):
             check_predictor(Breaks(law), rotates=True)
 
-    def test_predictions_of_a_log_are_causal(self):
-        LAWS["causal"](Predict(predictor="social"), sample_frames(TRACKS), 0)
-
 
 class TestSocial:
     @settings(max_examples=25)
@@ -194,20 +191,6 @@ class TestSocial:
             near = sorted((j for j in away if away[j] < 12), key=away.__getitem__)[:16]
             wanted += [(track, j) for j in near]
         assert list(zip(*(part.tolist() for part in found), strict=True)) == wanted
-
-    def test_people_at_the_same_distance_as_the_sixteenth_are_all_taken(self):
-        angle = np.linspace(0, 2 * np.pi, 20, endpoint=False)
-        now = np.concatenate([[[0.0, 0.0]], np.round(np.stack([np.cos(angle), np.sin(angle)], -1), 0) * 2])
-        people = PeopleSeen(now[:, None], np.ones((21, 1), bool), np.zeros(21, int), np.array([0]))
-        distance = np.hypot(*now[1:].T)
-        assert len(social.pairs_of(people, now)[1]) == (distance <= np.sort(distance)[15]).sum() > 0
-
-    def test_those_who_stand_still_have_forecasts_that_rotate_too(self):
-        """They have no direction, so that nothing may depend on it."""
-        xy_m = np.tile(np.array([[0.0, 0.0], [1.0, 0.0]])[:, None], (1, 8, 1))
-        east, north = (predict_together(SOCIAL, xy_m[:, :, axes], np.ones((2, 8), bool)) for axes in ([0, 1], [1, 0]))
-        np.testing.assert_allclose(north.mean, east.mean[..., ::-1], atol=1e-9)
-        np.testing.assert_allclose(north.cov, east.cov[..., ::-1, ::-1], atol=1e-9)
 
     def test_the_formulas_are_those_of_attention(self):
         """Against loops over tracks, people and steps, on the same features."""

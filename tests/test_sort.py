@@ -14,10 +14,10 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.transforms import TRACKERS
-from mcaptrack.transforms.sort import OcSort, Sort
+from mcaptrack.transforms.sort import Sort
 from mcaptrack.transforms.sort.state import distance_pairs
 from tests.references.sort import Box, ReferenceByteTrack, ReferenceOcSort, ReferenceSort
-from tests.worlds import boxes_at, detections, ids, ns
+from tests.worlds import boxes_at, ids, ns
 
 FRAMES = {"max_age_frames": 2, "min_hits_frames": 2, "min_iou": 0.3}
 
@@ -54,36 +54,6 @@ def test_degenerate_boxes_are_ignored():
     assert np.isfinite(out[-1].rows["x_px"]).all()
 
 
-def test_jitter_of_timestamps_changes_no_age():
-    """Ages and hit streaks in seconds are rounded to the nearest frame."""
-    rng = np.random.default_rng(4)
-    frames = detections(lambda n: [] if 10 <= n < 19 else [(50, 60)], 40)
-    for age in (0.8, 0.9, 1.0):
-        wanted = [ids(frame) for (frame,) in Sort(max_age_s=age, min_hits_s=0.3)(frames)]
-        for _ in range(10):
-            shaken = [frame._replace(t_ns=frame.t_ns + int(rng.integers(-4_000_000, 4_000_000))) for frame in frames]
-            assert [ids(frame) for (frame,) in Sort(max_age_s=age, min_hits_s=0.3)(shaken)] == wanted
-    assert wanted[-1] == [1]
-
-
-@pytest.mark.parametrize(("least_s", "hits"), [(0.24, 2), (0.26, 3)])
-def test_the_time_to_a_confirmed_track_is_rounded_to_the_nearest_frame(least_s, hits):
-    frames = detections(lambda n: [(50, 60)] if n >= 20 else [(200, 60)], 40)
-    out = [ids(frame) for (frame,) in Sort(max_age_s=0.5, min_hits_s=least_s)(frames)]
-    assert next(n for n, found in enumerate(out) if found == [2]) == 20 + hits
-
-
-def test_ages_are_in_seconds_where_the_frame_rate_changes():
-    """A person is missed for 0.9 s: at 10 frames a second, and after the rate has risen to 30."""
-    times = [n / 10 for n in range(40)] + [4 + n / 30 for n in range(120)]
-    away = [(2.0, 2.9), (6.0, 6.9)]
-    frames = [
-        Frame(ns(t), n, boxes_at([] if any(a <= t < b for a, b in away) else [(50, 60)])) for n, t in enumerate(times)
-    ]
-    assert ids([f for (f,) in Sort(max_age_s=1.2, min_hits_s=0.1)(frames)][-1]) == [1]
-    assert ids([f for (f,) in Sort(max_age_s=0.6, min_hits_s=0.1)(frames)][-1]) == [3]
-
-
 def test_a_score_at_the_limit_and_the_largest_class_pass():
     rows = boxes_at([(50, 50), (120, 50)])
     rows["score"], rows["class_id"] = [0.5, np.nextafter(np.float32(0.5), np.float32(0))], [2**31 - 1, 1]
@@ -103,18 +73,6 @@ def test_a_pair_at_the_gate_is_beyond_it():
     assert (pairs.detection.tolist(), pairs.track.tolist(), pairs.similarity.tolist()) == ([0], [0], [0.375])
     assert pairs.shape == (2, 2)
     assert distance_pairs(boxes[:, :1], predicted, 1.0, None).shape == (1, 2)
-
-
-def test_ocsort_recovers_a_person_who_stopped_while_occluded():
-    """The filter coasts on, away from the person; the last detection does not."""
-
-    def path(n):
-        return [] if 20 <= n < 32 else [(50 + 6 * min(n, 20), 50)]
-
-    options = {"max_age_frames": 30, "min_iou": 0.3}
-    assert ids(run(detections(path, 50), **options)[-1]) == [2]
-    assert ids(run(detections(path, 50), kind=OcSort, **options)[-1]) == [1]
-    assert ids(run(detections(path, 50), kind=OcSort, recover=False, **options)[-1]) == [2]
 
 
 @pytest.mark.parametrize(

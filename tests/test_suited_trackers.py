@@ -63,19 +63,6 @@ def run(path: Path, **options) -> tuple[str, list[str]]:
     return tracker_of(path), [note for note in result.notes if "suits" in note]
 
 
-def test_a_run_takes_the_tracker_that_suits_the_detector_and_says_so(log):
-    tracker, notes = run(log, detector=Choosy())
-    assert tracker == "ocsort"
-    assert len(notes) == 1
-    assert "track by ocsort, which suits the detector" in notes[0]
-
-
-def test_a_log_with_detections_alone_gets_the_suited_tracker_too(log):
-    mcaptrack.detect(log, detector="knn")
-    assert run(log)[0] == "sort"
-    assert run(log, detector=Choosy())[0] == "ocsort"
-
-
 def test_another_detector_brings_its_tracker(log):
     assert run(log, detector=Plain(), tracker="bytetrack")[0] == "bytetrack"
     assert run(log, detector=Choosy())[0] == "ocsort"

@@ -8,13 +8,23 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
 from mcaptrack.evaluation.metrics.displacement import ellipse_levels
-from mcaptrack.geometry.mixtures import Tails, squared_radius
+from mcaptrack.geometry.mixtures import Tails, mass_within, squared_radius
 from mcaptrack.notices import Notice, listening
 from mcaptrack.predictors import NAMES, Forecast, make, vehicle_tails
-from mcaptrack.predictors.position_noise import PositionNoise
-from mcaptrack.predictors.tail_calibration import Learned, TailCalibration, counts_of, fit_mixture, follow, table_of
+from mcaptrack.predictors.position_noise import NoiseOfErrors, PositionNoise, nonnegative, running
+from mcaptrack.predictors.tail_calibration import (
+    Learned,
+    TailCalibration,
+    correct,
+    counts_of,
+    fit_mixture,
+    follow,
+    level_counts,
+    table_of,
+)
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.predictions import tails_of
 from mcaptrack.transforms import PROFILES, forecasts
@@ -45,10 +55,6 @@ class TestTable:
         assert ((table.wide_weight > 0) & (table.wide_weight < 1)).all()
         assert table.short[0] > 1
         assert (table.coasting > 1).all()
-
-    def test_networks_with_other_weights_and_other_predictors_have_none(self):
-        assert table_of("red:mine.safetensors") is None
-        assert table_of("package:Class") is None
 
     def test_at_other_times_it_is_between_its_neighbours(self):
         table = table_of("red")
@@ -84,21 +90,11 @@ class TestFollowing:
         scale = np.where(rng.random(count) < 0.3, wide, narrow) + noise
         return scale * rng.exponential(size=count)
 
-    def test_without_comparisons_they_are_the_table(self):
-        found = self.followed([np.empty(0)] * 3)
-        for one, given in zip(found, self.TABLE, strict=True):
-            assert one.tolist() == pytest.approx(given.tolist())
-
     @pytest.mark.parametrize("noise", [0.0, 0.5])
     def test_after_many_they_are_those_of_the_log_without_the_noise_of_its_positions(self, noise):
         found = self.followed([self.samples(1.0, 20.0, 50_000, noise)] * 3, noise)
         for one, wanted in zip(found, (0.3, 1.0, 20.0), strict=True):
             assert one.tolist() == pytest.approx([wanted] * 3, rel=0.08)
-
-    def test_a_few_change_little_and_more_change_more(self):
-        sizes = [self.followed([self.samples(5.0, 5.0, count)] * 3).narrow_scale[1] for count in (0, 1, 30)]
-        assert sizes == sorted(sizes)
-        assert sizes[1] < 2.5  # they are 5
 
     def test_what_is_known_of_the_near_future_counts_for_the_distant_one_but_less(self):
         nothing = np.empty(0)
@@ -162,10 +158,6 @@ class TestCalibration:
         for level in (0.5, 0.95):
             assert (levels <= level).mean() == pytest.approx(level, abs=0.04)
 
-    def test_also_where_no_mixture_fits(self):
-        held = (self.forecasts(0.5, ring=True)[30:] <= 0.5).mean()
-        assert held == pytest.approx(0.5, abs=0.1)
-
     def test_they_are_no_smaller_than_noise_allows(self):
         self.forecasts(0.001, noise_m=0.3)
         nothing = Forecast(np.zeros((1, 3, 2)), np.tile(np.eye(2), (1, 3, 1, 1)))
@@ -201,29 +193,6 @@ class TestCalibration:
         assert np.isfinite(tails).all()
         assert np.isfinite(made.cov).all()
         assert (tails.narrow_scale[0] < 0.5).all()
-
-    def test_ellipses_that_do_not_follow_stay(self):
-        for level in (0.5, 0.95):
-            held = self.forecasts(0.05, adapts=False) <= level
-            assert held.all()
-
-    def test_one_exchange_of_ids_among_many_tracks_leaves_them_as_they_are(self):
-        """Two of 40 tracks exchange their places for good: a few large errors, once."""
-        predictor = make("cv", 6, 0.4)
-        now = []
-        for is_exchanged in (False, True):
-            calibration = TailCalibration.of("cv", predictor)
-            noise = np.random.default_rng(5).normal(0, 0.1, (60, 40, 2))
-            start = 5.0 * np.arange(40)[:, None] * [[1.0, 0.0]]
-            for step in range(8, 60):
-                place = noise[:step] + start + 0.4 * np.arange(step)[:, None, None] * [0.0, 1.0]
-                if is_exchanged and step > 40:
-                    place[40:, [0, 1]] = place[40:, [1, 0]]
-                past = place[-8:].transpose(1, 0, 2)
-                forecast = predictor.predict(past, np.ones(past.shape[:2], bool))
-                made, tails = calibration(np.full(40, step), np.arange(40), forecast, past, np.zeros(40, bool))
-            now.append((made.cov[5, :, 0, 0] * squared_radius(0.5, Tails(*(part[5] for part in tails)))) ** 0.5)
-        assert now[1].tolist() == pytest.approx(now[0].tolist(), rel=0.1)
 
     def test_ellipses_are_of_true_positions_though_measured_ones_have_noise(self):
         levels = self.forecasts(0.3, noise_m=0.3, steps=200)[100:]
@@ -292,44 +261,7 @@ class TestCalibration:
         assert (coasting > short).all()
 
 
-def spread(frames: list[Frame]) -> np.ndarray:
-    """The squared half axes of the 50 % ellipses of the last step, by time."""
-    out = []
-    for frame in frames:
-        rows = frame.rows[frame.rows["step"] == 12]
-        out.append(np.mean(rows["cov_xx_m2"] * squared_radius(0.5, tails_of(rows))) if len(rows) else np.nan)
-    return np.array(out)
-
-
 class TestInTransforms:
-    def test_predictions_follow_the_log(self):
-        """People who walk straight on come to have small ellipses, others keep theirs."""
-        calm = spread([frame for (frame,) in Predict()(walkers())])
-        assert calm[-1] < 0.3 * calm[3]  # the first, by the table
-
-    def test_interpolated_positions_say_nothing_about_noise(self, monkeypatch):
-        """A quarter of the positions is interpolated between neighbours: their noise is smaller, and like theirs."""
-        found: list[tuple[float, float]] = []
-        given = PositionNoise.variances_m2
-
-        def kept(*values: Any) -> tuple[np.ndarray, np.ndarray]:
-            out = given(*values)
-            found.append((float(out[0][-1]), float(out[1][-1])))
-            return out
-
-        monkeypatch.setattr(PositionNoise, "variances_m2", kept)
-        frames, rng = walkers(count=40, ticks=60, noise_m=0.2), np.random.default_rng(9)
-        for before, frame, after in zip(frames, frames[1:], frames[2:], strict=False):
-            is_seen = rng.random(40) > 0.25
-            for name in ("x_m", "y_m"):
-                between = (before.rows[name] + after.rows[name]) / 2
-                frame.rows[name] = np.where(is_seen, frame.rows[name], between)
-            frame.rows["observed"] = is_seen
-        list(Predict()(frames))
-        white_m, lasting_m = np.sqrt(np.median(found[-10:], axis=0))
-        assert white_m == pytest.approx(0.2, rel=0.1)
-        assert lasting_m < 0.1
-
     def test_positions_on_both_sides_of_times_with_velocities_are_not_neighbours(self, monkeypatch):
         """People on straight lines have no bends, also where some of their rows are of another tracker."""
         seen: list[np.ndarray] = []
@@ -529,3 +461,168 @@ def test_a_forecast_with_rest_has_the_mean_and_covariance_of_both():
             cov = sum(share * (spread + np.outer(at - mean, at - mean)) for share, at, spread in parts)
             np.testing.assert_allclose(found.mean[one, step], mean)
             np.testing.assert_allclose(found.cov[one, step], cov)
+
+
+# Ellipses corrected by what they have held, and the noise of positions as far as tracks show it
+
+
+AHEAD, STEP_S = 3, 0.4
+SHAPE = Tails(np.full(AHEAD, 0.3), np.full(AHEAD, 0.5), np.full(AHEAD, 5.0))
+AT_ONE_TIME = Tails(*(part[None] for part in SHAPE))
+
+
+def held(size: float, count: int) -> tuple[Tails, np.ndarray]:
+    """The correction of a mixture after errors ``size`` times as large as it says; half their squared distances."""
+    rng = np.random.default_rng(1)
+    scale = size * np.where(rng.random((AHEAD, count)) < 0.3, 5.0, 0.5)
+    half = scale * rng.exponential(size=(AHEAD, count))
+    step = np.repeat(np.arange(AHEAD), count)
+    counts = level_counts(step, half.ravel(), SHAPE.chosen(step), AHEAD)
+    return Tails(*(part[0] for part in correct(AT_ONE_TIME, counts[None]))), half
+
+
+class TestLevels:
+    def test_without_errors_and_with_those_that_were_expected_mixtures_stay(self):
+        for size, count in ((1.0, 0), (1.0, 20_000)):
+            found, _ = held(size, count)
+            for one, given in zip(found, SHAPE, strict=True):
+                assert one.tolist() == pytest.approx(given.tolist(), rel=0.05)
+
+    @pytest.mark.parametrize("size", [0.7, 1.5, 2.0])
+    def test_after_many_errors_ellipses_hold_half_of_them(self, size):
+        found, half = held(size, 20_000)
+        inside = mass_within(2 * half, Tails(*(part[:, None] for part in found)))
+        before = mass_within(2 * half, Tails(*(part[:, None] for part in SHAPE)))
+        assert abs((before <= 0.5).mean() - 0.5) > 0.08
+        assert (inside <= 0.5).mean() == pytest.approx(0.5, abs=0.05)
+
+    @pytest.mark.parametrize("size", [0.1, 10.0])
+    def test_corrections_have_limits(self, size):
+        found, _ = held(size, 20_000)
+        assert np.ptp(np.log(found.narrow_scale / SHAPE.narrow_scale)) == pytest.approx(0)
+        assert 0.5 <= found.narrow_scale[0] / SHAPE.narrow_scale[0] <= 2
+        assert 1 <= found.wide_scale[0] / SHAPE.wide_scale[0] <= 2
+
+    def test_large_errors_only_make_the_wide_part_larger(self):
+        less, more = held(0.5, 20_000)[0], held(3.0, 20_000)[0]
+        assert less.wide_scale.tolist() == SHAPE.wide_scale.tolist()
+        assert (less.narrow_scale < 0.8 * SHAPE.narrow_scale).all()
+        assert (more.wide_scale > 1.2 * SHAPE.wide_scale).all()
+
+    def test_few_errors_change_little(self):
+        few, more, many = (squared_radius(0.5, held(2.0, count)[0])[0] for count in (2, 30, 2000))
+        assert few < 1.15 * squared_radius(0.5, SHAPE)[0] < more < many
+
+    def test_steps_with_errors_of_their_own_are_corrected_more(self):
+        step, half = np.repeat(np.arange(AHEAD), 30), np.tile(np.geomspace(0.2, 20, 30), AHEAD)
+        counts = level_counts(step, half, SHAPE.chosen(step), AHEAD) * np.array([[0.0], [0.0], [1.0]])
+        (found,) = correct(AT_ONE_TIME, counts[None]).narrow_scale
+        assert found[2] > found[0] > 0.5
+
+    def test_several_times_are_corrected_as_each_of_them(self):
+        step = np.repeat(np.arange(AHEAD), 200)
+        rng = np.random.default_rng(4)
+        counts = np.stack([
+            level_counts(step, size * rng.exponential(size=len(step)), SHAPE.chosen(step), AHEAD) for size in (0.3, 2)
+        ])  # fmt: skip
+        together = correct(Tails(*(np.tile(part, (2, 1)) for part in SHAPE)), counts)
+        for number, one in enumerate(counts):
+            for part, alone in zip(together, correct(AT_ONE_TIME, one[None]), strict=True):
+                assert part[number].tolist() == alone[0].tolist()
+
+
+def test_running_sums_are_those_of_each_time_after_the_one_before():
+    before, kept, new = np.array([4.0, 1.0]), np.array([0.5, 0.1, 1.0]), np.arange(6.0).reshape(3, 2)
+    sums, last = running(before, kept, new)
+    assert sums.tolist() == [[2.0, 1.5], pytest.approx([2.2, 3.15]), pytest.approx([6.2, 8.15])]
+    assert last.tolist() == sums[-1].tolist()
+    assert running(before, kept[:0], new[:0])[1].tolist() == [4, 1]
+
+
+class TestNoise:
+    def lasting(self, rng: np.random.Generator, sd_m: float, steps: int, *shape: int) -> np.ndarray:
+        """Noise (steps, ...) that lasts: a part for each time constant, as of processes that forget (AR(1))."""
+        parts = []
+        for keep in np.exp(-STEP_S / np.array([0.6, 1.2, 2.4, 4.8])):
+            drawn = rng.normal(0, sd_m / 2, (steps, *shape))
+            drawn[1:] *= np.sqrt(1 - keep**2)
+            for step in range(1, steps):
+                drawn[step] += keep * drawn[step - 1]
+            parts.append(drawn)
+        return np.sum(parts, axis=0)
+
+    def paths(self, white_m: float, lasting_m: float, turns: float = 0.0) -> np.ndarray:
+        """The pasts, (93, 60, 8, 2), of 60 people who walk, straight on or in circles, and are measured."""
+        rng, people, steps = np.random.default_rng(2), 60, 100
+        angle = turns * STEP_S * np.arange(steps) + rng.uniform(0, 6, (people, 1))
+        path = np.cumsum(0.5 * np.stack([np.cos(angle), np.sin(angle)], axis=-1), axis=1)
+        path += self.lasting(rng, lasting_m, steps, people, 2).swapaxes(0, 1) + white_m * rng.normal(size=path.shape)
+        return np.stack([path[:, step - 7 : step + 1] for step in range(7, steps)])
+
+    def seen(self, white_m: float, lasting_m: float, **motion: float) -> tuple[float, float]:
+        """White and lasting noise of such people in m, at the end."""
+        past = self.paths(white_m, lasting_m, **motion)
+        place = np.repeat(np.arange(len(past)), past.shape[1])
+        found = PositionNoise(STEP_S).variances_m2(np.ones(len(past), int), place, past.reshape(-1, 8, 2))
+        return np.sqrt(found[0][-1]), np.sqrt(found[1][-1])
+
+    @pytest.mark.parametrize(("white_m", "lasting_m"), [(0.2, 0.0), (0.0, 0.2), (0.1, 0.3), (0.0, 0.0)])
+    def test_white_and_lasting_noise_are_told_apart(self, white_m, lasting_m):
+        white, lasting = self.seen(white_m, lasting_m)
+        assert white == pytest.approx(white_m, abs=0.06)
+        assert lasting == pytest.approx(lasting_m, abs=0.06)
+        if not white_m:
+            assert lasting == pytest.approx(lasting_m, rel=0.04, abs=1e-6)
+
+    def test_people_who_turn_are_not_taken_for_noise(self):
+        assert np.hypot(*self.seen(0.01, 0.0, turns=0.5)) < 0.06
+        assert self.seen(0.1, 0.0, turns=0.5)[0] == pytest.approx(0.1, rel=0.3)
+
+    def test_times_one_by_one_say_the_same_as_together(self):
+        past = self.paths(0.1, 0.2)[:30]
+        place = np.repeat(np.arange(30), 60)
+        together = PositionNoise(STEP_S).variances_m2(np.ones(30, int), place, past.reshape(-1, 8, 2))
+        noise, none = PositionNoise(STEP_S), np.zeros(60, int)
+        alone = [noise.variances_m2(np.ones(1, int), none, one) for one in past]
+        assert np.array(together).T.tolist() == [[white.item(), lasting.item()] for white, lasting in alone]
+
+    def test_what_is_older_counts_less(self):
+        noise, passed, none = PositionNoise(STEP_S), np.array([1]), np.zeros(60 * 93, int)
+        for white_m in (0.3, 0.1):
+            noise.variances_m2(passed, none, self.paths(white_m, 0.0).reshape(-1, 8, 2))
+        later = noise.variances_m2(np.array([1000]), none[:60], self.paths(0.1, 0.0)[0])
+        assert np.sqrt(later[0].item()) == pytest.approx(0.1, rel=0.35)
+
+    def test_errors_of_noise_that_lasts_are_smaller_near_and_larger_far_than_they_seem(self):
+        """A person stands; a forecast is the last measured position, and is compared with measured ones later."""
+        past = self.paths(0.0, 0.3).reshape(-1, 8, 2)
+        found = NoiseOfErrors(*(part[0] for part in self.effect(past)))
+        off = self.lasting(np.random.default_rng(3), 0.3, 13, 20_000)
+        added = [np.var(later - off[0]) - np.var(off[0]) for later in off[1:]]
+        assert found.added.tolist() == pytest.approx(added, abs=0.03)
+        assert found.added[0] < 0 < found.added[-1]
+        assert (found.least <= np.var(off[0])).all()
+
+    def test_of_white_noise_all_of_it_is_added(self):
+        found = self.effect(self.paths(0.2, 0.0).reshape(-1, 8, 2))
+        assert found.added[0].tolist() == pytest.approx([0.04] * 12, rel=0.25)
+
+    def test_few_positions_and_unknown_ones_say_nothing(self):
+        noise = PositionNoise(STEP_S)
+        for past in (np.full((40, 8, 2), np.nan), np.empty((0, 8, 2)), np.zeros((9, 8, 2))):
+            found = noise.follow(np.array([1]), np.zeros(len(past), int), past, 3)
+            assert found.added.tolist() == found.least.tolist() == [[0, 0, 0]]
+
+    def effect(self, past: np.ndarray) -> NoiseOfErrors:
+        """The effect of noise on the errors of forecasts of 12 steps, after all of these pasts."""
+        return PositionNoise(STEP_S).follow(np.array([1]), np.zeros(len(past), int), past, 12)
+
+
+def test_nonnegative_least_squares_are_those_of_scipy():
+    rng = np.random.default_rng(6)
+    shapes = rng.uniform(0, 3, (200, 3, 3)) * 10.0 ** rng.uniform(-2, 2, (200, 3, 1))
+    wanted = [lsq_linear(one, np.ones(3), (0, np.inf), tol=1e-14) for one in shapes]
+    found = nonnegative(shapes)
+    assert (found >= 0).all()
+    left = ((shapes @ found[..., None])[..., 0] - 1) ** 2
+    assert (left.sum(axis=1) / 2).tolist() == pytest.approx([one.cost for one in wanted], abs=1e-6)

@@ -466,10 +466,8 @@ def test_synthetic_walks_and_files_are_other_scenes(folder, given, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "changed", "corrupted"),
     [
-        ("--recipe paper", {}, {}),
         ("--epochs 3 --batch 9 --rate 0.01", {"epochs": 3, "batch": 9, "rate": 0.01}, {}),
-        ("--patience 4 --seed 6", {"patience": 4, "seed": 6}, {}),
-        ("--consistency-weight 2", {"consistency_weight": 2.0}, {}),
+        ("--patience 4 --seed 6 --consistency-weight 2", {"patience": 4, "seed": 6, "consistency_weight": 2.0}, {}),
         ("--noise-m 0.2 --gaps 0.1 --scale 0.3", {}, {"noise_m": 0.2, "gaps": 0.1, "scale": 0.3}),
         ("--noise-m 0 --gaps 0 --scale 0", {}, {"noise_m": 0.0, "gaps": 0.0, "scale": 0.0}),
         ("--recipe paper --epochs 1 --gaps 0.9", {"epochs": 1}, {"gaps": 0.9}),

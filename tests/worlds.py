@@ -285,3 +285,25 @@ def write_eventful(path: Path) -> Path:
                 writer.add_message(number, *message)
     mcaptrack.events(path)
     return path
+
+
+def _add_messages(writer: log.LogWriter, topic: str, frames: Sequence[Frame], made_by: str) -> None:
+    schema = PREDICTIONS if topic.endswith("/predictions") else TRACKS
+    messages = [(frame.t_ns, frame.index, schema.codec.encode(frame.rows)) for frame in frames]
+    how = Provenance(made_by, {"of": topic}, digest=digest(messages)).to_metadata() if made_by else {}
+    number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", how)
+    for message in messages:
+        writer.add_message(number, *message)
+
+
+def write_channels(path: Path, made_by: str = "ingest", **channels: Sequence[Frame]) -> Path:
+    """A log without pictures: tracks and predictions of /camera, made by a stage; without provenance if that is empty."""
+    with log.create(path) as writer:
+        for name, frames in channels.items():
+            _add_messages(writer, "/camera/" + name.replace("_", "/"), frames, made_by)
+    return path
+
+
+def replace_channel(path: Path, topic: str, frames: Sequence[Frame], made_by: str = "ingest") -> None:
+    with log.read(path) as opened, log.extend(opened, drop=[topic]) as writer:
+        _add_messages(writer, topic, frames, made_by)
