@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 from mcaptrack.api.ingesting import default_log
 from mcaptrack.cli import common
 from mcaptrack.cli.common import expand, only_one_output
-from mcaptrack.cli.declared import EachLog
 from mcaptrack.cli.flags import with_flags
-from mcaptrack.cli.many import many_options
+from mcaptrack.cli.many import EachLog
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
 
@@ -23,9 +22,10 @@ if TYPE_CHECKING:
 class Ingest(EachLog["IngestResult"]):
     """Make logs of videos, images, recordings and label files."""
 
-    def __init__(self, values: dict[str, Any]) -> None:
-        super().__init__(values)
-        self.names_output = not values["into"]
+    @property
+    def names_output(self) -> bool:  # type: ignore[override]
+        """Whether each input has an output of its own: unless they are added to a log."""
+        return not self.given["into"]
 
     def logs(self) -> Sequence[NamedLog]:
         """Return the inputs, each once, with the names of their logs."""
@@ -33,7 +33,7 @@ class Ingest(EachLog["IngestResult"]):
 
         sources = expand(self.given["inputs"], each=True)
         only_one_output(sources, self.given["output"] or self.given["into"])
-        if self.given["into"] is not None and many_options().output_dir is not None:
+        if self.given["into"] is not None and self.many.output_dir is not None:
             raise McaptrackError("--into and --output-dir are two places for the same results; give one")
         return [NamedLog(source, default_log(Path(source))) for source in dict.fromkeys(sources)]
 

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from mcaptrack.api.rendering import default_suffix
 from mcaptrack.cli import common
-from mcaptrack.cli.declared import EachLog
-from mcaptrack.cli.many import many_options
+from mcaptrack.cli.many import EachLog
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:
@@ -21,7 +20,7 @@ class Render(EachLog["RenderResult"]):
     def arguments(self, names: Sequence[str]) -> dict[str, Any]:
         """Return the arguments; in ``--output-dir`` the name of the output says what is written."""
         arguments = super().arguments(names)
-        return arguments | {"gif": arguments["gif"] and many_options().output_dir is None}
+        return arguments | {"gif": arguments["gif"] and self.many.output_dir is None}
 
     def suffix(self) -> str:
         """Return the end of the names of outputs."""
