@@ -4,15 +4,27 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, TypeVar
 
 import typer
 
 import mcaptrack
-from mcaptrack.api.declared import Parameter, one_of_many, options_of, with_dashes, words_of
+from mcaptrack.api.declared import (
+    Argument,
+    OneOfMany,
+    Parameter,
+    argument_of,
+    bare,
+    hints_of,
+    on_command_line,
+    options_of,
+    parameter_of,
+    with_dashes,
+    words_of,
+)
 from mcaptrack.cli import common
 from mcaptrack.cli.many import LogWork, process, takes_many
+from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:
@@ -22,28 +34,96 @@ T = TypeVar("T")
 _OF_ALL: dict[str, Any] = {"json": common.Json, "quiet": common.Quiet, "verbose": common.Verbose}
 
 
-class EachLog(Generic[T]):
-    """A command that calls its function with each log: how it prints what this returns.
+#: Options by name: their types, which ``Annotated[..., Option(...)]`` says more about, and their defaults.
+Options = Mapping[str, tuple[Any, Any]]
+
+
+class Called(Generic[T]):
+    """A command that calls its function: how options become arguments, and how it prints what this returns.
 
     ``given`` has the options of the call. Subclasses override what differs.
     """
 
-    #: As in ``LogWork``.
-    names_output = False
+    #: Options that the function has no use for.
+    more: ClassVar[Options] = {}
+    #: The options that come first in the help, if there are any of these among them.
+    most_used: ClassVar[tuple[str, ...]] = ()
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        self.given = values
+    def __init__(self, name: str, values: Mapping[str, Any]) -> None:
+        self.name, self.given = name, values
+
+    @property
+    def function(self) -> Callable[..., T]:
+        """The function. It is looked up when the command runs."""
+        function: Callable[..., T] = getattr(mcaptrack, self.name)
+        return function
 
     @classmethod
     def function_of(cls, name: str) -> Callable[..., None]:
         """Return the function of the command: with its options as Typer takes them."""
         declared = getattr(mcaptrack, name)
-        names = [option.name for option in options_of(declared) if option.name != "output"]
+        names = [option.name for option in options_of(declared)]
+        more = [parameter_of(option, hint, default) for option, (hint, default) in cls.more.items()]
 
         def run(values: Mapping[str, Any]) -> None:
-            cls(values)._run(name, names)
+            cls(name, values).run(names)
 
-        return command(name, declared, run)
+        options = {option.name: (annotation_of(option), option.default) for option in more}
+        return command(name, declared, run, options, cls.most_used)
+
+    def arguments(self, names: Sequence[str]) -> dict[str, Any]:
+        """Return the arguments of the function, of these names."""
+        return {name: self.given[name] for name in names}
+
+    def data(self, done: T) -> dict[str, Any]:
+        """Return a result as values of JSON."""
+        raise NotImplementedError
+
+    def run(self, names: Sequence[str]) -> None:
+        """Call the function with its options, which have these names, and print what it returns."""
+        raise NotImplementedError
+
+
+class Once(Called[T]):
+    """A command that calls its function once."""
+
+    def arguments(self, names: Sequence[str]) -> dict[str, Any]:
+        """Return the arguments of the function: the options of these names, and what the command takes by its place."""
+        placed = argument_of(self.function)
+        by_place = {placed[0]: self.given[placed[1].name]} if placed else {}
+        return by_place | super().arguments(names)
+
+    def show(self, done: T, talk: common.Talk) -> None:
+        """Print the result for people."""
+        raise NotImplementedError
+
+    def code(self, done: T) -> int:
+        """Return the exit code."""
+        return common.DONE
+
+    def run(self, names: Sequence[str]) -> None:
+        """Call the function with its options, which have these names, and print what it returns."""
+        with common.Talk(self.given["quiet"], self.given["verbose"]).open() as talk:
+            arguments = self.arguments(names)
+            with stdout_to_stderr():
+                done = common.with_progress(self.function, talk.progress)(**arguments)
+            self.print(done, talk)
+        if code := self.code(done):
+            raise typer.Exit(code)
+
+    def print(self, done: T, talk: common.Talk) -> None:
+        """Print the result: for people, or as JSON."""
+        if self.given["json"]:
+            common.print_json(self.data(done))
+        else:
+            self.show(done, talk)
+
+
+class EachLog(Called[T]):
+    """A command that calls its function with each log."""
+
+    #: As in ``LogWork``.
+    names_output = False
 
     def logs(self) -> Sequence[NamedLog]:
         """Return the inputs."""
@@ -51,20 +131,12 @@ class EachLog(Generic[T]):
 
         return find_logs(self.given["logs"])
 
-    def arguments(self, names: Sequence[str]) -> dict[str, Any]:
-        """Return the arguments of the function, of these names."""
-        return {name: self.given[name] for name in names}
-
     def suffix(self) -> str:
         """Return the end of the names of outputs in ``--output-dir``."""
         return ".mcap"
 
     def line(self, done: T) -> str:
         """Return a result as a line of text."""
-        raise NotImplementedError
-
-    def data(self, done: T) -> dict[str, Any]:
-        """Return a result as values of JSON."""
         raise NotImplementedError
 
     def show(self, log: Location, done: T, talk: common.Talk) -> None:
@@ -75,13 +147,14 @@ class EachLog(Generic[T]):
         """Return the exit code."""
         return common.DONE
 
-    def _run(self, name: str, names: Sequence[str]) -> None:
+    def run(self, names: Sequence[str]) -> None:
+        """Call the function with each log and its options, which have these names, and print what it returns."""
         values = self.given
         with common.Talk(values["quiet"], values["verbose"]).open() as talk:
-            logs, arguments = self.logs(), self.arguments(names)
+            logs, arguments = self.logs(), self.arguments([option for option in names if option != "output"])
             work: LogWork[T] = LogWork(
-                name,
-                getattr(mcaptrack, name),
+                self.name,
+                self.function,
                 arguments,
                 show=lambda log, done: self.show(log, done, talk),
                 data=self.data,
@@ -100,16 +173,19 @@ def command(
     name: str,
     declared: Callable[..., Any],
     run: Callable[[Mapping[str, Any]], None],
-    more: Mapping[str, Any] | None = None,
+    more: Options | None = None,
+    most_used: tuple[str, ...] = (),
 ) -> Callable[..., None]:
     """Return the function of a command, with the signature of a declared function as Typer takes it.
 
-    ``more`` are options in the place of ``**options``. ``run`` gets the values of all.
+    ``more`` are options that the function lacks, as Typer takes them. ``run`` gets the values of all.
     """
     annotations: dict[str, tuple[Any, Any]] = {}
-    if each := one_of_many(declared):
-        argument = typer.Argument(metavar=each.metavar, help=each.help, show_default=False)
-        annotations[each.name] = Annotated[list[Path], argument], inspect.Parameter.empty
+    placed = argument_of(declared)
+    if placed is not None:
+        parameter, about = placed
+        default = inspect.signature(declared).parameters[parameter].default
+        annotations[about.name] = argument_annotation(about, hints_of(declared)[parameter], default)
     annotations |= {parameter.name: (annotation_of(parameter), parameter.default) for parameter in options_of(declared)}
     annotations |= dict(more or {})
     annotations |= {option: (hint, False) for option, hint in _OF_ALL.items()} | {"config": (common.Config, None)}
@@ -122,10 +198,20 @@ def command(
         [inspect.Parameter(n, keyword, default=default, annotation=hint) for n, (hint, default) in annotations.items()]
     )
     call.__name__, call.__annotations__ = name, {n: hint for n, (hint, _) in annotations.items()}
-    function: Any = common.one_line(takes_many()(call) if each else call)
+    is_each = placed is not None and isinstance(placed[1], OneOfMany)
+    function: Any = common.one_line(takes_many()(call) if is_each else call)
     function.settable = ()
-    function.help, function.most_used = help_of(declared), getattr(declared, "most_used", ())
+    function.help, function.most_used = help_of(declared), most_used or getattr(declared, "most_used", ())
     return function  # type: ignore[no-any-return]
+
+
+def argument_annotation(about: Argument, hint: Any, default: Any) -> tuple[Any, Any]:
+    """Return the annotation and the default of an argument, as Typer takes them; ``hint`` is its type in Python."""
+    kind, many = (str, True) if about.words else on_command_line(bare(hint))
+    many, is_needed = many or isinstance(about, OneOfMany), default is inspect.Parameter.empty and not about.words
+    kind = list[kind] if many else kind  # type: ignore[valid-type]
+    argument = typer.Argument(metavar=about.metavar, help=about.text, show_default=about.shown)
+    return Annotated[kind if is_needed else kind | None, argument], default if is_needed else None
 
 
 def annotation_of(parameter: Parameter) -> Any:

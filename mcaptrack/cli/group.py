@@ -42,7 +42,7 @@ ENTRIES: Final = (
         "demo",
         _MAKE,
         "Draw a scene with known ground truth, run everything on it, and compare SORT with re-tracking.",
-        "demo:demo",
+        "demo:Demo",
     ),
     Listed("run", _RUN, "Run all stages that are missing or out of date, then events, views and tables.", "run:run"),
     Listed(
