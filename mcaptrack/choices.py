@@ -32,3 +32,11 @@ Role = Literal["detections", "tracks", "truth", "corrections"]
 InputRole: TypeAlias = Role | Literal["motion", "calibration"]
 #: Which tracks re-tracking writes.
 Mode = Literal["both", "offline", "online"]
+#: How ground truth and tracks are matched.
+Similarity = Literal["iou", "metres", "bev-iou", "3d-iou"]
+#: Whether tracks are compensated for the motion of the camera.
+CameraMotionUse = Literal["auto", "on", "off"]
+#: Formats of tables, of ROS 2 bags, and of files with the boxes of one channel.
+TableFormat = Literal["parquet", "arrow", "csv", "jsonl"]
+BagFormat = Literal["rosbag2", "rosbag2-sqlite3"]
+ExchangeFormat = Literal["mot", "kitti", "coco", "cvat", "boxes-csv", "rerun"]

@@ -18,7 +18,7 @@ from mcaptrack.api.common import Notes, as_path, detail, locations_of, names_of,
 from mcaptrack.api.declared import checked
 from mcaptrack.api.ingesting import parse_fps
 from mcaptrack.api.options import PathLike, Progress, no_progress
-from mcaptrack.choices import Point
+from mcaptrack.choices import Point, Similarity
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation import (
     COMBINED,
@@ -31,7 +31,7 @@ from mcaptrack.evaluation import (
     sequence_of_log,
 )
 from mcaptrack.evaluation import evaluate as score_sequences
-from mcaptrack.evaluation.aligned import IOU_THRESHOLD, Similarity
+from mcaptrack.evaluation.aligned import IOU_THRESHOLD
 from mcaptrack.evaluation.forecasts import smoothed_predictions
 from mcaptrack.evaluation.metrics import Rules
 from mcaptrack.files import place_of, publish_bytes, refuse_overwrite

@@ -16,11 +16,10 @@ from mcaptrack.api.declared import checked
 from mcaptrack.api.ingesting import parse_fps
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.api.running import Option, transform_of
-from mcaptrack.choices import Point
+from mcaptrack.choices import Point, Similarity
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions, ground_truth_of_log
 from mcaptrack.evaluation import tuning as searching
-from mcaptrack.evaluation.aligned import Similarity
 from mcaptrack.evaluation.tuning import Metric, Range, Task, Trial, declared_ranges, uses_optuna
 from mcaptrack.notices import Notice, collected
 from mcaptrack.registry import blamed

@@ -14,6 +14,7 @@ from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.api.running import Fusing, RunResult, Where, transform_of, transforms_of, work
 from mcaptrack.api.several import unfitting
+from mcaptrack.choices import CameraMotionUse
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.aligned import Similarity
 from mcaptrack.evaluation.events import EventOptions
@@ -24,7 +25,6 @@ from mcaptrack.location import Location, local_name
 from mcaptrack.pipeline import Job, PlaneChoice, Watch, ZoneWatch
 from mcaptrack.sources.zones import parse_zones, read_zones
 from mcaptrack.transforms import FUSION, STAGES, Transform
-from mcaptrack.transforms.sort.tracker import CameraMotionUse
 from mcaptrack.viewing.zones_page import zones_page
 
 # Count visits of zones and crossings of lines.

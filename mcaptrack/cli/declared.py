@@ -4,31 +4,137 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar, Generic, TypeVar
 
 import typer
 
-from mcaptrack.api.declared import Parameter, one_of_many, options_of, with_dashes, words_of
+import mcaptrack
+from mcaptrack.api.declared import (
+    Argument,
+    OneOfMany,
+    Option,
+    Parameter,
+    arguments_of,
+    bare,
+    hints_of,
+    on_command_line,
+    options_of,
+    parameter_of,
+    with_dashes,
+    words_of,
+)
+from mcaptrack.api.options import FILES, Force, PathLike
 from mcaptrack.cli import common
+from mcaptrack.cli.text import stdout_to_stderr
 
+T = TypeVar("T")
 _OF_ALL: dict[str, Any] = {"json": common.Json, "quiet": common.Quiet, "verbose": common.Verbose}
+
+
+#: Options by name: their types, which ``Annotated[..., Option(...)]`` says more about, and their defaults.
+Options = Mapping[str, tuple[Any, Any]]
+#: Options of commands whose results are what is printed to stdout: the file to write them to.
+PRINTED: Options = {
+    "output": (
+        Annotated[PathLike | None, Option(FILES, short="o", help="Write to this file instead of stdout.")],
+        None,
+    ),
+    "force": (Force, False),
+}
+
+
+class Called(Generic[T]):
+    """A command that calls its function: how options become arguments, and how it prints what this returns.
+
+    ``given`` has the options of the call. Subclasses override what differs.
+    """
+
+    #: Options that the function has no use for.
+    more: ClassVar[Options] = {}
+    #: The options that come first in the help, if there are any of these among them.
+    most_used: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, name: str, values: Mapping[str, Any]) -> None:
+        self.name, self.given = name, values
+
+    @property
+    def function(self) -> Callable[..., T]:
+        """The function. It is looked up when the command runs."""
+        function: Callable[..., T] = getattr(mcaptrack, self.name)
+        return function
+
+    @classmethod
+    def options(cls) -> Options:
+        """Return the options that the function has no use for."""
+        return cls.more
+
+    @classmethod
+    def function_of(cls, name: str) -> Callable[..., None]:
+        """Return the function of the command: with its options as Typer takes them."""
+        declared = getattr(mcaptrack, name)
+        names = {option.name: option.name for option in options_of(declared)}
+        placed = arguments_of(declared).items()
+        names |= {parameter: about.name for parameter, about in placed if not isinstance(about, OneOfMany)}
+        more = as_typer(cls.options())
+        return command(name, declared, lambda given: cls(name, given).run(names), more, cls.most_used)
+
+    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
+        """Return the arguments of the function; ``names`` has the name on the command line of each."""
+        return {parameter: self.given[name] for parameter, name in names.items()}
+
+    def data(self, done: T) -> dict[str, Any]:
+        """Return a result as values of JSON."""
+        raise NotImplementedError
+
+    def run(self, names: Mapping[str, str]) -> None:
+        """Call the function with its ``arguments``, and print what it returns."""
+        raise NotImplementedError
+
+
+class Once(Called[T]):
+    """A command that calls its function once."""
+
+    def show(self, done: T, talk: common.Talk) -> None:
+        """Print the result for people."""
+        raise NotImplementedError
+
+    def code(self, done: T) -> int:
+        """Return the exit code."""
+        return common.DONE
+
+    def run(self, names: Mapping[str, str]) -> None:
+        """Call the function with its ``arguments``, and print what it returns."""
+        with common.Talk(self.given["quiet"], self.given["verbose"]).open() as talk:
+            arguments = self.arguments(names)
+            with stdout_to_stderr():
+                done = common.with_progress(self.function, talk.progress)(**arguments)
+            self.print(done, talk)
+        if code := self.code(done):
+            raise typer.Exit(code)
+
+    def print(self, done: T, talk: common.Talk) -> None:
+        """Print the result: for people, or as JSON."""
+        if self.given["json"]:
+            common.print_json(self.data(done))
+        else:
+            self.show(done, talk)
 
 
 def command(
     name: str,
     declared: Callable[..., Any],
     run: Callable[[Mapping[str, Any]], None],
-    more: Mapping[str, Any] | None = None,
+    more: Options | None = None,
+    most_used: tuple[str, ...] = (),
 ) -> Callable[..., None]:
     """Return the function of a command, with the signature of a declared function as Typer takes it.
 
-    ``more`` are options in the place of ``**options``. ``run`` gets the values of all.
+    ``more`` are options that the function lacks, as Typer takes them. ``run`` gets the values of all.
     """
     annotations: dict[str, tuple[Any, Any]] = {}
-    if each := one_of_many(declared):
-        argument = typer.Argument(metavar=each.metavar, help=each.help, show_default=False)
-        annotations[each.name] = Annotated[list[Path], argument], inspect.Parameter.empty
+    for parameter, about in arguments_of(declared).items():
+        default = inspect.signature(declared).parameters[parameter].default
+        annotations[about.name] = argument_annotation(about, hints_of(declared)[parameter], default)
     annotations |= {parameter.name: (annotation_of(parameter), parameter.default) for parameter in options_of(declared)}
     annotations |= dict(more or {})
     annotations |= {option: (hint, False) for option, hint in _OF_ALL.items()} | {"config": (common.Config, None)}
@@ -43,8 +149,24 @@ def command(
     call.__name__, call.__annotations__ = name, {n: hint for n, (hint, _) in annotations.items()}
     function: Any = common.one_line(call)
     function.settable = ()
-    function.help, function.most_used = help_of(declared), getattr(declared, "most_used", ())
+    function.help, function.most_used = help_of(declared), most_used or getattr(declared, "most_used", ())
     return function  # type: ignore[no-any-return]
+
+
+def as_typer(options: Options) -> dict[str, tuple[Any, Any]]:
+    """Return the annotations and defaults of options, as Typer takes them."""
+    parameters = [parameter_of(name, hint, default) for name, (hint, default) in options.items()]
+    return {parameter.name: (annotation_of(parameter), parameter.default) for parameter in parameters}
+
+
+def argument_annotation(about: Argument, hint: Any, default: Any) -> tuple[Any, Any]:
+    """Return the annotation and the default of an argument, as Typer takes them; ``hint`` is its type in Python."""
+    kind, many = (str, True) if about.words else on_command_line(bare(hint))
+    many = many or (isinstance(about, OneOfMany) and not about.is_one)
+    is_needed = default is inspect.Parameter.empty and not about.words
+    kind = list[kind] if many else kind  # type: ignore[valid-type]
+    argument = typer.Argument(metavar=about.metavar, help=about.text, show_default=about.shown)
+    return Annotated[kind if is_needed else kind | None, argument], default if is_needed else None
 
 
 def annotation_of(parameter: Parameter) -> Any:

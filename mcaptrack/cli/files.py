@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.cli import common
+from mcaptrack.cli.declared import PRINTED
 from mcaptrack.cli.many import EachLog
 from mcaptrack.cli.text import console, show
 from mcaptrack.location import Location
@@ -25,7 +26,7 @@ class Check(EachLog["LogCheck"]):
     """Check logs; the findings are printed at the end."""
 
     writes = False
-    more = common.PRINTED
+    more = PRINTED
 
     def show(self, log: Location, done: LogCheck, talk: common.Talk) -> None:
         """Print nothing yet."""
@@ -126,6 +127,12 @@ class Recover(EachLog["LogRecovery"]):
 
 class Drop(EachLog["DropResult"]):
     """Remove channels from logs."""
+
+    def logs(self) -> Sequence[NamedLog]:
+        """Return the logs: the command takes one name, since those of channels follow."""
+        from mcaptrack.fleet import find_logs
+
+        return find_logs([self.given["logs"]])
 
     def show(self, log: Location, done: DropResult, talk: common.Talk) -> None:
         """Print what was removed."""

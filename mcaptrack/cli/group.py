@@ -42,7 +42,7 @@ ENTRIES: Final = (
         "demo",
         _MAKE,
         "Draw a scene with known ground truth, run everything on it, and compare SORT with re-tracking.",
-        "demo:demo",
+        "demo:Demo",
     ),
     Listed("run", _RUN, "Run all stages that are missing or out of date, then events, views and tables.", "run:run"),
     Listed(
@@ -133,20 +133,20 @@ ENTRIES: Final = (
         "check",
         _KEEP,
         "Check every byte of a log: structure, checksums, indexes, statistics, order of messages.",
-        "files:check",
+        "files:Check",
         reads=True,
     ),
     Listed(
         "recover",
         _KEEP,
         "Save what is intact in a damaged log to LOG.recovered.mcap; the damaged log stays unchanged.",
-        "files:recover",
+        "files:Recover",
     ),
     Listed(
         "drop",
         _KEEP,
         "Remove channels from a log, in place or in a copy; all others stay unchanged, to the byte.",
-        "files:drop",
+        "files:Drop",
     ),
     Listed(
         "doctor",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,10 +22,9 @@ if TYPE_CHECKING:
 class Ingest(EachLog["IngestResult"]):
     """Make logs of videos, images, recordings and label files."""
 
-    @property
-    def names_output(self) -> bool:  # type: ignore[override]
-        """Whether each input has an output of its own: unless they are added to a log."""
-        return not self.given["into"]
+    def __init__(self, name: str, values: Mapping[str, Any]) -> None:
+        super().__init__(name, values)
+        self.names_output = not values["into"]
 
     def logs(self) -> Sequence[NamedLog]:
         """Return the inputs, each once, with the names of their logs."""

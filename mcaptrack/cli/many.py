@@ -6,7 +6,7 @@ import re
 import signal
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, Type
 
 import typer
 
-import mcaptrack
 from mcaptrack import SCHEMA_VERSION, notices
-from mcaptrack.api.declared import options_of
+from mcaptrack.api.declared import Option
+from mcaptrack.api.options import PathLike
 from mcaptrack.cli import common
-from mcaptrack.cli.declared import command
+from mcaptrack.cli.declared import Called, Options
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.text import is_json, print_line_of_json, printable, say, stdout_to_stderr
 from mcaptrack.errors import McaptrackError
@@ -43,86 +43,58 @@ class ManyOptions:
 
     jobs: Annotated[
         int | None,
-        common.option(
-            "--jobs",
-            panel=PANEL,
-            least=1,
-            most=1024,
-            help="Number of logs to process at the same time.",
-            show_default="1, or one for each thread of the cluster",
+        Option(
+            PANEL,
+            1,
+            1024,
+            help="Number of logs to process at the same time; by default 1, or one for each thread of the cluster.",
         ),
     ] = None
     scheduler: Annotated[
         str | None,
-        common.option(
-            "--scheduler",
-            panel=PANEL,
+        Option(
+            PANEL,
             metavar="ADDRESS",
-            help="Let the workers of a Dask cluster process the logs, by the address of its scheduler.",
-            show_default="processes on this machine",
+            help="Let the workers of a Dask cluster process the logs, by the address of its scheduler; by default "
+            "processes on this machine.",
         ),
     ] = None
-    keep_going: Annotated[
-        bool, common.option("--keep-going/--no-keep-going", panel=PANEL, help="Go on after a log that failed.")
-    ] = True
+    keep_going: Annotated[bool, Option(PANEL, help="Go on after a log that failed.")] = True
     output_dir: Annotated[
-        Path | None,
-        common.option(
-            "--output-dir",
-            panel=PANEL,
+        PathLike | None,
+        Option(
+            PANEL,
             metavar="FOLDER",
-            help="Write the results for each log to this folder, under its name.",
-            show_default="in or beside each log",
+            help="Write the results for each log to this folder, under its name; by default in or beside each log.",
         ),
     ] = None
     ledger: Annotated[
-        Path | None,
-        common.option(
-            "--ledger",
-            panel=PANEL,
+        PathLike | None,
+        Option(
+            PANEL,
             metavar="FILE",
-            help="Add a line of JSON to this file for each log and try, and skip logs that it says are done.",
-            show_default="none",
+            help="Add a line of JSON to this file for each log and try, and skip logs that it says are done; by "
+            "default none.",
         ),
     ] = None
     timeout: Annotated[
         str | None,
-        common.option(
-            "--timeout",
-            panel=PANEL,
-            metavar="TIME",
-            help="Give a log up after this time, such as 90s, 10m or 2h.",
-            show_default="none",
-        ),
+        Option(PANEL, metavar="TIME", help="Give a log up after this time, such as 90s, 10m or 2h; by default none."),
     ] = None
     memory_limit: Annotated[
         str | None,
-        common.option(
-            "--memory-limit",
-            panel=PANEL,
+        Option(
+            PANEL,
             metavar="SIZE",
-            help="End a worker if its resident memory exceeds this size, such as 2GB.",
-            show_default="none",
+            help="End a worker if its resident memory exceeds this size, such as 2GB; by default none.",
         ),
     ] = None
     tries: Annotated[
-        int,
-        common.option(
-            "--tries",
-            panel=PANEL,
-            least=1,
-            most=100,
-            help="How often a log is tried that kills its worker or exceeds a limit.",
-        ),
+        int, Option(PANEL, 1, 100, help="How often a log is tried that kills its worker or exceeds a limit.")
     ] = 2
-    json_lines: Annotated[
-        bool,
-        common.option(
-            "--json-lines",
-            panel=PANEL,
-            help="Print a line of JSON for each log as soon as it has ended.",
-        ),
-    ] = False
+    json_lines: Annotated[bool, Option(PANEL, help="Print a line of JSON for each log as soon as it has ended.")] = (
+        False
+    )
 
     @property
     def concern_one(self) -> bool:
@@ -145,22 +117,12 @@ class ManyOptions:
 NAMES: Final = tuple(field.name for field in fields(ManyOptions))
 
 
-def many_of(writes: bool) -> dict[str, tuple[Any, Any]]:
-    """Return the options for many logs, as Typer takes them, with their defaults; ``--output-dir`` if it ``writes``."""
-    hints = get_type_hints(ManyOptions, include_extras=True)
-    names = [name for name in NAMES if writes or name != "output_dir"]
-    return {name: (hints[name], getattr(ManyOptions, name)) for name in names}
+class EachLog(Called[T]):
+    """A command that calls its function with each log, here or in workers: ``function(log, output=..., **arguments)``.
 
-
-class EachLog(Generic[T]):
-    """A command that calls its function with each log, here or in workers, and prints what this returns.
-
-    ``given`` has the options of the call, ``many`` those for many logs. Subclasses say what is printed, and override
-    what differs.
+    ``many`` has the options for many logs.
     """
 
-    #: Options that the function has no use for.
-    more: ClassVar[Mapping[str, tuple[Any, Any]]] = {}
     #: Whether logs, or files beside them, are changed.
     writes: ClassVar = True
     #: Whether results are what is printed to stdout: one after the other, in the order of the logs.
@@ -170,22 +132,16 @@ class EachLog(Generic[T]):
     #: Whether each input always has an output of its own, by default in the working folder.
     names_output = False
 
-    def __init__(self, name: str, given: Mapping[str, Any]) -> None:
-        self.name, self.given = name, given
-        self.many = ManyOptions(**{option: given[option] for option in NAMES if option in given})
-
-    @property
-    def function(self) -> Callable[..., T]:
-        """The function, which is called as ``function(log, output=..., **arguments, progress=...)``, also elsewhere."""
-        function: Callable[..., T] = getattr(mcaptrack, self.name)
-        return function
+    def __init__(self, name: str, values: Mapping[str, Any]) -> None:
+        super().__init__(name, values)
+        self.many = ManyOptions(**{option: values[option] for option in NAMES if option in values})
 
     @classmethod
-    def function_of(cls, name: str) -> Callable[..., None]:
-        """Return the function of the command: with its options as Typer takes them."""
-        declared = getattr(mcaptrack, name)
-        names = [option.name for option in options_of(declared)]
-        return command(name, declared, lambda given: cls(name, given).run(names), {**cls.more, **many_of(cls.writes)})
+    def options(cls) -> Options:
+        """Return the options that the function has no use for: also those for many logs."""
+        hints = get_type_hints(ManyOptions, include_extras=True)
+        names = [name for name in NAMES if cls.writes or name != "output_dir"]
+        return {**cls.more, **{name: (hints[name], getattr(ManyOptions, name)) for name in names}}
 
     def logs(self) -> Sequence[NamedLog]:
         """Return the inputs."""
@@ -193,20 +149,12 @@ class EachLog(Generic[T]):
 
         return find_logs(self.given["logs"])
 
-    def arguments(self, names: Sequence[str]) -> dict[str, Any]:
-        """Return the arguments of the function, of these names."""
-        return {name: self.given[name] for name in names}
-
     def suffix(self) -> str:
         """Return the end of the names of outputs in ``--output-dir``."""
         return ".mcap"
 
     def line(self, done: T) -> str:
         """Return a result as a line of text."""
-        raise NotImplementedError
-
-    def data(self, done: T) -> dict[str, Any]:
-        """Return a result as values of JSON."""
         raise NotImplementedError
 
     def show(self, log: Location, done: T, talk: common.Talk) -> None:
@@ -222,8 +170,8 @@ class EachLog(Generic[T]):
         """Return the exit code."""
         return common.DONE
 
-    def run(self, names: Sequence[str]) -> None:
-        """Call the function with each log and its options, which have these names, and print what it returns."""
+    def run(self, names: Mapping[str, str]) -> None:
+        """Call the function with each log and its ``arguments``, and print what it returns."""
         with common.Talk(self.given["quiet"], self.given["verbose"]).open() as talk:
             logs, arguments = self.logs(), self.arguments(names)
             results, totals = self._process(logs, arguments, arguments.pop("output", None), talk)
