@@ -30,5 +30,7 @@ Point = Literal["foot", "center"]
 #: What a label file holds, and what an input that is a text file can hold.
 Role = Literal["detections", "tracks", "truth", "corrections"]
 InputRole: TypeAlias = Role | Literal["motion", "calibration"]
+#: How ground truth and tracks are matched.
+Similarity = Literal["iou", "metres", "bev-iou", "3d-iou"]
 #: Which tracks re-tracking writes.
 Mode = Literal["both", "offline", "online"]
