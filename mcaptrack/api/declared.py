@@ -62,6 +62,8 @@ class Option:
         What the help shows in place of the type, and of the default.
     names : callable or None
         Returns the values to complete.
+    commas : bool
+        Whether several values are one text on the command line, with commas between them.
     help : str
         What the parameter means, for functions whose docstrings don't say it.
     """
@@ -76,6 +78,7 @@ class Option:
     metavar: str | None = None
     shown: str | bool | None = None
     names: Callable[[], Sequence[str]] | None = None
+    commas: bool = False
     help: str = ""
 
     @property
@@ -203,6 +206,9 @@ def _flag(name: str, hint: Any) -> str:
 def parameter_of(name: str, hint: Any, default: Any, text: str = "") -> Parameter:
     """An option of a type, which ``Annotated`` says more about; ``text`` is its help, by default that of its type."""
     option, (kind, many) = option_of(hint), on_command_line(bare(hint))
+    if option.commas:
+        kind, many = str, False
+        default = ",".join(f"{value:g}" for value in default) if isinstance(default, tuple) else default
     text, shown = _split_default(text or option.help)
     flag, _, off = _flag(name, hint).partition("/")
     if kind is bool and (off or default is not False):
@@ -216,9 +222,11 @@ def on_command_line(hint: Any) -> tuple[Any, bool]:
     """The type of one value of an option, and whether it may have several.
 
     Python takes more than a command line can say: of ``str | Sequence[str]`` an option takes several texts, of
-    ``float | str | Fraction`` a text, of ``str | os.PathLike`` a path.
+    ``float | str | Fraction`` a text, of ``str | os.PathLike`` a path, of ``Mapping[str, float]`` texts such as a=1.
     """
     parts = _parts(hint)
+    if any(get_origin(part) is Mapping for part in parts) and str not in parts:
+        return str, True
     several = [get_args(part)[0] for part in parts if get_origin(part) is Sequence]
     if several:
         return on_command_line(several[0])[0], True

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from fractions import Fraction
 from typing import Annotated, Final
 
 from mcaptrack.api.declared import OneOfMany, Option, PythonOnly
+from mcaptrack.choices import Point
 
 PathLike = str | os.PathLike[str]
 #: Called with the name of a stage, the amount that is done, and the total (None if it is not known).
@@ -15,6 +17,7 @@ Progress = Callable[[str, float, float | None], None]
 #: Headings of options in the help.
 FILES: Final = "Input and output"
 LABELS: Final = "Label files"
+SCORES: Final = "Scores"
 
 _LOGS: Final = "Logs, folders of logs, patterns, or - for a list of logs on stdin."
 EachLog = Annotated[PathLike, OneOfMany("logs", "LOG", _LOGS, help="The log.")]
@@ -39,6 +42,24 @@ Sidecar = Annotated[
 ]
 Force = Annotated[bool, Option(FILES, help="Overwrite the output file if it exists.")]
 Reports = Annotated[Progress, PythonOnly("Called as ``progress(stage, done, total)``.")]
+GroundPlane = Annotated[
+    PathLike | None, Option(LABELS, help="File with a 3x3 homography from pixels to metres on the ground.")
+]
+PointOfBox = Annotated[Point, Option(LABELS, tuning=True, help="Which point of a box touches the ground.")]
+#: What a file in the working folder may give for frames per second.
+FPS_PATTERN: Final = r"[0-9]+([.][0-9]+)?(/[0-9]+)?"
+LabelFps = Annotated[
+    float | str | Fraction | None,
+    Option(
+        LABELS,
+        tuning=FPS_PATTERN,
+        help="Frames per second of label files, such as 25 or 30000/1001; by default as seqinfo.ini beside them says.",
+    ),
+]
+MinIou = Annotated[
+    float,
+    Option(SCORES, 0.001, 1, tuning=True, help="Least overlap (IoU) at which ground truth and a track match."),
+]
 #: The value of a transform's option.
 Value = float | int | bool | str | None
 
@@ -46,6 +67,21 @@ Value = float | int | bool | str | None
 def output(shown: str | bool = False) -> Option:
     """The option of an output; ``shown`` is its default in the help."""
     return Option(FILES, short="o", shown=shown, help="Write to this file; the log stays unchanged.")
+
+
+def similarity(shown: str) -> Option:
+    """The option of how ground truth and tracks are matched; ``shown`` is its default in the help."""
+    text = (
+        "How ground truth and tracks are matched: by overlap of boxes in pictures (iou), distance on the ground "
+        "(metres), or overlap of 3D boxes, seen from above (bev-iou) or in space (3d-iou)."
+    )
+    return Option(SCORES, tuning=True, shown=shown, help=text)
+
+
+def gate_m(shown: str | None = None) -> Option:
+    """The option of the largest distance of a match; ``shown`` is its default in the help."""
+    text = "Gate: largest distance in metres at which ground truth and a track match."
+    return Option(SCORES, 0.001, 1e6, tuning=True, shown=shown, help=text)
 
 
 Output = Annotated[PathLike | None, output()]

@@ -14,9 +14,7 @@ from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.api.running import Fusing, RunResult, Where, transform_of, transforms_of, work
 from mcaptrack.api.several import unfitting
-from mcaptrack.choices import CameraMotionUse
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.aligned import Similarity
 from mcaptrack.evaluation.events import EventOptions
 from mcaptrack.evaluation.zones import ZoneOptions
 from mcaptrack.files import publish_bytes, refuse_overwrite
