@@ -21,12 +21,15 @@ _PARTS = {
     "running": ["RunResult"],
     "scoring": ["Scores", "evaluate"],
     "reading": ["FetchedMessage"],
-    "stages": ["detect", "fuse", "motion", "predict", "retrack", "sample", "track"],
+    "fusing": ["fuse"],
+    "stages": ["detect", "motion", "predict", "retrack", "sample", "track"],
     "training": ["TrainResult", "train"],
     "tuning": ["TuneResult", "tune"],
     "upkeep": ["DropResult", "LogCheck", "LogRecovery", "check", "drop", "recover"],
     "viewing": ["LogServer", "view"],
-    "whole": ["draw_zones", "events", "run", "zones"],
+    "events": ["events"],
+    "whole": ["run"],
+    "zones": ["draw_zones", "zones"],
 }
 #: Where the names of the package are defined; each is imported when it is first used.
 _MODULES = {name: f"mcaptrack.api.{module}" for module, names in _PARTS.items() for name in names} | {

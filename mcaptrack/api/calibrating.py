@@ -5,13 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.common import Notes, as_location, clock_offsets, split_names, warn_unused, warnings_about
-from mcaptrack.api.declared import checked
-from mcaptrack.api.options import PathLike, Progress, no_progress
+from mcaptrack.api.declared import Option, declared
+from mcaptrack.api.options import (
+    Cameras,
+    ClockOffsets,
+    EachLog,
+    Force,
+    Output,
+    Reports,
+    Sidecar,
+    no_progress,
+)
 from mcaptrack.api.running import Where, change, warn_stale
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice
@@ -110,48 +119,44 @@ class CalibrateResult:
     seconds: float
 
 
-@checked()
+@declared(most_used=("reference", "cameras", "dry_run", "clock_offset_s", "output", "force"))
 def calibrate(
-    log: PathLike,
+    log: EachLog,
     *,
-    cameras: str | Sequence[str] | None = None,
-    reference: str | Sequence[str] | None = None,
-    clock_offset_s: Mapping[str, float] | None = None,
+    cameras: Cameras = None,
+    reference: Annotated[
+        str | Sequence[str] | None, Option(metavar="A,B", commas=True, shown="what most cameras agree on")
+    ] = None,
+    clock_offset_s: ClockOffsets = None,
     dry_run: bool = False,
-    output: PathLike | None = None,
-    sidecar: bool | None = None,
-    force: bool = False,
-    progress: Progress = no_progress,
+    output: Output = None,
+    sidecar: Sidecar = None,
+    force: Force = False,
+    progress: Reports = no_progress,
 ) -> CalibrateResult:
-    """Correct the ground planes of cameras by the people that they see together.
+    """Correct the ground planes of cameras that disagree with the others, by the people that they see together.
 
-    Each camera is compared with what the others agree on. The plane of one that is off is corrected by a shift, a
-    rotation, a scale, or more, as far as that holds at other times than those to which it was fitted. The plane that
-    was given stays in the log; the corrected one is used instead.
+    Each camera is compared with what the others agree on. If its feet stand elsewhere, its plane is corrected by a
+    shift, a rotation, a scale, or more, as far as that also holds at other times than those to which it was fitted;
+    those that agree stay as they are.
+
+    /CAMERA/ground_plane stays in the log, and the corrected plane in /CAMERA/ground_plane/refined is used instead:
+    `run` and `fuse` make again what was made before. `mcaptrack drop log.mcap /CAMERA/ground_plane/refined` takes it
+    back.
+
+    The log needs detections and a measured ground plane of each camera. Of two cameras ``reference`` names the right
+    one.
 
     Parameters
     ----------
-    log : path
-        The log, with detections and a measured ground plane of each camera, all of one place.
     cameras : str or sequence of str, optional
-        Names of the cameras to compare, also with commas between them; by default all that have what is needed.
+        Cameras to compare.
+
+        Also with commas between names. By default all that have detections and a measured ground plane.
     reference : str or sequence of str, optional
-        Cameras that are right: their planes stay, and the others are brought to them. By default what most cameras
-        agree on is right; with two cameras one has to be named.
-    clock_offset_s : mapping of str to float, optional
-        How many seconds the times of a camera are late, by its name; those of others are estimated from people who
-        walk.
+        Cameras that are right: the others are brought to them.
     dry_run : bool, default False
-        Only compare; nothing is written.
-    output : path, optional
-        Write to this file instead; the log stays unchanged.
-    sidecar : bool, optional
-        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
-        ROS tools read, otherwise into the log.
-    force : bool, default False
-        Overwrite ``output`` if it exists.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
+        Only compare; write nothing.
 
     Returns
     -------
@@ -166,6 +171,10 @@ def calibrate(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack calibrate log.mcap --dry-run
+
     >>> import mcaptrack
     >>> result = mcaptrack.calibrate("log.mcap", dry_run=True)  # doctest: +SKIP
     >>> result.cameras["left"].correction  # doctest: +SKIP

@@ -10,8 +10,8 @@ from typing import Any, Literal
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.common import as_location, warnings_about
-from mcaptrack.api.declared import checked
-from mcaptrack.api.options import PathLike
+from mcaptrack.api.declared import declared
+from mcaptrack.api.options import EachLog
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.transform_series import TransformSeries
 from mcaptrack.location import Location
@@ -177,18 +177,17 @@ class LogInfo:
         return out | {"channels": list(out["channels"]), "frames": None if self.frames is None else list(out["frames"])}
 
 
-@checked()
-def info(log: PathLike, *, frames: bool = False) -> LogInfo:
-    """Return the channels of a log, their number of messages, and what was made from what.
+@declared()
+def info(log: EachLog, *, frames: bool = False) -> LogInfo:
+    """Show the channels of a log, their number of messages, and what was made from what.
 
-    Reads the summary of the log only, unless ``frames`` asks for more.
+    Those of each camera are together, if there are several, under its name. Reads the summary only, unless ``frames``
+    asks for more. On the command line -v shows also the parameters that channels were made with.
 
     Parameters
     ----------
-    log : path
-        The log.
-    frames : bool
-        Whether to read the transforms between frames of reference, too, and list the frames.
+    frames : bool, default False
+        Also read the transforms between frames of reference, and draw the tree of frames.
 
     Returns
     -------
@@ -202,6 +201,12 @@ def info(log: PathLike, *, frames: bool = False) -> LogInfo:
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack info log.mcap
+
+        mcaptrack info robot.mcap --frames
+
     >>> import mcaptrack
     >>> made = {channel.topic: channel.transform for channel in mcaptrack.info("log.mcap").channels}
     >>> made["/camera/tracks"]

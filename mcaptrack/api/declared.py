@@ -209,13 +209,15 @@ def parameter_of(name: str, hint: Any, default: Any, text: str = "") -> Paramete
     if option.commas:
         kind, many = str, False
         default = ",".join(f"{value:g}" for value in default) if isinstance(default, tuple) else default
-    text, shown = _split_default(text or option.help)
+    text, shown = (text or option.help).partition("\n\n")[0], option.shown
+    if shown is None:
+        text, shown = _split_default(text)
     flag, _, off = _flag(name, hint).partition("/")
     if kind is bool and (off or default is not False):
         off = f"--{off or f'no-{flag[2:]}'}"
         text = text.replace("(True)", f"({flag})").replace("(False)", f"({off})")
     names = (f"{flag}/{off}" if off else flag, *([f"-{option.short}"] if option.short else []))
-    return Parameter(name, kind, many, names, default, option, text, shown if option.shown is None else option.shown)
+    return Parameter(name, kind, many, names, default, option, text, shown)
 
 
 def on_command_line(hint: Any) -> tuple[Any, bool]:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 from mcaptrack.api.declared import OneOfMany, Option, PythonOnly
 from mcaptrack.choices import Point
+
+if TYPE_CHECKING:
+    from mcaptrack.registry import Kind
 
 PathLike = str | os.PathLike[str]
 #: Called with the name of a stage, the amount that is done, and the total (None if it is not known).
@@ -56,9 +59,16 @@ LabelFps = Annotated[
         help="Frames per second of label files, such as 25 or 30000/1001; by default as seqinfo.ini beside them says.",
     ),
 ]
-MinIou = Annotated[
-    float,
-    Option(SCORES, 0.001, 1, tuning=True, help="Least overlap (IoU) at which ground truth and a track match."),
+#: What files in the working folder may give for a detector, tracker or so on: built-in or installed ones.
+PLUGIN: Final = r"[A-Za-z0-9_-]+"
+Cameras = Annotated[str | Sequence[str] | None, Option(metavar="A,B", commas=True, shown="all with a ground plane")]
+ClockOffsets = Annotated[
+    Mapping[str, float] | None,
+    Option(
+        metavar="CAMERA=SECONDS",
+        shown="estimated from people who walk",
+        help="How many seconds the times of a camera are late, as in front=0.3; 0 for none.",
+    ),
 ]
 #: The value of a transform's option.
 Value = float | int | bool | str | None
@@ -84,7 +94,25 @@ def gate_m(shown: str | None = None) -> Option:
     return Option(SCORES, 0.001, 1e6, tuning=True, shown=shown, help=text)
 
 
+def min_iou(shown: str | None = None) -> Option:
+    """The option of the least overlap of a match; ``shown`` is its default in the help."""
+    text = "Least overlap (IoU) at which ground truth and a track match."
+    return Option(SCORES, 0.001, 1, tuning=True, shown=shown, help=text)
+
+
+def chooser(kind: Kind, intro: str = "The {kind} to use", panel: str = "", shown: str | None = None) -> Option:
+    """The option that chooses a detector, tracker or so on of the registry by name; ``shown`` is its default."""
+    from mcaptrack.registry import BUILT_IN, names
+
+    text = (
+        f"{intro.format(kind=kind)}: {', '.join(BUILT_IN[kind])}, one of an installed package, or module:Class.\n\n"
+        "Or a transform."
+    )
+    return Option(panel, tuning=PLUGIN, metavar="NAME", shown=shown, names=lambda: names(kind), help=text)
+
+
 Output = Annotated[PathLike | None, output()]
+MinIou = Annotated[float, min_iou()]
 
 
 def no_progress(stage: str, done: float, total: float | None) -> None:

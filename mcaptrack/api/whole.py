@@ -1,281 +1,150 @@
-"""Run all stages on a log, and write events of tracks."""
+"""Run all stages on a log."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
-from pathlib import Path
-from typing import Any, Final
+from collections.abc import Callable, Collection, Sequence
+from typing import Annotated, Final
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.common import as_location, as_path, log_location, names_of, optional_path, split_names, warn_unused
-from mcaptrack.api.declared import checked
-from mcaptrack.api.options import PathLike, Progress, no_progress
+from mcaptrack.api.common import as_location, split_names
+from mcaptrack.api.declared import PYTHON_ONLY, Option, declared
+from mcaptrack.api.options import (
+    FILES,
+    EachLog,
+    Force,
+    Frame,
+    Output,
+    PathLike,
+    Reports,
+    Sidecar,
+    Topic,
+    chooser,
+    no_progress,
+)
 from mcaptrack.api.running import Fusing, RunResult, Where, transform_of, transforms_of, work
 from mcaptrack.api.several import unfitting
+from mcaptrack.api.stages import Stages
+from mcaptrack.api.zones import ZonesLike, zones_of
+from mcaptrack.choices import CameraMotionUse
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.events import EventOptions
 from mcaptrack.evaluation.zones import ZoneOptions
-from mcaptrack.files import publish_bytes, refuse_overwrite
-from mcaptrack.geometry.zones import Zone
-from mcaptrack.location import Location, local_name
+from mcaptrack.location import Location
 from mcaptrack.pipeline import Job, PlaneChoice, Watch, ZoneWatch
-from mcaptrack.sources.zones import parse_zones, read_zones
 from mcaptrack.transforms import FUSION, STAGES, Transform
-from mcaptrack.viewing.zones_page import zones_page
+from mcaptrack.transforms.motion_limits import LIMITS_PATTERN
 
-# Count visits of zones and crossings of lines.
-
-
-_PAGE: Final = ".zones.html"
-
-#: Zones and lines: a file of GeoJSON, or its content.
-ZonesLike = PathLike | Mapping[str, Any]
+#: Headings in the help.
+_AFTER: Final = "After the stages"
+_CLASSES: Final = "Classes of objects"
+_SEVERAL: Final = "Several cameras"
+_AGAIN: Final = "Use this {kind}, also where another one was used before"
 
 
-def zones_of(source: ZonesLike | None) -> tuple[Zone, ...]:
-    """Return the zones of a file, or of GeoJSON; none of None. Raises McaptrackError if they can't be read."""
-    if source is None:
-        return ()
-    if isinstance(source, Mapping):
-        try:
-            return parse_zones(dict(source))
-        except McaptrackError as error:
-            raise McaptrackError(f"`zones=`: {error}") from None
-    return read_zones(as_path(source))
-
-
-@checked(margin_m=(0, 100), max_gap_s=(0, 1e6))
-def zones(
-    log: PathLike,
-    *,
-    zones: ZonesLike | None = None,
-    topic: str | Sequence[str] | None = None,
-    margin_m: float | None = None,
-    max_gap_s: float | None = None,
-    camera: str | None = None,
-    output: PathLike | None = None,
-    sidecar: bool | None = None,
-    force: bool = False,
-    progress: Progress = no_progress,
-) -> RunResult:
-    """Count visits of zones and crossings of lines by the tracks of a log, and write them into the log.
-
-    Parameters
-    ----------
-    log : path
-        The log.
-    zones : path or mapping, optional
-        A file of GeoJSON, or its content: Polygons are zones, LineStrings are lines, in "units" of "metres" or
-        "pixels". By default those that the log was counted with before.
-    topic : str or sequence of str, optional
-        Count these channels of tracks. By default /camera/tracks, the re-tracked tracks at the rate of the video,
-        /camera/truth, and those that were counted before.
-    margin_m : float, optional
-        A track changes sides where it is farther than this from an edge, so that noise at the edge counts once; by
-        default 0.25, at most half of what a narrow zone has room for.
-    max_gap_s : float, optional
-        A track that is not seen for longer ends its visit; by default 4.
-    camera : str, optional
-        Name of the camera, if the log has several.
-    output : path, optional
-        Write to this file instead; the log stays unchanged.
-    sidecar : bool, optional
-        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
-        ROS tools read, otherwise into the log.
-    force : bool, default False
-        Count again also what is up to date, and overwrite ``output`` if it exists.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
-
-    Returns
-    -------
-    RunResult
-        What was made; ``zones`` has the totals by the topic of the tracks.
-
-    Raises
-    ------
-    McaptrackError
-        If the log or the zones cannot be read, if there are no tracks, or none with positions in the units of a zone.
-
-    Examples
-    --------
-    >>> import mcaptrack
-    >>> square = [[-2, -2], [2, -2], [2, 2], [-2, 2], [-2, -2]]
-    >>> geometry = {"type": "Polygon", "coordinates": [square], "units": "metres"}
-    >>> result = mcaptrack.zones("log.mcap", zones=geometry)
-    >>> [total.zone for total in result.zones["/camera/tracks"]]
-    ['zone 1']
-
-    """
-    wanted, usual = zones_of(zones), ZoneOptions()
-    options = None
-    if margin_m is not None or max_gap_s is not None:
-        changed = {"margin_m": margin_m, "max_gap_s": max_gap_s}
-        options = ZoneOptions(
-            **{name: getattr(usual, name) if value is None else value for name, value in changed.items()}
-        )
-    elif zones is not None:
-        options = usual
-
-    def plan(opened: logs.Log, prefix: str, *_: object) -> list[Job]:
-        if not wanted and not pipeline.counted_zones(opened, prefix):
-            raise McaptrackError(f"{opened.path} was not counted yet; give a file of GeoJSON with `zones=`")
-        return []
-
-    watch = ZoneWatch(wanted, names_of(topic), options, force)
-    return work(Where(log, camera, None, output, sidecar, force), plan, None, progress, None, zones=watch)
-
-
-@checked()
-def draw_zones(
-    log: PathLike,
-    *,
-    camera: str | None = None,
-    output: PathLike | None = None,
-    force: bool = False,
-) -> Path:
-    """Write a page on which zones and lines are drawn in a browser, over a picture of the scene.
-
-    The page needs no other file and no network. It downloads the zones as GeoJSON, in pixels of the picture; or in
-    metres where the log has no pictures, over the places of its tracks.
-
-    Parameters
-    ----------
-    log : path
-        The log.
-    camera : str, optional
-        Name of the camera, if the log has several.
-    output : path, optional
-        Write to this file; by default LOG.zones.html beside the log.
-    force : bool, default False
-        Overwrite the page if it exists.
-
-    Returns
-    -------
-    pathlib.Path
-        The page.
-
-    Raises
-    ------
-    McaptrackError
-        If the log cannot be read, or has neither pictures nor tracks.
-
-    Examples
-    --------
-    >>> import mcaptrack
-    >>> mcaptrack.draw_zones("log.mcap").name
-    'log.zones.html'
-
-    """
-    path = log_location(log)
-    page = optional_path(output) or local_name(path, _PAGE)
-    if page.suffix.lower() not in (".html", ".htm"):
-        raise McaptrackError(f"{page} is not a name for a page; give one that ends with .html")
-    refuse_overwrite(page, force)
-    with logs.read(path) as opened:
-        prefix = pipeline.find_camera(opened, camera)
-        content = zones_page(opened, prefix, f"{path.stem}.geojson")
-    publish_bytes(page, content.encode())
-    return page
-
-
-@checked(person_height_m=(0.1, 10))
+@declared(
+    most_used=("output", "topic", "camera", "detector", "tracker", "retracker", "predictor", "zones", "force"),
+)
 def run(
-    log: PathLike,
+    log: EachLog,
     *,
-    topic: str | None = None,
-    camera: str | Sequence[str] | None = None,
-    frame: str | None = None,
-    output: PathLike | None = None,
-    sidecar: bool | None = None,
-    events: bool | EventOptions = True,
-    tables: bool = True,
-    zones: ZonesLike | None = None,
-    fuse: bool = True,
-    force: bool = False,
-    fuser: str | Transform | None = None,
-    detector: str | Transform | None = None,
-    tracker: str | Transform | None = None,
-    retracker: str | Transform | None = None,
-    predictor: str | Transform | None = None,
-    camera_motion: CameraMotionUse | None = None,
-    across_classes: bool | None = None,
-    class_limits: str | None = None,
-    fit_plane: bool | None = None,
-    person_height_m: float | None = None,
-    ground_frame: str | None = None,
-    stages: Mapping[str, str | Transform] | None = None,
-    follows: PathLike | Sequence[PathLike] | None = None,
-    progress: Progress = no_progress,
+    topic: Topic = None,
+    camera: Annotated[str | Sequence[str] | None, Option(FILES, metavar="A,B", commas=True, shown="all")] = None,
+    frame: Frame = None,
+    output: Output = None,
+    sidecar: Sidecar = None,
+    events: Annotated[bool | EventOptions, Option(_AFTER)] = True,
+    tables: Annotated[bool, Option(_AFTER)] = True,
+    zones: Annotated[ZonesLike | None, Option(_AFTER, metavar="FILE", shown="those that were counted before")] = None,
+    fuse: Annotated[bool, Option(_SEVERAL, tuning=True)] = True,
+    force: Force = False,
+    fuser: Annotated[str | Transform | None, chooser("fuser", _AGAIN, _SEVERAL, shown="as before, or feet")] = None,
+    detector: Annotated[str | Transform | None, chooser("detector", _AGAIN, shown="as before, or median")] = None,
+    tracker: Annotated[
+        str | Transform | None, chooser("tracker", _AGAIN, shown="as before, or one that suits the detections")
+    ] = None,
+    retracker: Annotated[str | Transform | None, chooser("retracker", _AGAIN, shown="as before, or likelihood")] = None,
+    predictor: Annotated[str | Transform | None, chooser("predictor", _AGAIN, shown="as before, or red")] = None,
+    camera_motion: Annotated[CameraMotionUse | None, Option(tuning=True, shown="auto")] = None,
+    across_classes: Annotated[
+        bool | None, Option(_CLASSES, tuning=True, flag="across-classes/within-classes", shown="within")
+    ] = None,
+    class_limits: Annotated[str | None, Option(_CLASSES, tuning=LIMITS_PATTERN, shown="a table")] = None,
+    fit_plane: Annotated[bool | None, Option(tuning=True, shown="estimate")] = None,
+    person_height_m: Annotated[float | None, Option("", 0.1, 10, tuning=True, shown="1.7")] = None,
+    ground_frame: Annotated[str | None, Option(shown="the fixed frame")] = None,
+    stages: Stages = None,
+    follows: Annotated[PathLike | Sequence[PathLike] | None, PYTHON_ONLY] = None,
+    progress: Reports = no_progress,
 ) -> RunResult:
-    """Run all stages that are missing or out of date, then write events, views, layouts and tables.
+    """Run all stages that are missing or out of date, then events, views and tables.
 
-    Of a log with several cameras all are run, one after the other. Those that have a measured ground plane are then
-    fused to a scene, as ``fuse`` does, and the scene is run, too.
+    From /camera/video (or the detections, tracks or samples that the log has) to /camera/predictions and
+    /camera/retracks; then events (see `mcaptrack events`), views, and Parquet tables beside the log. ``topic`` starts
+    with the pictures, or the boxes, of that channel. Channels that are up to date are kept; those that are out of date
+    are made again with the options that they had. ``force`` makes all again; on the command line with the parameters
+    that environment and config files set now, otherwise with those they had. Zones of ``zones`` are counted in later
+    runs, too.
 
-    Channels that are up to date stay as they are; those that are out of date are made again with the options that
-    they had.
+    All cameras of a log are run, one after the other. Those with a measured ground plane are fused to /world, as
+    `mcaptrack fuse` does, and this scene is run, too.
 
     Parameters
     ----------
-    log : path
-        The log.
     topic : str, optional
         Begin with the pictures, or the detections, of this channel.
     camera : str or sequence of str, optional
-        Names of the cameras to run, also with commas between them; by default all that have pictures or boxes. One
-        name runs this camera, or this scene, alone.
-    frame : str, optional
-        Bring boxes in space (3D) to this frame. By default as before, or to the root of the tree of frames, such as
-        map.
-    output : path, optional
-        Write to this file instead; the log stays unchanged.
-    sidecar : bool, optional
-        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
-        ROS tools read, otherwise into the log.
+        Which cameras, if the log has several; one alone is not fused.
+
+        Also with commas between names. By default all that have pictures or boxes.
     events : bool or EventOptions, default True
-        Write events of tracks and errors of predictions, and how tracks are matched with the ground truth for them.
+        Write events and scores of identities, as `mcaptrack events` does.
+
+        Or how tracks are matched with the ground truth for them.
     tables : bool, default True
         Write Parquet tables beside the log.
     zones : path or mapping, optional
-        Count visits of zones and crossings of lines, of a file of GeoJSON, or of its content (see ``zones``). By
-        default those that the log was counted with before, if any.
+        Count visits of zones and crossings of lines, as `mcaptrack zones` does.
+
+        Of a file of GeoJSON, or of its content. By default those that the log was counted with before, if any.
     fuse : bool, default True
-        Whether several cameras with measured ground planes are fused to a scene, ``/world``, and scenes that were made
-        before are brought up to date.
+        Fuse several cameras with measured ground planes to a scene, as `mcaptrack fuse` does.
+
+        Scenes that were made before are brought up to date.
     force : bool, default False
-        Run everything again, and overwrite ``output`` if it exists.
-    fuser : str or Transform, optional
-        Fuse cameras by this one, also where another one was used before: a name, or a transform, as for ``fuse``.
-    detector, tracker, retracker, predictor : str or Transform, optional
-        Use this one, also where another one was used before: a built-in name, the name of an installed one,
-        "module:Class", or a transform.
+        Run everything again, and replace the output file if it exists.
     camera_motion : {"auto", "on", "off"}, optional
-        Whether tracks are compensated for the motion of the camera: if it moves or has cuts, also if it only shakes,
-        or never. By default as before, and "auto" where there are no tracks yet.
+        Compensate tracks for the motion of the camera: if it moves or has cuts (auto), also if it only shakes (on), or
+        never (off); also where it was done otherwise before.
+
+        By default as before, and "auto" where there are no tracks yet.
     across_classes : bool, optional
-        Whether a track may continue with a detection, and after re-tracking with a track, of another class. By default
-        as before, and False where there are no tracks yet.
+        Let a track continue with a detection, and after re-tracking with a track, of another class.
+
+        By default as before, and False where there are no tracks yet.
     class_limits : str, optional
-        Limits of the motion of classes instead of those of the table, for all stages: NAME=SPEED:DRIFT:NOISE:GATE with
-        commas between several, as in "car=40,pedestrian=4::0.1". By default as before.
+        Limits of the motion of a class in all stages: NAME=SPEED:DRIFT:NOISE:GATE in m/s, m/s within a second, m and m,
+        as in car=40,pedestrian=4::0.1.
+
+        By default as before, or those of the table.
     fit_plane : bool, optional
-        Whether to estimate the ground plane from the boxes of a learned detector where none is given. By default as
-        before, and True where there is none yet.
+        Where no ground plane is given, estimate one from the boxes of a learned detector.
+
+        By default as before, and True where there is none yet.
     person_height_m : float, optional
-        Mean height of people in metres, for a ground plane that is not given. By default as before, or 1.7.
+        Mean height of people in metres, for a ground plane that is not given.
+
+        By default as before, or 1.7.
     ground_frame : str, optional
-        Frame of reference with the ground as z = 0, for a camera on a robot that has a calibration and transforms. By
-        default as before, or the fixed frame.
+        Frame with the ground as z = 0, for a camera of a robot with a calibration and transforms.
+
+        By default as before, or the fixed frame.
     stages : mapping of str to str or Transform, optional
         Transforms, or their names, by stage, for channels that are missing; with ``force`` also for those that exist.
     follows : path or sequence of path, optional
         The log before this one, of the same camera: people who are in the picture at the cut keep their ids, and others
         get ids that it doesn't have. Of several logs, in order, it is the one before this one.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
 
     Returns
     -------
@@ -289,6 +158,10 @@ def run(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack run log.mcap
+
     >>> import mcaptrack
     >>> from mcaptrack.transforms import ByteTrack
     >>> result = mcaptrack.run("log.mcap", output="done.mcap", tracker=ByteTrack(max_age_s=1.0))
@@ -346,73 +219,3 @@ def _log_before(log: Location, follows: PathLike | Sequence[PathLike] | None) ->
     if before is not None and before == log:
         raise McaptrackError(f"{log} can't follow itself; `follows=` is the log before it")
     return before
-
-
-@checked(gate_m=(0.001, 1e6), min_iou=(0.001, 1))
-def events(
-    log: PathLike,
-    *,
-    topic: str | Sequence[str] | None = None,
-    similarity: Similarity | None = None,
-    gate_m: float | None = None,
-    min_iou: float | None = None,
-    camera: str | None = None,
-    output: PathLike | None = None,
-    sidecar: bool | None = None,
-    force: bool = False,
-    progress: Progress = no_progress,
-) -> RunResult:
-    """Write events of tracks (begin, end, identity switches) and errors of predictions into a log.
-
-    Parameters
-    ----------
-    log : path
-        The log.
-    topic : str or sequence of str, optional
-        Write events of these channels of tracks. By default of /camera/tracks and /camera/retracks, with the errors
-        of predictions.
-    similarity : {"iou", "metres", "bev-iou", "3d-iou"}, optional
-        How ground truth and tracks are matched: by overlap of boxes or by distance on the ground. By default by
-        overlap where tracks are at the video's rate, otherwise by distance.
-    gate_m : float, optional
-        Largest distance of a match in metres, by default 1.
-    min_iou : float, optional
-        Least overlap of a match, by default 0.5.
-    camera : str, optional
-        Name of the camera, if the log has several.
-    output : path, optional
-        Write to this file instead; the log stays unchanged.
-    sidecar : bool, optional
-        Write into LOG.results.mcap beside the log (True) or into the log (False).
-    force : bool, default False
-        Overwrite ``output`` if it exists.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
-
-    Returns
-    -------
-    RunResult
-        What was made: ``events`` has the number of events of each kind.
-
-    Raises
-    ------
-    McaptrackError
-        If the log cannot be read or written, or has no tracks.
-
-    Examples
-    --------
-    >>> import mcaptrack
-    >>> result = mcaptrack.events("log.mcap", similarity="metres", gate_m=0.5)
-    >>> sorted(result.events)
-    ['/camera/retracks', '/camera/tracks']
-
-    """
-
-    def plan(*_: object) -> list[Job]:
-        if similarity is not None:
-            unused = {"min_iou": min_iou is not None} if similarity == "metres" else {"gate_m": gate_m is not None}
-            warn_unused(f"ground truth and tracks are compared by {similarity}", **unused)
-        return []
-
-    watch = Watch(EventOptions(similarity, gate_m, min_iou), topics=names_of(topic), again=True)
-    return work(Where(log, camera, None, output, sidecar, force), plan, watch, progress, None)

@@ -44,7 +44,9 @@ ENTRIES: Final = (
         "Draw a scene with known ground truth, run everything on it, and compare SORT with re-tracking.",
         "demo:Demo",
     ),
-    Listed("run", _RUN, "Run all stages that are missing or out of date, then events, views and tables.", "run:run"),
+    Listed(
+        "run", _RUN, "Run all stages that are missing or out of date, then events, views and tables.", "running:Run"
+    ),
     Listed(
         "detect",
         _RUN,
@@ -60,7 +62,7 @@ ENTRIES: Final = (
         "fuse",
         _RUN,
         "Fuse the detections of several cameras with one ground to detections of the whole scene.",
-        "fuse:fuse",
+        "running:Fuse",
     ),
     Listed(
         "models",
@@ -72,7 +74,7 @@ ENTRIES: Final = (
         "info",
         _LOOK,
         "Show the channels of a log, their number of messages, and what was made from what.",
-        "show:info",
+        "show:Info",
         reads=True,
     ),
     Listed(
@@ -105,7 +107,7 @@ ENTRIES: Final = (
         "export",
         _LOOK,
         "Write a log as tables (Parquet), one row per object and frame, as a ROS 2 bag, or for other programs.",
-        "show:export",
+        "show:Export",
     ),
     Listed("docs", _LOOK, "List the pages of the documentation, or print one.", "docs:docs", reads=True),
     Listed("evaluate", _MEASURE, "Score tracks and predictions against ground truth.", "evaluate:evaluate", reads=True),
@@ -113,19 +115,19 @@ ENTRIES: Final = (
         "events",
         _MEASURE,
         "Write events of tracks (begin, end, identity switches) and errors of predictions into the log.",
-        "events:events",
+        "running:Events",
     ),
     Listed(
         "zones",
         _MEASURE,
         "Count visits of zones and crossings of lines by the tracks of a log, and write them into the log.",
-        "zones:zones",
+        "zones:Zones",
     ),
     Listed(
         "calibrate",
         _MEASURE,
         "Correct the ground planes of cameras that disagree with the others, by the people that they see together.",
-        "calibrate:calibrate",
+        "calibrate:Calibrate",
     ),
     Listed("tune", _MEASURE, "Find the settings of a stage that score best against ground truth.", "tune:tune"),
     Listed("train", _MEASURE, "Train a predictor on tracks of people, or on synthetic walks.", "train:train"),
