@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from fractions import Fraction
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 from mcaptrack.api.declared import OneOfMany, Option, PythonOnly
 from mcaptrack.choices import Point
+
+if TYPE_CHECKING:
+    from mcaptrack.registry import Kind
 
 PathLike = str | os.PathLike[str]
 #: Called with the name of a stage, the amount that is done, and the total (None if it is not known).
@@ -19,8 +22,9 @@ FILES: Final = "Input and output"
 LABELS: Final = "Label files"
 SCORES: Final = "Scores"
 
-_LOGS: Final = "Logs, folders of logs, patterns, or - for a list of logs on stdin."
-EachLog = Annotated[PathLike, OneOfMany("logs", "LOG", _LOGS, help="The log.")]
+#: Help of an argument that names logs.
+LOGS: Final = "Logs, folders of logs, patterns, or - for a list of logs on stdin."
+EachLog = Annotated[PathLike, OneOfMany("logs", "LOG", LOGS, help="The log.")]
 Camera = Annotated[str | None, Option(FILES, help="Which camera, if the log has several.")]
 Topic = Annotated[str | None, Option(FILES, help="Read this channel instead of the usual one.")]
 To = Annotated[str | None, Option(FILES, help="Write to this channel instead of the usual one.")]
@@ -60,11 +64,13 @@ MinIou = Annotated[
     float,
     Option(SCORES, 0.001, 1, tuning=True, help="Least overlap (IoU) at which ground truth and a track match."),
 ]
+#: Names that files in the working folder may give: built-in or installed ones, but not ``module:Class``.
+NAME_PATTERN: Final = r"[A-Za-z0-9_-]+"
 #: The value of a transform's option.
 Value = float | int | bool | str | None
 
 
-def output(shown: str | bool = False) -> Option:
+def output(shown: str | None = None) -> Option:
     """The option of an output; ``shown`` is its default in the help."""
     return Option(FILES, short="o", shown=shown, help="Write to this file; the log stays unchanged.")
 
@@ -82,6 +88,24 @@ def gate_m(shown: str | None = None) -> Option:
     """The option of the largest distance of a match; ``shown`` is its default in the help."""
     text = "Gate: largest distance in metres at which ground truth and a track match."
     return Option(SCORES, 0.001, 1e6, tuning=True, shown=shown, help=text)
+
+
+def chooser(kind: Kind, intro: str = "The {kind} to use", panel: str = "", shown: str = "") -> Option:
+    """The option that chooses a detector, tracker or so on by its name in the registry.
+
+    ``shown`` is its default in the help, by default that of the registry.
+    """
+    from mcaptrack.registry import BUILT_IN, names
+
+    built_in = BUILT_IN[kind]
+    return Option(
+        panel,
+        tuning=NAME_PATTERN,
+        metavar="NAME",
+        shown=shown or next(iter(built_in)),
+        names=lambda: names(kind),
+        help=f"{intro.format(kind=kind)}: {', '.join(built_in)}, one of an installed package, or module:Class.",
+    )
 
 
 Output = Annotated[PathLike | None, output()]

@@ -217,7 +217,7 @@ def argument_annotation(about: Argument, hint: Any, default: Any) -> tuple[Any, 
 def annotation_of(parameter: Parameter) -> Any:
     """Return the annotation of an option, as Typer takes it."""
     about = parameter.option
-    settings: dict[str, Any] = {"help": parameter.help, "metavar": about.metavar}
+    settings: dict[str, Any] = {"help": parameter.help, "metavar": about.metavar, "case_sensitive": False}
     if parameter.shown is not None:
         settings["show_default"] = parameter.shown
     if about.names is not None:

@@ -66,7 +66,7 @@ ENTRIES: Final = (
         "models",
         _RUN,
         "List the learned detectors of the catalogue, or fetch the weights of one, once.",
-        "models:models",
+        "models:Models",
     ),
     Listed(
         "info",
@@ -79,7 +79,7 @@ ENTRIES: Final = (
         "view",
         _LOOK,
         "Serve a log to this machine's browser, and print links that open it in Lichtblick and Foxglove.",
-        "view:view",
+        "view:View",
         reads=True,
     ),
     Listed(
@@ -92,7 +92,7 @@ ENTRIES: Final = (
         "report",
         _LOOK,
         "Write one page about a log, or several: scores, forecasts, tracks over the scene, identity switches, lineage.",
-        "report:report",
+        "report:Report",
     ),
     Listed(
         "query",
@@ -127,8 +127,8 @@ ENTRIES: Final = (
         "Correct the ground planes of cameras that disagree with the others, by the people that they see together.",
         "calibrate:calibrate",
     ),
-    Listed("tune", _MEASURE, "Find the settings of a stage that score best against ground truth.", "tune:tune"),
-    Listed("train", _MEASURE, "Train a predictor on tracks of people, or on synthetic walks.", "train:train"),
+    Listed("tune", _MEASURE, "Find the settings of a stage that score best against ground truth.", "tune:Tune"),
+    Listed("train", _MEASURE, "Train a predictor on tracks of people, or on synthetic walks.", "train:Train"),
     Listed(
         "check",
         _KEEP,
@@ -153,7 +153,7 @@ ENTRIES: Final = (
         _KEEP,
         "Print what this installation has: versions, codecs, memory, folders, plug-ins, and what may be done with "
         "a store.",
-        "doctor:doctor",
+        "doctor:Doctor",
         reads=True,
     ),
 )
