@@ -172,10 +172,10 @@ def about(hint: Any) -> tuple[Any, ...]:
     return get_args(hint)[1:] if get_origin(hint) is Annotated else ()
 
 
-def argument_of(function: Callable[..., Any]) -> tuple[str, Argument] | None:
-    """The parameter that the command takes by its place, with the facts about it; None without one."""
+def arguments_of(function: Callable[..., Any]) -> dict[str, Argument]:
+    """The parameters that the command takes by their place, in order."""
     pairs = ((name, part) for name, hint in hints_of(function).items() for part in about(hint))
-    return next(((name, part) for name, part in pairs if isinstance(part, Argument)), None)
+    return {name: part for name, part in pairs if isinstance(part, Argument)}
 
 
 def options_of(function: Callable[..., Any]) -> list[Parameter]:

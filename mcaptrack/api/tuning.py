@@ -108,7 +108,7 @@ def tune(
     trials: Annotated[int, Option(_SEARCH, 1, 1_000_000, tuning=True)] = 100,
     search: Annotated[Search | None, Option(_SEARCH, tuning=r"[A-Za-z0-9_-]+(=[0-9.eE+-]+:[0-9.eE+-]+)?")] = None,
     seed: Annotated[int, Option(_SEARCH, 0, 2**31 - 1, tuning=True)] = 0,
-    study: Annotated[PathLike | None, Option(FILES, shown="beside -o")] = None,
+    study: Annotated[PathLike | None, Option(FILES, shown="beside the file of settings")] = None,
     similarity: Annotated[Similarity | None, similarity("iou; metres after track")] = None,
     gate_m: Annotated[float, gate_m()] = 1.0,
     min_iou: MinIou = 0.5,

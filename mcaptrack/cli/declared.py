@@ -12,8 +12,9 @@ import mcaptrack
 from mcaptrack.api.declared import (
     Argument,
     OneOfMany,
+    Option,
     Parameter,
-    argument_of,
+    arguments_of,
     bare,
     hints_of,
     on_command_line,
@@ -22,6 +23,7 @@ from mcaptrack.api.declared import (
     with_dashes,
     words_of,
 )
+from mcaptrack.api.options import FILES, Force, PathLike
 from mcaptrack.cli import common
 from mcaptrack.cli.many import LogWork, process, takes_many
 from mcaptrack.cli.text import stdout_to_stderr
@@ -36,6 +38,14 @@ _OF_ALL: dict[str, Any] = {"json": common.Json, "quiet": common.Quiet, "verbose"
 
 #: Options by name: their types, which ``Annotated[..., Option(...)]`` says more about, and their defaults.
 Options = Mapping[str, tuple[Any, Any]]
+#: Options of commands whose results are what is printed to stdout: the file to write them to.
+PRINTED: Options = {
+    "output": (
+        Annotated[PathLike | None, Option(FILES, short="o", help="Write to this file instead of stdout.")],
+        None,
+    ),
+    "force": (Force, False),
+}
 
 
 class Called(Generic[T]):
@@ -52,46 +62,47 @@ class Called(Generic[T]):
     def __init__(self, name: str, values: Mapping[str, Any]) -> None:
         self.name, self.given = name, values
 
+    @classmethod
+    def declaration(cls, name: str) -> Callable[..., T]:
+        """Return the function that declares the command: that of its name in the library."""
+        function: Callable[..., T] = getattr(mcaptrack, name)
+        return function
+
     @property
     def function(self) -> Callable[..., T]:
-        """The function. It is looked up when the command runs."""
-        function: Callable[..., T] = getattr(mcaptrack, self.name)
-        return function
+        """The function that is called. It is looked up when the command runs."""
+        return self.declaration(self.name)
+
+    @classmethod
+    def options(cls) -> Options:
+        """Return the options that the function has no use for."""
+        return cls.more
 
     @classmethod
     def function_of(cls, name: str) -> Callable[..., None]:
         """Return the function of the command: with its options as Typer takes them."""
-        declared = getattr(mcaptrack, name)
-        names = [option.name for option in options_of(declared)]
-        more = [parameter_of(option, hint, default) for option, (hint, default) in cls.more.items()]
+        declared = cls.declaration(name)
+        names = {option.name: option.name for option in options_of(declared)}
+        placed = arguments_of(declared).items()
+        names |= {parameter: about.name for parameter, about in placed if not isinstance(about, OneOfMany)}
+        more = as_typer(cls.options())
+        return command(name, declared, lambda given: cls(name, given).run(names), more, cls.most_used)
 
-        def run(values: Mapping[str, Any]) -> None:
-            cls(name, values).run(names)
-
-        options = {option.name: (annotation_of(option), option.default) for option in more}
-        return command(name, declared, run, options, cls.most_used)
-
-    def arguments(self, names: Sequence[str]) -> dict[str, Any]:
-        """Return the arguments of the function, of these names."""
-        return {name: self.given[name] for name in names}
+    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
+        """Return the arguments of the function; ``names`` has the name on the command line of each."""
+        return {parameter: self.given[name] for parameter, name in names.items()}
 
     def data(self, done: T) -> dict[str, Any]:
         """Return a result as values of JSON."""
         raise NotImplementedError
 
-    def run(self, names: Sequence[str]) -> None:
-        """Call the function with its options, which have these names, and print what it returns."""
+    def run(self, names: Mapping[str, str]) -> None:
+        """Call the function with its ``arguments``, and print what it returns."""
         raise NotImplementedError
 
 
 class Once(Called[T]):
     """A command that calls its function once."""
-
-    def arguments(self, names: Sequence[str]) -> dict[str, Any]:
-        """Return the arguments of the function: the options of these names, and what the command takes by its place."""
-        placed = argument_of(self.function)
-        by_place = {placed[0]: self.given[placed[1].name]} if placed else {}
-        return by_place | super().arguments(names)
 
     def show(self, done: T, talk: common.Talk) -> None:
         """Print the result for people."""
@@ -101,8 +112,8 @@ class Once(Called[T]):
         """Return the exit code."""
         return common.DONE
 
-    def run(self, names: Sequence[str]) -> None:
-        """Call the function with its options, which have these names, and print what it returns."""
+    def run(self, names: Mapping[str, str]) -> None:
+        """Call the function with its ``arguments``, and print what it returns."""
         with common.Talk(self.given["quiet"], self.given["verbose"]).open() as talk:
             arguments = self.arguments(names)
             with stdout_to_stderr():
@@ -147,11 +158,11 @@ class EachLog(Called[T]):
         """Return the exit code."""
         return common.DONE
 
-    def run(self, names: Sequence[str]) -> None:
-        """Call the function with each log and its options, which have these names, and print what it returns."""
+    def run(self, names: Mapping[str, str]) -> None:
+        """Call the function with each log and its ``arguments``, and print what it returns."""
         values = self.given
         with common.Talk(values["quiet"], values["verbose"]).open() as talk:
-            logs, arguments = self.logs(), self.arguments([option for option in names if option != "output"])
+            logs, arguments = self.logs(), self.arguments({name: name for name in names if name != "output"})
             work: LogWork[T] = LogWork(
                 self.name,
                 self.function,
@@ -181,9 +192,7 @@ def command(
     ``more`` are options that the function lacks, as Typer takes them. ``run`` gets the values of all.
     """
     annotations: dict[str, tuple[Any, Any]] = {}
-    placed = argument_of(declared)
-    if placed is not None:
-        parameter, about = placed
+    for parameter, about in arguments_of(declared).items():
         default = inspect.signature(declared).parameters[parameter].default
         annotations[about.name] = argument_annotation(about, hints_of(declared)[parameter], default)
     annotations |= {parameter.name: (annotation_of(parameter), parameter.default) for parameter in options_of(declared)}
@@ -198,11 +207,17 @@ def command(
         [inspect.Parameter(n, keyword, default=default, annotation=hint) for n, (hint, default) in annotations.items()]
     )
     call.__name__, call.__annotations__ = name, {n: hint for n, (hint, _) in annotations.items()}
-    is_each = placed is not None and isinstance(placed[1], OneOfMany)
+    is_each = any(isinstance(about, OneOfMany) for about in arguments_of(declared).values())
     function: Any = common.one_line(takes_many()(call) if is_each else call)
     function.settable = ()
     function.help, function.most_used = help_of(declared), most_used or getattr(declared, "most_used", ())
     return function  # type: ignore[no-any-return]
+
+
+def as_typer(options: Options) -> dict[str, tuple[Any, Any]]:
+    """Return the annotations and defaults of options, as Typer takes them."""
+    parameters = [parameter_of(name, hint, default) for name, (hint, default) in options.items()]
+    return {parameter.name: (annotation_of(parameter), parameter.default) for parameter in parameters}
 
 
 def argument_annotation(about: Argument, hint: Any, default: Any) -> tuple[Any, Any]:

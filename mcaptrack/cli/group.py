@@ -98,7 +98,7 @@ ENTRIES: Final = (
         "query",
         _LOOK,
         "Query the tables of logs in SQL: where people were, how fast, for how long, and how well they were tracked.",
-        "query:query",
+        "query:Query",
         reads=True,
     ),
     Listed(
@@ -107,8 +107,8 @@ ENTRIES: Final = (
         "Write a log as tables (Parquet), one row per object and frame, as a ROS 2 bag, or for other programs.",
         "show:export",
     ),
-    Listed("docs", _LOOK, "List the pages of the documentation, or print one.", "docs:docs", reads=True),
-    Listed("evaluate", _MEASURE, "Score tracks and predictions against ground truth.", "evaluate:evaluate", reads=True),
+    Listed("docs", _LOOK, "List the pages of the documentation, or print one.", "docs:Docs", reads=True),
+    Listed("evaluate", _MEASURE, "Score tracks and predictions against ground truth.", "evaluate:Evaluate", reads=True),
     Listed(
         "events",
         _MEASURE,

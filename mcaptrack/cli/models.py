@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -29,7 +29,7 @@ class Models(Once[tuple[Model, ...] | Path]):
         """The function: another one fetches."""
         return mcaptrack.get_model if self.given["words"] else mcaptrack.models
 
-    def arguments(self, names: Sequence[str]) -> dict[str, Any]:
+    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
         """Return the arguments of the function: the model to fetch, if there is one, and from where."""
         words, source = self.given["words"] or [], self.given["source"]
         if not words and source is not None:

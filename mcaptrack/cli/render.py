@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from mcaptrack.api.rendering import default_suffix
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class Render(EachLog["RenderResult"]):
     """Draw the annotated video."""
 
-    def arguments(self, names: Sequence[str]) -> dict[str, Any]:
+    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
         """Return the arguments; in ``--output-dir`` the name of the output says what is written."""
         arguments = super().arguments(names)
         return arguments | {"gif": arguments["gif"] and many_options().output_dir is None}

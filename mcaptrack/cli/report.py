@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from mcaptrack.cli import common
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 class Report(Once["ReportResult"]):
     """Write one HTML page about logs."""
 
-    def arguments(self, names: Sequence[str]) -> dict[str, Any]:
+    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
         """Return the arguments of the function: patterns and folders become logs."""
         return super().arguments(names) | {"log": expand(self.given["logs"], folders=True)}
 

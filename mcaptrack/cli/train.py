@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -30,7 +30,7 @@ _KINDS: Final = {"clean": "as they are", "noisy": "with 0.2 m of noise"}
 class Train(Once["TrainResult"]):
     """Train a predictor on tracks or on synthetic walks."""
 
-    def arguments(self, names: Sequence[str]) -> dict[str, Any]:
+    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
         """Return the arguments of the function: patterns and folders become files."""
         from mcaptrack.training.sources import SYNTHETIC
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 
@@ -36,7 +36,7 @@ class Tune(Once["TuneResult"]):
         super().__init__(name, values)
         self._has_tracker = STAGES[values["stage"]].default.reads is DETECTIONS
 
-    def arguments(self, names: Sequence[str]) -> dict[str, Any]:
+    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
         """Return the arguments of the function: patterns become files, texts become ranges."""
         given, output = self.given, self.given["output"]
         read_toml(output)  # a file that can't be edited is refused before the search
