@@ -64,8 +64,8 @@ MinIou = Annotated[
     float,
     Option(SCORES, 0.001, 1, tuning=True, help="Least overlap (IoU) at which ground truth and a track match."),
 ]
-#: Names that files in the working folder may give: built-in or installed ones, but not ``module:Class``.
-NAME_PATTERN: Final = r"[A-Za-z0-9_-]+"
+#: What files in the working folder may give for a detector, tracker or so on: built-in or installed ones.
+PLUGIN: Final = r"[A-Za-z0-9_-]+"
 #: The value of a transform's option.
 Value = float | int | bool | str | None
 
@@ -90,22 +90,15 @@ def gate_m(shown: str | None = None) -> Option:
     return Option(SCORES, 0.001, 1e6, tuning=True, shown=shown, help=text)
 
 
-def chooser(kind: Kind, intro: str = "The {kind} to use", panel: str = "", shown: str = "") -> Option:
-    """The option that chooses a detector, tracker or so on by its name in the registry.
-
-    ``shown`` is its default in the help, by default that of the registry.
-    """
+def chooser(kind: Kind, intro: str = "The {kind} to use", panel: str = "", shown: str | None = None) -> Option:
+    """The option that chooses a detector, tracker or so on of the registry by name; ``shown`` is its default."""
     from mcaptrack.registry import BUILT_IN, names
 
-    built_in = BUILT_IN[kind]
-    return Option(
-        panel,
-        tuning=NAME_PATTERN,
-        metavar="NAME",
-        shown=shown or next(iter(built_in)),
-        names=lambda: names(kind),
-        help=f"{intro.format(kind=kind)}: {', '.join(built_in)}, one of an installed package, or module:Class.",
+    text = (
+        f"{intro.format(kind=kind)}: {', '.join(BUILT_IN[kind])}, one of an installed package, or module:Class.\n\n"
+        "Or a transform."
     )
+    return Option(panel, tuning=PLUGIN, metavar="NAME", shown=shown, names=lambda: names(kind), help=text)
 
 
 Output = Annotated[PathLike | None, output()]

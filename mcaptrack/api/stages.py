@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.common import Notes, clock_offsets, split_names
-from mcaptrack.api.declared import PYTHON_ONLY, Option, checked, declared
+from mcaptrack.api.declared import PYTHON_ONLY, Option, PythonOnly, checked, declared
 from mcaptrack.api.options import (
     Camera,
     EachLog,
@@ -23,6 +24,7 @@ from mcaptrack.api.options import (
     To,
     Topic,
     Value,
+    chooser,
     no_progress,
 )
 from mcaptrack.api.running import RunResult, Where, change, transform_of
@@ -40,15 +42,18 @@ if TYPE_CHECKING:
 # Run a stage that reads pictures: detect, motion.
 
 
-#: Transforms of other stages, for channels that are missing.
-Stages = Annotated[Mapping[str, str | Transform] | None, PYTHON_ONLY]
+#: Transforms of other stages.
+Stages = Annotated[
+    Mapping[str, str | Transform] | None,
+    PythonOnly("Transforms, or their names, by stage, for channels that are missing and have to be made first."),
+]
 
 
 @declared(most_used=("detector", "threshold", "classes", "min_score", "output", "topic", "to", "camera", "force"))
 def detect(
     log: EachLog,
     *,
-    detector: str | Transform | None = None,
+    detector: Annotated[str | Transform | None, chooser("detector")] = None,
     topic: Topic = None,
     to: To = None,
     camera: Camera = None,
@@ -61,30 +66,10 @@ def detect(
 ) -> RunResult:
     """Detect what moves in the video of a log.
 
+    Reads /camera/video, writes /camera/detections.
+
     Parameters
     ----------
-    log : path
-        The log.
-    detector : str or Transform, optional
-        "median" (the default), "knn", "onnx:FILE", "yolox-nano" or another name that
-        `models` lists, the name of an installed detector, "module:Class", or a transform.
-    topic : str, optional
-        Read this channel instead of the usual one, /camera/video.
-    to : str, optional
-        Write to this channel instead of the usual one, /camera/detections.
-    camera : str, optional
-        Name of the camera, if the log has several.
-    output : path, optional
-        Write to this file instead; the log stays unchanged.
-    sidecar : bool, optional
-        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
-        ROS tools read, otherwise into the log.
-    force : bool, default False
-        Overwrite ``output`` if it exists.
-    stages : mapping of str to str or Transform, optional
-        Transforms, or their names, by stage, for channels that are missing and have to be made first.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
     **options
         Options of the detector; `mcaptrack detect --help` lists them.
 
@@ -111,19 +96,8 @@ def detect(
     """
     from mcaptrack.api.running import run_stage, transform_of
 
-    return run_stage(
-        "detect",
-        transform_of("detect", detector, options),
-        log,
-        topic=topic,
-        to=to,
-        camera=camera,
-        output=output,
-        sidecar=sidecar,
-        force=force,
-        stages=stages,
-        progress=progress,
-    )
+    chosen = transform_of("detect", detector, options)
+    return run_stage("detect", chosen, log, topic, to, camera, output, sidecar, force, stages, progress)
 
 
 @declared(most_used=("output", "topic", "to", "camera", "force"))
@@ -143,32 +117,13 @@ def motion(
 ) -> RunResult:
     """Estimate how the camera moves, from picture to picture.
 
-    Trackers move their predictions by it. ``run`` estimates it where it is needed: for boxes of a detector that takes
-    any camera.
+    Reads /camera/video, writes /camera/motion. Trackers move their predictions by it. ``run`` estimates it where it is
+    needed: for boxes of a detector that takes any camera.
 
     Parameters
     ----------
-    log : path
-        The log.
     transform : Transform, optional
         The transform to use instead of ``mcaptrack.transforms.EstimateMotion``.
-    topic : str, optional
-        Read this channel instead of the usual one, /camera/video.
-    to : str, optional
-        Write to this channel instead of the usual one, /camera/motion.
-    camera : str, optional
-        Name of the camera, if the log has several.
-    output : path, optional
-        Write to this file instead; the log stays unchanged.
-    sidecar : bool, optional
-        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
-        ROS tools read, otherwise into the log.
-    force : bool, default False
-        Overwrite ``output`` if it exists.
-    stages : mapping of str to str or Transform, optional
-        Transforms, or their names, by stage, for channels that are missing and have to be made first.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
     **options
         Options such as ``mask_boxes``; `mcaptrack motion --help` lists them.
 
@@ -195,26 +150,15 @@ def motion(
     """
     from mcaptrack.api.running import run_stage, transform_of
 
-    return run_stage(
-        "motion",
-        transform_of("motion", transform, options),
-        log,
-        topic=topic,
-        to=to,
-        camera=camera,
-        output=output,
-        sidecar=sidecar,
-        force=force,
-        stages=stages,
-        progress=progress,
-    )
+    chosen = transform_of("motion", transform, options)
+    return run_stage("motion", chosen, log, topic, to, camera, output, sidecar, force, stages, progress)
 
 
 @declared(most_used=("tracker", "max_age_s", "min_hits_s", "min_iou", "min_score", "output", "topic", "to", "force"))
 def track(
     log: EachLog,
     *,
-    tracker: str | Transform | None = None,
+    tracker: Annotated[str | Transform | None, chooser("tracker")] = None,
     topic: Topic = None,
     to: To = None,
     camera: Camera = None,
@@ -228,33 +172,13 @@ def track(
 ) -> RunResult:
     """Track detections: give each object an id that it keeps from frame to frame.
 
+    Reads /camera/detections, writes /camera/tracks.
+
     Parameters
     ----------
-    log : path
-        The log.
     tracker : str or Transform, optional
         "sort" (the default), "bytetrack" or "ocsort" for boxes in pictures, "ground" (the default for these) for boxes
-        in space, the name of an installed tracker, "module:Class", or a
-        transform.
-    topic : str, optional
-        Read this channel instead of the usual one, /camera/detections.
-    to : str, optional
-        Write to this channel instead of the usual one, /camera/tracks.
-    camera : str, optional
-        Name of the camera, if the log has several.
-    frame : str, optional
-        Bring boxes in space (3D) to this frame, such as map; by default to the root of the tree of frames.
-    output : path, optional
-        Write to this file instead; the log stays unchanged.
-    sidecar : bool, optional
-        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
-        ROS tools read, otherwise into the log.
-    force : bool, default False
-        Overwrite ``output`` if it exists.
-    stages : mapping of str to str or Transform, optional
-        Transforms, or their names, by stage, for channels that are missing and have to be made first.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
+        in space, the name of an installed tracker, "module:Class", or a transform.
     **options
         Options of the tracker, such as ``max_age_s``; `mcaptrack track --help` lists them.
 
@@ -282,20 +206,10 @@ def track(
     """
     from mcaptrack.api.running import run_stage, transform_of
 
+    chosen = None if tracker is None else transform_of("track", tracker, options)
+    make = partial(transform_of, "track", options=options)
     return run_stage(
-        "track",
-        None if tracker is None else transform_of("track", tracker, options),
-        log,
-        make=lambda name: transform_of("track", name, options),
-        frame=frame,
-        topic=topic,
-        to=to,
-        camera=camera,
-        output=output,
-        sidecar=sidecar,
-        force=force,
-        stages=stages,
-        progress=progress,
+        "track", chosen, log, topic, to, camera, output, sidecar, force, stages, progress, frame=frame, make=make
     )
 
 
@@ -316,29 +230,12 @@ def sample(
 ) -> RunResult:
     """Resample tracks to a fixed rate and project them to the ground plane.
 
+    Reads /camera/tracks, writes /camera/samples.
+
     Parameters
     ----------
-    log : path
-        The log.
     transform : Transform, optional
         The transform to use instead of ``mcaptrack.transforms.Sample``.
-    topic : str, optional
-        Read this channel instead of the usual one, /camera/tracks.
-    to : str, optional
-        Write to this channel instead of the usual one, /camera/samples.
-    camera : str, optional
-        Name of the camera, if the log has several.
-    output : path, optional
-        Write to this file instead; the log stays unchanged.
-    sidecar : bool, optional
-        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
-        ROS tools read, otherwise into the log.
-    force : bool, default False
-        Overwrite ``output`` if it exists.
-    stages : mapping of str to str or Transform, optional
-        Transforms, or their names, by stage, for channels that are missing and have to be made first.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
     **options
         Options such as ``rate_hz``; `mcaptrack sample --help` lists them.
 
@@ -365,19 +262,8 @@ def sample(
     """
     from mcaptrack.api.running import run_stage, transform_of
 
-    return run_stage(
-        "sample",
-        transform_of("sample", transform, options),
-        log,
-        topic=topic,
-        to=to,
-        camera=camera,
-        output=output,
-        sidecar=sidecar,
-        force=force,
-        stages=stages,
-        progress=progress,
-    )
+    chosen = transform_of("sample", transform, options)
+    return run_stage("sample", chosen, log, topic, to, camera, output, sidecar, force, stages, progress)
 
 
 @declared(most_used=("predictor", "horizon_s", "min_history", "output", "topic", "to", "camera", "force"))
@@ -397,30 +283,13 @@ def predict(
 ) -> RunResult:
     """Predict the future positions of tracks, with covariance.
 
+    Reads /camera/samples, writes /camera/predictions.
+
     Parameters
     ----------
-    log : path
-        The log.
     predictor : str or Transform, optional
         "red" (the default), "social" (looks at other people), "kalman", "holt-cv", "cv", "lstm" (less exact than "cv"),
         "red:FILE", "onnx:FILE", the name of an installed predictor, or "module:Class"; or a transform.
-    topic : str, optional
-        Read this channel instead of the usual one, /camera/samples.
-    to : str, optional
-        Write to this channel instead of the usual one, /camera/predictions.
-    camera : str, optional
-        Name of the camera, if the log has several.
-    output : path, optional
-        Write to this file instead; the log stays unchanged.
-    sidecar : bool, optional
-        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
-        ROS tools read, otherwise into the log.
-    force : bool, default False
-        Overwrite ``output`` if it exists.
-    stages : mapping of str to str or Transform, optional
-        Transforms, or their names, by stage, for channels that are missing and have to be made first.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
     **options
         Options such as ``horizon_s``; `mcaptrack predict --help` lists them.
 
@@ -447,26 +316,15 @@ def predict(
     """
     from mcaptrack.api.running import run_stage, transform_of
 
-    return run_stage(
-        "predict",
-        transform_of("predict", predictor, options),
-        log,
-        topic=topic,
-        to=to,
-        camera=camera,
-        output=output,
-        sidecar=sidecar,
-        force=force,
-        stages=stages,
-        progress=progress,
-    )
+    chosen = transform_of("predict", predictor, options)
+    return run_stage("predict", chosen, log, topic, to, camera, output, sidecar, force, stages, progress)
 
 
 @declared(most_used=("profile", "mode", "retracker", "predictor", "max_age_s", "output", "topic", "to", "force"))
 def retrack(
     log: EachLog,
     *,
-    retracker: str | Transform | None = None,
+    retracker: Annotated[str | Transform | None, chooser("retracker")] = None,
     profile: Annotated[Literal["default", "paper", "authors"] | None, Option(tuning=True, shown="default")] = None,
     mode: Annotated[Mode, Option(tuning=True)] = "both",
     topic: Topic = None,
@@ -481,35 +339,16 @@ def retrack(
 ) -> RunResult:
     """Re-track by prediction: link and repair tracks, and leave out false ones.
 
+    Reads /camera/samples, writes /camera/retracks.
+
     Parameters
     ----------
-    log : path
-        The log.
-    retracker : str or Transform, optional
-        "likelihood" (the default), "consistency", the name of an installed re-tracker, "module:Class", or a transform.
     profile : {"default", "paper", "authors"}, optional
         Values of all parameters: mcaptrack's own (default), the paper's, or those of its authors' program.
 
         They name the re-tracker, too. The paper is Yu and Zhou, IROS 2021.
     mode : {"both", "offline", "online"}, default "both"
         Write tracks that use the whole log (offline), the past alone (online), or both.
-    topic : str, optional
-        Read this channel instead of the usual one, /camera/samples.
-    to : str, optional
-        Write to this channel instead of the usual one, /camera/retracks.
-    camera : str, optional
-        Name of the camera, if the log has several.
-    output : path, optional
-        Write to this file instead; the log stays unchanged.
-    sidecar : bool, optional
-        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
-        ROS tools read, otherwise into the log.
-    force : bool, default False
-        Overwrite ``output`` if it exists.
-    stages : mapping of str to str or Transform, optional
-        Transforms, or their names, by stage, for channels that are missing and have to be made first.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
     **options
         Options that differ from the profile; `mcaptrack retrack --help` lists them.
 
@@ -541,20 +380,8 @@ def retrack(
         raise McaptrackError(f"the profile {profile} names a retracker; give one of them")
     if retracker is None:
         retracker = PROFILES[profile or "default"]
-    return run_stage(
-        "retrack",
-        transform_of("retrack", retracker, options),
-        log,
-        mode=mode,
-        topic=topic,
-        to=to,
-        camera=camera,
-        output=output,
-        sidecar=sidecar,
-        force=force,
-        stages=stages,
-        progress=progress,
-    )
+    chosen = transform_of("retrack", retracker, options)
+    return run_stage("retrack", chosen, log, topic, to, camera, output, sidecar, force, stages, progress, mode=mode)
 
 
 # Fuse the detections of several cameras.

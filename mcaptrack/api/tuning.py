@@ -103,7 +103,7 @@ def tune(
     *,
     truth: Annotated[PathLike | Sequence[PathLike] | None, Option(LABELS, shown=False)] = None,
     stage: Annotated[TunedStage, Option(_SEARCH, tuning=True)] = "track",
-    tracker: Annotated[str | Transform | None, chooser("tracker", "The {kind} to tune", _SEARCH)] = None,
+    tracker: Annotated[str | Transform | None, chooser("tracker", "The {kind} to tune", _SEARCH, "sort")] = None,
     metric: Annotated[Metric, Option(SCORES, tuning=True)] = "IDF1",
     trials: Annotated[int, Option(_SEARCH, 1, 1_000_000, tuning=True)] = 100,
     search: Annotated[Search | None, Option(_SEARCH, tuning=r"[A-Za-z0-9_-]+(=[0-9.eE+-]+:[0-9.eE+-]+)?")] = None,
