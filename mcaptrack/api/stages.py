@@ -64,9 +64,9 @@ def detect(
     progress: Reports = no_progress,
     **options: Value,
 ) -> RunResult:
-    """Detect what moves in the video of a log.
+    """Detect people in the video of a log: whoever moves, or what a network finds.
 
-    Reads /camera/video, writes /camera/detections.
+    Reads /camera/video, writes /camera/detections: one box for each person or object.
 
     Parameters
     ----------
@@ -117,8 +117,9 @@ def motion(
 ) -> RunResult:
     """Estimate how the camera moves, from picture to picture.
 
-    Reads /camera/video, writes /camera/motion. Trackers move their predictions by it. ``run`` estimates it where it is
-    needed: for boxes of a detector that takes any camera.
+    Reads /camera/video, writes /camera/motion: one row per picture, with the transform from the picture before, the one
+    to a reference picture, and whether the camera is still, shaking or moving. Trackers move their predictions by it.
+    ``run`` estimates it where it is needed: for boxes of a detector that takes any camera.
 
     Parameters
     ----------
@@ -170,9 +171,10 @@ def track(
     progress: Reports = no_progress,
     **options: Value,
 ) -> RunResult:
-    """Track detections: give each object an id that it keeps from frame to frame.
+    """Track detections: give each person an id that stays the same from frame to frame.
 
-    Reads /camera/detections, writes /camera/tracks.
+    Reads /camera/detections, writes /camera/tracks: one row per frame for each person who is tracked and detected in
+    it. Inputs that are missing are made first.
 
     Parameters
     ----------
@@ -228,9 +230,10 @@ def sample(
     progress: Reports = no_progress,
     **options: Value,
 ) -> RunResult:
-    """Resample tracks to a fixed rate and project them to the ground plane.
+    """Resample tracks to a fixed rate, in metres on the ground.
 
-    Reads /camera/tracks, writes /camera/samples.
+    Reads /camera/tracks, writes /camera/samples: one row per person and sample time; ``observed`` is false where a gap
+    was interpolated. Inputs that are missing are made first.
 
     Parameters
     ----------
@@ -281,9 +284,10 @@ def predict(
     progress: Reports = no_progress,
     **options: Value,
 ) -> RunResult:
-    """Predict the future positions of tracks, with covariance.
+    """Predict where tracked people will be, with covariance.
 
-    Reads /camera/samples, writes /camera/predictions.
+    Reads /camera/samples, writes /camera/predictions: one row per track and future step, for tracks with enough past
+    positions. Inputs that are missing are made first.
 
     Parameters
     ----------
@@ -337,9 +341,11 @@ def retrack(
     progress: Reports = no_progress,
     **options: Value,
 ) -> RunResult:
-    """Re-track by prediction: link and repair tracks, and leave out false ones.
+    """Repair tracks by prediction: link the parts of one, split mixed ones, and leave out false ones.
 
-    Reads /camera/samples, writes /camera/retracks.
+    Reads /camera/samples, writes /camera/retracks: tracks that use the whole log (offline), tracks that use the past
+    alone (online), predictions from the latter, and what was decided offline, with how likely each decision is right.
+    Inputs that are missing are made first.
 
     Parameters
     ----------
