@@ -56,7 +56,7 @@ class TestHelp:
     @pytest.mark.parametrize("width", one_in(2, ["80", "120"]))
     def test_names_of_options_are_not_cut_at_any_width(self, command, width, monkeypatch):
         monkeypatch.setenv("COLUMNS", width)
-        words = set(call(command, "--help").out.split())
+        words = set(call(command, "--help-all").out.split())
         assert {name for option in shown(command) for name in (*option.opts, *option.secondary_opts)} <= words
 
     @EVERY_COMMAND
@@ -75,16 +75,17 @@ class TestHelp:
 
     def test_parameters_of_transforms_are_shown_with_their_defaults(self, monkeypatch):
         monkeypatch.setenv("COLUMNS", "160")
-        words = call("track", "--help").out
+        words = call("track", "--help-all").out
         for option, default in (("--max-age-s", "1.4"), ("--min-iou", "0.2"), ("--min-hits-frames", "none")):
             assert option in words
             assert f"[default: ({default})]" in words
 
     @pytest.mark.parametrize("stage", STAGES)
-    def test_the_help_of_a_stage_begins_with_what_its_transforms_do(self, stage):
+    def test_the_help_of_a_stage_says_what_its_transforms_do(self, stage):
         words = COMMANDS[stage].help
-        for transform in STAGES[stage].built_in().values():
-            assert inspect.getdoc(transform).partition("\n\n")[0] in words
+        for name, transform in STAGES[stage].built_in().items() if STAGES[stage].kind else ():
+            first, _, _ = inspect.getdoc(transform).partition("\n\n")
+            assert f"- `{name}`: {' '.join(first.split())}" in words
 
     @EVERY_COMMAND
     def test_options_are_grouped_below_headings(self, command):
@@ -102,7 +103,7 @@ class TestHelp:
         choices = {"detector", "tracker", "retracker", "predictor", "output", "topic", "force", "truth", "profile"}
         if len(own) > 9:
             assert choices & set(own) <= set(first)
-            words = call(command, "--help").out
+            words = call(command, "--help-all").out
             names = [max(option.opts, key=len) for option in shown(command)]
             assert words.index(FIRST_PANEL) < min(words.index(f" {name} ") for name in names[len(first) :])
 
@@ -118,7 +119,19 @@ class TestHelp:
             ["--verbose", "-v"],
             ["--config"],
             ["--log-format"],
+            ["--help-all"],
         ]
+
+    @EVERY_COMMAND
+    def test_help_is_two_screens_that_name_what_else_there_is(self, command, monkeypatch):
+        monkeypatch.setenv("COLUMNS", "80")
+        words, first = call(command, "--help").out, COMMANDS[command].most_used
+        assert words.count("\n") <= 90
+        names = {max(option.opts, key=len): option for option in shown(command)}
+        panels = (FIRST_PANEL, LAST_PANELS[-1])
+        left_out = {name for name, option in names.items() if first and option.rich_help_panel not in panels}
+        assert {name for name in names if name not in words.split()} == left_out
+        assert (f"--help-all lists {len(left_out)} more options" in " ".join(words.split())) == bool(left_out)
 
     def test_options_for_many_logs_are_the_same_in_all_commands_that_take_a_log(self):
         def many(command: str) -> list[tuple[list[str], str]]:

@@ -233,11 +233,11 @@ def test_results_beside_a_log_are_recovered_by_themselves(folder, monkeypatch):
     Path("x.results.mcap").write_bytes(b"no log")
     found: list[str] = []
 
-    def process(logs: list[Any], *_: Any) -> None:
+    def run(_: Any, logs: list[Any], *__: Any, **___: Any) -> None:
         found.extend(str(one.path) for one in logs)
         raise Stop("stop")
 
-    monkeypatch.setattr("mcaptrack.cli.files.process", process)
+    monkeypatch.setattr("mcaptrack.fleet.run", run)
     call("recover", "*.mcap")
     assert found == ["x.mcap", "x.results.mcap"]
 

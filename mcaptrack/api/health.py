@@ -13,10 +13,11 @@ from dataclasses import asdict, dataclass
 from importlib import metadata
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 from uuid import uuid4
 
 from mcaptrack import __version__, log, objects
+from mcaptrack.api.declared import Argument, declared
 from mcaptrack.environment import CONTROL_GROUPS, THREADS, cache_folder, control_groups, share_of_cores
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import SCHEMES, Url, hide_secrets, parse
@@ -342,17 +343,23 @@ class DoctorResult:
         return data | {"temporary_folder": str(folder) if folder else None, "cache_folder": str(self.cache_folder)}
 
 
-def doctor(store: str | None = None) -> DoctorResult:
-    """Find out what this installation has, and whether a plain run would work.
+@declared()
+def doctor(
+    store: Annotated[
+        str | None, Argument("store", "STORE", "A bucket or prefix to try, such as s3://robots/night.")
+    ] = None,
+) -> DoctorResult:
+    """Print what this installation has: versions, codecs, memory, folders, plug-ins, and what may be done with a store.
 
     Pictures are encoded and decoded, a table is written, and a log is written to the temporary folder and read back.
-    The network is used for ``store`` only.
+    The network is used for a store only: objects are listed there, and a small hidden one is written, read, replaced
+    and removed. The exit code is 0 if all that a plain run needs is there, and 1 otherwise, with one line for each
+    fault.
 
     Parameters
     ----------
     store : str, optional
-        The URL of a bucket or prefix in a store, such as "s3://robots/night". Objects are listed there; a small hidden
-        one is written, read, replaced and removed.
+        The URL of a bucket or prefix in a store, such as "s3://robots/night".
 
     Returns
     -------
@@ -366,6 +373,12 @@ def doctor(store: str | None = None) -> DoctorResult:
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack doctor
+
+        mcaptrack doctor s3://robots/night
+
     >>> import mcaptrack
     >>> mcaptrack.doctor().faults
     ()

@@ -22,8 +22,9 @@ FILES: Final = "Input and output"
 LABELS: Final = "Label files"
 SCORES: Final = "Scores"
 
-_LOGS: Final = "Logs, folders of logs, patterns, or - for a list of logs on stdin."
-EachLog = Annotated[PathLike, OneOfMany("logs", "LOG", _LOGS, help="The log.")]
+#: Help of an argument that names logs.
+LOGS: Final = "Logs, folders of logs, patterns, or - for a list of logs on stdin."
+EachLog = Annotated[PathLike, OneOfMany("logs", "LOG", LOGS, help="The log.")]
 Camera = Annotated[str | None, Option(FILES, help="Which camera, if the log has several.")]
 Topic = Annotated[str | None, Option(FILES, help="Read this channel instead of the usual one.")]
 To = Annotated[str | None, Option(FILES, help="Write to this channel instead of the usual one.")]
@@ -74,7 +75,7 @@ ClockOffsets = Annotated[
 Value = float | int | bool | str | None
 
 
-def output(shown: str | bool = False) -> Option:
+def output(shown: str | None = None) -> Option:
     """The option of an output; ``shown`` is its default in the help."""
     return Option(FILES, short="o", shown=shown, help="Write to this file; the log stays unchanged.")
 

@@ -356,7 +356,6 @@ def run_stage(
     stage: str,
     transform: Transform | None,
     log: PathLike,
-    *,
     topic: str | None = None,
     to: str | None = None,
     camera: str | None = None,
@@ -364,10 +363,11 @@ def run_stage(
     sidecar: bool | None = None,
     force: bool = False,
     stages: Mapping[str, str | Transform] | None = None,
+    progress: Progress = no_progress,
+    *,
     mode: Mode | None = None,
     frame: str | None = None,
     make: Callable[[str], Transform] | None = None,
-    progress: Progress = no_progress,
 ) -> RunResult:
     """Run one stage with a transform; ``detect``, ``track`` and the others call this with their transform.
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from mcaptrack.api.declared import PYTHON_ONLY, Option, declared
+from mcaptrack.api.declared import PYTHON_ONLY, Option, PythonOnly, declared
 from mcaptrack.api.options import (
     Camera,
     EachLog,
@@ -17,8 +18,10 @@ from mcaptrack.api.options import (
     To,
     Topic,
     Value,
+    chooser,
     no_progress,
 )
+from mcaptrack.api.running import RunResult, transform_of
 from mcaptrack.choices import Mode
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms import PROFILES, Transform
@@ -30,15 +33,18 @@ if TYPE_CHECKING:
 # Run a stage that reads pictures: detect, motion.
 
 
-#: Transforms of other stages, for channels that are missing.
-Stages = Annotated[Mapping[str, str | Transform] | None, PYTHON_ONLY]
+#: Transforms of other stages.
+Stages = Annotated[
+    Mapping[str, str | Transform] | None,
+    PythonOnly("Transforms, or their names, by stage, for channels that are missing and have to be made first."),
+]
 
 
 @declared(most_used=("detector", "threshold", "classes", "min_score", "output", "topic", "to", "camera", "force"))
 def detect(
     log: EachLog,
     *,
-    detector: str | Transform | None = None,
+    detector: Annotated[str | Transform | None, chooser("detector")] = None,
     topic: Topic = None,
     to: To = None,
     camera: Camera = None,
@@ -49,32 +55,12 @@ def detect(
     progress: Reports = no_progress,
     **options: Value,
 ) -> RunResult:
-    """Detect what moves in the video of a log.
+    """Detect people in the video of a log: whoever moves, or what a network finds.
+
+    Reads /camera/video, writes /camera/detections: one box for each person or object.
 
     Parameters
     ----------
-    log : path
-        The log.
-    detector : str or Transform, optional
-        "median" (the default), "knn", "onnx:FILE", "yolox-nano" or another name that
-        `models` lists, the name of an installed detector, "module:Class", or a transform.
-    topic : str, optional
-        Read this channel instead of the usual one, /camera/video.
-    to : str, optional
-        Write to this channel instead of the usual one, /camera/detections.
-    camera : str, optional
-        Name of the camera, if the log has several.
-    output : path, optional
-        Write to this file instead; the log stays unchanged.
-    sidecar : bool, optional
-        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
-        ROS tools read, otherwise into the log.
-    force : bool, default False
-        Overwrite ``output`` if it exists.
-    stages : mapping of str to str or Transform, optional
-        Transforms, or their names, by stage, for channels that are missing and have to be made first.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
     **options
         Options of the detector; `mcaptrack detect --help` lists them.
 
@@ -99,21 +85,10 @@ def detect(
     ('detect',)
 
     """
-    from mcaptrack.api.running import run_stage, transform_of
+    from mcaptrack.api.running import run_stage
 
-    return run_stage(
-        "detect",
-        transform_of("detect", detector, options),
-        log,
-        topic=topic,
-        to=to,
-        camera=camera,
-        output=output,
-        sidecar=sidecar,
-        force=force,
-        stages=stages,
-        progress=progress,
-    )
+    chosen = transform_of("detect", detector, options)
+    return run_stage("detect", chosen, log, topic, to, camera, output, sidecar, force, stages, progress)
 
 
 @declared(most_used=("output", "topic", "to", "camera", "force"))
@@ -133,32 +108,14 @@ def motion(
 ) -> RunResult:
     """Estimate how the camera moves, from picture to picture.
 
-    Trackers move their predictions by it. ``run`` estimates it where it is needed: for boxes of a detector that takes
-    any camera.
+    Reads /camera/video, writes /camera/motion: one row per picture, with the transform from the picture before, the one
+    to a reference picture, and whether the camera is still, shaking or moving. Trackers move their predictions by it.
+    ``run`` estimates it where it is needed: for boxes of a detector that takes any camera.
 
     Parameters
     ----------
-    log : path
-        The log.
     transform : Transform, optional
         The transform to use instead of ``mcaptrack.transforms.EstimateMotion``.
-    topic : str, optional
-        Read this channel instead of the usual one, /camera/video.
-    to : str, optional
-        Write to this channel instead of the usual one, /camera/motion.
-    camera : str, optional
-        Name of the camera, if the log has several.
-    output : path, optional
-        Write to this file instead; the log stays unchanged.
-    sidecar : bool, optional
-        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
-        ROS tools read, otherwise into the log.
-    force : bool, default False
-        Overwrite ``output`` if it exists.
-    stages : mapping of str to str or Transform, optional
-        Transforms, or their names, by stage, for channels that are missing and have to be made first.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
     **options
         Options such as ``mask_boxes``; `mcaptrack motion --help` lists them.
 
@@ -183,28 +140,17 @@ def motion(
     ('motion',)
 
     """
-    from mcaptrack.api.running import run_stage, transform_of
+    from mcaptrack.api.running import run_stage
 
-    return run_stage(
-        "motion",
-        transform_of("motion", transform, options),
-        log,
-        topic=topic,
-        to=to,
-        camera=camera,
-        output=output,
-        sidecar=sidecar,
-        force=force,
-        stages=stages,
-        progress=progress,
-    )
+    chosen = transform_of("motion", transform, options)
+    return run_stage("motion", chosen, log, topic, to, camera, output, sidecar, force, stages, progress)
 
 
 @declared(most_used=("tracker", "max_age_s", "min_hits_s", "min_iou", "min_score", "output", "topic", "to", "force"))
 def track(
     log: EachLog,
     *,
-    tracker: str | Transform | None = None,
+    tracker: Annotated[str | Transform | None, chooser("tracker")] = None,
     topic: Topic = None,
     to: To = None,
     camera: Camera = None,
@@ -216,35 +162,16 @@ def track(
     progress: Reports = no_progress,
     **options: Value,
 ) -> RunResult:
-    """Track detections: give each object an id that it keeps from frame to frame.
+    """Track detections: give each person an id that stays the same from frame to frame.
+
+    Reads /camera/detections, writes /camera/tracks: one row per frame for each person who is tracked and detected in
+    it. Inputs that are missing are made first.
 
     Parameters
     ----------
-    log : path
-        The log.
     tracker : str or Transform, optional
         "sort" (the default), "bytetrack" or "ocsort" for boxes in pictures, "ground" (the default for these) for boxes
-        in space, the name of an installed tracker, "module:Class", or a
-        transform.
-    topic : str, optional
-        Read this channel instead of the usual one, /camera/detections.
-    to : str, optional
-        Write to this channel instead of the usual one, /camera/tracks.
-    camera : str, optional
-        Name of the camera, if the log has several.
-    frame : str, optional
-        Bring boxes in space (3D) to this frame, such as map; by default to the root of the tree of frames.
-    output : path, optional
-        Write to this file instead; the log stays unchanged.
-    sidecar : bool, optional
-        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
-        ROS tools read, otherwise into the log.
-    force : bool, default False
-        Overwrite ``output`` if it exists.
-    stages : mapping of str to str or Transform, optional
-        Transforms, or their names, by stage, for channels that are missing and have to be made first.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
+        in space, the name of an installed tracker, "module:Class", or a transform.
     **options
         Options of the tracker, such as ``max_age_s``; `mcaptrack track --help` lists them.
 
@@ -270,22 +197,12 @@ def track(
     ['/camera/tracks']
 
     """
-    from mcaptrack.api.running import run_stage, transform_of
+    from mcaptrack.api.running import run_stage
 
+    chosen = None if tracker is None else transform_of("track", tracker, options)
+    make = partial(transform_of, "track", options=options)
     return run_stage(
-        "track",
-        None if tracker is None else transform_of("track", tracker, options),
-        log,
-        make=lambda name: transform_of("track", name, options),
-        frame=frame,
-        topic=topic,
-        to=to,
-        camera=camera,
-        output=output,
-        sidecar=sidecar,
-        force=force,
-        stages=stages,
-        progress=progress,
+        "track", chosen, log, topic, to, camera, output, sidecar, force, stages, progress, frame=frame, make=make
     )
 
 
@@ -304,31 +221,15 @@ def sample(
     progress: Reports = no_progress,
     **options: Value,
 ) -> RunResult:
-    """Resample tracks to a fixed rate and project them to the ground plane.
+    """Resample tracks to a fixed rate, in metres on the ground.
+
+    Reads /camera/tracks, writes /camera/samples: one row per person and sample time; ``observed`` is false where a gap
+    was interpolated. Inputs that are missing are made first.
 
     Parameters
     ----------
-    log : path
-        The log.
     transform : Transform, optional
         The transform to use instead of ``mcaptrack.transforms.Sample``.
-    topic : str, optional
-        Read this channel instead of the usual one, /camera/tracks.
-    to : str, optional
-        Write to this channel instead of the usual one, /camera/samples.
-    camera : str, optional
-        Name of the camera, if the log has several.
-    output : path, optional
-        Write to this file instead; the log stays unchanged.
-    sidecar : bool, optional
-        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
-        ROS tools read, otherwise into the log.
-    force : bool, default False
-        Overwrite ``output`` if it exists.
-    stages : mapping of str to str or Transform, optional
-        Transforms, or their names, by stage, for channels that are missing and have to be made first.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
     **options
         Options such as ``rate_hz``; `mcaptrack sample --help` lists them.
 
@@ -353,21 +254,10 @@ def sample(
     ('/camera/samples',)
 
     """
-    from mcaptrack.api.running import run_stage, transform_of
+    from mcaptrack.api.running import run_stage
 
-    return run_stage(
-        "sample",
-        transform_of("sample", transform, options),
-        log,
-        topic=topic,
-        to=to,
-        camera=camera,
-        output=output,
-        sidecar=sidecar,
-        force=force,
-        stages=stages,
-        progress=progress,
-    )
+    chosen = transform_of("sample", transform, options)
+    return run_stage("sample", chosen, log, topic, to, camera, output, sidecar, force, stages, progress)
 
 
 @declared(most_used=("predictor", "horizon_s", "min_history", "output", "topic", "to", "camera", "force"))
@@ -385,32 +275,16 @@ def predict(
     progress: Reports = no_progress,
     **options: Value,
 ) -> RunResult:
-    """Predict the future positions of tracks, with covariance.
+    """Predict where tracked people will be, with covariance.
+
+    Reads /camera/samples, writes /camera/predictions: one row per track and future step, for tracks with enough past
+    positions. Inputs that are missing are made first.
 
     Parameters
     ----------
-    log : path
-        The log.
     predictor : str or Transform, optional
         "red" (the default), "social" (looks at other people), "kalman", "holt-cv", "cv", "lstm" (less exact than "cv"),
         "red:FILE", "onnx:FILE", the name of an installed predictor, or "module:Class"; or a transform.
-    topic : str, optional
-        Read this channel instead of the usual one, /camera/samples.
-    to : str, optional
-        Write to this channel instead of the usual one, /camera/predictions.
-    camera : str, optional
-        Name of the camera, if the log has several.
-    output : path, optional
-        Write to this file instead; the log stays unchanged.
-    sidecar : bool, optional
-        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
-        ROS tools read, otherwise into the log.
-    force : bool, default False
-        Overwrite ``output`` if it exists.
-    stages : mapping of str to str or Transform, optional
-        Transforms, or their names, by stage, for channels that are missing and have to be made first.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
     **options
         Options such as ``horizon_s``; `mcaptrack predict --help` lists them.
 
@@ -435,28 +309,17 @@ def predict(
     ('/camera/predictions',)
 
     """
-    from mcaptrack.api.running import run_stage, transform_of
+    from mcaptrack.api.running import run_stage
 
-    return run_stage(
-        "predict",
-        transform_of("predict", predictor, options),
-        log,
-        topic=topic,
-        to=to,
-        camera=camera,
-        output=output,
-        sidecar=sidecar,
-        force=force,
-        stages=stages,
-        progress=progress,
-    )
+    chosen = transform_of("predict", predictor, options)
+    return run_stage("predict", chosen, log, topic, to, camera, output, sidecar, force, stages, progress)
 
 
 @declared(most_used=("profile", "mode", "retracker", "predictor", "max_age_s", "output", "topic", "to", "force"))
 def retrack(
     log: EachLog,
     *,
-    retracker: str | Transform | None = None,
+    retracker: Annotated[str | Transform | None, chooser("retracker")] = None,
     profile: Annotated[Literal["default", "paper", "authors"] | None, Option(tuning=True, shown="default")] = None,
     mode: Annotated[Mode, Option(tuning=True)] = "both",
     topic: Topic = None,
@@ -469,37 +332,20 @@ def retrack(
     progress: Reports = no_progress,
     **options: Value,
 ) -> RunResult:
-    """Re-track by prediction: link and repair tracks, and leave out false ones.
+    """Repair tracks by prediction: link the parts of one, split mixed ones, and leave out false ones.
+
+    Reads /camera/samples, writes /camera/retracks: tracks that use the whole log (offline), tracks that use the past
+    alone (online), predictions from the latter, and what was decided offline, with how likely each decision is right.
+    Inputs that are missing are made first.
 
     Parameters
     ----------
-    log : path
-        The log.
-    retracker : str or Transform, optional
-        "likelihood" (the default), "consistency", the name of an installed re-tracker, "module:Class", or a transform.
     profile : {"default", "paper", "authors"}, optional
         Values of all parameters: mcaptrack's own (default), the paper's, or those of its authors' program.
 
         They name the re-tracker, too. The paper is Yu and Zhou, IROS 2021.
     mode : {"both", "offline", "online"}, default "both"
         Write tracks that use the whole log (offline), the past alone (online), or both.
-    topic : str, optional
-        Read this channel instead of the usual one, /camera/samples.
-    to : str, optional
-        Write to this channel instead of the usual one, /camera/retracks.
-    camera : str, optional
-        Name of the camera, if the log has several.
-    output : path, optional
-        Write to this file instead; the log stays unchanged.
-    sidecar : bool, optional
-        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
-        ROS tools read, otherwise into the log.
-    force : bool, default False
-        Overwrite ``output`` if it exists.
-    stages : mapping of str to str or Transform, optional
-        Transforms, or their names, by stage, for channels that are missing and have to be made first.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
     **options
         Options that differ from the profile; `mcaptrack retrack --help` lists them.
 
@@ -525,23 +371,11 @@ def retrack(
     ('/camera/retracks', '/camera/retracks/online')
 
     """
-    from mcaptrack.api.running import run_stage, transform_of
+    from mcaptrack.api.running import run_stage
 
     if profile is not None and retracker is not None:
         raise McaptrackError(f"the profile {profile} names a retracker; give one of them")
     if retracker is None:
         retracker = PROFILES[profile or "default"]
-    return run_stage(
-        "retrack",
-        transform_of("retrack", retracker, options),
-        log,
-        mode=mode,
-        topic=topic,
-        to=to,
-        camera=camera,
-        output=output,
-        sidecar=sidecar,
-        force=force,
-        stages=stages,
-        progress=progress,
-    )
+    chosen = transform_of("retrack", retracker, options)
+    return run_stage("retrack", chosen, log, topic, to, camera, output, sidecar, force, stages, progress, mode=mode)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import Field, dataclass, fields, replace
 from types import MappingProxyType
 from typing import Any, Final, get_type_hints
@@ -104,26 +104,21 @@ def make_transform(
     options: Mapping[str, Any],
     wanted: Mapping[str, Any],
     owners: Mapping[str, list[str]] = MappingProxyType({}),
-    typed: Collection[str] = (),
+    typed: Mapping[str, str] = MappingProxyType({}),
 ) -> Transform:
     """Return the chosen transform with those of the wanted parameters that it has.
 
-    ``owners`` has the names of the transforms that have an option. One of the options that were ``typed`` on the
-    command line is refused if the chosen transform lacks it; one from a file or the environment is ignored, since it
+    ``owners`` has the names of the transforms that have a parameter. One that was ``typed`` on the command line, in
+    these words, is refused if the chosen transform lacks it; one from a file or the environment is ignored, since it
     may be meant for another transform.
     """
     name = _chosen(stage, options, wanted)
     cls = stage.with_part(stage.find(name).cls if name else stage.default, wanted.get(stage.parameter))
     own = options_of(cls)
-    for option in wanted:
-        if option in owners and option not in own and option in typed:
-            fields_there = [
-                options_of(kind)[option] for kind in stage.built_in().values() if option in options_of(kind)
-            ]
-            is_flag = all(map(has_flag, fields_there))
-            flag = f"--{option.replace('_', '-')}" if is_flag else f"--set {option}"
+    for option, text in typed.items():
+        if option in owners and option not in own:
             chosen = name or wanted.get(stage.option) or stage.choice(stage.default())
-            raise McaptrackError(f"{flag} is an option of {listed(owners[option])}, not of {chosen}")
+            raise McaptrackError(f"{text} is an option of {listed(owners[option])}, not of {chosen}")
     hints = get_type_hints(cls)
     values = {
         option: tuple(value) if member_type(hints[option])[1] else value
@@ -151,7 +146,7 @@ class Maker:
     given: Mapping[str, Any]
     wanted: Mapping[str, Any]
     owners: Mapping[str, list[str]]
-    typed: tuple[str, ...]
+    typed: Mapping[str, str]
 
     @classmethod
     def of(
@@ -159,8 +154,9 @@ class Maker:
     ) -> Maker:
         """Return a maker for the running command."""
         chosen = {name: options[name] for name in (stage.kind, "profile") if name and name in options}
-        typed = [name for name in wanted if is_on_command_line(name if name in options else "set")]
-        return cls(stage.name, chosen, wanted, owners, tuple(typed))
+        flags = {name: f"--{name.replace('_', '-')}" if name in options else f"--set {name}" for name in wanted}
+        typed = {name: flag for name, flag in flags.items() if is_on_command_line(name if name in options else "set")}
+        return cls(stage.name, chosen, wanted, owners, typed)
 
     def __call__(self, name: str) -> Transform:
         """Make the transform of this name; for "" the one that the user chose, or the default one."""

@@ -139,12 +139,33 @@ class Command(TyperCommand):
         self.settings = declared_settings(name, arguments["callback"], self.params)
         self.most_used: tuple[str, ...] = getattr(arguments["callback"], "most_used", ()) or MOST_USED.get(name, ())
         arrange(self.most_used, self.params)
+        self._is_short = False
         self.settable: tuple[str, ...] = getattr(arguments["callback"], "settable", ())
         parameters: dict[str, Any] = {parameter.name or "": parameter for parameter in self.params}
         for parameter in parameters.values():
             parameter.process_value = _refusing_empty(parameter.process_value)
         config = parameters["config"]
         config.envvar = self.settings["config"].variable  # the others are read with the files, once this is known
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Print the help. Of a command with many options it has those that most people need, and names the others."""
+        self._is_short = bool(self.most_used) and not ctx.meta.get(_ALL)
+        hidden = [option for option in self.params if not self._is_shown(option)]
+        panels = ", ".join(dict.fromkeys(option.rich_help_panel for option in hidden))
+        about = f"`mcaptrack {self.name} --help-all` lists {len(hidden)} more options: {panels}."
+        self.epilog = about if hidden else None
+        try:
+            super().format_help(ctx, formatter)
+        finally:
+            self._is_short = False
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the parameters; while a short help is printed, those that it has."""
+        return [parameter for parameter in super().get_params(ctx) if self._is_shown(parameter)]
+
+    def _is_shown(self, parameter: Any) -> bool:
+        is_option = parameter.param_type_name == "option"
+        return not (self._is_short and is_option) or parameter.rich_help_panel in (FIRST_PANEL, LAST_PANELS[-1])
 
     def get_help_option(self, ctx: Any) -> Any:
         """Put ``--help`` below the heading of the options that all commands have."""
@@ -223,6 +244,8 @@ class Reading(Command):
 
 
 _DEFAULT: Final = 3
+#: What the context of a command has where its help lists all options.
+_ALL: Final = "mcaptrack.help_all"
 
 
 def _rank(ctx: Any, parameter: str, set_values: Mapping[str, tuple[Setting, Given]]) -> tuple[int, str]:
@@ -233,6 +256,14 @@ def _rank(ctx: Any, parameter: str, set_values: Mapping[str, tuple[Setting, Give
     if source.name == "DEFAULT_MAP":
         return set_values[parameter][1].rank, set_values[parameter][1].where
     return (1, "the environment") if source.name == "ENVIRONMENT" else (0, "")
+
+
+def show_all(context: typer.Context, is_wanted: bool) -> None:
+    """Print the help with all options, and end the command. This is the callback of ``--help-all``."""
+    if is_wanted and not context.resilient_parsing:
+        context.meta[_ALL] = True
+        typer.echo(context.get_help())
+        raise typer.Exit
 
 
 def read_config(context: typer.Context, path: Path | None) -> Path | None:

@@ -22,7 +22,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, ParamSpec, get_ty
 import typer
 
 from mcaptrack import SCHEMA_VERSION, notices
-from mcaptrack.cli.command import LAST_PANELS, check_ranges, is_on_command_line, read_config
+from mcaptrack.cli.command import LAST_PANELS, check_ranges, is_on_command_line, read_config, show_all
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.settings import Declared
 from mcaptrack.cli.text import Level, is_json, say
@@ -133,6 +133,10 @@ LogFormat = Annotated[
         panel=COMMON,
         help="Print notes, progress and errors as lines of text, or as objects of JSON with their times.",
     ),
+]
+HelpAll = Annotated[
+    bool,
+    option("--help-all", panel=COMMON, is_eager=True, callback=show_all, help="Show all options, by theme, and exit."),
 ]
 Camera = Annotated[str | None, option("--camera", panel=FILES, help="Which camera, if the log has several.")]
 Logs = Annotated[
@@ -278,12 +282,13 @@ def only_one_output(paths: Sequence[Location], output: Path | None) -> None:
 def one_line(command: Callable[P, None]) -> Callable[P, None]:
     """Wrap a command: print a McaptrackError as one line, exit with 1; print warnings, and keep them for the JSON.
 
-    Adds the option ``--log-format``, which ``Command`` puts into effect.
+    Adds the options ``--log-format``, which ``Command`` puts into effect, and ``--help-all``.
     """
 
     @wraps(command)
     def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
-        kwargs.pop("log_format", None)  # the command line has set it
+        for name in ("log_format", "help_all"):
+            kwargs.pop(name, None)  # the command line has put them into effect
         _WARNED.set([])
         batch = _Batch()
         _BATCH.set(batch)
@@ -314,9 +319,13 @@ def one_line(command: Callable[P, None]) -> Callable[P, None]:
     own = [
         parameter.replace(annotation=hints[name]) for name, parameter in inspect.signature(command).parameters.items()
     ]
-    added = inspect.Parameter("log_format", inspect.Parameter.KEYWORD_ONLY, default="text", annotation=LogFormat)
-    guarded.__signature__ = inspect.Signature([*own, added])  # type: ignore[attr-defined]
-    guarded.__annotations__ = {**hints, added.name: LogFormat}
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    added = [
+        inspect.Parameter("log_format", keyword, default="text", annotation=LogFormat),
+        inspect.Parameter("help_all", keyword, default=False, annotation=HelpAll),
+    ]
+    guarded.__signature__ = inspect.Signature([*own, *added])  # type: ignore[attr-defined]
+    guarded.__annotations__ = hints | {parameter.name: parameter.annotation for parameter in added}
     return guarded
 
 

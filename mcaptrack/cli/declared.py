@@ -57,11 +57,16 @@ class Called(Generic[T]):
     def __init__(self, name: str, values: Mapping[str, Any]) -> None:
         self.name, self.given = name, values
 
+    @classmethod
+    def declaration(cls, name: str) -> Callable[..., T]:
+        """Return the function that declares the command: that of its name in the library."""
+        function: Callable[..., T] = getattr(mcaptrack, name)
+        return function
+
     @property
     def function(self) -> Callable[..., T]:
-        """The function. It is looked up when the command runs."""
-        function: Callable[..., T] = getattr(mcaptrack, self.name)
-        return function
+        """The function that is called. It is looked up when the command runs."""
+        return self.declaration(self.name)
 
     @classmethod
     def options(cls) -> Options:
@@ -71,7 +76,7 @@ class Called(Generic[T]):
     @classmethod
     def function_of(cls, name: str) -> Callable[..., None]:
         """Return the function of the command: with its options as Typer takes them."""
-        declared = getattr(mcaptrack, name)
+        declared = cls.declaration(name)
         names = {option.name: option.name for option in options_of(declared)}
         placed = arguments_of(declared).items()
         names |= {parameter: about.name for parameter, about in placed if not isinstance(about, OneOfMany)}
@@ -172,7 +177,7 @@ def argument_annotation(about: Argument, hint: Any, default: Any) -> tuple[Any, 
 def annotation_of(parameter: Parameter) -> Any:
     """Return the annotation of an option, as Typer takes it."""
     about = parameter.option
-    settings: dict[str, Any] = {"help": parameter.help, "metavar": about.metavar}
+    settings: dict[str, Any] = {"help": parameter.help, "metavar": about.metavar, "case_sensitive": False}
     if parameter.shown is not None:
         settings["show_default"] = parameter.shown
     if about.names is not None:

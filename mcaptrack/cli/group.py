@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, MutableMapping
+from functools import cache
 from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import typer
 from typer.core import TyperGroup
 from typer.main import get_command
 
+from mcaptrack import _MODULES
 from mcaptrack.cli.command import Command, Reading, usage_in_one_line
 from mcaptrack.cli.settings import may_be_set
 
@@ -18,146 +23,70 @@ _MEASURE, _KEEP = "Measure and improve", "Check and repair logs"
 
 
 class Listed(NamedTuple):
-    """A command: its heading and its line in the help, and where in ``mcaptrack.cli`` it is.
+    """A command: its heading in the help, and where in ``mcaptrack.cli`` it is.
 
-    ``place`` is MODULE:NAME, of a function with the options of Typer, or of an object with ``function_of(name)``. A
-    command that ``reads`` changes no file except the one that -o names.
+    ``place`` is MODULE:NAME, of an object with ``function_of(name)``. A command that ``reads`` changes no file except
+    the one that -o names. ``source`` is the module and the name of the function that declares it, if that is not the
+    function of the library of its name.
     """
 
     name: str
     panel: str
-    summary: str
     place: str
     reads: bool = False
+    source: str = ""
+
+    @property
+    def summary(self) -> str:
+        """Its line in the help: the first paragraph of the docstring of its function.
+
+        It is read from the source, because an import of all commands takes half a second.
+        """
+        module, _, name = (self.source or f"{_MODULES[self.name]}:{self.name}").partition(":")
+        match = re.search(rf'^def {name}\(.*?"""(.*?)(?:\n\n|""")', _source_of(module), re.MULTILINE | re.DOTALL)
+        doc = match[1] if match else (getattr(import_module(module), name).__doc__ or "").partition("\n\n")[0]
+        return " ".join(doc.split())
+
+
+@cache
+def _source_of(module: str) -> str:
+    """The source of a module; "" if there is none, as in a frozen program."""
+    spec = find_spec(module)
+    try:
+        return Path((spec and spec.origin) or "").read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return ""
 
 
 ENTRIES: Final = (
-    Listed(
-        "ingest",
-        _MAKE,
-        "Make a log of a video, a folder of images, a ROS bag, an MCAP file, or a label file.",
-        "ingest:Ingest",
-    ),
-    Listed(
-        "demo",
-        _MAKE,
-        "Draw a scene with known ground truth, run everything on it, and compare SORT with re-tracking.",
-        "demo:Demo",
-    ),
-    Listed(
-        "run", _RUN, "Run all stages that are missing or out of date, then events, views and tables.", "running:Run"
-    ),
-    Listed(
-        "detect",
-        _RUN,
-        "Detect who differs from the median of the recording, in colour; shadows are removed, groups separated.",
-        "stages:StageCommand",
-    ),
-    Listed("motion", _RUN, "Estimate how the camera moves, from picture to picture.", "stages:StageCommand"),
-    Listed("track", _RUN, "Track detections over time.", "stages:StageCommand"),
-    Listed("sample", _RUN, "Resample tracks to a fixed rate, in metres on the ground.", "stages:StageCommand"),
-    Listed("predict", _RUN, "Predict where tracked people go.", "stages:StageCommand"),
-    Listed("retrack", _RUN, "Repair tracks: re-tracking by likelihood.", "stages:StageCommand"),
-    Listed(
-        "fuse",
-        _RUN,
-        "Fuse the detections of several cameras with one ground to detections of the whole scene.",
-        "running:Fuse",
-    ),
-    Listed(
-        "models",
-        _RUN,
-        "List the learned detectors of the catalogue, or fetch the weights of one, once.",
-        "models:models",
-    ),
-    Listed(
-        "info",
-        _LOOK,
-        "Show the channels of a log, their number of messages, and what was made from what.",
-        "show:Info",
-        reads=True,
-    ),
-    Listed(
-        "view",
-        _LOOK,
-        "Serve a log to this machine's browser, and print links that open it in Lichtblick and Foxglove.",
-        "view:view",
-        reads=True,
-    ),
-    Listed(
-        "render",
-        _LOOK,
-        "Draw boxes, trails and predictions on the video of a log: LOG.mp4, or a GIF.",
-        "render:Render",
-    ),
-    Listed(
-        "report",
-        _LOOK,
-        "Write one page about a log, or several: scores, forecasts, tracks over the scene, identity switches, lineage.",
-        "report:report",
-    ),
-    Listed(
-        "query",
-        _LOOK,
-        "Query the tables of logs in SQL: where people were, how fast, for how long, and how well they were tracked.",
-        "query:query",
-        reads=True,
-    ),
-    Listed(
-        "export",
-        _LOOK,
-        "Write a log as tables (Parquet), one row per object and frame, as a ROS 2 bag, or for other programs.",
-        "show:Export",
-    ),
-    Listed("docs", _LOOK, "List the pages of the documentation, or print one.", "docs:docs", reads=True),
-    Listed("evaluate", _MEASURE, "Score tracks and predictions against ground truth.", "evaluate:evaluate", reads=True),
-    Listed(
-        "events",
-        _MEASURE,
-        "Write events of tracks (begin, end, identity switches) and errors of predictions into the log.",
-        "running:Events",
-    ),
-    Listed(
-        "zones",
-        _MEASURE,
-        "Count visits of zones and crossings of lines by the tracks of a log, and write them into the log.",
-        "zones:Zones",
-    ),
-    Listed(
-        "calibrate",
-        _MEASURE,
-        "Correct the ground planes of cameras that disagree with the others, by the people that they see together.",
-        "calibrate:Calibrate",
-    ),
-    Listed("tune", _MEASURE, "Find the settings of a stage that score best against ground truth.", "tune:tune"),
-    Listed("train", _MEASURE, "Train a predictor on tracks of people, or on synthetic walks.", "train:train"),
-    Listed(
-        "check",
-        _KEEP,
-        "Check every byte of a log: structure, checksums, indexes, statistics, order of messages.",
-        "files:Check",
-        reads=True,
-    ),
-    Listed(
-        "recover",
-        _KEEP,
-        "Save what is intact in a damaged log to LOG.recovered.mcap; the damaged log stays unchanged.",
-        "files:Recover",
-    ),
-    Listed(
-        "drop",
-        _KEEP,
-        "Remove channels from a log, in place or in a copy; all others stay unchanged, to the byte.",
-        "files:Drop",
-    ),
-    Listed(
-        "doctor",
-        _KEEP,
-        "Print what this installation has: versions, codecs, memory, folders, plug-ins, and what may be done with "
-        "a store.",
-        "doctor:doctor",
-        reads=True,
-    ),
+    Listed("ingest", _MAKE, "ingest:Ingest"),
+    Listed("demo", _MAKE, "demo:Demo"),
+    Listed("run", _RUN, "running:Run"),
+    Listed("detect", _RUN, "stages:StageCommand"),
+    Listed("motion", _RUN, "stages:StageCommand"),
+    Listed("track", _RUN, "stages:StageCommand"),
+    Listed("sample", _RUN, "stages:StageCommand"),
+    Listed("predict", _RUN, "stages:StageCommand"),
+    Listed("retrack", _RUN, "stages:StageCommand"),
+    Listed("fuse", _RUN, "running:Fuse"),
+    Listed("models", _RUN, "models:Models"),
+    Listed("info", _LOOK, "show:Info", reads=True),
+    Listed("view", _LOOK, "view:View", reads=True),
+    Listed("render", _LOOK, "render:Render"),
+    Listed("report", _LOOK, "report:Report"),
+    Listed("query", _LOOK, "query:Query", reads=True),
+    Listed("export", _LOOK, "show:Export"),
+    Listed("docs", _LOOK, "docs:Docs", reads=True, source="mcaptrack.cli.docs:documentation"),
+    Listed("evaluate", _MEASURE, "evaluate:Evaluate", reads=True),
+    Listed("events", _MEASURE, "running:Events"),
+    Listed("zones", _MEASURE, "zones:Zones"),
+    Listed("calibrate", _MEASURE, "calibrate:Calibrate"),
+    Listed("tune", _MEASURE, "tune:Tune"),
+    Listed("train", _MEASURE, "train:Train"),
+    Listed("check", _KEEP, "files:Check", reads=True),
+    Listed("recover", _KEEP, "files:Recover"),
+    Listed("drop", _KEEP, "files:Drop"),
+    Listed("doctor", _KEEP, "doctor:Doctor", reads=True),
 )
 #: Commands with options of plug-ins.
 _WITH_PLUGINS: Final = ("run", *(entry.name for entry in ENTRIES if entry.place == "stages:StageCommand"))

@@ -26,7 +26,7 @@ from mcaptrack.notices import listening
 from mcaptrack.registry import BUILT_IN, names
 from mcaptrack.transforms import STAGES, Stage, Transform
 
-_HELP: Final = ("--help", "-h")
+_HELP: Final = ("--help", "-h", "--help-all")
 
 
 def commands_with_plugins(commands: Mapping[str, Any], arguments: Sequence[str]) -> dict[str, Any]:

@@ -13,12 +13,12 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
 
 import mcaptrack
-from mcaptrack.api.declared import Option, Parameter, parameter_of, words_of
+from mcaptrack.api.declared import Option, Parameter, parameter_of
 from mcaptrack.api.declared import options_of as options_of_function
 from mcaptrack.api.options import PLUGIN, chooser
 from mcaptrack.cli.chosen import Maker, configured, has_flag, is_open, listed, options_of, values_set
 from mcaptrack.cli.command import is_on_command_line
-from mcaptrack.cli.declared import Options, as_typer, command
+from mcaptrack.cli.declared import Options, as_typer, command, help_of
 from mcaptrack.cli.many import NAMES
 from mcaptrack.cli.running import RunsStages
 from mcaptrack.cli.text import stdout_to_stderr
@@ -131,14 +131,14 @@ def _options(stage: Stage, kinds: Mapping[str, type[Transform]]) -> tuple[Option
 
 
 def stage_help(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> str:
-    """Return the help of the command of a stage; the docstrings of plug-ins come first."""
-    where = f"From /camera/{stage.input_topic} to /camera/{stage.output_topic}. Inputs that are missing are made first."
-    others = [f"{name}: {text}" for name, plugin in plugins.items() if (text := _own_doc(plugin))]
-    docs = [*others, *(inspect.cleandoc(cls.__doc__ or "") for cls in stage.built_in().values())]
-    intros = [re.split(r"\n\n\w+\n---", doc)[0] for doc in docs]  # without the sections on use from Python
-    return "\n\n".join(
-        [*intros, where, *(f"Example: {line}" for line in words_of(getattr(mcaptrack, stage.name)).examples)]
-    )
+    """Return the help of the command of a stage: that of its function, and what its transforms do, plug-ins first."""
+    text, *examples = help_of(getattr(mcaptrack, stage.name)).split("\n\nExample: ")
+    built_in = stage.built_in() if stage.kind else {}
+    firsts = {name: inspect.cleandoc(cls.__doc__ or "").partition("\n\n")[0] for name, cls in built_in.items()}
+    lines = [f"- `{name}`: {' '.join(first.split())}" for name, first in firsts.items()]
+    others = [f"{name}: {doc}" for name, plugin in plugins.items() if (doc := _own_doc(plugin))]
+    others = [re.split(r"\n\n\w+\n---", doc)[0] for doc in others]  # without the sections on use from Python
+    return "\n\n".join([text, *others, "\n".join(lines), *(f"Example: {line}" for line in examples)])
 
 
 def _own_doc(cls: type[Transform]) -> str:
