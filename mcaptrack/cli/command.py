@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Final
 import typer
 from typer.core import TyperCommand
 
+from mcaptrack.api.declared import Parameter
 from mcaptrack.cli.flags import RUNNING
 from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, gather
 from mcaptrack.cli.text import log_format, refuse_usage, say
@@ -124,7 +125,8 @@ class Command(TyperCommand):
     def __init__(self, name: str, **arguments: Any) -> None:
         super().__init__(name, **arguments)
         function = arguments["callback"]
-        self.settings = declared_settings(name, function.parameters)
+        self.parameters: tuple[Parameter, ...] = function.parameters
+        self.settings = declared_settings(name, self.parameters)
         self.most_used: tuple[str, ...] = function.most_used
         self.settable: tuple[str, ...] = function.settable
         arrange(self.most_used, self.params)

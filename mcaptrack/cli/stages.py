@@ -109,7 +109,7 @@ def _options(stage: Stage, kinds: Mapping[str, type[Transform]]) -> tuple[Option
         field = options_of(kinds[having[0]])[name]
         if has_flag(field):
             is_shared = set(stage.built_in()) <= set(having)
-            options[name] = _option(field, get_type_hints(kinds[having[0]])[name], () if is_shared else having), None
+            options[name] = hint_of(kinds[having[0]], field, () if is_shared else having), None
         else:
             settable.append(name)
     if settable:
@@ -142,22 +142,22 @@ def _panel(theme: str, of: Sequence[str]) -> str:
     return f"{theme} ({those})" if theme else f"Options of {those}"
 
 
-def _option(field: Field[Any], annotation: Any, of: Sequence[str]) -> Any:
-    """Return the option for a parameter. Its value is None unless it is set; its help shows the default.
+def hint_of(kind: type[Transform], field: Field[Any], of: Sequence[str] = ()) -> Any:
+    """Return the type of the option for a parameter of a transform. Its value is None unless it is set.
 
     ``of`` are the names of the transforms that have the parameter; none if all have it.
     """
-    (kind, is_tuple), about = member_type(annotation), field.metadata
+    (member, is_tuple), about = member_type(get_type_hints(kind)[field.name]), field.metadata
     text = str(about.get("help", "") or f"parameter {field.name} of {' and '.join(of)}")
     option = Option(
         _panel(about.get("theme", ""), of),
         about.get("least", -math.inf),
         about.get("most", math.inf),
-        tuning=PLUGIN if about.get("kind") else about.get("pattern") or bool(choices(kind)) or kind is not str,
+        tuning=PLUGIN if about.get("kind") else about.get("pattern") or bool(choices(member)) or member is not str,
         shown=shown_default(field.default_factory() if field.default_factory is not MISSING else field.default),
         help=f"{text[:1].upper()}{text[1:]}.",
     )
-    return Annotated[(Sequence[kind] if is_tuple else kind) | None, option]  # type: ignore[valid-type]
+    return Annotated[(Sequence[member] if is_tuple else member) | None, option]  # type: ignore[valid-type]
 
 
 def shown_default(default: Any) -> str:
