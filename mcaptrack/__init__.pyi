@@ -60,6 +60,7 @@ from mcaptrack.errors import McaptrackError as McaptrackError
 from mcaptrack.notices import McaptrackWarning as McaptrackWarning
 from mcaptrack.notices import Notice as Notice
 
+_MODULES: dict[str, str]
 __all__ = [
     "CalibrateResult",
     "CameraCorrection",

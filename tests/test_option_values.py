@@ -16,10 +16,11 @@ import pyarrow as pa
 import pytest
 
 import mcaptrack
+from mcaptrack.api.declared import Option
 from mcaptrack.cli import common, many, text
 from mcaptrack.cli.flags import RUNNING, with_flags
 from mcaptrack.cli.many import ManyOptions
-from mcaptrack.cli.settings import Declared, Setting
+from mcaptrack.cli.settings import Setting
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import FleetStatus, Running
 from tests.commands import GROUP, Terminal, call, done
@@ -67,7 +68,7 @@ def asked(monkeypatch):
 
 
 def setting(kind: Any, many: bool = False, **declared: Any) -> Setting:
-    return Setting("track", "some-option", "some_option", kind, many, Declared(**declared))
+    return Setting("track", "some-option", "some_option", kind, many, Option(**declared))
 
 
 VALUES = [

@@ -69,7 +69,7 @@ def models(
     return (session.find(name),) if name else tuple(session.CATALOGUE.values())
 
 
-@checked()
+@checked
 def get_model(name: str, *, source: PathLike | None = None) -> Path:
     """Fetch the weights of a detector of the catalogue, once, into the user's folder of caches.
 

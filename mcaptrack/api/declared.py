@@ -278,49 +278,36 @@ def with_dashes(text: str, flags: dict[str, str]) -> str:
     return re.sub(r"``(\w+)``|`(\w+)=`", option, text).replace("``", "")
 
 
-def checked(**ranges: tuple[float, float]) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Check parameters before a function runs: paths, those of a ``Literal``, those with a range, and ``progress``.
+def checked(function: Callable[P, T]) -> Callable[P, T]:
+    """Check arguments before a function runs: paths, those of a ``Literal``, those with a range, and ``progress``.
 
-    Parameters
-    ----------
-    **ranges : tuple of two float
-        Smallest and largest value of a parameter that is a number, or several.
-
-    Returns
-    -------
-    callable
-        A decorator. The function raises McaptrackError, and does nothing, if a value is an empty name of a file, none
-        of the choices, or out of its range.
-
+    The function raises McaptrackError, and does nothing, if a value is an empty name of a file, none of the choices, or
+    out of the range that ``Option`` declares.
     """
+    signature = inspect.signature(function)
 
-    def decorate(function: Callable[P, T]) -> Callable[P, T]:
-        signature = inspect.signature(function)
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        for name, value in signature.bind(*args, **kwargs).arguments.items():
+            if value is signature.parameters[name].default:
+                continue
+            kinds = _kinds(function).get(name, ())
+            choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
+            if "" in map(_name_of, _paths_in(value, kinds)):
+                raise McaptrackError(f"`{name}=` is an empty name; give the name of a file or folder")
+            if choices:
+                _check_choice(name, value, choices)
+            if kinds and set(kinds) <= {str, type(None)} and not isinstance(value, tuple(kinds)):
+                raise McaptrackError(f"`{name}=` is text, not {value!r:.40}")
+            if ends := _ranges(function).get(name):
+                _check_range(name, value, ends, is_whole=float not in kinds)
+            if name == "progress" and not callable(value):
+                raise McaptrackError(
+                    f"`progress=` is called as progress(stage, done, total), which {value!r:.40} is not"
+                )
+        return function(*args, **kwargs)
 
-        @wraps(function)
-        def call(*args: P.args, **kwargs: P.kwargs) -> T:
-            for name, value in signature.bind(*args, **kwargs).arguments.items():
-                if value is signature.parameters[name].default:
-                    continue
-                kinds = _kinds(function).get(name, ())
-                choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
-                if "" in map(_name_of, _paths_in(value, kinds)):
-                    raise McaptrackError(f"`{name}=` is an empty name; give the name of a file or folder")
-                if choices:
-                    _check_choice(name, value, choices)
-                if kinds and set(kinds) <= {str, type(None)} and not isinstance(value, tuple(kinds)):
-                    raise McaptrackError(f"`{name}=` is text, not {value!r:.40}")
-                if ends := ranges.get(name) or _ranges(function).get(name):
-                    _check_range(name, value, ends, is_whole=float not in kinds)
-                if name == "progress" and not callable(value):
-                    raise McaptrackError(
-                        f"`progress=` is called as progress(stage, done, total), which {value!r:.40} is not"
-                    )
-            return function(*args, **kwargs)
-
-        return call
-
-    return decorate
+    return call
 
 
 def declared(*, most_used: tuple[str, ...] = ()) -> Callable[[Callable[P, T]], Callable[P, T]]:
@@ -332,7 +319,7 @@ def declared(*, most_used: tuple[str, ...] = ()) -> Callable[[Callable[P, T]], C
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
         if function.__doc__:  # there is none with python -OO
             function.__doc__ = _completed(function)
-        call = checked()(function)
+        call = checked(function)
         vars(call)["most_used"] = most_used
         return call
 

@@ -143,7 +143,7 @@ class TableList:
     channels: tuple[str, ...]
 
 
-@checked()
+@checked
 def list_tables(log: PathLike | Sequence[PathLike] = (), *, files: Mapping[str, PathLike] | None = None) -> TableList:
     """List the tables that queries can name, with their columns, units and meanings.
 

@@ -150,7 +150,7 @@ def supervision_of(frames: Iterable[Frame], names: Mapping[int, str]) -> Iterato
         yield frame.t_ns, Detections(xyxy=xyxy, **columns)
 
 
-@checked()
+@checked
 def detections(
     boxes: Any = None,
     scores: ArrayLike | None = None,

@@ -211,7 +211,7 @@ class Scores:
             raise McaptrackError(f"no class {of_class!r:.60} was scored by itself; there are {scored or 'none'}")
         return [row for row in rows if row["sequence"] == COMBINED] or rows
 
-    @checked()
+    @checked
     def draw_curves(self, output: PathLike, force: bool = False) -> Path:
         """Draw the error of predictions (ADE) over recall, in metres and squared, as an SVG.
 

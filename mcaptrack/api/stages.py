@@ -44,7 +44,7 @@ Stages = Annotated[
 def detect(
     log: EachLog,
     *,
-    detector: Annotated[str | Transform | None, chooser("detector")] = None,
+    detector: Annotated[str | Transform | None, chooser("detector", shown="median")] = None,
     topic: Topic = None,
     to: To = None,
     camera: Camera = None,
@@ -150,7 +150,7 @@ def motion(
 def track(
     log: EachLog,
     *,
-    tracker: Annotated[str | Transform | None, chooser("tracker")] = None,
+    tracker: Annotated[str | Transform | None, chooser("tracker", shown="sort")] = None,
     topic: Topic = None,
     to: To = None,
     camera: Camera = None,
@@ -165,13 +165,11 @@ def track(
     """Track detections: give each person an id that stays the same from frame to frame.
 
     Reads /camera/detections, writes /camera/tracks: one row per frame for each person who is tracked and detected in
-    it. Inputs that are missing are made first.
+    it. Boxes in space (3D) are tracked by ``ground``, unless another tracker is named. Inputs that are missing are made
+    first.
 
     Parameters
     ----------
-    tracker : str or Transform, optional
-        "sort" (the default), "bytetrack" or "ocsort" for boxes in pictures, "ground" (the default for these) for boxes
-        in space, the name of an installed tracker, "module:Class", or a transform.
     **options
         Options of the tracker, such as ``max_age_s``; `mcaptrack track --help` lists them.
 
@@ -319,7 +317,7 @@ def predict(
 def retrack(
     log: EachLog,
     *,
-    retracker: Annotated[str | Transform | None, chooser("retracker")] = None,
+    retracker: Annotated[str | Transform | None, chooser("retracker", shown="likelihood")] = None,
     profile: Annotated[Literal["default", "paper", "authors"] | None, Option(tuning=True, shown="default")] = None,
     mode: Annotated[Mode, Option(tuning=True)] = "both",
     topic: Topic = None,

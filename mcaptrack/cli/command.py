@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Final
 import typer
 from typer.core import TyperCommand
 
+from mcaptrack.api.declared import Parameter
 from mcaptrack.cli.flags import RUNNING
 from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, gather
 from mcaptrack.cli.text import log_format, refuse_usage, say
@@ -87,19 +88,6 @@ FIRST_PANEL: Final = "Most used"
 MORE_PANEL: Final = "More options"
 LAST_PANELS: Final = ("Input and output", "Many logs", "Options of all commands")
 
-#: The options of a command that come first, in order, by the names of its parameters. Commands with few have none.
-MOST_USED: Final[Mapping[str, tuple[str, ...]]] = {
-    "run": ("output", "topic", "camera", "detector", "tracker", "retracker", "predictor", "zones", "force"),
-    "events": ("topic", "similarity", "gate_m", "output", "force"),
-    "fuse": ("to", "cameras", "clock_offset_s", "min_score", "output", "force"),
-    "calibrate": ("reference", "cameras", "dry_run", "clock_offset_s", "output", "force"),
-    "zones": ("zones", "topic", "camera", "output", "force"),
-    "evaluate": ("truth", "topic", "similarity", "gate_m", "rules", "fail_under", "csv", "output", "force"),
-    "export": ("form", "topic", "output", "force"),
-    "query": ("file", "form", "rows", "tables", "output", "force"),
-    "tune": ("truth", "stage", "tracker", "metric", "trials", "search", "topic", "output", "force"),
-    "train": ("recipe", "epochs", "device", "validate", "topic", "output", "force"),
-}
 #: The heading of a theme that not all detectors, trackers or predictors have: the names of those that have it.
 _THOSE: Final = re.compile(r"\((.+)\)$|^Options of (.+)$")
 
@@ -136,11 +124,13 @@ class Command(TyperCommand):
 
     def __init__(self, name: str, **arguments: Any) -> None:
         super().__init__(name, **arguments)
-        self.settings = declared_settings(name, arguments["callback"], self.params)
-        self.most_used: tuple[str, ...] = getattr(arguments["callback"], "most_used", ()) or MOST_USED.get(name, ())
+        function = arguments["callback"]
+        self.parameters: tuple[Parameter, ...] = function.parameters
+        self.settings = declared_settings(name, self.parameters)
+        self.most_used: tuple[str, ...] = function.most_used
+        self.settable: tuple[str, ...] = function.settable
         arrange(self.most_used, self.params)
         self._is_short = False
-        self.settable: tuple[str, ...] = getattr(arguments["callback"], "settable", ())
         parameters: dict[str, Any] = {parameter.name or "": parameter for parameter in self.params}
         for parameter in parameters.values():
             parameter.process_value = _refusing_empty(parameter.process_value)
@@ -150,7 +140,7 @@ class Command(TyperCommand):
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Print the help. Of a command with many options it has those that most people need, and names the others."""
         self._is_short = bool(self.most_used) and not ctx.meta.get(_ALL)
-        hidden = [option for option in self.params if not self._is_shown(option)]
+        hidden: list[Any] = [option for option in self.params if not self._is_shown(option)]
         panels = ", ".join(dict.fromkeys(option.rich_help_panel for option in hidden))
         about = f"`mcaptrack {self.name} --help-all` lists {len(hidden)} more options: {panels}."
         self.epilog = about if hidden else None

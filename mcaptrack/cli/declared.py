@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
-from typing import Annotated, Any, ClassVar, Generic, TypeVar
+from collections.abc import Callable, Iterable, Mapping
+from typing import Annotated, Any, ClassVar, Final, Generic, Literal, TypeVar
 
 import typer
 
@@ -25,14 +25,31 @@ from mcaptrack.api.declared import (
 )
 from mcaptrack.api.options import FILES, Force, PathLike
 from mcaptrack.cli import common
+from mcaptrack.cli.command import LAST_PANELS, read_config, show_all
 from mcaptrack.cli.text import stdout_to_stderr
+from mcaptrack.ranges import limits
 
 T = TypeVar("T")
-_OF_ALL: dict[str, Any] = {"json": common.Json, "quiet": common.Quiet, "verbose": common.Verbose}
-
-
+#: Heading of the options of all commands.
+COMMON: Final = LAST_PANELS[-1]
 #: Options by name: their types, which ``Annotated[..., Option(...)]`` says more about, and their defaults.
 Options = Mapping[str, tuple[Any, Any]]
+_CONFIG = "Read options from this file, not mcaptrack.toml in the working folder (tuning only) and your config folder."
+_LOG_FORMAT = "Print notes, progress and errors as lines of text, or as objects of JSON with their times."
+#: The options of all commands.
+OF_ALL: Final[Options] = {
+    "json": (Annotated[bool, Option(COMMON, help="Print JSON for programs.")], False),
+    "quiet": (Annotated[bool, Option(COMMON, short="q", help="Say nothing but errors and warnings.")], False),
+    "verbose": (
+        Annotated[bool, Option(COMMON, short="v", help="Print more, such as where each option was set.")],
+        False,
+    ),
+    "config": (Annotated[PathLike | None, Option(COMMON, help=_CONFIG)], None),
+    "log_format": (Annotated[Literal["text", "json"], Option(COMMON, help=_LOG_FORMAT)], "text"),
+    "help_all": (Annotated[bool, Option(COMMON, help="Show all options, by theme, and exit.")], False),
+}
+#: What takes effect before other options are read.
+_EAGER: Final[Mapping[str, Callable[..., Any]]] = {"config": read_config, "help_all": show_all}
 #: Options of commands whose results are what is printed to stdout: the file to write them to.
 PRINTED: Options = {
     "output": (
@@ -80,7 +97,7 @@ class Called(Generic[T]):
         names = {option.name: option.name for option in options_of(declared)}
         placed = arguments_of(declared).items()
         names |= {parameter: about.name for parameter, about in placed if not isinstance(about, OneOfMany)}
-        more = as_typer(cls.options())
+        more = parameters_of(cls.options())
         return command(name, declared, lambda given: cls(name, given).run(names), more, cls.most_used)
 
     def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
@@ -129,39 +146,37 @@ def command(
     name: str,
     declared: Callable[..., Any],
     run: Callable[[Mapping[str, Any]], None],
-    more: Options | None = None,
+    more: Iterable[Parameter],
     most_used: tuple[str, ...] = (),
 ) -> Callable[..., None]:
     """Return the function of a command, with the signature of a declared function as Typer takes it.
 
-    ``more`` are options that the function lacks, as Typer takes them. ``run`` gets the values of all.
+    ``more`` are options that the function lacks. ``run`` gets the values of all.
     """
-    annotations: dict[str, tuple[Any, Any]] = {}
-    for parameter, about in arguments_of(declared).items():
-        default = inspect.signature(declared).parameters[parameter].default
-        annotations[about.name] = argument_annotation(about, hints_of(declared)[parameter], default)
-    annotations |= {parameter.name: (annotation_of(parameter), parameter.default) for parameter in options_of(declared)}
-    annotations |= dict(more or {})
-    annotations |= {option: (hint, False) for option, hint in _OF_ALL.items()} | {"config": (common.Config, None)}
+    hints, signature = hints_of(declared), inspect.signature(declared).parameters
+    parameters = {option.name: option for option in (*options_of(declared), *more, *parameters_of(OF_ALL))}
+    annotations = {
+        about.name: argument_annotation(about, hints[parameter], signature[parameter].default)
+        for parameter, about in arguments_of(declared).items()
+    } | {option.name: (annotation_of(option), option.default) for option in parameters.values()}
 
     def call(**values: Any) -> None:
         run(values)
 
     keyword = inspect.Parameter.KEYWORD_ONLY
-    call.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+    function: Any = common.one_line(call)
+    function.__signature__ = inspect.Signature(
         [inspect.Parameter(n, keyword, default=default, annotation=hint) for n, (hint, default) in annotations.items()]
     )
-    call.__name__, call.__annotations__ = name, {n: hint for n, (hint, _) in annotations.items()}
-    function: Any = common.one_line(call)
-    function.settable = ()
+    function.__name__, function.__annotations__ = name, {n: hint for n, (hint, _) in annotations.items()}
+    function.parameters, function.settable = tuple(parameters.values()), ()
     function.help, function.most_used = help_of(declared), most_used or getattr(declared, "most_used", ())
     return function  # type: ignore[no-any-return]
 
 
-def as_typer(options: Options) -> dict[str, tuple[Any, Any]]:
-    """Return the annotations and defaults of options, as Typer takes them."""
-    parameters = [parameter_of(name, hint, default) for name, (hint, default) in options.items()]
-    return {parameter.name: (annotation_of(parameter), parameter.default) for parameter in parameters}
+def parameters_of(options: Options) -> list[Parameter]:
+    """Return options as parameters."""
+    return [parameter_of(name, hint, default) for name, (hint, default) in options.items()]
 
 
 def argument_annotation(about: Argument, hint: Any, default: Any) -> tuple[Any, Any]:
@@ -175,20 +190,25 @@ def argument_annotation(about: Argument, hint: Any, default: Any) -> tuple[Any, 
 
 
 def annotation_of(parameter: Parameter) -> Any:
-    """Return the annotation of an option, as Typer takes it."""
-    about = parameter.option
-    settings: dict[str, Any] = {"help": parameter.help, "metavar": about.metavar, "case_sensitive": False}
-    if parameter.shown is not None:
-        settings["show_default"] = parameter.shown
-    if about.names is not None:
-        settings["autocompletion"] = about.names
-    info = common.option(
+    """Return the annotation of an option, as Typer takes it. The help names the range.
+
+    Options of all commands, and of input and output, show no defaults unless they are declared to.
+    """
+    about, text = parameter.option, parameter.help
+    if ends := limits(about.least, about.most):
+        text += f" {ends[0].upper()}{ends[1:]}."
+    shown = about.panel not in (COMMON, FILES) if parameter.shown is None else parameter.shown
+    info = typer.Option(
         *parameter.flags,
-        panel=about.panel,
-        tuning=about.tuning,
-        least=about.least,
-        most=about.most,
-        **settings,
+        help=text,
+        metavar=about.metavar,
+        show_default=shown,
+        show_envvar=False,
+        rich_help_panel=about.panel or None,
+        case_sensitive=False,
+        autocompletion=about.names,
+        is_eager=parameter.name in _EAGER,
+        callback=_EAGER.get(parameter.name),
     )
     kind: Any = list[parameter.kind] if parameter.many else parameter.kind  # type: ignore[name-defined]
     return Annotated[kind | None if parameter.default is None else kind, info]

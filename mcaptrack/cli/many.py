@@ -19,6 +19,7 @@ from mcaptrack import SCHEMA_VERSION, notices
 from mcaptrack.api.declared import Option
 from mcaptrack.api.options import PathLike
 from mcaptrack.cli import common
+from mcaptrack.cli.command import LAST_PANELS
 from mcaptrack.cli.declared import Called, Options
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.text import is_json, print_line_of_json, printable, say, stdout_to_stderr
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 #: Heading of the options in the help.
-PANEL: Final = common.MANY
+PANEL: Final = LAST_PANELS[1]
 _TIME: Final = re.compile(r"([0-9]+(?:\.[0-9]+)?)\s*([smh]?)")
 _SECONDS: Final = {"": 1, "s": 1, "m": 60, "h": 3600}
 #: The number of logs from which on the summary repeats why logs failed.

@@ -10,16 +10,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field
 from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import mcaptrack
-from mcaptrack.api.declared import Option, Parameter, parameter_of
+from mcaptrack.api.declared import Option, Parameter
 from mcaptrack.api.declared import options_of as options_of_function
-from mcaptrack.api.options import PLUGIN, chooser
+from mcaptrack.api.options import PLUGIN
 from mcaptrack.cli.chosen import Maker, configured, has_flag, is_open, listed, options_of, values_set
 from mcaptrack.cli.command import is_on_command_line
-from mcaptrack.cli.declared import Options, as_typer, command, help_of
-from mcaptrack.cli.many import NAMES
+from mcaptrack.cli.declared import OF_ALL, Options, command, help_of, parameters_of
 from mcaptrack.cli.running import RunsStages
 from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.errors import McaptrackError
@@ -38,8 +37,6 @@ Set = Annotated[
         help="Set a parameter that has no option of its own, as often as needed; `mcaptrack docs options` lists them.",
     ),
 ]
-#: Options that every command has beside those of its function.
-RESERVED: Final = ("help", "logs", "json", "quiet", "verbose", "config", "log-format", *NAMES)
 
 
 class StageCommand(RunsStages):
@@ -81,21 +78,16 @@ class StageCommand(RunsStages):
     ) -> Callable[..., None]:
         """Return the function of the command, with the options of ``plugins``: transforms of other packages."""
         stage, declared = STAGES[name], getattr(mcaptrack, name)
-        kinds = {**plugins, **stage.built_in()}
-        own = {option.name: option for option in options_of_function(declared)}
-        more, settable = _options(stage, kinds)
-        added = [parameter_of(option, hint, default) for option, (hint, default) in more.items()]
-        flags = Counter(flag for option in (*own.values(), *added) for flag in _flags(option))
-        if stage.kind:
-            flags -= Counter(_flags(own[stage.kind]))
-        flags += Counter(flag.replace("_", "-") for flag in RESERVED)
+        kinds, own = {**plugins, **stage.built_in()}, options_of_function(declared)
+        options, settable = _options(stage, kinds)
+        more = parameters_of({**options, **cls.options()})
+        flags = Counter(flag for option in (*own, *more, *parameters_of(OF_ALL)) for flag in _flags(option))
+        flags += Counter(["help", "logs"])
         if twice := {flag.replace("-", "_") for flag, count in flags.items() if count > 1}:
             text = f"{' and '.join(plugins)} can't have a parameter {' or '.join(sorted(twice))}"
             raise McaptrackError(f"{text}: that is the name of an option of {name}")
-        names = {option: option for option in own}
-        function: Any = command(
-            name, declared, lambda given: cls(name, given, kinds).run(names), as_typer({**more, **cls.options()})
-        )
+        names = {option.name: option.name for option in own}
+        function: Any = command(name, declared, lambda given: cls(name, given, kinds).run(names), more)
         function.help, function.settable = stage_help(stage, plugins), settable
         return function  # type: ignore[no-any-return]
 
@@ -117,16 +109,11 @@ def _options(stage: Stage, kinds: Mapping[str, type[Transform]]) -> tuple[Option
         field = options_of(kinds[having[0]])[name]
         if has_flag(field):
             is_shared = set(stage.built_in()) <= set(having)
-            options[name] = _option(field, get_type_hints(kinds[having[0]])[name], () if is_shared else having), None
+            options[name] = hint_of(kinds[having[0]], field, () if is_shared else having), None
         else:
             settable.append(name)
     if settable:
         options["set"] = Set, None
-    if stage.kind:
-        usual = stage.entry(stage.default).name
-        which = chooser(stage.kind, shown=usual if stage.profiles else None)
-        # None where a profile may choose the transform.
-        options[stage.kind] = Annotated[str | None, which], None if stage.profiles else usual
     return options, tuple(settable)
 
 
@@ -155,22 +142,22 @@ def _panel(theme: str, of: Sequence[str]) -> str:
     return f"{theme} ({those})" if theme else f"Options of {those}"
 
 
-def _option(field: Field[Any], annotation: Any, of: Sequence[str]) -> Any:
-    """Return the option for a parameter. Its value is None unless it is set; its help shows the default.
+def hint_of(kind: type[Transform], field: Field[Any], of: Sequence[str] = ()) -> Any:
+    """Return the type of the option for a parameter of a transform. Its value is None unless it is set.
 
     ``of`` are the names of the transforms that have the parameter; none if all have it.
     """
-    (kind, is_tuple), about = member_type(annotation), field.metadata
+    (member, is_tuple), about = member_type(get_type_hints(kind)[field.name]), field.metadata
     text = str(about.get("help", "") or f"parameter {field.name} of {' and '.join(of)}")
     option = Option(
         _panel(about.get("theme", ""), of),
         about.get("least", -math.inf),
         about.get("most", math.inf),
-        tuning=PLUGIN if about.get("kind") else about.get("pattern") or bool(choices(kind)) or kind is not str,
+        tuning=PLUGIN if about.get("kind") else about.get("pattern") or bool(choices(member)) or member is not str,
         shown=shown_default(field.default_factory() if field.default_factory is not MISSING else field.default),
         help=f"{text[:1].upper()}{text[1:]}.",
     )
-    return Annotated[(Sequence[kind] if is_tuple else kind) | None, option]  # type: ignore[valid-type]
+    return Annotated[(Sequence[member] if is_tuple else member) | None, option]  # type: ignore[valid-type]
 
 
 def shown_default(default: Any) -> str:
