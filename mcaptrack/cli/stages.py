@@ -67,7 +67,7 @@ class StageCommand(RunsStages):
             wanted[option] = value
         make = Maker.of(stage, self.given, wanted, owners)
         with stdout_to_stderr():
-            self._transform = None if is_open(stage, self.given) else make("")
+            self._transform = None if is_open(stage, self.given) else make()
             arguments: dict[str, Any] = {"stages": configured(), "make": make}
         where = ("topic", "to", "frame", "camera", "output", "sidecar", "force", "mode")
         return arguments | {name: self.given[name] for name in where if name in names}

@@ -70,8 +70,6 @@ class Stage:
         Outputs to write, by the name of the mode; empty for all.
     beside : tuple[str, ...]
         Outputs that are made wherever the main one is, also again in logs that lack them.
-    implied : Mapping[str, str]
-        Options that belong to one transform and choose it, by its name, if none is named.
     """
 
     name: str
@@ -89,7 +87,6 @@ class Stage:
     profiles: Mapping[str, Transform] = field(default_factory=dict)
     modes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     beside: tuple[str, ...] = ()
-    implied: Mapping[str, str] = field(default_factory=dict)
 
     def outputs(self, target: str) -> tuple[str, ...]:
         """The topics that the stage writes if its main output is ``target``."""
@@ -302,7 +299,6 @@ _STAGES: Final = (
             {"both": (), "offline": ("", "decisions", "appearance"), "online": ("online", "predictions")}
         ),
         beside=("decisions", "appearance"),
-        implied=MappingProxyType({"distance": "consistency"}),
     ),
 )
 #: All stages by name, in the order in which they run.
