@@ -209,11 +209,6 @@ def test_every_option_arrives_under_its_name(command, folder, asked):
     assert tried or command in ("recover", "drop")
 
 
-def test_commands_that_only_read_are_known():
-    reading = {"check", "docs", "doctor", "evaluate", "info", "query", "view"}
-    assert {name for name, one in GROUP.commands.items() if one.reads} == reading
-
-
 def test_patterns_are_replaced_by_files_in_order_without_results_of_logs_that_are_there(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("b.mcap", "a.mcap", "a.results.mcap", "other.results.mcap", "deep/er/c.mcap", "d[1].mcap"):
