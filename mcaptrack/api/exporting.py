@@ -24,7 +24,7 @@ from mcaptrack.tables.rosbag2 import Storage, write_bag
 from mcaptrack.tables.rosbag2 import default_folder as default_bag
 
 #: ROS 2 bags by the format of ``export``.
-_BAGS: Mapping[BagFormat, Storage] = {"rosbag2": "mcap", "rosbag2-sqlite3": "sqlite3"}
+_BAGS: Mapping[str, Storage] = {"rosbag2": "mcap", "rosbag2-sqlite3": "sqlite3"}
 
 
 @dataclass(frozen=True)

@@ -86,8 +86,8 @@ class Run(RunsStages):
         from mcaptrack.transforms import STAGES
 
         arguments = super().arguments(names)
-        chosen = {stage.option: arguments.pop(stage.option) for stage in STAGES.values() if stage.option}
-        chosen = {kind: name for kind, name in chosen.items() if name}
+        named = {str(stage.option): arguments.pop(stage.option) for stage in STAGES.values() if stage.option}
+        chosen = {kind: name for kind, name in named.items() if name}
         with stdout_to_stderr():
             settings, stages = settings_of("events"), configured(chosen)
         arguments |= {s.option: stages.pop(s.name) for s in STAGES.values() if s.option in chosen}

@@ -64,7 +64,8 @@ class Export(EachLog["ExportResult"]):
 
     @property
     def _folder(self) -> Path | None:
-        return self.given["output"] or self.many.output_dir
+        folder: Path | None = self.given["output"] or self.given["output_dir"]
+        return folder
 
     def suffix(self) -> str:
         """Return the end of the names of bags and files."""
