@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from mcaptrack import log as logs
 from mcaptrack import tables
-from mcaptrack.api.columns import times_of
 from mcaptrack.api.common import names_of
 from mcaptrack.api.declared import Option, checked
 from mcaptrack.api.notebook import Choice, Player, show_log, show_tables
@@ -25,6 +24,7 @@ from mcaptrack.location import Location, Url
 from mcaptrack.log import Log
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
+from mcaptrack.sources.own_rows import times_of
 from mcaptrack.sources.pictures import Pictures, find_pictures
 from mcaptrack.sources.video import decode_bgr, decode_gray
 from mcaptrack.tables import export
