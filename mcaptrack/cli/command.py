@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 import typer
 from typer.core import TyperCommand
@@ -115,12 +115,7 @@ def arrange(first: Sequence[str], parameters: list[Any]) -> None:
 
 
 class Command(TyperCommand):
-    """A command. ``settings`` has its options by name.
-
-    A command that ``reads`` changes no file except the one that -o names.
-    """
-
-    reads: ClassVar = False
+    """A command. ``settings`` has its options by name."""
 
     def __init__(self, name: str, **arguments: Any) -> None:
         super().__init__(name, **arguments)
@@ -225,12 +220,6 @@ def _values_of(args: Sequence[str], option: str) -> Iterator[str]:
             yield "".join(args[number + 1 : number + 2])
         elif word.startswith(f"{option}="):
             yield word.partition("=")[2]
-
-
-class Reading(Command):
-    """A command that changes no file except the one that -o names."""
-
-    reads: ClassVar = True
 
 
 _DEFAULT: Final = 3

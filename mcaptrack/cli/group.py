@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, MutableMapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -15,7 +15,7 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 from mcaptrack import _MODULES
-from mcaptrack.cli.command import Command, Reading, usage_in_one_line
+from mcaptrack.cli.command import Command, usage_in_one_line
 from mcaptrack.cli.settings import may_be_set
 
 _MAKE, _RUN, _LOOK = "Make a log", "Detect, track, predict", "Look at results"
@@ -23,18 +23,17 @@ _MEASURE, _KEEP = "Measure and improve", "Check and repair logs"
 
 
 class Listed(NamedTuple):
-    """A command: its heading in the help, and where in ``mcaptrack.cli`` it is.
-
-    ``place`` is MODULE:NAME, of an object with ``function_of(name)``. A command that ``reads`` changes no file except
-    the one that -o names. ``source`` is the module and the name of the function that declares it, if that is not the
-    function of the library of its name.
-    """
+    """A command: its heading in the help, and where in ``mcaptrack.cli`` its class is, as MODULE:CLASS."""
 
     name: str
     panel: str
     place: str
-    reads: bool = False
-    source: str = ""
+
+    @property
+    def command(self) -> Any:
+        """The class of the command (``cli.declared.Called``), which is imported now."""
+        module, _, name = self.place.partition(":")
+        return getattr(import_module(f"mcaptrack.cli.{module}"), name)
 
     @property
     def summary(self) -> str:
@@ -42,9 +41,9 @@ class Listed(NamedTuple):
 
         It is read from the source, because an import of all commands takes half a second.
         """
-        module, _, name = (self.source or f"{_MODULES[self.name]}:{self.name}").partition(":")
-        match = re.search(rf'^def {name}\(.*?"""(.*?)(?:\n\n|""")', _source_of(module), re.MULTILINE | re.DOTALL)
-        doc = match[1] if match else (getattr(import_module(module), name).__doc__ or "").partition("\n\n")[0]
+        source = _source_of(_MODULES[self.name]) if self.name in _MODULES else ""
+        match = re.search(rf'^def {self.name}\(.*?"""(.*?)(?:\n\n|""")', source, re.MULTILINE | re.DOTALL)
+        doc = match[1] if match else (self.command.declaration(self.name).__doc__ or "").partition("\n\n")[0]
         return " ".join(doc.split())
 
 
@@ -58,7 +57,7 @@ def _source_of(module: str) -> str:
         return ""
 
 
-ENTRIES: Final = (
+_LISTED: Final = (
     Listed("ingest", _MAKE, "ingest:Ingest"),
     Listed("demo", _MAKE, "demo:Demo"),
     Listed("run", _RUN, "running:Run"),
@@ -70,78 +69,69 @@ ENTRIES: Final = (
     Listed("retrack", _RUN, "stages:StageCommand"),
     Listed("fuse", _RUN, "running:Fuse"),
     Listed("models", _RUN, "models:Models"),
-    Listed("info", _LOOK, "show:Info", reads=True),
-    Listed("view", _LOOK, "view:View", reads=True),
+    Listed("info", _LOOK, "show:Info"),
+    Listed("view", _LOOK, "view:View"),
     Listed("render", _LOOK, "render:Render"),
     Listed("report", _LOOK, "report:Report"),
-    Listed("query", _LOOK, "query:Query", reads=True),
+    Listed("query", _LOOK, "query:Query"),
     Listed("export", _LOOK, "show:Export"),
-    Listed("docs", _LOOK, "docs:Docs", reads=True, source="mcaptrack.cli.docs:documentation"),
-    Listed("evaluate", _MEASURE, "evaluate:Evaluate", reads=True),
+    Listed("docs", _LOOK, "docs:Docs"),
+    Listed("evaluate", _MEASURE, "evaluate:Evaluate"),
     Listed("events", _MEASURE, "running:Events"),
     Listed("zones", _MEASURE, "zones:Zones"),
     Listed("calibrate", _MEASURE, "calibrate:Calibrate"),
     Listed("tune", _MEASURE, "tune:Tune"),
     Listed("train", _MEASURE, "train:Train"),
-    Listed("check", _KEEP, "files:Check", reads=True),
+    Listed("check", _KEEP, "files:Check"),
     Listed("recover", _KEEP, "files:Recover"),
     Listed("drop", _KEEP, "files:Drop"),
-    Listed("doctor", _KEEP, "doctor:Doctor", reads=True),
+    Listed("doctor", _KEEP, "doctor:Doctor"),
 )
+#: The commands by name.
+ENTRIES: Final = {entry.name: entry for entry in _LISTED}
 #: Commands with options of plug-ins.
-_WITH_PLUGINS: Final = ("run", *(entry.name for entry in ENTRIES if entry.place == "stages:StageCommand"))
+_WITH_PLUGINS: Final = ("run", *(entry.name for entry in _LISTED if entry.place == "stages:StageCommand"))
 
 
 def make(entry: Listed, function: Any = None) -> Any:
     """Make a command of Typer of an entry; ``function`` is its function, if it is not the usual one."""
-    module, _, name = entry.place.partition(":")
-    target = function or getattr(import_module(f"mcaptrack.cli.{module}"), name)
-    function = target.function_of(entry.name) if hasattr(target, "function_of") else target
+    function = function or entry.command.function_of(entry.name)
     app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
     app.command(
         entry.name,
-        cls=Reading if entry.reads else Command,
-        help=getattr(function, "help", None),
+        cls=Command,
+        help=function.help,
         context_settings={"help_option_names": ["--help", "-h"]},
         rich_help_panel=entry.panel,
     )(function)
     return get_command(app)
 
 
-class Commands(MutableMapping[str, Any]):
+class Commands(Mapping[str, Any]):
     """The commands by name; each is made when it is looked up."""
 
-    def __init__(self, changed: Mapping[str, Any] | None = None, commands_made: dict[str, Any] | None = None) -> None:
-        self._entries = {entry.name: entry for entry in ENTRIES}
-        self._made: dict[str, Any] = {} if commands_made is None else commands_made
-        self._changed = changed or {}
+    def __init__(self, made: dict[str, Any] | None = None, changed: Mapping[str, Any] | None = None) -> None:
+        self._made, self._changed = {} if made is None else made, changed or {}
 
     def __getitem__(self, name: str) -> Any:
         if name in self._changed:
             return self._changed[name]
         if name not in self._made:
-            self._made[name] = make(self._entries[name])
+            self._made[name] = make(ENTRIES[name])
         return self._made[name]
 
-    def __setitem__(self, name: str, command: Any) -> None:
-        self._made[name] = command
-
-    def __delitem__(self, name: str) -> None:
-        del self._made[name]
-
     def __iter__(self) -> Iterator[str]:
-        return iter(self._entries)
+        return iter(ENTRIES)
 
     def __len__(self) -> int:
-        return len(self._entries)
+        return len(ENTRIES)
 
     def __contains__(self, name: object) -> bool:
-        return name in self._entries
+        return name in ENTRIES
 
     def changed(self, functions: Mapping[str, Any]) -> Commands:
         """Return a copy of the table, with other functions for some commands."""
-        changed = {name: make(self._entries[name], function) for name, function in functions.items()}
-        return Commands(changed, self._made)
+        return Commands(self._made, {name: make(ENTRIES[name], function) for name, function in functions.items()})
 
 
 class Group(TyperGroup):
@@ -149,7 +139,8 @@ class Group(TyperGroup):
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes | {"commands": {}})
-        self.commands = self._own = Commands()
+        self._own = Commands()
+        self.commands: Any = self._own
         self._lists = False
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -160,8 +151,8 @@ class Group(TyperGroup):
         """Return a command; one that shows no more than its line, while the commands are listed."""
         if not self._lists or cmd_name not in self.commands:
             return super().get_command(ctx, cmd_name) if cmd_name in self.commands else None
-        entry = next(candidate for candidate in ENTRIES if candidate.name == cmd_name)
-        line: Any = typer.core.TyperCommand(entry.name, help=entry.summary, rich_help_panel=entry.panel)
+        entry = ENTRIES[cmd_name]
+        line: Any = typer.core.TyperCommand(cmd_name, help=entry.summary, rich_help_panel=entry.panel)
         return line
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
