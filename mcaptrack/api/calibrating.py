@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.common import Notes, as_location, clock_offsets, split_names, warn_unused, warnings_about
+from mcaptrack.api.common import as_location, clock_offsets, split_names, warn_unused, warnings_about
 from mcaptrack.api.declared import Option, declared
 from mcaptrack.api.options import (
     Cameras,
@@ -26,6 +26,7 @@ from mcaptrack.location import Location
 from mcaptrack.notices import Notice
 from mcaptrack.pipeline.calibrating import CorrectedPlanes, calibrate_cameras, changes_of, write_changes
 from mcaptrack.pipeline.refining import Refined
+from mcaptrack.pipeline.several import Say
 from mcaptrack.schema.provenance import REFINE
 from mcaptrack.sources.fixed_frame import BoxesRead
 
@@ -197,7 +198,7 @@ def calibrate(
         corrections = {camera.name: _correction(camera, offset_s, planes) for camera in refined}
         return CalibrateResult(path, corrections, dict(changes.topics), changes.unchanged, changes.dropped), changes
 
-    def act(opened: logs.Log, target: Path | None, notes: Notes, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
+    def act(opened: logs.Log, target: Path | None, say: Say, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
         result, changes = compare(opened)
         outcome.append((result, {topic for topic in opened.channels if pipeline.is_stale(opened, topic)}))
         is_new = write_changes(opened, changes, target)

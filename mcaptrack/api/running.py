@@ -18,7 +18,6 @@ from mcaptrack import notices, pipeline
 from mcaptrack.api.common import Notes, as_location, log_output, warnings_about
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.api.products import refuse_foreign_products, write_products
-from mcaptrack.api.several import Act, CameraResult, Done, EveryCamera, refuse_failed, together
 from mcaptrack.choices import Mode
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation.zones import ZoneTotals
@@ -26,6 +25,7 @@ from mcaptrack.files import is_same_file, refuse_overwrite
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice, warn
 from mcaptrack.pipeline import AS_BEFORE, Job, PlaneChoice, Summary, Watch, ZoneWatch
+from mcaptrack.pipeline.several import Act, CameraResult, Done, EveryCamera, Say, refuse_failed, together
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
 from mcaptrack.transforms import FUSION, STAGES, Transform
@@ -175,32 +175,32 @@ def work(
     def run_at(prefix: str, progress: Progress) -> Act:
         """Run a camera; without a prefix the only one."""
 
-        def act(opened: logs.Log, output: Path | None, notes: Notes, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
+        def act(opened: logs.Log, output: Path | None, say: Say, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
             topics = watch.topics if watch else zones.topics if zones else ()
             at = prefix or pipeline.find_camera(opened, where.camera, where.topic or next(iter(topics), None))
             fused = {}
             if fuses is not None:
-                fused = pipeline.fuse_again(opened, at, force, notes.say, progress, not fuses.names, fuses.fuser)
+                fused = pipeline.fuse_again(opened, at, force, say, progress, not fuses.names, fuses.fuser)
             run = partial(pipeline.run, opened, at, output=output, progress=progress, watch=watch, plane=plane)
             run = partial(run, boxes=boxes, zones=zones, fused=fused)
             if follows is None:
-                return at, run(plan(opened, at, notes.say, fused, ()))
+                return at, run(plan(opened, at, say, fused, ()))
             with logs.read(follows) as earlier:
                 if prefix and (why := pipeline.begins_here(earlier, opened, at)):
                     warn(why, "left-out")
-                    return at, run(plan(opened, at, notes.say, fused, ()))
+                    return at, run(plan(opened, at, say, fused, ()))
                 before = pipeline.Before(earlier, opened, at)
-                report = run(plan(opened, at, notes.say, fused, before.renewed(opened)), before=before)
+                report = run(plan(opened, at, say, fused, before.renewed(opened)), before=before)
             continued.append(before.result)
             for line in before.result.words():
-                notes.say(line)
+                say(line)
             return at, report
 
         return act
 
     def fuse_to(scene: str, names: Sequence[str], progress: Progress) -> Act:
-        def act(opened: logs.Log, output: Path | None, notes: Notes, _: BoxesRead) -> tuple[str, pipeline.Report]:
-            notes.say(f"fusing {', '.join(names)} to /{scene}")
+        def act(opened: logs.Log, output: Path | None, say: Say, _: BoxesRead) -> tuple[str, pipeline.Report]:
+            say(f"fusing {', '.join(names)} to /{scene}")
             fuser = (fuses.fuser if fuses is not None else None) or FUSION.make()
             return pipeline.fuse_cameras(opened, names, scene, fuser, {}, output, progress, is_asked=False)
 
@@ -236,13 +236,13 @@ def change(
                 opened.lock()  # a second process is refused before it computes anything
             if tables and not where.force:
                 refuse_foreign_products(opened, target)
-            has_several = each is not None and each.chooses(opened, notes)
-            done = [] if has_several else [Done("", *act(opened, output, notes, boxes))]
+            has_several = each is not None and each.chooses(opened, notes.say)
+            done = [] if has_several else [Done("", *act(opened, output, notes.say, boxes))]
             written_to = output or opened.parts[-1].path
             report = together([camera.report for camera in done])
             named = {topic: pipeline.camera_to_name(opened, topic) for topic in report.stale}
         if each is not None and has_several:
-            done = each.run(path, output, place, notes, progress)
+            done = each.run(path, output, place, notes.say, progress)
             report = together([camera.report for camera in done])
             with logs.read(target) as opened:
                 report.stale = [topic for topic in report.stale if pipeline.is_stale(opened, topic)]
