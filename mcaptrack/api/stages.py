@@ -62,7 +62,7 @@ def detect(
     Parameters
     ----------
     **options
-        Options of the detector; `mcaptrack detect --help` lists them.
+        Options of the detector; `mcaptrack detect --help-all` lists them.
 
     Returns
     -------
@@ -117,7 +117,7 @@ def motion(
     transform : Transform, optional
         The transform to use instead of ``mcaptrack.transforms.EstimateMotion``.
     **options
-        Options such as ``mask_boxes``; `mcaptrack motion --help` lists them.
+        Options such as ``mask_boxes``; `mcaptrack motion --help-all` lists them.
 
     Returns
     -------
@@ -171,7 +171,7 @@ def track(
     Parameters
     ----------
     **options
-        Options of the tracker, such as ``max_age_s``; `mcaptrack track --help` lists them.
+        Options of the tracker, such as ``max_age_s``; `mcaptrack track --help-all` lists them.
 
     Returns
     -------
@@ -229,7 +229,7 @@ def sample(
     transform : Transform, optional
         The transform to use instead of ``mcaptrack.transforms.Sample``.
     **options
-        Options such as ``rate_hz``; `mcaptrack sample --help` lists them.
+        Options such as ``rate_hz``; `mcaptrack sample --help-all` lists them.
 
     Returns
     -------
@@ -284,7 +284,7 @@ def predict(
         "red" (the default), "social" (looks at other people), "kalman", "holt-cv", "cv", "lstm" (less exact than "cv"),
         "red:FILE", "onnx:FILE", the name of an installed predictor, or "module:Class"; or a transform.
     **options
-        Options such as ``horizon_s``; `mcaptrack predict --help` lists them.
+        Options such as ``horizon_s``; `mcaptrack predict --help-all` lists them.
 
     Returns
     -------
@@ -345,7 +345,7 @@ def retrack(
     mode : {"both", "offline", "online"}, default "both"
         Write tracks that use the whole log (offline), the past alone (online), or both.
     **options
-        Options that differ from the profile; `mcaptrack retrack --help` lists them.
+        Options that differ from the profile; `mcaptrack retrack --help-all` lists them.
 
     Returns
     -------

@@ -94,7 +94,7 @@ def _read_member(value: str, kind: Any) -> Any:
 
 def is_open(stage: Stage, values: Mapping[str, Any]) -> bool:
     """Return whether the boxes of a log decide which tracker runs, because the user named none."""
-    return stage.default.reads is DETECTIONS and not values["tracker"]
+    return stage.reads is DETECTIONS and not values["tracker"]
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import difflib
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from copy import copy
 from pathlib import Path
 from typing import Any, Final
 
@@ -41,7 +42,7 @@ def usage_in_one_line(command: str = "") -> Iterator[None]:
         text = " ".join(error.format_message().replace("Value error, ", "").rstrip(".").split())
         if hasattr(error, "possibilities"):
             text = _unknown_option(error)
-        page = " ".join(filter(None, ["mcaptrack", command, "--help"]))
+        page = f"mcaptrack {command} {ALL}" if command else "mcaptrack --help"
         end = "" if text.endswith("?") else ";"
         refuse_usage(f"{text[:1].lower()}{text[1:]}{end} `{page}` lists the {'options' if command else 'commands'}")
 
@@ -87,6 +88,8 @@ def _options_of(command: Any) -> list[str]:
 FIRST_PANEL: Final = "Most used"
 MORE_PANEL: Final = "More options"
 LAST_PANELS: Final = ("Input and output", "Many logs", "Options of all commands")
+#: The option that shows all options; ``--help`` shows those that most people need.
+ALL: Final = "--help-all"
 
 #: The heading of a theme that not all detectors, trackers or predictors have: the names of those that have it.
 _THOSE: Final = re.compile(r"\((.+)\)$|^Options of (.+)$")
@@ -126,38 +129,46 @@ class Command(TyperCommand):
         self.settable: tuple[str, ...] = function.settable
         arrange(self.most_used, self.params)
         self._is_short = False
+        self._help_all: Any = None
         parameters: dict[str, Any] = {parameter.name or "": parameter for parameter in self.params}
         for parameter in parameters.values():
             parameter.process_value = _refusing_empty(parameter.process_value)
         config = parameters["config"]
         config.envvar = self.settings["config"].variable  # the others are read with the files, once this is known
 
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Print the help. Of a command with many options it has those that most people need, and names the others."""
-        self._is_short = bool(self.most_used) and not ctx.meta.get(_ALL)
-        hidden: list[Any] = [option for option in self.params if not self._is_shown(option)]
-        panels = ", ".join(dict.fromkeys(option.rich_help_panel for option in hidden))
-        about = f"`mcaptrack {self.name} --help-all` lists {len(hidden)} more options: {panels}."
-        self.epilog = about if hidden else None
-        try:
-            super().format_help(ctx, formatter)
-        finally:
-            self._is_short = False
-
-    def get_params(self, ctx: Any) -> list[Any]:
-        """Return the parameters; while a short help is printed, those that it has."""
-        return [parameter for parameter in super().get_params(ctx) if self._is_shown(parameter)]
-
-    def _is_shown(self, parameter: Any) -> bool:
-        is_option = parameter.param_type_name == "option"
-        return not (self._is_short and is_option) or parameter.rich_help_panel in (FIRST_PANEL, LAST_PANELS[-1])
-
     def get_help_option(self, ctx: Any) -> Any:
         """Put ``--help`` below the heading of the options that all commands have."""
         option = super().get_help_option(ctx)
         if option is not None:
             option.rich_help_panel = LAST_PANELS[-1]
+            option.help = "Show the options that most people need, and exit."
         return option
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the parameters, with ``--help-all``; while the short help is printed, only those that stand in it."""
+        if self._help_all is None:
+            self._help_all = copy(self.get_help_option(ctx))
+            self._help_all.name, self._help_all.opts, self._help_all.callback = "help_all", [ALL], _show_all
+            self._help_all.help = "Show all options, by theme, and exit."
+        parameters = [*super().get_params(ctx), self._help_all]
+        return list(filter(self._is_in_short_help, parameters)) if self._is_short else parameters
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Print the help: with ``--help-all`` of all options, otherwise of those that most people need."""
+        left_out = [] if ctx.meta.get(ALL) else [o for o in self.get_params(ctx) if not self._is_in_short_help(o)]
+        if left_out:
+            panels = dict.fromkeys(re.sub(r" \(.*", "", option.rich_help_panel) for option in left_out)
+            self._is_short, self.epilog = True, f"`{ALL}` shows all options, also: {', '.join(panels)}."
+        try:
+            super().format_help(ctx, formatter)
+        finally:
+            self._is_short, self.epilog = False, None
+
+    def _is_in_short_help(self, parameter: Any) -> bool:
+        if parameter.param_type_name != "option":
+            return True
+        panel = parameter.rich_help_panel
+        return panel == FIRST_PANEL if self.most_used else panel not in LAST_PANELS[1:]
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the command line; whatever is wrong with it ends the command in one line."""
@@ -193,6 +204,13 @@ class Command(TyperCommand):
         return f"options: {', '.join(parts)}"
 
 
+def _show_all(ctx: Any, _: Any, is_asked: bool) -> None:
+    if is_asked and not ctx.resilient_parsing:
+        ctx.meta[ALL] = True
+        typer.echo(ctx.get_help(), color=ctx.color)
+        ctx.exit()
+
+
 def _refusing_empty(process: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
     """Return ``process_value`` of a parameter, which refuses empty text: as a path it would be the working folder."""
 
@@ -223,8 +241,6 @@ def _values_of(args: Sequence[str], option: str) -> Iterator[str]:
 
 
 _DEFAULT: Final = 3
-#: What the context of a command has where its help lists all options.
-_ALL: Final = "mcaptrack.help_all"
 
 
 def _rank(ctx: Any, parameter: str, set_values: Mapping[str, tuple[Setting, Given]]) -> tuple[int, str]:
@@ -235,14 +251,6 @@ def _rank(ctx: Any, parameter: str, set_values: Mapping[str, tuple[Setting, Give
     if source.name == "DEFAULT_MAP":
         return set_values[parameter][1].rank, set_values[parameter][1].where
     return (1, "the environment") if source.name == "ENVIRONMENT" else (0, "")
-
-
-def show_all(context: typer.Context, is_wanted: bool) -> None:
-    """Print the help with all options, and end the command. This is the callback of ``--help-all``."""
-    if is_wanted and not context.resilient_parsing:
-        context.meta[_ALL] = True
-        typer.echo(context.get_help())
-        raise typer.Exit
 
 
 def read_config(context: typer.Context, path: Path | None) -> Path | None:

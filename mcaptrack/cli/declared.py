@@ -25,7 +25,7 @@ from mcaptrack.api.declared import (
 )
 from mcaptrack.api.options import FILES, Force, PathLike
 from mcaptrack.cli import common
-from mcaptrack.cli.command import LAST_PANELS, read_config, show_all
+from mcaptrack.cli.command import LAST_PANELS, read_config
 from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.ranges import limits
 
@@ -46,10 +46,7 @@ OF_ALL: Final[Options] = {
     ),
     "config": (Annotated[PathLike | None, Option(COMMON, help=_CONFIG)], None),
     "log_format": (Annotated[Literal["text", "json"], Option(COMMON, help=_LOG_FORMAT)], "text"),
-    "help_all": (Annotated[bool, Option(COMMON, help="Show all options, by theme, and exit.")], False),
 }
-#: What takes effect before other options are read.
-_EAGER: Final[Mapping[str, Callable[..., Any]]] = {"config": read_config, "help_all": show_all}
 #: Options of commands whose results are what is printed to stdout: the file to write them to.
 PRINTED: Options = {
     "output": (
@@ -207,8 +204,8 @@ def annotation_of(parameter: Parameter) -> Any:
         rich_help_panel=about.panel or None,
         case_sensitive=False,
         autocompletion=about.names,
-        is_eager=parameter.name in _EAGER,
-        callback=_EAGER.get(parameter.name),
+        is_eager=parameter.name == "config",  # the file has the defaults of the others
+        callback=read_config if parameter.name == "config" else None,
     )
     kind: Any = list[parameter.kind] if parameter.many else parameter.kind  # type: ignore[name-defined]
     return Annotated[kind | None if parameter.default is None else kind, info]

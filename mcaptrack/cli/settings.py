@@ -26,7 +26,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.ranges import limits
 
 #: Options that only the command line can set.
-CALL_ONLY: Final = ("config", "help", "help-all")
+CALL_ONLY: Final = ("config", "help")
 _YES: Final = ("1", "true", "yes", "on")
 _NO: Final = ("0", "false", "no", "off")
 _LARGEST: Final = 2**63

@@ -82,7 +82,7 @@ class StageCommand(RunsStages):
         options, settable = _options(stage, kinds)
         more = parameters_of({**options, **cls.options()})
         flags = Counter(flag for option in (*own, *more, *parameters_of(OF_ALL)) for flag in _flags(option))
-        flags += Counter(["help", "logs"])
+        flags += Counter(["help", "help-all", "logs"])
         if twice := {flag.replace("-", "_") for flag, count in flags.items() if count > 1}:
             text = f"{' and '.join(plugins)} can't have a parameter {' or '.join(sorted(twice))}"
             raise McaptrackError(f"{text}: that is the name of an option of {name}")

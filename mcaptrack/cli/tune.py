@@ -34,7 +34,7 @@ class Tune(Once["TuneResult"]):
 
     def __init__(self, name: str, values: Mapping[str, Any]) -> None:
         super().__init__(name, values)
-        self._has_tracker = STAGES[values["stage"]].default.reads is DETECTIONS
+        self._has_tracker = STAGES[values["stage"]].reads is DETECTIONS
 
     def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
         """Return the arguments of the function: patterns become files, texts become ranges."""

@@ -68,7 +68,7 @@ def _needs_still_camera(opened: log.Log, boxes: str, jobs: Sequence[Job]) -> boo
 def detects_motion(provenance: Provenance | None) -> bool:
     """Whether a channel has the boxes of a detector that needs a still camera."""
     stage = STAGES.get(provenance.transform) if provenance and "transform" not in provenance.plugins else None
-    if provenance is None or stage is None or stage.default.reads is not VIDEO:
+    if provenance is None or stage is None or stage.reads is not VIDEO:
         return False
     name = provenance.parameters.get("detector", "")
     return traits_of(stage.built_in().get(str(name), stage.default)).needs_still_camera
@@ -129,7 +129,7 @@ def moves(opened: log.Log, prefix: str, results: Mapping[str, Made]) -> bool:
 
 def _boxes(opened: log.Log, prefix: str, results: Mapping[str, Made]) -> SideInputs:
     """The boxes of people, by the time of their picture."""
-    usual = f"{prefix}/{next(s.output_topic for s in STAGES.values() if s.default.writes[''] is DETECTIONS)}"
+    usual = f"{prefix}/{next(s.output_topic for s in STAGES.values() if s.writes[''] is DETECTIONS)}"
     topic = usual if usual in results or usual in opened.channels else camera_at(opened, prefix).boxes
     boxes_read = None if topic is None else _read(opened, topic, DETECTIONS, results)
     if topic is None or boxes_read is None or _needs_still_camera(opened, topic, ()):

@@ -146,7 +146,7 @@ def _trackers_of(space: str) -> list[str]:
 
 def suited_tracker(opened: log.Log, stage: Stage, source: str) -> str:
     """Return the tracker for boxes that the default one can't take; "" for others, and for other stages."""
-    if stage.default.reads is not DETECTIONS:
+    if stage.reads is not DETECTIONS:
         return ""
     spaces, default = spaces_of_boxes(opened, source), traits_of(STAGES["track"].default).space
     return tracker_of(next(iter(sorted(spaces)))) if spaces and default not in spaces else ""
@@ -316,7 +316,7 @@ class _Planner:
         if stage in self._sources or usual in self._opened.channels:
             return self._sources.get(stage, usual)
         camera = camera_at(self._opened, self._prefix)
-        reads = STAGES[stage].default.reads
+        reads = STAGES[stage].reads
         if reads is VIDEO and camera.pictures:
             self._notes.append(f"{usual} is missing: taking the pictures of {camera.pictures}")
             if camera.boxes:
@@ -543,7 +543,7 @@ class _Planner:
 
     def _given_pictures(self) -> str:
         """The topic of the pictures that a run begins with, if it was told which."""
-        return next((topic for name, topic in self._sources.items() if STAGES[name].default.reads is VIDEO), "")
+        return next((topic for name, topic in self._sources.items() if STAGES[name].reads is VIDEO), "")
 
     def _with_choice(self, transform: Any) -> Any:
         """Return a transform with those of the shared options that it has."""

@@ -403,7 +403,7 @@ class PictureSource:
                 yield None if payload is None else read(payload)
 
         if self._pictures is not None:
-            for frame in self._pictures.frames(numbers.tolist()):
+            for frame in self._pictures.readable(numbers.tolist()):
                 image = np.asarray(frame.rows, np.uint8)
                 yield frame.index, (image.shape[1], image.shape[0]), image, list(at(frame.t_ns))
             return
