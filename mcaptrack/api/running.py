@@ -16,7 +16,7 @@ import numpy as np
 from mcaptrack import log as logs
 from mcaptrack import notices, pipeline
 from mcaptrack.api.common import Notes, as_location, log_output, warnings_about
-from mcaptrack.api.options import PathLike, Progress, no_progress
+from mcaptrack.api.options import PathLike, Progress, Value, no_progress
 from mcaptrack.api.products import refuse_foreign_products, write_products
 from mcaptrack.choices import Mode
 from mcaptrack.errors import McaptrackError, call
@@ -29,9 +29,6 @@ from mcaptrack.pipeline.several import Act, CameraResult, Done, EveryCamera, Say
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
 from mcaptrack.transforms import FUSION, STAGES, Transform
-
-#: The value of a transform's option.
-Option = float | int | bool | str | None
 
 
 @dataclass(frozen=True)
@@ -311,7 +308,7 @@ def warn_stale(topic: str, log: Location, cameras: Mapping[str, str] = {}) -> No
     warn(f"{topic} is out of date, because its input was replaced; {again} brings it up to date", "out-of-date")
 
 
-def transform_of(stage: str, chosen: str | Transform | None, options: Mapping[str, Option]) -> Transform:
+def transform_of(stage: str, chosen: str | Transform | None, options: Mapping[str, Value]) -> Transform:
     """Return the transform of a stage: the one of this name, or this one; with these options.
 
     Raises McaptrackError for a name or an option that does not exist, and for what is no transform.
@@ -333,7 +330,7 @@ def transforms_of(stages: Mapping[str, str | Transform] | None) -> dict[str, Tra
     return {stage: transform_of(stage, chosen, {}) for stage, chosen in (stages or {}).items()}
 
 
-def _with_options(base: Transform, options: Mapping[str, Option]) -> Transform:
+def _with_options(base: Transform, options: Mapping[str, Value]) -> Transform:
     """Return a transform with other values of some options. Raises McaptrackError for an unknown option."""
     if isinstance(base, type):
         raise McaptrackError(f"{base.__name__} is a class; give an object of it: {base.__name__}()")
