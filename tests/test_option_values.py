@@ -24,7 +24,6 @@ from mcaptrack.cli.settings import Setting
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import FleetStatus, Running
 from tests.commands import GROUP, Terminal, call, done
-from tests.test_settings import another, options_of, words_for
 
 
 @pytest.fixture
@@ -182,31 +181,8 @@ def test_options_that_concern_a_single_log_make_it_one_of_many():
 # What commands give to the functions of the same names
 
 
-#: Options that a command treats itself or gives in another form.
-OWN = {"json", "quiet", "verbose", "form", "csv", "fail_under", "search", "file", "rows", "tables", "study", "output"}
 OF_FUNCTIONS = ("demo", "drop", "evaluate", "events", "export", "ingest", "recover", "render", "report", "train")
 FIRST = {"drop": ["x.mcap", "/a"], "demo": [], "query": ["x.mcap", "select 1"]}
-
-
-@pytest.mark.parametrize("command", [*OF_FUNCTIONS, "tune", "view"])
-def test_every_option_arrives_under_its_name(command, folder, asked):
-    known = inspect.signature(getattr(mcaptrack, command)).parameters
-    tried = set()
-    for one in options_of(command):
-        if one.parameter in OWN or one.parameter not in known:
-            continue
-        value = True if one.kind is bool else another(one, None)
-        if one.kind in (int, float):
-            value = one.kind(max(one.declared.least, min(one.declared.most, value)))
-        value = {"similarity": "metres"}.get(one.parameter, value)
-        wanted = [str(part) for part in value] if one.many else value
-        if one.parameter == "gate_m" and one.kind is str:
-            value, wanted = "0.25", ["0.25"]
-        got = asked(command, *FIRST.get(command, ["x.mcap"]), *words_for(one, value))[one.parameter]
-        got = [str(part) for part in got] if isinstance(got, list | tuple) else got
-        assert (str(got) if isinstance(got, Path) else got) == wanted, one.name
-        tried.add(one.parameter)
-    assert tried or command in ("recover", "drop")
 
 
 def test_patterns_are_replaced_by_files_in_order_without_results_of_logs_that_are_there(tmp_path, monkeypatch):

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
     from mcaptrack import log as logs
     from mcaptrack import pipeline
-    from mcaptrack.api.common import Notes
     from mcaptrack.api.running import RunResult
+    from mcaptrack.pipeline.several import Say
     from mcaptrack.sources.fixed_frame import BoxesRead
 
 #: The parameters of the usual fuser.
@@ -112,7 +112,7 @@ def fuse(
     if not to.strip("/") or not to.isprintable() or "/" in to.strip("/"):
         raise McaptrackError(f"`to={to!r}` is no name of a scene; give one such as world")
 
-    def act(opened: logs.Log, target: Path | None, notes: Notes, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
+    def act(opened: logs.Log, target: Path | None, say: Say, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
         return pipeline.fuse_cameras(opened, names, to.strip("/"), chosen, offsets, target, progress)
 
     return change(Where(log, None, None, output, sidecar, force), act, progress, None)

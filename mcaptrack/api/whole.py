@@ -24,7 +24,6 @@ from mcaptrack.api.options import (
     no_progress,
 )
 from mcaptrack.api.running import Fusing, RunResult, Where, transform_of, transforms_of, work
-from mcaptrack.api.several import unfitting
 from mcaptrack.api.stages import Stages
 from mcaptrack.api.zones import ZonesLike, zones_of
 from mcaptrack.choices import CameraMotionUse
@@ -33,6 +32,7 @@ from mcaptrack.evaluation.events import EventOptions
 from mcaptrack.evaluation.zones import ZoneOptions
 from mcaptrack.location import Location
 from mcaptrack.pipeline import Job, PlaneChoice, Watch, ZoneWatch
+from mcaptrack.pipeline.several import unfitting
 from mcaptrack.transforms import FUSION, STAGES, Transform
 from mcaptrack.transforms.motion_limits import LIMITS_PATTERN
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.cli import common
@@ -97,16 +98,5 @@ def _distances(median_m: float | None, p90_m: float | None) -> str:
 
 
 def _camera_as_json(camera: CameraCorrection) -> dict[str, Any]:
-    return {
-        "correction": camera.correction or None,
-        "moved_m": camera.moved_m,
-        "pairs": camera.pairs,
-        "median_before_m": camera.median_before_m,
-        "p90_before_m": camera.p90_before_m,
-        "median_after_m": camera.median_after_m,
-        "p90_after_m": camera.p90_after_m,
-        "why": with_flags(camera.why) or None,
-        "limit": camera.limit or None,
-        "clock_offset_s": camera.clock_offset_s,
-        "homography": list(camera.homography) if camera.homography else None,
-    }
+    empty = {"correction": camera.correction or None, "why": with_flags(camera.why) or None}
+    return asdict(camera) | empty | {"limit": camera.limit or None, "homography": camera.homography or None}

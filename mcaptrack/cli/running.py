@@ -21,8 +21,8 @@ from mcaptrack.location import Location
 
 if TYPE_CHECKING:
     from mcaptrack import RunResult
-    from mcaptrack.api.several import CameraResult
     from mcaptrack.pipeline import Summary
+    from mcaptrack.pipeline.several import CameraResult
 
 _UP_TO_DATE = "nothing to do, everything is up to date"
 #: Parts of a run are listed that take at least this share of its time.
