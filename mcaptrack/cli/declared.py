@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping
-from typing import Annotated, Any, ClassVar, Final, Generic, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Final, Generic, Literal, TypeVar, get_type_hints
 
 import typer
 
@@ -32,29 +32,25 @@ from mcaptrack.ranges import limits
 T = TypeVar("T")
 #: Heading of the options of all commands.
 COMMON: Final = LAST_PANELS[-1]
-#: Options by name: their types, which ``Annotated[..., Option(...)]`` says more about, and their defaults.
-Options = Mapping[str, tuple[Any, Any]]
 _CONFIG = "Read options from this file, not mcaptrack.toml in the working folder (tuning only) and your config folder."
 _LOG_FORMAT = "Print notes, progress and errors as lines of text, or as objects of JSON with their times."
-#: The options of all commands.
-OF_ALL: Final[Options] = {
-    "json": (Annotated[bool, Option(COMMON, help="Print JSON for programs.")], False),
-    "quiet": (Annotated[bool, Option(COMMON, short="q", help="Say nothing but errors and warnings.")], False),
-    "verbose": (
-        Annotated[bool, Option(COMMON, short="v", help="Print more, such as where each option was set.")],
-        False,
-    ),
-    "config": (Annotated[PathLike | None, Option(COMMON, help=_CONFIG)], None),
-    "log_format": (Annotated[Literal["text", "json"], Option(COMMON, help=_LOG_FORMAT)], "text"),
-}
-#: Options of commands that print their results to stdout: the file to write them to.
-PRINTED: Options = {
-    "output": (
-        Annotated[PathLike | None, Option(FILES, short="o", help="Write to this file instead of stdout.")],
-        None,
-    ),
-    "force": (Force, False),
-}
+
+
+class OfAll:
+    """The options of all commands."""
+
+    json: Annotated[bool, Option(COMMON, help="Print JSON for programs.")] = False
+    quiet: Annotated[bool, Option(COMMON, short="q", help="Say nothing but errors and warnings.")] = False
+    verbose: Annotated[bool, Option(COMMON, short="v", help="Print more, such as where each option was set.")] = False
+    config: Annotated[PathLike | None, Option(COMMON, help=_CONFIG)] = None
+    log_format: Annotated[Literal["text", "json"], Option(COMMON, help=_LOG_FORMAT)] = "text"
+
+
+class Printed:
+    """Options of commands that print their results to stdout: the file to write them to."""
+
+    output: Annotated[PathLike | None, Option(FILES, short="o", help="Write to this file instead of stdout.")] = None
+    force: Force = False
 
 
 class Called(Generic[T]):
@@ -63,8 +59,8 @@ class Called(Generic[T]):
     ``given`` has the options of the call. Subclasses override what differs.
     """
 
-    #: Options that the function has no use for.
-    more: ClassVar[Options] = {}
+    #: A class with the options that the function has no use for, as attributes.
+    More: ClassVar[type] = object
     #: The options that come first in the help, if there are any of these among them.
     most_used: ClassVar[tuple[str, ...]] = ()
 
@@ -83,9 +79,9 @@ class Called(Generic[T]):
         return self.declaration(self.name)
 
     @classmethod
-    def options(cls) -> Options:
+    def options(cls) -> list[Parameter]:
         """Return the options that the function has no use for."""
-        return cls.more
+        return parameters_of(cls.More)
 
     @classmethod
     def function_of(cls, name: str) -> Callable[..., None]:
@@ -94,8 +90,7 @@ class Called(Generic[T]):
         names = {option.name: option.name for option in options_of(declared)}
         placed = arguments_of(declared).items()
         names |= {parameter: about.name for parameter, about in placed if not isinstance(about, OneOfMany)}
-        more = parameters_of(cls.options())
-        return command(name, declared, lambda given: cls(name, given).run(names), more, cls.most_used)
+        return command(name, declared, lambda given: cls(name, given).run(names), cls.options(), cls.most_used)
 
     def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
         """Return the arguments of the function; ``names`` has the name on the command line of each."""
@@ -151,7 +146,7 @@ def command(
     ``more`` are options that the function lacks. ``run`` gets the values of all.
     """
     hints, signature = hints_of(declared), inspect.signature(declared).parameters
-    parameters = {option.name: option for option in (*options_of(declared), *more, *parameters_of(OF_ALL))}
+    parameters = {option.name: option for option in (*options_of(declared), *more, *parameters_of(OfAll))}
     annotations = {
         about.name: argument_annotation(about, hints[parameter], signature[parameter].default)
         for parameter, about in arguments_of(declared).items()
@@ -171,9 +166,10 @@ def command(
     return function  # type: ignore[no-any-return]
 
 
-def parameters_of(options: Options) -> list[Parameter]:
-    """Return options as parameters."""
-    return [parameter_of(name, hint, default) for name, (hint, default) in options.items()]
+def parameters_of(options: type) -> list[Parameter]:
+    """Return the options that the attributes of a class declare."""
+    hints = get_type_hints(options, include_extras=True)
+    return [parameter_of(name, hint, getattr(options, name)) for name, hint in hints.items()]
 
 
 def argument_annotation(about: Argument, hint: Any, default: Any) -> tuple[Any, Any]:

@@ -6,11 +6,11 @@ import sys
 from collections.abc import Callable
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 from mcaptrack.api.declared import Argument, declared
 from mcaptrack.cli import common
-from mcaptrack.cli.declared import PRINTED, Once, Options
+from mcaptrack.cli.declared import Once, Printed
 from mcaptrack.cli.generated import PARTS, with_parts
 from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError
@@ -68,7 +68,7 @@ def documentation(
 class Docs(Once[Pages]):
     """List the pages, or print one."""
 
-    more: ClassVar[Options] = PRINTED
+    More = Printed
 
     @classmethod
     def declaration(cls, name: str) -> Callable[..., Pages]:

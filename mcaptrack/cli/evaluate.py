@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from mcaptrack.api.declared import Option
 from mcaptrack.api.options import FILES, SCORES, PathLike
 from mcaptrack.cli import common
 from mcaptrack.cli.common import expand
-from mcaptrack.cli.declared import PRINTED, Once, Options
+from mcaptrack.cli.declared import Once, Printed
 from mcaptrack.cli.text import console, printable, say
 from mcaptrack.errors import McaptrackError
 
@@ -47,21 +47,20 @@ _OVERLAPS: Final = {"iou": "IoU", "bev-iou": "BEV IoU", "3d-iou": "3D IoU"}
 _NESTED: Final = ("displacement", "class_means")
 
 
-_FAIL_UNDER = Option(SCORES, shown=False, help="Exit 4 if a score is lower, as in idf1=0.7.")
-
-
 class Evaluate(Once["Scores"]):
     """Score tracks and predictions against ground truth."""
 
-    more: ClassVar[Options] = {
-        "fail_under": (Annotated[Sequence[str] | None, _FAIL_UNDER], None),
-        "curves": (
-            Annotated[PathLike | None, Option(FILES, help="Draw the error of predictions over recall as an SVG.")],
-            None,
-        ),
-        "csv": (Annotated[bool, Option(FILES, help="Print rows for a spreadsheet.")], False),
-        **PRINTED,
-    }
+    class More(Printed):
+        """Options that the function has no use for."""
+
+        fail_under: Annotated[
+            Sequence[str] | None, Option(SCORES, shown=False, help="Exit 4 if a score is lower, as in idf1=0.7.")
+        ] = None
+        curves: Annotated[
+            PathLike | None, Option(FILES, help="Draw the error of predictions over recall as an SVG.")
+        ] = None
+        csv: Annotated[bool, Option(FILES, help="Print rows for a spreadsheet.")] = False
+
     most_used = ("truth", "topic", "similarity", "gate_m", "rules", "fail_under", "csv", "output", "force")
 
     def __init__(self, name: str, values: Mapping[str, Any]) -> None:

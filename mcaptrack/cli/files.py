@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.cli import common
-from mcaptrack.cli.declared import PRINTED
+from mcaptrack.cli.declared import Printed
 from mcaptrack.cli.many import EachLog
 from mcaptrack.cli.text import console, show
 from mcaptrack.location import Location
@@ -26,7 +26,7 @@ class Check(EachLog["LogCheck"]):
     """Check logs; the findings are printed at the end."""
 
     writes = False
-    more = PRINTED
+    More = Printed
 
     def show(self, log: Location, done: LogCheck, talk: common.Talk) -> None:
         """Print nothing yet."""

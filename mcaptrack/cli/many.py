@@ -11,16 +11,16 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, TypeVar
 
 import typer
 
 from mcaptrack import SCHEMA_VERSION, notices
-from mcaptrack.api.declared import Option
+from mcaptrack.api.declared import Option, Parameter
 from mcaptrack.api.options import PathLike
 from mcaptrack.cli import common
 from mcaptrack.cli.command import LAST_PANELS
-from mcaptrack.cli.declared import Called, Options
+from mcaptrack.cli.declared import Called, parameters_of
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.text import is_json, print_line_of_json, printable, say, stdout_to_stderr
 from mcaptrack.errors import McaptrackError
@@ -138,11 +138,10 @@ class EachLog(Called[T]):
         self.many = ManyOptions(**{option: values[option] for option in NAMES if option in values})
 
     @classmethod
-    def options(cls) -> Options:
+    def options(cls) -> list[Parameter]:
         """Return the options that the function has no use for: also those for many logs."""
-        hints = get_type_hints(ManyOptions, include_extras=True)
-        names = [name for name in NAMES if cls.writes or name != "output_dir"]
-        return {**cls.more, **{name: (hints[name], getattr(ManyOptions, name)) for name in names}}
+        many = [option for option in parameters_of(ManyOptions) if cls.writes or option.name != "output_dir"]
+        return [*super().options(), *many]
 
     def logs(self) -> Sequence[NamedLog]:
         """Return the inputs."""

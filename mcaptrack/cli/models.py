@@ -5,24 +5,27 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import mcaptrack
 from mcaptrack import Model
 from mcaptrack.api.declared import Option
 from mcaptrack.api.options import FILES
 from mcaptrack.cli import common
-from mcaptrack.cli.declared import Once, Options
+from mcaptrack.cli.declared import Once
 from mcaptrack.cli.text import show
 from mcaptrack.errors import McaptrackError, command
-
-_FROM = Option(FILES, flag="from", metavar="FILE|URL", help="Take the weights from here instead.")
 
 
 class Models(Once[tuple[Model, ...] | Path]):
     """List the detectors; or, with ``get``, fetch the weights of one."""
 
-    more: ClassVar[Options] = {"source": (Annotated[str | None, _FROM], None)}
+    class More:
+        """Options that the list has no use for."""
+
+        source: Annotated[
+            str | None, Option(FILES, flag="from", metavar="FILE|URL", help="Take the weights from here instead.")
+        ] = None
 
     @property
     def function(self) -> Callable[..., tuple[Model, ...] | Path]:

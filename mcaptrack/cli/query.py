@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import mcaptrack
 from mcaptrack.api.declared import Option
@@ -15,7 +15,7 @@ from mcaptrack.api.querying import QUERY
 from mcaptrack.cli import common
 from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.common import expand
-from mcaptrack.cli.declared import PRINTED, Once, Options
+from mcaptrack.cli.declared import Once, Printed
 from mcaptrack.cli.text import console, printable, show
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_overwrite, refuse_url
@@ -40,40 +40,25 @@ _KEYWORDS: Final = ("select", "from", "with", "describe", "summarize", "explain"
 class Query(Once["pa.Table | TableList"]):
     """Answer a query, or list what can be queried; the list is another function."""
 
-    more: ClassVar[Options] = {
-        "file": (
-            Annotated[
-                PathLike | None,
-                Option(QUERY, short="f", shown=False, help="Read the query from this file; all arguments are logs."),
-            ],
-            None,
-        ),
-        "form": (
-            Annotated[
-                Form | None,
-                Option(QUERY, flag="format", shown="table, or what -o ends with", help="Format of the answer."),
-            ],
-            None,
-        ),
-        "rows": (
-            Annotated[
-                int | None,
-                Option(
-                    QUERY,
-                    0,
-                    1_000_000_000,
-                    shown="60 on a terminal",
-                    help="Number of rows that a table shows; 0 for all.",
-                ),
-            ],
-            None,
-        ),
-        "tables": (
-            Annotated[bool, Option(QUERY, help="List the tables with their columns, units and meanings; no query.")],
-            False,
-        ),
-        **PRINTED,
-    }
+    class More(Printed):
+        """Options that the function has no use for."""
+
+        file: Annotated[
+            PathLike | None,
+            Option(QUERY, short="f", shown=False, help="Read the query from this file; all arguments are logs."),
+        ] = None
+        form: Annotated[
+            Form | None,
+            Option(QUERY, flag="format", shown="table, or what -o ends with", help="Format of the answer."),
+        ] = None
+        rows: Annotated[
+            int | None,
+            Option(QUERY, 0, 10**9, shown="60 on a terminal", help="Number of rows that a table shows; 0 for all."),
+        ] = None
+        tables: Annotated[
+            bool, Option(QUERY, help="List the tables with their columns, units and meanings; no query.")
+        ] = False
+
     most_used = ("file", "form", "rows", "tables", "output", "force")
 
     @property

@@ -66,19 +66,17 @@ class Fuse(RunsStages):
 class Run(RunsStages):
     """Run all stages that are missing or out of date."""
 
-    more: ClassVar = {
-        "follows": (
-            Annotated[
-                bool,
-                Option(
-                    flag="continue",
-                    help="The logs follow one another, in this order, and are of one camera: people who are in the "
-                    "picture at a cut keep their ids. One log is done after the other.",
-                ),
-            ],
-            False,
-        )
-    }
+    class More:
+        """Options that the function has in another form."""
+
+        follows: Annotated[
+            bool,
+            Option(
+                flag="continue",
+                help="The logs follow one another, in this order, and are of one camera: people who are in the picture "
+                "at a cut keep their ids. One log is done after the other.",
+            ),
+        ] = False
 
     def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
         """Return the arguments of the function: with the transforms that environment and files configure."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.cli import common
-from mcaptrack.cli.declared import PRINTED
+from mcaptrack.cli.declared import Printed
 from mcaptrack.cli.many import EachLog
 from mcaptrack.cli.text import console, printable
 from mcaptrack.location import Location
@@ -26,7 +26,7 @@ class Info(EachLog["LogInfo"]):
 
     writes = False
     prints_results = True
-    more = PRINTED
+    More = Printed
 
     def run(self, names: Mapping[str, str]) -> None:
         """Run the command; what it prints goes to a file, if one is named."""

@@ -13,12 +13,12 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import mcaptrack
-from mcaptrack.api.declared import Option, Parameter
+from mcaptrack.api.declared import Option, Parameter, parameter_of
 from mcaptrack.api.declared import options_of as options_of_function
 from mcaptrack.api.options import PLUGIN
 from mcaptrack.cli.chosen import Maker, configured, has_flag, is_open, listed, options_of, values_set
 from mcaptrack.cli.command import is_on_command_line
-from mcaptrack.cli.declared import OF_ALL, Options, command, help_of, parameters_of
+from mcaptrack.cli.declared import OfAll, command, help_of, parameters_of
 from mcaptrack.cli.running import RunsStages
 from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.errors import McaptrackError
@@ -80,8 +80,8 @@ class StageCommand(RunsStages):
         stage, declared = STAGES[name], getattr(mcaptrack, name)
         kinds, own = {**plugins, **stage.built_in()}, options_of_function(declared)
         options, settable = _options(stage, kinds)
-        more = parameters_of({**options, **cls.options()})
-        flags = Counter(flag for option in (*own, *more, *parameters_of(OF_ALL)) for flag in _flags(option))
+        more = [*options, *cls.options()]
+        flags = Counter(flag for option in (*own, *more, *parameters_of(OfAll)) for flag in _flags(option))
         flags += Counter(["help", "help-all", "logs"])
         if twice := {flag.replace("-", "_") for flag, count in flags.items() if count > 1}:
             text = f"{' and '.join(plugins)} can't have a parameter {' or '.join(sorted(twice))}"
@@ -101,19 +101,20 @@ def _owners(kinds: Mapping[str, type[Transform]]) -> dict[str, list[str]]:
     return owners
 
 
-def _options(stage: Stage, kinds: Mapping[str, type[Transform]]) -> tuple[Options, tuple[str, ...]]:
+def _options(stage: Stage, kinds: Mapping[str, type[Transform]]) -> tuple[list[Parameter], tuple[str, ...]]:
     """The options for the transforms of a stage, and the parameters that only ``--set`` sets."""
-    options: dict[str, tuple[Any, Any]] = {}
+    options = []
     settable = []
     for name, having in _owners(kinds).items():
         field = options_of(kinds[having[0]])[name]
         if has_flag(field):
             is_shared = set(stage.built_in()) <= set(having)
-            options[name] = hint_of(kinds[having[0]], field, () if is_shared else having), None
+            hint = hint_of(kinds[having[0]], field, () if is_shared else having)
+            options.append(parameter_of(name, hint, None))
         else:
             settable.append(name)
     if settable:
-        options["set"] = Set, None
+        options.append(parameter_of("set", Set, None))
     return options, tuple(settable)
 
 

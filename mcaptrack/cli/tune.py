@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from mcaptrack.api.declared import Option
 from mcaptrack.api.options import FILES, PathLike
@@ -13,7 +13,7 @@ from mcaptrack.cli.chosen import has_flag, options_of
 from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.common import expand
 from mcaptrack.cli.config import NAME, read_toml, write_settings
-from mcaptrack.cli.declared import Once, Options
+from mcaptrack.cli.declared import Once
 from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import sibling
@@ -24,13 +24,17 @@ if TYPE_CHECKING:
     from mcaptrack import TuneResult
 
 _SHOWN: Final = ("IDF1", "MOTA", "HOTA", "IDSW", "FP", "FN")
-_OUTPUT = Option(FILES, short="o", shown=True, help="Write the settings to this file.")
 
 
 class Tune(Once["TuneResult"]):
     """Search parameters, and write the best ones to a file of settings."""
 
-    more: ClassVar[Options] = {"output": (Annotated[PathLike, _OUTPUT], Path(NAME))}
+    class More:
+        """Options that the function has no use for."""
+
+        output: Annotated[PathLike, Option(FILES, short="o", shown=True, help="Write the settings to this file.")] = (
+            Path(NAME)
+        )
 
     def __init__(self, name: str, values: Mapping[str, Any]) -> None:
         super().__init__(name, values)

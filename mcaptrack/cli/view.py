@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 from mcaptrack.api.declared import Option
 from mcaptrack.cli import common
-from mcaptrack.cli.declared import Once, Options
+from mcaptrack.cli.declared import Once
 from mcaptrack.cli.text import show
 from mcaptrack.errors import command
 
 if TYPE_CHECKING:
     from mcaptrack import LogServer
 
-_LINKS = Option("What is opened", 0, 1_000_000, help="Print the links of at most so many events.")
-
 
 class View(Once["LogServer"]):
     """Serve a log to viewers in a browser."""
 
-    more: ClassVar[Options] = {"links": (Annotated[int, _LINKS], 8)}
+    class More:
+        """Options that the function has no use for."""
+
+        links: Annotated[
+            int, Option("What is opened", 0, 1_000_000, help="Print the links of at most so many events.")
+        ] = 8
 
     def print(self, done: LogServer, talk: common.Talk) -> None:
         """Print the links, and serve the log until Ctrl-C."""
