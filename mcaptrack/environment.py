@@ -107,7 +107,7 @@ _NO_LIMIT: Final = 1 << 60
 
 
 def memory_bytes() -> int | None:
-    """How much memory this process may use: that of the machine, or the limit of its control group."""
+    """The memory that this process may use: that of the machine, or the limit of its control group."""
     limits = memory_limits()
     with suppress(ValueError, OSError, AttributeError):
         limits.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))

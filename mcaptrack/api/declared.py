@@ -65,7 +65,7 @@ class Option:
     commas : bool
         Whether several values are one text on the command line, with commas between them.
     help : str
-        What the parameter means, for functions whose docstrings don't say it.
+        The meaning of the parameter, where the docstring of a function doesn't say it.
     """
 
     panel: str = ""
@@ -100,7 +100,7 @@ class Argument:
     words : bool
         Whether the command takes any number of words there, and reads by itself what they mean.
     help : str
-        What the parameter means in Python, for functions whose docstrings don't say it.
+        The meaning of the parameter in Python, where the docstring of a function doesn't say it.
     """
 
     name: str
@@ -124,7 +124,7 @@ class OneOfMany(Argument):
 
 @dataclass(frozen=True)
 class PythonOnly:
-    """A parameter that is no option; ``help`` is what it means, for functions whose docstrings don't say it."""
+    """A parameter that is no option; ``help`` is its meaning, where the docstring of a function doesn't say it."""
 
     help: str = ""
 
@@ -173,7 +173,7 @@ def option_of(hint: Any) -> Option:
 
 
 def about(hint: Any) -> tuple[Any, ...]:
-    """What ``Annotated`` adds to a type."""
+    """The facts that ``Annotated`` adds to a type."""
     return get_args(hint)[1:] if get_origin(hint) is Annotated else ()
 
 
@@ -350,7 +350,7 @@ def _names_of(block: str) -> list[str]:
 
 
 def _described(parameter: inspect.Parameter, hint: Any) -> str:
-    """What the annotation of a parameter says about it, as numpydoc has it."""
+    """The description of a parameter by its annotation, as numpydoc has it."""
     text = next((part.help for part in about(hint) if part.help), "")
     default = parameter.default
     is_said = isinstance(default, str | int | float)

@@ -47,7 +47,7 @@ OF_ALL: Final[Options] = {
     "config": (Annotated[PathLike | None, Option(COMMON, help=_CONFIG)], None),
     "log_format": (Annotated[Literal["text", "json"], Option(COMMON, help=_LOG_FORMAT)], "text"),
 }
-#: Options of commands whose results are what is printed to stdout: the file to write them to.
+#: Options of commands that print their results to stdout: the file to write them to.
 PRINTED: Options = {
     "output": (
         Annotated[PathLike | None, Option(FILES, short="o", help="Write to this file instead of stdout.")],
