@@ -78,7 +78,7 @@ def run(
     follows: Annotated[PathLike | Sequence[PathLike] | None, PYTHON_ONLY] = None,
     progress: Reports = no_progress,
 ) -> RunResult:
-    """Run all stages that are missing or out of date, then events, views and tables.
+    """Detect, track, re-track and predict: run all stages that are missing or out of date, then events and tables.
 
     From /camera/video (or the detections, tracks or samples that the log has) to /camera/predictions and
     /camera/retracks; then events (see `mcaptrack events`), views, and Parquet tables beside the log. ``topic`` starts
