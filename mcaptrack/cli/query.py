@@ -22,8 +22,6 @@ from mcaptrack.files import is_same_file, refuse_overwrite, refuse_url
 from mcaptrack.location import is_remote, parse
 
 if TYPE_CHECKING:
-    import pyarrow as pa
-
     from mcaptrack import TableList
 
 Form = Literal["table", "csv", "json", "jsonl", "parquet", "arrow"]
@@ -37,7 +35,7 @@ _PLAN: Final = ["explain_key", "explain_value"]
 _KEYWORDS: Final = ("select", "from", "with", "describe", "summarize", "explain", "pivot", "show", "values")
 
 
-class Query(Once["pa.Table | TableList"]):
+class Query(Once[Any]):
     """Answer a query, or list what can be queried; the list is another function."""
 
     class More(Printed):
@@ -62,7 +60,7 @@ class Query(Once["pa.Table | TableList"]):
     most_used = ("file", "form", "rows", "tables", "output", "force")
 
     @property
-    def function(self) -> Callable[..., pa.Table | TableList]:
+    def function(self) -> Callable[..., Any]:
         """The function: another one lists the tables."""
         return mcaptrack.list_tables if self.given["tables"] else mcaptrack.query
 
@@ -80,7 +78,7 @@ class Query(Once["pa.Table | TableList"]):
                 raise McaptrackError(f"{output} is both input and output; give another name with -o")
         return {"log": logs, "files": _named(given["files"] or [])} | ({} if given["tables"] else {"sql": sql})
 
-    def print(self, done: pa.Table | TableList, talk: common.Talk) -> None:
+    def print(self, done: Any, talk: common.Talk) -> None:
         """Print the answer, or write it to a file."""
         output, json = self.given["output"], self.given["json"]
         if self.given["tables"]:
