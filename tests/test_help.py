@@ -119,31 +119,6 @@ class TestHelp:
         told = " ".join(text.partition("--help-all shows all options, also: ")[2].split())
         assert [panel for panel in names.values() if panel in last and panel.partition(" (")[0] not in told] == []
 
-    def test_common_options_are_the_same_in_all_commands(self):
-        def common(command: str) -> list[tuple[list[str], str]]:
-            return [(one.opts, one.help) for one in shown(command) if one.rich_help_panel == LAST_PANELS[-1]]
-
-        for command in COMMANDS:
-            assert common(command) == common("run")
-        assert [names for names, _ in common("run")] == [
-            ["--json"],
-            ["--quiet", "-q"],
-            ["--verbose", "-v"],
-            ["--config"],
-            ["--log-format"],
-        ]
-
-    def test_options_for_many_logs_are_the_same_in_all_commands_that_take_a_log(self):
-        def many(command: str) -> list[tuple[list[str], str]]:
-            return [(one.opts, one.help) for one in shown(command) if one.rich_help_panel == "Many logs"]
-
-        known = many("run")
-        assert len(known) == 9
-        printing = [one for one in known if one[0] != ["--output-dir"]]
-        each = {*STAGES, "run", "fuse", "calibrate", "events", "zones", "ingest", "render", "export", "recover", "drop"}
-        for command in COMMANDS:
-            assert many(command) == (known if command in each else printing if command in ("info", "check") else [])
-
     def test_a_short_name_means_the_same_in_all_commands(self):
         for command in COMMANDS:
             short = {name: one.name for one in shown(command) for name in one.opts if re.fullmatch("-[a-z]", name)}
