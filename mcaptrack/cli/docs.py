@@ -20,7 +20,7 @@ Pages = dict[str, Path]
 
 @declared()
 def documentation(
-    page: Annotated[str | None, Argument("page", "[PAGE]", "The page to print.", shown="a list of the pages")] = None,
+    page: Annotated[str | None, Argument("page", "PAGE", "The page to print.", shown="a list of the pages")] = None,
 ) -> Pages:
     """List the pages of the documentation, or print one.
 

@@ -122,8 +122,8 @@ def stage_help(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingPro
     """Return the help of the command of a stage: that of its function, and what its transforms do, plug-ins first."""
     text, *examples = help_of(getattr(mcaptrack, stage.name)).split("\n\nExample: ")
     built_in = stage.built_in() if stage.kind else {}
-    firsts = {name: inspect.cleandoc(cls.__doc__ or "").partition("\n\n")[0] for name, cls in built_in.items()}
-    lines = [f"- `{name}`: {' '.join(first.split())}" for name, first in firsts.items()]
+    firsts = {name: _own_doc(cls).partition("\n\n")[0] for name, cls in built_in.items()}
+    lines = [f"- `{name}`: {' '.join(first.split())}" for name, first in firsts.items() if first]
     others = [f"{name}: {doc}" for name, plugin in plugins.items() if (doc := _own_doc(plugin))]
     others = [re.split(r"\n\n\w+\n---", doc)[0] for doc in others]  # without the sections on use from Python
     return "\n\n".join([text, *others, "\n".join(lines), *(f"Example: {line}" for line in examples)])
