@@ -1,4 +1,4 @@
-"""Run a stage that reads rows: track, sample, predict, retrack. Inputs that are missing are made first."""
+"""Run one stage on a log: detect, motion, track, sample, predict, retrack. Inputs that are missing are made first."""
 
 from __future__ import annotations
 
@@ -21,10 +21,9 @@ from mcaptrack.api.options import (
     chooser,
     no_progress,
 )
-from mcaptrack.api.running import RunResult, transform_of
 from mcaptrack.choices import Mode
 from mcaptrack.errors import McaptrackError
-from mcaptrack.transforms import PROFILES, Transform
+from mcaptrack.transforms import Transform
 
 if TYPE_CHECKING:
     from mcaptrack.api.running import RunResult
@@ -85,7 +84,7 @@ def detect(
     ('detect',)
 
     """
-    from mcaptrack.api.running import run_stage
+    from mcaptrack.api.running import run_stage, transform_of
 
     chosen = transform_of("detect", detector, options)
     return run_stage("detect", chosen, log, topic, to, camera, output, sidecar, force, stages, progress)
@@ -140,7 +139,7 @@ def motion(
     ('motion',)
 
     """
-    from mcaptrack.api.running import run_stage
+    from mcaptrack.api.running import run_stage, transform_of
 
     chosen = transform_of("motion", transform, options)
     return run_stage("motion", chosen, log, topic, to, camera, output, sidecar, force, stages, progress)
@@ -195,7 +194,7 @@ def track(
     ['/camera/tracks']
 
     """
-    from mcaptrack.api.running import run_stage
+    from mcaptrack.api.running import run_stage, transform_of
 
     chosen = None if tracker is None else transform_of("track", tracker, options)
     make = partial(transform_of, "track", options=options)
@@ -252,7 +251,7 @@ def sample(
     ('/camera/samples',)
 
     """
-    from mcaptrack.api.running import run_stage
+    from mcaptrack.api.running import run_stage, transform_of
 
     chosen = transform_of("sample", transform, options)
     return run_stage("sample", chosen, log, topic, to, camera, output, sidecar, force, stages, progress)
@@ -307,7 +306,7 @@ def predict(
     ('/camera/predictions',)
 
     """
-    from mcaptrack.api.running import run_stage
+    from mcaptrack.api.running import run_stage, transform_of
 
     chosen = transform_of("predict", predictor, options)
     return run_stage("predict", chosen, log, topic, to, camera, output, sidecar, force, stages, progress)
@@ -369,7 +368,8 @@ def retrack(
     ('/camera/retracks', '/camera/retracks/online')
 
     """
-    from mcaptrack.api.running import run_stage
+    from mcaptrack.api.running import run_stage, transform_of
+    from mcaptrack.transforms import PROFILES
 
     if profile is not None and retracker is not None:
         raise McaptrackError(f"the profile {profile} names a retracker; give one of them")

@@ -1,4 +1,7 @@
-"""Commands of declared functions (``api.declared``): their options, their help, and calls on each of many logs."""
+"""Commands of declared functions (``api.declared``): a class for each command says what it prints.
+
+``Once`` calls the function once, ``many.EachLog`` with each of many. ``command`` makes the function that Typer takes.
+"""
 
 from __future__ import annotations
 
