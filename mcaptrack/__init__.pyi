@@ -32,6 +32,7 @@ from mcaptrack.api.recording import open as open  # noqa: A004
 from mcaptrack.api.rendering import RenderResult as RenderResult
 from mcaptrack.api.rendering import render as render
 from mcaptrack.api.rows import detections as detections
+from mcaptrack.api.run import run as run
 from mcaptrack.api.running import RunResult as RunResult
 from mcaptrack.api.scoring import Scores as Scores
 from mcaptrack.api.scoring import evaluate as evaluate
@@ -53,7 +54,6 @@ from mcaptrack.api.upkeep import drop as drop
 from mcaptrack.api.upkeep import recover as recover
 from mcaptrack.api.viewing import LogServer as LogServer
 from mcaptrack.api.viewing import view as view
-from mcaptrack.api.whole import run as run
 from mcaptrack.api.zones import draw_zones as draw_zones
 from mcaptrack.api.zones import zones as zones
 from mcaptrack.errors import McaptrackError as McaptrackError

@@ -11,8 +11,8 @@ from mcaptrack.api.common import Notes, as_path
 from mcaptrack.api.declared import Option, declared
 from mcaptrack.api.ingesting import ingest
 from mcaptrack.api.options import FILES, Force, PathLike, Progress, Reports, no_progress
+from mcaptrack.api.run import run
 from mcaptrack.api.scoring import Scores, evaluate
-from mcaptrack.api.whole import run
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import Notice, collected
 from mcaptrack.sources import demo as drawing

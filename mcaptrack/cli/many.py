@@ -121,7 +121,7 @@ NAMES: Final = tuple(field.name for field in fields(ManyOptions))
 class EachLog(Called[T]):
     """A command that calls its function with each log, here or in workers: ``function(log, output=..., **arguments)``.
 
-    ``many`` has the options for many logs.
+    ``many`` has the options for many logs, and ``inputs`` are the logs, once the command runs.
     """
 
     #: Whether logs, or files beside them, are changed.
@@ -135,6 +135,7 @@ class EachLog(Called[T]):
 
     def __init__(self, name: str, values: Mapping[str, Any]) -> None:
         super().__init__(name, values)
+        self.inputs: Sequence[NamedLog] = ()
         self.many = ManyOptions(**{option: values[option] for option in NAMES if option in values})
 
     @classmethod
@@ -173,8 +174,9 @@ class EachLog(Called[T]):
     def run(self, names: Mapping[str, str]) -> None:
         """Call the function with each log and its ``arguments``, and print what it returns."""
         with common.Talk(self.given["quiet"], self.given["verbose"]).open() as talk:
-            logs, arguments = self.logs(), self.arguments(names)
-            results, totals = self._process(logs, arguments, arguments.pop("output", None), talk)
+            self.inputs = self.logs()
+            arguments = self.arguments(names)
+            results, totals = self._process(self.inputs, arguments, arguments.pop("output", None), talk)
         self.print(results, totals)
         if code := self.code(results):
             raise typer.Exit(code)

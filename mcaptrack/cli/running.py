@@ -99,7 +99,7 @@ class Run(RunsStages):
 
         Raises McaptrackError for one log alone, and for options that don't go with an order.
         """
-        many, logs = self.many, [log.path for log in self.logs()]
+        many, logs = self.many, [log.path for log in self.inputs]
         order, place = "one log is done after the other", "ids go on in the logs themselves"
         refused: dict[str, tuple[object, str]] = {
             "--jobs": ((many.jobs or 1) > 1, order),

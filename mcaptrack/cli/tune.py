@@ -69,7 +69,7 @@ class Tune(Once["TuneResult"]):
         else:
             warn_unused("it is about label files; logs have theirs inside", "ground_plane", "point", "fps")
         if not self._has_tracker:
-            warn_unused(f"{done.stage} has no trackers", "tracker")
+            warn_unused(f"{given['stage']} has no trackers", "tracker")
         by_overlap = done.similarity == "iou"
         warn_unused(*(("overlap is compared", "gate_m") if by_overlap else ("distance is compared", "min_iou")))
         score, before = done.scores[metric], done.default_scores[metric]
