@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping
+from importlib import import_module
 from typing import Annotated, Any, ClassVar, Final, Generic, Literal, TypeVar, get_type_hints
 
 import typer
 
 import mcaptrack
+from mcaptrack import _MODULES
 from mcaptrack.api.declared import (
     Argument,
     OneOfMany,
@@ -73,13 +75,15 @@ class Called(Generic[T]):
     @classmethod
     def declaration(cls, name: str) -> Callable[..., T]:
         """Return the function that declares the command: that of its name in the library."""
-        function: Callable[..., T] = getattr(mcaptrack, name)
+        function: Callable[..., T] = getattr(import_module(_MODULES[name]), name)
         return function
 
     @property
     def function(self) -> Callable[..., T]:
-        """The function that is called. It is looked up when the command runs."""
-        return self.declaration(self.name)
+        """The function that is called. It is looked up when the command runs, because another one may stand for it."""
+        function: Callable[..., T]
+        function = getattr(mcaptrack, self.name) if self.name in _MODULES else self.declaration(self.name)
+        return function
 
     @classmethod
     def options(cls) -> list[Parameter]:

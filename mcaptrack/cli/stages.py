@@ -12,7 +12,6 @@ from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
-import mcaptrack
 from mcaptrack.api.declared import Option, Parameter, parameter_of
 from mcaptrack.api.declared import options_of as options_of_function
 from mcaptrack.api.options import PLUGIN
@@ -77,7 +76,7 @@ class StageCommand(RunsStages):
         cls, name: str, plugins: Mapping[str, type[Transform]] = MappingProxyType({})
     ) -> Callable[..., None]:
         """Return the function of the command, with the options of ``plugins``: transforms of other packages."""
-        stage, declared = STAGES[name], getattr(mcaptrack, name)
+        stage, declared = STAGES[name], cls.declaration(name)
         kinds, own = {**plugins, **stage.built_in()}, options_of_function(declared)
         options, settable = _options(stage, kinds)
         more = [*options, *cls.options()]
@@ -88,7 +87,7 @@ class StageCommand(RunsStages):
             raise McaptrackError(f"{text}: that is the name of an option of {name}")
         names = {option.name: option.name for option in own}
         function: Any = command(name, declared, lambda given: cls(name, given, kinds).run(names), more)
-        function.help, function.settable = stage_help(stage, plugins), settable
+        function.help, function.settable = stage_help(stage, help_of(declared), plugins), settable
         return function  # type: ignore[no-any-return]
 
 
@@ -118,9 +117,9 @@ def _options(stage: Stage, kinds: Mapping[str, type[Transform]]) -> tuple[list[P
     return options, tuple(settable)
 
 
-def stage_help(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> str:
-    """Return the help of the command of a stage: that of its function, and what its transforms do, plug-ins first."""
-    text, *examples = help_of(getattr(mcaptrack, stage.name)).split("\n\nExample: ")
+def stage_help(stage: Stage, text: str, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> str:
+    """Return the help of the command of a stage: ``text``, and what its transforms do, plug-ins first."""
+    text, *examples = text.split("\n\nExample: ")
     built_in = stage.built_in() if stage.kind else {}
     firsts = {name: _own_doc(cls).partition("\n\n")[0] for name, cls in built_in.items()}
     lines = [f"- `{name}`: {' '.join(first.split())}" for name, first in firsts.items() if first]
