@@ -10,8 +10,10 @@ from mcaptrack.api.contents import LogInfo as LogInfo
 from mcaptrack.api.contents import info as info
 from mcaptrack.api.demonstration import DemoResult as DemoResult
 from mcaptrack.api.demonstration import demo as demo
+from mcaptrack.api.events import events as events
 from mcaptrack.api.exporting import ExportResult as ExportResult
 from mcaptrack.api.exporting import export as export
+from mcaptrack.api.fusing import fuse as fuse
 from mcaptrack.api.health import DoctorResult as DoctorResult
 from mcaptrack.api.health import doctor as doctor
 from mcaptrack.api.ingesting import IngestResult as IngestResult
@@ -30,11 +32,11 @@ from mcaptrack.api.recording import open as open  # noqa: A004
 from mcaptrack.api.rendering import RenderResult as RenderResult
 from mcaptrack.api.rendering import render as render
 from mcaptrack.api.rows import detections as detections
+from mcaptrack.api.run import run as run
 from mcaptrack.api.running import RunResult as RunResult
 from mcaptrack.api.scoring import Scores as Scores
 from mcaptrack.api.scoring import evaluate as evaluate
 from mcaptrack.api.stages import detect as detect
-from mcaptrack.api.stages import fuse as fuse
 from mcaptrack.api.stages import motion as motion
 from mcaptrack.api.stages import predict as predict
 from mcaptrack.api.stages import retrack as retrack
@@ -52,14 +54,13 @@ from mcaptrack.api.upkeep import drop as drop
 from mcaptrack.api.upkeep import recover as recover
 from mcaptrack.api.viewing import LogServer as LogServer
 from mcaptrack.api.viewing import view as view
-from mcaptrack.api.whole import draw_zones as draw_zones
-from mcaptrack.api.whole import events as events
-from mcaptrack.api.whole import run as run
-from mcaptrack.api.whole import zones as zones
+from mcaptrack.api.zones import draw_zones as draw_zones
+from mcaptrack.api.zones import zones as zones
 from mcaptrack.errors import McaptrackError as McaptrackError
 from mcaptrack.notices import McaptrackWarning as McaptrackWarning
 from mcaptrack.notices import Notice as Notice
 
+_MODULES: dict[str, str]
 __all__ = [
     "CalibrateResult",
     "CameraCorrection",

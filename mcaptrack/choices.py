@@ -30,5 +30,13 @@ Point = Literal["foot", "center"]
 #: What a label file holds, and what an input that is a text file can hold.
 Role = Literal["detections", "tracks", "truth", "corrections"]
 InputRole: TypeAlias = Role | Literal["motion", "calibration"]
+#: How ground truth and tracks are matched.
+Similarity = Literal["iou", "metres", "bev-iou", "3d-iou"]
 #: Which tracks re-tracking writes.
 Mode = Literal["both", "offline", "online"]
+#: Whether tracks are compensated for the motion of the camera.
+CameraMotionUse = Literal["auto", "on", "off"]
+#: Formats of tables, of ROS 2 bags, and of files with the boxes of one channel.
+TableFormat = Literal["parquet", "arrow", "csv", "jsonl"]
+BagFormat = Literal["rosbag2", "rosbag2-sqlite3"]
+ExchangeFormat = Literal["mot", "kitti", "coco", "cvat", "boxes-csv", "rerun"]

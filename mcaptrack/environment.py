@@ -102,6 +102,29 @@ def cpu_quotas(root: Path = CONTROL_GROUPS, own: str | None = None) -> list[floa
     return [quota for quota in quotas if quota > 0]
 
 
+#: Version 1 of control groups states a number beyond all memory where there is no limit.
+_NO_LIMIT: Final = 1 << 60
+
+
+def memory_bytes() -> int | None:
+    """The memory that this process may use: that of the machine, or the limit of its control group."""
+    limits = memory_limits()
+    with suppress(ValueError, OSError, AttributeError):
+        limits.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    return min(limits, default=None)
+
+
+def memory_limits(root: Path = CONTROL_GROUPS, own: str | None = None) -> list[int]:
+    """The limits of memory of this process's control group and those above it, in bytes."""
+    limits = []
+    for folder in control_groups(root, own):
+        with suppress(OSError, ValueError):
+            limits.append(int((folder / "memory.max").read_text()))  # "max" is no number
+    with suppress(OSError, ValueError):
+        limits.append(int((root / "memory/memory.limit_in_bytes").read_text()))
+    return [limit for limit in limits if 0 < limit < _NO_LIMIT]
+
+
 def control_groups(root: Path = CONTROL_GROUPS, own: str | None = None) -> list[Path]:
     """The folders of this process's control group and those above it. ``own`` is /proc/self/cgroup."""
     text = own

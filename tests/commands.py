@@ -19,6 +19,8 @@ from mcaptrack.cli import app
 from tests.worlds import write_clip
 
 GROUP = get_command(app)
+#: Commands that change no file except the one that -o names.
+ONLY_READ = ("check", "docs", "doctor", "evaluate", "info", "query", "view")
 
 
 class Outcome(NamedTuple):

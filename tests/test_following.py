@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -163,7 +165,8 @@ def test_the_command_line_takes_logs_in_their_order(parts, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     for old in parts[:2]:
         Path(old.name).write_bytes(old.read_bytes())
-    out = json.loads(done("run", "0.mcap", "1.mcap", "--continue", "--no-tables", "--no-events", "--json").out)
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"0.mcap\n1.mcap\n")))  # it can be read once
+    out = json.loads(done("run", "-", "--continue", "--no-tables", "--no-events", "--json").out)
     assert "continued" not in out["results"][0]
     assert out["results"][1]["continued"] == {"log": "0.mcap", "gap_s": pytest.approx(0.1), "at_cut": {}, "kept": {}}
     for words, said in (

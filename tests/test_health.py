@@ -140,8 +140,8 @@ def test_limits_are_those_of_the_control_group_and_of_those_above_it(tmp_path):
     (tmp_path / "a" / "memory.max").write_text("2000000000\n")
     (inner / "memory.max").write_text("max\n")
     assert environment.cpu_quotas(tmp_path, "0::/a/b\n") == [1.5]
-    assert health.memory_limits(tmp_path, "0::/a/b\n") == [2_000_000_000]
-    assert health.memory_limits(tmp_path, "") == []
+    assert environment.memory_limits(tmp_path, "0::/a/b\n") == [2_000_000_000]
+    assert environment.memory_limits(tmp_path, "") == []
 
 
 def test_limits_of_the_first_version_of_control_groups(tmp_path):
@@ -153,6 +153,6 @@ def test_limits_of_the_first_version_of_control_groups(tmp_path):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
     assert environment.cpu_quotas(tmp_path, "") == [0.5]
-    assert health.memory_limits(tmp_path, "") == [1_000_000_000]
+    assert environment.memory_limits(tmp_path, "") == [1_000_000_000]
     (tmp_path / "memory/memory.limit_in_bytes").write_text("9223372036854771712")  # no limit
-    assert health.memory_limits(tmp_path, "") == []
+    assert environment.memory_limits(tmp_path, "") == []

@@ -16,14 +16,14 @@ import pyarrow as pa
 import pytest
 
 import mcaptrack
+from mcaptrack.api.declared import Option
 from mcaptrack.cli import common, many, text
 from mcaptrack.cli.flags import RUNNING, with_flags
 from mcaptrack.cli.many import ManyOptions
-from mcaptrack.cli.settings import Declared, Setting
+from mcaptrack.cli.settings import Setting
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import FleetStatus, Running
 from tests.commands import GROUP, Terminal, call, done
-from tests.test_settings import another, options_of, words_for
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def asked(monkeypatch):
 
 
 def setting(kind: Any, many: bool = False, **declared: Any) -> Setting:
-    return Setting("track", "some-option", "some_option", kind, many, Declared(**declared))
+    return Setting("track", "some-option", "some_option", kind, many, Option(**declared))
 
 
 VALUES = [
@@ -162,10 +162,10 @@ def test_texts_of_options_are_numbers_and_names_for_the_library(folder, asked):
     for said, seconds in (("90s", 90), ("90", 90), (" 1.5M ", 90), ("2h", 7200), ("10 m", 600), (None, None)):
         assert ManyOptions(timeout=said).for_fleet()["timeout_s"] == seconds
     for words, study, tracker in (
-        ([], "mcaptrack.sort.trials.jsonl", "sort"),
+        ([], "mcaptrack.sort.trials.jsonl", None),
         (["--tracker", "own:It"], "mcaptrack.own.It.trials.jsonl", "own:It"),
         (["--stage", "retrack", "-o", "to/b.toml"], "to/b.retrack.trials.jsonl", None),
-        (["--study", "mine"], "mine", "sort"),
+        (["--study", "mine"], "mine", None),
     ):
         given = asked("tune", "x.mcap", *words)
         assert (given["study"], given["tracker"]) == (Path(study), tracker)
@@ -181,36 +181,8 @@ def test_options_that_concern_a_single_log_make_it_one_of_many():
 # What commands give to the functions of the same names
 
 
-#: Options that a command treats itself or gives in another form.
-OWN = {"json", "quiet", "verbose", "form", "csv", "fail_under", "search", "file", "rows", "tables", "study", "output"}
 OF_FUNCTIONS = ("demo", "drop", "evaluate", "events", "export", "ingest", "recover", "render", "report", "train")
 FIRST = {"drop": ["x.mcap", "/a"], "demo": [], "query": ["x.mcap", "select 1"]}
-
-
-@pytest.mark.parametrize("command", [*OF_FUNCTIONS, "tune", "view"])
-def test_every_option_arrives_under_its_name(command, folder, asked):
-    known = inspect.signature(getattr(mcaptrack, command)).parameters
-    tried = set()
-    for one in options_of(command):
-        if one.parameter in OWN or one.parameter not in known:
-            continue
-        value = True if one.kind is bool else another(one, None)
-        if one.kind in (int, float):
-            value = one.kind(max(one.declared.least, min(one.declared.most, value)))
-        value = {"similarity": "metres"}.get(one.parameter, value)
-        wanted = [str(part) for part in value] if one.many else value
-        if one.parameter == "gate_m" and one.kind is str:
-            value, wanted = "0.25", ["0.25"]
-        got = asked(command, *FIRST.get(command, ["x.mcap"]), *words_for(one, value))[one.parameter]
-        got = [str(part) for part in got] if isinstance(got, list | tuple) else got
-        assert (str(got) if isinstance(got, Path) else got) == wanted, one.name
-        tried.add(one.parameter)
-    assert tried or command in ("recover", "drop")
-
-
-def test_commands_that_only_read_are_known():
-    reading = {"check", "docs", "doctor", "evaluate", "info", "query", "view"}
-    assert {name for name, one in GROUP.commands.items() if one.reads} == reading
 
 
 def test_patterns_are_replaced_by_files_in_order_without_results_of_logs_that_are_there(tmp_path, monkeypatch):
@@ -233,11 +205,11 @@ def test_results_beside_a_log_are_recovered_by_themselves(folder, monkeypatch):
     Path("x.results.mcap").write_bytes(b"no log")
     found: list[str] = []
 
-    def process(logs: list[Any], *_: Any) -> None:
+    def run(_: Any, logs: list[Any], *__: Any, **___: Any) -> None:
         found.extend(str(one.path) for one in logs)
         raise Stop("stop")
 
-    monkeypatch.setattr("mcaptrack.cli.files.process", process)
+    monkeypatch.setattr("mcaptrack.fleet.run", run)
     call("recover", "*.mcap")
     assert found == ["x.mcap", "x.results.mcap"]
 
@@ -338,7 +310,7 @@ def test_text_is_printed_without_what_a_terminal_acts_on():
 
 def test_a_terminal_shows_sixty_rows_of_an_answer_and_a_pipe_all(folder, monkeypatch, terminal):
     answer = pa.table({"n": pa.array(range(61), pa.int64()), "word": ["a\x1b[31m"] * 61})
-    monkeypatch.setattr(mcaptrack, "query", lambda paths, sql, files: answer)
+    monkeypatch.setattr(mcaptrack, "query", lambda log, sql, files: answer)
 
     def on_screen(*words: str) -> str:
         screen = Terminal()

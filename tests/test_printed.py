@@ -21,7 +21,6 @@ import pytest
 
 import mcaptrack
 from mcaptrack import fleet
-from mcaptrack.api.several import CameraResult
 from mcaptrack.api.upkeep import LogCheck, LogRecovery
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.zones import ZoneTotals
@@ -29,6 +28,7 @@ from mcaptrack.fleet import FleetResult, LogOutcome
 from mcaptrack.log.check import CheckResult
 from mcaptrack.log.check_summary import Finding
 from mcaptrack.notices import Notice
+from mcaptrack.pipeline.several import CameraResult
 from mcaptrack.pipeline.summary import Corrected, Looks, Repair, Summary, SummaryScores
 from tests.commands import call, run_result, zones_file
 from tests.worlds import write_clip

@@ -186,10 +186,10 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "api/running.py:warn_stale:run": lambda s: s.says("detect", "LOG", "--detector", "knn"),
     "api/ingesting.py:_changes:run": lambda s: s.says("ingest", "truth.txt", "--as", "corrections", "--into", "LOG"),
     "api/running.py:change:export": lambda s: s.says("run", "s3://bucket/a.mcap"),
-    "cli/train.py:_print:predict": lambda s: s.says(
+    "cli/train.py:show:predict": lambda s: s.says(
         "train", "synthetic", "--walks", "1000", "--epochs", "1", "-o", "my net"
     ),
-    "cli/view.py:_print:run": lambda s: s.untracked().says("view", "LOG"),
+    "cli/view.py:show:run": lambda s: s.untracked().says("view", "LOG"),
     "evaluation/__init__.py:sequence_of_log:run": lambda s: s.untracked().says("evaluate", "LOG"),
     "evaluation/__init__.py:ground_truth_of_log:ingest": lambda s: s.without("/camera/truth*").says("evaluate", "LOG"),
     "api/viewing.py:_report:report": lambda s: s.with_an_old_report().says("view", "LOG"),
@@ -207,9 +207,9 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "api/catalogue.py:get_model:get_model": lambda s: s.says(
         "models", "get", "yolox-nano", "--from", "http://127.0.0.1:1/"
     ),
-    "cli/models.py:models:models": lambda s: s.says("models", "get"),
-    "cli/models.py:_list:models": lambda s: s.says("models"),
-    "cli/models.py:models:run": lambda s: s.says("models", "get", "yolox-nano"),
+    "cli/models.py:arguments:models": lambda s: s.says("models", "get"),
+    "cli/models.py:show:models": lambda s: s.says("models"),
+    "cli/models.py:show:run": lambda s: s.says("models", "get", "yolox-nano"),
     "log/reader.py:channel:info": lambda s: s.says("export", "LOG", "--topic", "/nothing"),
     "pipeline/checks.py:_lacks:info": lambda s: s.says("sample", "LOG", "--topic", "/nothing"),
     "pipeline/checks.py:_lacks:ingest": lambda s: s.ingested("truth.txt", "--as", "truth", "--fps", "10").says(

@@ -13,7 +13,7 @@ import pytest
 
 from mcaptrack.log.journal import journal_of
 from mcaptrack.viewing.serving import Server
-from tests.commands import GROUP, call, done, made_log
+from tests.commands import GROUP, ONLY_READ, call, done, made_log
 from tests.effects.commands import CASES
 from tests.interrupted import everything, interrupt
 from tests.logs import READING
@@ -122,7 +122,7 @@ def line_of(command: str) -> str:
     base = LINES.get(command) or CASES[command]["json"].base
     name = {"train": "b", "export": "b", "report": "b.html", "render": "b.mp4", "tune": "b.toml"}
     output = f" -o {{elsewhere}}/{name.get(command, 'b.mcap')}"
-    return base if GROUP.commands[command].reads else base + output
+    return base if command in ONLY_READ else base + output
 
 
 def seen(folder: Path) -> dict[str, tuple[object, ...]]:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests import bounded
-from tests.commands import GROUP, done
+from tests.commands import GROUP, ONLY_READ, done
 from tests.effects.commands import line_of
 from tests.tiers import one_in
 
@@ -31,8 +31,8 @@ DEEDS = {
 }
 MOMENTS = [
     (command, deed)
-    for command, known in GROUP.commands.items()
-    for deed in DEEDS.get(command, ["read"] if known.reads else ["read", "write", "publish"])
+    for command in GROUP.commands
+    for deed in DEEDS.get(command, ["read"] if command in ONLY_READ else ["read", "write", "publish"])
 ]
 #: Where these commands read or write; all others do so in the working folder.
 ELSEWHERE = {"docs": Path(__file__).parent.parent / "docs", "doctor": Path(tempfile.gettempdir())}

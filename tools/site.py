@@ -7,16 +7,30 @@ MkDocs calls ``on_page_markdown`` for each page (``hooks`` in mkdocs.yml). A pag
 
 from __future__ import annotations
 
+import inspect
 import re
 import sys
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import fields, is_dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args
+
+import griffe
 
 ROOT = Path(__file__).resolve().parent.parent
 REPOSITORY = "https://github.com/mcaptrack/mcaptrack"
 _KINDS = {bool: "", int: "whole number", float: "number", Path: "path"}
+
+
+class Completed(griffe.Extension):
+    """Docstrings of declared functions, with the parameters that annotations describe: what Python has when it runs."""
+
+    def on_function(self, *, func: griffe.Function, **_: Any) -> None:
+        """Replace the docstring of a function that is a command."""
+        if any(str(decorator.value).startswith("declared(") for decorator in func.decorators):
+            doc = inspect.getdoc(getattr(import_module(func.module.path), func.name)) or ""
+            func.docstring = griffe.Docstring(doc, parent=func)
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:

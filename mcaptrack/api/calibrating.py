@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.common import Notes, as_location, clock_offsets, split_names, warn_unused, warnings_about
-from mcaptrack.api.declared import checked
-from mcaptrack.api.options import PathLike, Progress, no_progress
+from mcaptrack.api.common import as_location, clock_offsets, split_names, warn_unused, warnings_about
+from mcaptrack.api.declared import Option, declared
+from mcaptrack.api.options import (
+    Cameras,
+    ClockOffsets,
+    EachLog,
+    Force,
+    Output,
+    Reports,
+    Sidecar,
+    no_progress,
+)
 from mcaptrack.api.running import Where, change, warn_stale
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice
 from mcaptrack.pipeline.calibrating import CorrectedPlanes, calibrate_cameras, changes_of, write_changes
 from mcaptrack.pipeline.refining import Refined
+from mcaptrack.pipeline.several import Say
 from mcaptrack.schema.provenance import REFINE
 from mcaptrack.sources.fixed_frame import BoxesRead
 
@@ -102,56 +112,52 @@ class CalibrateResult:
     corrected: Mapping[str, str]
     unchanged: tuple[str, ...]
     dropped: tuple[str, ...]
-    is_dry_run: bool
-    stale: tuple[str, ...]
-    written_to: Location | None
-    written_because: str
-    warnings: tuple[Notice, ...]
-    seconds: float
+    is_dry_run: bool = False
+    stale: tuple[str, ...] = ()
+    written_to: Location | None = None
+    written_because: str = ""
+    warnings: tuple[Notice, ...] = ()
+    seconds: float = 0.0
 
 
-@checked()
+@declared(most_used=("reference", "cameras", "dry_run", "clock_offset_s", "output", "force"))
 def calibrate(
-    log: PathLike,
+    log: EachLog,
     *,
-    cameras: str | Sequence[str] | None = None,
-    reference: str | Sequence[str] | None = None,
-    clock_offset_s: Mapping[str, float] | None = None,
+    cameras: Cameras = None,
+    reference: Annotated[
+        str | Sequence[str] | None, Option(metavar="A,B", commas=True, shown="what most cameras agree on")
+    ] = None,
+    clock_offset_s: ClockOffsets = None,
     dry_run: bool = False,
-    output: PathLike | None = None,
-    sidecar: bool | None = None,
-    force: bool = False,
-    progress: Progress = no_progress,
+    output: Output = None,
+    sidecar: Sidecar = None,
+    force: Force = False,
+    progress: Reports = no_progress,
 ) -> CalibrateResult:
-    """Correct the ground planes of cameras by the people that they see together.
+    """Correct the ground planes of cameras that disagree with the others, by the people that they see together.
 
-    Each camera is compared with what the others agree on. The plane of one that is off is corrected by a shift, a
-    rotation, a scale, or more, as far as that holds at other times than those to which it was fitted. The plane that
-    was given stays in the log; the corrected one is used instead.
+    Each camera is compared with what the others agree on. If its feet stand elsewhere, its plane is corrected by a
+    shift, a rotation, a scale, or more, as far as that also holds at other times than those to which it was fitted;
+    those that agree stay as they are.
+
+    /CAMERA/ground_plane stays in the log, and the corrected plane in /CAMERA/ground_plane/refined is used instead:
+    `run` and `fuse` make again what was made before. `mcaptrack drop log.mcap /CAMERA/ground_plane/refined` takes it
+    back.
+
+    The log needs detections and a measured ground plane of each camera. Of two cameras ``reference`` names the right
+    one.
 
     Parameters
     ----------
-    log : path
-        The log, with detections and a measured ground plane of each camera, all of one place.
     cameras : str or sequence of str, optional
-        Names of the cameras to compare, also with commas between them; by default all that have what is needed.
+        Cameras to compare.
+
+        Also with commas between names. By default all that have detections and a measured ground plane.
     reference : str or sequence of str, optional
-        Cameras that are right: their planes stay, and the others are brought to them. By default what most cameras
-        agree on is right; with two cameras one has to be named.
-    clock_offset_s : mapping of str to float, optional
-        How many seconds the times of a camera are late, by its name; those of others are estimated from people who
-        walk.
+        Cameras that are right: the others are brought to them.
     dry_run : bool, default False
-        Only compare; nothing is written.
-    output : path, optional
-        Write to this file instead; the log stays unchanged.
-    sidecar : bool, optional
-        Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings that
-        ROS tools read, otherwise into the log.
-    force : bool, default False
-        Overwrite ``output`` if it exists.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
+        Only compare; write nothing.
 
     Returns
     -------
@@ -166,6 +172,10 @@ def calibrate(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack calibrate log.mcap --dry-run
+
     >>> import mcaptrack
     >>> result = mcaptrack.calibrate("log.mcap", dry_run=True)  # doctest: +SKIP
     >>> result.cameras["left"].correction  # doctest: +SKIP
@@ -176,34 +186,33 @@ def calibrate(
     right = split_names("reference", reference if isinstance(reference, str) else reference or None)
     offsets = clock_offsets(clock_offset_s)
 
-    def compare(opened: logs.Log) -> Any:
+    path = as_location(log)
+    outcome: list[tuple[CalibrateResult, set[str]]] = []
+
+    def compare(opened: logs.Log) -> tuple[CalibrateResult, CorrectedPlanes]:
         def report(done: int, total: int) -> None:
             progress(REFINE, done, total)
 
-        return calibrate_cameras(opened, names, right, offsets, report)
-
-    outcome: list[Any] = []
-
-    def act(opened: logs.Log, target: Path | None, notes: Notes, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
-        refined, offset_s, planes = compare(opened)
-        before = {topic for topic in opened.channels if pipeline.is_stale(opened, topic)}
+        refined, offset_s, planes = calibrate_cameras(opened, names, right, offsets, report)
         changes = changes_of(opened, refined, planes)
+        corrections = {camera.name: _correction(camera, offset_s, planes) for camera in refined}
+        return CalibrateResult(path, corrections, dict(changes.topics), changes.unchanged, changes.dropped), changes
+
+    def act(opened: logs.Log, target: Path | None, say: Say, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
+        result, changes = compare(opened)
+        outcome.append((result, {topic for topic in opened.channels if pipeline.is_stale(opened, topic)}))
         is_new = write_changes(opened, changes, target)
-        outcome.extend((refined, offset_s, planes, changes, before))
-        stages = [REFINE] if is_new or target is not None else []
-        return "", pipeline.Report(stages=stages)
+        return "", pipeline.Report(stages=[REFINE] if is_new or target is not None else [])
 
     with warnings_about(log) as warnings:
         if dry_run:
             unused = {"output": output is not None, "sidecar": sidecar is not None, "force": force}
             warn_unused("a dry run writes nothing", **unused)
-            path = as_location(log)
             with logs.read(path) as opened:
-                refined, offset_s, planes = compare(opened)
-                changes = changes_of(opened, refined, planes)
-            return _result(path, refined, offset_s, planes, changes, is_dry_run=True, warnings=warnings)
+                result, _ = compare(opened)
+            return replace(result, is_dry_run=True, warnings=tuple(dict.fromkeys(warnings)))
         done = change(Where(log, None, None, output, sidecar, force), act, progress, None)
-        refined, offset_s, planes, changes, before = outcome
+        ((result, before),) = outcome
         with logs.read(done.log) as opened:
             stale = sorted(
                 topic for topic in opened.channels if topic not in before and pipeline.is_stale(opened, topic)
@@ -211,51 +220,29 @@ def calibrate(
             named = {topic: pipeline.camera_to_name(opened, topic) for topic in stale}
         for topic in stale:
             warn_stale(topic, done.log, named)
-    return _result(
-        done.log, refined, offset_s, planes, changes, tuple(stale), done.written_to, done.written_because, warnings,
-        done.seconds,
-    )  # fmt: skip
-
-
-def _result(
-    path: Location,
-    refined: Sequence[Refined],
-    offset_s: Mapping[str, float],
-    planes: Mapping[str, Any],
-    changes: CorrectedPlanes,
-    stale: tuple[str, ...] = (),
-    written_to: Location | None = None,
-    written_because: str = "",
-    warnings: Sequence[Notice] = (),
-    seconds: float = 0.0,
-    is_dry_run: bool = False,
-) -> CalibrateResult:
-    def of(camera: Refined) -> CameraCorrection:
-        before, after = camera.before, camera.after
-        return CameraCorrection(
-            correction=camera.model,
-            moved_m=round(camera.moved_m, 4),
-            pairs=before.pairs if before else 0,
-            median_before_m=before.median_m if before else None,
-            p90_before_m=before.p90_m if before else None,
-            median_after_m=after.median_m if after else None,
-            p90_after_m=after.p90_m if after else None,
-            why=camera.why,
-            limit=camera.limit,
-            clock_offset_s=offset_s.get(camera.name, 0.0),
-            homography=planes[camera.name].homography if camera.name in planes else None,
-        )
-
-    return CalibrateResult(
-        log=path,
-        cameras={camera.name: of(camera) for camera in refined},
-        corrected=dict(changes.topics),
-        unchanged=changes.unchanged,
-        dropped=changes.dropped,
-        is_dry_run=is_dry_run,
-        stale=stale,
-        written_to=written_to,
-        written_because=written_because,
+    return replace(
+        result,
+        log=done.log,
+        stale=tuple(stale),
+        written_to=done.written_to,
+        written_because=done.written_because,
         warnings=tuple(dict.fromkeys(warnings)),
-        seconds=seconds,
+        seconds=done.seconds,
+    )
+
+
+def _correction(camera: Refined, offset_s: Mapping[str, float], planes: Mapping[str, Any]) -> CameraCorrection:
+    before, after = camera.before, camera.after
+    return CameraCorrection(
+        correction=camera.model,
+        moved_m=round(camera.moved_m, 4),
+        pairs=before.pairs if before else 0,
+        median_before_m=before.median_m if before else None,
+        p90_before_m=before.p90_m if before else None,
+        median_after_m=after.median_m if after else None,
+        p90_after_m=after.p90_m if after else None,
+        why=camera.why,
+        limit=camera.limit,
+        clock_offset_s=offset_s.get(camera.name, 0.0),
+        homography=planes[camera.name].homography if camera.name in planes else None,
     )

@@ -7,9 +7,9 @@ import logging
 import re
 from pathlib import Path
 from time import monotonic
-from typing import Any
+from typing import Annotated, Any
 
-from mcaptrack.api.declared import checked
+from mcaptrack.api.declared import Argument, checked, declared
 from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import publish_bytes, refuse_special
@@ -27,8 +27,17 @@ _LEAST_BYTES_PER_S, _PATIENCE_S = 2000, 60
 _CHUNK = 4096
 
 
-def models(name: str | None = None) -> tuple[Model, ...]:
-    """List the detectors of the catalogue, with weights to fetch.
+@declared()
+def models(
+    name: Annotated[
+        str | None,
+        Argument("words", "get NAME", "`get` fetches the weights of NAME.", shown="a list", words=True),
+    ] = None,
+) -> tuple[Model, ...]:
+    """List the learned detectors of the catalogue, or fetch the weights of one, once.
+
+    Only a file with the known SHA-256 is taken. The weights are kept in your folder of caches, or where the environment
+    variable MCAPTRACK_MODELS says.
 
     Parameters
     ----------
@@ -47,6 +56,12 @@ def models(name: str | None = None) -> tuple[Model, ...]:
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack models
+
+        mcaptrack models get yolox-nano
+
     >>> import mcaptrack
     >>> [model.name for model in mcaptrack.models()]
     ['yolox-nano', 'yolox-tiny', 'yolox-s']
@@ -54,7 +69,7 @@ def models(name: str | None = None) -> tuple[Model, ...]:
     return (session.find(name),) if name else tuple(session.CATALOGUE.values())
 
 
-@checked()
+@checked
 def get_model(name: str, *, source: PathLike | None = None) -> Path:
     """Fetch the weights of a detector of the catalogue, once, into the user's folder of caches.
 

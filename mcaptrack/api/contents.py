@@ -8,10 +8,9 @@ from math import degrees
 from typing import Any, Literal
 
 from mcaptrack import log as logs
-from mcaptrack import pipeline
 from mcaptrack.api.common import as_location, warnings_about
-from mcaptrack.api.declared import checked
-from mcaptrack.api.options import PathLike
+from mcaptrack.api.declared import declared
+from mcaptrack.api.options import EachLog
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.transform_series import TransformSeries
 from mcaptrack.location import Location
@@ -177,18 +176,17 @@ class LogInfo:
         return out | {"channels": list(out["channels"]), "frames": None if self.frames is None else list(out["frames"])}
 
 
-@checked()
-def info(log: PathLike, *, frames: bool = False) -> LogInfo:
-    """Return the channels of a log, their number of messages, and what was made from what.
+@declared()
+def info(log: EachLog, *, frames: bool = False) -> LogInfo:
+    """Show the channels of a log, their number of messages, and what was made from what.
 
-    Reads the summary of the log only, unless ``frames`` asks for more.
+    Those of each camera are together, if there are several, under its name. Reads the summary only, unless ``frames``
+    asks for more. On the command line -v shows also the parameters that channels were made with.
 
     Parameters
     ----------
-    log : path
-        The log.
-    frames : bool
-        Whether to read the transforms between frames of reference, too, and list the frames.
+    frames : bool, default False
+        Also read the transforms between frames of reference, and draw the tree of frames.
 
     Returns
     -------
@@ -202,6 +200,12 @@ def info(log: PathLike, *, frames: bool = False) -> LogInfo:
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack info log.mcap
+
+        mcaptrack info robot.mcap --frames
+
     >>> import mcaptrack
     >>> made = {channel.topic: channel.transform for channel in mcaptrack.info("log.mcap").channels}
     >>> made["/camera/tracks"]
@@ -212,7 +216,10 @@ def info(log: PathLike, *, frames: bool = False) -> LogInfo:
     """
     path = as_location(log)
     with warnings_about(path) as warnings, logs.read(path) as opened:
-        pipeline.warn_clock_jumps(opened)
+        if logs.clock_jumps(opened):
+            from mcaptrack.pipeline import warn_clock_jumps
+
+            warn_clock_jumps(opened)
         every = [(channel, part) for part in opened.parts for channel in part.recorded]
         every.sort(key=lambda pair: (pair[0].topic, pair[1] is opened, pair[0].id))
         names = names_by_topic(opened)
@@ -250,9 +257,18 @@ def _channel(opened: logs.Log, part: logs.Log, channel: logs.Channel, camera: st
         plugins={part: plugin._asdict() for part, plugin in provenance.plugins.items()} if provenance else None,
         parameters=dict(provenance.parameters) if provenance else None,
         frame=frame_id_of(channel.metadata) or None,
-        stale=not replaced and pipeline.is_stale(opened, channel.topic),
+        stale=not replaced and _is_stale(opened, channel.topic, provenance),
         camera=camera,
     )
+
+
+def _is_stale(opened: logs.Log, topic: str, provenance: Provenance | None) -> bool:
+    """Return whether a channel is out of date. Only one that was made of others can be: others need no pipeline."""
+    if provenance is None or not (provenance.input or provenance.references):
+        return False
+    from mcaptrack.pipeline import is_stale
+
+    return is_stale(opened, topic)
 
 
 def _rate(opened: logs.Log, messages: int) -> float | None:

@@ -2,7 +2,8 @@
 
 The signature says what there is: names, types, defaults. The docstring says what it means: the first paragraph of a
 parameter is its help, and ``; by default X.`` at its end is the default that the help shows. ``Annotated`` adds what
-neither can say: the range of a number, the heading in the help, who may set it (``Option``). This module imports
+neither can say: the range of a number, the heading in the help, who may set it (``Option``). A parameter that many
+functions share says there what it means, too, and ``declared`` puts this into their docstrings. This module imports
 nothing heavy, so that ``--help`` stays quick; a declared function imports what it needs in its body. By the same
 annotations the arguments of calls are checked (``checked``): names of files, choices, ranges of numbers, progress.
 """
@@ -10,9 +11,11 @@ annotations the arguments of calls are checked (``checked``): names of files, ch
 from __future__ import annotations
 
 import inspect
+import json
 import math
 import os
 import re
+import textwrap
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
@@ -59,6 +62,10 @@ class Option:
         What the help shows in place of the type, and of the default.
     names : callable or None
         Returns the values to complete.
+    commas : bool
+        Whether several values are one text on the command line, with commas between them.
+    help : str
+        The meaning of the parameter, where the docstring of a function doesn't say it.
     """
 
     panel: str = ""
@@ -71,6 +78,8 @@ class Option:
     metavar: str | None = None
     shown: str | bool | None = None
     names: Callable[[], Sequence[str]] | None = None
+    commas: bool = False
+    help: str = ""
 
     @property
     def is_bounded(self) -> bool:
@@ -79,19 +88,49 @@ class Option:
 
 
 @dataclass(frozen=True)
-class OneOfMany:
-    """A path that the function takes one of, and the command many: each gets a call of its own, in worker processes.
+class Argument:
+    """A parameter that the command takes by its place on the command line.
 
-    ``name`` is that of the argument of the command, ``metavar`` and ``help`` are what its help shows.
+    Attributes
+    ----------
+    name : str
+        Name of the argument of the command.
+    metavar, text, shown : str
+        What its help shows: the name, the text, and the default.
+    words : bool
+        Whether the command takes any number of words there, and reads by itself what they mean.
+    help : str
+        The meaning of the parameter in Python, where the docstring of a function doesn't say it.
     """
 
     name: str
     metavar: str
-    help: str
+    text: str
+    _: KW_ONLY
+    shown: str | bool = False
+    words: bool = False
+    help: str = ""
+
+
+@dataclass(frozen=True)
+class OneOfMany(Argument):
+    """A path that the function takes one of, and the command many: each gets a call of its own, in worker processes.
+
+    With ``is_one`` the command takes one name, since other arguments follow; a folder or a pattern stands for many.
+    """
+
+    is_one: bool = False
+
+
+@dataclass(frozen=True)
+class PythonOnly:
+    """A parameter that is no option; ``help`` is its meaning, where the docstring of a function doesn't say it."""
+
+    help: str = ""
 
 
 #: For a parameter that is no option: ``Annotated[..., PYTHON_ONLY]``.
-PYTHON_ONLY: Final = object()
+PYTHON_ONLY: Final = PythonOnly()
 
 
 class Words(NamedTuple):
@@ -130,51 +169,66 @@ def bare(hint: Any) -> Any:
 
 def option_of(hint: Any) -> Option:
     """The facts about an option in an annotation."""
-    return next((part for part in _about(hint) if isinstance(part, Option)), Option())
+    return next((part for part in about(hint) if isinstance(part, Option)), Option())
 
 
-def one_of_many(function: Callable[..., Any]) -> OneOfMany | None:
-    """The facts about the parameter of which the command takes many; None without one."""
-    about = (part for hint in hints_of(function).values() for part in _about(hint))
-    return next((part for part in about if isinstance(part, OneOfMany)), None)
-
-
-def _about(hint: Any) -> tuple[Any, ...]:
+def about(hint: Any) -> tuple[Any, ...]:
+    """The facts that ``Annotated`` adds to a type."""
     return get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+
+
+def arguments_of(function: Callable[..., Any]) -> dict[str, Argument]:
+    """The parameters that the command takes by their place, in order."""
+    pairs = ((name, part) for name, hint in hints_of(function).items() for part in about(hint))
+    return {name: part for name, part in pairs if isinstance(part, Argument)}
 
 
 def options_of(function: Callable[..., Any]) -> list[Parameter]:
     """The parameters of a declared function that are options of its command, in order."""
-    doc, hints = words_of(function), hints_of(function)
-    flags = {name: f"--{(option_of(hint).flag or name).replace('_', '-')}" for name, hint in hints.items()}
-    out = []
-    for name, parameter in inspect.signature(function).parameters.items():
-        about = _about(hints[name])
-        if (
-            parameter.kind is parameter.VAR_KEYWORD
-            or PYTHON_ONLY in about
-            or any(isinstance(each, OneOfMany) for each in about)
-        ):
-            continue
-        option, (kind, many) = option_of(hints[name]), on_command_line(bare(hints[name]))
-        text, shown = _split_default(doc.parameters.get(name, [""])[0])
-        flag, _, off = flags[name].partition("/")
-        if kind is bool and (off or parameter.default is not False):
-            off = f"--{off or f'no-{flag[2:]}'}"
-            text = text.replace("(True)", f"({flag})").replace("(False)", f"({off})")
-        names = (f"{flag}/{off}" if off else flag, *([f"-{option.short}"] if option.short else []))
-        default = shown if option.shown is None else option.shown
-        out.append(Parameter(name, kind, many, names, parameter.default, option, with_dashes(text, flags), default))
-    return out
+    doc, hints, flags = words_of(function), hints_of(function), flags_of(function)
+    return [
+        parameter_of(name, hints[name], parameter.default, with_dashes(doc.parameters.get(name, [""])[0], flags))
+        for name, parameter in inspect.signature(function).parameters.items()
+        if parameter.kind is not parameter.VAR_KEYWORD
+        and not any(isinstance(part, PythonOnly | Argument) for part in about(hints[name]))
+    ]
+
+
+def flags_of(function: Callable[..., Any]) -> dict[str, str]:
+    """The names of options by the names of the parameters of a function, with dashes."""
+    return {name: _flag(name, hint) for name, hint in hints_of(function).items()}
+
+
+def _flag(name: str, hint: Any) -> str:
+    return f"--{(option_of(hint).flag or name).replace('_', '-')}"
+
+
+def parameter_of(name: str, hint: Any, default: Any, text: str = "") -> Parameter:
+    """An option of a type, which ``Annotated`` says more about; ``text`` is its help, by default that of its type."""
+    option, (kind, many) = option_of(hint), on_command_line(bare(hint))
+    if option.commas:
+        kind, many = str, False
+        default = ",".join(f"{value:g}" for value in default) if isinstance(default, tuple) else default
+    text, shown = (text or option.help).partition("\n\n")[0], option.shown
+    if shown is None:
+        text, shown = _split_default(text)
+    flag, _, off = _flag(name, hint).partition("/")
+    if kind is bool and (off or default is not False):
+        off = f"--{off or f'no-{flag[2:]}'}"
+        text = text.replace("(True)", f"({flag})").replace("(False)", f"({off})")
+    names = (f"{flag}/{off}" if off else flag, *([f"-{option.short}"] if option.short else []))
+    return Parameter(name, kind, many, names, default, option, text, shown)
 
 
 def on_command_line(hint: Any) -> tuple[Any, bool]:
     """The type of one value of an option, and whether it may have several.
 
     Python takes more than a command line can say: of ``str | Sequence[str]`` an option takes several texts, of
-    ``float | str | Fraction`` a text, of ``str | os.PathLike`` a path.
+    ``float | str | Fraction`` a text, of ``str | os.PathLike`` a path, of ``Mapping[str, float]`` texts such as a=1.
     """
     parts = _parts(hint)
+    if any(get_origin(part) is Mapping for part in parts) and str not in parts:
+        return str, True
     several = [get_args(part)[0] for part in parts if get_origin(part) is Sequence]
     if several:
         return on_command_line(several[0])[0], True
@@ -202,9 +256,9 @@ def words_of(function: Callable[..., Any]) -> Words:
     sections = dict(zip(rest[::2], rest[1::2], strict=True))
     parameters: dict[str, list[str]] = {}
     for block in re.split(r"^(?=\S)", sections.get("Parameters", ""), flags=re.M):
-        names, _, lines = block.partition("\n")
-        for name in names.partition(" : ")[0].split(", "):
-            parameters[name.lstrip("*")] = [" ".join(part.split()) for part in inspect.cleandoc(lines).split("\n\n")]
+        for name in _names_of(block):
+            lines = inspect.cleandoc(block.partition("\n")[2])
+            parameters[name] = [" ".join(part.split()) for part in lines.split("\n\n")]
     return Words(text.strip(), parameters, re.findall(r"^ +(mcaptrack .+)$", sections.get("Examples", ""), re.M))
 
 
@@ -224,60 +278,106 @@ def with_dashes(text: str, flags: dict[str, str]) -> str:
     return re.sub(r"``(\w+)``|`(\w+)=`", option, text).replace("``", "")
 
 
-def checked(**ranges: tuple[float, float]) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Check parameters before a function runs: paths, those of a ``Literal``, those with a range, and ``progress``.
+def checked(function: Callable[P, T]) -> Callable[P, T]:
+    """Check arguments before a function runs: paths, those of a ``Literal``, those with a range, and ``progress``.
 
-    Parameters
-    ----------
-    **ranges : tuple of two float
-        Smallest and largest value of a parameter that is a number, or several.
-
-    Returns
-    -------
-    callable
-        A decorator. The function raises McaptrackError, and does nothing, if a value is an empty name of a file, none
-        of the choices, or out of its range.
-
+    The function raises McaptrackError, and does nothing, if a value is an empty name of a file, none of the choices, or
+    out of the range that ``Option`` declares.
     """
+    signature = inspect.signature(function)
 
-    def decorate(function: Callable[P, T]) -> Callable[P, T]:
-        signature = inspect.signature(function)
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        for name, value in signature.bind(*args, **kwargs).arguments.items():
+            if value is signature.parameters[name].default:
+                continue
+            kinds = _kinds(function).get(name, ())
+            choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
+            if "" in map(_name_of, _paths_in(value, kinds)):
+                raise McaptrackError(f"`{name}=` is an empty name; give the name of a file or folder")
+            if choices:
+                _check_choice(name, value, choices)
+            if kinds and set(kinds) <= {str, type(None)} and not isinstance(value, tuple(kinds)):
+                raise McaptrackError(f"`{name}=` is text, not {value!r:.40}")
+            if ends := _ranges(function).get(name):
+                _check_range(name, value, ends, is_whole=float not in kinds)
+            if name == "progress" and not callable(value):
+                raise McaptrackError(
+                    f"`progress=` is called as progress(stage, done, total), which {value!r:.40} is not"
+                )
+        return function(*args, **kwargs)
 
-        @wraps(function)
-        def call(*args: P.args, **kwargs: P.kwargs) -> T:
-            for name, value in signature.bind(*args, **kwargs).arguments.items():
-                if value is signature.parameters[name].default:
-                    continue
-                kinds = _kinds(function).get(name, ())
-                choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
-                if "" in map(_name_of, _paths_in(value, kinds)):
-                    raise McaptrackError(f"`{name}=` is an empty name; give the name of a file or folder")
-                if choices:
-                    _check_choice(name, value, choices)
-                if kinds and set(kinds) <= {str, type(None)} and not isinstance(value, tuple(kinds)):
-                    raise McaptrackError(f"`{name}=` is text, not {value!r:.40}")
-                if ends := ranges.get(name) or _ranges(function).get(name):
-                    _check_range(name, value, ends, is_whole=float not in kinds)
-                if name == "progress" and not callable(value):
-                    raise McaptrackError(
-                        f"`progress=` is called as progress(stage, done, total), which {value!r:.40} is not"
-                    )
-            return function(*args, **kwargs)
-
-        return call
-
-    return decorate
+    return call
 
 
 def declared(*, most_used: tuple[str, ...] = ()) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Declare a command: a function that is ``checked``. The options ``most_used`` come first in its help."""
+    """Declare a command: a function that is ``checked``. The options ``most_used`` come first in its help.
+
+    What the annotations say of parameters that the docstring leaves out is added to it.
+    """
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
-        call = checked()(function)
+        if function.__doc__:  # there is none with python -OO
+            function.__doc__ = _completed(function)
+        call = checked(function)
         vars(call)["most_used"] = most_used
         return call
 
     return decorate
+
+
+def _completed(function: Callable[..., Any]) -> str:
+    """The docstring of a function with all parameters, in order: also with those that annotations alone describe."""
+    doc, hints, parameters = inspect.getdoc(function) or "", hints_of(function), inspect.signature(function).parameters
+    if _PARAMETERS not in doc:
+        doc = re.sub(r"(?=^Returns\n)|\Z", f"{_PARAMETERS}\n\n", doc, count=1, flags=re.M)
+    before, _, rest = doc.partition(_PARAMETERS)
+    own, *after = re.split(r"^(?=\w+\n-+\n)", rest, maxsplit=1, flags=re.M)
+    blocks = [block.rstrip() for block in re.split(r"^(?=\S)", own, flags=re.M) if block.strip()]
+    described = {name for block in blocks for name in _names_of(block)}
+    blocks += [_described(parameters[name], hints[name]) for name in parameters if name not in described]
+    blocks.sort(key=lambda block: list(parameters).index(_names_of(block)[0]))
+    return "\n".join([f"{before}{_PARAMETERS}", *blocks, "", *after])
+
+
+#: The heading of a section of a docstring.
+_PARAMETERS: Final = "Parameters\n----------"
+
+
+def _names_of(block: str) -> list[str]:
+    """The parameters that a block of a docstring is about."""
+    return [name.lstrip("*") for name in block.partition("\n")[0].partition(" : ")[0].split(", ")]
+
+
+def _described(parameter: inspect.Parameter, hint: Any) -> str:
+    """The description of a parameter by its annotation, as numpydoc has it."""
+    text = next((part.help for part in about(hint) if part.help), "")
+    default = parameter.default
+    is_said = isinstance(default, str | int | float)
+    end = f", default {json.dumps(default) if isinstance(default, str) else default}" if is_said else ", optional"
+    lines = [textwrap.fill(part, 116, initial_indent="    ", subsequent_indent="    ") for part in text.split("\n\n")]
+    kind = _in_words(bare(hint)) + ("" if default is parameter.empty else end)
+    return "\n".join([f"{parameter.name} : {kind}", "\n\n".join(lines)])
+
+
+def _in_words(hint: Any) -> str:
+    """A type as numpydoc has it: "path or sequence of path"."""
+    parts = [part for part in _parts(hint) if part is not type(None)]
+    if any(get_origin(part) is os.PathLike for part in parts):
+        parts.remove(str)
+    names = [_name_in_words(part) for part in parts]
+    return " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+
+
+def _name_in_words(kind: Any) -> str:
+    origin, members = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return f"{{{', '.join(map(json.dumps, members))}}}"
+    if origin is Sequence:
+        return f"sequence of {_in_words(members[0])}"
+    if origin is Mapping:
+        return f"mapping of {_in_words(members[0])} to {_in_words(members[1])}"
+    return {os.PathLike: "path", Callable: "callable"}.get(origin) or str(kind.__name__)
 
 
 @cache

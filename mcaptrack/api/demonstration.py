@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Annotated, Final, Literal
 
 from mcaptrack.api.common import Notes, as_path
-from mcaptrack.api.declared import checked
+from mcaptrack.api.declared import Option, declared
 from mcaptrack.api.ingesting import ingest
-from mcaptrack.api.options import PathLike, Progress, no_progress
+from mcaptrack.api.options import FILES, Force, PathLike, Progress, Reports, no_progress
+from mcaptrack.api.run import run
 from mcaptrack.api.scoring import Scores, evaluate
-from mcaptrack.api.whole import run
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import Notice, collected
 from mcaptrack.sources import demo as drawing
@@ -59,30 +59,32 @@ class DemoResult:
     warnings: tuple[Notice, ...]
 
 
-@checked(seed=(0, 2**31 - 1))
+@declared()
 def demo(
-    output: PathLike = "mcaptrack-demo",
+    output: Annotated[PathLike, Option(FILES, short="o", shown=True)] = "mcaptrack-demo",
     *,
     scene: SceneName = "square",
-    seed: int = 2,
-    force: bool = False,
-    progress: Progress = no_progress,
+    seed: Annotated[int, Option("", 0, 2**31 - 1)] = 2,
+    force: Force = False,
+    progress: Reports = no_progress,
 ) -> DemoResult:
     """Draw a scene with known ground truth, run everything on it, and compare SORT with re-tracking.
+
+    The scene has what makes tracking fail: people who cross, meet and part, occlusion behind a kiosk, a tree that
+    sways, a camera that shakes a little. Writes a video, a log, tables and layouts. Scores of one seed are a random
+    sample, so the mean and the range over ten seeds of each scene are printed, too.
 
     Parameters
     ----------
     output : path, default "mcaptrack-demo"
         Folder for the video, the log, the tables and the layouts.
     scene : {"square", "walkers", "crowd", "side-by-side", "standing", "three-cameras"}, default "square"
-        The scene to draw: people who cross, meet and part on a square; 10 walkers or a crowd of 20 on random routes;
-        three pairs side by side; people who stand still for a while; 8 walkers seen by three cameras from three sides.
+        Scene to draw: people who cross, meet and part on a square; 10 walkers or a crowd of 20 on random routes; three
+        pairs side by side; people who stand still for a while; 8 walkers seen by three cameras.
     seed : int, default 2
         Random seed of the noise, the shaking and the routes.
     force : bool, default False
         Replace the demonstration in the folder.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
 
     Returns
     -------
@@ -96,6 +98,10 @@ def demo(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack demo --scene crowd --seed 7 -o crowd
+
     >>> import mcaptrack
     >>> result = mcaptrack.demo("crowd", scene="crowd", seed=7)
     >>> 0 < result.scores.score("IDF1", "retracks") <= 1

@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, cast
+from typing import Annotated, cast
 
 from mcaptrack import log as logs
 from mcaptrack.api.common import log_location, names_of, optional_path, warn_unused, warnings_about
-from mcaptrack.api.declared import checked
-from mcaptrack.api.options import PathLike, Progress, no_progress
+from mcaptrack.api.declared import Option, declared
+from mcaptrack.api.options import FILES, EachLog, Force, PathLike, Progress, Reports, no_progress, output
+from mcaptrack.choices import BagFormat, ExchangeFormat, TableFormat
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, place_of
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice, warn
-from mcaptrack.tables import Format
 from mcaptrack.tables.exchange import FORMATS as EXCHANGE_FORMATS
-from mcaptrack.tables.exchange import ExchangeFormat, default_file, write_boxes
+from mcaptrack.tables.exchange import default_file, write_boxes
 from mcaptrack.tables.export import default_folder, main_file, recording_key, recording_name
 from mcaptrack.tables.export import export as write_tables
 from mcaptrack.tables.rosbag2 import Storage, write_bag
@@ -63,45 +63,46 @@ class ExportResult:
         return not self.written
 
 
-@checked()
+@declared(most_used=("form", "topic", "output", "force"))
 def export(
-    log: PathLike,
-    output: PathLike | None = None,
+    log: EachLog,
+    output: Annotated[PathLike | None, output("LOG.tables, LOG.rosbag2, LOG.cvat.xml, ... beside the log")] = None,
     *,
-    form: Format | Literal["rosbag2", "rosbag2-sqlite3"] | ExchangeFormat = "parquet",
-    topic: str | Sequence[str] | None = None,
-    blobs: bool = False,
-    force: bool = False,
-    progress: Progress = no_progress,
+    form: Annotated[TableFormat | BagFormat | ExchangeFormat, Option(FILES, flag="format")] = "parquet",
+    topic: Annotated[str | Sequence[str] | None, Option(FILES, shown=False)] = None,
+    blobs: Annotated[bool, Option(FILES)] = False,
+    force: Force = False,
+    progress: Reports = no_progress,
 ) -> ExportResult:
-    """Write a log as tables, one row per object and frame, as a ROS 2 bag, or as a file of another program.
+    """Write a log as tables (Parquet), one row per object and frame, as a ROS 2 bag, or for other programs.
 
-    A bag has detections and tracks as ``vision_msgs/Detection3DArray`` or ``Detection2DArray``, predictions as
-    ``nav_msgs/Path``, drawings of tracks and predictions as ``visualization_msgs/MarkerArray``, and the transforms of
-    the log.
+    One folder a table (frames, detections, tracks, track_summary, predictions, events, metrics, channels, recordings
+    and others), one file a log in it; several logs can share a folder. Exporting again replaces what has changed.
+    `mcaptrack docs tables` lists all columns. A bag (rosbag2) holds results as ROS messages, for RViz and `ros2 bag`:
+    `vision_msgs/Detection3DArray` or `Detection2DArray`, `nav_msgs/Path`, `visualization_msgs/MarkerArray`, transforms.
 
-    A file of another program has the boxes of one channel: the re-tracked boxes of the only camera at the rate of the
-    video, or else its tracks or detections, or those of ``topic``. What its format can't hold is a warning.
+    A file (mot, kitti, coco, cvat, boxes-csv) has the boxes of one channel: the re-tracked boxes of the only camera at
+    the rate of the video, or else its tracks or detections, or those of ``topic``. `mcaptrack ingest` reads it again;
+    what its format can't hold is a warning.
 
     Parameters
     ----------
-    log : path
-        The log.
     output : path, optional
-        Folder for the tables, by default LOG.tables beside the log, or for the bag, by default LOG.rosbag2, or the
-        file, such as LOG.cvat.xml; of a log in a store, in the working folder.
+        Folder for the tables or the bag, or the file.
+
+        By default LOG.tables, LOG.rosbag2, or a file such as LOG.cvat.xml beside the log; of a log in a store, in the
+        working folder.
     form : {"parquet", "arrow", "csv", "jsonl", "rosbag2", "rosbag2-sqlite3", "mot", "kitti", "coco", "cvat", ...}
-        Format of the files. "rosbag2" is a ROS 2 bag in MCAP, "rosbag2-sqlite3" one in a database. "mot"
-        (MOTChallenge), "kitti" (KITTI tracking), "coco" (with tracks), "cvat" (CVAT for video 1.1) and "boxes-csv"
-        are files with the boxes of one channel; "rerun" is a recording with pictures and forecasts, too.
+        Tables (parquet, arrow, csv, jsonl), a ROS 2 bag, or a file with the boxes of one channel: MOTChallenge, KITTI
+        tracking, COCO with tracks, CVAT for video, a table, or a recording of Rerun.
+
+        "rosbag2" is a bag in MCAP, "rosbag2-sqlite3" one in a database.
     topic : str or sequence of str, optional
-        Also write a table of all messages of these channels; the channel with the boxes for a file.
+        Also write a table of all messages of this channel; the channel with the boxes for a file.
     blobs : bool, default False
         With ``topic``: include binary fields, such as pictures and point clouds.
     force : bool, default False
         Write all tables again, also over those of another log of this name; replace a bag or a file.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
 
     Returns
     -------
@@ -115,6 +116,14 @@ def export(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack export log.mcap -o tables/
+
+        mcaptrack export log.mcap --format cvat -o boxes.xml
+
+        mcaptrack export robot.mcap --topic /imu --format csv
+
     >>> import mcaptrack
     >>> mcaptrack.export("log.mcap", "tables").rows["tracks"] > 0
     True
@@ -125,19 +134,17 @@ def export(
         return _export_file(path, optional_path(output), form, names_of(topic), blobs, force, progress)
     if form in _BAGS:
         return _export_bag(path, optional_path(output), _BAGS[form], topic, blobs, force, progress)
-    folder = optional_path(output) or default_folder(path)
+    folder, kind = optional_path(output) or default_folder(path), cast("TableFormat", form)
     if folder.exists() and not folder.is_dir():
         raise McaptrackError(f"{folder} is a file; tables go to a folder")
     if blobs and not topic:
         raise McaptrackError("`blobs=True` needs a channel to write; name it with `topic=`")
     with warnings_about(path) as warnings:
         with logs.read(path) as opened:
-            done = write_tables(
-                opened, folder, progress, form=cast("Format", form), topics=names_of(topic), blobs=blobs, force=force
-            )
+            done = write_tables(opened, folder, progress, form=kind, topics=names_of(topic), blobs=blobs, force=force)
         for note in done.notes:
             warn(note, "left-out")
-    owed = (main_file(path, folder, cast("Format", form)),)
+    owed = (main_file(path, folder, kind),)
     return ExportResult(path, folder, done.rows, tuple(done.written), tuple(dict.fromkeys(warnings)), owed)
 
 

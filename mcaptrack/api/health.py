@@ -7,53 +7,24 @@ import platform
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import metadata
-from itertools import islice
 from pathlib import Path
-from typing import Any, Final
-from uuid import uuid4
+from typing import Annotated, Any, Final
 
-from mcaptrack import __version__, log, objects
-from mcaptrack.environment import CONTROL_GROUPS, THREADS, cache_folder, control_groups, share_of_cores
+from mcaptrack import __version__, log
+from mcaptrack.api.declared import Argument, declared
+from mcaptrack.environment import THREADS, cache_folder, memory_bytes, share_of_cores
 from mcaptrack.errors import McaptrackError
-from mcaptrack.location import SCHEMES, Url, hide_secrets, parse
 from mcaptrack.notices import Notice, collected, warn
-from mcaptrack.objects import Version
-from mcaptrack.objects.stores import described
+from mcaptrack.objects.trial import StoreCheck, check_store, url_of_store
 
 #: Extras for people who work on mcaptrack itself, or read its examples.
 _NOT_SHOWN: Final = ("docs", "examples", "test")
 _LITTLE_BYTES: Final = 1_000_000_000
 _REQUIREMENT: Final = re.compile(r"([\w.-]+)\s*(?:\[[^]]*\])?\s*(?:[^;]*?>=\s*([\d.]+))?[^;]*(?:;(.*))?")
-
-
-# Limits of this process on its machine: memory and folders; and packages that lack something.
-
-
-#: Version 1 of control groups states a number beyond all memory where there is no limit.
-_NO_LIMIT: Final = 1 << 60
-
-
-def memory_bytes() -> int | None:
-    """Return how much memory this process may use: that of the machine, or the limit of its control group."""
-    limits = memory_limits()
-    with suppress(ValueError, OSError, AttributeError):
-        limits.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    return min(limits, default=None)
-
-
-def memory_limits(root: Path = CONTROL_GROUPS, own: str | None = None) -> list[int]:
-    """Return the limits of memory of this process's control group and those above it, in bytes."""
-    limits = []
-    for folder in control_groups(root, own):
-        with suppress(OSError, ValueError):
-            limits.append(int((folder / "memory.max").read_text()))  # "max" is no number
-    with suppress(OSError, ValueError):
-        limits.append(int((root / "memory/memory.limit_in_bytes").read_text()))
-    return [limit for limit in limits if 0 < limit < _NO_LIMIT]
 
 
 def temporary_folder() -> tuple[Path | None, str]:
@@ -73,129 +44,6 @@ def temporary_folder() -> tuple[Path | None, str]:
         return folder, str(error)
     except OSError as error:
         return folder, error.strerror or str(error)
-
-
-# Try a bucket or a prefix in a store with a small hidden object, which is removed again.
-
-
-#: The operations, and the consequence of one that fails.
-_STORE_CHECK_TRIED: Final = {
-    "list": "objects can't be listed",
-    "write": "objects can't be written",
-    "read": "objects can't be read",
-    "put-if-absent": "two commands at once may both write the first results of a log",
-    "replace": "results of two commands at once may replace each other",
-    "delete": "objects can't be removed",
-}
-_REASON: Final = re.compile(r"^.*? can't be (?:read|written|removed): ")
-
-
-@dataclass(frozen=True)
-class StoreCheck:
-    """The operations that a bucket or a prefix allows.
-
-    Attributes
-    ----------
-    url : str
-        The bucket or prefix.
-    server, region : str
-        The address of the server, or the name of the service; and its region ("" where there are none).
-    credentials : str
-        Where they come from.
-    access : dict of str to str
-        Why each of "list", "write", "read", "put-if-absent" (write an object only if it is absent), "replace" (only if
-        it is unchanged) and "delete" fails; "" where it works. What could not be tried is not there.
-
-    """
-
-    url: str
-    server: str
-    region: str
-    credentials: str
-    access: dict[str, str]
-
-    @property
-    def faults(self) -> tuple[str, ...]:
-        """One line for each reason."""
-        reasons: dict[str, list[str]] = {}
-        for name, why in self.access.items():
-            if why:
-                reasons.setdefault(why, []).append(_STORE_CHECK_TRIED[name])
-        return tuple(f"{self.url}: {' and '.join(tried)}: {why}" for why, tried in reasons.items())
-
-
-def url_of_store(store: str) -> Url:
-    """Return the URL of a bucket or prefix; that of a log stands for the prefix with it.
-
-    Raises McaptrackError for anything else, and if what reads the store is not installed.
-    """
-    url = parse(store)
-    if not isinstance(url, Url):
-        examples = ", ".join(f"{scheme}://" for scheme in SCHEMES)
-        name = hide_secrets(store) if "://" in store else store
-        raise McaptrackError(f"{name:.200} is no bucket or prefix in a store; give a URL with {examples}")
-    objects.library(url)
-    return url.parent if url.suffix.lower() == ".mcap" else url
-
-
-def check_store(url: Url) -> StoreCheck:
-    """Try the operations of a run on a store."""
-    server, region, credentials = described(url)
-    access = dict(_tries(url))
-    return StoreCheck(
-        str(url), server, region, credentials, {name: access[name] for name in _STORE_CHECK_TRIED if name in access}
-    )
-
-
-def _tries(url: Url) -> Iterator[tuple[str, str]]:
-    """Yield each operation, and why it failed; "" if it didn't."""
-    listed: list[Url] = []
-    yield "list", _why(lambda: listed.extend(member for member, _ in islice(objects.list_objects(url), 1)))
-    probe = url / f".mcaptrack-doctor-{uuid4().hex}"
-    texts = [f"{number} {uuid4().hex}".encode() for number in range(4)]
-    versions: list[Version | None] = []
-    why = _why(lambda: versions.append(objects.put_if_unchanged(probe, texts[0], None)))
-    yield "write", why
-    if why or versions[0] is None:
-        if listed:
-            yield "read", _why(lambda: objects.read_end(listed[0], 1))
-        return
-    first = versions[0]
-    try:
-        yield "read", _why(lambda: _compare(probe, first, texts[0]))
-        yield "put-if-absent", _why(lambda: _refuse(objects.put_if_unchanged(probe, texts[1], None)))
-        yield "replace", _why(lambda: _replace(probe, first, texts))
-    finally:
-        why = _why(lambda: objects.delete(probe))
-    yield "delete", why
-
-
-def _why(attempt: Callable[[], object]) -> str:
-    """Do something, and return why it failed; "" if it didn't."""
-    try:
-        attempt()
-    except McaptrackError as error:
-        return _REASON.sub("", str(error))
-    return ""
-
-
-def _compare(url: Url, version: Version, text: bytes) -> None:
-    if objects.read_ranges(url, version, [(0, len(text))]) != [text]:
-        raise McaptrackError("the store gives other bytes than were written")
-
-
-def _refuse(written: Version | None) -> None:
-    if written is not None:
-        raise McaptrackError("the store overwrites an object although it was asked not to")
-
-
-def _replace(url: Url, first: Version, texts: list[bytes]) -> None:
-    with suppress(McaptrackError):  # a store that overwrote it has another version now
-        first = objects.find(url) or first
-    second = objects.put_if_unchanged(url, texts[2], first)
-    if second is None:
-        raise McaptrackError("the store does not replace an object that is unchanged")
-    _refuse(objects.put_if_unchanged(url, texts[3], first))
 
 
 def broken_packages() -> dict[str, str]:
@@ -342,17 +190,23 @@ class DoctorResult:
         return data | {"temporary_folder": str(folder) if folder else None, "cache_folder": str(self.cache_folder)}
 
 
-def doctor(store: str | None = None) -> DoctorResult:
-    """Find out what this installation has, and whether a plain run would work.
+@declared()
+def doctor(
+    store: Annotated[
+        str | None, Argument("store", "STORE", "A bucket or prefix to try, such as s3://robots/night.")
+    ] = None,
+) -> DoctorResult:
+    """Print what this installation has: versions, codecs, memory, folders, plug-ins, and what may be done with a store.
 
     Pictures are encoded and decoded, a table is written, and a log is written to the temporary folder and read back.
-    The network is used for ``store`` only.
+    The network is used for a store only: objects are listed there, and a small hidden one is written, read, replaced
+    and removed. The exit code is 0 if all that a plain run needs is there, and 1 otherwise, with one line for each
+    fault.
 
     Parameters
     ----------
     store : str, optional
-        The URL of a bucket or prefix in a store, such as "s3://robots/night". Objects are listed there; a small hidden
-        one is written, read, replaced and removed.
+        The URL of a bucket or prefix in a store, such as "s3://robots/night".
 
     Returns
     -------
@@ -366,6 +220,12 @@ def doctor(store: str | None = None) -> DoctorResult:
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack doctor
+
+        mcaptrack doctor s3://robots/night
+
     >>> import mcaptrack
     >>> mcaptrack.doctor().faults
     ()

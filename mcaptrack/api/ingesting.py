@@ -11,8 +11,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from mcaptrack.api.declared import OneOfMany, Option, declared
-from mcaptrack.api.options import FILES, LABELS, PathLike, Reports, Sidecar, no_progress, output
-from mcaptrack.choices import ImageFormat, InputRole, LabelFormat, LengthUnit, Point
+from mcaptrack.api.options import (
+    FILES,
+    FPS_PATTERN,
+    LABELS,
+    Force,
+    GroundPlane,
+    PathLike,
+    PointOfBox,
+    Reports,
+    Sidecar,
+    no_progress,
+    output,
+)
+from mcaptrack.choices import ImageFormat, InputRole, LabelFormat, LengthUnit
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.location import sibling
 from mcaptrack.notices import Notice, warn
@@ -24,8 +36,6 @@ _EPOCH: Final = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
 #: Headings in the help: how pictures are stored, and how label files are read.
 _PICTURES: Final = "Pictures"
 _READING: Final = "Reading of label files"
-#: What a file in the working folder may give for ``fps``.
-_FPS: Final = r"[0-9]+([.][0-9]+)?(/[0-9]+)?"
 
 Source = Annotated[
     PathLike,
@@ -84,16 +94,16 @@ def ingest(
     output: Annotated[PathLike | None, output("INPUT.mcap in the working folder")] = None,
     *,
     camera: Annotated[str, Option(FILES)] = "camera",
-    fps: Annotated[float | str | Fraction | None, Option(_PICTURES, tuning=_FPS, shown=False)] = None,
+    fps: Annotated[float | str | Fraction | None, Option(_PICTURES, tuning=FPS_PATTERN, shown=False)] = None,
     start_time: Annotated[float | str | dt.datetime | None, Option(_PICTURES)] = None,
     image_format: Annotated[ImageFormat, Option(_PICTURES, tuning=True)] = "auto",
     quality: Annotated[int | None, Option(_PICTURES, 1, 100, tuning=True)] = None,
     keyframe_interval_s: Annotated[float | None, Option(_PICTURES, 0.01, 60, tuning=True)] = None,
-    ground_plane: _Labels = None,
+    ground_plane: GroundPlane = None,
     calibration: Annotated[PathLike | Sequence[PathLike] | None, Option(LABELS, metavar="FILE", shown=False)] = None,
     calibration_name: Annotated[str | None, Option(LABELS, metavar="NAME")] = None,
     calibration_unit: Annotated[LengthUnit, Option(LABELS, tuning=True)] = "auto",
-    point: Annotated[Point, Option(LABELS, tuning=True)] = "foot",
+    point: PointOfBox = "foot",
     detections: _Labels = None,
     tracks: _Labels = None,
     truth: _Labels = None,
@@ -109,7 +119,7 @@ def ingest(
     role: Annotated[InputRole | None, Option(LABELS, flag="as")] = None,
     into: Annotated[PathLike | None, Option(FILES)] = None,
     sidecar: Sidecar = None,
-    force: Annotated[bool, Option(FILES)] = False,
+    force: Force = False,
     progress: Reports = no_progress,
 ) -> IngestResult:
     """Make a log of a video, a folder of images, a ROS bag, an MCAP file, or a label file.
@@ -143,8 +153,6 @@ def ingest(
     keyframe_interval_s : float, optional
         Longest time between keyframes, in seconds; streams with longer gaps are re-encoded; by default 2 if copied, 1
         if encoded.
-    ground_plane : path, optional
-        File with a 3x3 homography from pixels to metres on the ground.
     calibration : path or sequence of path, optional
         File with the calibration of the camera, of OpenCV, ROS (camera_info) or Kalibr; two if intrinsics and the pose
         in the world are two files. The ground plane (z = 0) follows from both.
@@ -154,8 +162,6 @@ def ingest(
         Unit of lengths of the pose. auto: that in which the camera has a usual height.
 
         A warning says so if that isn't metres.
-    point : {"foot", "center"}, default "foot"
-        Which point of a box touches the ground.
     detections : path, optional
         Label file with detections: boxes without ids.
     tracks : path, optional
@@ -202,8 +208,6 @@ def ingest(
         With ``into``: write into LOG.results.mcap beside the log (True) or into the log (False).
     force : bool, default False
         Overwrite the log; with ``into``, replace the channels it has already.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
 
     Returns
     -------

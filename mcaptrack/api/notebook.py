@@ -108,7 +108,7 @@ class Player:
         what = "scenes" if self.is_above else "pictures"
         return f"{shown}, {self.first_s:.1f} to {self.last_s:.1f} s: {count} {what}{step}"
 
-    @checked()
+    @checked
     def save(self, path: PathLike, *, force: bool = False) -> Path:
         """Write it as a page that needs no other file.
 

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from typing import Annotated, Final
+from collections.abc import Callable, Mapping, Sequence
+from fractions import Fraction
+from typing import TYPE_CHECKING, Annotated, Final
 
-from mcaptrack.api.declared import PYTHON_ONLY, OneOfMany, Option
+from mcaptrack.api.declared import OneOfMany, Option, PythonOnly
+from mcaptrack.choices import Point
+
+if TYPE_CHECKING:
+    from mcaptrack.registry import Kind
 
 PathLike = str | os.PathLike[str]
 #: Called with the name of a stage, the amount that is done, and the total (None if it is not known).
@@ -15,29 +20,100 @@ Progress = Callable[[str, float, float | None], None]
 #: Headings of options in the help.
 FILES: Final = "Input and output"
 LABELS: Final = "Label files"
+SCORES: Final = "Scores"
 
-_LOGS: Final = "Logs, folders of logs, patterns, or - for a list of logs on stdin."
-EachLog = Annotated[PathLike, OneOfMany("logs", "LOG", _LOGS)]
-Camera = Annotated[str | None, Option(FILES)]
-Topic = Annotated[str | None, Option(FILES)]
-To = Annotated[str | None, Option(FILES)]
-Frame = Annotated[str | None, Option(FILES)]
+#: Help of an argument that names logs.
+LOGS: Final = "Logs, folders of logs, patterns, or - for a list of logs on stdin."
+EachLog = Annotated[PathLike, OneOfMany("logs", "LOG", LOGS, help="The log.")]
+Camera = Annotated[str | None, Option(FILES, help="Which camera, if the log has several.")]
+Topic = Annotated[str | None, Option(FILES, help="Read this channel instead of the usual one.")]
+To = Annotated[str | None, Option(FILES, help="Write to this channel instead of the usual one.")]
+Frame = Annotated[
+    str | None,
+    Option(
+        FILES,
+        help="Bring boxes in space (3D) to this frame, such as map; by default to the root of the tree of frames.",
+    ),
+]
 Sidecar = Annotated[
     bool | None,
-    Option(FILES, flag="sidecar/in-place"),
+    Option(
+        FILES,
+        flag="sidecar/in-place",
+        help="Write into LOG.results.mcap beside the log (True) or into the log (False). By default beside recordings "
+        "that ROS tools read, otherwise into the log.",
+    ),
 ]
-Force = Annotated[bool, Option(FILES)]
-Reports = Annotated[Progress, PYTHON_ONLY]
+Force = Annotated[bool, Option(FILES, help="Overwrite the output file if it exists.")]
+Reports = Annotated[Progress, PythonOnly("Called as ``progress(stage, done, total)``.")]
+GroundPlane = Annotated[
+    PathLike | None, Option(LABELS, help="File with a 3x3 homography from pixels to metres on the ground.")
+]
+PointOfBox = Annotated[Point, Option(LABELS, tuning=True, help="Which point of a box touches the ground.")]
+#: What a file in the working folder may give for frames per second.
+FPS_PATTERN: Final = r"[0-9]+([.][0-9]+)?(/[0-9]+)?"
+LabelFps = Annotated[
+    float | str | Fraction | None,
+    Option(
+        LABELS,
+        tuning=FPS_PATTERN,
+        help="Frames per second of label files, such as 25 or 30000/1001; by default as seqinfo.ini beside them says.",
+    ),
+]
+#: What files in the working folder may give for a detector, tracker or so on: built-in or installed ones.
+PLUGIN: Final = r"[A-Za-z0-9_-]+"
+Cameras = Annotated[str | Sequence[str] | None, Option(metavar="A,B", commas=True, shown="all with a ground plane")]
+ClockOffsets = Annotated[
+    Mapping[str, float] | None,
+    Option(
+        metavar="CAMERA=SECONDS",
+        shown="estimated from people who walk",
+        help="How many seconds the times of a camera are late, as in front=0.3; 0 for none.",
+    ),
+]
 #: The value of a transform's option.
 Value = float | int | bool | str | None
 
 
-def output(shown: str | bool = False) -> Option:
+def output(shown: str | None = None) -> Option:
     """The option of an output; ``shown`` is its default in the help."""
-    return Option(FILES, short="o", shown=shown)
+    return Option(FILES, short="o", shown=shown, help="Write to this file; the log stays unchanged.")
+
+
+def similarity(shown: str) -> Option:
+    """The option of how ground truth and tracks are matched; ``shown`` is its default in the help."""
+    text = (
+        "How ground truth and tracks are matched: by overlap of boxes in pictures (iou), distance on the ground "
+        "(metres), or overlap of 3D boxes, seen from above (bev-iou) or in space (3d-iou)."
+    )
+    return Option(SCORES, tuning=True, shown=shown, help=text)
+
+
+def gate_m(shown: str | None = None) -> Option:
+    """The option of the largest distance of a match; ``shown`` is its default in the help."""
+    text = "Gate: largest distance in metres at which ground truth and a track match."
+    return Option(SCORES, 0.001, 1e6, tuning=True, shown=shown, help=text)
+
+
+def min_iou(shown: str | None = None) -> Option:
+    """The option of the least overlap of a match; ``shown`` is its default in the help."""
+    text = "Least overlap (IoU) at which ground truth and a track match."
+    return Option(SCORES, 0.001, 1, tuning=True, shown=shown, help=text)
+
+
+def chooser(kind: Kind, intro: str = "The {kind} to use", panel: str = "", shown: str | None = None) -> Option:
+    """The option that chooses a detector, tracker or so on of the registry by name; ``shown`` is its default."""
+    from mcaptrack.registry import BUILT_IN, names
+
+    text = (
+        f"{intro.format(kind=kind)}: {', '.join(BUILT_IN[kind])}, one of an installed package, or module:Class.\n\n"
+        "Or a transform."
+    )
+    return Option(panel, tuning=PLUGIN, metavar="NAME", shown=shown, names=lambda: names(kind), help=text)
 
 
 Output = Annotated[PathLike | None, output()]
+MinIou = Annotated[float, min_iou()]
 
 
 def no_progress(stage: str, done: float, total: float | None) -> None:

@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 from mcaptrack import log as logs
 from mcaptrack.api.common import detail, locations_of, log_location, optional_path, warn_unused
-from mcaptrack.api.declared import checked
-from mcaptrack.api.options import PathLike, Progress, no_progress
+from mcaptrack.api.declared import Argument, declared
+from mcaptrack.api.options import LOGS, Camera, Force, PathLike, Reports, no_progress, output
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, place_of, publish_bytes, refuse_overwrite
 from mcaptrack.location import distinct_names, local_name, parse
@@ -62,32 +62,30 @@ class ReportResult:
         return framed_html(page, caption if page is not None else f"{caption} is too large to show here; open the file")
 
 
-@checked()
+@declared()
 def report(
-    log: PathLike | Sequence[PathLike],
-    output: PathLike | None = None,
+    log: Annotated[PathLike | Sequence[PathLike], Argument("logs", "LOG", LOGS)],
+    output: Annotated[PathLike | None, output()] = None,
     *,
-    camera: str | None = None,
-    force: bool = False,
-    progress: Progress = no_progress,
+    camera: Camera = None,
+    force: Force = False,
+    progress: Reports = no_progress,
 ) -> ReportResult:
-    """Write one HTML page about a log, or several: scores, predictions, tracks over the scene, identity switches.
+    """Write one page about a log, or several: scores, forecasts, tracks over the scene, identity switches, lineage.
 
-    Of a folder with the tables of many logs, the page has the totals, trends, worst logs, outliers and warnings.
+    The page needs no network and has no scripts; it contains its numbers as JSON, which --json prints. Scores are those
+    of `mcaptrack evaluate`; without ground truth in the log there are none. Only reads logs; `mcaptrack run` runs
+    stages that are missing. Of a folder with the tables of many logs, the page has totals, trends, the worst logs,
+    outliers and warnings.
 
     Parameters
     ----------
     log : path or sequence of paths
         The log, or several; or a folder of tables.
     output : path, optional
-        The page, by default LOG.report.html beside the log, or in the working folder if that is in a store; several
-        logs need a name, and so do tables.
-    camera : str, optional
-        Name of the camera, if a log has several.
-    force : bool, default False
-        Overwrite the page if it exists.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
+        Write the page to this file; by default LOG.report.html beside the log.
+
+        In the working folder if the log is in a store. Several logs need a name, and so do tables.
 
     Returns
     -------
@@ -101,6 +99,14 @@ def report(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack report log.mcap -o report.html
+
+        mcaptrack report 'logs/*.mcap' -o report.html
+
+        mcaptrack report tables/ -o fleet.html
+
     >>> import mcaptrack
     >>> mcaptrack.report("log.mcap", "page.html").page.name
     'page.html'

@@ -4,34 +4,52 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Final
 
 from mcaptrack.api.common import as_path, detail, locations_of
-from mcaptrack.api.declared import checked
+from mcaptrack.api.declared import PYTHON_ONLY, Argument, Option, checked, declared
 from mcaptrack.api.options import PathLike
 from mcaptrack.tables import RECORDING, TABLES
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
+#: Heading of options in the help.
+QUERY: Final = "Query and answer"
 
-@checked()
+
+@declared()
 def query(
-    log: PathLike | Sequence[PathLike],
-    sql: str,
+    log: Annotated[
+        PathLike | Sequence[PathLike],
+        Argument(
+            "words",
+            "LOG... QUERY",
+            "Logs, patterns or folders of tables, then the query in quotes; - reads it from standard input.",
+            words=True,
+        ),
+    ],
+    sql: Annotated[str, PYTHON_ONLY],
     *,
-    files: Mapping[str, PathLike] | None = None,
+    files: Annotated[
+        Mapping[str, PathLike] | None, Option(QUERY, flag="with", metavar="NAME=FILE", shown=False)
+    ] = None,
 ) -> pa.Table:
-    """Query the tables of logs in SQL. Needs DuckDB.
+    """Query the tables of logs in SQL: where people were, how fast, for how long, and how well they were tracked.
+
+    The tables are those of `mcaptrack export` (`mcaptrack docs tables`); the column `recording` names the log. They are
+    read from the files beside the log if those are up to date, otherwise from the log. Each other channel is a table
+    under its topic in double quotes. Queries read nothing else and change nothing. Needs DuckDB (`pip install duckdb`).
+    `mcaptrack docs sql` has examples.
 
     Parameters
     ----------
     log : path or sequence of paths
-        Logs, or folders of tables; the column ``recording`` tells several apart.
+        Logs, or folders of tables.
     sql : str
         The query.
     files : mapping of str to path, optional
-        CSV, JSON or Parquet files as more tables, by name.
+        A CSV, JSON or Parquet file as one more table.
 
     Returns
     -------
@@ -45,6 +63,12 @@ def query(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack query log.mcap "select topic, count(distinct track_id) from tracks group by topic"
+
+        mcaptrack query 'runs/*.mcap' -f speed.sql -o speed.csv
+
     >>> import mcaptrack
     >>> mcaptrack.query("log.mcap", "select count(*) > 0 as found from tracks").to_pydict()
     {'found': [True]}
@@ -119,7 +143,7 @@ class TableList:
     channels: tuple[str, ...]
 
 
-@checked()
+@checked
 def list_tables(log: PathLike | Sequence[PathLike] = (), *, files: Mapping[str, PathLike] | None = None) -> TableList:
     """List the tables that queries can name, with their columns, units and meanings.
 

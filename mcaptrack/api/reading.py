@@ -7,16 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from threading import RLock
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import log as logs
 from mcaptrack import tables
-from mcaptrack.api.columns import times_of
 from mcaptrack.api.common import names_of
-from mcaptrack.api.declared import checked
+from mcaptrack.api.declared import Option, checked
 from mcaptrack.api.notebook import Choice, Player, show_log, show_tables
 from mcaptrack.api.options import Progress, no_progress
 from mcaptrack.api.rows import supervision_of
@@ -25,6 +24,7 @@ from mcaptrack.location import Location, Url
 from mcaptrack.log import Log
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
+from mcaptrack.sources.own_rows import times_of
 from mcaptrack.sources.pictures import Pictures, find_pictures
 from mcaptrack.sources.video import decode_bgr, decode_gray
 from mcaptrack.tables import export
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 Colour = Literal["bgr", "rgb", "grey"]
+_Seconds = Annotated[float | None, Option(least=0, most=1e9)]
 
 
 # Read single messages of a log by their place in the file, and pictures by their time.
@@ -157,7 +158,7 @@ class LogReader:
         """The topics of all channels, in alphabetical order."""
         return tuple(sorted(self._there.channels))
 
-    @checked()
+    @checked
     def table(self, name: str, topic: str | None = None) -> pa.Table:
         """Return a table as Arrow: the same as in the files that ``export`` writes, with the column ``recording``.
 
@@ -235,7 +236,7 @@ class LogReader:
         """
         return tables.table_to_array(self.table(name, topic))
 
-    @checked()
+    @checked
     def frames(
         self, topic: str = "video", times: Sequence[int] | NDArray[Any] | None = None, colour: Colour = "bgr"
     ) -> Iterator[Frame]:
@@ -275,18 +276,18 @@ class LogReader:
         frames = self._decoded(channel, wanted, colour)
         return frames if wanted is None else (frame for frame in frames for _ in range(wanted[frame.index]))
 
-    @checked(at_s=(0, 1e9), start_s=(0, 1e9), end_s=(0, 1e9), every=(1, 1e9), width=(16, 4096), max_mb=(0.1, 100))
+    @checked
     def show(
         self,
-        at_s: float | None = None,
+        at_s: _Seconds = None,
         *,
         topic: str | Sequence[str] | None = None,
         camera: str | None = None,
-        start_s: float = 0.0,
-        end_s: float | None = None,
-        every: int | None = None,
-        width: int | None = None,
-        max_mb: float = 8.0,
+        start_s: Annotated[float, Option(least=0, most=1e9)] = 0.0,
+        end_s: _Seconds = None,
+        every: Annotated[int | None, Option(least=1, most=1e9)] = None,
+        width: Annotated[int | None, Option(least=16, most=4096)] = None,
+        max_mb: Annotated[float, Option(least=0.1, most=100)] = 8.0,
         progress: Progress = no_progress,
     ) -> Player:
         """Return a player for a notebook: the pictures with boxes, trails and predictions, or the ground from above.

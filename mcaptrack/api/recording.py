@@ -101,7 +101,7 @@ class Recording(LogReader):
         return count
 
 
-@checked()
+@checked
 def open(path: str | Path, *, create: bool = False) -> Recording:  # noqa: A001  # mcaptrack.open is its name
     """Open a log, with its results if they stand beside it.
 

@@ -83,8 +83,6 @@ def render(
 
     Parameters
     ----------
-    log : path
-        The log.
     output : path, optional
         Write to this file: a video (.mp4 or .gif), with ``blur`` also a log (.mcap), with ``heatmap`` a picture.
 
@@ -114,10 +112,6 @@ def render(
         Which camera, if the log has several.
 
         A log is written with the people hidden in the pictures of all cameras.
-    force : bool, default False
-        Overwrite the output file if it exists.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
 
     Returns
     -------

@@ -13,24 +13,26 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mcaptrack import tables
-from mcaptrack.api.class_names import checked_names, numbered_columns, numbers_of
-from mcaptrack.api.columns import (
-    UNNUMBERED,
-    BoxFormat,
-    boxes_of,
-    check_frames,
-    columns_in_space,
-    frame_of,
-    frames_of_columns,
-    kind_of,
-    number_of,
-    time_of,
-)
 from mcaptrack.api.declared import checked
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import PERSON, UNKNOWN, class_name, is_person
+from mcaptrack.sources.own_rows import (
+    UNNUMBERED,
+    BoxFormat,
+    boxes_of,
+    check_frames,
+    checked_names,
+    columns_in_space,
+    frame_of,
+    frames_of_columns,
+    kind_of,
+    number_of,
+    numbered_columns,
+    numbers_of,
+    time_of,
+)
 
 # ``supervision.Detections`` as frames of rows, and back; the package need not be installed to write them.
 #
@@ -150,7 +152,7 @@ def supervision_of(frames: Iterable[Frame], names: Mapping[int, str]) -> Iterato
         yield frame.t_ns, Detections(xyxy=xyxy, **columns)
 
 
-@checked()
+@checked
 def detections(
     boxes: Any = None,
     scores: ArrayLike | None = None,

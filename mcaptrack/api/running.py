@@ -16,9 +16,8 @@ import numpy as np
 from mcaptrack import log as logs
 from mcaptrack import notices, pipeline
 from mcaptrack.api.common import Notes, as_location, log_output, warnings_about
-from mcaptrack.api.options import PathLike, Progress, no_progress
+from mcaptrack.api.options import PathLike, Progress, Value, no_progress
 from mcaptrack.api.products import refuse_foreign_products, write_products
-from mcaptrack.api.several import Act, CameraResult, Done, EveryCamera, refuse_failed, together
 from mcaptrack.choices import Mode
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation.zones import ZoneTotals
@@ -26,12 +25,10 @@ from mcaptrack.files import is_same_file, refuse_overwrite
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice, warn
 from mcaptrack.pipeline import AS_BEFORE, Job, PlaneChoice, Summary, Watch, ZoneWatch
+from mcaptrack.pipeline.several import Act, CameraResult, Done, EveryCamera, Say, refuse_failed, together
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
 from mcaptrack.transforms import FUSION, STAGES, Transform
-
-#: The value of a transform's option.
-Option = float | int | bool | str | None
 
 
 @dataclass(frozen=True)
@@ -175,32 +172,32 @@ def work(
     def run_at(prefix: str, progress: Progress) -> Act:
         """Run a camera; without a prefix the only one."""
 
-        def act(opened: logs.Log, output: Path | None, notes: Notes, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
+        def act(opened: logs.Log, output: Path | None, say: Say, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
             topics = watch.topics if watch else zones.topics if zones else ()
             at = prefix or pipeline.find_camera(opened, where.camera, where.topic or next(iter(topics), None))
             fused = {}
             if fuses is not None:
-                fused = pipeline.fuse_again(opened, at, force, notes.say, progress, not fuses.names, fuses.fuser)
+                fused = pipeline.fuse_again(opened, at, force, say, progress, not fuses.names, fuses.fuser)
             run = partial(pipeline.run, opened, at, output=output, progress=progress, watch=watch, plane=plane)
             run = partial(run, boxes=boxes, zones=zones, fused=fused)
             if follows is None:
-                return at, run(plan(opened, at, notes.say, fused, ()))
+                return at, run(plan(opened, at, say, fused, ()))
             with logs.read(follows) as earlier:
                 if prefix and (why := pipeline.begins_here(earlier, opened, at)):
                     warn(why, "left-out")
-                    return at, run(plan(opened, at, notes.say, fused, ()))
+                    return at, run(plan(opened, at, say, fused, ()))
                 before = pipeline.Before(earlier, opened, at)
-                report = run(plan(opened, at, notes.say, fused, before.renewed(opened)), before=before)
+                report = run(plan(opened, at, say, fused, before.renewed(opened)), before=before)
             continued.append(before.result)
             for line in before.result.words():
-                notes.say(line)
+                say(line)
             return at, report
 
         return act
 
     def fuse_to(scene: str, names: Sequence[str], progress: Progress) -> Act:
-        def act(opened: logs.Log, output: Path | None, notes: Notes, _: BoxesRead) -> tuple[str, pipeline.Report]:
-            notes.say(f"fusing {', '.join(names)} to /{scene}")
+        def act(opened: logs.Log, output: Path | None, say: Say, _: BoxesRead) -> tuple[str, pipeline.Report]:
+            say(f"fusing {', '.join(names)} to /{scene}")
             fuser = (fuses.fuser if fuses is not None else None) or FUSION.make()
             return pipeline.fuse_cameras(opened, names, scene, fuser, {}, output, progress, is_asked=False)
 
@@ -236,13 +233,13 @@ def change(
                 opened.lock()  # a second process is refused before it computes anything
             if tables and not where.force:
                 refuse_foreign_products(opened, target)
-            has_several = each is not None and each.chooses(opened, notes)
-            done = [] if has_several else [Done("", *act(opened, output, notes, boxes))]
+            has_several = each is not None and each.chooses(opened, notes.say)
+            done = [] if has_several else [Done("", *act(opened, output, notes.say, boxes))]
             written_to = output or opened.parts[-1].path
             report = together([camera.report for camera in done])
             named = {topic: pipeline.camera_to_name(opened, topic) for topic in report.stale}
         if each is not None and has_several:
-            done = each.run(path, output, place, notes, progress)
+            done = each.run(path, output, place, notes.say, progress)
             report = together([camera.report for camera in done])
             with logs.read(target) as opened:
                 report.stale = [topic for topic in report.stale if pipeline.is_stale(opened, topic)]
@@ -311,7 +308,7 @@ def warn_stale(topic: str, log: Location, cameras: Mapping[str, str] = {}) -> No
     warn(f"{topic} is out of date, because its input was replaced; {again} brings it up to date", "out-of-date")
 
 
-def transform_of(stage: str, chosen: str | Transform | None, options: Mapping[str, Option]) -> Transform:
+def transform_of(stage: str, chosen: str | Transform | None, options: Mapping[str, Value]) -> Transform:
     """Return the transform of a stage: the one of this name, or this one; with these options.
 
     Raises McaptrackError for a name or an option that does not exist, and for what is no transform.
@@ -333,7 +330,7 @@ def transforms_of(stages: Mapping[str, str | Transform] | None) -> dict[str, Tra
     return {stage: transform_of(stage, chosen, {}) for stage, chosen in (stages or {}).items()}
 
 
-def _with_options(base: Transform, options: Mapping[str, Option]) -> Transform:
+def _with_options(base: Transform, options: Mapping[str, Value]) -> Transform:
     """Return a transform with other values of some options. Raises McaptrackError for an unknown option."""
     if isinstance(base, type):
         raise McaptrackError(f"{base.__name__} is a class; give an object of it: {base.__name__}()")
@@ -356,7 +353,6 @@ def run_stage(
     stage: str,
     transform: Transform | None,
     log: PathLike,
-    *,
     topic: str | None = None,
     to: str | None = None,
     camera: str | None = None,
@@ -364,10 +360,11 @@ def run_stage(
     sidecar: bool | None = None,
     force: bool = False,
     stages: Mapping[str, str | Transform] | None = None,
+    progress: Progress = no_progress,
+    *,
     mode: Mode | None = None,
     frame: str | None = None,
     make: Callable[[str], Transform] | None = None,
-    progress: Progress = no_progress,
 ) -> RunResult:
     """Run one stage with a transform; ``detect``, ``track`` and the others call this with their transform.
 

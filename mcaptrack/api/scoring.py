@@ -8,17 +8,30 @@ from fractions import Fraction
 from html import escape
 from itertools import count
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.common import Notes, as_path, detail, locations_of, names_of, optional_path, paths_of, warn_unused
-from mcaptrack.api.declared import checked
+from mcaptrack.api.declared import Argument, Option, checked, declared
 from mcaptrack.api.ingesting import parse_fps
-from mcaptrack.api.options import PathLike, Progress, no_progress
-from mcaptrack.choices import Point
+from mcaptrack.api.options import (
+    LABELS,
+    SCORES,
+    Camera,
+    GroundPlane,
+    LabelFps,
+    MinIou,
+    PathLike,
+    PointOfBox,
+    Reports,
+    gate_m,
+    no_progress,
+    similarity,
+)
+from mcaptrack.choices import Point, Similarity
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation import (
     COMBINED,
@@ -31,7 +44,7 @@ from mcaptrack.evaluation import (
     sequence_of_log,
 )
 from mcaptrack.evaluation import evaluate as score_sequences
-from mcaptrack.evaluation.aligned import IOU_THRESHOLD, Similarity
+from mcaptrack.evaluation.aligned import IOU_THRESHOLD
 from mcaptrack.evaluation.forecasts import smoothed_predictions
 from mcaptrack.evaluation.metrics import Rules
 from mcaptrack.files import place_of, publish_bytes, refuse_overwrite
@@ -198,7 +211,7 @@ class Scores:
             raise McaptrackError(f"no class {of_class!r:.60} was scored by itself; there are {scored or 'none'}")
         return [row for row in rows if row["sequence"] == COMBINED] or rows
 
-    @checked()
+    @checked
     def draw_curves(self, output: PathLike, force: bool = False) -> Path:
         """Draw the error of predictions (ADE) over recall, in metres and squared, as an SVG.
 
@@ -277,59 +290,59 @@ def _check_name(name: str, row: Mapping[str, Any]) -> None:
         raise McaptrackError(f"there is no score {name}; there are {', '.join(scores)}")
 
 
-@checked(gate_m=(0.001, 1e6), min_iou=(0.001, 1))
+#: Several distances are one text on the command line: 0.5,1,2.
+_Gates = Annotated[float | Sequence[float] | Floats, replace(gate_m(), commas=True, tuning=r"[0-9.eE+, -]+")]
+
+
+@declared()
 def evaluate(
-    tracks: PathLike | Sequence[PathLike],
+    tracks: Annotated[
+        PathLike | Sequence[PathLike],
+        Argument("inputs", "LOG|TRACKS", "Logs, folders of logs, patterns, or files of tracks."),
+    ],
     *,
-    truth: PathLike | Sequence[PathLike] | None = None,
-    similarity: Similarity | None = None,
-    gate_m: float | Sequence[float] | Floats = (0.5, 1.0, 2.0),
-    min_iou: float = 0.5,
-    rules: Rules = "trackeval",
-    smoothed: bool = False,
-    topic: str | Sequence[str] | None = None,
-    classes: str | None = None,
-    camera: str | None = None,
-    ground_plane: PathLike | None = None,
-    point: Point = "foot",
-    fps: float | str | Fraction | None = None,
-    progress: Progress = no_progress,
+    truth: Annotated[PathLike | Sequence[PathLike] | None, Option(LABELS, shown=False)] = None,
+    similarity: Annotated[Similarity | None, similarity("both, as far as there are boxes and metres")] = None,
+    gate_m: _Gates = DEFAULT_GATES_M,
+    min_iou: MinIou = 0.5,
+    rules: Annotated[Rules, Option(SCORES, tuning=True)] = "trackeval",
+    smoothed: Annotated[bool, Option(SCORES, tuning=True)] = False,
+    topic: Annotated[str | Sequence[str] | None, Option(SCORES)] = None,
+    classes: Annotated[str | None, Option(LABELS)] = None,
+    camera: Camera = None,
+    ground_plane: GroundPlane = None,
+    point: PointOfBox = "foot",
+    fps: LabelFps = None,
+    progress: Reports = no_progress,
 ) -> Scores:
     """Score tracks and predictions against ground truth.
+
+    Reads /camera/truth and the tracks of a log; or files of tracks, with ``truth``: MOTChallenge (by the rules of
+    MOT15, or of MOT16 and later where the truth names classes), KITTI tracking, Parquet as `mcaptrack export` writes
+    it, and the label files that `mcaptrack ingest` reads. Distances are on the ground, overlaps are those of boxes.
 
     Parameters
     ----------
     tracks : path or sequence of paths
-        Logs, which hold their ground truth; or, with ``truth``, files of tracks: MOTChallenge, KITTI tracking, Parquet,
-        and the label files that ``ingest`` reads. 3D boxes of files are compared by their times.
+        Logs, which hold their ground truth; or, with ``truth``, files of tracks. 3D boxes of files are compared by
+        their times.
     truth : path or sequence of paths, optional
         Ground truth for files of tracks: one file for each, matched by name or in order.
-    similarity : {"iou", "metres", "bev-iou", "3d-iou"}, optional
-        Match by overlap of boxes in pictures, by distance on the ground, or by overlap of 3D boxes, seen from above
-        (bev) or in space; by default by the first two, as far as there are boxes and metres.
     gate_m : float or sequence of float, default (0.5, 1, 2)
-        Largest distance of a match in metres, from 0.001; scores are given for each.
-    min_iou : float, default 0.5
-        Least overlap (IoU) of a match.
+        Gate: largest distance in metres at which ground truth and a track match.
+
+        Scores are given for each of several.
     rules : {"trackeval", "motmetrics"}, default "trackeval"
         Rules for counting switches and fragments.
     smoothed : bool, default False
-        Of logs: score predictions from smoothed samples, too, as "samples, smoothed" (the paper's SORT + smoothing).
+        Of logs: score predictions from smoothed samples, too (SORT + smoothing).
+
+        They are called "samples, smoothed"; the paper names them SORT + smoothing.
     topic : str or sequence of str, optional
-        Score these channels. By default tracks, samples, retracks and retracks/online, and retracks/full of 3D boxes.
+        Score these channels; by default tracks, samples, retracks, retracks/online; of 3D boxes retracks/full, too.
     classes : str, optional
-        Of files: score these classes, by name or number with commas between them, or all. By default people; of 3D
-        boxes all.
-    camera : str, optional
-        Name of the camera, if a log has several.
-    ground_plane : path, optional
-        For files: 3x3 homography from pixels to metres on the ground.
-    point : {"foot", "center"}, default "foot"
-        For files: which point of a box touches the ground.
-    fps : float, str or Fraction, optional
-        For files: frames per second.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
+        Classes of label files to score, by name or number, as in person,car; all for every one; by default person; 3D
+        boxes: all.
 
     Returns
     -------
@@ -343,6 +356,12 @@ def evaluate(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack evaluate log.mcap --similarity metres --gate-m 1
+
+        mcaptrack evaluate tracks.txt --truth gt.txt --fail-under idf1=0.7
+
     >>> import mcaptrack
     >>> scores = mcaptrack.evaluate("log.mcap", similarity="metres", gate_m=1.0)
     >>> 0.5 < scores.score("IDF1", "retracks") <= 1.0

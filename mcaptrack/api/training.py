@@ -5,16 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
-from typing import Final, Literal
+from typing import Annotated, Final, Literal
 
 from mcaptrack import __version__
 from mcaptrack.api.common import Notes, as_path, optional_path, paths_of
-from mcaptrack.api.declared import checked
+from mcaptrack.api.declared import Argument, Option, declared
 from mcaptrack.api.ingesting import parse_fps
-from mcaptrack.api.options import PathLike, Progress, no_progress
-from mcaptrack.choices import Point
+from mcaptrack.api.options import FILES, Force, GroundPlane, LabelFps, PathLike, PointOfBox, Reports, Topic, no_progress
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import Notice, collected
 from mcaptrack.training.recipe import RECIPES, Recipe
@@ -23,6 +21,9 @@ from mcaptrack.training.windows import Windows
 
 Device = Literal["auto", "cpu", "cuda", "mps"]
 RecipeName = Literal["red", "paper"]
+#: Headings in the help.
+_TRAINING: Final = "Training"
+_WINDOWS: Final = "Training data"
 #: The licence of weights that were trained on files.
 _LICENCE: Final = "that of the data it was trained on"
 _VALIDATION_SHARE: Final = 0.1
@@ -65,48 +66,46 @@ class TrainResult:
     warnings: tuple[Notice, ...]
 
 
-@checked(
-    epochs=(1, 1_000_000),
-    batch=(1, 1_000_000),
-    rate=(1e-9, 1),
-    noise_m=(0, 10),
-    gaps=(0, 0.9),
-    scale=(0, 1),
-    consistency_weight=(0, 1e6),
-    patience=(0, 1_000_000),
-    walks=(1000, 100_000_000),
-    seed=(0, 2**31 - 1),
-    threads=(1, 1024),
-)
+@declared(most_used=("recipe", "epochs", "device", "validate", "topic", "output", "force"))
 def train(
-    sources: PathLike | Sequence[PathLike],
-    output: PathLike = "trained",
+    sources: Annotated[
+        PathLike | Sequence[PathLike],
+        Argument(
+            "sources",
+            "SOURCE",
+            "Label files (TrajNet, Stanford Drone, ETH, MOTChallenge), Parquet tables, logs, folders of these, or "
+            "`synthetic`.",
+        ),
+    ],
+    output: Annotated[PathLike, Option(FILES, short="o", shown=True)] = "trained",
     *,
-    recipe: RecipeName = "red",
-    validate: PathLike | Sequence[PathLike] | None = None,
-    epochs: int | None = None,
-    batch: int | None = None,
-    rate: float | None = None,
-    noise_m: float | None = None,
-    gaps: float | None = None,
-    scale: float | None = None,
-    consistency_weight: float = 0.0,
-    patience: int = 0,
-    walks: int = 60_000,
-    seed: int = 1,
-    device: Device = "auto",
-    threads: int = 1,
-    resume: bool = False,
-    topic: str | None = None,
-    fps: float | str | Fraction | None = None,
-    ground_plane: PathLike | None = None,
-    point: Point = "foot",
-    force: bool = False,
-    progress: Progress = no_progress,
+    recipe: Annotated[RecipeName, Option(_TRAINING, tuning=True)] = "red",
+    validate: Annotated[PathLike | Sequence[PathLike] | None, Option(FILES)] = None,
+    epochs: Annotated[int | None, Option(_TRAINING, 1, 1_000_000, tuning=True)] = None,
+    batch: Annotated[int | None, Option(_TRAINING, 1, 1_000_000, tuning=True)] = None,
+    rate: Annotated[float | None, Option(_TRAINING, 1e-9, 1, tuning=True)] = None,
+    noise_m: Annotated[float | None, Option(_WINDOWS, 0, 10, tuning=True)] = None,
+    gaps: Annotated[float | None, Option(_WINDOWS, 0, 0.9, tuning=True)] = None,
+    scale: Annotated[float | None, Option(_WINDOWS, 0, 1, tuning=True)] = None,
+    consistency_weight: Annotated[float, Option(_TRAINING, 0, 1e6, tuning=True)] = 0.0,
+    patience: Annotated[int, Option(_TRAINING, 0, 1_000_000, tuning=True)] = 0,
+    walks: Annotated[int, Option(_WINDOWS, 1000, 100_000_000, tuning=True)] = 60_000,
+    seed: Annotated[int, Option(_TRAINING, 0, 2**31 - 1, tuning=True)] = 1,
+    device: Annotated[Device, Option(_TRAINING, tuning=True)] = "auto",
+    threads: Annotated[int, Option(_TRAINING, 1, 1024, tuning=True)] = 1,
+    resume: Annotated[bool, Option(FILES)] = False,
+    topic: Topic = None,
+    fps: LabelFps = None,
+    ground_plane: GroundPlane = None,
+    point: PointOfBox = "foot",
+    force: Force = False,
+    progress: Reports = no_progress,
 ) -> TrainResult:
-    """Train a predictor on tracks of people, or on synthetic walks. Needs torch.
+    """Train a predictor on tracks of people, or on synthetic walks.
 
-    Writes weights, a log of the epochs and a state to resume from into a folder.
+    Writes the weights (safetensors, with a model card in the header), a log of the epochs and a state to resume from
+    into a folder, and compares the predictor with constant velocity on the same windows. Use the weights with
+    `mcaptrack predict --predictor red:FOLDER/red.safetensors`. Needs torch: `pip install 'mcaptrack[train]'`.
 
     Parameters
     ----------
@@ -115,47 +114,43 @@ def train(
     output : path, default "trained"
         Folder for the weights, the log of epochs and the state.
     recipe : {"red", "paper"}, default "red"
-        Network and training: those of this project, or those of the paper (Yu and Zhou, IROS 2021).
+        Network and training: mcaptrack's own (red), or the paper's.
+
+        The paper is Yu and Zhou, IROS 2021.
     validate : path or sequence of paths, optional
         Sources to validate on; by default a tenth of the windows, whole scenes apart.
     epochs : int, optional
-        Number of passes over the windows: by default 20, "paper" 50.
+        Number of passes over the training windows; by default 20; paper: 50.
     batch : int, optional
-        Number of windows per step: by default 256, "paper" 60.
+        Number of windows per step; by default 256; paper: 60.
     rate : float, optional
-        Learning rate: by default 0.003, "paper" 0.0001.
+        Learning rate; by default 0.003; paper: 0.0001.
     noise_m : float, optional
-        Largest noise added to past positions, in metres: by default 0.4, "paper" 0.
+        Largest noise added to past positions, in metres; by default 0.4; paper: 0.
     gaps : float, optional
-        Share of past positions that are removed: by default 0.3, "paper" 0.
+        Share of past positions that are removed; by default 0.3; paper: 0.
     scale : float, optional
-        Largest scaling of positions, as a natural logarithm: by default 0.15, "paper" 0.
+        Largest scaling of positions, as a natural logarithm; by default 0.15; paper: 0.
     consistency_weight : float, default 0
         Weight of the difference between predictions of successive steps in the loss.
     patience : int, default 0
         Stop after this many epochs without improvement; 0 for never.
     walks : int, default 60000
-        Number of walks that "synthetic" makes.
+        Number of walks that `synthetic` makes.
     seed : int, default 1
         Random seed.
     device : {"auto", "cpu", "cuda", "mps"}, default "auto"
-        Device to compute on; "auto" is the fastest one available.
+        Device to compute on.
+
+        "auto" is the fastest one available.
     threads : int, default 1
-        Threads of the processor to use.
+        Threads of the processor to use; more than one rarely helps.
     resume : bool, default False
         Continue the training in the folder.
     topic : str, optional
-        Read this channel of logs and tables; by default the ground truth, or the best tracks.
-    fps : float, str or Fraction, optional
-        For label files: frames per second.
-    ground_plane : path, optional
-        For label files: 3x3 homography from pixels to metres on the ground.
-    point : {"foot", "center"}, default "foot"
-        For label files: which point of a box touches the ground.
+        Read this channel of logs and tables; by default truth, or the best tracks.
     force : bool, default False
         Replace the training in the folder.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
 
     Returns
     -------
@@ -170,6 +165,10 @@ def train(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack train synthetic -o trained
+
     >>> import mcaptrack
     >>> result = mcaptrack.train("synthetic", "network", walks=1000, epochs=1, device="cpu")
     >>> mcaptrack.predict("log.mcap", predictor=result.predictor, output="predictions.mcap").stages

@@ -7,20 +7,37 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Final, Literal
+from typing import Annotated, Final, Literal
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.common import Notes, detail, optional_path, paths_of
-from mcaptrack.api.declared import checked
+from mcaptrack.api.declared import Argument, Option, declared
 from mcaptrack.api.ingesting import parse_fps
-from mcaptrack.api.options import PathLike, Progress, no_progress
-from mcaptrack.api.running import Option, transform_of
-from mcaptrack.choices import Point
+from mcaptrack.api.options import (
+    FILES,
+    LABELS,
+    SCORES,
+    Camera,
+    Force,
+    GroundPlane,
+    LabelFps,
+    MinIou,
+    PathLike,
+    PointOfBox,
+    Reports,
+    Topic,
+    Value,
+    chooser,
+    gate_m,
+    no_progress,
+    similarity,
+)
+from mcaptrack.api.running import transform_of
+from mcaptrack.choices import Point, Similarity
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions, ground_truth_of_log
 from mcaptrack.evaluation import tuning as searching
-from mcaptrack.evaluation.aligned import Similarity
 from mcaptrack.evaluation.tuning import Metric, Range, Task, Trial, declared_ranges, uses_optuna
 from mcaptrack.notices import Notice, collected
 from mcaptrack.registry import blamed
@@ -32,6 +49,7 @@ TunedStage = Literal["track", "sample", "retrack"]
 #: Parameters to search: their names; or ranges by name, None for the range that the stage declares.
 Search = Sequence[str] | Mapping[str, tuple[float, float] | None]
 
+_SEARCH: Final = "Search"  # a heading in the help
 _BY_CHANCE: Final = "random numbers; with `pip install mcaptrack[tune]` they learn from each other"
 
 
@@ -66,7 +84,7 @@ class TuneResult:
     stage: TunedStage
     metric: Metric
     similarity: Similarity
-    settings: Mapping[str, Option | Transform]
+    settings: Mapping[str, Value | Transform]
     scores: Mapping[str, float]
     default_scores: Mapping[str, float]
     trials: int
@@ -75,33 +93,39 @@ class TuneResult:
     warnings: tuple[Notice, ...]
 
 
-@checked(trials=(1, 1_000_000), seed=(0, 2**31 - 1), gate_m=(0.001, 1e6), min_iou=(0.001, 1))
+@declared(
+    most_used=("truth", "stage", "tracker", "metric", "trials", "search", "topic", "output", "force"),
+)
 def tune(
-    inputs: PathLike | Sequence[PathLike],
+    inputs: Annotated[
+        PathLike | Sequence[PathLike], Argument("inputs", "LOG|DETECTIONS", "Logs, or files of detections.")
+    ],
     *,
-    truth: PathLike | Sequence[PathLike] | None = None,
-    stage: TunedStage = "track",
-    tracker: str | Transform | None = None,
-    metric: Metric = "IDF1",
-    trials: int = 100,
-    search: Search | None = None,
-    seed: int = 0,
-    study: PathLike | None = None,
-    similarity: Similarity | None = None,
-    gate_m: float = 1.0,
-    min_iou: float = 0.5,
-    fps: float | str | Fraction | None = None,
-    ground_plane: PathLike | None = None,
-    point: Point = "foot",
-    topic: str | None = None,
-    camera: str | None = None,
-    force: bool = False,
-    progress: Progress = no_progress,
+    truth: Annotated[PathLike | Sequence[PathLike] | None, Option(LABELS, shown=False)] = None,
+    stage: Annotated[TunedStage, Option(_SEARCH, tuning=True)] = "track",
+    tracker: Annotated[str | Transform | None, chooser("tracker", "The {kind} to tune", _SEARCH, "sort")] = None,
+    metric: Annotated[Metric, Option(SCORES, tuning=True)] = "IDF1",
+    trials: Annotated[int, Option(_SEARCH, 1, 1_000_000, tuning=True)] = 100,
+    search: Annotated[Search | None, Option(_SEARCH, tuning=r"[A-Za-z0-9_-]+(=[0-9.eE+-]+:[0-9.eE+-]+)?")] = None,
+    seed: Annotated[int, Option(_SEARCH, 0, 2**31 - 1, tuning=True)] = 0,
+    study: Annotated[PathLike | None, Option(FILES, shown="beside the file of settings")] = None,
+    similarity: Annotated[Similarity | None, similarity("iou; metres after track")] = None,
+    gate_m: Annotated[float, gate_m()] = 1.0,
+    min_iou: MinIou = 0.5,
+    fps: LabelFps = None,
+    ground_plane: GroundPlane = None,
+    point: PointOfBox = "foot",
+    topic: Topic = None,
+    camera: Camera = None,
+    force: Force = False,
+    progress: Reports = no_progress,
 ) -> TuneResult:
-    """Find the options of a stage that score best against ground truth.
+    """Find the settings of a stage that score best against ground truth.
 
-    Nothing is written but ``study``. Trials learn from each other if Optuna is installed, otherwise they are random.
-    Score the settings on other recordings before you trust them.
+    Reads detections and ground truth from logs, or from files with ``truth``. The command writes the best settings to
+    mcaptrack.toml, which every command reads; other settings in it stay. A search that was interrupted continues where
+    it stopped. With Optuna installed trials learn from each other, otherwise they are random. Score the settings on
+    other recordings before you trust them.
 
     Parameters
     ----------
@@ -111,39 +135,22 @@ def tune(
         Ground truth for files of detections: one file for each, matched by name or in order.
     stage : {"track", "sample", "retrack"}, default "track"
         The stage to tune.
-    tracker : str or Transform, optional
-        The tracker to tune, by default "sort"; a transform keeps its other options. Only for the stage "track".
     metric : {"IDF1", "MOTA", "HOTA", "IDP", "IDR", "DetA", "AssA"}, default "IDF1"
-        The score to maximise.
+        Score to maximise.
     trials : int, default 100
-        Number of settings to try, the defaults first, and those in ``study`` included.
+        Number of settings to try, the defaults first.
+
+        Those in ``study`` are included.
     search : sequence of str, or mapping of str to (float, float) or None, optional
-        Parameters to search, with ranges or without. By default all that the stage declares.
+        Parameters to search, with a range as in min-iou=0.1:0.5, or without; by default all that the stage declares.
+
+        In Python ranges are pairs: ``{"min_iou": (0.1, 0.5)}``.
     seed : int, default 0
         Random seed.
     study : path, optional
-        Keep trials in this file, and continue with those in it.
-    similarity : {"iou", "metres", "bev-iou", "3d-iou"}, optional
-        Match by overlap of boxes or by distance on the ground; by default by overlap for the stage "track", otherwise
-        by distance.
-    gate_m : float, default 1
-        Largest distance of a match in metres.
-    min_iou : float, default 0.5
-        Least overlap (IoU) of a match.
-    fps : float, str or Fraction, optional
-        For files: frames per second.
-    ground_plane : path, optional
-        For files: 3x3 homography from pixels to metres on the ground.
-    point : {"foot", "center"}, default "foot"
-        For files: which point of a box touches the ground.
-    topic : str, optional
-        Read this channel instead of the usual one.
-    camera : str, optional
-        Name of the camera, if a log has several.
+        Keep trials in this file; go on with those in it.
     force : bool, default False
-        Forget the trials in ``study``.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
+        Forget earlier trials.
 
     Returns
     -------
@@ -157,6 +164,10 @@ def tune(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack tune log.mcap --tracker ocsort --metric hota --trials 200
+
     >>> import mcaptrack
     >>> result = mcaptrack.tune("log.mcap", search={"min_iou": (0.1, 0.5)}, trials=2)
     >>> result.scores["IDF1"] >= result.default_scores["IDF1"]

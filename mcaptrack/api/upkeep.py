@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Annotated, Final
 
 from mcaptrack import log as logs
 from mcaptrack.api.common import log_file, log_location, log_output, names_of, warnings_about
-from mcaptrack.api.declared import checked
-from mcaptrack.api.options import PathLike, Progress, no_progress
+from mcaptrack.api.declared import Argument, OneOfMany, Option, declared
+from mcaptrack.api.options import FILES, EachLog, Force, Output, PathLike, Reports, no_progress, output
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_overwrite
 from mcaptrack.foxglove.views import SCENE_SUFFIX
@@ -20,6 +21,9 @@ from mcaptrack.notices import Notice
 from mcaptrack.schema.provenance import REFINE, Provenance
 from mcaptrack.sources.ingest.bags.metadata_yaml import update_metadata
 from mcaptrack.sources.ingest.sidecar import recording_of
+
+_ONE_LOG: Final = "A log, a folder of logs, a pattern, or - for a list on stdin."
+_TOPICS: Final = "Channels to remove, or patterns such as '/camera/*'."
 
 
 @dataclass(frozen=True)
@@ -53,16 +57,12 @@ class LogCheck:
         return tuple(finding for file in self.files for finding in file.findings)
 
 
-@checked()
-def check(log: PathLike, *, progress: Progress = no_progress) -> LogCheck:
+@declared()
+def check(log: EachLog, *, progress: Reports = no_progress) -> LogCheck:
     """Check every byte of a log: structure, checksums, indexes, statistics, order of messages.
 
-    Parameters
-    ----------
-    log : path
-        The log; results that stand beside it are checked, too.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
+    The exit code is 1 if there are errors; warnings are about what could be better. `mcaptrack recover` saves what is
+    intact. Results that stand beside a log are checked, too.
 
     Returns
     -------
@@ -76,6 +76,10 @@ def check(log: PathLike, *, progress: Progress = no_progress) -> LogCheck:
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack check log.mcap
+
     >>> import mcaptrack
     >>> mcaptrack.check("log.mcap").is_sound
     True
@@ -117,22 +121,18 @@ class LogRecovery:
     warnings: tuple[Notice, ...]
 
 
-@checked()
+@declared()
 def recover(
-    log: PathLike, output: PathLike | None = None, *, force: bool = False, progress: Progress = no_progress
+    log: EachLog,
+    output: Annotated[PathLike | None, output("LOG.recovered.mcap beside the log")] = None,
+    *,
+    force: Force = False,
+    progress: Reports = no_progress,
 ) -> LogRecovery:
-    """Save what is intact in a damaged log; the damaged log stays unchanged.
+    """Save what is intact in a damaged log to LOG.recovered.mcap; the damaged log stays unchanged.
 
-    Parameters
-    ----------
-    log : path
-        The damaged log.
-    output : path, optional
-        The log to write, by default LOG.recovered.mcap beside the log, or in the working folder if that is in a store.
-    force : bool, default False
-        Overwrite ``output`` if it exists.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
+    Every chunk that can be read and has the right checksum is copied, with new indexes. What is lost is printed, and
+    the exit code is then 3.
 
     Returns
     -------
@@ -146,6 +146,10 @@ def recover(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack recover broken.mcap -o saved.mcap
+
     >>> import mcaptrack
     >>> mcaptrack.recover("log.mcap", "saved.mcap").lost
     ()
@@ -188,31 +192,24 @@ class DropResult:
     warnings: tuple[Notice, ...]
 
 
-@checked()
+@declared()
 def drop(
-    log: PathLike,
-    topics: str | Sequence[str],
+    log: Annotated[PathLike, OneOfMany("logs", "LOG", _ONE_LOG, is_one=True, help="The log.")],
+    topics: Annotated[str | Sequence[str], Argument("topics", "TOPIC", _TOPICS, help=_TOPICS)],
     *,
-    output: PathLike | None = None,
-    in_place: bool = False,
-    force: bool = False,
+    output: Output = None,
+    in_place: Annotated[bool, Option(FILES)] = False,
+    force: Force = False,
 ) -> DropResult:
     """Remove channels from a log, in place or in a copy; all others stay unchanged, to the byte.
 
-    Channels that only describe a removed one (its views, events and scores) are removed with it.
+    Channels that only describe a removed one are removed with it: its `/view/`, `/events`, `/counts`, `/errors` and
+    `/scores`. Results that stand beside the log are part of it, and of a copy.
 
     Parameters
     ----------
-    log : path
-        The log.
-    topics : str or sequence of str
-        Channels to remove, or patterns such as "/camera/*".
-    output : path, optional
-        Write a copy to this file; the log stays unchanged.
     in_place : bool, default False
         Also change a recording in place that ROS tools may have to read.
-    force : bool, default False
-        Overwrite ``output`` if it exists.
 
     Returns
     -------
@@ -226,6 +223,10 @@ def drop(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack drop log.mcap /camera/video -o small.mcap
+
     >>> import mcaptrack
     >>> mcaptrack.drop("log.mcap", "/camera/video", output="small.mcap").dropped
     ('/camera/video',)

@@ -9,11 +9,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final, Self
+from typing import Annotated, Final, Self
 
 from mcaptrack import log as logs
 from mcaptrack.api.common import Notes, as_path, log_file
-from mcaptrack.api.declared import checked
+from mcaptrack.api.declared import Argument, Option, declared
 from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.clocks import NS_PER_S
@@ -24,6 +24,9 @@ from mcaptrack.viewing import links
 from mcaptrack.viewing.links import LICHTBLICK, LinkedEvent, is_about, viewer_links, with_links
 from mcaptrack.viewing.serving import Server
 
+#: Headings in the help.
+_OPENED: Final = "What is opened"
+_VIEWER: Final = "Server and viewer"
 #: The names of codecs of videos.
 _CODECS: Final = {"h264": "H.264", "h265": "H.265", "vp9": "VP9", "av1": "AV1"}
 
@@ -145,37 +148,41 @@ class LogServer:
         self._server.server_close()
 
 
-@checked(port=(0, 65535), at_s=(0, 1e9), event=(1, 1e9))
+@declared()
 def view(
-    log: PathLike,
+    log: Annotated[PathLike, Argument("path", "LOG", "The log.", help="The log.")],
     *,
-    at_s: float | None = None,
-    event: int | None = None,
-    port: int = 0,
-    lichtblick: str = LICHTBLICK,
-    layout: PathLike | None = None,
-    browser: bool = False,
+    at_s: Annotated[float | None, Option(_OPENED, 0, 1e9, flag="at")] = None,
+    event: Annotated[int | None, Option(_OPENED, 1, 1e9, shown="none")] = None,
+    layout: Annotated[PathLike | None, Option(_OPENED, metavar="NAME or FILE", shown="all of the log")] = None,
+    port: Annotated[int, Option(_VIEWER, 0, 65535, shown="any that is free")] = 0,
+    lichtblick: Annotated[str, Option(_VIEWER)] = LICHTBLICK,
+    browser: Annotated[bool, Option(_VIEWER, flag="open/no-open")] = False,
 ) -> LogServer:
-    """Serve a log and its layouts to the browser of this machine, with links that open it in Lichtblick and Foxglove.
+    """Serve a log to this machine's browser, and print links that open it in Lichtblick and Foxglove.
 
-    Viewers open a second before the first identity switch or repair of the tracks that layouts show, so that there is
-    something to see; without any event, where tracks are. Layout files beside the log are served as they are, also
-    while they are edited. Only these files are served, only to this machine.
+    Links open the log where something happens, and there is a link for each identity switch and repair. Also serves
+    its layouts (tracking, comparing, predictions): the links open Lichtblick with one; in Foxglove import the file
+    (Layouts, Import from file). Layout files beside the log are served as they are, also while they are edited, and
+    its report with a link at each time. Only these files are served, only to this machine, until Ctrl-C.
 
     Parameters
     ----------
-    log : path
-        The log.
     at_s : float, optional
-        Open at this time of the log, in seconds.
+        Open at this time of the log, in seconds; by default a second before the first identity switch or repair of the
+        best tracks.
+
+        Without any of these, where tracks are.
     event : int, optional
-        Open a second before this event, by its number in ``LogServer.events``.
+        Open a second before this event, by its number.
+
+        Its place in ``LogServer.events``, from 1.
+    layout : str or path, optional
+        Print a link for this layout only: tracking, comparing or predictions, or the layout in this file.
     port : int, default 0
-        Port to serve it at; 0 is any that is free.
+        Port to serve it at.
     lichtblick : str, optional
         Address of Lichtblick, if you have installed it yourself.
-    layout : str or path, optional
-        Serve only this layout: "tracking", "comparing" or "predictions", or the layout in this file.
     browser : bool, default False
         Open Lichtblick in the browser.
 
@@ -191,6 +198,12 @@ def view(
 
     Examples
     --------
+    On the command line:
+
+        mcaptrack view log.mcap
+
+        mcaptrack view log.mcap --event 3 --open
+
     >>> import mcaptrack
     >>> with mcaptrack.view("log.mcap", layout="tracking") as server:
     ...     server.links["Lichtblick"].startswith("https://lichtblick-suite.github.io/lichtblick/?ds=remote-file")

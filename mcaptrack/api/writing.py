@@ -9,8 +9,6 @@ import numpy as np
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.class_names import checked_names
-from mcaptrack.api.columns import UNNUMBERED
 from mcaptrack.api.common import warnings_about
 from mcaptrack.api.options import no_progress
 from mcaptrack.api.products import write_products
@@ -25,6 +23,7 @@ from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.sources.camera_motion import path_of, tracks_topic
 from mcaptrack.sources.cameras import USUAL
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
+from mcaptrack.sources.own_rows import UNNUMBERED, checked_names
 
 #: What channels usually hold, by the end of their topic.
 _HOLDS: Final[Mapping[str, Schema]] = {"detections": DETECTIONS, "tracks": TRACKS, "truth": TRACKS}

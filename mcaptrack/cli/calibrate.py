@@ -1,13 +1,16 @@
-"""``mcaptrack calibrate``: correct the ground planes of cameras by the people that they see together."""
+"""``mcaptrack calibrate``: what it prints."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.cli import common
 from mcaptrack.cli.flags import with_flags
-from mcaptrack.cli.fuse import ClockOffsets, offsets_of
-from mcaptrack.cli.many import LogWork, process, takes_many
+from mcaptrack.cli.many import EachLog
+from mcaptrack.cli.running import offsets_of
+from mcaptrack.location import Location
 
 if TYPE_CHECKING:
     from mcaptrack import CalibrateResult, CameraCorrection
@@ -23,90 +26,49 @@ _IN_WORDS: Final = {
 }
 
 
-@common.one_line
-@takes_many()
-def calibrate(
-    logs: common.Logs,
-    cameras: Annotated[
-        str | None,
-        common.option("--cameras", metavar="A,B", help="Cameras to compare.", show_default="all with a ground plane"),
-    ] = None,
-    reference: Annotated[
-        str | None,
-        common.option(
-            "--reference",
-            metavar="A,B",
-            help="Cameras that are right: the others are brought to them.",
-            show_default="what most cameras agree on",
-        ),
-    ] = None,
-    clock_offset_s: ClockOffsets = None,
-    dry_run: Annotated[bool, common.option("--dry-run", help="Only compare; write nothing.")] = False,
-    output: common.Output = None,
-    sidecar: common.Sidecar = None,
-    force: common.Force = False,
-    json: common.Json = False,
-    quiet: common.Quiet = False,
-    verbose: common.Verbose = False,
-    config: common.Config = None,
-) -> None:
-    """Correct the ground planes of cameras that disagree with the others, by the people that they see together.
+class Calibrate(EachLog["CalibrateResult"]):
+    """Correct the ground planes of cameras."""
 
-    Each camera is compared with what the others agree on. If its feet stand elsewhere, its plane is corrected by a
-    shift, a rotation, a scale, or more, as far as that also holds at other times; those that agree stay as they are.
+    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
+        """Return the arguments of the function."""
+        arguments = super().arguments(names)
+        return arguments | {"clock_offset_s": offsets_of(arguments["clock_offset_s"])}
 
-    /CAMERA/ground_plane stays in the log, and the corrected plane in /CAMERA/ground_plane/refined is used instead:
-    `run` and `fuse` make again what was made before. `mcaptrack drop log.mcap /CAMERA/ground_plane/refined` takes it
-    back.
+    def show(self, log: Location, done: CalibrateResult, talk: common.Talk) -> None:
+        """Print what was found about each camera."""
+        took = f" in {done.seconds:.1f} s" if done.seconds else ""
+        talk.say(f"{done.log}: {self.line(done)}{took}")
+        lines = [(name, _words(camera, name in done.unchanged)) for name, camera in done.cameras.items()]
+        dropped = "would be dropped" if done.is_dry_run else "dropped"
+        lines += [(dropped, f"{topic}: the camera agrees without it") for topic in done.dropped]
+        if done.written_because and done.written_to:
+            lines.append(("written", f"the planes are in {done.written_to}: {done.written_because}"))
+        width = max(len(name) for name, _ in lines)
+        for name, description in lines:
+            talk.say(f"  {name:<{width}}  {description}")
 
-    The log needs detections and a measured ground plane of each camera. Of two cameras --reference names the right one.
+    def line(self, done: CalibrateResult) -> str:
+        """Return which cameras were corrected."""
+        would = "would be corrected" if done.is_dry_run else "corrected"
+        new = [name for name in done.corrected if name not in done.unchanged]
+        names = f": {', '.join(new)}" if new else ""
+        before = f", {len(done.unchanged)} already: {', '.join(done.unchanged)}" if done.unchanged else ""
+        return f"{len(new)} of {len(done.cameras)} cameras {would}{names}{before}"
 
-    Example: mcaptrack calibrate log.mcap --dry-run
-    """
-    import mcaptrack
-    from mcaptrack.fleet import find_logs
-
-    options: dict[str, Any] = {
-        "cameras": cameras,
-        "reference": reference,
-        "clock_offset_s": offsets_of(clock_offset_s or ()),
-        "dry_run": dry_run,
-        "sidecar": sidecar,
-        "force": force,
-    }
-    with common.Talk(quiet, verbose).open() as talk:
-        work: LogWork[CalibrateResult] = LogWork(
-            "calibrate",
-            mcaptrack.calibrate,
-            options,
-            show=lambda _, result: _print(result, talk),
-            data=_as_json,
-            line=_in_short,
-        )
-        results, totals = process(find_logs(logs), work, talk, output)
-    if json:
-        common.print_json({"results": [_as_json(result) for result in results], **totals})
-
-
-def _in_short(result: CalibrateResult) -> str:
-    would = "would be corrected" if result.is_dry_run else "corrected"
-    new = [name for name in result.corrected if name not in result.unchanged]
-    names = f": {', '.join(new)}" if new else ""
-    before = f", {len(result.unchanged)} already: {', '.join(result.unchanged)}" if result.unchanged else ""
-    return f"{len(new)} of {len(result.cameras)} cameras {would}{names}{before}"
-
-
-def _print(result: CalibrateResult, talk: common.Talk) -> None:
-    took = f" in {result.seconds:.1f} s" if result.seconds else ""
-    talk.say(f"{result.log}: {_in_short(result)}{took}")
-    lines = [(name, _words(camera, name in result.unchanged)) for name, camera in result.cameras.items()]
-    dropped = "would be dropped" if result.is_dry_run else "dropped"
-    lines += [(dropped, f"{topic}: the camera agrees without it") for topic in result.dropped]
-    if result.written_because and result.written_to:
-        lines.append(("written", f"the planes are in {result.written_to}: {result.written_because}"))
-    width = max(len(name) for name, _ in lines)
-    for name, description in lines:
-        talk.say(f"  {name:<{width}}  {description}")
+    def data(self, done: CalibrateResult) -> dict[str, Any]:
+        """Return the result as values of JSON."""
+        return {
+            "log": str(done.log),
+            "cameras": {name: _camera_as_json(camera) for name, camera in done.cameras.items()},
+            "corrected": dict(done.corrected),
+            "unchanged": list(done.unchanged),
+            "dropped": list(done.dropped),
+            "is_dry_run": done.is_dry_run,
+            "stale": list(done.stale),
+            "written_to": str(done.written_to) if done.written_to else None,
+            "written_there_because": with_flags(done.written_because) or None,
+            "seconds": done.seconds,
+        }
 
 
 def _words(camera: CameraCorrection, is_unchanged: bool) -> str:
@@ -135,33 +97,6 @@ def _distances(median_m: float | None, p90_m: float | None) -> str:
     return f"{median_m:.2f} m (90 %: {p90_m:.2f} m)"
 
 
-def _as_json(result: CalibrateResult) -> dict[str, Any]:
-    """Return the result as values of JSON."""
-    return {
-        "log": str(result.log),
-        "cameras": {name: _camera_as_json(camera) for name, camera in result.cameras.items()},
-        "corrected": dict(result.corrected),
-        "unchanged": list(result.unchanged),
-        "dropped": list(result.dropped),
-        "is_dry_run": result.is_dry_run,
-        "stale": list(result.stale),
-        "written_to": str(result.written_to) if result.written_to else None,
-        "written_there_because": with_flags(result.written_because) or None,
-        "seconds": result.seconds,
-    }
-
-
 def _camera_as_json(camera: CameraCorrection) -> dict[str, Any]:
-    return {
-        "correction": camera.correction or None,
-        "moved_m": camera.moved_m,
-        "pairs": camera.pairs,
-        "median_before_m": camera.median_before_m,
-        "p90_before_m": camera.p90_before_m,
-        "median_after_m": camera.median_after_m,
-        "p90_after_m": camera.p90_after_m,
-        "why": with_flags(camera.why) or None,
-        "limit": camera.limit or None,
-        "clock_offset_s": camera.clock_offset_s,
-        "homography": list(camera.homography) if camera.homography else None,
-    }
+    empty = {"correction": camera.correction or None, "why": with_flags(camera.why) or None}
+    return asdict(camera) | empty | {"limit": camera.limit or None, "homography": camera.homography or None}

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import Field, dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import Field, dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any, Final, get_type_hints
 
 from mcaptrack.cli.command import is_on_command_line, settings_of
-from mcaptrack.cli.flags import RUNNING
 from mcaptrack.cli.settings import found_of
-from mcaptrack.cli.text import refuse_usage, say
+from mcaptrack.cli.text import refuse_usage
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS
 from mcaptrack.transforms import STAGES, Stage, Transform
@@ -95,99 +94,76 @@ def _read_member(value: str, kind: Any) -> Any:
 
 def is_open(stage: Stage, values: Mapping[str, Any]) -> bool:
     """Return whether the boxes of a log decide which tracker runs, because the user named none."""
-    is_tracker = stage.reads is DETECTIONS
-    return is_tracker and values["tracker"] == stage.entry(stage.default).name and not is_on_command_line("tracker")
-
-
-def make_transform(
-    stage: Stage,
-    options: Mapping[str, Any],
-    wanted: Mapping[str, Any],
-    owners: Mapping[str, list[str]] = MappingProxyType({}),
-    typed: Collection[str] = (),
-) -> Transform:
-    """Return the chosen transform with those of the wanted parameters that it has.
-
-    ``owners`` has the names of the transforms that have an option. One of the options that were ``typed`` on the
-    command line is refused if the chosen transform lacks it; one from a file or the environment is ignored, since it
-    may be meant for another transform.
-    """
-    name = _chosen(stage, options, wanted)
-    cls = stage.with_part(stage.find(name).cls if name else stage.default, wanted.get(stage.parameter))
-    own = options_of(cls)
-    for option in wanted:
-        if option in owners and option not in own and option in typed:
-            fields_there = [
-                options_of(kind)[option] for kind in stage.built_in().values() if option in options_of(kind)
-            ]
-            is_flag = all(map(has_flag, fields_there))
-            flag = f"--{option.replace('_', '-')}" if is_flag else f"--set {option}"
-            chosen = name or wanted.get(stage.option) or stage.choice(stage.default())
-            raise McaptrackError(f"{flag} is an option of {listed(owners[option])}, not of {chosen}")
-    hints = get_type_hints(cls)
-    values = {
-        option: tuple(value) if member_type(hints[option])[1] else value
-        for option, value in wanted.items()
-        if option in own
-    }
-    if stage.profiles and (profile := options.get("profile")):
-        return replace(stage.profiles[profile], **values)
-    return stage.make(name, **values)
+    return stage.reads is DETECTIONS and not values["tracker"]
 
 
 @dataclass(frozen=True)
 class Maker:
-    """Makes the transform of a stage by name, as ``make_transform`` does; other processes can do so, too.
+    """Makes the transform of a stage as the user wants it; other processes can do so, too.
 
     Attributes
     ----------
     stage : str
         Name of the stage.
-    given, wanted, owners, typed
-        The arguments of ``make_transform``; ``given`` has the profile, and the choice of the user.
+    chosen, profile : str
+        The names of the transform and of the profile that the user chose, or "".
+    wanted : mapping of str to object
+        Values of parameters. Those that the transform lacks are ignored, since they may be meant for another one.
+    typed : mapping of str to str
+        How the parameters among them were typed on the command line: these are refused if the transform lacks them.
+    owners : mapping of str to list of str
+        The names of the transforms that have a parameter.
     """
 
     stage: str
-    given: Mapping[str, Any]
+    chosen: str
+    profile: str
     wanted: Mapping[str, Any]
-    owners: Mapping[str, list[str]]
-    typed: tuple[str, ...]
+    typed: Mapping[str, str] = field(default_factory=dict)
+    owners: Mapping[str, list[str]] = field(default_factory=dict)
 
     @classmethod
     def of(
-        cls, stage: Stage, options: Mapping[str, Any], wanted: Mapping[str, Any], owners: Mapping[str, list[str]]
+        cls,
+        stage: Stage,
+        options: Mapping[str, Any],
+        wanted: Mapping[str, Any],
+        owners: Mapping[str, list[str]] = MappingProxyType({}),
     ) -> Maker:
-        """Return a maker for the running command."""
-        chosen = {name: options[name] for name in (stage.kind, "profile") if name and name in options}
-        typed = [name for name in wanted if is_on_command_line(name if name in options else "set")]
-        return cls(stage.name, chosen, wanted, owners, tuple(typed))
+        """Return a maker for ``options`` of a command; those of the running one have ``owners``."""
+        flags = {name: f"--{name.replace('_', '-')}" if name in options else f"--set {name}" for name in owners}
+        typed = {
+            name: flags[name]
+            for name in wanted
+            if name in owners and is_on_command_line(name if name in options else "set")
+        }
+        chosen = (options.get(stage.kind) if stage.kind else "") or ""
+        return cls(stage.name, chosen, options.get("profile") or "", wanted, typed, dict(owners))
 
-    def __call__(self, name: str) -> Transform:
-        """Make the transform of this name; for "" the one that the user chose, or the default one."""
-        stage, context = STAGES[self.stage], RUNNING.get()
-        options = {**self.given, "quiet": context is None or context.params.get("quiet")}
-        if name and stage.kind:
-            options[stage.kind] = name
-        return make_transform(stage, options, self.wanted, self.owners, self.typed)
+    def __call__(self, name: str = "") -> Transform:
+        """Make the transform of this name; without one that which the user chose, or the default one.
 
-
-def _chosen(stage: Stage, options: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
-    """Return the name of the chosen transform: from its option, the profile, or an option that implies it; else "".
-
-    Raises McaptrackError if the profile is of another transform.
-    """
-    name = (options.get(stage.kind) if stage.kind else "") or ""
-    if stage.profiles and (profile := options.get("profile")):
-        meant = stage.choice(stage.profiles[profile])
-        if name not in ("", meant):
-            raise McaptrackError(f"the profile {profile} is of the {stage.kind} {meant}, not of {name}")
-        return meant
-    for option, implied in stage.implied.items():
-        if not name and option in wanted:
-            if not options.get("quiet"):
-                say(f"{option} belongs to --{stage.kind} {implied}, which is used; the next release requires that")
-            return implied
-    return name
+        Raises McaptrackError if the profile, or a parameter that was typed, is of another transform.
+        """
+        stage = STAGES[self.stage]
+        name, profile = name or self.chosen, stage.profiles.get(self.profile)
+        if profile is not None:
+            if name not in ("", stage.choice(profile)):
+                of = f"{stage.kind} {stage.choice(profile)}"
+                raise McaptrackError(f"the profile {self.profile} is of the {of}, not of {name}")
+            name = stage.choice(profile)
+        cls = stage.with_part(stage.find(name).cls if name else stage.default, self.wanted.get(stage.parameter))
+        own, hints = options_of(cls), get_type_hints(cls)
+        for option, text in self.typed.items():
+            if option not in own:
+                named = name or self.wanted.get(stage.option) or stage.choice(stage.default())
+                raise McaptrackError(f"{text} is an option of {listed(self.owners[option])}, not of {named}")
+        values = {
+            option: tuple(value) if member_type(hints[option])[1] else value
+            for option, value in self.wanted.items()
+            if option in own
+        }
+        return stage.make(name, **values) if profile is None else replace(profile, **values)
 
 
 def configured(chosen: Mapping[str, str] = MappingProxyType({})) -> dict[str, Transform]:
@@ -205,5 +181,5 @@ def configured(chosen: Mapping[str, str] = MappingProxyType({})) -> dict[str, Tr
         kinds = dict(stage.built_in()) | ({chosen_plugin: stage.find(chosen_plugin).cls} if chosen_plugin else {})
         wanted |= values_set(stage.name, wanted.pop("set", None), kinds)
         if wanted.keys() & {*own, stage.option, "profile"}:
-            out[stage.name] = make_transform(stage, settings, wanted)
+            out[stage.name] = Maker.of(stage, settings, wanted)()
     return out

@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 import typer
 from typer.core import TyperCommand
 
+from mcaptrack.api.declared import Parameter
 from mcaptrack.cli.flags import RUNNING
 from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, gather
 from mcaptrack.cli.text import log_format, refuse_usage, say
@@ -90,19 +91,6 @@ LAST_PANELS: Final = ("Input and output", "Many logs", "Options of all commands"
 #: The option that shows all options; ``--help`` shows those that most people need.
 ALL: Final = "--help-all"
 
-#: The options of a command that come first, in order, by the names of its parameters. Commands with few have none.
-MOST_USED: Final[Mapping[str, tuple[str, ...]]] = {
-    "run": ("output", "topic", "camera", "detector", "tracker", "retracker", "predictor", "zones", "force"),
-    "events": ("topic", "similarity", "gate_m", "output", "force"),
-    "fuse": ("to", "cameras", "clock_offset_s", "min_score", "output", "force"),
-    "calibrate": ("reference", "cameras", "dry_run", "clock_offset_s", "output", "force"),
-    "zones": ("zones", "topic", "camera", "output", "force"),
-    "evaluate": ("truth", "topic", "similarity", "gate_m", "rules", "fail_under", "csv", "output", "force"),
-    "export": ("form", "topic", "output", "force"),
-    "query": ("file", "form", "rows", "tables", "output", "force"),
-    "tune": ("truth", "stage", "tracker", "metric", "trials", "search", "topic", "output", "force"),
-    "train": ("recipe", "epochs", "device", "validate", "topic", "output", "force"),
-}
 #: The heading of a theme that not all detectors, trackers or predictors have: the names of those that have it.
 _THOSE: Final = re.compile(r"\((.+)\)$|^Options of (.+)$")
 
@@ -130,19 +118,16 @@ def arrange(first: Sequence[str], parameters: list[Any]) -> None:
 
 
 class Command(TyperCommand):
-    """A command. ``settings`` has its options by name.
-
-    A command that ``reads`` changes no file except the one that -o names.
-    """
-
-    reads: ClassVar = False
+    """A command. ``settings`` has its options by name."""
 
     def __init__(self, name: str, **arguments: Any) -> None:
         super().__init__(name, **arguments)
-        self.settings = declared_settings(name, arguments["callback"], self.params)
-        self.most_used: tuple[str, ...] = getattr(arguments["callback"], "most_used", ()) or MOST_USED.get(name, ())
+        function = arguments["callback"]
+        self.parameters: tuple[Parameter, ...] = function.parameters
+        self.settings = declared_settings(name, self.parameters)
+        self.most_used: tuple[str, ...] = function.most_used
+        self.settable: tuple[str, ...] = function.settable
         arrange(self.most_used, self.params)
-        self.settable: tuple[str, ...] = getattr(arguments["callback"], "settable", ())
         self._is_short = False
         self._help_all: Any = None
         parameters: dict[str, Any] = {parameter.name or "": parameter for parameter in self.params}
@@ -253,12 +238,6 @@ def _values_of(args: Sequence[str], option: str) -> Iterator[str]:
             yield "".join(args[number + 1 : number + 2])
         elif word.startswith(f"{option}="):
             yield word.partition("=")[2]
-
-
-class Reading(Command):
-    """A command that changes no file except the one that -o names."""
-
-    reads: ClassVar = True
 
 
 _DEFAULT: Final = 3

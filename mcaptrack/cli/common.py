@@ -6,7 +6,6 @@ import inspect
 import io
 import json
 import logging
-import math
 import re
 import sys
 import traceback
@@ -17,20 +16,18 @@ from dataclasses import dataclass, field
 from functools import partial, wraps
 from pathlib import Path
 from time import monotonic
-from typing import Annotated, Any, Final, Literal, NamedTuple, ParamSpec, get_type_hints
+from typing import Any, Final, NamedTuple, ParamSpec
 
 import typer
 
 from mcaptrack import SCHEMA_VERSION, notices
-from mcaptrack.cli.command import LAST_PANELS, check_ranges, is_on_command_line, read_config
+from mcaptrack.cli.command import check_ranges, is_on_command_line
 from mcaptrack.cli.flags import with_flags
-from mcaptrack.cli.settings import Declared
 from mcaptrack.cli.text import Level, is_json, say
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish_bytes, refuse_overwrite, refuse_special, refuse_url
 from mcaptrack.location import Location, is_remote, parse
 from mcaptrack.notices import Notice
-from mcaptrack.ranges import limits
 from mcaptrack.streams import LostOutputError
 
 P = ParamSpec("P")
@@ -58,89 +55,10 @@ _UNUSED: Final = re.compile(r"`(\w+)=` ")
 #: The warnings of the running command, and its inputs.
 _WARNED: Final[ContextVar[list[Notice]]] = ContextVar("warned")
 _BATCH: Final[ContextVar[_Batch]] = ContextVar("batch")
-#: Headings of options in the help: input and output, many logs, and options of all commands.
-FILES, MANY, COMMON = LAST_PANELS
-
 #: Seconds between two lines about progress, with ``--log-format json``.
 PROGRESS_S: Final = 5.0
 
 DONE, REFUSED, LOST, GATE_MISSED = 0, 1, 3, 4
-
-
-def option(
-    *names: str,
-    panel: str = "",
-    tuning: bool | str = False,
-    least: float = -math.inf,
-    most: float = math.inf,
-    **settings: Any,
-) -> Any:
-    """Return a Typer option below the heading ``panel``; ``Declared`` explains the other parameters.
-
-    The help names the range. Options of ``COMMON`` and of ``FILES`` show no defaults, and none shows its environment
-    variable.
-    """
-    if range_text := limits(least, most):
-        settings["help"] += f" {range_text[0].upper()}{range_text[1:]}."
-    if panel:
-        settings["rich_help_panel"] = panel
-    if panel in (COMMON, FILES):
-        settings.setdefault("show_default", False)
-    info: Any = typer.Option(*names, show_envvar=False, **settings)
-    info.declared = Declared(tuning, least, most)
-    return info
-
-
-def output(shown: str | bool = False) -> Any:
-    """Return the option --output; ``shown`` is its default in the help."""
-    text = "Write to this file; the input stays unchanged."
-    return option("--output", "-o", panel=FILES, help=text, show_default=shown)
-
-
-Output = Annotated[Path | None, output()]
-Printed = Annotated[Path | None, option("--output", "-o", panel=FILES, help="Write to this file instead of stdout.")]
-Sidecar = Annotated[
-    bool | None,
-    option(
-        "--sidecar/--in-place",
-        panel=FILES,
-        help="Write results to LOG.results.mcap from now on, so that LOG stays unchanged (--sidecar), or into LOG "
-        "(--in-place; as ROS messages if it is a recording of ROS 2).",
-        show_default="sidecar for recordings that ROS tools read, otherwise in place",
-    ),
-]
-Force = Annotated[bool, option("--force", panel=FILES, help="Overwrite the output file if it exists.")]
-Json = Annotated[bool, option("--json", panel=COMMON, help="Print JSON for programs.")]
-Quiet = Annotated[bool, option("--quiet", "-q", panel=COMMON, help="Say nothing but errors and warnings.")]
-Verbose = Annotated[
-    bool, option("--verbose", "-v", panel=COMMON, help="Print more, such as where each option was set.")
-]
-Config = Annotated[
-    Path | None,
-    option(
-        "--config",
-        panel=COMMON,
-        help="Read options from this file, instead of mcaptrack.toml in the working folder (tuning only) and in your "
-        "config folder.",
-        is_eager=True,
-        callback=read_config,
-    ),
-]
-LogFormat = Annotated[
-    Literal["text", "json"],
-    option(
-        "--log-format",
-        panel=COMMON,
-        help="Print notes, progress and errors as lines of text, or as objects of JSON with their times.",
-    ),
-]
-Camera = Annotated[str | None, option("--camera", panel=FILES, help="Which camera, if the log has several.")]
-Logs = Annotated[
-    list[Path],
-    typer.Argument(
-        metavar="LOG", help="Logs, folders of logs, patterns, or - for a list of logs on stdin.", show_default=False
-    ),
-]
 
 
 class Talk:
@@ -276,14 +194,10 @@ def only_one_output(paths: Sequence[Location], output: Path | None) -> None:
 
 
 def one_line(command: Callable[P, None]) -> Callable[P, None]:
-    """Wrap a command: print a McaptrackError as one line, exit with 1; print warnings, and keep them for the JSON.
-
-    Adds the option ``--log-format``, which ``Command`` puts into effect.
-    """
+    """Wrap a command: print a McaptrackError as one line, exit with 1; print warnings, and keep them for the JSON."""
 
     @wraps(command)
     def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
-        kwargs.pop("log_format", None)  # the command line has set it
         _WARNED.set([])
         batch = _Batch()
         _BATCH.set(batch)
@@ -310,20 +224,7 @@ def one_line(command: Callable[P, None]) -> Callable[P, None]:
         if batch.failed or batch.is_early:
             raise typer.Exit(LOST)
 
-    hints = hints_of(command)
-    own = [
-        parameter.replace(annotation=hints[name]) for name, parameter in inspect.signature(command).parameters.items()
-    ]
-    added = inspect.Parameter("log_format", inspect.Parameter.KEYWORD_ONLY, default="text", annotation=LogFormat)
-    guarded.__signature__ = inspect.Signature([*own, added])  # type: ignore[attr-defined]
-    guarded.__annotations__ = {**hints, added.name: LogFormat}
     return guarded
-
-
-def hints_of(command: Callable[..., Any]) -> dict[str, Any]:
-    """Return the annotations of a command; those that are text become types."""
-    hints = dict(getattr(command, "__annotations__", {}))
-    return get_type_hints(command, include_extras=True) if any(isinstance(h, str) for h in hints.values()) else hints
 
 
 def tried(inputs: int) -> None:

@@ -1,148 +1,214 @@
-"""Commands of declared functions (``api.declared``): their options, their help, and calls on each of many logs."""
+"""Commands of declared functions (``api.declared``): a class for each command says what it prints.
+
+``Once`` calls the function once, ``many.EachLog`` with each of many. ``command`` makes the function that Typer takes.
+"""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar
+from collections.abc import Callable, Iterable, Mapping
+from importlib import import_module
+from typing import Annotated, Any, ClassVar, Final, Generic, Literal, TypeVar, get_type_hints
 
 import typer
 
 import mcaptrack
-from mcaptrack.api.declared import Parameter, one_of_many, options_of, with_dashes, words_of
+from mcaptrack import _MODULES
+from mcaptrack.api.declared import (
+    Argument,
+    OneOfMany,
+    Option,
+    Parameter,
+    arguments_of,
+    bare,
+    hints_of,
+    on_command_line,
+    options_of,
+    parameter_of,
+    with_dashes,
+    words_of,
+)
+from mcaptrack.api.options import FILES, Force, PathLike
 from mcaptrack.cli import common
-from mcaptrack.cli.many import LogWork, process, takes_many
-from mcaptrack.location import Location
-
-if TYPE_CHECKING:
-    from mcaptrack.fleet import NamedLog
+from mcaptrack.cli.command import LAST_PANELS, read_config
+from mcaptrack.cli.text import stdout_to_stderr
+from mcaptrack.ranges import limits
 
 T = TypeVar("T")
-_OF_ALL: dict[str, Any] = {"json": common.Json, "quiet": common.Quiet, "verbose": common.Verbose}
+#: Heading of the options of all commands.
+COMMON: Final = LAST_PANELS[-1]
+_CONFIG = "Read options from this file, not mcaptrack.toml in the working folder (tuning only) and your config folder."
+_LOG_FORMAT = "Print notes, progress and errors as lines of text, or as objects of JSON with their times."
 
 
-class EachLog(Generic[T]):
-    """A command that calls its function with each log: how it prints what this returns.
+class OfAll:
+    """The options of all commands."""
+
+    json: Annotated[bool, Option(COMMON, help="Print JSON for programs.")] = False
+    quiet: Annotated[bool, Option(COMMON, short="q", help="Say nothing but errors and warnings.")] = False
+    verbose: Annotated[bool, Option(COMMON, short="v", help="Print more, such as where each option was set.")] = False
+    config: Annotated[PathLike | None, Option(COMMON, help=_CONFIG)] = None
+    log_format: Annotated[Literal["text", "json"], Option(COMMON, help=_LOG_FORMAT)] = "text"
+
+
+class Printed:
+    """Options of commands that print their results to stdout: the file to write them to."""
+
+    output: Annotated[PathLike | None, Option(FILES, short="o", help="Write to this file instead of stdout.")] = None
+    force: Force = False
+
+
+class Called(Generic[T]):
+    """A command that calls its function: how options become arguments, and how it prints what this returns.
 
     ``given`` has the options of the call. Subclasses override what differs.
     """
 
-    #: As in ``LogWork``.
-    names_output = False
+    #: A class with the options that the function has no use for, as attributes.
+    More: ClassVar[type] = object
+    #: The options that come first in the help, if there are any of these among them.
+    most_used: ClassVar[tuple[str, ...]] = ()
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        self.given = values
+    def __init__(self, name: str, values: Mapping[str, Any]) -> None:
+        self.name, self.given = name, values
+
+    @classmethod
+    def declaration(cls, name: str) -> Callable[..., T]:
+        """Return the function that declares the command: that of its name in the library."""
+        function: Callable[..., T] = getattr(import_module(_MODULES[name]), name)
+        return function
+
+    @property
+    def function(self) -> Callable[..., T]:
+        """The function that is called. It is looked up when the command runs, because another one may stand for it."""
+        function: Callable[..., T]
+        function = getattr(mcaptrack, self.name) if self.name in _MODULES else self.declaration(self.name)
+        return function
+
+    @classmethod
+    def options(cls) -> list[Parameter]:
+        """Return the options that the function has no use for."""
+        return parameters_of(cls.More)
 
     @classmethod
     def function_of(cls, name: str) -> Callable[..., None]:
         """Return the function of the command: with its options as Typer takes them."""
-        declared = getattr(mcaptrack, name)
-        names = [option.name for option in options_of(declared) if option.name != "output"]
+        declared = cls.declaration(name)
+        names = {option.name: option.name for option in options_of(declared)}
+        placed = arguments_of(declared).items()
+        names |= {parameter: about.name for parameter, about in placed if not isinstance(about, OneOfMany)}
+        return command(name, declared, lambda given: cls(name, given).run(names), cls.options(), cls.most_used)
 
-        def run(values: Mapping[str, Any]) -> None:
-            cls(values)._run(name, names)
-
-        return command(name, declared, run)
-
-    def logs(self) -> Sequence[NamedLog]:
-        """Return the inputs."""
-        from mcaptrack.fleet import find_logs
-
-        return find_logs(self.given["logs"])
-
-    def arguments(self, names: Sequence[str]) -> dict[str, Any]:
-        """Return the arguments of the function, of these names."""
-        return {name: self.given[name] for name in names}
-
-    def suffix(self) -> str:
-        """Return the end of the names of outputs in ``--output-dir``."""
-        return ".mcap"
-
-    def line(self, done: T) -> str:
-        """Return a result as a line of text."""
-        raise NotImplementedError
+    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
+        """Return the arguments of the function; ``names`` has the name on the command line of each."""
+        return {parameter: self.given[name] for parameter, name in names.items()}
 
     def data(self, done: T) -> dict[str, Any]:
         """Return a result as values of JSON."""
         raise NotImplementedError
 
-    def show(self, log: Location, done: T, talk: common.Talk) -> None:
-        """Print the result of one log alone."""
-        talk.say(f"{log}: {self.line(done)}")
+    def run(self, names: Mapping[str, str]) -> None:
+        """Call the function with its ``arguments``, and print what it returns."""
+        raise NotImplementedError
 
-    def code(self, results: Sequence[T]) -> int:
+
+class Once(Called[T]):
+    """A command that calls its function once."""
+
+    def show(self, done: T, talk: common.Talk) -> None:
+        """Print the result for people."""
+        raise NotImplementedError
+
+    def code(self, done: T) -> int:
         """Return the exit code."""
         return common.DONE
 
-    def _run(self, name: str, names: Sequence[str]) -> None:
-        values = self.given
-        with common.Talk(values["quiet"], values["verbose"]).open() as talk:
-            logs, arguments = self.logs(), self.arguments(names)
-            work: LogWork[T] = LogWork(
-                name,
-                getattr(mcaptrack, name),
-                arguments,
-                show=lambda log, done: self.show(log, done, talk),
-                data=self.data,
-                line=self.line,
-                suffix=self.suffix(),
-                names_output=self.names_output,
-            )
-            results, totals = process(logs, work, talk, values["output"])
-        if values["json"]:
-            common.print_json({"results": [self.data(result) for result in results], **totals})
-        if code := self.code(results):
+    def run(self, names: Mapping[str, str]) -> None:
+        """Call the function with its ``arguments``, and print what it returns."""
+        with common.Talk(self.given["quiet"], self.given["verbose"]).open() as talk:
+            arguments = self.arguments(names)
+            with stdout_to_stderr():
+                done = common.with_progress(self.function, talk.progress)(**arguments)
+            self.print(done, talk)
+        if code := self.code(done):
             raise typer.Exit(code)
+
+    def print(self, done: T, talk: common.Talk) -> None:
+        """Print the result: for people, or as JSON."""
+        if self.given["json"]:
+            common.print_json(self.data(done))
+        else:
+            self.show(done, talk)
 
 
 def command(
     name: str,
     declared: Callable[..., Any],
     run: Callable[[Mapping[str, Any]], None],
-    more: Mapping[str, Any] | None = None,
+    more: Iterable[Parameter],
+    most_used: tuple[str, ...] = (),
 ) -> Callable[..., None]:
     """Return the function of a command, with the signature of a declared function as Typer takes it.
 
-    ``more`` are options in the place of ``**options``. ``run`` gets the values of all.
+    ``more`` are options that the function lacks. ``run`` gets the values of all.
     """
-    annotations: dict[str, tuple[Any, Any]] = {}
-    if each := one_of_many(declared):
-        argument = typer.Argument(metavar=each.metavar, help=each.help, show_default=False)
-        annotations[each.name] = Annotated[list[Path], argument], inspect.Parameter.empty
-    annotations |= {parameter.name: (annotation_of(parameter), parameter.default) for parameter in options_of(declared)}
-    annotations |= dict(more or {})
-    annotations |= {option: (hint, False) for option, hint in _OF_ALL.items()} | {"config": (common.Config, None)}
+    hints, signature = hints_of(declared), inspect.signature(declared).parameters
+    parameters = {option.name: option for option in (*options_of(declared), *more, *parameters_of(OfAll))}
+    annotations = {
+        about.name: argument_annotation(about, hints[parameter], signature[parameter].default)
+        for parameter, about in arguments_of(declared).items()
+    } | {option.name: (annotation_of(option), option.default) for option in parameters.values()}
 
     def call(**values: Any) -> None:
         run(values)
 
     keyword = inspect.Parameter.KEYWORD_ONLY
-    call.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+    function: Any = common.one_line(call)
+    function.__signature__ = inspect.Signature(
         [inspect.Parameter(n, keyword, default=default, annotation=hint) for n, (hint, default) in annotations.items()]
     )
-    call.__name__, call.__annotations__ = name, {n: hint for n, (hint, _) in annotations.items()}
-    function: Any = common.one_line(takes_many()(call) if each else call)
-    function.settable = ()
-    function.help, function.most_used = help_of(declared), getattr(declared, "most_used", ())
+    function.__name__, function.__annotations__ = name, {n: hint for n, (hint, _) in annotations.items()}
+    function.parameters, function.settable = tuple(parameters.values()), ()
+    function.help, function.most_used = help_of(declared), most_used or getattr(declared, "most_used", ())
     return function  # type: ignore[no-any-return]
 
 
+def parameters_of(options: type) -> list[Parameter]:
+    """Return the options that the attributes of a class declare."""
+    hints = get_type_hints(options, include_extras=True)
+    return [parameter_of(name, hint, getattr(options, name)) for name, hint in hints.items()]
+
+
+def argument_annotation(about: Argument, hint: Any, default: Any) -> tuple[Any, Any]:
+    """Return the annotation and the default of an argument, as Typer takes them; ``hint`` is its type in Python."""
+    kind, many = (str, True) if about.words else on_command_line(bare(hint))
+    many = many or (isinstance(about, OneOfMany) and not about.is_one)
+    is_needed = default is inspect.Parameter.empty and not about.words
+    kind = list[kind] if many else kind  # type: ignore[valid-type]
+    argument = typer.Argument(metavar=about.metavar, help=about.text, show_default=about.shown)
+    return Annotated[kind if is_needed else kind | None, argument], default if is_needed else None
+
+
 def annotation_of(parameter: Parameter) -> Any:
-    """Return the annotation of an option, as Typer takes it."""
-    about = parameter.option
-    settings: dict[str, Any] = {"help": parameter.help, "metavar": about.metavar}
-    if parameter.shown is not None:
-        settings["show_default"] = parameter.shown
-    if about.names is not None:
-        settings["autocompletion"] = about.names
-    info = common.option(
+    """Return the annotation of an option, as Typer takes it. The help names the range.
+
+    Options of all commands, and of input and output, show no defaults unless they are declared to.
+    """
+    about, text = parameter.option, parameter.help
+    if ends := limits(about.least, about.most):
+        text += f" {ends[0].upper()}{ends[1:]}."
+    shown = about.panel not in (COMMON, FILES) if parameter.shown is None else parameter.shown
+    info = typer.Option(
         *parameter.flags,
-        panel=about.panel,
-        tuning=about.tuning,
-        least=about.least,
-        most=about.most,
-        **settings,
+        help=text,
+        metavar=about.metavar,
+        show_default=shown,
+        show_envvar=False,
+        rich_help_panel=about.panel or None,
+        case_sensitive=False,
+        autocompletion=about.names,
+        is_eager=parameter.name == "config",  # the file has the defaults of the others
+        callback=read_config if parameter.name == "config" else None,
     )
     kind: Any = list[parameter.kind] if parameter.many else parameter.kind  # type: ignore[name-defined]
     return Annotated[kind | None if parameter.default is None else kind, info]

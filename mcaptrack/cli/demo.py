@@ -1,4 +1,4 @@
-"""``mcaptrack demo``: run everything on a synthetic scene."""
+"""``mcaptrack demo``: what it prints."""
 
 from __future__ import annotations
 
@@ -7,67 +7,42 @@ from importlib.util import find_spec
 from pathlib import Path
 from shlex import quote
 from shutil import which
-from typing import Annotated, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.cli import common
+from mcaptrack.cli.declared import Once
 from mcaptrack.cli.text import show
 
-_LICHTBLICK: Final = "lichtblick-suite.github.io/lichtblick"
+if TYPE_CHECKING:
+    from mcaptrack import DemoResult
+
+_OPEN_IN: Final = "in Foxglove, or in Lichtblick (https://lichtblick-suite.github.io/lichtblick)"
 
 
-@common.one_line
-def demo(
-    output: Annotated[
-        Path, common.option("--output", "-o", panel=common.FILES, help="Folder for all files.", show_default=True)
-    ] = Path("mcaptrack-demo"),
-    scene: Annotated[
-        Literal["square", "walkers", "crowd", "side-by-side", "standing", "three-cameras"],
-        common.option(
-            "--scene",
-            help="Scene to draw: people who cross, meet and part on a square; 10 walkers or a crowd of 20 on random "
-            "routes; three pairs side by side; people who stand still for a while; 8 walkers seen by three cameras.",
-        ),
-    ] = "square",
-    seed: Annotated[
-        int,
-        common.option("--seed", least=0, most=2**31 - 1, help="Random seed of the noise, the shaking and the routes."),
-    ] = 2,
-    force: common.Force = False,
-    json: common.Json = False,
-    quiet: common.Quiet = False,
-    verbose: common.Verbose = False,
-    config: common.Config = None,
-) -> None:
-    """Draw a scene with known ground truth, run everything on it, and compare SORT with re-tracking.
+class Demo(Once["DemoResult"]):
+    """Run everything on a synthetic scene."""
 
-    The scene has what makes tracking fail: people who cross, meet and part, occlusion behind a kiosk, a tree that
-    sways, a camera that shakes a little. Writes a video, a log, tables and layouts. Scores of one seed are a random
-    sample, so the mean and the range over ten seeds of each scene are printed, too.
+    def data(self, done: DemoResult) -> dict[str, Any]:
+        """Return the scores as values of JSON."""
+        return {"scene": self.given["scene"], "seed": self.given["seed"], "results": done.scores.rows()}
 
-    Example: mcaptrack demo --scene crowd --seed 7 -o crowd
-    """
-    import mcaptrack
-
-    with common.Talk(quiet, verbose).open() as talk:
-        result = mcaptrack.demo(output, scene=scene, seed=seed, force=force, progress=talk.progress)
-    sort, retracked = result.scores.rows()
-    if json:
-        common.print_json({"scene": scene, "seed": seed, "results": [sort, retracked]})
-        return
-    show(
-        *_side_by_side(sort, retracked, "tracker" if result.truth.suffix == ".csv" else "SORT"),
-        "",
-        *_over_seeds(scene, seed),
-        "",
-        f"video    {result.video}",
-        f"log      {result.log}",
-        f"layouts  {'  '.join(str(path) for path in result.layouts)}",
-        f"tables   {result.tables}",
-        "",
-        f"Open the log in Foxglove, or in Lichtblick (https://{_LICHTBLICK}): open local file, then import a layout.",
-        "See more:",
-        *(f"  {line}" for line in _next_commands(result.log)),
-    )
+    def show(self, done: DemoResult, talk: common.Talk) -> None:
+        """Print the scores, the files, and commands to try next."""
+        sort, retracked = done.scores.rows()
+        show(
+            *_side_by_side(sort, retracked, "tracker" if done.truth.suffix == ".csv" else "SORT"),
+            "",
+            *_over_seeds(self.given["scene"], self.given["seed"]),
+            "",
+            f"video    {done.video}",
+            f"log      {done.log}",
+            f"layouts  {'  '.join(str(path) for path in done.layouts)}",
+            f"tables   {done.tables}",
+            "",
+            f"Open the log {_OPEN_IN}: open local file, then import a layout.",
+            "See more:",
+            *(f"  {line}" for line in _next_commands(done.log)),
+        )
 
 
 def _next_commands(target: Path) -> list[str]:

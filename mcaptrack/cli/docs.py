@@ -3,75 +3,104 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-import typer
-
+from mcaptrack.api.declared import Argument, declared
 from mcaptrack.cli import common
+from mcaptrack.cli.declared import Once, Printed
 from mcaptrack.cli.generated import PARTS, with_parts
 from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError
 
+Pages = dict[str, Path]
 
-@common.one_line
-def docs(
-    page: Annotated[
-        str | None, typer.Argument(metavar="[PAGE]", help="The page to print.", show_default="a list of the pages")
-    ] = None,
-    output: common.Printed = None,
-    force: common.Force = False,
-    json: common.Json = False,
-    quiet: common.Quiet = False,
-    verbose: common.Verbose = False,
-    config: common.Config = None,
-) -> None:
+
+@declared()
+def documentation(
+    page: Annotated[str | None, Argument("page", "PAGE", "The page to print.", shown="a list of the pages")] = None,
+) -> Pages:
     """List the pages of the documentation, or print one.
 
     The pages are installed with mcaptrack and describe its version. A pipe or a file gets their Markdown.
 
-    Example: mcaptrack docs
+    Parameters
+    ----------
+    page : str, optional
+        The page.
 
-    Example: mcaptrack docs tables
+    Returns
+    -------
+    dict of str to pathlib.Path
+        The pages by name: those in the installed package, or those beside it in a checkout; or one of them.
+
+    Raises
+    ------
+    McaptrackError
+        If there is no such page.
+
+    Examples
+    --------
+    On the command line:
+
+        mcaptrack docs
+
+        mcaptrack docs tables
     """
-    pages = documentation()
+    package = Path(__file__).resolve().parent.parent
+    inside = package / "docs"
+    beside = [path for path in package.parent.glob("*.md") if path.stem in ("README", "CHANGELOG")]
+    shown = inside.glob("*.md") if inside.is_dir() else [*beside, *(package.parent / "docs").glob("*.md")]
+    paths = sorted(shown, key=lambda path: (path.stem != "README", path.stem.lower()))
+    pages = {path.stem.lower(): path for path in paths}
     if page is None:
-        titles = {name: _title(path) for name, path in pages.items()}
-        with common.printed_to(output, force):
-            if json:
-                common.print_json({"pages": [{"name": name, "title": title} for name, title in titles.items()]})
-            else:
-                width = max(map(len, titles)) + 2
-                show(*(f"{name:<{width}}{title}" for name, title in titles.items()))
-        return
+        return pages
     name = Path(page).name.lower().removesuffix(".md")
     if name not in pages:
         near = get_close_matches(name, pages, 1)
-        raise McaptrackError(
-            f"there is no page {page}; {f'did you mean {near[0]}? ' if near else ''}There are {', '.join(pages)}"
-        )
-    text = with_parts(pages[name].read_text(encoding="utf-8"), PARTS)
-    with common.printed_to(output, force):
-        if json:
-            common.print_json({"name": name, "title": _title(pages[name]), "text": text})
-        elif output is None and sys.stdout.isatty():
+        meant = f"did you mean {near[0]}? " if near else ""
+        raise McaptrackError(f"there is no page {page}; {meant}There are {', '.join(pages)}")
+    return {name: pages[name]}
+
+
+class Docs(Once[Pages]):
+    """List the pages, or print one."""
+
+    More = Printed
+
+    @classmethod
+    def declaration(cls, name: str) -> Callable[..., Pages]:
+        """Return the function that declares the command."""
+        return documentation
+
+    def print(self, done: Pages, talk: common.Talk) -> None:
+        """Print the list, or the page."""
+        with common.printed_to(self.given["output"], self.given["force"]):
+            super().print(done, talk)
+
+    def data(self, done: Pages) -> dict[str, Any]:
+        """Return the list, or the page, as values of JSON."""
+        titles = [{"name": name, "title": _title(path)} for name, path in done.items()]
+        return {"pages": titles} if self.given["page"] is None else {**titles[0], "text": _text(done)}
+
+    def show(self, done: Pages, talk: common.Talk) -> None:
+        """Print the list; or the page, on a terminal with its headings and tables."""
+        if self.given["page"] is None:
+            width = max(map(len, done)) + 2
+            show(*(f"{name:<{width}}{_title(path)}" for name, path in done.items()))
+        elif self.given["output"] is None and sys.stdout.isatty():
             from rich.markdown import Markdown
 
-            console().print(Markdown(text))
+            console().print(Markdown(_text(done)))
         else:
-            show(*text.splitlines())
+            show(*_text(done).splitlines())
 
 
-def documentation() -> dict[str, Path]:
-    """Return the pages by name: those in the installed package, or those beside it in a checkout."""
-    package = Path(__file__).resolve().parent.parent
-    inside = package / "docs"
-    pages = [path for path in package.parent.glob("*.md") if path.stem in ("README", "CHANGELOG")]
-    shown = inside.glob("*.md") if inside.is_dir() else [*pages, *(package.parent / "docs").glob("*.md")]
-    return {
-        path.stem.lower(): path for path in sorted(shown, key=lambda path: (path.stem != "README", path.stem.lower()))
-    }
+def _text(done: Pages) -> str:
+    (path,) = done.values()
+    return with_parts(path.read_text(encoding="utf-8"), PARTS)
 
 
 def _title(path: Path) -> str:

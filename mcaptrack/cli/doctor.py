@@ -1,55 +1,40 @@
-"""``mcaptrack doctor``: print what this installation has and lacks, and what may be done with a store."""
+"""``mcaptrack doctor``: what it prints."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated
+from typing import TYPE_CHECKING, Any
 
-import typer
-
-import mcaptrack
 from mcaptrack.cli import common
-from mcaptrack.cli.text import say, show, stdout_to_stderr
+from mcaptrack.cli.declared import Once
+from mcaptrack.cli.text import say, show
+
+if TYPE_CHECKING:
+    from mcaptrack import DoctorResult
 
 
-@common.one_line
-def doctor(
-    store: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="STORE", help="A bucket or prefix to try, such as s3://robots/night.", show_default=False
-        ),
-    ] = None,
-    json: common.Json = False,
-    quiet: common.Quiet = False,
-    verbose: common.Verbose = False,
-    config: common.Config = None,
-) -> None:
-    """Print what this installation has: versions, codecs, memory, folders, plug-ins, and what may be done with a store.
+class Doctor(Once["DoctorResult"]):
+    """Print what this installation has and lacks, and what may be done with a store."""
 
-    The network is used for a store only: objects are listed there, and a small hidden one is written, read, replaced
-    and removed. The exit code is 0 if all that a plain run needs is there, and 1 otherwise, with one line for each
-    fault.
+    def data(self, done: DoctorResult) -> dict[str, Any]:
+        """Return what there is as values of JSON."""
+        return done.to_json()
 
-    Example: mcaptrack doctor
+    def show(self, done: DoctorResult, talk: common.Talk) -> None:
+        """Print a line for each thing that is there, or lacking."""
+        if not self.given["quiet"]:
+            lines = list(_lines(done, self.given["verbose"]))
+            width = max(len(name) for name, _ in lines)
+            show(*(f"{name:<{width}}  {value}" for name, value in lines))
 
-    Example: mcaptrack doctor s3://robots/night
-    """
-    with stdout_to_stderr():
-        result = mcaptrack.doctor(store)
-    if json:
-        common.print_json(result.to_json())
-    elif not quiet:
-        lines = list(_lines(result, verbose))
-        width = max(len(name) for name, _ in lines)
-        show(*(f"{name:<{width}}  {value}" for name, value in lines))
-    for fault in result.faults:
-        say(fault, "error")
-    if result.faults:
-        raise typer.Exit(common.REFUSED)
+    def code(self, done: DoctorResult) -> int:
+        """Print the faults; return the exit code."""
+        for fault in done.faults:
+            say(fault, "error")
+        return common.REFUSED if done.faults else common.DONE
 
 
-def _lines(result: mcaptrack.DoctorResult, verbose: bool) -> Iterator[tuple[str, str]]:
+def _lines(result: DoctorResult, verbose: bool) -> Iterator[tuple[str, str]]:
     """Yield the lines of the page: their names and their texts."""
     yield "mcaptrack", result.version
     yield "Python", f"{result.python}, {result.system}"

@@ -1,16 +1,16 @@
-"""``mcaptrack evaluate``: score tracks and predictions against ground truth; print a table, JSON or CSV."""
+"""``mcaptrack evaluate``: print scores as a table, JSON or CSV."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Collection, Mapping
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
-import typer
-
-from mcaptrack.cli import common, labels
+from mcaptrack.api.declared import Option
+from mcaptrack.api.options import FILES, SCORES, PathLike
+from mcaptrack.cli import common
 from mcaptrack.cli.common import expand
+from mcaptrack.cli.declared import Once, Printed
 from mcaptrack.cli.text import console, printable, say
 from mcaptrack.errors import McaptrackError
 
@@ -47,127 +47,56 @@ _OVERLAPS: Final = {"iou": "IoU", "bev-iou": "BEV IoU", "3d-iou": "3D IoU"}
 _NESTED: Final = ("displacement", "class_means")
 
 
-@common.one_line
-def evaluate(
-    inputs: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="LOG|TRACKS", help="Logs, folders of logs, patterns, or files of tracks.", show_default=False
-        ),
-    ],
-    truth: Annotated[
-        list[Path] | None,
-        common.option(
-            "--truth",
-            panel=labels.LABELS,
-            help="Ground truth for files of tracks: one file for each, matched by name or in order.",
-            show_default=False,
-        ),
-    ] = None,
-    similarity: Annotated[
-        labels.SimilarityName | None, labels.similarity("both, as far as there are boxes and metres")
-    ] = None,
-    gate_m: Annotated[str, labels.gate_m(tuning=r"[0-9.eE+, -]+")] = "0.5,1,2",
-    min_iou: Annotated[float, labels.min_iou()] = 0.5,
-    rules: Annotated[
-        Literal["trackeval", "motmetrics"],
-        common.option("--rules", panel=labels.SCORES, tuning=True, help="Rules for counting switches and fragments."),
-    ] = "trackeval",
-    smoothed: Annotated[
-        bool,
-        common.option(
-            "--smoothed",
-            panel=labels.SCORES,
-            tuning=True,
-            help="Of logs: score predictions from smoothed samples, too (SORT + smoothing).",
-        ),
-    ] = False,
-    topic: Annotated[
-        list[str] | None,
-        common.option(
-            "--topic",
-            panel=labels.SCORES,
-            help="Score these channels.",
-            show_default="tracks, samples, retracks, retracks/online; of 3D boxes retracks/full, too",
-        ),
-    ] = None,
-    classes: Annotated[
-        str | None,
-        common.option(
-            "--classes",
-            panel=labels.LABELS,
-            help="Classes of label files to score, by name or number, as in person,car; all for every one.",
-            show_default="person; 3D boxes: all",
-        ),
-    ] = None,
-    camera: common.Camera = None,
-    ground_plane: labels.GroundPlane = None,
-    point: labels.Point = "foot",
-    fps: labels.LabelFps = None,
-    fail_under: Annotated[
-        list[str] | None,
-        common.option(
-            "--fail-under", panel=labels.SCORES, help="Exit 4 if a score is lower, as in idf1=0.7.", show_default=False
-        ),
-    ] = None,
-    curves: Annotated[
-        Path | None,
-        common.option("--curves", panel=common.FILES, help="Draw the error of predictions over recall as an SVG."),
-    ] = None,
-    csv: Annotated[bool, common.option("--csv", panel=common.FILES, help="Print rows for a spreadsheet.")] = False,
-    output: common.Printed = None,
-    force: common.Force = False,
-    json: common.Json = False,
-    quiet: common.Quiet = False,
-    verbose: common.Verbose = False,
-    config: common.Config = None,
-) -> None:
-    """Score tracks and predictions against ground truth.
+class Evaluate(Once["Scores"]):
+    """Score tracks and predictions against ground truth."""
 
-    Reads /camera/truth and the tracks of a log; or files of tracks, with --truth: MOTChallenge (by the rules of MOT15,
-    or of MOT16 and later where the truth names classes), KITTI tracking, Parquet as `mcaptrack export` writes it, and
-    the label files that `mcaptrack ingest` reads. Distances are on the ground, overlaps are those of boxes.
+    class More(Printed):
+        """Options that the function has no use for."""
 
-    Example: mcaptrack evaluate log.mcap --similarity metres --gate-m 1
+        fail_under: Annotated[
+            Sequence[str] | None, Option(SCORES, shown=False, help="Exit 4 if a score is lower, as in idf1=0.7.")
+        ] = None
+        curves: Annotated[
+            PathLike | None, Option(FILES, help="Draw the error of predictions over recall as an SVG.")
+        ] = None
+        csv: Annotated[bool, Option(FILES, help="Print rows for a spreadsheet.")] = False
 
-    Example: mcaptrack evaluate tracks.txt --truth gt.txt --fail-under idf1=0.7
-    """
-    import mcaptrack
+    most_used = ("truth", "topic", "similarity", "gate_m", "rules", "fail_under", "csv", "output", "force")
 
-    limits = dict(_limit(text) for text in fail_under or ())
-    gates = _gates(gate_m)
-    with common.Talk(quiet, verbose).open() as talk:
-        paths, truths = expand(inputs, folders=True), expand(truth) if truth else None
-        scores = mcaptrack.evaluate(
-            paths,
-            truth=truths,
-            similarity=similarity,
-            gate_m=gates,
-            min_iou=min_iou,
-            rules=rules,
-            smoothed=smoothed,
-            topic=topic,
-            classes=classes,
-            camera=camera,
-            ground_plane=ground_plane,
-            point=point,
-            fps=fps,
-            progress=talk.progress,
-        )
-    if curves is not None:
-        scores.draw_curves(curves, force)
-    with common.printed_to(output, force):
-        if json:
-            common.print_json({"results": scores.rows()})
-        elif csv:
-            _print_csv(scores)
-        else:
-            print_results(scores)
-    missed = scores.below(limits)
-    for line in missed:
-        say(line)
-    if missed:
-        raise typer.Exit(common.GATE_MISSED)
+    def __init__(self, name: str, values: Mapping[str, Any]) -> None:
+        super().__init__(name, values)
+        self._limits = dict(_limit(text) for text in values["fail_under"] or ())
+
+    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
+        """Return the arguments of the function: patterns become files, text becomes gates."""
+        truth = self.given["truth"]
+        return super().arguments(names) | {
+            "gate_m": _gates(self.given["gate_m"]),
+            "tracks": expand(self.given["inputs"], folders=True),
+            "truth": expand(truth) if truth else None,
+        }
+
+    def data(self, done: Scores) -> dict[str, Any]:
+        """Return the scores as values of JSON."""
+        return {"results": done.rows()}
+
+    def print(self, done: Scores, talk: common.Talk) -> None:
+        """Print the scores, or write them to a file, and draw curves."""
+        if self.given["curves"] is not None:
+            done.draw_curves(self.given["curves"], self.given["force"])
+        with common.printed_to(self.given["output"], self.given["force"]):
+            super().print(done, talk)
+
+    def show(self, done: Scores, talk: common.Talk) -> None:
+        """Print a table, or rows of CSV."""
+        (_print_csv if self.given["csv"] else print_results)(done)
+
+    def code(self, done: Scores) -> int:
+        """Return the exit code, and print the scores that are below their limits."""
+        missed = done.below(self._limits)
+        for line in missed:
+            say(line)
+        return common.GATE_MISSED if missed else common.DONE
 
 
 def _gates(text: str) -> tuple[float, ...]:

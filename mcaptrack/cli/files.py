@@ -1,74 +1,58 @@
-"""``mcaptrack check``, ``recover`` and ``drop``: check logs, save damaged ones, and remove channels."""
+"""``mcaptrack check``, ``recover`` and ``drop``: what they print about a log's bytes, and what was saved or removed."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.cli import common
-from mcaptrack.cli.many import LogWork, many_options, process, takes_many
+from mcaptrack.cli.declared import Printed
+from mcaptrack.cli.many import EachLog
 from mcaptrack.cli.text import console, show
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:
     from mcaptrack import DropResult, LogCheck, LogRecovery
+    from mcaptrack.fleet import NamedLog
     from mcaptrack.log import CheckResult
 
-_SHOWN = 20
+#: The most losses of a log that are printed without -v.
+_SHOWN: Final = 20
 #: Ending of the names of logs that were saved.
-_RECOVERED = ".recovered.mcap"
+_RECOVERED: Final = ".recovered.mcap"
 
 
-@common.one_line
-@takes_many(outputs=False)
-def check(
-    logs: common.Logs,
-    output: common.Printed = None,
-    force: common.Force = False,
-    json: common.Json = False,
-    quiet: common.Quiet = False,
-    verbose: common.Verbose = False,
-    config: common.Config = None,
-) -> None:
-    """Check every byte of a log: structure, checksums, indexes, statistics, order of messages.
+class Check(EachLog["LogCheck"]):
+    """Check logs; the findings are printed at the end."""
 
-    The exit code is 1 if there are errors; warnings are about what could be better. `mcaptrack recover` saves what is
-    intact.
+    writes = False
+    More = Printed
 
-    Example: mcaptrack check log.mcap
-    """
-    import mcaptrack
-    from mcaptrack.fleet import find_logs
+    def show(self, log: Location, done: LogCheck, talk: common.Talk) -> None:
+        """Print nothing yet."""
 
-    work: LogWork[LogCheck] = LogWork(
-        "check",
-        mcaptrack.check,
-        {},
-        show=lambda *_: None,
-        data=lambda log_check: {"files": [_as_json(file) for file in log_check.files]},
-        line=_verdict,
-        writes=False,
-    )
-    with common.Talk(quiet, verbose).open() as talk:
-        checks, totals = process(find_logs(logs), work, talk)
-    checked = [file for log_check in checks for file in log_check.files]
-    with common.printed_to(output, force):
-        if json:
-            common.print_json({"results": [_as_json(file) for file in checked], **totals})
-        elif not many_options().json_lines:
-            for file in checked:
-                _print_check(file, quiet)
-    if not all(file.is_sound for file in checked):
-        raise typer.Exit(common.REFUSED)
+    def line(self, done: LogCheck) -> str:
+        """Return the verdict on one of many logs."""
+        errors = sum(finding.level == "error" for finding in done.findings)
+        return "sound" if done.is_sound else f"damaged, {errors} errors"
 
+    def data(self, done: LogCheck) -> dict[str, Any]:
+        """Return the findings in a log and its results as values of JSON."""
+        return {"files": [_as_json(file) for file in done.files]}
 
-def _verdict(checked: LogCheck) -> str:
-    """Return the result of one of many logs in one line; the findings are printed at the end."""
-    if checked.is_sound:
-        return "sound"
-    return f"damaged, {sum(finding.level == 'error' for finding in checked.findings)} errors"
+    def print(self, results: Sequence[LogCheck], totals: Mapping[str, Any]) -> None:
+        """Print the findings in each file."""
+        files = [file for checked in results for file in checked.files]
+        with common.printed_to(self.given["output"], self.given["force"]):
+            if self.given["json"]:
+                common.print_json({"results": [_as_json(file) for file in files], **totals})
+            elif not self.many.json_lines:
+                for file in files:
+                    _print_check(file, self.given["quiet"])
+
+    def code(self, results: Sequence[LogCheck]) -> int:
+        """Return the exit code: 1 if there are errors."""
+        return common.DONE if all(checked.is_sound for checked in results) else common.REFUSED
 
 
 def _as_json(checked: CheckResult) -> dict[str, object]:
@@ -103,102 +87,62 @@ def _print_check(checked: CheckResult, quiet: bool) -> None:
     console().print(table)
 
 
-@common.one_line
-@takes_many()
-def recover(
-    logs: common.Logs,
-    output: Annotated[Path | None, common.output("LOG.recovered.mcap beside the log")] = None,
-    force: common.Force = False,
-    json: common.Json = False,
-    quiet: common.Quiet = False,
-    verbose: common.Verbose = False,
-    config: common.Config = None,
-) -> None:
-    """Save what is intact in a damaged log to LOG.recovered.mcap; the damaged log stays unchanged.
+class Recover(EachLog["LogRecovery"]):
+    """Save what is intact in damaged logs."""
 
-    Every chunk that can be read and has the right checksum is copied, with new indexes. What is lost is printed, and
-    the exit code is then 3.
+    def logs(self) -> Sequence[NamedLog]:
+        """Return the damaged logs: results beside a log are saved by themselves, logs that were saved are left out."""
+        from mcaptrack.fleet import find_logs
 
-    Example: mcaptrack recover broken.mcap -o saved.mcap
-    """
-    import mcaptrack
-    from mcaptrack.fleet import find_logs
+        return find_logs(self.given["logs"], each=True, leave_out=_RECOVERED)
 
-    def show(_: Location, report: LogRecovery) -> None:
-        talk.say(f"{report.output}: {report.messages} messages in {report.chunks} chunks are saved")
-        for loss in report.lost if verbose else report.lost[:_SHOWN]:
+    def suffix(self) -> str:
+        """Return the end of the names of outputs."""
+        return _RECOVERED
+
+    def show(self, log: Location, done: LogRecovery, talk: common.Talk) -> None:
+        """Print what was saved and what was lost."""
+        talk.say(f"{done.output}: {done.messages} messages in {done.chunks} chunks are saved")
+        for loss in done.lost if self.given["verbose"] else done.lost[:_SHOWN]:
             talk.say(f"lost: {loss}")
-        if len(report.lost) > _SHOWN and not verbose:
-            talk.say(f"lost: {len(report.lost) - _SHOWN} more; -v shows them")
-        if not report.lost:
+        if len(done.lost) > _SHOWN and not self.given["verbose"]:
+            talk.say(f"lost: {len(done.lost) - _SHOWN} more; -v shows them")
+        if not done.lost:
             talk.say("nothing was lost")
 
-    def line(report: LogRecovery) -> str:
-        saved = f"{report.messages} messages in {report.chunks} chunks are saved in {report.output}"
-        return f"{saved}; {f'{len(report.lost)} losses' if report.lost else 'nothing was lost'}"
+    def line(self, done: LogRecovery) -> str:
+        """Return what was saved in a line."""
+        saved = f"{done.messages} messages in {done.chunks} chunks are saved in {done.output}"
+        return f"{saved}; {f'{len(done.lost)} losses' if done.lost else 'nothing was lost'}"
 
-    def data(report: LogRecovery) -> dict[str, object]:
-        saved = {"log": str(report.log), "output": str(report.output), "messages": report.messages}
-        return saved | {"chunks": report.chunks, "lost": list(report.lost)}
+    def data(self, done: LogRecovery) -> dict[str, Any]:
+        """Return the result as values of JSON."""
+        saved = {"log": str(done.log), "output": str(done.output), "messages": done.messages}
+        return saved | {"chunks": done.chunks, "lost": list(done.lost)}
 
-    logs_found = find_logs(logs, each=True, leave_out=_RECOVERED)
-    with common.Talk(quiet, verbose).open() as talk:
-        work = LogWork("recover", mcaptrack.recover, {"force": force}, show, data, line, _RECOVERED)
-        reports, totals = process(logs_found, work, talk, output)
-    if json:
-        common.print_json({"results": [data(report) for report in reports], **totals})
-    if any(report.lost for report in reports):
-        raise typer.Exit(common.LOST)
+    def code(self, results: Sequence[LogRecovery]) -> int:
+        """Return the exit code: 3 if anything was lost."""
+        return common.LOST if any(done.lost for done in results) else common.DONE
 
 
-@common.one_line
-@takes_many()
-def drop(
-    path: Annotated[
-        Path,
-        typer.Argument(
-            metavar="LOG", help="A log, a folder of logs, a pattern, or - for a list on stdin.", show_default=False
-        ),
-    ],
-    topics: Annotated[
-        list[str],
-        typer.Argument(metavar="TOPIC", help="Channels to remove, or patterns such as '/camera/*'."),
-    ],
-    output: common.Output = None,
-    in_place: Annotated[
-        bool,
-        common.option(
-            "--in-place", panel=common.FILES, help="Also change a recording in place that ROS tools may have to read."
-        ),
-    ] = False,
-    force: common.Force = False,
-    json: common.Json = False,
-    quiet: common.Quiet = False,
-    verbose: common.Verbose = False,
-    config: common.Config = None,
-) -> None:
-    """Remove channels from a log, in place or in a copy; all others stay unchanged, to the byte.
+class Drop(EachLog["DropResult"]):
+    """Remove channels from logs."""
 
-    Channels that only describe a removed one are removed with it: its `/view/`, `/events`, `/counts`, `/errors` and
-    `/scores`. Results that stand beside the log are part of it, and of a copy.
+    def logs(self) -> Sequence[NamedLog]:
+        """Return the logs: the command takes one name, since those of channels follow."""
+        from mcaptrack.fleet import find_logs
 
-    Example: mcaptrack drop log.mcap /camera/video -o small.mcap
-    """
-    import mcaptrack
-    from mcaptrack.fleet import find_logs
+        return find_logs([self.given["logs"]])
 
-    def line(done: DropResult) -> str:
+    def show(self, log: Location, done: DropResult, talk: common.Talk) -> None:
+        """Print what was removed."""
+        talk.say(f"{done.log}: {self.line(done)}")
+
+    def line(self, done: DropResult) -> str:
+        """Return what was removed in a line."""
         dropped = f"{', '.join(done.dropped)} with {done.messages} messages left out"
         return f"{dropped}; {done.bytes_before} bytes became {done.bytes}"
 
-    def data(done: DropResult) -> dict[str, object]:
+    def data(self, done: DropResult) -> dict[str, Any]:
+        """Return the result as values of JSON."""
         return {"log": str(done.log), "dropped": list(done.dropped), "messages": done.messages, "bytes": done.bytes}
-
-    options = {"topics": topics, "in_place": in_place, "force": force}
-    with common.Talk(quiet, verbose).open() as talk:
-        work = LogWork(
-            "drop", mcaptrack.drop, options, lambda _, done: talk.say(f"{done.log}: {line(done)}"), data, line
-        )
-        results, totals = process(find_logs([path]), work, talk, output)
-    if json:
-        common.print_json({"results": [data(done) for done in results], **totals})

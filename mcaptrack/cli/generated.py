@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import fields
-from typing import Any, get_type_hints
+from typing import get_args
+
+from mcaptrack.api.declared import Parameter, parameter_of
+from mcaptrack.ranges import limits
 
 MARK = re.compile(r"<!-- generated: (\w+) -->")
 _HEAD = "| option | values | default | meaning |\n|---|---|---|---|"
@@ -30,18 +32,20 @@ def environment() -> str:
 
 def stage_options() -> str:
     """All parameters of stages, a table for each implementation with parameters of its own, as Markdown."""
+    from mcaptrack.cli.chosen import has_flag, options_of
+    from mcaptrack.cli.stages import hint_of
     from mcaptrack.transforms import STAGES
 
     sections = []
     for command, stage in STAGES.items():
         listed: set[str] = set()
         for name, kind in stage.built_in().items():
-            default = kind()
-            rows = {
-                field.name: _parameter(default, field) for field in fields(kind) if not field.metadata.get("context")
-            }
-            new_rows = [row for field, row in rows.items() if field not in listed]
-            if not new_rows:
+            rows = [
+                _row(parameter_of(option, hint_of(kind, field), None), "" if has_flag(field) else f"--set {option}=")
+                for option, field in options_of(kind).items()
+                if option not in listed
+            ]
+            if not rows:
                 continue
             heading = f"### {command}"
             if listed:
@@ -49,52 +53,31 @@ def stage_options() -> str:
             elif stage.kind:
                 names = " ".join(f"`{each}`" for each in stage.built_in())
                 values = f"{names}, one of an installed package, or `module:Class`"
-                new_rows.insert(0, f"| `--{stage.kind}` | {values} | {name} | The {stage.kind} to use |")
-            listed |= rows.keys()
-            sections.append("\n".join([heading, "", _HEAD, *new_rows]))
+                rows.insert(0, f"| `--{stage.kind}` | {values} | {name} | The {stage.kind} to use |")
+            listed |= options_of(kind).keys()
+            sections.append("\n".join([heading, "", _HEAD, *rows]))
     return "\n\n".join(sections)
 
 
-def _parameter(transform: Any, field: Any) -> str:
-    """The row of a parameter of a transform."""
-    from mcaptrack.ranges import limits
-    from mcaptrack.transforms.protocol import bare_type, choices
-
-    kind = bare_type(get_type_hints(type(transform))[field.name])
-    value = getattr(transform, field.name)
-    default = "none" if value is None else str(value).lower() if kind is bool else f"{value}"
-    values = (
-        " ".join(f"`{name}`" for name in choices(kind))
-        or f"{_KINDS[kind]} {limits(field.metadata['least'], field.metadata['most'])}"
-    )
-    text = field.metadata["help"]
-    name = f"--{field.name.replace('_', '-')}" if field.metadata["flag"] else f"--set {field.name}="
-    return f"| `{name}` | {values.strip()} | {default} | {text[:1].upper()}{text[1:]} |"
+def _row(option: Parameter, name: str = "") -> str:
+    """The row of an option; ``name`` is what it is called, if it is not by its flag."""
+    ends = limits(option.option.least, option.option.most)
+    values = " ".join(f"`{choice}`" for choice in get_args(option.kind)) or f"{_KINDS[option.kind]} {ends}".strip()
+    default = option.shown if isinstance(option.shown, str) else option.default
+    called = name or option.flags[0].partition("/")[0]
+    return f"| `{called}` | {values} | {default} | {option.help.removesuffix('.')} |"
 
 
 def other_numbers() -> str:
     """The options with numbers of commands that are no stages, as Markdown; those for many logs with `run` alone."""
-    from typer.main import get_command
-
-    from mcaptrack.cli import app
+    from mcaptrack.cli.group import Commands
     from mcaptrack.cli.many import NAMES
-    from mcaptrack.ranges import limits
     from mcaptrack.transforms import STAGES
 
     sections = []
-    for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]
-        options = {each.name: each for each in command.params if each.param_type_name == "option" and not each.hidden}
-        rows = []
-        for setting in command.settings.values():
-            option = options.get(setting.parameter)
-            is_listed = setting.kind in (int, float) and (name == "run" or setting.parameter not in NAMES)
-            if option is None or not is_listed:
-                continue
-            bounds = limits(setting.declared.least, setting.declared.most)
-            default = option.show_default if isinstance(option.show_default, str) else option.default
-            text = option.help.removesuffix(".").removesuffix(f"{bounds[:1].upper()}{bounds[1:]}").strip()
-            text = text.removesuffix(".")
-            rows.append(f"| `--{setting.name}` | {_KINDS[setting.kind]} {bounds} | {default} | {text} |")
+    for name, command in Commands().items():
+        numbers = [option for option in command.parameters if option.kind in (int, float)]
+        rows = [_row(option) for option in numbers if name == "run" or option.name not in NAMES]
         if rows and name not in STAGES:
             sections.append("\n".join([f"### {name}", "", _HEAD, *rows]))
     return "\n\n".join(sections)

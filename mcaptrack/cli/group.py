@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, MutableMapping
+import re
+from collections.abc import Iterator, Mapping
+from functools import cache
 from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import typer
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from mcaptrack.cli.command import Command, Reading, usage_in_one_line
+from mcaptrack import _MODULES
+from mcaptrack.cli.command import Command, usage_in_one_line
 from mcaptrack.cli.settings import may_be_set
 
 _MAKE, _RUN, _LOOK = "Make a log", "Detect, track, predict", "Look at results"
@@ -18,199 +23,115 @@ _MEASURE, _KEEP = "Measure and improve", "Check and repair logs"
 
 
 class Listed(NamedTuple):
-    """A command: its heading and its line in the help, and where in ``mcaptrack.cli`` it is.
-
-    ``place`` is MODULE:NAME, of a function with the options of Typer, or of an object with ``function_of(name)``. A
-    command that ``reads`` changes no file except the one that -o names.
-    """
+    """A command: its heading in the help, and where in ``mcaptrack.cli`` its class is, as MODULE:CLASS."""
 
     name: str
     panel: str
-    summary: str
     place: str
-    reads: bool = False
+
+    @property
+    def command(self) -> Any:
+        """The class of the command (``cli.declared.Called``), which is imported now."""
+        module, _, name = self.place.partition(":")
+        return getattr(import_module(f"mcaptrack.cli.{module}"), name)
+
+    @property
+    def summary(self) -> str:
+        """Its line in the help: the first paragraph of the docstring of its function.
+
+        It is read from the source, because an import of all commands takes half a second.
+        """
+        source = _source_of(_MODULES[self.name]) if self.name in _MODULES else ""
+        match = re.search(rf'^def {self.name}\(.*?"""(.*?)(?:\n\n|""")', source, re.MULTILINE | re.DOTALL)
+        doc = match[1] if match else (self.command.declaration(self.name).__doc__ or "").partition("\n\n")[0]
+        return " ".join(doc.split())
 
 
-ENTRIES: Final = (
-    Listed(
-        "ingest",
-        _MAKE,
-        "Make a log of a video, a folder of images, a ROS bag, an MCAP file, or a label file.",
-        "ingest:Ingest",
-    ),
-    Listed(
-        "demo",
-        _MAKE,
-        "Draw a scene with known ground truth, run everything on it, and compare SORT with re-tracking.",
-        "demo:demo",
-    ),
-    Listed("run", _RUN, "Run all stages that are missing or out of date, then events, views and tables.", "run:run"),
-    Listed(
-        "detect",
-        _RUN,
-        "Detect who differs from the median of the recording, in colour; shadows are removed, groups separated.",
-        "stages:StageCommand",
-    ),
-    Listed("motion", _RUN, "Estimate how the camera moves, from picture to picture.", "stages:StageCommand"),
-    Listed("track", _RUN, "Track detections over time.", "stages:StageCommand"),
-    Listed("sample", _RUN, "Resample tracks to a fixed rate, in metres on the ground.", "stages:StageCommand"),
-    Listed("predict", _RUN, "Predict where tracked people go.", "stages:StageCommand"),
-    Listed("retrack", _RUN, "Repair tracks: re-tracking by likelihood.", "stages:StageCommand"),
-    Listed(
-        "fuse",
-        _RUN,
-        "Fuse the detections of several cameras with one ground to detections of the whole scene.",
-        "fuse:fuse",
-    ),
-    Listed(
-        "models",
-        _RUN,
-        "List the learned detectors of the catalogue, or fetch the weights of one, once.",
-        "models:models",
-    ),
-    Listed(
-        "info",
-        _LOOK,
-        "Show the channels of a log, their number of messages, and what was made from what.",
-        "show:info",
-        reads=True,
-    ),
-    Listed(
-        "view",
-        _LOOK,
-        "Serve a log to this machine's browser, and print links that open it in Lichtblick and Foxglove.",
-        "view:view",
-        reads=True,
-    ),
-    Listed(
-        "render",
-        _LOOK,
-        "Draw boxes, trails and predictions on the video of a log: LOG.mp4, or a GIF.",
-        "render:Render",
-    ),
-    Listed(
-        "report",
-        _LOOK,
-        "Write one page about a log, or several: scores, forecasts, tracks over the scene, identity switches, lineage.",
-        "report:report",
-    ),
-    Listed(
-        "query",
-        _LOOK,
-        "Query the tables of logs in SQL: where people were, how fast, for how long, and how well they were tracked.",
-        "query:query",
-        reads=True,
-    ),
-    Listed(
-        "export",
-        _LOOK,
-        "Write a log as tables (Parquet), one row per object and frame, as a ROS 2 bag, or for other programs.",
-        "show:export",
-    ),
-    Listed("docs", _LOOK, "List the pages of the documentation, or print one.", "docs:docs", reads=True),
-    Listed("evaluate", _MEASURE, "Score tracks and predictions against ground truth.", "evaluate:evaluate", reads=True),
-    Listed(
-        "events",
-        _MEASURE,
-        "Write events of tracks (begin, end, identity switches) and errors of predictions into the log.",
-        "events:events",
-    ),
-    Listed(
-        "zones",
-        _MEASURE,
-        "Count visits of zones and crossings of lines by the tracks of a log, and write them into the log.",
-        "zones:zones",
-    ),
-    Listed(
-        "calibrate",
-        _MEASURE,
-        "Correct the ground planes of cameras that disagree with the others, by the people that they see together.",
-        "calibrate:calibrate",
-    ),
-    Listed("tune", _MEASURE, "Find the settings of a stage that score best against ground truth.", "tune:tune"),
-    Listed("train", _MEASURE, "Train a predictor on tracks of people, or on synthetic walks.", "train:train"),
-    Listed(
-        "check",
-        _KEEP,
-        "Check every byte of a log: structure, checksums, indexes, statistics, order of messages.",
-        "files:check",
-        reads=True,
-    ),
-    Listed(
-        "recover",
-        _KEEP,
-        "Save what is intact in a damaged log to LOG.recovered.mcap; the damaged log stays unchanged.",
-        "files:recover",
-    ),
-    Listed(
-        "drop",
-        _KEEP,
-        "Remove channels from a log, in place or in a copy; all others stay unchanged, to the byte.",
-        "files:drop",
-    ),
-    Listed(
-        "doctor",
-        _KEEP,
-        "Print what this installation has: versions, codecs, memory, folders, plug-ins, and what may be done with "
-        "a store.",
-        "doctor:doctor",
-        reads=True,
-    ),
+@cache
+def _source_of(module: str) -> str:
+    """The source of a module; "" if there is none, as in a frozen program."""
+    spec = find_spec(module)
+    try:
+        return Path((spec and spec.origin) or "").read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return ""
+
+
+_LISTED: Final = (
+    Listed("ingest", _MAKE, "ingest:Ingest"),
+    Listed("demo", _MAKE, "demo:Demo"),
+    Listed("run", _RUN, "running:Run"),
+    Listed("detect", _RUN, "stages:StageCommand"),
+    Listed("motion", _RUN, "stages:StageCommand"),
+    Listed("track", _RUN, "stages:StageCommand"),
+    Listed("sample", _RUN, "stages:StageCommand"),
+    Listed("predict", _RUN, "stages:StageCommand"),
+    Listed("retrack", _RUN, "stages:StageCommand"),
+    Listed("fuse", _RUN, "running:Fuse"),
+    Listed("models", _RUN, "models:Models"),
+    Listed("info", _LOOK, "show:Info"),
+    Listed("view", _LOOK, "view:View"),
+    Listed("render", _LOOK, "render:Render"),
+    Listed("report", _LOOK, "report:Report"),
+    Listed("query", _LOOK, "query:Query"),
+    Listed("export", _LOOK, "show:Export"),
+    Listed("docs", _LOOK, "docs:Docs"),
+    Listed("evaluate", _MEASURE, "evaluate:Evaluate"),
+    Listed("events", _MEASURE, "running:Events"),
+    Listed("zones", _MEASURE, "zones:Zones"),
+    Listed("calibrate", _MEASURE, "calibrate:Calibrate"),
+    Listed("tune", _MEASURE, "tune:Tune"),
+    Listed("train", _MEASURE, "train:Train"),
+    Listed("check", _KEEP, "files:Check"),
+    Listed("recover", _KEEP, "files:Recover"),
+    Listed("drop", _KEEP, "files:Drop"),
+    Listed("doctor", _KEEP, "doctor:Doctor"),
 )
+#: The commands by name.
+ENTRIES: Final = {entry.name: entry for entry in _LISTED}
 #: Commands with options of plug-ins.
-_WITH_PLUGINS: Final = ("run", *(entry.name for entry in ENTRIES if entry.place == "stages:StageCommand"))
+_WITH_PLUGINS: Final = ("run", *(entry.name for entry in _LISTED if entry.place == "stages:StageCommand"))
 
 
 def make(entry: Listed, function: Any = None) -> Any:
     """Make a command of Typer of an entry; ``function`` is its function, if it is not the usual one."""
-    module, _, name = entry.place.partition(":")
-    target = function or getattr(import_module(f"mcaptrack.cli.{module}"), name)
-    function = target.function_of(entry.name) if hasattr(target, "function_of") else target
+    function = function or entry.command.function_of(entry.name)
     app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
     app.command(
         entry.name,
-        cls=Reading if entry.reads else Command,
-        help=getattr(function, "help", None),
+        cls=Command,
+        help=function.help,
         context_settings={"help_option_names": ["--help", "-h"]},
         rich_help_panel=entry.panel,
     )(function)
     return get_command(app)
 
 
-class Commands(MutableMapping[str, Any]):
+class Commands(Mapping[str, Any]):
     """The commands by name; each is made when it is looked up."""
 
-    def __init__(self, changed: Mapping[str, Any] | None = None, commands_made: dict[str, Any] | None = None) -> None:
-        self._entries = {entry.name: entry for entry in ENTRIES}
-        self._made: dict[str, Any] = {} if commands_made is None else commands_made
-        self._changed = changed or {}
+    def __init__(self, made: dict[str, Any] | None = None, changed: Mapping[str, Any] | None = None) -> None:
+        self._made, self._changed = {} if made is None else made, changed or {}
 
     def __getitem__(self, name: str) -> Any:
         if name in self._changed:
             return self._changed[name]
         if name not in self._made:
-            self._made[name] = make(self._entries[name])
+            self._made[name] = make(ENTRIES[name])
         return self._made[name]
 
-    def __setitem__(self, name: str, command: Any) -> None:
-        self._made[name] = command
-
-    def __delitem__(self, name: str) -> None:
-        del self._made[name]
-
     def __iter__(self) -> Iterator[str]:
-        return iter(self._entries)
+        return iter(ENTRIES)
 
     def __len__(self) -> int:
-        return len(self._entries)
+        return len(ENTRIES)
 
     def __contains__(self, name: object) -> bool:
-        return name in self._entries
+        return name in ENTRIES
 
     def changed(self, functions: Mapping[str, Any]) -> Commands:
         """Return a copy of the table, with other functions for some commands."""
-        changed = {name: make(self._entries[name], function) for name, function in functions.items()}
-        return Commands(changed, self._made)
+        return Commands(self._made, {name: make(ENTRIES[name], function) for name, function in functions.items()})
 
 
 class Group(TyperGroup):
@@ -218,7 +139,8 @@ class Group(TyperGroup):
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes | {"commands": {}})
-        self.commands = self._own = Commands()
+        self._own = Commands()
+        self.commands: Any = self._own
         self._lists = False
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -229,8 +151,8 @@ class Group(TyperGroup):
         """Return a command; one that shows no more than its line, while the commands are listed."""
         if not self._lists or cmd_name not in self.commands:
             return super().get_command(ctx, cmd_name) if cmd_name in self.commands else None
-        entry = next(candidate for candidate in ENTRIES if candidate.name == cmd_name)
-        line: Any = typer.core.TyperCommand(entry.name, help=entry.summary, rich_help_panel=entry.panel)
+        entry = ENTRIES[cmd_name]
+        line: Any = typer.core.TyperCommand(cmd_name, help=entry.summary, rich_help_panel=entry.panel)
         return line
 
     def format_help(self, ctx: Any, formatter: Any) -> None:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mcaptrack.api.ingesting import default_log
 from mcaptrack.cli import common
 from mcaptrack.cli.common import expand, only_one_output
-from mcaptrack.cli.declared import EachLog
 from mcaptrack.cli.flags import with_flags
-from mcaptrack.cli.many import many_options
+from mcaptrack.cli.many import EachLog
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
 
@@ -23,8 +22,8 @@ if TYPE_CHECKING:
 class Ingest(EachLog["IngestResult"]):
     """Make logs of videos, images, recordings and label files."""
 
-    def __init__(self, values: dict[str, Any]) -> None:
-        super().__init__(values)
+    def __init__(self, name: str, values: Mapping[str, Any]) -> None:
+        super().__init__(name, values)
         self.names_output = not values["into"]
 
     def logs(self) -> Sequence[NamedLog]:
@@ -33,7 +32,7 @@ class Ingest(EachLog["IngestResult"]):
 
         sources = expand(self.given["inputs"], each=True)
         only_one_output(sources, self.given["output"] or self.given["into"])
-        if self.given["into"] is not None and many_options().output_dir is not None:
+        if self.given["into"] is not None and self.many.output_dir is not None:
             raise McaptrackError("--into and --output-dir are two places for the same results; give one")
         return [NamedLog(source, default_log(Path(source))) for source in dict.fromkeys(sources)]
 

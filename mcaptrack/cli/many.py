@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-import inspect
 import re
 import signal
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from contextvars import ContextVar
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, TypeVar
+
+import typer
 
 from mcaptrack import SCHEMA_VERSION, notices
+from mcaptrack.api.declared import Option, Parameter
+from mcaptrack.api.options import PathLike
 from mcaptrack.cli import common
-from mcaptrack.cli.common import only_one_output
-from mcaptrack.cli.flags import RUNNING, with_flags
+from mcaptrack.cli.command import LAST_PANELS
+from mcaptrack.cli.declared import Called, parameters_of
+from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.text import is_json, print_line_of_json, printable, say, stdout_to_stderr
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
@@ -28,7 +31,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 #: Heading of the options in the help.
-PANEL: Final = common.MANY
+PANEL: Final = LAST_PANELS[1]
 _TIME: Final = re.compile(r"([0-9]+(?:\.[0-9]+)?)\s*([smh]?)")
 _SECONDS: Final = {"": 1, "s": 1, "m": 60, "h": 3600}
 #: The number of logs from which on the summary repeats why logs failed.
@@ -41,86 +44,58 @@ class ManyOptions:
 
     jobs: Annotated[
         int | None,
-        common.option(
-            "--jobs",
-            panel=PANEL,
-            least=1,
-            most=1024,
-            help="Number of logs to process at the same time.",
-            show_default="1, or one for each thread of the cluster",
+        Option(
+            PANEL,
+            1,
+            1024,
+            help="Number of logs to process at the same time; by default 1, or one for each thread of the cluster.",
         ),
     ] = None
     scheduler: Annotated[
         str | None,
-        common.option(
-            "--scheduler",
-            panel=PANEL,
+        Option(
+            PANEL,
             metavar="ADDRESS",
-            help="Let the workers of a Dask cluster process the logs, by the address of its scheduler.",
-            show_default="processes on this machine",
+            help="Let the workers of a Dask cluster process the logs, by the address of its scheduler; by default "
+            "processes on this machine.",
         ),
     ] = None
-    keep_going: Annotated[
-        bool, common.option("--keep-going/--no-keep-going", panel=PANEL, help="Go on after a log that failed.")
-    ] = True
+    keep_going: Annotated[bool, Option(PANEL, help="Go on after a log that failed.")] = True
     output_dir: Annotated[
-        Path | None,
-        common.option(
-            "--output-dir",
-            panel=PANEL,
+        PathLike | None,
+        Option(
+            PANEL,
             metavar="FOLDER",
-            help="Write the results for each log to this folder, under its name.",
-            show_default="in or beside each log",
+            help="Write the results for each log to this folder, under its name; by default in or beside each log.",
         ),
     ] = None
     ledger: Annotated[
-        Path | None,
-        common.option(
-            "--ledger",
-            panel=PANEL,
+        PathLike | None,
+        Option(
+            PANEL,
             metavar="FILE",
-            help="Add a line of JSON to this file for each log and try, and skip logs that it says are done.",
-            show_default="none",
+            help="Add a line of JSON to this file for each log and try, and skip logs that it says are done; by "
+            "default none.",
         ),
     ] = None
     timeout: Annotated[
         str | None,
-        common.option(
-            "--timeout",
-            panel=PANEL,
-            metavar="TIME",
-            help="Give a log up after this time, such as 90s, 10m or 2h.",
-            show_default="none",
-        ),
+        Option(PANEL, metavar="TIME", help="Give a log up after this time, such as 90s, 10m or 2h; by default none."),
     ] = None
     memory_limit: Annotated[
         str | None,
-        common.option(
-            "--memory-limit",
-            panel=PANEL,
+        Option(
+            PANEL,
             metavar="SIZE",
-            help="End a worker if its resident memory exceeds this size, such as 2GB.",
-            show_default="none",
+            help="End a worker if its resident memory exceeds this size, such as 2GB; by default none.",
         ),
     ] = None
     tries: Annotated[
-        int,
-        common.option(
-            "--tries",
-            panel=PANEL,
-            least=1,
-            most=100,
-            help="How often a log is tried that kills its worker or exceeds a limit.",
-        ),
+        int, Option(PANEL, 1, 100, help="How often a log is tried that kills its worker or exceeds a limit.")
     ] = 2
-    json_lines: Annotated[
-        bool,
-        common.option(
-            "--json-lines",
-            panel=PANEL,
-            help="Print a line of JSON for each log as soon as it has ended.",
-        ),
-    ] = False
+    json_lines: Annotated[bool, Option(PANEL, help="Print a line of JSON for each log as soon as it has ended.")] = (
+        False
+    )
 
     @property
     def concern_one(self) -> bool:
@@ -140,86 +115,242 @@ class ManyOptions:
         }
 
 
-#: The options of the running command.
-_OPTIONS: Final[ContextVar[ManyOptions]] = ContextVar("many")
 NAMES: Final = tuple(field.name for field in fields(ManyOptions))
 
 
-def many_options() -> ManyOptions:
-    """Return the options of the running command."""
-    return _OPTIONS.get()
+class EachLog(Called[T]):
+    """A command that calls its function with each log, here or in workers: ``function(log, output=..., **arguments)``.
 
-
-def takes_many(*, outputs: bool = True) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Add the options for many logs to a command; without ``outputs`` all but ``--output-dir``."""
-    names = [name for name in NAMES if outputs or name != "output_dir"]
-
-    def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        own = inspect.signature(command).parameters
-        hints = common.hints_of(command)
-        annotations = {name: hints[name] for name in own}
-        added = get_type_hints(ManyOptions, include_extras=True)
-        parameters = [
-            own[name].replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY)
-            for name, hint in annotations.items()
-        ]
-        defaults = ManyOptions()
-        parameters += [
-            inspect.Parameter(
-                name, inspect.Parameter.KEYWORD_ONLY, default=getattr(defaults, name), annotation=added[name]
-            )
-            for name in names
-        ]
-
-        def with_options(**values: Any) -> None:
-            _OPTIONS.set(ManyOptions(**{name: values.pop(name) for name in names}))
-            command(**values)
-
-        with_options.__name__, with_options.__doc__ = command.__name__, command.__doc__
-        with_options.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        with_options.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-        return with_options
-
-    return decorate
-
-
-@dataclass(frozen=True)
-class LogWork(Generic[T]):
-    """The work of a command on each log.
-
-    Attributes
-    ----------
-    name : str
-        The command.
-    function, options
-        What is called: ``function(log, output=..., **options, progress=...)``; it is sent to other processes.
-    show : callable
-        Prints a result, as the command does for a single log.
-    line : callable or None
-        Returns a result as one line. None where the results themselves are what is printed to stdout; they are printed
-        in the order of the logs then.
-    suffix : str
-        Ending of the names of outputs in ``--output-dir``.
-    data : callable
-        Returns a result as values of JSON.
-    writes : bool
-        Whether logs, or files beside them, are changed.
-    shares_output : bool
-        Whether all logs have one output, a folder.
-    names_output : bool
-        Whether each input always has an output of its own, by default in the working folder.
+    ``many`` has the options for many logs, and ``inputs`` are the logs, once the command runs.
     """
 
-    name: str
-    function: Callable[..., T]
-    options: Mapping[str, Any]
-    show: Callable[[Location, T], None]
-    data: Callable[[T], Mapping[str, Any]]
-    line: Callable[[T], str] | None = None
-    suffix: str = ".mcap"
-    writes: bool = True
-    shares_output: bool = False
-    names_output: bool = False
+    #: Whether logs, or files beside them, are changed.
+    writes: ClassVar = True
+    #: Whether results are what is printed to stdout: one after the other, in the order of the logs.
+    prints_results: ClassVar = False
+    #: Whether all logs have one output, a folder.
+    shares_output = False
+    #: Whether each input always has an output of its own, by default in the working folder.
+    names_output = False
+
+    def __init__(self, name: str, values: Mapping[str, Any]) -> None:
+        super().__init__(name, values)
+        self.inputs: Sequence[NamedLog] = ()
+        self.many = ManyOptions(**{option: values[option] for option in NAMES if option in values})
+
+    @classmethod
+    def options(cls) -> list[Parameter]:
+        """Return the options that the function has no use for: also those for many logs."""
+        many = [option for option in parameters_of(ManyOptions) if cls.writes or option.name != "output_dir"]
+        return [*super().options(), *many]
+
+    def logs(self) -> Sequence[NamedLog]:
+        """Return the inputs."""
+        from mcaptrack.fleet import find_logs
+
+        return find_logs(self.given["logs"])
+
+    def suffix(self) -> str:
+        """Return the end of the names of outputs in ``--output-dir``."""
+        return ".mcap"
+
+    def line(self, done: T) -> str:
+        """Return a result as a line of text."""
+        raise NotImplementedError
+
+    def show(self, log: Location, done: T, talk: common.Talk) -> None:
+        """Print the result of one log alone."""
+        talk.say(f"{log}: {self.line(done)}")
+
+    def print(self, results: Sequence[T], totals: Mapping[str, Any]) -> None:
+        """Print the results of all logs, with totals if there are several: as JSON."""
+        if self.given["json"]:
+            common.print_json({"results": [self.data(done) for done in results], **totals})
+
+    def code(self, results: Sequence[T]) -> int:
+        """Return the exit code."""
+        return common.DONE
+
+    def run(self, names: Mapping[str, str]) -> None:
+        """Call the function with each log and its ``arguments``, and print what it returns."""
+        with common.Talk(self.given["quiet"], self.given["verbose"]).open() as talk:
+            self.inputs = self.logs()
+            arguments = self.arguments(names)
+            results, totals = self._process(self.inputs, arguments, arguments.pop("output", None), talk)
+        self.print(results, totals)
+        if code := self.code(results):
+            raise typer.Exit(code)
+
+    def _process(
+        self, logs: Sequence[NamedLog], arguments: Mapping[str, Any], output: Path | None, talk: common.Talk
+    ) -> tuple[list[T], dict[str, Any]]:
+        """Process one log here, or several in workers. Returns the results, and totals for the JSON of several.
+
+        ``output`` is that of a single log. An error in one of several logs is printed and does not stop the others; the
+        command ends with exit code 3 then.
+        """
+        many, options = self.many, dict(arguments)
+        if not logs:
+            talk.say("the list of logs is empty; there is nothing to do")
+            return [], {}
+        if many.output_dir is not None and output is not None:
+            raise McaptrackError("--output and --output-dir are two places for the same results; give one")
+        if many.json_lines and self.given["json"]:
+            raise McaptrackError("--json prints one object, and --json-lines one for each log; give one")
+        if output is not None:
+            options["output"] = output
+        folder = many.output_dir or (Path() if self.names_output and output is None else None)
+        if not self.shares_output:
+            common.only_one_output([log.path for log in logs], output)
+        elif folder is not None:
+            options["output"], folder = folder, None
+        if len(logs) == 1 and not many.concern_one:
+            path = logs[0].path
+            with notices.about(output or path):
+                with stdout_to_stderr():
+                    result = common.with_progress(self.function, talk.progress)(path, **options)
+                self.show(path, result, talk)
+            state = "up-to-date" if getattr(result, "is_up_to_date", False) else "done"
+            talk.event(f"{path}: {state}", "log", log=str(path), state=state)
+            return [result], {}
+        from mcaptrack.fleet import run as run_fleet
+
+        listener: _Printer[T] = _Printer(self, talk, [log.path for log in logs])
+        try:
+            is_hidden = talk.quiet or self.prints_results or many.json_lines or is_json()
+            with LiveTable.on_terminal(is_hidden) as table:
+                done = run_fleet(
+                    self.function,
+                    logs,
+                    options,
+                    name=self.name,
+                    output_dir=folder,
+                    suffix=self.suffix(),
+                    writes=self.writes,
+                    on_outcome=listener.hear,
+                    on_status=lambda status: listener.watch(status, table),
+                    on_note=talk.say,
+                    **many.for_fleet(),
+                )
+        except (KeyboardInterrupt, SystemExit) as ended:
+            if isinstance(ended, KeyboardInterrupt) or ended.code == 128 + signal.SIGTERM:
+                talk.say(
+                    f"ended by a signal: {listener.ended} of {len(logs)} logs were processed; the same command goes on"
+                )
+            raise
+        _summarise(done, talk)
+        return [done.results[log.path] for log in logs if log.path in done.results], {"fleet": done.to_json()}
+
+
+class _Printer(Generic[T]):
+    """Prints the outcomes of logs; results for stdout in the order of the logs."""
+
+    def __init__(self, work: EachLog[T], talk: common.Talk, logs: Sequence[Location]) -> None:
+        self._work, self._talk = work, talk
+        self._has_lines = work.many.json_lines
+        self._shown = monotonic()
+        self.ended = 0
+        self._next = deque(logs)
+        self._waiting: dict[Location, T | None] = {}
+
+    def hear(self, outcome: LogOutcome[T]) -> None:
+        """Print what became of a log."""
+        self.ended += 1
+        for line in outcome.printed.splitlines():
+            self._talk.say(f"{outcome.log}: {line}")
+        for notice in outcome.warnings:
+            with notices.about(notice.log or outcome.log):
+                notices.warn(notice.message, notice.code)
+        if outcome.state == "skipped":
+            self._talk.detail(f"{outcome.log}: done before, as the ledger says")
+        elif outcome.result is None:
+            for line in outcome.detail.splitlines():
+                self._talk.detail(line)
+            common.record_failure(outcome.log, outcome.error, **_about(outcome))
+        if self._has_lines:
+            self._print_line(outcome)
+        if self._work.prints_results:
+            if not self._has_lines:
+                self._show_in_order(outcome)
+        elif outcome.result is not None and self._talk.verbose:
+            self._work.show(outcome.log, outcome.result, self._talk)
+        elif outcome.result is not None:
+            summary = self._work.line(outcome.result)
+            self._talk.say(f"{outcome.log}: {summary}", "info", "log", **_about(outcome))
+
+    def watch(self, status: FleetStatus, table: LiveTable) -> None:
+        """Show how far the logs are: in a table, or now and then in a line for programs."""
+        table.show(status)
+        if monotonic() - self._shown < common.PROGRESS_S:
+            return
+        self._shown = monotonic()
+        ended = status.logs - status.left
+        running = [{**asdict(log), "log": str(log.log), "seconds": round(log.seconds, 1)} for log in status.running]
+        text = f"{ended} of {status.logs} logs"
+        self._talk.event(text, "progress", done=ended, total=status.logs, states=dict(status.ended), running=running)
+
+    def _print_line(self, outcome: LogOutcome[T]) -> None:
+        """Print the outcome as a line of JSON to stdout."""
+        result = None if outcome.result is None else self._work.data(outcome.result)
+        line = {
+            "schema_version": SCHEMA_VERSION,
+            **_about(outcome),
+            "error": with_flags(outcome.error) or None,
+            "warnings": [
+                {"code": warning.code, "message": with_flags(warning.message)} for warning in outcome.warnings
+            ],
+            "result": result,
+        }
+        print_line_of_json(line, sys.stdout)
+
+    def _show_in_order(self, outcome: LogOutcome[T]) -> None:
+        self._waiting[outcome.log] = outcome.result
+        while self._next and self._next[0] in self._waiting:
+            log = self._next.popleft()
+            result = self._waiting.pop(log)
+            if result is not None:
+                self._work.show(log, result, self._talk)
+
+
+def _about(outcome: LogOutcome[Any]) -> dict[str, Any]:
+    """Return the outcome of a log as values of JSON, without what it made."""
+    return {
+        "log": str(outcome.log),
+        "state": outcome.state,
+        "tries": outcome.tries,
+        "seconds": outcome.seconds,
+        "cpu_seconds": outcome.cpu_seconds,
+        "peak_bytes": outcome.peak_bytes,
+    }
+
+
+def _summarise(done: FleetResult[Any], talk: common.Talk) -> None:
+    """Print the totals, and with many logs once more why some failed."""
+    common.tried(len(done.outcomes))
+    counts = [f"{count} {state}" for state, count in done.counts.items()]
+    rate = len(done.outcomes) / max(done.seconds, 1e-3)
+    line = f"{len(done.outcomes)} logs in {done.seconds:.1f} s ({rate:.1f} a second): {', '.join(counts)}"
+    if done.peak_bytes:
+        ran = [outcome for outcome in done.outcomes if outcome.tries]
+        used = done.cpu_seconds / max(1, len(ran))
+        line += f"; at most {done.peak_bytes / 1e6:,.0f} MB of memory, {used:.2f} s of processor time a log"
+    talk.say(line, "info", "summary", **done.to_json())
+    if len(done.outcomes) >= _REPEATED:
+        for outcome in done.failed:
+            say(f"  {outcome.state}: {outcome.error}", "info", "log", **_about(outcome))
+    if done.stopped:
+        left = done.counts.get("not-tried", 0)
+        common.end_early(f"{done.stopped}; {left} of {len(done.outcomes)} logs are left, and the same command goes on")
+
+
+def _seconds(text: str | None) -> float | None:
+    """Return a time such as 90s, 10m or 2h in seconds; None for None."""
+    if text is None:
+        return None
+    match = _TIME.fullmatch(text.strip().lower())
+    if match is None or not float(match[1]):
+        raise McaptrackError(f"--timeout needs a time such as 90s, 10m or 2h, not {text!r:.40}")
+    return float(match[1]) * _SECONDS[match[2]]
 
 
 # A table of the logs that workers are busy with, on a terminal.
@@ -269,174 +400,3 @@ def table_of(status: FleetStatus) -> Any:
         cells = (printable(log.stage), done, f"{log.seconds:.0f}", f"{log.resident_bytes / 1e6:,.0f}")
         table.add_row(Text(printable(str(log.log))), *cells)
     return table
-
-
-def process(
-    logs: Sequence[NamedLog], work: LogWork[T], talk: common.Talk, output: Path | None = None
-) -> tuple[list[T], dict[str, Any]]:
-    """Process one log here, or several in workers. Returns the results, and totals for the JSON of several.
-
-    ``output`` is that of a single log. An error in one of several logs is printed and does not stop the others; the
-    command ends with exit code 3 then.
-    """
-    many = many_options()
-    if not logs:
-        talk.say("the list of logs is empty; there is nothing to do")
-        return [], {}
-    if many.output_dir is not None and output is not None:
-        raise McaptrackError("--output and --output-dir are two places for the same results; give one")
-    if many.json_lines and RUNNING.get().params.get("json"):
-        raise McaptrackError("--json prints one object, and --json-lines one for each log; give one")
-    options = {**work.options} if output is None else {**work.options, "output": output}
-    folder = many.output_dir or (Path() if work.names_output and output is None else None)
-    if work.shares_output and folder is not None:
-        options, folder = {**options, "output": folder}, None
-    elif not work.shares_output:
-        only_one_output([log.path for log in logs], output)
-    if len(logs) == 1 and not many.concern_one:
-        path = logs[0].path
-        with notices.about(output or path):
-            with stdout_to_stderr():
-                result = common.with_progress(work.function, talk.progress)(path, **options)
-            work.show(path, result)
-        state = "up-to-date" if getattr(result, "is_up_to_date", False) else "done"
-        talk.event(f"{path}: {state}", "log", log=str(path), state=state)
-        return [result], {}
-    from mcaptrack.fleet import run as run_fleet
-
-    listener: _Printer[T] = _Printer(work, talk, [log.path for log in logs])
-    try:
-        is_hidden = talk.quiet or work.line is None or many.json_lines or is_json()
-        with LiveTable.on_terminal(is_hidden) as table:
-            done = run_fleet(
-                work.function,
-                logs,
-                options,
-                name=work.name,
-                output_dir=folder,
-                suffix=work.suffix,
-                writes=work.writes,
-                on_outcome=listener.hear,
-                on_status=lambda status: listener.watch(status, table),
-                on_note=talk.say,
-                **many.for_fleet(),
-            )
-    except (KeyboardInterrupt, SystemExit) as ended:
-        if isinstance(ended, KeyboardInterrupt) or ended.code == 128 + signal.SIGTERM:
-            talk.say(
-                f"ended by a signal: {listener.ended} of {len(logs)} logs were processed; the same command goes on"
-            )
-        raise
-    _summarise(done, talk)
-    return [done.results[log.path] for log in logs if log.path in done.results], {"fleet": done.to_json()}
-
-
-class _Printer(Generic[T]):
-    """Prints the outcomes of logs; results for stdout in the order of the logs."""
-
-    def __init__(self, work: LogWork[T], talk: common.Talk, logs: Sequence[Location]) -> None:
-        self._work, self._talk = work, talk
-        self._has_lines = many_options().json_lines
-        self._shown = monotonic()
-        self.ended = 0
-        self._next = deque(logs)
-        self._waiting: dict[Location, T | None] = {}
-
-    def hear(self, outcome: LogOutcome[T]) -> None:
-        """Print what became of a log."""
-        self.ended += 1
-        for line in outcome.printed.splitlines():
-            self._talk.say(f"{outcome.log}: {line}")
-        for notice in outcome.warnings:
-            with notices.about(notice.log or outcome.log):
-                notices.warn(notice.message, notice.code)
-        if outcome.state == "skipped":
-            self._talk.detail(f"{outcome.log}: done before, as the ledger says")
-        elif outcome.result is None:
-            for line in outcome.detail.splitlines():
-                self._talk.detail(line)
-            common.record_failure(outcome.log, outcome.error, **_about(outcome))
-        if self._has_lines:
-            self._print_line(outcome)
-        if self._work.line is None:
-            if not self._has_lines:
-                self._show_in_order(outcome)
-        elif outcome.result is not None and self._talk.verbose:
-            self._work.show(outcome.log, outcome.result)
-        elif outcome.result is not None:
-            summary = self._work.line(outcome.result)
-            self._talk.say(f"{outcome.log}: {summary}", "info", "log", **_about(outcome))
-
-    def watch(self, status: FleetStatus, table: LiveTable) -> None:
-        """Show how far the logs are: in a table, or now and then in a line for programs."""
-        table.show(status)
-        if monotonic() - self._shown < common.PROGRESS_S:
-            return
-        self._shown = monotonic()
-        ended = status.logs - status.left
-        running = [{**asdict(log), "log": str(log.log), "seconds": round(log.seconds, 1)} for log in status.running]
-        text = f"{ended} of {status.logs} logs"
-        self._talk.event(text, "progress", done=ended, total=status.logs, states=dict(status.ended), running=running)
-
-    def _print_line(self, outcome: LogOutcome[T]) -> None:
-        """Print the outcome as a line of JSON to stdout."""
-        result = None if outcome.result is None else self._work.data(outcome.result)
-        line = {
-            "schema_version": SCHEMA_VERSION,
-            **_about(outcome),
-            "error": with_flags(outcome.error) or None,
-            "warnings": [
-                {"code": warning.code, "message": with_flags(warning.message)} for warning in outcome.warnings
-            ],
-            "result": result,
-        }
-        print_line_of_json(line, sys.stdout)
-
-    def _show_in_order(self, outcome: LogOutcome[T]) -> None:
-        self._waiting[outcome.log] = outcome.result
-        while self._next and self._next[0] in self._waiting:
-            log = self._next.popleft()
-            result = self._waiting.pop(log)
-            if result is not None:
-                self._work.show(log, result)
-
-
-def _about(outcome: LogOutcome[Any]) -> dict[str, Any]:
-    """Return the outcome of a log as values of JSON, without what it made."""
-    return {
-        "log": str(outcome.log),
-        "state": outcome.state,
-        "tries": outcome.tries,
-        "seconds": outcome.seconds,
-        "cpu_seconds": outcome.cpu_seconds,
-        "peak_bytes": outcome.peak_bytes,
-    }
-
-
-def _summarise(done: FleetResult[Any], talk: common.Talk) -> None:
-    """Print the totals, and with many logs once more why some failed."""
-    common.tried(len(done.outcomes))
-    counts = [f"{count} {state}" for state, count in done.counts.items()]
-    rate = len(done.outcomes) / max(done.seconds, 1e-3)
-    line = f"{len(done.outcomes)} logs in {done.seconds:.1f} s ({rate:.1f} a second): {', '.join(counts)}"
-    if done.peak_bytes:
-        ran = [outcome for outcome in done.outcomes if outcome.tries]
-        used = done.cpu_seconds / max(1, len(ran))
-        line += f"; at most {done.peak_bytes / 1e6:,.0f} MB of memory, {used:.2f} s of processor time a log"
-    talk.say(line, "info", "summary", **done.to_json())
-    if len(done.outcomes) >= _REPEATED:
-        for outcome in done.failed:
-            say(f"  {outcome.state}: {outcome.error}", "info", "log", **_about(outcome))
-    if done.stopped:
-        left = done.counts.get("not-tried", 0)
-        common.end_early(f"{done.stopped}; {left} of {len(done.outcomes)} logs are left, and the same command goes on")
-
-
-def _seconds(text: str | None) -> float | None:
-    """Return a time such as 90s, 10m or 2h in seconds; None for None."""
-    if text is None:
-        return None
-    match = _TIME.fullmatch(text.strip().lower())
-    if match is None or not float(match[1]):
-        raise McaptrackError(f"--timeout needs a time such as 90s, 10m or 2h, not {text!r:.40}")
-    return float(match[1]) * _SECONDS[match[2]]

@@ -2,73 +2,70 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 import mcaptrack
+from mcaptrack import Model
+from mcaptrack.api.declared import Option
+from mcaptrack.api.options import FILES
 from mcaptrack.cli import common
-from mcaptrack.cli.text import say, show
+from mcaptrack.cli.declared import Once
+from mcaptrack.cli.text import show
 from mcaptrack.errors import McaptrackError, command
 
 
-@common.one_line
-def models(
-    action: Annotated[
-        str | None, typer.Argument(metavar="[get", help="`get` fetches the weights of NAME.", show_default="a list")
-    ] = None,
-    name: Annotated[str | None, typer.Argument(metavar="NAME]", help="The model to fetch.", show_default=False)] = None,
-    source: Annotated[
-        str | None,
-        common.option("--from", panel=common.FILES, metavar="FILE|URL", help="Take the weights from here instead."),
-    ] = None,
-    json: common.Json = False,
-    quiet: common.Quiet = False,
-    verbose: common.Verbose = False,
-    config: common.Config = None,
-) -> None:
-    """List the learned detectors of the catalogue, or fetch the weights of one, once.
+class Models(Once[tuple[Model, ...] | Path]):
+    """List the detectors; or, with ``get``, fetch the weights of one."""
 
-    Only a file with the known SHA-256 is taken. The weights are kept in your folder of caches, or where the environment
-    variable MCAPTRACK_MODELS says.
+    class More:
+        """Options that the list has no use for."""
 
-    Example: mcaptrack models
+        source: Annotated[
+            str | None, Option(FILES, flag="from", metavar="FILE|URL", help="Take the weights from here instead.")
+        ] = None
 
-    Example: mcaptrack models get yolox-nano
-    """
-    if action is None:
-        if source is not None:
+    @property
+    def function(self) -> Callable[..., tuple[Model, ...] | Path]:
+        """The function: another one fetches."""
+        return mcaptrack.get_model if self.given["words"] else mcaptrack.models
+
+    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
+        """Return the arguments of the function: the model to fetch, if there is one, and from where."""
+        words, source = self.given["words"] or [], self.given["source"]
+        if not words and source is not None:
             raise McaptrackError("--from goes with get and the name of a model")
-        _list(json, verbose)
-        return
-    if action != "get" or name is None:
-        text = " ".join(filter(None, (action, name)))
-        raise McaptrackError(
-            f"models takes nothing, or get and a name, not {text}; {command('models')} lists the names"
-        )
-    path = mcaptrack.get_model(name, source=source)
-    if json:
-        common.print_json({"name": name, "path": str(path)})
-    elif not quiet:
-        say(f"{path}: {command('run', 'LOG', '--detector', name)} uses it")
+        if words and (words[0] != "get" or len(words) != 2):
+            names_them = f"{command('models')} lists the names"
+            raise McaptrackError(f"models takes nothing, or get and a name, not {' '.join(words)}; {names_them}")
+        return {"name": words[1], "source": source} if words else {}
+
+    def data(self, done: tuple[Model, ...] | Path) -> dict[str, Any]:
+        """Return the models, or the file that was fetched, as values of JSON."""
+        if isinstance(done, Path):
+            return {"name": self.given["words"][1], "path": str(done)}
+        return {"models": [{**asdict(model), "path": _file_of(model)} for model in done]}
+
+    def show(self, done: tuple[Model, ...] | Path, talk: common.Talk) -> None:
+        """Print the models, or where the weights are."""
+        if isinstance(done, Path):
+            talk.say(f"{done}: {command('run', 'LOG', '--detector', self.given['words'][1])} uses it")
+            return
+        for model in done:
+            where = _file_of(model) or f"not fetched; {command('models', 'get', model.name)} fetches it"
+            size = f"{model.size_bytes / 1e6:.1f} MB"
+            show(
+                f"{model.name}  {size}, {model.licence}, trained on {model.trained_on}",
+                f"  good for  {model.good_for}",
+                f"  source    {model.source}",
+                f"  file      {where}",
+            )
+            if self.given["verbose"]:
+                show(f"  sha256    {model.sha256}", *(f"  url       {url}" for url in model.urls))
 
 
-def _list(json: bool, verbose: bool) -> None:
-    models: list[dict[str, Any]] = [
-        {**asdict(model), "path": str(model.path) if model.path.is_file() else None} for model in mcaptrack.models()
-    ]
-    if json:
-        common.print_json({"models": models})
-        return
-    for model in models:
-        where = model["path"] or f"not fetched; {command('models', 'get', model['name'])} fetches it"
-        size = f"{model['size_bytes'] / 1e6:.1f} MB"
-        lines = [
-            f"{model['name']}  {size}, {model['licence']}, trained on {model['trained_on']}",
-            f"  good for  {model['good_for']}",
-            f"  source    {model['source']}",
-            f"  file      {where}",
-        ]
-        lines += [f"  sha256    {model['sha256']}", *(f"  url       {url}" for url in model["urls"])] if verbose else []
-        show(*lines)
+def _file_of(model: Model) -> str | None:
+    """Return the file of the weights, if they were fetched."""
+    return str(model.path) if model.path.is_file() else None

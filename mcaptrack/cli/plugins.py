@@ -19,7 +19,7 @@ import typer
 from mcaptrack.cli import common
 from mcaptrack.cli.command import ALL
 from mcaptrack.cli.config import ConfigFile, read_files
-from mcaptrack.cli.stages import stage_command
+from mcaptrack.cli.stages import StageCommand
 from mcaptrack.cli.text import say, stdout_to_stderr
 from mcaptrack.environment import PREFIX
 from mcaptrack.errors import McaptrackError
@@ -49,7 +49,7 @@ def commands_with_plugins(commands: Mapping[str, Any], arguments: Sequence[str])
                 plugins |= _of_settings(stage, files, commands)
             plugins = {name: cls for name, cls in plugins.items() if cls is not stage.default}
             if plugins:
-                functions[stage.name] = stage_command(stage, plugins)
+                functions[stage.name] = StageCommand.function_of(stage.name, plugins)
         except McaptrackError as error:
             say(str(error), "error")
             raise typer.Exit(common.REFUSED) from None

@@ -1,28 +1,30 @@
-"""``mcaptrack query``: query the tables of logs in SQL."""
+"""``mcaptrack query``: what is asked, and how the answer is printed."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-import typer
-
+import mcaptrack
+from mcaptrack.api.declared import Option
+from mcaptrack.api.options import PathLike
+from mcaptrack.api.querying import QUERY
 from mcaptrack.cli import common
 from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.common import expand
+from mcaptrack.cli.declared import Once, Printed
 from mcaptrack.cli.text import console, printable, show
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import refuse_url
+from mcaptrack.files import is_same_file, refuse_overwrite, refuse_url
 from mcaptrack.location import is_remote, parse
 
 if TYPE_CHECKING:
     from mcaptrack import TableList
 
 Form = Literal["table", "csv", "json", "jsonl", "parquet", "arrow"]
-_QUERY: Final = "Query and answer"
 #: Number of rows that a terminal shows by default.
 _SHOWN: Final = 60
 #: Most characters of a cell in a table: on a terminal, and elsewhere.
@@ -33,105 +35,64 @@ _PLAN: Final = ["explain_key", "explain_value"]
 _KEYWORDS: Final = ("select", "from", "with", "describe", "summarize", "explain", "pivot", "show", "values")
 
 
-@common.one_line
-def query(
-    words: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="LOG... QUERY",
-            help="Logs, patterns or folders of tables, then the query in quotes; - reads it from standard input.",
-            show_default=False,
-        ),
-    ] = None,
-    file: Annotated[
-        Path | None,
-        common.option(
-            "--file",
-            "-f",
-            panel=_QUERY,
-            help="Read the query from this file; all arguments are logs.",
-            show_default=False,
-        ),
-    ] = None,
-    form: Annotated[
-        Form | None,
-        common.option(
-            "--format", panel=_QUERY, help="Format of the answer.", show_default="table, or what -o ends with"
-        ),
-    ] = None,
-    files: Annotated[
-        list[str] | None,
-        common.option(
-            "--with",
-            panel=_QUERY,
-            metavar="NAME=FILE",
-            help="A CSV, JSON or Parquet file as one more table.",
-            show_default=False,
-        ),
-    ] = None,
-    rows: Annotated[
-        int | None,
-        common.option(
-            "--rows",
-            panel=_QUERY,
-            least=0,
-            most=1_000_000_000,
-            help="Number of rows that a table shows; 0 for all.",
-            show_default="60 on a terminal",
-        ),
-    ] = None,
-    tables: Annotated[
-        bool,
-        common.option(
-            "--tables", panel=_QUERY, help="List the tables with their columns, units and meanings; no query."
-        ),
-    ] = False,
-    output: common.Printed = None,
-    force: common.Force = False,
-    json: common.Json = False,
-    quiet: common.Quiet = False,
-    verbose: common.Verbose = False,
-    config: common.Config = None,
-) -> None:
-    """Query the tables of logs in SQL: where people were, how fast, for how long, and how well they were tracked.
+class Query(Once[Any]):
+    """Answer a query, or list what can be queried; the list is another function."""
 
-    The tables are those of `mcaptrack export` (`mcaptrack docs tables`); the column `recording` names the log. They are
-    read from the files beside the log if those are up to date, otherwise from the log. Each other channel is a table
-    under its topic in double quotes. Queries read nothing else and change nothing. Needs DuckDB (`pip install duckdb`).
-    `mcaptrack docs sql` has examples.
+    class More(Printed):
+        """Options that the function has no use for."""
 
-    Example: mcaptrack query log.mcap "select topic, count(distinct track_id) from tracks group by topic"
+        file: Annotated[
+            PathLike | None,
+            Option(QUERY, short="f", shown=False, help="Read the query from this file; all arguments are logs."),
+        ] = None
+        form: Annotated[
+            Form | None,
+            Option(QUERY, flag="format", shown="table, or what -o ends with", help="Format of the answer."),
+        ] = None
+        rows: Annotated[
+            int | None,
+            Option(QUERY, 0, 10**9, shown="60 on a terminal", help="Number of rows that a table shows; 0 for all."),
+        ] = None
+        tables: Annotated[
+            bool, Option(QUERY, help="List the tables with their columns, units and meanings; no query.")
+        ] = False
 
-    Example: mcaptrack query 'runs/*.mcap' -f speed.sql -o speed.csv
-    """
-    paths, sql = _asked(words or [], file, tables)
-    if tables:
-        warn_unused("--tables lists what could be asked", "form", "rows")
-    logs = expand(paths, folders=True)
-    chosen = _form(form, output, json)
-    if output is not None:
-        from mcaptrack.files import is_same_file, refuse_overwrite
+    most_used = ("file", "form", "rows", "tables", "output", "force")
 
-        refuse_overwrite(output, force)
-        if any(is_same_file(output, path) for path in logs):
-            raise McaptrackError(f"{output} is both input and output; give another name with -o")
-    import mcaptrack
+    @property
+    def function(self) -> Callable[..., Any]:
+        """The function: another one lists the tables."""
+        return mcaptrack.list_tables if self.given["tables"] else mcaptrack.query
 
-    with common.Talk(quiet, verbose).open() as talk:
-        if tables:
-            listed = mcaptrack.list_tables(logs, files=_named(files or []))
-            with common.printed_to(output, force):
-                _print_tables(listed, json)
-            return
-        answer = mcaptrack.query(logs, sql, files=_named(files or []))
-        if chosen == "table":
-            limit = rows if rows is not None else _SHOWN if sys.stdout.isatty() and output is None else 0
-            with common.printed_to(output, force):
-                words_after = _print_answer(answer, limit)
-            talk.say(words_after) if words_after else None
+    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
+        """Return the arguments of the function: what the words of the command line mean."""
+        given, output = self.given, self.given["output"]
+        paths, sql = _asked(given["words"] or [], given["file"], given["tables"])
+        if given["tables"]:
+            warn_unused("--tables lists what could be asked", "form", "rows")
+        logs = expand(paths, folders=True)
+        self._form = _form(given["form"], output, given["json"])
+        if output is not None:
+            refuse_overwrite(output, given["force"])
+            if any(is_same_file(output, path) for path in logs):
+                raise McaptrackError(f"{output} is both input and output; give another name with -o")
+        return {"log": logs, "files": _named(given["files"] or [])} | ({} if given["tables"] else {"sql": sql})
+
+    def print(self, done: Any, talk: common.Talk) -> None:
+        """Print the answer, or write it to a file."""
+        output, json = self.given["output"], self.given["json"]
+        if self.given["tables"]:
+            with common.printed_to(output, self.given["force"]):
+                _print_tables(done, json)
+        elif self._form == "table":
+            limit = _SHOWN if sys.stdout.isatty() and output is None else 0
+            with common.printed_to(output, self.given["force"]):
+                note = _print_answer(done, limit if self.given["rows"] is None else self.given["rows"])
+            if note:
+                talk.say(note)
         else:
-            warn_unused(f"{chosen} has all rows", "rows")
-            _write(answer, chosen, output, json)
+            warn_unused(f"{self._form} has all rows", "rows")
+            _write(done, self._form, output, json)
 
 
 def _asked(arguments: Sequence[str], file: Path | None, tables: bool) -> tuple[list[Path], str]:

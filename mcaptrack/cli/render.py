@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from mcaptrack.api.rendering import default_suffix
 from mcaptrack.cli import common
-from mcaptrack.cli.declared import EachLog
-from mcaptrack.cli.many import many_options
+from mcaptrack.cli.many import EachLog
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:
@@ -18,10 +17,10 @@ if TYPE_CHECKING:
 class Render(EachLog["RenderResult"]):
     """Draw the annotated video."""
 
-    def arguments(self, names: Sequence[str]) -> dict[str, Any]:
+    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
         """Return the arguments; in ``--output-dir`` the name of the output says what is written."""
         arguments = super().arguments(names)
-        return arguments | {"gif": arguments["gif"] and many_options().output_dir is None}
+        return arguments | {"gif": arguments["gif"] and self.many.output_dir is None}
 
     def suffix(self) -> str:
         """Return the end of the names of outputs."""

@@ -1,53 +1,32 @@
-"""``mcaptrack report``: write one HTML page about logs."""
+"""``mcaptrack report``: what it prints."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from mcaptrack.cli import common
 from mcaptrack.cli.common import expand
+from mcaptrack.cli.declared import Once
+
+if TYPE_CHECKING:
+    from mcaptrack import ReportResult
 
 
-@common.one_line
-def report(
-    logs: common.Logs,
-    output: Annotated[
-        Path | None,
-        common.option(
-            "--output",
-            "-o",
-            panel=common.FILES,
-            help="Write the page to this file.",
-            show_default="LOG.report.html beside the log",
-        ),
-    ] = None,
-    camera: common.Camera = None,
-    force: common.Force = False,
-    json: common.Json = False,
-    quiet: common.Quiet = False,
-    verbose: common.Verbose = False,
-    config: common.Config = None,
-) -> None:
-    """Write one page about a log, or several: scores, forecasts, tracks over the scene, identity switches, lineage.
+class Report(Once["ReportResult"]):
+    """Write one HTML page about logs."""
 
-    The page needs no network and has no scripts; it contains its numbers as JSON, which --json prints. Scores are those
-    of `mcaptrack evaluate`; without ground truth in the log there are none. Only reads logs; `mcaptrack run` runs
-    stages that are missing. Of a folder that logs were exported to, with --output-dir, the page has totals,
-    trends, the worst logs, outliers and warnings.
+    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
+        """Return the arguments of the function: patterns and folders become logs."""
+        return super().arguments(names) | {"log": expand(self.given["logs"], folders=True)}
 
-    Example: mcaptrack report log.mcap -o report.html
+    def data(self, done: ReportResult) -> dict[str, Any]:
+        """Return the numbers of the page."""
+        return dict(done.data)
 
-    Example: mcaptrack report 'logs/*.mcap' -o report.html
-
-    Example: mcaptrack report tables/ -o fleet.html
-    """
-    import mcaptrack
-
-    paths = expand(logs, folders=True)
-    with common.Talk(quiet, verbose).open() as talk:
-        done = mcaptrack.report(paths, output, camera=camera, force=force, progress=talk.progress)
-        count = done.data["summary"]["logs"] if "summary" in done.data else len(paths)
+    def print(self, done: ReportResult, talk: common.Talk) -> None:
+        """Print where the page is, and with ``--json`` its numbers."""
+        count = done.data["summary"]["logs"] if "summary" in done.data else len(done.data["logs"])
         talk.say(f"{done.page}: {count} log{'s' if count > 1 else ''}, {done.size / 1e6:.2f} MB")
-    if json:
-        common.print_json(dict(done.data))
+        if self.given["json"]:
+            common.print_json(self.data(done))

@@ -1,74 +1,139 @@
-"""Run stages on logs, and print the results."""
+"""Commands that run stages on logs, and what they print: ``run``, ``events``, ``fuse`` (``stages`` has the others)."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
+from mcaptrack.api.declared import Option
 from mcaptrack.cli import common
+from mcaptrack.cli.chosen import configured
+from mcaptrack.cli.command import settings_of
 from mcaptrack.cli.flags import with_flags
-from mcaptrack.cli.many import LogWork, many_options, process
+from mcaptrack.cli.many import EachLog
+from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.cli.zones import zones_in_short
 from mcaptrack.errors import McaptrackError, command
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:
     from mcaptrack import RunResult
-    from mcaptrack.api.several import CameraResult
     from mcaptrack.pipeline import Summary
-
-#: Runs stages on a log; takes the keywords output, sidecar, force and camera, and may take progress.
-Run = Callable[..., "RunResult"]
+    from mcaptrack.pipeline.several import CameraResult
 
 _UP_TO_DATE = "nothing to do, everything is up to date"
 #: Parts of a run are listed that take at least this share of its time.
 _SLOW_SHARE = 0.05
 
 
-def run_on_logs(values: Mapping[str, Any], name: str, function: Run, options: Mapping[str, Any]) -> None:
-    """Run stages on each log, and print the results. ``function`` takes a log and ``options``."""
-    from mcaptrack.fleet import find_logs
+class RunsStages(EachLog["RunResult"]):
+    """A command that runs stages on each log."""
 
-    where = {name: values[name] for name in ("camera", "sidecar", "force") if name in values}
-    shows_events = name == "events"
-    with common.Talk(values["quiet"], values["verbose"]).open() as talk:
-        work: LogWork[RunResult] = LogWork(
-            name,
-            function,
-            {**options, **where},
-            show=lambda _, result: _print(result, shows_events, talk),
-            data=_as_json,
-            line=lambda result: _line_of(result, shows_events),
-        )
-        results, totals = process(find_logs(values["logs"]), work, talk, values["output"])
-    if values["json"]:
-        common.print_json({"results": [_as_json(result) for result in results], **totals})
+    #: Whether the numbers of events are what is asked for.
+    shows_events: ClassVar = False
+
+    def show(self, log: Location, done: RunResult, talk: common.Talk) -> None:
+        """Print what was made, and commands to run next."""
+        _print(done, self.shows_events, talk)
+
+    def line(self, done: RunResult) -> str:
+        """Return the result for one of many logs in one line."""
+        return _line_of(done, self.shows_events)
+
+    def data(self, done: RunResult) -> dict[str, Any]:
+        """Return the result of one log as values of JSON."""
+        return _as_json(done)
 
 
-def in_order(logs: Sequence[Path], output: Path | None) -> list[Location]:
-    """Return logs that follow one another, as they were named.
+class Events(RunsStages):
+    """Write events of tracks."""
 
-    Raises McaptrackError for one log alone, and for options that don't go with an order.
-    """
-    from mcaptrack.fleet import find_logs
+    shows_events = True
 
-    many, ordered = many_options(), [log.path for log in find_logs(logs)]
-    order, place = "one log is done after the other", "ids go on in the logs themselves"
-    refused: dict[str, tuple[object, str]] = {
-        "--jobs": ((many.jobs or 1) > 1, order),
-        "--scheduler": (many.scheduler, order),
-        "--ledger": (many.ledger, "it judges each log by itself, and a second run does only what is missing, anyway"),
-        "--output-dir": (many.output_dir, place),
-        "--output": (output, place),
-    }
-    for name, (is_given, why) in refused.items():
-        if is_given:
-            raise McaptrackError(f"--continue doesn't go with {name}: {why}; leave {name} out")
-    if len(ordered) < 2:
-        raise McaptrackError("--continue needs several logs, in the order of their times; name the one before, too")
-    return ordered
+
+class Fuse(RunsStages):
+    """Fuse the detections of several cameras."""
+
+    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
+        """Return the arguments of the function."""
+        arguments = super().arguments(names)
+        return arguments | {"clock_offset_s": offsets_of(arguments["clock_offset_s"])}
+
+
+class Run(RunsStages):
+    """Run all stages that are missing or out of date."""
+
+    class More:
+        """Options that the function has in another form."""
+
+        follows: Annotated[
+            bool,
+            Option(
+                flag="continue",
+                help="The logs follow one another, in this order, and are of one camera: people who are in the picture "
+                "at a cut keep their ids. One log is done after the other.",
+            ),
+        ] = False
+
+    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
+        """Return the arguments of the function: with the transforms that environment and files configure."""
+        from mcaptrack.evaluation.events import EventOptions
+        from mcaptrack.transforms import STAGES
+
+        arguments = super().arguments(names)
+        named = {str(stage.option): arguments.pop(stage.option) for stage in STAGES.values() if stage.option}
+        chosen = {kind: name for kind, name in named.items() if name}
+        with stdout_to_stderr():
+            settings, stages = settings_of("events"), configured(chosen)
+        arguments |= {s.option: stages.pop(s.name) for s in STAGES.values() if s.option in chosen}
+        if self.given["follows"]:
+            arguments["follows"] = self._in_order()
+        watched = EventOptions(*(settings.get(name) for name in ("similarity", "gate_m", "min_iou")))
+        return arguments | {"events": watched if arguments["events"] else False, "stages": stages}
+
+    def _in_order(self) -> list[Location]:
+        """Return logs that follow one another, as they were named.
+
+        Raises McaptrackError for one log alone, and for options that don't go with an order.
+        """
+        many, logs = self.many, [log.path for log in self.inputs]
+        order, place = "one log is done after the other", "ids go on in the logs themselves"
+        refused: dict[str, tuple[object, str]] = {
+            "--jobs": ((many.jobs or 1) > 1, order),
+            "--scheduler": (many.scheduler, order),
+            "--ledger": (
+                many.ledger,
+                "it judges each log by itself, and a second run does only what is missing",
+            ),
+            "--output-dir": (many.output_dir, place),
+            "--output": (self.given["output"], place),
+        }
+        for name, (is_given, why) in refused.items():
+            if is_given:
+                raise McaptrackError(f"--continue doesn't go with {name}: {why}; leave {name} out")
+        if len(logs) < 2:
+            raise McaptrackError("--continue needs several logs, in the order of their times; name the one before, too")
+        return logs
+
+
+def offsets_of(texts: Sequence[str] | None) -> dict[str, float]:
+    """Return the offsets of clocks by camera. Raises McaptrackError for others than CAMERA=SECONDS."""
+    out: dict[str, float] = {}
+    for text in texts or ():
+        name, equals, value = text.partition("=")
+        try:
+            seconds = float(value)
+        except ValueError:
+            seconds = math.nan
+        if not equals or not name or not math.isfinite(seconds):
+            raise McaptrackError(f"--clock-offset-s {text} is no CAMERA=SECONDS, as in front=0.3")
+        if name in out:
+            raise McaptrackError(f"--clock-offset-s is given twice for {name}")
+        out[name] = seconds
+    return out
 
 
 def _as_json(result: RunResult) -> dict[str, Any]:

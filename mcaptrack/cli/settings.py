@@ -7,8 +7,6 @@ the working folder and then that of the user.
 from __future__ import annotations
 
 import difflib
-import inspect
-import math
 import os
 import re
 import reprlib
@@ -18,8 +16,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, Protocol, get_args, get_origin, get_type_hints
+from typing import Any, Final, NamedTuple, Protocol
 
+from mcaptrack.api.declared import Option, Parameter
 from mcaptrack.cli.config import NAME, ConfigFile, read_files, user_file
 from mcaptrack.cli.text import refuse_usage
 from mcaptrack.environment import PREFIX, VARIABLES
@@ -31,24 +30,6 @@ CALL_ONLY: Final = ("config", "help")
 _YES: Final = ("1", "true", "yes", "on")
 _NO: Final = ("0", "false", "no", "off")
 _LARGEST: Final = 2**63
-
-
-@dataclass(frozen=True)
-class Declared:
-    """Properties of an option that Typer doesn't have.
-
-    Attributes
-    ----------
-    tuning : bool or str
-        Whether a file in the working folder may set it: numbers, choices and switches that change how results are
-        computed. For text, a pattern that the whole value has to match, because text could be a path.
-    least, most : float
-        The range of numbers.
-    """
-
-    tuning: bool | str = False
-    least: float = -math.inf
-    most: float = math.inf
 
 
 class Given(NamedTuple):
@@ -68,7 +49,7 @@ class Setting:
     parameter: str
     kind: Any
     many: bool
-    declared: Declared
+    declared: Option
 
     @property
     def variable(self) -> str:
@@ -138,23 +119,10 @@ Commands = Mapping[str, HasSettings]
 _KNOWN: Final[ContextVar[tuple[Commands, dict[str, dict[str, Given]]]]] = ContextVar("known")
 
 
-def declared_settings(command: str, function: Any, parameters: Iterable[Any]) -> dict[str, Setting]:
-    """Return the options of a command by name. ``parameters`` are Typer's; ``function`` has their annotations."""
-    hints = get_type_hints(inspect.unwrap(function), include_extras=True)
-    hints |= {name: hint for name, hint in function.__annotations__.items() if not isinstance(hint, str)}
-    out = {}
-    for parameter in parameters:
-        if parameter.param_type_name != "option":
-            continue
-        annotation, *about = get_args(hints[parameter.name])
-        declared = next((declaration for part in about if (declaration := getattr(part, "declared", None))), Declared())
-        members = [part for part in get_args(annotation) if part is not type(None)]
-        kind = annotation if get_origin(annotation) is Literal or not members else members[0]
-        many = get_origin(kind) is list
-        name = max(parameter.opts, key=len).lstrip("-")
-        kind = get_args(kind)[0] if many else kind
-        out[name] = Setting(command, name, parameter.name, kind, many, declared)
-    return out
+def declared_settings(command: str, parameters: Iterable[Parameter]) -> dict[str, Setting]:
+    """Return the options of a command by name."""
+    names = ((max(each.flags, key=len).partition("/")[0].lstrip("-"), each) for each in parameters)
+    return {name: Setting(command, name, each.name, each.kind, each.many, each.option) for name, each in names}
 
 
 def may_be_set(arguments: Sequence[str]) -> bool:

@@ -1,12 +1,14 @@
-"""``mcaptrack info`` and ``mcaptrack export``: show the channels of a log, and write them as tables."""
+"""``mcaptrack info`` and ``mcaptrack export``: what they print about the channels of a log, and its tables."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.cli import common
-from mcaptrack.cli.many import LogWork, many_options, process, takes_many
+from mcaptrack.cli.declared import Printed
+from mcaptrack.cli.many import EachLog
 from mcaptrack.cli.text import console, printable
 from mcaptrack.location import Location
 
@@ -16,49 +18,83 @@ if TYPE_CHECKING:
     from rich.tree import Tree
 
     from mcaptrack import ExportResult, LogInfo
+    from mcaptrack.fleet import NamedLog
 
 
-@common.one_line
-@takes_many(outputs=False)
-def info(
-    logs: common.Logs,
-    frames: Annotated[
-        bool,
-        common.option(
-            "--frames", help="Also read the transforms between frames of reference, and draw the tree of frames."
-        ),
-    ] = False,
-    output: common.Printed = None,
-    force: common.Force = False,
-    json: common.Json = False,
-    quiet: common.Quiet = False,
-    verbose: common.Verbose = False,
-    config: common.Config = None,
-) -> None:
-    """Show the channels of a log, their number of messages, and what was made from what.
+class Info(EachLog["LogInfo"]):
+    """Show the channels of logs."""
 
-    Those of each camera are together, if there are several, under its name.
+    writes = False
+    prints_results = True
+    More = Printed
 
-    Reads the summary only, unless --frames is given. With -v also the parameters that channels were made with.
+    def run(self, names: Mapping[str, str]) -> None:
+        """Run the command; what it prints goes to a file, if one is named."""
+        with common.printed_to(self.given["output"], self.given["force"]):
+            super().run(names)
 
-    Example: mcaptrack info log.mcap
+    def show(self, log: Location, done: LogInfo, talk: common.Talk) -> None:
+        """Print the channels."""
+        if not self.given["json"]:
+            _print(done.to_json(), self.given["verbose"])
 
-    Example: mcaptrack info robot.mcap --frames
-    """
-    import mcaptrack
-    from mcaptrack.fleet import find_logs
+    def data(self, done: LogInfo) -> dict[str, Any]:
+        """Return the channels as values of JSON."""
+        return done.to_json()
 
-    def show(_: Location, log_info: LogInfo) -> None:
-        if not json:
-            _print(log_info.to_json(), verbose)
 
-    work: LogWork[LogInfo] = LogWork(
-        "info", mcaptrack.info, {"frames": frames}, show, lambda log_info: log_info.to_json(), writes=False
-    )
-    with common.Talk(quiet, verbose).open() as talk, common.printed_to(output, force):
-        infos, totals = process(find_logs(logs), work, talk)
-        if json:
-            common.print_json({"results": [log_info.to_json() for log_info in infos], **totals})
+class Export(EachLog["ExportResult"]):
+    """Write logs as tables, as ROS 2 bags, or for other programs."""
+
+    @property
+    def shares_output(self) -> bool:  # type: ignore[override]
+        """Whether all logs have one output: a folder of tables."""
+        from mcaptrack.tables import FORMATS
+
+        return self.given["form"] in FORMATS
+
+    def logs(self) -> Sequence[NamedLog]:
+        """Return the logs. Raises McaptrackError if two would have the same tables."""
+        from mcaptrack.api.exporting import refuse_same_tables
+
+        logs = super().logs()
+        if self.shares_output:
+            refuse_same_tables([log.path for log in logs], self._folder)
+        return logs
+
+    @property
+    def _folder(self) -> Path | None:
+        folder: Path | None = self.given["output"] or self.given["output_dir"]
+        return folder
+
+    def suffix(self) -> str:
+        """Return the end of the names of bags and files."""
+        from mcaptrack.tables.exchange import ends_with
+
+        form: str = self.given["form"]
+        return ".rosbag2" if form.startswith("rosbag2") else ends_with(form)
+
+    def show(self, log: Location, done: ExportResult, talk: common.Talk) -> None:
+        """Print what was written."""
+        talk.say(f"{done.folder}: {self.line(done)}")
+        talk.detail(f"{done.folder}: written {', '.join(done.written) or 'nothing, all tables are up to date'}")
+
+    def line(self, done: ExportResult) -> str:
+        """Return the number of rows of each table."""
+        return ", ".join(f"{name} {count}" for name, count in done.rows.items())
+
+    def data(self, done: ExportResult) -> dict[str, Any]:
+        """Return the result as values of JSON."""
+        written = {"log": str(done.log), "folder": str(done.folder), "rows": done.rows}
+        return written | {"written": list(done.written)}
+
+    def print(self, results: Sequence[ExportResult], totals: Mapping[str, Any]) -> None:
+        """Print the results; bring the catalogue of several logs in one folder up to date."""
+        from mcaptrack.tables.catalogue import refresh
+
+        if self._folder is not None and self.given["form"] == "parquet" and len(self.given["logs"]) > 1:
+            refresh(self._folder)
+        super().print(results, totals)
 
 
 def _print(data: dict[str, Any], verbose: bool) -> None:
@@ -183,123 +219,3 @@ def _frames(frames: list[dict[str, Any]], start_ns: int) -> Tree:
         node = above.add(label)
         nodes[frame["frame"]] = (node, depth + 1) if depth < _DEEPEST else (above, depth)
     return root
-
-
-@common.one_line
-@takes_many()
-def export(
-    logs: common.Logs,
-    output: Annotated[
-        Path | None,
-        common.option(
-            "--output",
-            "-o",
-            panel=common.FILES,
-            help="Folder for the tables or the bag, or the file.",
-            show_default="LOG.tables, LOG.rosbag2, LOG.cvat.xml, ... beside the log",
-        ),
-    ] = None,
-    form: Annotated[
-        Literal[
-            "parquet",
-            "arrow",
-            "csv",
-            "jsonl",
-            "rosbag2",
-            "rosbag2-sqlite3",
-            "mot",
-            "kitti",
-            "coco",
-            "cvat",
-            "boxes-csv",
-            "rerun",
-        ],
-        common.option(
-            "--format",
-            panel=common.FILES,
-            help="Tables (parquet, arrow, csv, jsonl), a ROS 2 bag, or a file with the boxes of one channel: "
-            "MOTChallenge, KITTI tracking, COCO with tracks, CVAT for video, a table, or a recording of Rerun.",
-        ),
-    ] = "parquet",
-    topic: Annotated[
-        list[str] | None,
-        common.option(
-            "--topic",
-            panel=common.FILES,
-            help="Also write a table of all messages of this channel; the channel with the boxes for a file.",
-            show_default=False,
-        ),
-    ] = None,
-    blobs: Annotated[
-        bool,
-        common.option(
-            "--blobs",
-            panel=common.FILES,
-            help="With --topic: include binary fields, such as pictures and point clouds.",
-        ),
-    ] = False,
-    force: Annotated[
-        bool,
-        common.option(
-            "--force",
-            panel=common.FILES,
-            help="Write all tables again, also over those of another log of this name; replace a bag or a file.",
-        ),
-    ] = False,
-    json: common.Json = False,
-    quiet: common.Quiet = False,
-    verbose: common.Verbose = False,
-    config: common.Config = None,
-) -> None:
-    """Write a log as tables (Parquet), one row per object and frame, as a ROS 2 bag, or for other programs.
-
-    One folder a table (frames, detections, tracks, track_summary, predictions, events, metrics, channels, recordings
-    and others), one file a log in it; several logs can share a folder. Exporting again replaces what has changed.
-    `mcaptrack docs tables` lists all columns. A bag (rosbag2) holds results as ROS messages, for RViz and `ros2 bag`.
-    A file (mot, kitti, coco, cvat, boxes-csv) has the boxes of one channel; `mcaptrack ingest` reads it again.
-
-    Example: mcaptrack export log.mcap -o tables/
-
-    Example: mcaptrack export log.mcap --format cvat -o boxes.xml
-
-    Example: mcaptrack export robot.mcap --topic /imu --format csv
-    """
-    import mcaptrack
-    from mcaptrack.api.exporting import refuse_same_tables
-    from mcaptrack.fleet import find_logs
-    from mcaptrack.tables import FORMATS as TABLES
-    from mcaptrack.tables.catalogue import refresh
-    from mcaptrack.tables.exchange import ends_with
-
-    logs_found, is_table = find_logs(logs), form in TABLES
-    folder = output or many_options().output_dir
-    if is_table:
-        refuse_same_tables([log.path for log in logs_found], folder)
-
-    def rows(done: ExportResult) -> str:
-        return ", ".join(f"{name} {count}" for name, count in done.rows.items())
-
-    def show(_: Location, done: ExportResult) -> None:
-        talk.say(f"{done.folder}: {rows(done)}")
-        talk.detail(f"{done.folder}: written {', '.join(done.written) or 'nothing, all tables are up to date'}")
-
-    def data(done: ExportResult) -> dict[str, object]:
-        return {"log": str(done.log), "folder": str(done.folder), "rows": done.rows, "written": list(done.written)}
-
-    options: dict[str, Any] = {"form": form, "topic": topic, "blobs": blobs, "force": force}
-    with common.Talk(quiet, verbose).open() as talk:
-        work = LogWork(
-            "export",
-            mcaptrack.export,
-            options,
-            show,
-            data,
-            rows,
-            ".rosbag2" if form.startswith("rosbag2") else ends_with(form),
-            shares_output=is_table,
-        )
-        results, totals = process(logs_found, work, talk, output)
-        if folder is not None and form == "parquet" and len(logs_found) > 1:
-            refresh(folder)
-    if json:
-        common.print_json({"results": [data(result) for result in results], **totals})

@@ -10,88 +10,122 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field
 from functools import partial
 from types import MappingProxyType
-from typing import Annotated, Any, Final, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
-import mcaptrack
+from mcaptrack.api.declared import Option, Parameter, parameter_of
 from mcaptrack.api.declared import options_of as options_of_function
-from mcaptrack.api.declared import words_of
-from mcaptrack.cli import common
+from mcaptrack.api.options import PLUGIN
 from mcaptrack.cli.chosen import Maker, configured, has_flag, is_open, listed, options_of, values_set
 from mcaptrack.cli.command import is_on_command_line
-from mcaptrack.cli.declared import annotation_of, command
-from mcaptrack.cli.many import NAMES
-from mcaptrack.cli.running import run_on_logs
+from mcaptrack.cli.declared import OfAll, command, help_of, parameters_of
+from mcaptrack.cli.running import RunsStages
 from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.errors import McaptrackError
-from mcaptrack.registry import BUILT_IN, Kind, names
 from mcaptrack.transforms import STAGES, Stage, Transform
 from mcaptrack.transforms.protocol import choices, member_type
 
-Topic = Annotated[
-    str | None, common.option("--topic", panel=common.FILES, help="Read this channel instead of the default one.")
-]
-Frame = Annotated[
-    str | None, common.option("--frame", panel=common.FILES, help="Bring boxes in space to this frame, such as map.")
-]
+if TYPE_CHECKING:
+    from mcaptrack import RunResult
+
 Set = Annotated[
-    list[str] | None,
-    common.option(
-        "--set",
+    Sequence[str] | None,
+    Option(
         tuning=r"[A-Za-z0-9_-]+=[A-Za-z0-9_.,+ -]*",
         metavar="NAME=VALUE",
+        shown=False,
         help="Set a parameter that has no option of its own, as often as needed; `mcaptrack docs options` lists them.",
-        show_default=False,
     ),
 ]
-#: Names that files in the working folder may give: built-in or installed ones, but not ``module:Class``.
-_NAME: Final = r"[A-Za-z0-9_-]+"
 
 
-def chooser(kind: Kind, intro: str = "The {kind} to use", panel: str = "", shown: str | bool = True) -> Any:
-    """Return the option that chooses a detector, tracker or so on of the registry by name."""
-    built_in = ", ".join(BUILT_IN[kind])
-    return common.option(
-        f"--{kind}",
-        tuning=_NAME,
-        panel=panel,
-        metavar="NAME",
-        help=f"{intro.format(kind=kind)}: {built_in}, one of an installed package, or module:Class.",
-        autocompletion=lambda: names(kind),
-        show_default=shown,
-    )
+class StageCommand(RunsStages):
+    """The command of a stage: declared by its function, with the parameters of its transforms as options.
+
+    ``kinds`` are its transforms by name.
+    """
+
+    def __init__(self, name: str, values: Mapping[str, Any], kinds: Mapping[str, type[Transform]]) -> None:
+        super().__init__(name, values)
+        self.kinds = kinds
+        self._transform: Transform | None = None
+
+    @property
+    def function(self) -> Callable[..., RunResult]:
+        """The function, with the transform that ``arguments`` has made."""
+        from mcaptrack.api.running import run_stage
+
+        return partial(run_stage, self.name, self._transform)
+
+    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
+        """Return the arguments of the function, and make the transform, unless the boxes of a log decide which."""
+        stage, owners = STAGES[self.name], _owners(self.kinds)
+        wanted = {option: self.given[option] for option in owners if self.given.get(option) is not None}
+        for option, value in values_set(self.name, self.given.get("set"), self.kinds).items():
+            if option in wanted and is_on_command_line(option):
+                raise McaptrackError(f"--set {option} and the option of this name are both given; give one of them")
+            wanted[option] = value
+        make = Maker.of(stage, self.given, wanted, owners)
+        with stdout_to_stderr():
+            self._transform = None if is_open(stage, self.given) else make()
+            arguments: dict[str, Any] = {"stages": configured(), "make": make}
+        where = ("topic", "to", "frame", "camera", "output", "sidecar", "force", "mode")
+        return arguments | {name: self.given[name] for name in where if name in names}
+
+    @classmethod
+    def function_of(
+        cls, name: str, plugins: Mapping[str, type[Transform]] = MappingProxyType({})
+    ) -> Callable[..., None]:
+        """Return the function of the command, with the options of ``plugins``: transforms of other packages."""
+        stage, declared = STAGES[name], cls.declaration(name)
+        kinds, own = {**plugins, **stage.built_in()}, options_of_function(declared)
+        options, settable = _options(stage, kinds)
+        more = [*options, *cls.options()]
+        flags = Counter(flag for option in (*own, *more, *parameters_of(OfAll)) for flag in _flags(option))
+        flags += Counter(["help", "help-all", "logs"])
+        if twice := {flag.replace("-", "_") for flag, count in flags.items() if count > 1}:
+            text = f"{' and '.join(plugins)} can't have a parameter {' or '.join(sorted(twice))}"
+            raise McaptrackError(f"{text}: that is the name of an option of {name}")
+        names = {option.name: option.name for option in own}
+        function: Any = command(name, declared, lambda given: cls(name, given, kinds).run(names), more)
+        function.help, function.settable = stage_help(stage, help_of(declared), plugins), settable
+        return function  # type: ignore[no-any-return]
 
 
-#: Options that every command has beside those of its function.
-RESERVED: Final = (
-    "help",
-    "logs",
-    "json",
-    "quiet",
-    "verbose",
-    "config",
-    "log-format",
-    *(n.replace("_", "-") for n in NAMES),
-)
+def _owners(kinds: Mapping[str, type[Transform]]) -> dict[str, list[str]]:
+    """The names of the transforms that have a parameter, by its name."""
+    owners: dict[str, list[str]] = {}
+    for name, kind in kinds.items():
+        for option in options_of(kind):
+            owners.setdefault(option, []).append(name)
+    return owners
 
 
-class StageCommand:
-    """The commands of stages: declared by their functions, with the parameters of their transforms as options."""
+def _options(stage: Stage, kinds: Mapping[str, type[Transform]]) -> tuple[list[Parameter], tuple[str, ...]]:
+    """The options for the transforms of a stage, and the parameters that only ``--set`` sets."""
+    options = []
+    settable = []
+    for name, having in _owners(kinds).items():
+        field = options_of(kinds[having[0]])[name]
+        if has_flag(field):
+            is_shared = set(stage.built_in()) <= set(having)
+            hint = hint_of(kinds[having[0]], field, () if is_shared else having)
+            options.append(parameter_of(name, hint, None))
+        else:
+            settable.append(name)
+    if settable:
+        options.append(parameter_of("set", Set, None))
+    return options, tuple(settable)
 
-    @staticmethod
-    def function_of(name: str) -> Callable[..., None]:
-        """Return the function of the command of a stage."""
-        return stage_command(STAGES[name])
 
-
-def stage_help(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> str:
-    """Return the help of the command of a stage; the docstrings of plug-ins come first."""
-    where = f"From /camera/{stage.input_topic} to /camera/{stage.output_topic}. Inputs that are missing are made first."
-    others = [f"{name}: {text}" for name, plugin in plugins.items() if (text := _own_doc(plugin))]
-    docs = [*others, *(inspect.cleandoc(cls.__doc__ or "") for cls in stage.built_in().values())]
-    intros = [re.split(r"\n\n\w+\n---", doc)[0] for doc in docs]  # without the sections on use from Python
-    return "\n\n".join(
-        [*intros, where, *(f"Example: {line}" for line in words_of(getattr(mcaptrack, stage.name)).examples)]
-    )
+def stage_help(stage: Stage, text: str, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> str:
+    """Return the help of the command of a stage: ``text``, and what its transforms do, plug-ins first."""
+    text, *examples = text.split("\n\nExample: ")
+    built_in = stage.built_in() if stage.kind else {}
+    firsts = {name: _own_doc(cls).partition("\n\n")[0] for name, cls in built_in.items()}
+    lines = [f"- `{name}`: {' '.join(first.split())}" for name, first in firsts.items() if first]
+    others = [f"{name}: {doc}" for name, plugin in plugins.items() if (doc := _own_doc(plugin))]
+    others = [re.split(r"\n\n\w+\n---", doc)[0] for doc in others]  # without the sections on use from Python
+    return "\n\n".join([text, *others, "\n".join(lines), *(f"Example: {line}" for line in examples)])
 
 
 def _own_doc(cls: type[Transform]) -> str:
@@ -108,38 +142,22 @@ def _panel(theme: str, of: Sequence[str]) -> str:
     return f"{theme} ({those})" if theme else f"Options of {those}"
 
 
-def _option(field: Field[Any], annotation: Any, of: Sequence[str] = ()) -> Any:
-    """Return the option for a parameter. Its value is None unless it is set; its help shows the default.
+def hint_of(kind: type[Transform], field: Field[Any], of: Sequence[str] = ()) -> Any:
+    """Return the type of the option for a parameter of a transform. Its value is None unless it is set.
 
     ``of`` are the names of the transforms that have the parameter; none if all have it.
     """
-    (kind, is_tuple), about = member_type(annotation), field.metadata
-    flag = "--" + field.name.replace("_", "-")
-    switch = f"{flag}/--no-{flag[2:]}" if kind is bool and not is_tuple else flag
-    tuning = _NAME if about.get("kind") else about.get("pattern") or bool(choices(kind)) or kind is not str
-    text = f"parameter {field.name} of {' and '.join(of)}"
-    info = option_of(field, switch, _panel(about.get("theme", ""), of), tuning, text)
-    values: Any = list[kind] if is_tuple else kind  # type: ignore[valid-type]
-    return Annotated[values | None, info]
-
-
-def option_of(field: Field[Any], switch: str, panel: str, tuning: Any = True, otherwise: str = "") -> Any:
-    """Return the option for a parameter of a transform, with its help, range and default.
-
-    ``otherwise`` is the help of a parameter without any.
-    """
-    about = field.metadata
-    text = str(about.get("help", "") or otherwise)
-    default = field.default_factory() if field.default_factory is not MISSING else field.default
-    return common.option(
-        switch,
-        panel=panel,
-        tuning=tuning,
+    (member, is_tuple), about = member_type(get_type_hints(kind)[field.name]), field.metadata
+    text = str(about.get("help", "") or f"parameter {field.name} of {' and '.join(of)}")
+    option = Option(
+        _panel(about.get("theme", ""), of),
+        about.get("least", -math.inf),
+        about.get("most", math.inf),
+        tuning=PLUGIN if about.get("kind") else about.get("pattern") or bool(choices(member)) or member is not str,
+        shown=shown_default(field.default_factory() if field.default_factory is not MISSING else field.default),
         help=f"{text[:1].upper()}{text[1:]}.",
-        least=about.get("least", -math.inf),
-        most=about.get("most", math.inf),
-        show_default=shown_default(default),
     )
+    return Annotated[(Sequence[member] if is_tuple else member) | None, option]  # type: ignore[valid-type]
 
 
 def shown_default(default: Any) -> str:
@@ -151,67 +169,7 @@ def shown_default(default: Any) -> str:
     return str(default).lower() if isinstance(default, bool) else f"{default}"
 
 
-def _flags(parameter: str, annotation: Any) -> set[str]:
+def _flags(option: Parameter) -> set[str]:
     """The names that an option has on the command line, without the dashes."""
-    about = get_args(annotation)[1]
-    # Typer takes the first name for a default until it reads the annotation.
-    names = (about.default, *(about.param_decls or ()))
-    names_given = [part for name in names if isinstance(name, str) for part in name.split("/")]
-    return {name.removeprefix("--") for name in (*names_given, parameter.replace("_", "-")) if name}
-
-
-def stage_command(stage: Stage, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> Callable[..., None]:
-    """Return the function of a stage's command: the options of its function, and the parameters of its transforms.
-
-    The options of ``plugins``, transforms of other packages, are added.
-    """
-    declared = getattr(mcaptrack, stage.name)
-    kinds = {**plugins, **stage.built_in()}
-    own = {name: options_of(kind) for name, kind in kinds.items()}
-    owners: dict[str, list[str]] = {}
-    for name, options_there in own.items():
-        for option in options_there:
-            owners.setdefault(option, []).append(name)
-    built_in = set(stage.built_in())
-    more: dict[str, tuple[Any, Any]] = {}
-    for option, having in owners.items():
-        if not has_flag(own[having[0]][option]):
-            continue
-        hint = get_type_hints(kinds[having[0]])[option]
-        more[option] = _option(own[having[0]][option], hint, () if built_in <= set(having) else having), None
-    if len(more) < len(owners):
-        more["set"] = Set, None
-    taken = {option.name: annotation_of(option) for option in options_of_function(declared)}
-    if stage.kind:
-        usual = stage.entry(stage.default).name
-        which = chooser(stage.kind, shown=usual if stage.profiles else True)
-        # None where a profile may choose the transform.
-        taken[stage.kind] = Annotated[str | None, which] if stage.profiles else Annotated[str, which]
-    pairs = [*taken.items(), *((option, hint) for option, (hint, _) in more.items())]
-    flags = Counter(flag for option, hint in pairs for flag in _flags(option, hint)) + Counter(RESERVED)
-    if twice := {flag.replace("-", "_") for flag, count in flags.items() if count > 1}:
-        text = f"{' and '.join(plugins)} can't have a parameter {' or '.join(sorted(twice))}"
-        raise McaptrackError(f"{text}: that is the name of an option of {stage.name}")
-    if stage.kind:
-        more[stage.kind] = taken[stage.kind], None if stage.profiles else usual
-
-    def run(values: Mapping[str, Any]) -> None:
-        wanted = {option: values[option] for option in owners if values.get(option) is not None}
-        for option, value in values_set(stage.name, values.get("set"), kinds).items():
-            if option in wanted and is_on_command_line(option):
-                raise McaptrackError(f"--set {option} and the option of this name are both given; give one of them")
-            wanted[option] = value
-
-        from mcaptrack.api.running import run_stage
-
-        make = Maker.of(stage, values, wanted, owners)
-        options: dict[str, Any] = {"topic": values["topic"], "to": values["to"], "frame": values.get("frame")}
-        with stdout_to_stderr():
-            transform = None if is_open(stage, values) else make("")
-            options |= {"stages": configured(), "mode": values["mode"] if stage.modes else None, "make": make}
-        run_on_logs(values, stage.name, partial(run_stage, stage.name, transform), options)
-
-    function: Any = command(stage.name, declared, run, more)
-    function.help = stage_help(stage, plugins)
-    function.settable = tuple(option for option in owners if option not in more)
-    return function  # type: ignore[no-any-return]
+    flags = {name.removeprefix("--") for flag in option.flags for name in flag.split("/")}
+    return flags | {option.name.replace("_", "-")}

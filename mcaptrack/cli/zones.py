@@ -1,121 +1,70 @@
-"""``mcaptrack zones``: count visits of zones and crossings of lines."""
+"""``mcaptrack zones``: what it prints."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any, Final
 
+import mcaptrack
 from mcaptrack.cli import common
-from mcaptrack.cli.many import LogWork, process, takes_many
+from mcaptrack.cli.many import EachLog
 from mcaptrack.cli.text import console, say
 from mcaptrack.errors import McaptrackError
+from mcaptrack.location import Location
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from mcaptrack import RunResult
 
-_COUNT = "Counting"
 #: The word before a log that is drawn on.
-_DRAW = "draw"
+_DRAW: Final = "draw"
 
 
-@common.one_line
-@takes_many()
-def zones(
-    logs: common.Logs,
-    zones: Annotated[
-        Path | None,
-        common.option(
-            "--zones",
-            panel=_COUNT,
-            metavar="FILE",
-            help="Zones (Polygons) and lines (LineStrings) of GeoJSON, in metres or pixels.",
-            show_default="those that were counted before",
-        ),
-    ] = None,
-    topic: Annotated[
-        list[str] | None,
-        common.option(
-            "--topic",
-            panel=_COUNT,
-            help="Count these channels of tracks.",
-            show_default="tracks, re-tracked tracks, truth",
-        ),
-    ] = None,
-    margin_m: Annotated[
-        float | None,
-        common.option(
-            "--margin-m",
-            panel=_COUNT,
-            least=0,
-            most=100,
-            help="A track changes sides where it is farther than so many metres from an edge: noise there counts once.",
-            show_default="0.25",
-        ),
-    ] = None,
-    max_gap_s: Annotated[
-        float | None,
-        common.option(
-            "--max-gap-s",
-            panel=_COUNT,
-            least=0,
-            most=1e6,
-            help="A track that is not seen for more seconds than this ends its visit.",
-            show_default="4",
-        ),
-    ] = None,
-    camera: common.Camera = None,
-    output: common.Output = None,
-    sidecar: common.Sidecar = None,
-    force: common.Force = False,
-    json: common.Json = False,
-    quiet: common.Quiet = False,
-    verbose: common.Verbose = False,
-    config: common.Config = None,
-) -> None:
-    """Count visits of zones and crossings of lines by the tracks of a log, and write them into the log.
+class Zones(EachLog["RunResult"]):
+    """Count visits of zones and crossings of lines; with ``draw`` before a log, write a page to draw them on."""
 
-    Beside each channel of tracks, such as /camera/retracks/full, go .../zones/visits, .../zones/crossings, and counts
-    for each frame in .../zones/counts. `mcaptrack run --zones FILE` does this, too, and later runs count again where
-    tracks have changed. `mcaptrack docs zones` says what the file holds.
-
-    With `draw` before the log, a page is written on which zones are drawn over a picture of the scene, in a browser.
-
-    Example: mcaptrack zones log.mcap --zones zones.geojson
-
-    Example: mcaptrack zones draw log.mcap
-    """
-    import mcaptrack
-    from mcaptrack.fleet import find_logs
-
-    if str(logs[0]) == _DRAW and len(logs) == 1 and not Path(_DRAW).exists():
-        raise McaptrackError("`zones draw` needs a log: name it after draw")
-    if str(logs[0]) == _DRAW and len(logs) > 1:
-        extra = {"--zones": zones, "--topic": topic, "--margin-m": margin_m, "--max-gap-s": max_gap_s}
-        extra |= {"--sidecar": sidecar}
+    def run(self, names: Mapping[str, str]) -> None:
+        """Run the command."""
+        logs = self.given["logs"]
+        if str(logs[0]) != _DRAW or (len(logs) == 1 and Path(_DRAW).exists()):
+            super().run(names)
+            return
+        if len(logs) == 1:
+            raise McaptrackError("`zones draw` needs a log: name it after draw")
+        counting = ("zones", "topic", "margin_m", "max_gap_s", "sidecar")
+        extra = {f"--{name.replace('_', '-')}": self.given[name] for name in counting}
         if len(logs) > 2 or any(value is not None for value in extra.values()):
             unused = next((name for name, value in extra.items() if value is not None), f"another log ({logs[-1]})")
             raise McaptrackError(f"`zones draw` takes one log, --camera, --output and --force, not {unused}")
-        page = mcaptrack.draw_zones(logs[1], camera=camera, output=output, force=force)
-        if json:
+        options = {name: self.given[name] for name in ("camera", "output", "force")}
+        page = mcaptrack.draw_zones(logs[1], **options)
+        if self.given["json"]:
             common.print_json({"log": str(logs[1]), "page": str(page)})
-        elif not quiet:
+        elif not self.given["quiet"]:
             say(f"{page}: open it in a browser, draw, and download the file for --zones")
-        return
 
-    options: dict[str, Any] = {"zones": zones, "topic": topic, "margin_m": margin_m, "max_gap_s": max_gap_s}
-    options |= {"camera": camera, "sidecar": sidecar, "force": force}
-    with common.Talk(quiet, verbose).open() as talk:
-        work: LogWork[RunResult] = LogWork(
-            "zones",
-            mcaptrack.zones,
-            options,
-            show=lambda _, result: _print(result, talk, json),
-            data=_as_json,
-            line=zones_in_short,
-        )
-        results, totals = process(find_logs(logs), work, talk, output)
-    if json:
-        common.print_json({"results": [_as_json(result) for result in results], **totals})
+    def show(self, log: Location, done: RunResult, talk: common.Talk) -> None:
+        """Print the totals of zones and lines."""
+        if not self.given["json"]:
+            print_zones(done)
+        where = f"results are in {done.written_to}" if done.written_to else "everything was up to date"
+        where += f": {done.written_because}" if done.written_to and done.written_because else ""
+        talk.say(f"{done.log}: {where}")
+
+    def line(self, done: RunResult) -> str:
+        """Return the number of zones and lines that were counted."""
+        return zones_in_short(done)
+
+    def data(self, done: RunResult) -> dict[str, Any]:
+        """Return the totals as values of JSON."""
+        return {
+            "log": str(done.log),
+            "stages": list(done.stages),
+            "zones": {topic: [total.to_json() for total in totals] for topic, totals in done.zones.items()},
+            "written_to": str(done.written_to) if done.written_to else None,
+            "seconds": done.seconds,
+        }
 
 
 def zones_in_short(result: RunResult) -> str:
@@ -124,24 +73,6 @@ def zones_in_short(result: RunResult) -> str:
     topics = len(result.zones)
     named = "zone or line" if zones == 1 else "zones and lines"
     return f"{zones} {named}, of {topics} channel{'' if topics == 1 else 's'} of tracks"
-
-
-def _as_json(result: RunResult) -> dict[str, Any]:
-    return {
-        "log": str(result.log),
-        "stages": list(result.stages),
-        "zones": {topic: [total.to_json() for total in totals] for topic, totals in result.zones.items()},
-        "written_to": str(result.written_to) if result.written_to else None,
-        "seconds": result.seconds,
-    }
-
-
-def _print(result: RunResult, talk: common.Talk, is_json: bool) -> None:
-    if not is_json:
-        print_zones(result)
-    where = f"results are in {result.written_to}" if result.written_to else "everything was up to date"
-    where += f": {result.written_because}" if result.written_to and result.written_because else ""
-    talk.say(f"{result.log}: {where}")
 
 
 def print_zones(result: RunResult) -> None:

@@ -17,13 +17,13 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack import log
+from mcaptrack.choices import Similarity
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation import metrics
 from mcaptrack.evaluation.aligned import (
     IOU_THRESHOLD,
     LocatedRows,
     RowComparison,
-    Similarity,
     align,
     are_3d,
     compare_rows,

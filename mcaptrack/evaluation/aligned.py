@@ -6,10 +6,11 @@ Letters: N rows, T times, G people of the ground truth, H tracks in one frame.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Final, Literal, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
+from mcaptrack.choices import Similarity
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import metrics
 from mcaptrack.evaluation.metrics import Matchup
@@ -23,8 +24,6 @@ from mcaptrack.geometry.ragged import cross_pairs, group_index
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.framing import frame_times, join_frames, split_rows
 from mcaptrack.schema.resampling import is_observed_at, resample
-
-Similarity = Literal["iou", "metres", "bev-iou", "3d-iou"]
 
 #: The default gates: least overlap of boxes, and largest distance on the ground.
 IOU_THRESHOLD: Final = 0.5

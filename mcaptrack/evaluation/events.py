@@ -14,6 +14,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from mcaptrack.choices import Similarity
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.aligned import (
     GATE_3D_M,
@@ -21,7 +22,6 @@ from mcaptrack.evaluation.aligned import (
     IOU_THRESHOLD,
     LocatedRows,
     RowComparison,
-    Similarity,
     align,
     are_3d,
     compare_rows,

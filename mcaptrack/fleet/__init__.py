@@ -30,7 +30,7 @@ T = TypeVar("T")
 __all__ = ["FleetResult", "FleetStatus", "LogOutcome", "NamedLog", "Running", "find_logs", "run"]
 
 
-@checked()
+@checked
 def run(
     function: Callable[..., T],
     logs: str | os.PathLike[str] | Iterable[str | os.PathLike[str] | NamedLog],

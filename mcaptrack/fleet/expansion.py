@@ -96,7 +96,7 @@ class NamedLog:
     below: Path
 
 
-@checked()
+@checked
 def find_logs(
     arguments: Iterable[str | os.PathLike[str]],
     *,

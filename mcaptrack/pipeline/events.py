@@ -17,8 +17,8 @@ from typing import Any, Final, NamedTuple, get_args
 import numpy as np
 
 from mcaptrack import foxglove, log
+from mcaptrack.choices import Similarity
 from mcaptrack.errors import McaptrackError, call
-from mcaptrack.evaluation.aligned import Similarity
 from mcaptrack.evaluation.event_text import SUFFIX, log_messages, nouns_of
 from mcaptrack.evaluation.events import EventOptions, find_events
 from mcaptrack.evaluation.forecasts import FORECAST_INPUTS, find_forecast_errors

@@ -38,7 +38,7 @@ from mcaptrack.tables.build import (
 )
 from mcaptrack.tables.catalogue import join
 from mcaptrack.tables.fields import RECORDING, TABLE_VERSION, TABLES, Field, Table
-from mcaptrack.tables.files import FORMATS, Format, file_metadata, verify, write
+from mcaptrack.tables.files import FORMATS, file_metadata, verify, write
 from mcaptrack.tables.messages import messages_table
 from mcaptrack.tables.rows import TrackNames, names_by_track, rows_in_pieces, rows_table, summary_table
 
@@ -48,7 +48,6 @@ __all__ = [
     "TABLES",
     "TABLE_VERSION",
     "Field",
-    "Format",
     "Pointers",
     "Table",
     "TablePieces",

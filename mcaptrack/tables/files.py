@@ -11,18 +11,18 @@ import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, get_args
 
 import numpy as np
 
+from mcaptrack.choices import TableFormat
 from mcaptrack.environment import release_memory
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish
 from mcaptrack.tables.build import PIECE_ROWS, pieces_of
 from mcaptrack.tables.fields import TABLE_VERSION
 
-Format = Literal["parquet", "arrow", "csv", "jsonl"]
-FORMATS: Final[tuple[Format, ...]] = get_args(Format)
+FORMATS: Final[tuple[TableFormat, ...]] = get_args(TableFormat)
 #: Formats with metadata, by which a file can be found up to date.
 _DESCRIBED: Final = ("parquet", "arrow")
 
@@ -42,7 +42,7 @@ def write(
     table: Any,
     provenance: Mapping[str, str],
     order: Sequence[str] = (),
-    form: Format = "parquet",
+    form: TableFormat = "parquet",
     force: bool = False,
 ) -> bool:
     """Write a table; the file appears when it is complete and reads back identically. Returns whether it was written.
@@ -163,7 +163,7 @@ def _write_arrow(part: Path, table: Any, texts: Mapping[str, str]) -> None:
             writer.write_table(piece.combine_chunks())
 
 
-def file_metadata(path: Path, form: Format) -> dict[str, str] | None:
+def file_metadata(path: Path, form: TableFormat) -> dict[str, str] | None:
     """The metadata of a file, read from its end; None if there is no such file."""
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -180,7 +180,7 @@ def file_metadata(path: Path, form: Format) -> dict[str, str] | None:
     return {key.removeprefix(_PREFIX): value for key, value in pairs if key.startswith(_PREFIX)}
 
 
-def verify(path: Path, form: Format = "parquet") -> int:
+def verify(path: Path, form: TableFormat = "parquet") -> int:
     """Read a whole file and compare its content with the digest in its metadata; returns the number of rows.
 
     Raises McaptrackError if it can't be read, has no digest or holds something else.

@@ -81,8 +81,6 @@ class Stage:
         Outputs to write, by the name of the mode; empty for all.
     beside : tuple[str, ...]
         Outputs that are made wherever the main one is, also again in logs that lack them.
-    implied : Mapping[str, str]
-        Options that belong to one transform and choose it, by its name, if none is named.
     """
 
     name: str
@@ -102,7 +100,6 @@ class Stage:
     profiles_place: str = ""
     modes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     beside: tuple[str, ...] = ()
-    implied: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
     def default(self) -> type[Transform]:
@@ -353,7 +350,6 @@ _STAGES: Final = (
             {"both": (), "offline": ("", "decisions", "appearance"), "online": ("online", "predictions")}
         ),
         beside=("decisions", "appearance"),
-        implied=MappingProxyType({"distance": "consistency"}),
     ),
 )
 #: All stages by name, in the order in which they run.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -29,7 +29,9 @@ from mcaptrack.sources.foreign.decoding import (
     text,
     to_bytes,
 )
-from mcaptrack.sources.video import PixelLayout
+
+if TYPE_CHECKING:
+    from mcaptrack.sources.video import PixelLayout
 
 __all__ = [
     "BOXES_3D_READ",
@@ -236,6 +238,8 @@ def _format(text: str) -> str:
 
 
 def _raw(message: Any) -> Picture:
+    from mcaptrack.sources.video import PixelLayout
+
     layout = PixelLayout(
         integer(message.width),
         integer(message.height),

@@ -56,17 +56,9 @@ MOTION: Final = "motion"
 
 @dataclass(frozen=True, kw_only=True)
 class IngestOptions:
-    """Options of making a log. ``labels`` are label files by role; ``role`` is that of an input that is a label file.
+    """The parameters of ``mcaptrack.ingest``, which explains them, as values: paths, fractions, names of columns.
 
-    ``motion`` is a file with the motion of the camera, ``calibration`` are files with its calibration; of a file with
-    several cameras ``calibration_name`` chooses one, and ``calibration_unit`` is that of lengths.
-
-    ``fps``, ``image_format``, ``quality`` and ``keyframe_interval_s`` are as in ``video.VideoOptions``. ``first_frame``
-    is the number that label files give the first picture, if it isn't that of their format; ``frames`` is the number of
-    pictures, for labels without pictures. ``columns`` are names of columns of tables with a header, by what they hold;
-    ``size`` is the size of pictures, (width, height), for labels without pictures. ``classes`` are those of tracks and
-    ground truth, by default people, and all of 3D boxes. ``frame_id`` is the frame of reference of 3D boxes, ``scene``
-    the name of a scene of nuScenes.
+    ``labels`` are label files by role; ``frame_id`` is its ``frame``.
     """
 
     camera: str = "camera"

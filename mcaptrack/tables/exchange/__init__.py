@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal, get_args
+from typing import Final, get_args
 
 from mcaptrack import log
+from mcaptrack.choices import ExchangeFormat
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish_stream, refuse_overwrite
 from mcaptrack.location import Location, local_name
@@ -22,7 +23,6 @@ from mcaptrack.tables.exchange.rerun_file import write_recording
 
 __all__ = ["FORMATS", "ExchangeFormat", "WrittenBoxes", "default_file", "ends_with", "write_boxes"]
 
-ExchangeFormat = Literal["mot", "kitti", "coco", "cvat", "boxes-csv", "rerun"]
 FORMATS: Final[tuple[ExchangeFormat, ...]] = get_args(ExchangeFormat)
 Progress = Callable[[str, int, int], None]
 

@@ -17,10 +17,11 @@ from pathlib import Path
 from typing import Final
 
 from mcaptrack import __version__, log, tables
+from mcaptrack.choices import TableFormat
 from mcaptrack.files import sweep
 from mcaptrack.location import Location, local_name
 from mcaptrack.sources.fixed_frame import BoxesRead
-from mcaptrack.tables import TABLES, Format
+from mcaptrack.tables import TABLES
 from mcaptrack.tables.export.contents import LogTables, file_name, recording_key, recording_name, topic_folder
 from mcaptrack.tables.export.ownership import claimed, owner_words, refuse_tables_of_another
 
@@ -57,7 +58,7 @@ def default_folder(path: Location) -> Path:
     return local_name(path, ".tables")
 
 
-def main_file(path: Location, folder: Path, form: Format = "parquet") -> Path:
+def main_file(path: Location, folder: Path, form: TableFormat = "parquet") -> Path:
     """The file of a log that is written last: if it exists, all tables of the log do."""
     return folder / "recordings" / f"recording={recording_name(path)}" / f"part-0.{form}"
 
@@ -76,7 +77,7 @@ def export(
     folder: Path,
     progress: Callable[[str, int, int], None] = lambda *_: None,
     *,
-    form: Format = "parquet",
+    form: TableFormat = "parquet",
     topics: Sequence[str] = (),
     blobs: bool = False,
     force: bool = False,
@@ -144,7 +145,7 @@ def _write_all(job: _Job, topics: Sequence[str], blobs: bool, progress: Callable
 class _Job:
     contents: LogTables
     folder: Path
-    form: Format
+    form: TableFormat
     force: bool
     done: Exported
 

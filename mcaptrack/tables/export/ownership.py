@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from mcaptrack import log, tables
+from mcaptrack.choices import TableFormat
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import place_of
 from mcaptrack.location import Location, Url, is_remote, local_name, parse
 from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.tables.export.contents import file_name, location_of, recording_key, recording_name
-from mcaptrack.tables.files import FORMATS, Format
+from mcaptrack.tables.files import FORMATS
 
 #: The table that says which log the tables are of.
 _TABLE: Final = "recordings"
@@ -141,7 +142,7 @@ def _seen_from(folder: Path, path: Location) -> str:
     return os.fsencode(os.path.relpath(place, place_of(folder))).decode("utf-8", "backslashreplace")
 
 
-def _owner(file: Path, form: Format) -> _Owner | None:
+def _owner(file: Path, form: TableFormat) -> _Owner | None:
     """The log that ``recordings`` names; None if it names none."""
     about = tables.file_metadata(file, form)
     if about:
@@ -151,7 +152,7 @@ def _owner(file: Path, form: Format) -> _Owner | None:
     return _Owner(str(row.get("file", "")), str(row.get("location", "")), "", {}) if row else None
 
 
-def _first_row(file: Path, form: Format) -> Mapping[str, Any]:
+def _first_row(file: Path, form: TableFormat) -> Mapping[str, Any]:
     try:
         with file.open(encoding="utf-8", newline="") as stream:
             rows: Sequence[Mapping[str, Any]]

@@ -12,10 +12,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice, pairwise
 from types import MappingProxyType
-from typing import ClassVar, Final, Literal, NamedTuple
+from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
 
+from mcaptrack.choices import CameraMotionUse
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry import kalman
 from mcaptrack.geometry.affine import IDENTITY
@@ -78,7 +79,6 @@ class AssociationInput(NamedTuple):
 
 
 #: What trackers do about the motion of the camera.
-CameraMotionUse = Literal["auto", "on", "off"]
 
 # Headings of the options in the help.
 _ASSOCIATION: Final = "Association"

@@ -10,9 +10,10 @@ from typing import Any, Final, get_args
 import numpy as np
 
 from mcaptrack import log, pipeline
+from mcaptrack.choices import Similarity
 from mcaptrack.errors import DamagedError, McaptrackError, command
 from mcaptrack.evaluation import EvaluateOptions, EvaluationInput, EvaluationRow, evaluate, sequence_of_log
-from mcaptrack.evaluation.aligned import Similarity, has_positions, resample_frames
+from mcaptrack.evaluation.aligned import has_positions, resample_frames
 from mcaptrack.evaluation.event_text import PEOPLE, nouns_of
 from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events
 from mcaptrack.evaluation.people import PersonScores, person_scores

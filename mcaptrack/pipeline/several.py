@@ -9,8 +9,6 @@ from pathlib import Path
 
 from mcaptrack import log as logs
 from mcaptrack import notices, pipeline
-from mcaptrack.api.common import Notes
-from mcaptrack.api.options import Progress
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish
 from mcaptrack.location import Location
@@ -22,8 +20,12 @@ from mcaptrack.sources.ingest.sidecar import SidecarChoice
 from mcaptrack.transforms import STAGES, Transform
 from mcaptrack.transforms.protocol import traits_of
 
+#: Called with the name of a stage, the amount that is done, and the total (None if it is not known).
+Progress = Callable[[str, float, float | None], None]
+#: Takes a note.
+Say = Callable[[str], None]
 #: Changes an open log, or a copy of it at the path; returns the prefix of the camera, and what was done.
-Act = Callable[[logs.Log, Path | None, Notes, BoxesRead], tuple[str, Report]]
+Act = Callable[[logs.Log, Path | None, Say, BoxesRead], tuple[str, Report]]
 
 
 @dataclass
@@ -85,7 +87,7 @@ class EveryCamera:
     prefixes: tuple[str, ...] = ()
     scenes: tuple[str, ...] = ()
 
-    def chooses(self, opened: logs.Log, notes: Notes) -> bool:
+    def chooses(self, opened: logs.Log, say: Say) -> bool:
         """Return whether the log has several cameras, or several are named; note which are run."""
         chosen = pipeline.choose_cameras(opened, self.names)
         if chosen is None:
@@ -96,18 +98,18 @@ class EveryCamera:
             warn(f"the camera {name} is left out: it {why}", "left-out")
         if len(self.prefixes) > 1:
             listed = ", ".join(prefix[1:] for prefix in self.prefixes)
-            notes.say(f"running {len(self.prefixes)} cameras, {listed}; `camera=` names those to run")
+            say(f"running {len(self.prefixes)} cameras, {listed}; `camera=` names those to run")
         for prefix in self.prefixes:
             if reason := pipeline.begins_with(opened, prefix):
-                notes.say(reason)
+                say(reason)
         return True
 
     def run(
-        self, path: Location, output: Path | None, sidecar: SidecarChoice, notes: Notes, progress: Progress
+        self, path: Location, output: Path | None, sidecar: SidecarChoice, say: Say, progress: Progress
     ) -> list[Done]:
         """Run each camera, then scenes. The log is written for each of them; ``output`` is written as a whole."""
         with publish(output) if output is not None else nullcontext() as part:
-            steps = _Steps(path, part, output, sidecar, notes, progress)
+            steps = _Steps(path, part, output, sidecar, say, progress)
             for prefix in self.prefixes:
                 steps.take(prefix[1:], self.run_at(prefix, _named(progress, prefix[1:])))
             if steps.failed:
@@ -126,7 +128,7 @@ class EveryCamera:
                 joined, why = pipeline.fusable(opened, names)
                 self.not_fused = "" if joined else why
                 if joined and why:
-                    steps.notes.say(f"not in the scene: {why}")
+                    steps.say(f"not in the scene: {why}")
         if joined:
             scenes, name = (SCENE,), SCENE[1:]
             if not steps.take(name, self.fuse_to(name, joined, _named(steps.progress, name)), is_scene=True):
@@ -135,7 +137,7 @@ class EveryCamera:
         if not self.is_fused and not self.scenes:
             self.not_fused = "`fuse=False` was given"
         elif self.not_fused:
-            steps.notes.say(f"no scene is made of the cameras: {self.not_fused}")
+            steps.say(f"no scene is made of the cameras: {self.not_fused}")
         for scene in scenes:
             steps.take(scene[1:], self.run_at(scene, _named(steps.progress, scene[1:])), is_scene=True)
 
@@ -153,7 +155,7 @@ class _Steps:
     part: Path | None
     output: Path | None
     sidecar: SidecarChoice
-    notes: Notes
+    say: Say
     progress: Progress
     done: list[Done] = field(default_factory=list)
 
@@ -175,7 +177,7 @@ class _Steps:
             if self.part is None:
                 opened.lock()
             try:
-                prefix, report = act(opened, output, self.notes, BoxesRead())
+                prefix, report = act(opened, output, self.say, BoxesRead())
             except McaptrackError as error:
                 why = str(error).replace(str(self.part), str(self.output))
                 self.done = [step for step in self.done if step.name != name]
