@@ -264,7 +264,7 @@ class Film:
         self.t_ns = np.array([ns(t / 10) for t in range(100)])
         self.decoded = []
 
-    def frames(self, numbers):
+    def readable(self, numbers):
         for number in sorted(set(numbers)):
             self.decoded.append(number)
             image = np.full((240, 320, 3), 20, np.uint8)
