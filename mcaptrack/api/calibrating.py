@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from mcaptrack import log as logs
-from mcaptrack import pipeline
 from mcaptrack.api.common import as_location, clock_offsets, split_names, warn_unused, warnings_about
 from mcaptrack.api.declared import Option, declared
 from mcaptrack.api.options import (
@@ -21,14 +19,14 @@ from mcaptrack.api.options import (
     Sidecar,
     no_progress,
 )
-from mcaptrack.api.running import Where, change, warn_stale
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice
-from mcaptrack.pipeline.calibrating import CorrectedPlanes, calibrate_cameras, changes_of, write_changes
-from mcaptrack.pipeline.refining import Refined
-from mcaptrack.pipeline.several import Say
-from mcaptrack.schema.provenance import REFINE
-from mcaptrack.sources.fixed_frame import BoxesRead
+
+if TYPE_CHECKING:
+    from mcaptrack.pipeline.calibrating import CorrectedPlanes
+    from mcaptrack.pipeline.refining import Refined
+    from mcaptrack.pipeline.several import Say
+    from mcaptrack.sources.fixed_frame import BoxesRead
 
 
 @dataclass(frozen=True)
@@ -182,6 +180,12 @@ def calibrate(
     'rigid'
 
     """
+    from mcaptrack import log as logs
+    from mcaptrack import pipeline
+    from mcaptrack.api.running import Where, change, warn_stale
+    from mcaptrack.pipeline.calibrating import calibrate_cameras, changes_of, write_changes
+    from mcaptrack.schema.provenance import REFINE
+
     names = split_names("cameras", cameras if isinstance(cameras, str) else cameras or None)
     right = split_names("reference", reference if isinstance(reference, str) else reference or None)
     offsets = clock_offsets(clock_offset_s)

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from mcaptrack import log as logs
 from mcaptrack import notices
 from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError
@@ -56,7 +55,9 @@ def log_location(path: PathLike) -> Location:
     """Return the location of a log that stands. Raises McaptrackError as ``as_path``, and for a folder."""
     location = as_location(path)
     if isinstance(location, Path) and location.is_dir():
-        logs.refuse_non_mcap(location)
+        from mcaptrack.log import refuse_non_mcap
+
+        refuse_non_mcap(location)
         raise McaptrackError(f"{location} is a folder, not an MCAP file; give the log in it")
     return location
 
@@ -115,7 +116,9 @@ def log_output(path: PathLike, source: Location) -> Path:
     """
     target = as_path(path)
     if target.is_dir():
-        logs.refuse_non_mcap(target)
+        from mcaptrack.log import refuse_non_mcap
+
+        refuse_non_mcap(target)
         raise McaptrackError(f"{target} is a folder; give the name of a file")
     if target.suffix.lower() != ".mcap" and not is_same_file(target, source):
         raise McaptrackError(f"{target} is not a name for a log: logs are MCAP files; give a name that ends with .mcap")

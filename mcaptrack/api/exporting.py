@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, cast
+from typing import TYPE_CHECKING, Annotated, cast, get_args
 
-from mcaptrack import log as logs
 from mcaptrack.api.common import log_location, names_of, optional_path, warn_unused, warnings_about
 from mcaptrack.api.declared import Option, declared
 from mcaptrack.api.options import FILES, EachLog, Force, PathLike, Progress, Reports, no_progress, output
@@ -16,12 +15,9 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, place_of
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice, warn
-from mcaptrack.tables.exchange import FORMATS as EXCHANGE_FORMATS
-from mcaptrack.tables.exchange import default_file, write_boxes
-from mcaptrack.tables.export import default_folder, main_file, recording_key, recording_name
-from mcaptrack.tables.export import export as write_tables
-from mcaptrack.tables.rosbag2 import Storage, write_bag
-from mcaptrack.tables.rosbag2 import default_folder as default_bag
+
+if TYPE_CHECKING:
+    from mcaptrack.tables.rosbag2 import Storage
 
 #: ROS 2 bags by the format of ``export``.
 _BAGS: Mapping[str, Storage] = {"rosbag2": "mcap", "rosbag2-sqlite3": "sqlite3"}
@@ -129,9 +125,15 @@ def export(
     True
 
     """
+    from mcaptrack import log as logs
+    from mcaptrack.tables.export import default_folder, main_file
+    from mcaptrack.tables.export import export as write_tables
+
     path = log_location(log)
-    if form in EXCHANGE_FORMATS:
-        return _export_file(path, optional_path(output), form, names_of(topic), blobs, force, progress)
+    if form in get_args(ExchangeFormat):
+        return _export_file(
+            path, optional_path(output), cast("ExchangeFormat", form), names_of(topic), blobs, force, progress
+        )
     if form in _BAGS:
         return _export_bag(path, optional_path(output), _BAGS[form], topic, blobs, force, progress)
     folder, kind = optional_path(output) or default_folder(path), cast("TableFormat", form)
@@ -158,9 +160,12 @@ def _export_bag(
     progress: Progress,
 ) -> ExportResult:
     """Write a log as a ROS 2 bag."""
+    from mcaptrack import log as logs
+    from mcaptrack.tables.rosbag2 import default_folder, write_bag
+
     with warnings_about(path) as warnings:
         warn_unused("a bag has no tables", topic=bool(topic), blobs=blobs)
-        folder = output or default_bag(path)
+        folder = output or default_folder(path)
         with logs.read(path) as opened:
             done = write_bag(opened, folder, progress, storage=storage, force=force)
         for note in done.notes:
@@ -180,6 +185,9 @@ def _export_file(
     progress: Progress,
 ) -> ExportResult:
     """Write one channel of a log as a file of another program."""
+    from mcaptrack import log as logs
+    from mcaptrack.tables.exchange import default_file, write_boxes
+
     if len(topics) > 1:
         raise McaptrackError(f"a file of {form} has the boxes of one channel, not of {', '.join(topics)}; give one")
     target = output or default_file(path, form)
@@ -198,6 +206,8 @@ def _export_file(
 
 def refuse_same_tables(logs_to_export: Sequence[Location], output: Path | None) -> None:
     """Raise McaptrackError if two different logs would have the same name in the tables of one folder."""
+    from mcaptrack.tables.export import default_folder, recording_key, recording_name
+
     folders: dict[tuple[str, str], Location] = {}
     for path in logs_to_export:
         folder = recording_key(str(output or default_folder(path)))

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Sequence
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
-from mcaptrack import log as logs
-from mcaptrack import pipeline
 from mcaptrack.api.common import as_location, split_names
 from mcaptrack.api.declared import PYTHON_ONLY, Option, declared
 from mcaptrack.api.options import (
@@ -23,18 +21,19 @@ from mcaptrack.api.options import (
     chooser,
     no_progress,
 )
-from mcaptrack.api.running import Fusing, RunResult, Where, transform_of, transforms_of, work
 from mcaptrack.api.stages import Stages
 from mcaptrack.api.zones import ZonesLike, zones_of
 from mcaptrack.choices import CameraMotionUse
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.events import EventOptions
-from mcaptrack.evaluation.zones import ZoneOptions
-from mcaptrack.location import Location
-from mcaptrack.pipeline import Job, PlaneChoice, Watch, ZoneWatch
-from mcaptrack.pipeline.several import unfitting
 from mcaptrack.transforms import FUSION, STAGES, Transform
 from mcaptrack.transforms.motion_limits import LIMITS_PATTERN
+
+if TYPE_CHECKING:
+    from mcaptrack import log as logs
+    from mcaptrack.api.running import RunResult
+    from mcaptrack.location import Location
+    from mcaptrack.pipeline import Job
 
 #: Headings in the help.
 _AFTER: Final = "After the stages"
@@ -169,6 +168,11 @@ def run(
     True
 
     """
+    from mcaptrack.api.running import Fusing, Where, transform_of, transforms_of, work
+    from mcaptrack.evaluation.zones import ZoneOptions
+    from mcaptrack.pipeline import PlaneChoice, Watch, ZoneWatch, plan_all
+    from mcaptrack.pipeline.several import unfitting
+
     names = tuple(dict.fromkeys(split_names("camera", camera)))
     if len(names) > 1 and topic is not None:
         raise McaptrackError(f"`topic={topic!r}` is of one camera, and `camera=` names {len(names)}; leave one out")
@@ -193,9 +197,7 @@ def run(
         others = unfitting(opened, prefix, transforms, say) if len(names) != 1 and topic is None else set()
         kept = {stage: transform for stage, transform in transforms.items() if stage not in others}
         options = chosen.keys() - {STAGES[stage].option for stage in others}
-        return pipeline.plan_all(
-            opened, prefix, say, topic, kept, force, options, shared, plane, frame or "", changed, renewed
-        )
+        return plan_all(opened, prefix, say, topic, kept, force, options, shared, plane, frame or "", changed, renewed)
 
     options = events if isinstance(events, EventOptions) else EventOptions()
     watch = Watch(options, force=force) if events else None

@@ -6,21 +6,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
-from mcaptrack import log as logs
 from mcaptrack.api.common import log_file, log_location, log_output, names_of, warnings_about
 from mcaptrack.api.declared import Argument, OneOfMany, Option, declared
 from mcaptrack.api.options import FILES, EachLog, Force, Output, PathLike, Reports, no_progress, output
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_overwrite
-from mcaptrack.foxglove.views import SCENE_SUFFIX
 from mcaptrack.location import Location, local_name
-from mcaptrack.log import CheckResult, Finding
 from mcaptrack.notices import Notice
-from mcaptrack.schema.provenance import REFINE, Provenance
-from mcaptrack.sources.ingest.bags.metadata_yaml import update_metadata
-from mcaptrack.sources.ingest.sidecar import recording_of
+
+if TYPE_CHECKING:
+    from mcaptrack import log as logs
+    from mcaptrack.log import CheckResult, Finding
 
 _ONE_LOG: Final = "A log, a folder of logs, a pattern, or - for a list on stdin."
 _TOPICS: Final = "Channels to remove, or patterns such as '/camera/*'."
@@ -85,6 +83,8 @@ def check(log: EachLog, *, progress: Reports = no_progress) -> LogCheck:
     True
 
     """
+    from mcaptrack import log as logs
+
     path = log_location(log)
     with warnings_about(path) as warnings:
         files = [logs.check(path, progress)]  # before its results, so that errors of a store name the log
@@ -155,6 +155,8 @@ def recover(
     ()
 
     """
+    from mcaptrack import log as logs
+
     path = log_location(log)
     target = local_name(path, ".recovered.mcap") if output is None else log_output(output, path)
     if is_same_file(target, path):
@@ -232,6 +234,11 @@ def drop(
     ('/camera/video',)
 
     """
+    from mcaptrack import log as logs
+    from mcaptrack.schema.provenance import Provenance
+    from mcaptrack.sources.ingest.bags.metadata_yaml import update_metadata
+    from mcaptrack.sources.ingest.sidecar import recording_of
+
     path = log_file(log)
     if not names_of(topics):
         raise McaptrackError("name the channels to remove with `topics=`")
@@ -275,6 +282,9 @@ def _chosen(opened: logs.Log, patterns: Sequence[str]) -> set[str]:
 
     Raises McaptrackError for a pattern that fits none.
     """
+    from mcaptrack.foxglove.views import SCENE_SUFFIX
+    from mcaptrack.schema.provenance import REFINE, Provenance
+
     chosen: set[str] = set()
     for pattern in patterns:
         fitting = {pattern} & opened.channels.keys()
