@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.ingest.labels import box_rows, delimited, json_boxes, yolo
-from mcaptrack.sources.ingest.labels.box_rows import fitted
-from mcaptrack.sources.ingest.labels.content import Labels
+from mcaptrack.sources.ingest.labels import content, delimited, json_boxes, yolo
+from mcaptrack.sources.ingest.labels.content import Labels, fitted
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline
 
@@ -435,7 +434,7 @@ def test_a_header_has_four_names_and_no_number(tmp_path):
 
 
 def test_names_of_pictures_are_numbered_in_one_sequence():
-    numbers = box_rows.numbers_of_names
+    numbers = content.numbers_of_names
     assert numbers(["d/x12_a.jpg", "e\\x007_a.png"]) == [12, 7]
     assert numbers(["1_2.jpg", "1_3.jpg"]) == [2, 3]
     assert numbers(["x1.jpg", "y2.jpg"]) is None
@@ -446,7 +445,7 @@ def test_names_of_pictures_are_numbered_in_one_sequence():
     assert numbers([f"{2**31 - 1}"]) == [2**31 - 1]
     assert numbers([f"{2**31}"]) is None
     with pytest.raises(ValueError, match=r"names of several sequences, 'a.b' and 'c'"):
-        reader = box_rows.FrameNames()
+        reader = content.FrameNames()
         assert (reader.number("a.3b.jpg"), reader.number("4c")) == (3, 4)
 
 

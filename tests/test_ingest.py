@@ -49,9 +49,9 @@ class TestLabels:
         "half a frame": (
             "1.5,1,1,1,2,2\n",
             "auto",
-            r"a\.txt:1: the frame \(a count of pictures, no time\) has to be a whole number from 0 on, not 1\.5",
+            r"a\.txt:1: the frame \(a count of pictures, no time\) has to be a whole number from 0 to 2147483647, not 1\.5",
         ),
-        "not a number": ("1,1,nan,1,2,2\n", "auto", r"a\.txt:1: a number is not finite"),
+        "not a number": ("1,1,nan,1,2,2\n", "auto", r"a\.txt:1: a number of the box is missing or not finite"),
         "nothing": ("\n\n", "auto", "holds no labels"),
     }
 

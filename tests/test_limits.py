@@ -30,6 +30,9 @@ LIMITS = {
         "_MAX_NAME": 256,
     },
     f"{LABELS}.number_table": {
+        "MAX_PLACE": 1e8,
+        "MAX_SCORE": 1e9,
+        "MAX_FRAME": 2_147_483_647,
         "_MAX_ROWS": 10_000_000,
         "_MAX_LINE": 4096,
         "EXACT": 9_007_199_254_740_992,
@@ -42,12 +45,14 @@ LIMITS = {
         "_MAX_NAME": 256,
         "_MOST": 2.0,
     },
-    f"{LABELS}.box_rows": {"_MAX_CLASS": 2_147_483_647, "_MOST_SHARE": 2.0},
+    f"{LABELS}.content": {
+        "_MAX_CLASS": 2_147_483_647,
+        "_MOST_SHARE": 2.0,
+        "_LEAST_LENGTH_M": 0.05,
+        "_MOST_LENGTH_M": 60.0,
+    },
     f"{LABELS}.timeline": {"MAX_FRAMES": 10_000_000, "_EMPTY_FRAMES": 100_000, "_EMPTY_A_LABELLED": 100},
     f"{LABELS}.formats": {
-        "MAX_PLACE": 1e8,
-        "MAX_SCORE": 1e9,
-        "MAX_FRAME": 2_147_483_647,
         "_MAX_NAMES": 65_536,
         "KITTI_HEIGHT_PX": 25.0,
     },
@@ -60,7 +65,6 @@ LIMITS = {
         "_MAX_TEXT": 65_536,
         "_MAX_CLASSES": 65_536,
     },
-    f"{LABELS}.boxes_3d.rows": {"_LEAST_LENGTH_M": 0.05, "_MOST_LENGTH_M": 60.0},
     "mcaptrack.sources.ingest.calibration.content": {"_MAX_BYTES": MIB, "_MAX_DEPTH": 16, "_MAX_NODES": 20_000},
     f"{BAGS}.rosbag1": {"_MAX_HEADER_BYTES": MIB, "_MAX_DATA_BYTES": 256 * MIB},
     "mcaptrack.log.chunks": {

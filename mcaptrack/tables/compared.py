@@ -35,9 +35,8 @@ from mcaptrack.sources.ingest.label_job import LabelJob
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
 from mcaptrack.sources.ingest.labels.content import ONLY_PEOPLE, IgnoredBoxes, Labels, WantedClasses
 from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX
-from mcaptrack.sources.ingest.labels.label_rows import label_rows
-from mcaptrack.sources.ingest.labels.long_files import LabelFile
 from mcaptrack.sources.ingest.labels.reading import in_order, read_homography, read_labels
+from mcaptrack.sources.ingest.labels.timeline import label_rows
 
 #: Formats that give the frame number of each row.
 _COUNTING: Final = ("mot", "kitti", "parquet")
@@ -182,7 +181,7 @@ def detections_and_ground_truth(
 class _PairJob(LabelJob):
     """Labels of detections and of ground truth, which may be a table."""
 
-    def read(self, path: Path, role: Role) -> LabelFile:
+    def read(self, path: Path, role: Role) -> Labels:
         return _read(path, role, (), ONLY_PEOPLE) if role == "truth" else super().read(path, role)
 
 
@@ -190,7 +189,7 @@ def _read(path: Path, role: Role, topics: Sequence[str], wanted: WantedClasses) 
     if path.suffix.lower() in (".parquet", ".pq"):
         return _read_parquet(path, role, topics)
     if role == "tracks" and path.is_file() and _is_blank(path):
-        return _no_tracks()
+        return _no_tracks(path)
     labels = read_labels(path, role=role, wanted=wanted)
     if labels.times_s is not None or labels.is_normalised:
         what = "times instead of frames" if labels.times_s is not None else "boxes in shares of the picture's size"
@@ -204,10 +203,11 @@ def _is_blank(path: Path) -> bool:
     return path.stat().st_size < _BLANK_BYTES and not path.read_bytes().strip()
 
 
-def _no_tracks() -> Labels:
+def _no_tracks(path: Path) -> Labels:
     """A file of tracks without rows: of a tracker that found no people."""
     none = np.empty(0, np.int64)
-    return Labels("mot", 1, none, none, np.empty((0, 4)), None, np.empty(0), none, np.empty(0, np.uint32))
+    kinds = np.empty(0, np.uint32)
+    return Labels(path, "mot", str, none, none, np.empty((0, 4)), np.empty(0), kinds, first_frame=1)
 
 
 def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
@@ -231,7 +231,8 @@ def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
     xy_m = np.stack([table["x_m"][mine], table["y_m"][mine]], axis=-1)
     people = np.full(len(frame), PERSON, np.uint32)
     name: Any = "parquet"
-    labels = Labels(name, 0, frame, track_id, boxes, xy_m, table["score"][mine], np.unique(frame), people)
+    labels = Labels(path, name, str, frame, track_id, boxes, table["score"][mine], people, xy_m=xy_m)
+    labels.labelled = np.unique(frame)
     return in_order(labels, has_ids=True)
 
 

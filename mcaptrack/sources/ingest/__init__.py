@@ -20,10 +20,9 @@ from mcaptrack.sources.ingest.boxes_3d_job import Boxes3DJob
 from mcaptrack.sources.ingest.calibration import is_calibration
 from mcaptrack.sources.ingest.job import MOTION, IngestJob, IngestOptions, IngestReport, Progress
 from mcaptrack.sources.ingest.label_job import LabelJob, label_frames
-from mcaptrack.sources.ingest.labels.box_rows import OTHERS
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
 from mcaptrack.sources.ingest.labels.camera import boxes_extent, camera_of, picture_size, timeline_of
-from mcaptrack.sources.ingest.labels.content import Format
+from mcaptrack.sources.ingest.labels.content import OTHERS, Format
 from mcaptrack.sources.ingest.labels.cvat import is_cvat
 from mcaptrack.sources.ingest.labels.yolo import is_label_folder
 from mcaptrack.sources.ingest.recording_job import RecordingJob

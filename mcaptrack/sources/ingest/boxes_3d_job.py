@@ -28,8 +28,8 @@ from mcaptrack.sources.fixed_frame import holds_boxes_3d, named_detections
 from mcaptrack.sources.frames import transforms_of
 from mcaptrack.sources.ingest.job import SCHEMA_OF, IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import read_boxes_3d
-from mcaptrack.sources.ingest.labels.boxes_3d.rows import BoxRows3D, TimedLabels
 from mcaptrack.sources.ingest.labels.camera import DEFAULT, camera_prefix
+from mcaptrack.sources.ingest.labels.content import BoxRows3D, describe_classes
 from mcaptrack.sources.ingest.labels.timeline import frame_times_ns
 
 #: The frame of reference of boxes, if neither the user nor the format nor the log names one.
@@ -162,20 +162,18 @@ class Boxes3DJob(IngestJob):
         root = root_frame(self.into) if self.into else ""
         frame_id = rows.frame_id or root or FRAME
         reason = "by its format" if rows.frame_id else "the root of the log's transforms" if root else "assumed"
-        text = f"{rows.path}: boxes are taken as those of the frame {frame_id!r} ({reason}); `frame=` names another"
+        text = f": boxes are taken as those of the frame {frame_id!r} ({reason}); `frame=` names another"
         if reason == "assumed":
-            rows.doubts.append((text, "other"))
+            rows.doubt(text)
         else:
-            rows.remarks.append(text)
+            rows.remark(text)
         return frame_id
 
-    def _at_times(self, role: Role, rows: BoxRows3D) -> TimedLabels:
-        if rows.labelled is None:
-            rows.labelled = np.unique(rows.number)
-        t_ns, labelled = self._times(rows, rows.number, rows.labelled)
-        timed = rows.timed(t_ns, labelled, role, self.options.classes)
+    def _at_times(self, role: Role, rows: BoxRows3D) -> BoxRows3D:
+        t_ns, labelled = self._times(rows, rows.frame, rows.labelled)
+        timed = rows.settled(t_ns, labelled, role, self.options.classes)
         if self.into is not None and any(part.index.counts for part in self.into.parts):
-            first, last = int(timed.t_ns[0]), int(timed.t_ns[-1])
+            first, last = int(timed.labelled[0]), int(timed.labelled[-1])
             if first > self.into.end_ns + _MARGIN_NS or last < self.into.start_ns - _MARGIN_NS:
                 raise McaptrackError(
                     f"{rows.path} is from {first / NS_PER_S:.3f} to {last / NS_PER_S:.3f} s, {self.into.path} from "
@@ -187,23 +185,20 @@ class Boxes3DJob(IngestJob):
     def _times(self, rows: BoxRows3D, number: Ints, labelled: Ints) -> tuple[Ints, Ints]:
         """The times of rows (N,) and of labelled frames (F,), by their own times, a frame rate, or the log."""
         options = self.options
-        if rows.t_ns is not None:
+        if rows.is_timed:
             for name, value in (("fps", options.fps), ("first_frame", options.first_frame)):
                 if value is not None:
                     raise McaptrackError(f"{rows.path} has times; leave `{name}=` out")
             shift = 0 if options.start_ns is None else options.start_ns - int(labelled[0])
             return number + shift, labelled + shift
-        first = options.first_frame if options.first_frame is not None else min(int(labelled[0]), 1)
+        first = options.first_frame
+        if first is None:
+            first = rows.assume_first(int(labelled[0])) if rows.format == "csv" else 0
         if int(labelled[0]) < first:
             raise McaptrackError(f"{rows.path}: its first frame is {labelled[0]}, before `first_frame={first}`")
-        if options.first_frame is None and labelled[0] > 0 and rows.format == "csv":
-            text = f"{rows.path}: frames begin with {labelled[0]}; frame {first} is assumed to be the first"
-            rows.doubts.append((f"{text}, `first_frame=` sets the number", "clock"))
-        if rows.format != "csv" and options.first_frame is None:
-            first = 0
         if options.fps is not None:
             start = options.start_ns if options.start_ns is not None else self._log_start_ns()
-            rows.remarks.append(f"{rows.path}: frame {first} is at {start / NS_PER_S:.3f} s")
+            rows.remark(f": frame {first} is at {start / NS_PER_S:.3f} s")
             both = (start + frame_times_ns(numbers - first, options.fps) for numbers in (number, labelled))
             return next(both), next(both)
         if self.into is None or not self._topic:
@@ -217,7 +212,7 @@ class Boxes3DJob(IngestJob):
                 f"{rows.path}: its last frame is {labelled[-1]}, and {self._topic} has {len(times)} messages, from "
                 f"frame {first} on; give the number of the first with `first_frame=`, or the rate with `fps=`"
             )
-        rows.remarks.append(f"{rows.path}: frame {first} is the first message of {self._topic}")
+        rows.remark(f": frame {first} is the first message of {self._topic}")
         return times[number - first], times[labelled - first]
 
     def _log_start_ns(self) -> int:
@@ -238,15 +233,13 @@ class Boxes3DJob(IngestJob):
             if rows.left_out:
                 warn(f"{rows.path} also holds {rows.left_out}; left out of {role}", "left-out")
             timed = self._timed[role]
-            numbers, counts = np.unique(timed.class_id, return_counts=True)
-            named = [f"{number} {timed.classes.get(number, '')}".strip() for number in numbers.tolist()]
-            text = ", ".join(f"{name} ({count})" for name, count in zip(named, counts.tolist(), strict=True))
+            text = describe_classes(*np.unique(timed.class_id, return_counts=True), timed.classes)
             self.report.remarks.append(f"{rows.path}: class_id is {text}")
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
         """Write the boxes."""
         if self.into is None and not has_clock:
-            start = min(int(timed.t_ns[0]) for timed in self._timed.values())
+            start = min(int(timed.labelled[0]) for timed in self._timed.values())
             writer.add_metadata(CLOCK, {"start_ns": str(start)})
         for role, rows in self.boxes.items():
             timed = self._timed[role]
@@ -280,18 +273,20 @@ class Boxes3DJob(IngestJob):
     def all_frames(self, role: Role) -> list[Frame]:
         """The boxes of a role as frames, at all times that the file describes."""
         timed = self._timed[role]
-        return split_rows(timed.t_ns, range(len(timed.t_ns)), label_rows_3d(timed, role), timed.ends)
+        ends = np.searchsorted(timed.frame, timed.labelled, "right")
+        return split_rows(timed.labelled, range(len(ends)), label_rows_3d(timed, role), ends)
 
 
-def label_rows_3d(labels: TimedLabels, role: Role) -> Rows:
+def label_rows_3d(labels: BoxRows3D, role: Role) -> Rows:
     """Convert the N rows of labels to rows of detections or tracks."""
     columns = dict(zip(COLUMNS, labels.boxes.T, strict=True))
-    columns |= dict(zip(("vx_m_per_s", "vy_m_per_s"), labels.velocity.T, strict=True))
+    if labels.velocity is not None:
+        columns |= dict(zip(("vx_m_per_s", "vy_m_per_s"), labels.velocity.T, strict=True))
     none = np.full(len(labels.boxes), -1)
     if role == "detections":
         return DETECTIONS.rows(score=labels.score, class_id=labels.class_id, source_id=none, **columns)
     return TRACKS.rows(
-        track_id=labels.track_id,
+        track_id=labels.id,
         score=labels.score,
         observed=np.ones(len(none), bool),
         source_id=none,

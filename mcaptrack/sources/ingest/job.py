@@ -12,12 +12,18 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, Self
 
+import numpy as np
+
 from mcaptrack import foxglove, log
 from mcaptrack.choices import ImageFormat, InputRole, LengthUnit, Point, Role
 from mcaptrack.errors import McaptrackError, call
+from mcaptrack.geometry.affine import IDENTITY, compose, scale_of
+from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.camera_path import Verdict, poses_of
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import Notice, warn
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, TRACKS, Frame, Schema
+from mcaptrack.schema.camera_motion import is_motion, pose_to_rows
 from mcaptrack.schema.classes import classes_beside_rows, only_class, without_class
 from mcaptrack.schema.encodings import PROTOBUF, Encoding, encoded, record_of
 from mcaptrack.schema.ground_plane import plane_to_rows
@@ -26,14 +32,18 @@ from mcaptrack.sources.calibrations import is_rectified_topic
 from mcaptrack.sources.cameras import corrected_plane
 from mcaptrack.sources.corrections import CORRECTED
 from mcaptrack.sources.ingest.calibration import Calibrated, GivenCalibration
-from mcaptrack.sources.ingest.labels.box_rows import OTHERS, fitted
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
-from mcaptrack.sources.ingest.labels.content import ONLY_PEOPLE, Format, Labels, WantedClasses, describe_classes
-from mcaptrack.sources.ingest.labels.label_rows import frames_of_labels
-from mcaptrack.sources.ingest.labels.long_files import LabelFile, read_labels_of_any_length
-from mcaptrack.sources.ingest.labels.number_table import motion_frames, read_motions
-from mcaptrack.sources.ingest.labels.reading import read_homography
-from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline
+from mcaptrack.sources.ingest.labels.content import (
+    ONLY_PEOPLE,
+    OTHERS,
+    Format,
+    Labels,
+    WantedClasses,
+    describe_classes,
+)
+from mcaptrack.sources.ingest.labels.number_table import NumberTable, lines_of
+from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
+from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline, frames_of_labels
 from mcaptrack.sources.ingest.sidecar import encoding_for
 from mcaptrack.sources.video import VideoOptions
 
@@ -213,6 +223,67 @@ class GivenGround:
         return {topic: 1}
 
 
+# Read published motions of cameras: a 2x3 transform per frame, from pixels of the frame before. Letters: F frames.
+
+
+_MOTION_COLUMNS: Final = 7
+#: The largest zoom from one frame to the next.
+_MOST_ZOOM: Final = 4.0
+_MOTION: Final = "a camera motion (frame,m00,m01,m02,m10,m11,m12: 7 columns)"
+
+
+def read_motions(path: Path) -> Floats:
+    """Read the motions (F, 2, 3) of frames 0 to F - 1 from a text file.
+
+    Raises McaptrackError, with the line, for anything else.
+    """
+    table = NumberTable(path, lines_of(path), _MOTION, _MOTION_COLUMNS, _parse_motion)
+    if not len(table.values):
+        raise McaptrackError(f"{path} holds no camera motion")
+    frame, motions = table.values[:, 0], table.values[:, 1:].reshape(-1, 2, 3)
+    table.refuse(
+        frame != np.arange(len(frame)),
+        lambda row: f"frame {frame[row]:g} is not {row}: frames count from 0, without gaps",
+    )
+    wrong = np.array([not is_motion(motion) for motion in motions])
+    table.refuse(wrong, lambda row: "the motion is not finite, or can't be inverted")
+    scale = np.array([scale_of(motion) for motion in motions])
+    table.refuse(
+        (scale > _MOST_ZOOM) | (scale < 1 / _MOST_ZOOM),
+        lambda row: f"the motion enlarges the picture {scale[row]:.3g} times; no camera does that in a frame",
+    )
+    return motions
+
+
+def _parse_motion(parts: list[str]) -> list[float]:
+    if len(parts) != _MOTION_COLUMNS:
+        raise ValueError(f"{len(parts)} columns")
+    return [float(part) for part in parts]
+
+
+def motion_frames(motions: Floats, index: Ints, t_ns: Ints, size: tuple[int, int]) -> list[Frame]:
+    """The motions (F, 2, 3) of a file as frames of pictures ``index`` (P,) at ``t_ns`` (P,), of this width and height.
+
+    The motion of a picture that follows on missing ones is that of all of them together. Pictures beyond the last
+    motion are lost.
+    """
+    kept: list[Floats] = []
+    last = -1
+    for number in index.tolist():
+        motion = IDENTITY
+        for at in range(last + 1, min(number + 1, len(motions))):
+            motion = compose(motions[at], motion) if at else IDENTITY
+        kept.append(motion)
+        last = number
+    poses = poses_of(np.array(kept), *size)
+    frames = []
+    for pose, number, t in zip(poses, index.tolist(), t_ns.tolist(), strict=True):
+        judged = pose if number < len(motions) else pose._replace(verdict=Verdict.LOST)
+        reference = judged._replace(reference=int(index[judged.reference]))
+        frames.append(Frame(t, number, pose_to_rows(reference, *size)))
+    return frames
+
+
 class IngestJob:
     """Base class of inputs: the topics of a camera, its labels and its ground plane.
 
@@ -235,13 +306,13 @@ class IngestJob:
         calibration = GivenCalibration.read(*source_options) if options.calibration else None
         #: The ground plane and the calibration that were given.
         self.ground_given = GivenGround(options.ground_plane, calibration, options.point)
-        self.labels: dict[Role, tuple[Path, LabelFile]] = {
+        self.labels: dict[Role, tuple[Path, Labels]] = {
             role: (path, self.read(path, role)) for role, path in options.labels.items()
         }
         self.motions = read_motions(options.motion) if options.motion else None
         self.check_labels()
 
-    def read(self, path: Path, role: Role) -> LabelFile:
+    def read(self, path: Path, role: Role) -> Labels:
         """Read a label file with the format options."""
         options = self.options
         wanted = options.classes or (WantedClasses("all") if role == "corrections" else ONLY_PEOPLE)
@@ -250,7 +321,8 @@ class IngestJob:
                 f"{path} holds 3D boxes, and {self.source} does not; add them with "
                 f"{call('ingest', path, role=role, into='LOG')}"
             )
-        return read_labels_of_any_length(path, options.label_format, role, options.first_frame, options.columns, wanted)
+        given = (options.label_format, role, options.first_frame, options.columns, wanted)
+        return read_labels(path, *given, in_parts=True)
 
     @property
     def has_labels(self) -> bool:
@@ -285,9 +357,9 @@ class IngestJob:
             )
         if actual is None:
             return
-        for role, (path, labels) in self.labels.items():
-            if isinstance(labels, Labels) and labels.format in OTHERS:
-                self.labels[role] = path, fitted(path, labels, actual)
+        for _, labels in self.labels.values():
+            if labels.format in OTHERS:
+                labels.fit(actual)
 
     def check_labels(self) -> None:
         """Refuse labels that don't suit their role."""
@@ -314,7 +386,9 @@ class IngestJob:
             if labels.step > 1:
                 text = f"{path} has labels every {labels.step} frames, from {labels.labelled[0]} on"
                 self.report.remarks.append(f"{text}; the frames in between are left out")
-            if text := describe_classes(*labels.class_counts(), labels.classes):
+            kinds, counts = labels.class_counts()
+            if len(kinds) > 1:
+                text = describe_classes(kinds, counts, labels.classes)
                 self.report.remarks.append(f"{path} has several classes; class_id is {text}")
 
     def __enter__(self) -> Self:
@@ -414,7 +488,7 @@ class IngestJob:
         frames = motion_frames(self.motions, timeline.index, timeline.t_ns, size)
         self.write_rows(writer, MOTION, CAMERA_MOTION, lambda: iter(frames), {"file": path.name})
 
-    def label_parameters(self, role: Role, labels: LabelFile) -> dict[str, Any]:
+    def label_parameters(self, role: Role, labels: Labels) -> dict[str, Any]:
         """Additional parameters in the provenance of labels."""
         out: dict[str, Any] = {} if self.options.first_frame is None else {"first_frame": labels.first_frame}
         if self.options.columns and labels.format in ("csv", "supervision"):

@@ -39,7 +39,6 @@ from mcaptrack.sources.ingest.labels.camera import (
     timeline_of,
 )
 from mcaptrack.sources.ingest.labels.content import Format, Labels, WantedClasses
-from mcaptrack.sources.ingest.labels.long_files import LabelFile
 from mcaptrack.sources.ingest.labels.timeline import MAX_FRAMES, Placed, Timeline, count_frames
 from mcaptrack.sources.video import SEQINFO, find_seqinfo
 
@@ -131,8 +130,7 @@ class LabelJob(IngestJob):
             self.prefix, self.pictures = camera_of(into, options.camera)
         if into is not None and "corrections" in self.labels:
             path, labels = self.labels["corrections"]
-            if isinstance(labels, Labels):  # corrections are never read in parts
-                self.labels = {**self.labels, "corrections": (path, with_new_ids(into, self.prefix, labels))}
+            self.labels = {**self.labels, "corrections": (path, with_new_ids(into, self.prefix, labels))}
             self.frame_id = frame_of(into, self.pictures) if self.pictures else ""
         seen = detections_topic(into, self.prefix) if into is not None and not self.pictures else ""
         pictures_of = partial(picture_size, into, self.pictures) if into is not None and self.pictures else None
@@ -312,7 +310,7 @@ class LabelJob(IngestJob):
         self.write_labels(writer, self.ground, self.timeline)
         self.write_motion(writer, self.timeline, self._size)
 
-    def label_parameters(self, role: Role, labels: LabelFile) -> dict[str, Any]:
+    def label_parameters(self, role: Role, labels: Labels) -> dict[str, Any]:
         """The frame rate, if there were no pictures."""
         return super().label_parameters(role, labels) | ({} if self._fps is None else {"fps": str(self._fps)})
 
@@ -326,7 +324,7 @@ def _seconds(t_ns: int) -> str:
     return f"{t_ns / NS_PER_S:.3f} s"
 
 
-def _known(path: Path, labels: LabelFile) -> _Known:
+def _known(path: Path, labels: Labels) -> _Known:
     """Frame rate and number of frames by the format of a label file, or by seqinfo.ini."""
     if labels.format == "sdd":
         return _Known(_SDD_FPS, None, _BY_FORMAT[labels.format])

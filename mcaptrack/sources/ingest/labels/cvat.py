@@ -27,8 +27,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import read_beginning
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.schema.classes import PERSON, is_person
-from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows
-from mcaptrack.sources.ingest.labels.content import NO_ID, Labels, WantedClasses
+from mcaptrack.sources.ingest.labels.content import NO_CLASS, NO_ID, Labels, WantedClasses
 from mcaptrack.sources.ingest.xml_reader import XmlReader
 
 _MAX_BYTES: Final = 512 * 2**20
@@ -304,21 +303,15 @@ def read_cvat(path: Path, role: Role, wanted: WantedClasses) -> Labels:
         raise McaptrackError(f"{path} holds no boxes{f', only {others}' if others else ''}")
     values: Floats = np.frombuffer(parser.values, np.float64).reshape(-1, _COLUMNS)
     number, names = _classes(parser.labels)
-    rows = BoxRows(
-        path,
-        "cvat",
-        lambda row: f"{path}:{values[row, 8]:.0f}",
-        values[:, 0],
-        values[:, 1:5],
-        values[:, _ID],
-        np.full(len(values), np.nan),
-        number[values[:, 6].astype(int)],
-        names,
-        first_frame=0,
-        observed=values[:, 7] == 0,
-    )
+    none, kind, is_seen = np.full(len(values), np.nan), number[values[:, 6].astype(int)], values[:, 7] == 0
+
+    def at(row: int) -> str:
+        return f"{path}:{values[row, 8]:.0f}"
+
+    rows = Labels(path, "cvat", at, values[:, 0], values[:, _ID], values[:, 1:5], none, kind, observed=is_seen)
     rows.labelled, doubt = _frames(parser, values[:, 0])
-    rows.doubts += [(f"{path}: {doubt}", "clock")] if doubt else []
+    if doubt:
+        rows.doubt(f": {doubt}", "clock")
     if parser.tracks:
         own = values[:, _ID].astype(int)
         ids, new_ids, remarks = _ids(path, parser.tracks, np.bincount(own, minlength=len(parser.tracks)))
@@ -326,16 +319,15 @@ def read_cvat(path: Path, role: Role, wanted: WantedClasses) -> Labels:
         rows.remarks += remarks
     if parser.unread:
         shown = ", ".join(repr(text) for text in list(parser.unread)[:3])
-        unread = f"{path}: {parser.unread.total()} boxes have a track_id that is not a whole number ({shown})"
-        rows.doubts.append((f"{unread}; these are not read", "other"))
+        unread = f": {parser.unread.total()} boxes have a track_id that is not a whole number ({shown})"
+        rows.doubt(f"{unread}; these are not read")
     if parser.interpolated:
-        rows.remarks.append(f"{path}: {parser.interpolated} boxes are interpolated between others of their tracks")
+        rows.remark(f": {parser.interpolated} boxes are interpolated between others of their tracks")
     if parser.rotated:
-        rows.doubts.append((f"{path}: {parser.rotated} boxes are rotated, and taken without their rotation", "other"))
-    left = _counted(parser.others)
-    if left:
-        rows.doubts.append((f"{path} also holds {left}; they are left out, because they are no boxes", "left-out"))
-    return rows.labels(role, wanted)
+        rows.doubt(f": {parser.rotated} boxes are rotated, and taken without their rotation")
+    if left := _counted(parser.others):
+        rows.doubt(f" also holds {left}; they are left out, because they are no boxes", "left-out")
+    return rows.settled(role, wanted, names)
 
 
 def _counted(others: Counter[str]) -> str:

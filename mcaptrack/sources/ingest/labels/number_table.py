@@ -11,14 +11,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
-from mcaptrack.geometry.affine import IDENTITY, compose, scale_of
 from mcaptrack.geometry.arrays import Floats, Ints
-from mcaptrack.geometry.camera_path import Verdict, poses_of
-from mcaptrack.schema import Frame
-from mcaptrack.schema.camera_motion import is_motion, pose_to_rows
 
 #: Line numbers and lines, without empty lines and comments.
 Lines = Iterator[tuple[int, str]]
@@ -27,6 +24,12 @@ _MAX_ROWS: Final = 10_000_000
 _MAX_LINE: Final = 4096
 #: Integers from here on are not exact as float64.
 EXACT: Final = 2**53
+#: Coordinates, in pixels or metres, and scores can't be larger.
+MAX_PLACE: Final = 1e8
+MAX_SCORE: Final = 1e9
+MAX_FRAME: Final = 2**31 - 1
+#: The name of the column of frames in messages.
+FRAME: Final = "the frame (a count of pictures, no time)"
 #: The number of characters of a line that errors show.
 _SHOWN: Final = 60
 
@@ -58,7 +61,44 @@ def split(line: str) -> list[str]:
     return [part.strip() for part in line.split(",")] if "," in line else line.split()
 
 
-class NumberTable:
+class CheckedRows:
+    """Rows of a file whose faults are reported with the place of the row in the file, by ``at``."""
+
+    at: Callable[[int], str]
+
+    def refuse(self, wrong: Any, describe: Callable[[int], str]) -> None:
+        """Raise McaptrackError for the first row where ``wrong`` (N,) is true, with its text by ``describe``."""
+        if wrong.any():
+            row = int(wrong.argmax())
+            raise McaptrackError(f"{self.at(row)}: {describe(row)}")
+
+    def whole(self, values: NDArray[Any], what: str, least: int, most: int = EXACT - 1) -> Ints:
+        """Values (N,) as whole numbers."""
+        wrong = ~((values == np.rint(values)) & (values >= least) & (values <= most))
+        self.refuse(wrong, lambda row: f"{what} has to be a whole number from {least} to {most}, not {values[row]:g}")
+        return values.astype(np.int64)
+
+    def check_places(self, places: Floats, what: str = "a coordinate", unit: str = "") -> None:
+        """Check that no coordinate (N, C) is too large."""
+        largest = np.abs(places).max(axis=1, initial=0)
+        text = f"at most {MAX_PLACE:g}{unit}"
+        self.refuse(largest > MAX_PLACE, lambda row: f"{what} can't be {largest[row]:g}; {text}")
+
+    def check_boxes(self, boxes: Floats) -> None:
+        """Check that boxes (N, 4) of left, top, width, height can be some."""
+        self.refuse(~np.isfinite(boxes).all(axis=1), lambda _: "a number of the box is missing or not finite")
+        self.check_places(boxes)
+        self.refuse(
+            (boxes[:, 2:] < 0).any(axis=1),
+            lambda row: f"a box can't be {boxes[row, 2]:g} wide and {boxes[row, 3]:g} high",
+        )
+
+    def check_scores(self, score: Floats) -> None:
+        """Check that no score (N,) is too large."""
+        self.refuse(np.abs(score) > MAX_SCORE, lambda row: f"a score can't be {score[row]:g}")
+
+
+class NumberTable(CheckedRows):
     """Rows of numbers: ``values`` (N, C), and their line numbers ``line`` (N,).
 
     ``parse`` converts the parts of a line to C numbers, and raises ValueError if they are not a valid row. ``what``
@@ -74,7 +114,6 @@ class NumberTable:
         parse: Callable[[list[str]], Sequence[float]],
         split: Callable[[str], list[str]] = split,
     ) -> None:
-        self._path = path
         values, numbers = array("d"), array("q")
         for number, line in lines:
             try:
@@ -90,88 +129,5 @@ class NumberTable:
                 )
         self.values: Floats = np.frombuffer(values, np.float64).reshape(-1, columns)
         self.line: Ints = np.frombuffer(numbers, np.int64)
-
-    def refuse(self, wrong: Any, describe: Callable[[int], str]) -> None:
-        """Raise McaptrackError for the first row where ``wrong`` (N,) is true, with its text by ``describe``."""
-        if wrong.any():
-            row = int(wrong.argmax())
-            raise McaptrackError(f"{self._path}:{self.line[row]}: {describe(row)}")
-
-    def within(self, columns: slice, what: str, most: float) -> Floats:
-        """Columns (N, C) of finite numbers with absolute values up to ``most``."""
-        values = self.values[:, columns]
-        self.refuse(~np.isfinite(values).all(axis=1), lambda _: "a number is not finite")
-        largest = np.abs(values).max(axis=1, initial=0)
-        self.refuse(largest > most, lambda row: f"{what} can't be {largest[row]:g}; at most {most:g}")
-        return values
-
-    def whole(self, column: int, what: str, least: int, most: int = EXACT - 1) -> Ints:
-        """A column (N,) of whole numbers."""
-        values = self.values[:, column]
-        self.refuse(
-            ~((values == np.rint(values)) & (values >= least)),
-            lambda row: f"{what} has to be a whole number from {least} on, not {values[row]:g}",
-        )
-        self.refuse(values > most, lambda row: f"{what} can be {most} at most, not {values[row]:.17g}")
-        return values.astype(np.int64)
-
-
-# Read published motions of cameras: a 2x3 transform per frame, from pixels of the frame before. Letters: F frames.
-
-
-_COLUMNS: Final = 7
-#: The largest zoom from one frame to the next.
-_MOST_ZOOM: Final = 4.0
-_KIND: Final = "a camera motion (frame,m00,m01,m02,m10,m11,m12: 7 columns)"
-
-
-def read_motions(path: Path) -> Floats:
-    """Read the motions (F, 2, 3) of frames 0 to F - 1 from a text file.
-
-    Raises McaptrackError, with the line, for anything else.
-    """
-    table = NumberTable(path, lines_of(path), _KIND, _COLUMNS, _parse)
-    if not len(table.values):
-        raise McaptrackError(f"{path} holds no camera motion")
-    frame, motions = table.values[:, 0], table.values[:, 1:].reshape(-1, 2, 3)
-    table.refuse(
-        frame != np.arange(len(frame)),
-        lambda row: f"frame {frame[row]:g} is not {row}: frames count from 0, without gaps",
-    )
-    wrong = np.array([not is_motion(motion) for motion in motions])
-    table.refuse(wrong, lambda row: "the motion is not finite, or can't be inverted")
-    scale = np.array([scale_of(motion) for motion in motions])
-    table.refuse(
-        (scale > _MOST_ZOOM) | (scale < 1 / _MOST_ZOOM),
-        lambda row: f"the motion enlarges the picture {scale[row]:.3g} times; no camera does that in a frame",
-    )
-    return motions
-
-
-def _parse(parts: list[str]) -> list[float]:
-    if len(parts) != _COLUMNS:
-        raise ValueError(f"{len(parts)} columns")
-    return [float(part) for part in parts]
-
-
-def motion_frames(motions: Floats, index: Ints, t_ns: Ints, size: tuple[int, int]) -> list[Frame]:
-    """The motions (F, 2, 3) of a file as frames of pictures ``index`` (P,) at ``t_ns`` (P,), of this width and height.
-
-    The motion of a picture that follows on missing ones is that of all of them together. Pictures beyond the last
-    motion are lost.
-    """
-    kept: list[Floats] = []
-    last = -1
-    for number in index.tolist():
-        motion = IDENTITY
-        for at in range(last + 1, min(number + 1, len(motions))):
-            motion = compose(motions[at], motion) if at else IDENTITY
-        kept.append(motion)
-        last = number
-    poses = poses_of(np.array(kept), *size)
-    frames = []
-    for pose, number, t in zip(poses, index.tolist(), t_ns.tolist(), strict=True):
-        judged = pose if number < len(motions) else pose._replace(verdict=Verdict.LOST)
-        reference = judged._replace(reference=int(index[judged.reference]))
-        frames.append(Frame(t, number, pose_to_rows(reference, *size)))
-    return frames
+        line = self.line  # places don't keep the values in memory
+        self.at = lambda row: f"{path}:{line[row]}"

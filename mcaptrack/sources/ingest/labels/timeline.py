@@ -9,18 +9,23 @@ Letters: P pictures, F labelled frames.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import lru_cache
 from pathlib import Path
 from typing import Final, NamedTuple, Self
 
 import numpy as np
 
+from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import warn
-from mcaptrack.sources.ingest.labels.long_files import LabelFile
+from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Rows
+from mcaptrack.sources.ingest.labels.content import Labels
 
 #: The largest frame number: more than three days at 30 frames a second.
 MAX_FRAMES: Final = 10_000_000
@@ -112,7 +117,7 @@ class Timeline:
         gaps = np.diff(self.t_ns) / np.diff(self.index)
         return NS_PER_S / float(np.median(gaps)) if len(gaps) else 0.0
 
-    def place(self, path: Path, labels: LabelFile, lost: list[str]) -> Placed:
+    def place(self, path: Path, labels: Labels, lost: list[str]) -> Placed:
         """Assign the labelled frames of a file to pictures, including frames without labels in between.
 
         Raises McaptrackError if there are labels before the first or after the last picture. If pictures are known to
@@ -174,7 +179,7 @@ class Timeline:
         number[nearest] = np.arange(len(seconds))
         return Placed(number, self.index, self.t_ns)
 
-    def _every(self, path: Path, labels: LabelFile) -> int:
+    def _every(self, path: Path, labels: Labels) -> int:
         """The step of frame numbers in a label file, which may use the numbers in the names of images."""
         if self.every == 1 or ((labels.labelled - labels.first_frame) % self.every).any():
             return 1
@@ -182,7 +187,7 @@ class Timeline:
             warn(f"{path} counts frames as the names of {self.of} do, every {self.every}", "clock")
         return self.every
 
-    def _beyond(self, path: Path, labels: LabelFile, beyond: int, end: int) -> str:
+    def _beyond(self, path: Path, labels: Labels, beyond: int, end: int) -> str:
         """The error for labels after frame ``end`` of the file, the last picture."""
         frame, count = labels.frame_counts()
         first, last = int(frame[0]), int(frame[-1])
@@ -206,7 +211,7 @@ def frame_times_ns(index: Ints, fps: Fraction) -> Ints:
     return rounded
 
 
-def count_frames(path: Path, labels: LabelFile) -> int:
+def count_frames(path: Path, labels: Labels) -> int:
     """The number of frames up to the last one that a file labels.
 
     Raises McaptrackError if nearly all of them would be empty, which means that the numbers are wrong.
@@ -222,3 +227,65 @@ def count_frames(path: Path, labels: LabelFile) -> int:
             f"{mend}, or {first}"
         )
     return count
+
+
+# Labels as rows of detections and tracks. Letters: N rows.
+
+
+#: The number of frames of a block, for which times are converted together.
+_BLOCK: Final = 4096
+
+
+def label_rows(labels: Labels, role: Role, plane: GroundPlane | None) -> Rows:
+    """Convert the N rows of labels to rows of detections or tracks, with positions in metres if a plane is given."""
+    if role == "detections" and labels.boxes_px is not None:
+        x, y, w, h = labels.boxes_px.T
+        return DETECTIONS.rows(x_px=x, y_px=y, w_px=w, h_px=h, score=labels.score, class_id=labels.class_id)
+    nowhere = np.full((len(labels.frame), 4), np.nan)
+    boxes = nowhere if labels.boxes_px is None else labels.boxes_px
+    xy_m = labels.xy_m
+    if xy_m is None:
+        xy_m = plane.boxes_to_metres(boxes) if plane else nowhere[:, :2]
+    return TRACKS.rows(
+        track_id=labels.id,
+        x_px=boxes[:, 0],
+        y_px=boxes[:, 1],
+        w_px=boxes[:, 2],
+        h_px=boxes[:, 3],
+        x_m=xy_m[:, 0],
+        y_m=xy_m[:, 1],
+        score=labels.score,
+        observed=np.ones(len(labels.frame), bool) if role != "tracks" or labels.observed is None else labels.observed,
+        source_id=np.full(len(labels.frame), -1),
+        class_id=labels.class_id,
+    )
+
+
+def frames_of_labels(
+    parts: Sequence[Callable[[], Labels]], role: Role, plane: GroundPlane | None, placed: Placed
+) -> Callable[[], Iterator[Frame]]:
+    """The rows of labels, in parts of whole frames, as frames: those that are ``placed``, also empty ones.
+
+    They are made as often as the result is called, and converted once if there is one part.
+    """
+
+    @lru_cache(maxsize=1)
+    def converted(number: int) -> tuple[Ints, Rows]:
+        labels = parts[number]()
+        return labels.frame, label_rows(labels, role, plane)
+
+    def frames() -> Iterator[Frame]:
+        low = 0
+        for number in range(len(parts)):
+            frame, rows = converted(number)
+            is_last = number == len(parts) - 1
+            high = len(placed.number) if is_last else int(np.searchsorted(placed.number, frame[-1], "right"))
+            for start in range(low, high, _BLOCK):
+                some = slice(start, min(start + _BLOCK, high))
+                ends = (np.searchsorted(frame, placed.number[some], side) for side in ("left", "right"))
+                columns = (column.tolist() for column in (placed.t_ns[some], placed.index[some], *ends))
+                for t_ns, index, first, last in zip(*columns, strict=True):
+                    yield Frame(t_ns, index, rows[first:last])
+            low = high
+
+    return frames

@@ -13,12 +13,10 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
 from mcaptrack.sources.ingest.labels.boxes_3d.argoverse import is_argoverse, read_argoverse
 from mcaptrack.sources.ingest.labels.boxes_3d.nuscenes import read_nuscenes, tables_folder
-from mcaptrack.sources.ingest.labels.boxes_3d.rows import BoxRows3D
-from mcaptrack.sources.ingest.labels.boxes_3d.table import holds_boxes_3d, read_table
-from mcaptrack.sources.ingest.labels.content import FORMATS_3D, Format
-from mcaptrack.sources.ingest.labels.delimited import MAX_LINE
+from mcaptrack.sources.ingest.labels.content import FORMATS_3D, NO_ID, BoxRows3D, Format
+from mcaptrack.sources.ingest.labels.delimited import MAX_LINE, holds_boxes_3d, read_table_3d
 from mcaptrack.sources.ingest.labels.formats import ClassNames
-from mcaptrack.sources.ingest.labels.number_table import NumberTable, lines_of
+from mcaptrack.sources.ingest.labels.number_table import FRAME, MAX_FRAME, NumberTable, lines_of
 
 _BEGIN_BYTES: Final = 4096
 
@@ -59,7 +57,7 @@ _COLUMNS: Final = (
     "frame id type truncated occluded alpha left top right bottom height width length x y z rotation score"
 )
 #: The frame of reference: of the camera, with z up.
-FRAME: Final = "camera_link"
+CAMERA_FRAME: Final = "camera_link"
 
 
 def read_kitti_3d(path: Path) -> BoxRows3D:
@@ -77,7 +75,8 @@ def read_kitti_3d(path: Path) -> BoxRows3D:
         return [float(parts[0]), float(parts[1]), names.number(parts[2]), *map(float, parts[10:17]), score]
 
     table = NumberTable(path, lines_of(path), f"KITTI tracking ({_COLUMNS})", 11, parse)
-    frame, track_id = table.whole(0, "the frame (a count of pictures, no time)", 0), table.whole(1, "the id", -1)
+    frame = table.whole(table.values[:, 0], FRAME, 0, MAX_FRAME)
+    track_id = table.whole(table.values[:, 1], "the id", NO_ID)
     kind = table.values[:, 2].astype(np.int64)
     is_region = np.array([name.lower() == _REGION for name in names.names], bool)[kind] if len(kind) else kind == -2
     has_no_box = ~is_region & (table.values[:, 3:6] <= 0).any(axis=1)  # results of detectors in pictures
@@ -89,22 +88,12 @@ def read_kitti_3d(path: Path) -> BoxRows3D:
     left = [f"{int(is_region.sum())} regions (DontCare)"] if is_region.any() else []
     left += [f"{int(has_no_box.sum())} rows without a 3D box"] if has_no_box.any() else []
     axes = "x is forward, y left, z up (in the file x is right, y down, z forward); positions are centres of boxes"
-    return BoxRows3D(
-        path,
-        "kitti-3d",
-        lambda row: f"{path}:{table.line[kept[row]]}",
-        np.stack([z, -x, -y + height / 2, length, width, height, heading], axis=-1),
-        track_id[kept],
-        kind[kept],
-        names.names,
-        table.values[kept, 10],
-        np.full((len(kept), 2), np.nan),
-        frame=frame[kept],
-        labelled=np.unique(frame),
-        frame_id=FRAME,
-        left_out=" and ".join(left),
-        remarks=[f"{path}: {axes}"],
-    )
+    boxes, score = np.full((len(frame), 7), np.nan), table.values[:, 10]
+    boxes[kept] = np.stack([z, -x, -y + height / 2, length, width, height, heading], axis=-1)
+    rows = BoxRows3D(path, "kitti-3d", table.at, frame, track_id, boxes, score, kind, frame_id=CAMERA_FRAME)
+    rows.names, rows.left_out, rows.labelled = names.names, " and ".join(left), np.unique(frame)
+    rows.remark(f": {axes}")
+    return rows.take(kept)
 
 
 def read_boxes_3d(
@@ -154,6 +143,6 @@ def read_boxes_3d(
     elif label_format == "argoverse":
         rows = read_argoverse(path)
     else:
-        rows = read_kitti_3d(path) if label_format == "kitti-3d" else read_table(path, columns or {})
+        rows = read_kitti_3d(path) if label_format == "kitti-3d" else read_table_3d(path, columns or {})
     rows.check(role)
     return rows
