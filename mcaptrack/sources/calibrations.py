@@ -22,8 +22,7 @@ from mcaptrack.geometry.transform_tree import Poses, TransformTree
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import INGEST
 from mcaptrack.sources.cameras import Camera, provenance_of
-from mcaptrack.sources.foreign import stamp_of
-from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name, stamp_of
 from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.frames import poses_at, transforms_of
 from mcaptrack.sources.pictures import size_of_pictures

@@ -14,8 +14,7 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.transform_tree import Poses, PoseSamples, Recorded, TransformTree
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.sources.foreign import stamp_of
-from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name, stamp_of
 from mcaptrack.sources.foreign.flatten import message_type_of
 
 #: Schemas of transforms, by their names in ROS 1 and Foxglove; ROS 2 adds "/msg/".

@@ -18,45 +18,14 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.notices import warn
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.sources.foreign.boxes import DETECTIONS_READ, Classes, boxes_decoder
+from mcaptrack.sources.foreign.boxes import DETECTIONS_READ
+from mcaptrack.sources.foreign.boxes import Classes as Classes
+from mcaptrack.sources.foreign.boxes import boxes_decoder as boxes_decoder
 from mcaptrack.sources.foreign.boxes_3d import BOXES_3D_READ, DRAWINGS, Message3d, boxes_3d_decoder
-from mcaptrack.sources.foreign.decoding import (
-    MessageType,
-    decoder_with_errors,
-    integer,
-    plain_name,
-    stamp_of,
-    text,
-    to_bytes,
-)
+from mcaptrack.sources.foreign.decoding import MessageType as MessageType
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, integer, plain_name, stamp_of, text, to_bytes
+from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.video import PixelLayout
-
-__all__ = [
-    "BOXES_3D_READ",
-    "BOXES_READ",
-    "DETECTIONS_READ",
-    "PICTURES_READ",
-    "Classes",
-    "MessageType",
-    "NamedFrames",
-    "Picture",
-    "boxes_3d",
-    "boxes_decoder",
-    "detections",
-    "holds_detections",
-    "holds_pictures",
-    "is_compressed",
-    "is_drawing",
-    "is_picture",
-    "may_hold_boxes_3d",
-    "named_detections",
-    "picture_decoder",
-    "picture_reader",
-    "pictures",
-    "settle_classes",
-    "stamp_of",
-    "stamps",
-]
 
 _COMPRESSED: Final = (foxglove.VIDEO, foxglove.IMAGE, "sensor_msgs/CompressedImage")
 _RAW: Final = ("foxglove.RawImage", "sensor_msgs/Image")
@@ -182,12 +151,8 @@ def _decoded(
 def _reader(
     opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]]
 ) -> Callable[[log.Message], Any]:
-    channel = opened.channel(topic)
-    index = opened.part(channel.topic).index
-    schema = index.schemas.get(index.channels[channel.id].schema_id)
-    fields = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
     try:
-        decode = make(MessageType(*fields, channel.message_encoding))
+        decode = make(message_type_of(opened, topic))
     except McaptrackError as error:
         raise McaptrackError(f"{opened.path}: {topic}: {error}") from None
 

@@ -16,7 +16,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, Rows
 from mcaptrack.schema.classes import PERSON, UNKNOWN, is_person
-from mcaptrack.sources.foreign.decoding import MessageType, decoder_with_errors, plain_name
+from mcaptrack.sources.foreign.decoding import MessageType, decoder_with_errors, number, plain_name
 
 #: Schemas of boxes of other software.
 DETECTIONS_READ: Final = ("vision_msgs/Detection2DArray",)
@@ -113,14 +113,19 @@ def _box(detection: Any, classes: Classes) -> tuple[float, float, float, float, 
         raise ValueError(f"a box can't be {w:g} x {h:g} at ({x:g}, {y:g})")
     if theta:
         w, h = (abs(w * cos(theta)) + abs(h * sin(theta)), abs(w * sin(theta)) + abs(h * cos(theta)))
-    guesses = [getattr(result, "hypothesis", result) for result in detection.results]
-    scored = [(float(guess.score), guess) for guess in guesses]
+    name, score = best_hypothesis(detection.results)
+    return x - w / 2, y - h / 2, w, h, score, UNKNOWN if name is None else classes.class_id(name)
+
+
+def best_hypothesis(results: Any) -> tuple[str | None, float]:
+    """The class with the highest score of results of vision_msgs, None if there is none, and its score, or NaN.
+
+    Before ROS 2 Humble a result is its own hypothesis, with ``id`` in the place of ``class_id``.
+    """
+    guesses = [getattr(result, "hypothesis", result) for result in results]
+    scored = [(number(guess.score), guess) for guess in guesses]
     finite = [(score, guess) for score, guess in scored if isfinite(score)]
     score, best = max(finite or scored, key=lambda pair: pair[0], default=(nan, None))
-    return x - w / 2, y - h / 2, w, h, score if finite else nan, _class_id(best, classes)
-
-
-def _class_id(guess: Any, classes: Classes) -> int:
-    if guess is None:
-        return UNKNOWN
-    return classes.class_id(str(guess.class_id if hasattr(guess, "class_id") else guess.id).strip())
+    if best is None:
+        return None, nan
+    return str(best.class_id if hasattr(best, "class_id") else best.id).strip(), score if finite else nan

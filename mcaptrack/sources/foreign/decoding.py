@@ -13,6 +13,7 @@ from collections.abc import Callable
 from copy import copy
 from datetime import UTC, datetime
 from functools import lru_cache
+from math import nan
 from types import SimpleNamespace
 from typing import Any, Final, NamedTuple
 
@@ -175,6 +176,13 @@ def integer(value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not -_LIMIT_NS <= value < _LIMIT_NS:
         raise ValueError(f"{str(value)[:40]!r} where a whole number belongs")
     return int(value)
+
+
+def number(value: Any) -> float:
+    """A number, also from the texts that stand for NaN and infinity in JSON; null is NaN."""
+    if isinstance(value, bool):
+        raise ValueError("true or false where a number belongs")
+    return nan if value is None else float(value)
 
 
 def text(value: Any) -> str:

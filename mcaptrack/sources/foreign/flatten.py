@@ -34,7 +34,7 @@ class _Messages(tuple[Any, ...]):
 def message_type_of(opened: log.Log, topic: str) -> MessageType:
     """The message type of a channel of a log."""
     channel = opened.channel(topic)
-    index = opened.part(topic).index
+    index = opened.part(channel.topic).index
     schema = index.schemas.get(index.channels[channel.id].schema_id)
     fields = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
     return MessageType(*fields, channel.message_encoding)

@@ -487,7 +487,7 @@ _HEADERS_3D: Final[Mapping[str, tuple[str, ...]]] = {
     "vy_m_per_s": ("vympers", "vyms", "vym/s", "vy", "velocityy"),
 }
 #: Headers that only tables of 3D boxes have.
-_OF_BOXES: Final = frozenset(("zm", "tzm", "lengthm", "headingrad", "headingdeg"))
+_ONLY_3D: Final = frozenset(("zm", "tzm", "lengthm", "headingrad", "headingdeg"))
 #: A length in another unit than metres, at the end of a header.
 _OTHER_UNIT: Final = re.compile(r"(?:^|[_ \[(])(mm|cm|km|ft|feet|inch|inches|px)[\])]?$", re.IGNORECASE)
 
@@ -500,7 +500,7 @@ def holds_boxes_3d(path: Path, first: str, chosen: Mapping[str, str]) -> bool:
     if not header:
         return False
     plain = _plain(header)
-    if {"xm", "ym"} <= set(plain) or _OF_BOXES & set(plain):
+    if {"xm", "ym"} <= set(plain) or _ONLY_3D & set(plain):
         return True
     keys = {key for key, names in _HEADERS_3D.items() if set(names) & set(plain)}
     return set(_PLACE) <= keys and bool(keys & {*_HEADING, "qw"})
