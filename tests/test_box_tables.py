@@ -13,7 +13,7 @@ import pytest
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.labels import content, delimited, json_boxes, yolo
-from mcaptrack.sources.ingest.labels.content import Labels, fitted
+from mcaptrack.sources.ingest.labels.content import Labels
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline
 
@@ -305,17 +305,18 @@ def test_a_box_is_outside_where_no_pixel_of_it_or_less_than_half_is_inside(place
     assert [words.removeprefix(": ") for words in said(tmp_path, labels)] == wanted
     path = tmp_path / "a"
     labels = read(tmp_path, table(f"0,{','.join(map(str, place))}", "1,1,1,1.5,1"))
-    made = fitted(path, labels, (100, 50))
-    assert [words.removeprefix(f"{path}: ") for words, _ in made.doubts] == wanted
-    assert made.boxes_px.tolist() == labels.boxes_px.tolist()
+    before = labels.boxes_px.tolist()
+    labels.fit((100, 50))
+    assert [words.removeprefix(f"{path}: ") for words, _ in labels.doubts] == wanted
+    assert labels.boxes_px.tolist() == before
 
 
 def test_shares_become_pixels_once(tmp_path):
     labels = read(tmp_path, table("0,0.25,0.5,0.125,1"))
     assert labels.is_normalised
-    once = fitted(tmp_path / "a", labels, (64, 32))
-    assert once.boxes_px.tolist() == [[16, 16, 8, 32]]
-    assert fitted(tmp_path / "a", once, (64, 32)).boxes_px.tolist() == once.boxes_px.tolist()
+    for _ in range(2):
+        labels.fit((64, 32))
+        assert labels.boxes_px.tolist() == [[16, 16, 8, 32]]
     assert read(tmp_path, table("0,0.25,0.5,0.125,2")).is_normalised
     assert not read(tmp_path, table("0,0.25,0.5,0.125,2.01")).is_normalised
     assert not read(tmp_path, table("0,1,0,1,2")).is_normalised  # whole numbers
@@ -578,7 +579,7 @@ def test_pictures_by_times_have_limits():
 def placed(folder: Path, made: Timeline, *seconds: float) -> list[int]:
     """The row of labels at these times that each picture has; -1 for none."""
     labels = read(folder, table(*(f"{s},1,2,3,4" for s in seconds), header="t,x,y,w,h"))
-    return made.place(folder / "a", labels, []).number.tolist()
+    return made.place(labels, []).number.tolist()
 
 
 def test_times_of_labels_belong_to_the_nearest_picture_that_is_near(tmp_path):

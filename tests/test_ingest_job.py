@@ -12,8 +12,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.sources.ingest.job import IngestJob, IngestOptions
-from mcaptrack.sources.ingest.labels.camera import boxes_extent
 from mcaptrack.sources.ingest.labels.content import WantedClasses
+from mcaptrack.sources.ingest.labels.timeline import boxes_extent
 from mcaptrack.tables.compared import pair_files
 from tests.logs import add_rows, some_log
 from tests.worlds import boxes_at, tracks_at

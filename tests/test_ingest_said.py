@@ -26,11 +26,7 @@ from mcaptrack.sources.ingest.bags import decompression, plain_yaml
 from mcaptrack.sources.ingest.bags.metadata_yaml import read_metadata
 from mcaptrack.sources.ingest.bags.plain_yaml import UnsupportedYamlError
 from mcaptrack.sources.ingest.bags.rosbag2 import known_definition
-from mcaptrack.sources.ingest.labels.camera import (
-    CameraTopics,
-    camera_prefix,
-    choose_camera,
-)
+from mcaptrack.sources.ingest.labels.timeline import CameraTopics, camera_prefix, choose_camera
 from mcaptrack.sources.ingest.recording_job import RecordingJob
 from tests.bags import ROS1, STRING1, T0, bag1
 from tests.worlds import ns

@@ -24,9 +24,9 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest import IngestOptions, ingest, label_frames
-from mcaptrack.sources.ingest.labels.camera import timeline_of
 from mcaptrack.sources.ingest.labels.content import FORMATS_3D, OTHERS, Format
 from mcaptrack.sources.ingest.labels.formats import READERS
+from mcaptrack.sources.ingest.labels.timeline import timeline_of
 from mcaptrack.sources.video import H264Encoder
 from mcaptrack.sources.video.h264 import inspect
 from mcaptrack.tables.compared import compare_files, detections_and_ground_truth

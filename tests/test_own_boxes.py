@@ -166,15 +166,15 @@ def test_times_belong_to_the_nearest_picture(start_ns, is_absolute, tmp_path):
     times = [(start_ns * is_absolute + ms * 10**6) // 10**6 for ms in (210, 90)]
     path = written(tmp_path, "l.csv", f"t_ms,x,y,w,h\n{times[0]},1,2,3,4\n{times[1]},5,6,7,8\n")
     labels = read_labels(path, role="detections")
-    placed = pictures.place(path, labels, [])
+    placed = pictures.place(labels, [])
     assert placed.number.tolist() == [-1, 0, 1, -1]
     assert labels.boxes_px[:, 0].tolist() == [5, 1]
     written(tmp_path, "l.csv", "t,x,y,w,h\n0.09,1,2,3,4\n0.11,5,6,7,8\n")
     with pytest.raises(McaptrackError, match=r"0\.09 and 0\.11 s are nearest to the same"):
-        pictures.place(path, read_labels(path), [])
+        pictures.place(read_labels(path), [])
     written(tmp_path, "l.csv", "t,x,y,w,h\n0.09,1,2,3,4\n7,5,6,7,8\n")
     with pytest.raises(McaptrackError, match=r"its times are from 0\.09 to 7 s"):
-        pictures.place(path, read_labels(path), [])
+        pictures.place(read_labels(path), [])
 
 
 def test_columns_are_named_by_the_user(tmp_path):

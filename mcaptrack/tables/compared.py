@@ -29,9 +29,8 @@ from mcaptrack.schema.classes import PERSON
 from mcaptrack.schema.framing import split_rows
 from mcaptrack.sources import ingest
 from mcaptrack.sources.ingest.bags.opening import is_mcap
-from mcaptrack.sources.ingest.boxes_3d_job import FRAME, Boxes3DJob
 from mcaptrack.sources.ingest.job import IngestOptions
-from mcaptrack.sources.ingest.label_job import LabelJob
+from mcaptrack.sources.ingest.label_job import FRAME, Boxes3DJob, LabelJob
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
 from mcaptrack.sources.ingest.labels.content import ONLY_PEOPLE, IgnoredBoxes, Labels, WantedClasses
 from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX
@@ -118,11 +117,11 @@ def compare_files(
     if any(have_3d):
         text = f"{tracks if have_3d[0] else ground_truth} holds 3D boxes, and {tracks if have_3d[1] else ground_truth}"
         raise McaptrackError(f"{text} does not; they can't be compared")
-    both: dict[Role, tuple[Path, Labels]] = {
-        "truth": (ground_truth, _read(ground_truth, "truth", topics, WantedClasses(classes or ONLY_PEOPLE.text))),
-        "tracks": (tracks, _read(tracks, "tracks", topics, WantedClasses(classes or ONLY_PEOPLE.text, may_lack=True))),
+    both: dict[Role, Labels] = {
+        "truth": _read(ground_truth, "truth", topics, WantedClasses(classes or ONLY_PEOPLE.text)),
+        "tracks": _read(tracks, "tracks", topics, WantedClasses(classes or ONLY_PEOPLE.text, may_lack=True)),
     }
-    formats = [labels.format for _, labels in both.values()]
+    formats = [labels.format for labels in both.values()]
     if not all(name in _COUNTING for name in formats) and len(set(formats)) > 1:
         if "parquet" in formats:
             raise McaptrackError(f"{tracks} and {ground_truth} share no clock: one counts frames, the other does not")
@@ -137,9 +136,9 @@ def compare_files(
     return _by_number(both, ground_plane, point, notes)
 
 
-def _names_of(both: Mapping[Role, tuple[Path, Labels]]) -> tuple[Mapping[int, str], Mapping[int, str]]:
+def _names_of(both: Mapping[Role, Labels]) -> tuple[Mapping[int, str], Mapping[int, str]]:
     """The names of the classes of ground truth and tracks."""
-    return both["truth"][1].classes, both["tracks"][1].classes
+    return both["truth"].classes, both["tracks"].classes
 
 
 def _boxes_3d(
@@ -172,7 +171,7 @@ def detections_and_ground_truth(
     """
     options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point)
     with _PairJob([("detections", detections), ("truth", ground_truth)], options) as job:
-        if not all(labels.has_boxes for _, labels in job.labels.values()):
+        if not all(labels.has_boxes for labels in job.labels.values()):
             raise McaptrackError(f"{detections} and {ground_truth} have to hold boxes in pixels, both")
         planes = ((0, job.ground),) if job.ground else ()
         return AlignedDetections(job.all_frames("detections"), job.all_frames("truth"), planes)
@@ -236,32 +235,30 @@ def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
     return in_order(labels, has_ids=True)
 
 
-def _by_number(
-    both: dict[Role, tuple[Path, Labels]], ground_plane: Path | None, point: Point, notes: list[str]
-) -> AlignedFiles:
+def _by_number(both: dict[Role, Labels], ground_plane: Path | None, point: Point, notes: list[str]) -> AlignedFiles:
     """The frames with rows in either file, by their numbers, both counted from 0."""
-    ground_truth, tracks = both["truth"][1], both["tracks"][1]
+    ground_truth, tracks = both["truth"], both["tracks"]
     plane = _plane(ground_plane, point, ground_truth, tracks)
-    numbers_of = {role: labels.frame - labels.first_frame for role, (_, labels) in both.items()}
+    numbers_of = {role: labels.frame - labels.first_frame for role, labels in both.items()}
     if ground_truth.first_frame != tracks.first_frame and len(tracks.frame):
-        first = {role: f"{path} counts frames from {labels.first_frame}" for role, (path, labels) in both.items()}
+        first = {role: f"{labels.path} counts frames from {labels.first_frame}" for role, labels in both.items()}
         notes.append(f"{first['tracks']}, {first['truth']}: their first frames are taken as the same")
     if len(tracks.frame):
         spans = {role: (int(numbers.min()), int(numbers.max())) for role, numbers in numbers_of.items()}
         (a, b), (c, d) = spans["truth"], spans["tracks"]
         if b < c or d < a:
-            spans_as_text = [f"{both[role][0]} ({low} to {high})" for role, (low, high) in spans.items()]
+            spans_as_text = [f"{both[role].path} ({low} to {high})" for role, (low, high) in spans.items()]
             raise McaptrackError(f"the frames of {' and '.join(spans_as_text)} never overlap, counted from 0")
     step = max(ground_truth.step, tracks.step) if len(tracks.frame) else ground_truth.step
     sparse = ground_truth if ground_truth.step >= tracks.step or not len(tracks.frame) else tracks
     start = int(sparse.labelled[0] - sparse.first_frame) % step
     numbers = np.unique(np.concatenate([*numbers_of.values()]))  # frames without rows do not change any score
     numbers = numbers[numbers % step == start]
-    frames = {role: _frames(labels, numbers, numbers_of[role], plane, role) for role, (_, labels) in both.items()}
+    frames = {role: _frames(labels, numbers, numbers_of[role], plane, role) for role, labels in both.items()}
     if ground_truth.ignored is not None and ground_truth.boxes_px is not None:
         frames["tracks"], gone = _without_ignored(frames["truth"], frames["tracks"], ground_truth)
         if gone:
-            notes.append(f"{gone} boxes of {both['tracks'][0]} match labels that don't count; they are ignored")
+            notes.append(f"{gone} boxes of {both['tracks'].path} match labels that don't count; they are ignored")
     return AlignedFiles(frames["truth"], frames["tracks"], notes, _names_of(both))
 
 

@@ -16,14 +16,13 @@ from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.calibrations import frame_of
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.ingest.bags.opening import open_recording
-from mcaptrack.sources.ingest.boxes_3d_job import Boxes3DJob
 from mcaptrack.sources.ingest.calibration import is_calibration
 from mcaptrack.sources.ingest.job import MOTION, IngestJob, IngestOptions, IngestReport, Progress
-from mcaptrack.sources.ingest.label_job import LabelJob, label_frames
+from mcaptrack.sources.ingest.label_job import Boxes3DJob, LabelJob, label_frames
 from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
-from mcaptrack.sources.ingest.labels.camera import boxes_extent, camera_of, picture_size, timeline_of
 from mcaptrack.sources.ingest.labels.content import OTHERS, Format
 from mcaptrack.sources.ingest.labels.cvat import is_cvat
+from mcaptrack.sources.ingest.labels.timeline import boxes_extent, camera_of, picture_size, timeline_of
 from mcaptrack.sources.ingest.labels.yolo import is_label_folder
 from mcaptrack.sources.ingest.recording_job import RecordingJob
 from mcaptrack.sources.ingest.video_job import VideoJob
@@ -107,8 +106,8 @@ def ingest(
         job.report.uses_classes = bool(job.roles - {"detections"})
         job.report.holds_boxes_3d = isinstance(job, Boxes3DJob)
         is_sized = bool(job.options.calibration) and not job.pictures
-        job.report.uses_size = is_sized or any(labels.format in OTHERS for _, labels in job.labels.values())
-        job.report.uses_camera = bool(job.has_labels or job.ground_given.is_given or job.options.motion) or isinstance(
+        job.report.uses_size = is_sized or any(labels.format in OTHERS for labels in job.labels.values())
+        job.report.uses_camera = bool(job.has_labels or job.has_ground_given or job.options.motion) or isinstance(
             job, VideoJob
         )
     return job.report

@@ -144,83 +144,8 @@ class IngestReport:
     holds_boxes_3d: bool = False
 
 
-# The ground plane and the calibration that a user gave for a camera: read, fitted to its pictures, and written.
-
-
-#: The last parts of the topics.
+#: The last parts of the topics of the ground plane and the calibration that a user gave.
 PLANE, CALIBRATION = "ground_plane", "calibration"
-
-
-class GivenGround:
-    """A homography, or a calibration, or neither. Raises McaptrackError for files that can't be read."""
-
-    def __init__(self, homography: Path | None, calibration: GivenCalibration | None, point: Point) -> None:
-        self._path, self._calibration, self._point = homography, calibration, point
-        self._homography = read_homography(homography) if homography else None
-        self._calibrated: Calibrated | None = None
-        if homography and calibration and calibration.has_pose:
-            raise McaptrackError(
-                f"{homography} and {', '.join(map(str, calibration.paths))} are both a ground plane; give one"
-            )
-
-    @property
-    def is_given(self) -> bool:
-        """Whether there is a homography or a calibration."""
-        return self._homography is not None or self._calibration is not None
-
-    @property
-    def has_plane(self) -> bool:
-        """Whether there is a ground plane."""
-        return self._homography is not None or (self._calibration is not None and self._calibration.has_pose)
-
-    def suffixes(self) -> Iterator[str]:
-        """The last parts of the topics that will be written."""
-        if self._calibration is not None:
-            yield CALIBRATION
-        if self.has_plane:
-            yield PLANE
-
-    def plane(
-        self, size: tuple[int, int], prefix: str, pictures: str, frame_id: str, is_stated: bool, remarks: list[str]
-    ) -> GroundPlane | None:
-        """The ground plane for pictures of this size in this topic; None if none follows from what was given.
-
-        ``is_stated`` is false if the size is no more than the extent of boxes. Lines about it are added to ``remarks``.
-        """
-        if self._calibration is not None:
-            is_rectified = is_rectified_topic(pictures)
-            self._calibrated = self._calibration.calibrated(
-                prefix, pictures, size, is_stated, frame_id, self._point, is_rectified
-            )
-            remarks += self._calibrated.remarks
-            if self._calibrated.plane is not None:
-                return self._calibrated.plane
-        if self._homography is None:
-            return None
-        try:
-            return GroundPlane(self._homography, *size, self._point)
-        except McaptrackError as error:
-            raise McaptrackError(f"{self._path}: {error}") from None
-
-    def parameters(self) -> dict[str, Any]:
-        """The parameters of the ground plane in its provenance."""
-        if self._path is not None:
-            return {"file": self._path.name, "point": self._point}
-        return {**(self._calibrated.parameters if self._calibrated else {}), "point": self._point}
-
-    def write_calibration(
-        self, writer: log.LogWriter, prefix: str, pictures: str, t_ns: int, encoding: Encoding
-    ) -> dict[str, int]:
-        """Write the calibration as viewers read it, from a time on. Returns the number of messages by topic."""
-        if self._calibrated is None:
-            return {}
-        topic, message = f"{prefix}/{CALIBRATION}", (t_ns, 0, self._calibrated.at(t_ns))
-        provenance = Provenance(INGEST, self._calibrated.parameters, pictures, digest=digest(iter([message])))
-        record = foxglove.record_in(foxglove.CALIBRATION, encoding)
-        channel = writer.add_channel(topic, record, encoding, provenance.to_metadata())
-        for packed in foxglove.messages_in(foxglove.CALIBRATION, [message], encoding):
-            writer.add_message(channel, *packed)
-        return {topic: 1}
 
 
 # Read published motions of cameras: a 2x3 transform per frame, from pixels of the frame before. Letters: F frames.
@@ -303,12 +228,14 @@ class IngestJob:
         #: The topic of the pictures that labels belong to; "" if there is none.
         self.pictures = ""
         source_options = (options.calibration, options.calibration_name, options.calibration_unit)
-        calibration = GivenCalibration.read(*source_options) if options.calibration else None
-        #: The ground plane and the calibration that were given.
-        self.ground_given = GivenGround(options.ground_plane, calibration, options.point)
-        self.labels: dict[Role, tuple[Path, Labels]] = {
-            role: (path, self.read(path, role)) for role, path in options.labels.items()
-        }
+        #: The calibration and the homography of the ground plane that were given.
+        self.calibration = GivenCalibration.read(*source_options) if options.calibration else None
+        self._calibrated: Calibrated | None = None
+        self._homography = read_homography(options.ground_plane) if options.ground_plane else None
+        if self._homography and self.calibration and self.calibration.has_pose:
+            names = ", ".join(map(str, self.calibration.paths))
+            raise McaptrackError(f"{options.ground_plane} and {names} are both a ground plane; give one")
+        self.labels: dict[Role, Labels] = {role: self.read(path, role) for role, path in options.labels.items()}
         self.motions = read_motions(options.motion) if options.motion else None
         self.check_labels()
 
@@ -323,6 +250,16 @@ class IngestJob:
             )
         given = (options.label_format, role, options.first_frame, options.columns, wanted)
         return read_labels(path, *given, in_parts=True)
+
+    @property
+    def has_ground_given(self) -> bool:
+        """Whether a homography or a calibration was given."""
+        return self._homography is not None or self.calibration is not None
+
+    @property
+    def _has_plane(self) -> bool:
+        """Whether a ground plane follows from what was given."""
+        return self._homography is not None or (self.calibration is not None and self.calibration.has_pose)
 
     @property
     def has_labels(self) -> bool:
@@ -341,8 +278,8 @@ class IngestJob:
         not known, or isn't the given one.
         """
         stated = self.options.size
-        paths = [path for path, labels in self.labels.values() if labels.is_normalised]
-        if not any(labels.format in OTHERS for _, labels in self.labels.values()):
+        paths = [labels.path for labels in self.labels.values() if labels.is_normalised]
+        if not any(labels.format in OTHERS for labels in self.labels.values()):
             return
         actual = size() if size else stated
         if stated and actual and actual != stated:
@@ -357,27 +294,29 @@ class IngestJob:
             )
         if actual is None:
             return
-        for _, labels in self.labels.values():
+        for labels in self.labels.values():
             if labels.format in OTHERS:
                 labels.fit(actual)
 
     def check_labels(self) -> None:
         """Refuse labels that don't suit their role."""
-        for role, (path, labels) in self.labels.items():
+        for role, labels in self.labels.items():
             if role == "detections" and not labels.has_boxes:
-                raise McaptrackError(f"{path} holds positions, not boxes; detections are boxes")
+                raise McaptrackError(f"{labels.path} holds positions, not boxes; detections are boxes")
             if role != "detections" and not labels.has_ids:
-                raise McaptrackError(f"{path} has no ids (all are -1); {role} need ids")
+                raise McaptrackError(f"{labels.path} has no ids (all are -1); {role} need ids")
 
     def report_assumptions(self) -> None:
         """Report what is assumed about the labels, and what of them is left out."""
-        firsts = {labels.first_frame: f"frame {labels.first_frame} of {path}" for path, labels in self.labels.values()}
+        all_labels = self.labels.values()
+        firsts = {labels.first_frame: f"frame {labels.first_frame} of {labels.path}" for labels in all_labels}
         if len(firsts) > 1:
             warn(
                 f"{' and '.join(firsts.values())} are assumed to be the same picture; `first_frame=` sets the number",
                 "clock",
             )
-        for role, (path, labels) in self.labels.items():
+        for role, labels in self.labels.items():
+            path = labels.path
             self.report.remarks += labels.remarks
             for text, code in labels.doubts:
                 warn(text, code)
@@ -444,7 +383,10 @@ class IngestJob:
     def topics(self) -> Iterator[str]:
         """The topics that will be written."""
         yield from (f"{self.prefix}/{TOPIC_OF.get(role, role)}" for role in self.labels)
-        yield from (f"{self.prefix}/{suffix}" for suffix in self.ground_given.suffixes())
+        if self.calibration is not None:
+            yield f"{self.prefix}/{CALIBRATION}"
+        if self._has_plane:
+            yield f"{self.prefix}/{PLANE}"
         if self.motions is not None:
             yield f"{self.prefix}/{MOTION}"
 
@@ -452,27 +394,54 @@ class IngestJob:
     frame_id = ""
 
     def plane(self, width_px: int, height_px: int, is_stated: bool = True) -> GroundPlane | None:
-        """The ground plane for pictures of this size; None if none was given. ``is_stated``: they have this size."""
-        frame_id, remarks = self.frame_id or self.prefix.lstrip("/"), self.report.remarks
-        return self.ground_given.plane((width_px, height_px), self.prefix, self.pictures, frame_id, is_stated, remarks)
+        """The ground plane for pictures of this size; None if none was given. ``is_stated``: they have this size, which
+        is otherwise no more than the extent of boxes.
+        """
+        if self.calibration is not None:
+            self._calibrated = self.calibration.calibrated(
+                self.prefix,
+                self.pictures,
+                (width_px, height_px),
+                is_stated,
+                self.frame_id or self.prefix.lstrip("/"),
+                self.options.point,
+                is_rectified_topic(self.pictures),
+            )
+            self.report.remarks += self._calibrated.remarks
+            if self._calibrated.plane is not None:
+                return self._calibrated.plane
+        if self._homography is None:
+            return None
+        try:
+            return GroundPlane(self._homography, width_px, height_px, self.options.point)
+        except McaptrackError as error:
+            raise McaptrackError(f"{self.options.ground_plane}: {error}") from None
 
     def write_plane(self, writer: log.LogWriter, plane: GroundPlane | None, t_ns: int) -> None:
         """Write the ground plane and the calibration, if they were given, valid from a time on."""
-        ground = self.ground_given
-        if plane is not None and ground.has_plane:
+        calibrated, file = self._calibrated, self.options.ground_plane
+        if plane is not None and self._has_plane:
             frame = Frame(t_ns, 0, plane_to_rows(plane))
-            self.write_rows(writer, PLANE, GROUND_PLANE, lambda: iter([frame]), ground.parameters())
-        self.report.messages |= ground.write_calibration(writer, self.prefix, self.pictures, t_ns, self.encoding)
+            parameters = {"file": file.name} if file else calibrated.parameters if calibrated else {}
+            parameters = parameters | {"point": self.options.point}
+            self.write_rows(writer, PLANE, GROUND_PLANE, lambda: iter([frame]), parameters)
+        if calibrated is None:
+            return
+        topic, message = f"{self.prefix}/{CALIBRATION}", (t_ns, 0, calibrated.at(t_ns))
+        provenance = Provenance(INGEST, calibrated.parameters, self.pictures, digest=digest(iter([message])))
+        record = foxglove.record_in(foxglove.CALIBRATION, self.encoding)
+        channel = writer.add_channel(topic, record, self.encoding, provenance.to_metadata())
+        for packed in foxglove.messages_in(foxglove.CALIBRATION, [message], self.encoding):
+            writer.add_message(channel, *packed)
+        self.report.messages[topic] = 1
 
     def write_labels(self, writer: log.LogWriter, plane: GroundPlane | None, timeline: Timeline) -> None:
         """Write the labels, each frame at the time of its picture."""
-        for role, (path, labels) in self.labels.items():
-            placed = timeline.place(path, labels, self.report.lost)
+        for role, labels in self.labels.items():
+            placed = timeline.place(labels, self.report.lost)
             if role == "corrections":  # frames beyond those that were looked at stay as they are
                 placed = placed.between(int(labels.labelled[0]), int(labels.labelled[-1]))
-            parameters: dict[str, Any] = {"file": path.name, "format": labels.format} | self.label_parameters(
-                role, labels
-            )
+            parameters = {"file": labels.path.name, "format": labels.format} | self.label_parameters(role, labels)
             frames = self.frames(role, plane, placed)
             self.write_rows(writer, TOPIC_OF.get(role, role), SCHEMA_OF[role], frames, parameters, labels.classes)
 
@@ -501,7 +470,7 @@ class IngestJob:
 
     def frames(self, role: Role, plane: GroundPlane | None, placed: Placed) -> Frames:
         """The labels of these frames, including empty frames."""
-        return frames_of_labels(self.labels[role][1].parts, role, plane, placed)
+        return frames_of_labels(self.labels[role].parts, role, plane, placed)
 
     def write_rows(
         self,

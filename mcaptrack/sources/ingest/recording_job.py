@@ -22,8 +22,7 @@ from mcaptrack.sources.calibrations import frame_named
 from mcaptrack.sources.foreign.decoding import decoder_with_errors
 from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
 from mcaptrack.sources.ingest.job import IngestJob, IngestOptions, Progress
-from mcaptrack.sources.ingest.labels.camera import choose_camera, picture_predicate, timeline_of
-from mcaptrack.sources.ingest.labels.timeline import Timeline
+from mcaptrack.sources.ingest.labels.timeline import Timeline, choose_camera, picture_predicate, timeline_of
 from mcaptrack.sources.ingest.sidecar import encoding_for
 from mcaptrack.sources.video import EncodedPicture, decode_gray
 
@@ -63,7 +62,7 @@ class RecordingJob(IngestJob):
             self._connections: list[Connection] = []
             self._channels: dict[Connection, int] = {}
             self._written: dict[int, int] = {}
-            if self.labels or self.ground_given.is_given or self.motions is not None:
+            if self.labels or self.has_ground_given or self.motions is not None:
                 self._find_pictures()
                 self.fit_to_pictures(self._picture_size)
         except BaseException:
@@ -245,7 +244,7 @@ class RecordingJob(IngestJob):
     # Pictures
 
     def _plane(self) -> GroundPlane | None:
-        if not self.ground_given.is_given:
+        if not self.has_ground_given:
             return None
         self.frame_id = self._picture_frame()
         return self.plane(*self._picture_size())

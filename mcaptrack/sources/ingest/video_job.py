@@ -15,8 +15,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import CLOCK, Provenance
 from mcaptrack.sources.ingest.job import IngestJob, IngestOptions, Progress
-from mcaptrack.sources.ingest.labels.camera import labels_of
-from mcaptrack.sources.ingest.labels.timeline import Timeline
+from mcaptrack.sources.ingest.labels.timeline import Timeline, labels_of
 from mcaptrack.sources.video import Video, open_video
 
 _FOXGLOVE_ALONE: Final = {"vp9": "VP9", "av1": "AV1"}
