@@ -8,8 +8,8 @@ Letters: M messages.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator
-from typing import Final, Protocol
+from collections.abc import Callable, Container, Iterable, Iterator
+from typing import Final
 
 import numpy as np
 
@@ -44,11 +44,8 @@ def size_of_pictures(opened: log.Log, topic: str) -> tuple[int, int] | None:
     return None if first is None else (first.rows.shape[1], first.rows.shape[0])
 
 
-class Pixels(Protocol):
-    """The interface of ``video.decode_bgr`` and ``video.decode_gray``."""
-
-    def __call__(self, pictures: Iterable[EncodedPicture], wanted: Container[int] | None = None, /) -> Iterator[Frame]:
-        """Decode the wanted pictures."""
+#: The interface of ``video.decode_bgr`` and ``video.decode_gray``: pictures, and which of them are wanted.
+Pixels = Callable[[Iterable[EncodedPicture], Container[int]], Iterator[Frame]]
 
 
 def find_pictures(opened: log.Log, topic: str) -> str:

@@ -40,7 +40,7 @@ class RecordingJob(IngestJob):
         options: IngestOptions,
         recorded: RecordingReader,
         progress: Progress,
-        into: log.Log | None = None,
+        into: log.Log | None,
     ) -> None:
         self._recorded, self._progress = recorded, progress
         try:
@@ -124,7 +124,7 @@ class RecordingJob(IngestJob):
         self.report.notes += self._recorded.findings.notes
         self.report.lost += self._recorded.findings.lost
         timeline = self._count_copied(writer) if self._copied_log else self._write_messages(writer)
-        self._recorded.extras(writer, has_clock, is_copied=self._copied_log is not None)
+        self._recorded.extras(writer, has_clock, self._copied_log is not None)
         if self._connections:
             if not len(timeline.t_ns):
                 raise McaptrackError(f"{self.source}: {self.pictures} has no pictures that labels could be of")

@@ -108,16 +108,12 @@ def _own_metadata(paths: Sequence[Path]) -> Bag:
     return Bag()
 
 
-class _Files:
-    """Common parts of databases and MCAP files. ``findings`` is known before any message is read."""
-
-    profile = "ros2"
-    as_log: log.Log | None = None
+class _Files(RecordingReader):
+    """Common parts of databases and MCAP files."""
 
     def __init__(self, paths: Sequence[Path], whole: Path, bag: Bag) -> None:
+        super().__init__()
         self.paths, self.whole, self.bag = paths, whole, bag
-        self.findings = ReadingNotes()
-        self.closing = ExitStack()
         self.declared_counts: dict[Connection, int] = {}
         self._known_connections: dict[tuple[object, ...], Connection] = {}
         self._message_counts: dict[Connection, int] = {}
@@ -128,15 +124,7 @@ class _Files:
             self.close()
             raise
         self._compare()
-
-    @property
-    def connections(self) -> list[Connection]:
-        """All connections, also those without messages."""
-        return list(self.declared_counts)
-
-    def close(self) -> None:
-        """Close the files."""
-        self.closing.close()
+        self.connections = list(self.declared_counts)
 
     def messages(self, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
         """All messages, file by file, in their order there."""
@@ -144,7 +132,7 @@ class _Files:
         for number in range(len(self.paths)):
             yield from self._messages(number, report)
 
-    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:
+    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool) -> None:
         """Write metadata.yaml, which a copied MCAP file doesn't contain."""
         if self.bag.text:
             writer.add_attachment(METADATA, "application/yaml", self.bag.text)
@@ -219,7 +207,7 @@ class Databases(_Files):
             text = f"its definition is that of {where}" if where else "its definition is not known: it has no schema"
             self.findings.notes.append(f"{whole} does not say what {kind} is; {text}")
 
-    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:
+    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool) -> None:
         """Write metadata.yaml and the metadata in the databases, as rosbag2 writes them to MCAP files."""
         super().extras(writer, has_clock, is_copied)
         if self._distro:
@@ -325,7 +313,7 @@ class Logs(_Files):
         self.profile = profiles.pop() if len(profiles) == 1 else ""
         self.as_log = self.logs[0] if len(self.logs) == 1 and not bag.packed else None
 
-    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:
+    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool) -> None:
         """Write metadata.yaml, and all attachments and metadata records of the files."""
         super().extras(writer, has_clock, is_copied)
         for opened in [] if is_copied else self.logs:
