@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest import IngestOptions, ingest
-from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d, read_boxes_3d
 from mcaptrack.sources.ingest.labels.content import BoxRows3D, WantedClasses, headings, numbered
+from mcaptrack.sources.ingest.labels.reading import is_3d, read_boxes_3d
 
 USUAL = {
     "t_ns": "1000",

@@ -21,8 +21,7 @@ from mcaptrack.environment import CONTROL_GROUPS, THREADS, cache_folder, control
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import SCHEMES, Url, hide_secrets, parse
 from mcaptrack.notices import Notice, collected, warn
-from mcaptrack.objects import Version
-from mcaptrack.objects.stores import described
+from mcaptrack.objects import Version, described
 
 #: Extras for people who work on mcaptrack itself, or read its examples.
 _NOT_SHOWN: Final = ("docs", "examples", "test")

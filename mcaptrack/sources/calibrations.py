@@ -17,14 +17,13 @@ from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.pinhole import Lens, ground_homography
 from mcaptrack.geometry.plane import GroundPlane, Planes
-from mcaptrack.geometry.transform_series import OTHER_CLOCK_S
-from mcaptrack.geometry.transform_tree import Poses, TransformTree
+from mcaptrack.geometry.transform_tree import OTHER_CLOCK_S, Poses, TransformTree
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import INGEST
 from mcaptrack.sources.cameras import Camera, provenance_of
+from mcaptrack.sources.fixed_frame import poses_at, transforms_of
 from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name, stamp_of
 from mcaptrack.sources.foreign.flatten import message_type_of
-from mcaptrack.sources.frames import poses_at, transforms_of
 from mcaptrack.sources.pictures import size_of_pictures
 
 #: Schemas of calibrations, by their names in ROS 1 and Foxglove; ROS 2 adds "/msg/".

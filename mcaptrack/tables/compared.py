@@ -31,10 +31,9 @@ from mcaptrack.sources import ingest
 from mcaptrack.sources.ingest.bags.opening import is_mcap
 from mcaptrack.sources.ingest.job import IngestOptions
 from mcaptrack.sources.ingest.label_job import FRAME, Boxes3DJob, LabelJob
-from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
 from mcaptrack.sources.ingest.labels.content import ONLY_PEOPLE, IgnoredBoxes, Labels, WantedClasses
 from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX
-from mcaptrack.sources.ingest.labels.reading import in_order, read_homography, read_labels
+from mcaptrack.sources.ingest.labels.reading import in_order, is_3d, read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import label_rows
 
 #: Formats that give the frame number of each row.

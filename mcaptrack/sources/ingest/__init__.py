@@ -19,9 +19,9 @@ from mcaptrack.sources.ingest.bags.opening import open_recording
 from mcaptrack.sources.ingest.calibration import is_calibration
 from mcaptrack.sources.ingest.job import MOTION, IngestJob, IngestOptions, IngestReport, Progress
 from mcaptrack.sources.ingest.label_job import Boxes3DJob, LabelJob, label_frames
-from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
 from mcaptrack.sources.ingest.labels.content import OTHERS, Format
 from mcaptrack.sources.ingest.labels.cvat import is_cvat
+from mcaptrack.sources.ingest.labels.reading import is_3d
 from mcaptrack.sources.ingest.labels.timeline import boxes_extent, camera_of, picture_size, timeline_of
 from mcaptrack.sources.ingest.labels.yolo import is_label_folder
 from mcaptrack.sources.ingest.recording_job import RecordingJob
@@ -31,23 +31,9 @@ from mcaptrack.sources.video import IMAGE_SUFFIXES
 __all__ = ["Format", "IngestOptions", "IngestReport", "ingest", "label_frames"]
 
 VIDEO_SUFFIXES: Final = (
-    ".mp4",
-    ".mov",
-    ".mkv",
-    ".avi",
-    ".webm",
-    ".m4v",
-    ".ts",
-    ".h264",
-    ".264",
-    ".mpg",
-    ".mpeg",
-    ".h265",
-    ".265",
-    ".hevc",
-    ".ivf",
-    ".obu",
-)
+    ".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".ts", ".h264", ".264", ".mpg", ".mpeg", ".h265", ".265", ".hevc",
+    ".ivf", ".obu",
+)  # fmt: skip
 #: Files with these endings hold text, whatever their first bytes are.
 _TEXT_SUFFIXES: Final = (".csv", ".tsv", ".txt", ".json", ".xml")
 

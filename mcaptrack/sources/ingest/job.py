@@ -32,7 +32,6 @@ from mcaptrack.sources.calibrations import is_rectified_topic
 from mcaptrack.sources.cameras import corrected_plane
 from mcaptrack.sources.corrections import CORRECTED
 from mcaptrack.sources.ingest.calibration import Calibrated, GivenCalibration
-from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
 from mcaptrack.sources.ingest.labels.content import (
     ONLY_PEOPLE,
     OTHERS,
@@ -42,7 +41,7 @@ from mcaptrack.sources.ingest.labels.content import (
     describe_classes,
 )
 from mcaptrack.sources.ingest.labels.number_table import NumberTable, lines_of
-from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
+from mcaptrack.sources.ingest.labels.reading import is_3d, read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline, frames_of_labels
 from mcaptrack.sources.ingest.sidecar import encoding_for
 from mcaptrack.sources.video import VideoOptions

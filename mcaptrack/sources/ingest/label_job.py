@@ -30,12 +30,11 @@ from mcaptrack.sources.calibrations import frame_of
 from mcaptrack.sources.camera_motion import planes_in
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.corrections import CORRECTED, CORRECTED_FROM
-from mcaptrack.sources.fixed_frame import holds_boxes_3d, named_detections
+from mcaptrack.sources.fixed_frame import holds_boxes_3d, named_detections, transforms_of
 from mcaptrack.sources.foreign import holds_pictures
-from mcaptrack.sources.frames import transforms_of
 from mcaptrack.sources.ingest.job import SCHEMA_OF, IngestJob, IngestOptions
-from mcaptrack.sources.ingest.labels.boxes_3d.reading import read_boxes_3d
 from mcaptrack.sources.ingest.labels.content import BoxRows3D, Format, Labels, WantedClasses, describe_classes
+from mcaptrack.sources.ingest.labels.reading import read_boxes_3d
 from mcaptrack.sources.ingest.labels.timeline import (
     DEFAULT,
     MAX_FRAMES,

@@ -15,8 +15,7 @@ import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.geometry.transform_series import OTHER_CLOCK_S
-from mcaptrack.geometry.transform_tree import plain_frame
+from mcaptrack.geometry.transform_tree import OTHER_CLOCK_S, plain_frame
 from mcaptrack.sources.foreign.boxes import Classes
 from mcaptrack.sources.foreign.boxes_3d.box import Box3d, Message3d
 

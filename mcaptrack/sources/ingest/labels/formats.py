@@ -29,8 +29,16 @@ from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.schema.classes import PERSON
-from mcaptrack.sources.ingest.labels.content import NO_ID, ClassIds, Format, IgnoredBoxes, Labels, WantedClasses
-from mcaptrack.sources.ingest.labels.number_table import FRAME, MAX_FRAME, Lines, NumberTable
+from mcaptrack.sources.ingest.labels.content import (
+    NO_ID,
+    BoxRows3D,
+    ClassIds,
+    Format,
+    IgnoredBoxes,
+    Labels,
+    WantedClasses,
+)
+from mcaptrack.sources.ingest.labels.number_table import FRAME, MAX_FRAME, Lines, NumberTable, lines_of
 
 #: The classes of MOT16, 17 and 20.
 _MOT_NAMES: Final = (
@@ -50,6 +58,8 @@ _KITTI_NAMES: Final = ("pedestrian", "cyclist", "car", "van", "truck", "tram", "
 _KITTI_CLASSES: Final = {name: number for number, name in enumerate(_KITTI_NAMES, start=PERSON)} | {"person": 7}
 _SDD_CLASSES: Final = {"pedestrian": PERSON, "biker": 2, "skater": 3, "cart": 4, "car": 5, "bus": 6}
 _KITTI_REGION: Final = "dontcare"
+#: The frame of reference: of the camera, with z up.
+CAMERA_FRAME: Final = "camera_link"
 #: The number of class names of a column, at most: there are data sets with 21,841 classes.
 _MAX_NAMES: Final = 65_536
 
@@ -162,21 +172,26 @@ def read_mot(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Lab
     return out.keep(kept)
 
 
-def read_kitti(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Labels:
-    """KITTI tracking. Column 18 is the score of a tracker, if there is one."""
+def _kitti(path: Path, lines: Lines) -> tuple[NumberTable, ClassNames]:
+    """Rows of KITTI tracking, with the type as the number of a name. Column 18 is the score of a tracker, if any."""
     names = ClassNames()
 
     def parse(parts: list[str]) -> list[float]:
         _columns(parts, 17, 18)
-        score = float(parts[17]) if len(parts) == 18 else np.nan
-        return [*(float(parts[at]) for at in (0, 1, 3, 4, 6, 7, 8, 9)), score, names.number(parts[2])]
+        numbers = [float(part) if place != 2 else names.number(part) for place, part in enumerate(parts)]
+        return numbers + [np.nan] * (18 - len(parts))
 
     columns = "frame id type truncated occluded alpha left top right bottom height width length x y z rotation score"
-    table = NumberTable(path, lines, f"KITTI tracking ({columns})", 10, parse)
+    return NumberTable(path, lines, f"KITTI tracking ({columns})", 18, parse), names
+
+
+def read_kitti(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Labels:
+    """KITTI tracking."""
+    table, names = _kitti(path, lines)
     frame, track_id = _ids(table, 0, 1)
-    boxes, score, kind = _boxes(table, slice(4, 8), corners=True), table.values[:, 8], table.values[:, 9]
+    boxes, score, kind = _boxes(table, slice(6, 10), corners=True), table.values[:, 17], table.values[:, 2]
     table.check_scores(score)
-    truncated, occluded = table.values[:, 2], table.values[:, 3]
+    truncated, occluded = table.values[:, 3], table.values[:, 4]
     people, region = names.are(kind, "pedestrian"), names.are(kind, _KITTI_REGION)
     class_id, classes = names.ids(kind, _KITTI_CLASSES)
     if role != "detections" and not wanted.is_people:
@@ -203,6 +218,32 @@ def read_kitti(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> L
     if role == "truth":
         out.ignored = IgnoredBoxes(frame[ignored], boxes[ignored], ~region[ignored], region[ignored])
     return out.keep(kept)
+
+
+def read_kitti_3d(path: Path) -> BoxRows3D:
+    """Read a file of one sequence.
+
+    In the file, x is right, y down and z forward, the position is the centre of the box's bottom, and the rotation
+    about y is 0 for an object that faces right. Here x is forward, y left and z up.
+    """
+    table, names = _kitti(path, lines_of(path))
+    frame, track_id = _ids(table, 0, 1)
+    kind, is_region = table.values[:, 2].astype(np.int64), names.are(table.values[:, 2], _KITTI_REGION)
+    has_no_box = ~is_region & (table.values[:, 10:13] <= 0).any(axis=1)  # results of detectors in pictures
+    kept = np.flatnonzero(~is_region & ~has_no_box)
+    if not len(kept):
+        raise McaptrackError(f"{path} holds no 3D boxes")
+    height, width, length, x, y, z, rotation = table.values[kept, 10:17].T
+    heading = -rotation - np.pi / 2
+    left = [f"{int(is_region.sum())} regions (DontCare)"] if is_region.any() else []
+    left += [f"{int(has_no_box.sum())} rows without a 3D box"] if has_no_box.any() else []
+    axes = "x is forward, y left, z up (in the file x is right, y down, z forward); positions are centres of boxes"
+    boxes, score = np.full((len(frame), 7), np.nan), table.values[:, 17]
+    boxes[kept] = np.stack([z, -x, -y + height / 2, length, width, height, heading], axis=-1)
+    rows = BoxRows3D(path, "kitti-3d", table.at, frame, track_id, boxes, score, kind, frame_id=CAMERA_FRAME)
+    rows.names, rows.left_out, rows.labelled = names.names, " and ".join(left), np.unique(frame)
+    rows.remark(f": {axes}")
+    return rows.take(kept)
 
 
 def read_sdd(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Labels:

@@ -23,15 +23,8 @@ from mcaptrack.sources.video.image_folder import IMAGE_SUFFIXES, natural_order
 
 _NAMES: Final = ("classes.txt", "obj.names", "_classes.txt", "labels.txt")
 _DATA: Final = ("data.yaml", "data.yml", "dataset.yaml")
-_NOT_LABELS: Final = (
-    *_NAMES,
-    "readme.txt",
-    "readme.roboflow.txt",
-    "readme.dataset.txt",
-    "train.txt",
-    "val.txt",
-    "test.txt",
-)
+_READMES: Final = ("readme.txt", "readme.roboflow.txt", "readme.dataset.txt")
+_NOT_LABELS: Final = (*_NAMES, *_READMES, "train.txt", "val.txt", "test.txt")
 _MAX_FILES: Final = 1_000_000
 _MAX_ROWS: Final = 10_000_000
 _MAX_CLASSES: Final = 65536
