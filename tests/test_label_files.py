@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import FPS_RANGE
-from mcaptrack.sources.ingest.labels import formats, number_table
+from mcaptrack.sources.ingest.labels import content, formats
 from mcaptrack.sources.ingest.labels.content import Labels, WantedClasses
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline, count_frames
@@ -319,7 +319,7 @@ def test_a_line_of_4096_characters_is_read_and_ids_may_repeat_in_detections(tmp_
 
 
 def test_a_table_is_no_longer_than_its_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(number_table, "_MAX_ROWS", 2)
+    monkeypatch.setattr(content, "_MAX_ROWS", 2)
     path = written(tmp_path / "a.txt", "1 1 1 1\n2 1 1 1\n")
     assert len(read_labels(path).frame) == 2
     with pytest.raises(McaptrackError, match="has more than 2 rows; give it in parts"):

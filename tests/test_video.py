@@ -24,7 +24,7 @@ from mcaptrack.sources.video import (
     open_video,
     write_mp4,
 )
-from mcaptrack.sources.video.h264 import inspect
+from mcaptrack.sources.video.codecs import CODECS
 from mcaptrack.sources.video.reader import images as upright_images
 from tests.tiers import thorough
 from tests.worlds import write_clip
@@ -71,7 +71,7 @@ def test_every_message_of_a_passed_on_stream_stands_on_its_own(tmp_path, name):
     path = tmp_path / name
     write_clip(path, options=NO_B)
     for picture in pictures(path):
-        unit = inspect(picture.data)
+        unit = CODECS["h264"].inspect(picture.data)
         assert picture.data.startswith(b"\x00\x00")
         assert unit.is_key == unit.has_parameter_sets == (picture.index % 10 == 0)
         assert not unit.reorders
@@ -101,7 +101,7 @@ def test_other_streams_are_encoded_again_and_the_reason_is_known(tmp_path, clip,
     made = pictures(path)
     assert len(made) == len(images)
     assert [picture.index for picture in made] == list(range(len(images)))
-    assert not any(inspect(picture.data).reorders for picture in made)
+    assert not any(CODECS["h264"].inspect(picture.data).reorders for picture in made)
     for image, seen in zip(images, through_the_log(made), strict=True):  # in the order in which they are shown
         gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         assert np.abs(gray.astype(int) - seen).mean() < 6

@@ -28,7 +28,7 @@ from mcaptrack.schema import Frame
 from mcaptrack.schema.classes import PERSON
 from mcaptrack.schema.framing import split_rows
 from mcaptrack.sources import ingest
-from mcaptrack.sources.ingest.bags.opening import is_mcap
+from mcaptrack.sources.ingest.bags.rosbag2 import is_mcap
 from mcaptrack.sources.ingest.job import IngestOptions
 from mcaptrack.sources.ingest.label_job import FRAME, Boxes3DJob, LabelJob
 from mcaptrack.sources.ingest.labels.content import ONLY_PEOPLE, IgnoredBoxes, Labels, WantedClasses

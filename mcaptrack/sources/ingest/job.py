@@ -37,10 +37,11 @@ from mcaptrack.sources.ingest.labels.content import (
     OTHERS,
     Format,
     Labels,
+    NumberTable,
     WantedClasses,
     describe_classes,
+    lines_of,
 )
-from mcaptrack.sources.ingest.labels.number_table import NumberTable, lines_of
 from mcaptrack.sources.ingest.labels.reading import is_3d, read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline, frames_of_labels
 from mcaptrack.sources.ingest.sidecar import encoding_for

@@ -12,8 +12,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.schema import Frame
-from mcaptrack.sources.video import h264
-from mcaptrack.sources.video.codecs import CODECS
+from mcaptrack.sources.video.codecs import CODECS, largest_size
 from mcaptrack.sources.video.container import is_size_error
 from mcaptrack.sources.video.limits import check_size, check_still, max_pixels, still_size, too_large
 from mcaptrack.sources.video.raw_pixels import PixelLayout, raw_bgr, raw_gray
@@ -157,7 +156,7 @@ class _VideoDecoder:
         # Copied to memory of FFmpeg: its threads can't release Python memory while Python waits for them (a deadlock).
         data = self._sets + picture.data
         if picture.format == "h264" and (self._sets or head.has_parameter_sets):  # FFmpeg only reports them as invalid
-            check_size(*h264.largest_size(data), picture.name)
+            check_size(*largest_size(data), picture.name)
         packet = av.Packet(len(data))
         packet.update(data)
         packet.pts = packet.dts = self._count  # not the time: recorded messages may share one

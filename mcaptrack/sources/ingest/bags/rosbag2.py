@@ -1,4 +1,4 @@
-"""Read rosbag2 recordings: folders with metadata.yaml, SQLite databases and MCAP files, also single ones.
+"""Open recordings, and read those of rosbag2: folders with metadata.yaml, SQLite databases and MCAP files.
 
 The databases are read as rosbag2's sqlite3 storage plugin lays them out (schema versions 1 to 4): nothing that they
 hold is made sense of, so nothing is refused. rosbags knows the definitions of ROS's own messages, for databases that
@@ -16,15 +16,17 @@ from typing import Any, Final
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import follow_links, read_beginning, temporary_folder
+from mcaptrack.files import follow_links, read_beginning, refuse_special, temporary_folder
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.ingest.bags import decompression
 from mcaptrack.sources.ingest.bags.metadata_yaml import METADATA, Bag, holds_metadata, read_metadata
 from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
+from mcaptrack.sources.ingest.bags.rosbag1 import Bag1
 from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables
+from mcaptrack.sources.video import IMAGE_SUFFIXES
 
-_MCAP_MAGIC, _SQLITE_MAGIC, _ZSTD_MAGIC = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
+_MCAP, _ROS1, _SQLITE, _ZSTD = b"\x89MCAP0\r\n", b"#ROSBAG V", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
 #: A message that is larger decompressed is not read.
 _MAX_MESSAGE_BYTES: Final = 2**28
 #: At most this many unknown topic ids are named.
@@ -75,13 +77,12 @@ def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> Re
         parts = [_decompressed_file(path, opened) for path in paths]
         heads = [read_beginning(path, 16) for path in parts]
         source: _Files
-        if all(head.startswith(_SQLITE_MAGIC) for head in heads):
+        if all(head.startswith(_SQLITE) for head in heads):
             source = Databases(parts, whole, bag)
-        elif all(head.startswith(_MCAP_MAGIC) for head in heads):
+        elif all(head.startswith(_MCAP) for head in heads):
             source = Logs(parts, whole, bag)
         else:
-            magics = (_MCAP_MAGIC, _SQLITE_MAGIC)
-            wrong = [path for path, head in zip(paths, heads, strict=True) if not head.startswith(magics)]
+            wrong = [path for path, head in zip(paths, heads, strict=True) if not head.startswith((_MCAP, _SQLITE))]
             if not wrong:
                 raise McaptrackError(f"{whole} holds both MCAP files and databases; one bag is made of either")
             raise McaptrackError(f"{wrong[0]} is neither an MCAP file nor a rosbag2 database; it may be damaged")
@@ -91,7 +92,7 @@ def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> Re
 
 def _decompressed_file(path: Path, opened: ExitStack) -> Path:
     """The file, or its decompressed copy if it is compressed as a whole."""
-    if not read_beginning(path, 16).startswith(_ZSTD_MAGIC):
+    if not read_beginning(path, 16).startswith(_ZSTD):
         return path
     out = Path(opened.enter_context(temporary_folder())) / path.name.removesuffix(".zstd")
     decompression.unzstd_file(path, out)
@@ -293,7 +294,7 @@ class Databases(_Files):
             if not isinstance(t_ns, int) or not isinstance(data, bytes):
                 raise McaptrackError(f"{path} is damaged: a message without time or data")
             if self.bag.packed or (
-                data.startswith(_ZSTD_MAGIC) and connection.encoding == "cdr"
+                data.startswith(_ZSTD) and connection.encoding == "cdr"
             ):  # CDR starts with a zero byte
                 data = _unpack_message(data, path, t_ns, left)  # noqa: PLW2901
                 left -= len(data)
@@ -362,3 +363,53 @@ def _unpack_message(data: bytes, path: Path, t_ns: int, left: int) -> bytes:
         return decompression.unzstd(data, min(left, _MAX_MESSAGE_BYTES))
     except decompression.NotUnpackedError as error:
         raise McaptrackError(f"{path}: the message at {t_ns} ns can't be decompressed: {error}") from None
+
+
+# Open a recording: its kind is detected by its first bytes, not by the name of the file.
+
+
+_SUFFIXES: Final = {".mcap": "an MCAP file", ".bag": "a ROS bag", ".db3": "a rosbag2 database"}
+
+
+def open_recording(path: Path) -> RecordingReader | None:
+    """Open the recording at ``path``; None if it is something else.
+
+    Raises McaptrackError for a recording that can't be read.
+    """
+    if path.is_dir():
+        return _open_folder(path)
+    head = read_beginning(path, 16)
+    if head.startswith(_ROS1):
+        return Bag1(path)
+    if head.startswith((_ZSTD, _MCAP, _SQLITE)):
+        return open_files([path], path)
+    if path.suffix.lower() in _SUFFIXES:
+        what = "is empty" if not head else "does not begin as one does"
+        raise McaptrackError(f"{path} can't be read as {_SUFFIXES[path.suffix.lower()]}: it {what}")
+    return None
+
+
+def is_mcap(path: Path) -> bool:
+    """Whether a file begins with the magic bytes of MCAP; False if it can't be read."""
+    refuse_special(path)
+    try:
+        with path.open("rb") as stream:
+            return stream.read(len(_MCAP)) == _MCAP
+    except OSError:
+        return False
+
+
+def _open_folder(path: Path) -> RecordingReader | None:
+    if holds_metadata(path / METADATA):
+        return open_bag(path)
+    names = sorted(entry.name for entry in path.iterdir())
+    if any(Path(name).suffix.lower() in IMAGE_SUFFIXES for name in names):
+        return None
+    if parts := log.split_files_in(path):
+        return open_files(parts, path) if len(parts) > 1 else open_recording(parts[0])
+    logs = [name for name in names if Path(name).suffix.lower() in _SUFFIXES]
+    if logs:
+        raise McaptrackError(
+            f"{path} has no {METADATA}, and its {len(logs)} logs are no parts of one; give {logs[0]} and so on by name"
+        )
+    return None

@@ -24,8 +24,7 @@ from mcaptrack.geometry.pinhole import Lens
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import warn
 from mcaptrack.sources.calibrations import calibration_of
-from mcaptrack.sources.ingest.bags.plain_yaml import Scalar, UnsupportedYamlError, load
-from mcaptrack.sources.ingest.xml_reader import XmlReader
+from mcaptrack.sources.ingest.bags.plain_yaml import Scalar, UnsupportedYamlError, XmlReader, load
 
 #: Names of values in files of OpenCV, in small letters and without "_", "-" and blanks.
 _MATRIX: Final = ("cameramatrix", "intrinsicmatrix", "intrinsics", "intrinsic", "mtx", "k", "m1")

@@ -27,8 +27,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import read_beginning
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.schema.classes import PERSON, is_person
+from mcaptrack.sources.ingest.bags.plain_yaml import XmlReader
 from mcaptrack.sources.ingest.labels.content import NO_CLASS, NO_ID, Labels, WantedClasses
-from mcaptrack.sources.ingest.xml_reader import XmlReader
 
 _MAX_BYTES: Final = 512 * 2**20
 _MAX_ROWS: Final = 10_000_000

@@ -26,6 +26,8 @@ from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.schema.classes import PERSON, is_person
 from mcaptrack.sources.ingest.labels.content import (
+    FRAME,
+    MAX_FRAME,
     NO_CLASS,
     NO_ID,
     UNKNOWN_FIRST,
@@ -33,13 +35,15 @@ from mcaptrack.sources.ingest.labels.content import (
     Format,
     FrameNames,
     Labels,
+    Lines,
+    NumberTable,
     TrackIds,
     WantedClasses,
     headings,
+    lines_of,
     numbered,
 )  # fmt: skip
 from mcaptrack.sources.ingest.labels.formats import ClassNames
-from mcaptrack.sources.ingest.labels.number_table import FRAME, MAX_FRAME, Lines, NumberTable, lines_of
 
 #: Columns that supervision writes before those of the user.
 SUPERVISION: Final = ("x_min", "y_min", "x_max", "y_max", "class_id", "confidence", "tracker_id")

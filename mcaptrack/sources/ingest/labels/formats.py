@@ -30,15 +30,19 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.schema.classes import PERSON
 from mcaptrack.sources.ingest.labels.content import (
+    FRAME,
+    MAX_FRAME,
     NO_ID,
     BoxRows3D,
     ClassIds,
     Format,
     IgnoredBoxes,
     Labels,
+    Lines,
+    NumberTable,
     WantedClasses,
+    lines_of,
 )
-from mcaptrack.sources.ingest.labels.number_table import FRAME, MAX_FRAME, Lines, NumberTable, lines_of
 
 #: The classes of MOT16, 17 and 20.
 _MOT_NAMES: Final = (

@@ -26,6 +26,8 @@ from mcaptrack.sources.ingest.labels.content import (
     Format,
     Labels,
     WantedClasses,
+    lines_of,
+    split,
 )
 from mcaptrack.sources.ingest.labels.cvat import is_cvat, read_cvat
 from mcaptrack.sources.ingest.labels.delimited import (
@@ -40,7 +42,6 @@ from mcaptrack.sources.ingest.labels.delimited import (
 )
 from mcaptrack.sources.ingest.labels.formats import READERS, read_kitti_3d
 from mcaptrack.sources.ingest.labels.json_boxes import is_json, read_json
-from mcaptrack.sources.ingest.labels.number_table import lines_of, split
 from mcaptrack.sources.ingest.labels.nuscenes import read_nuscenes, tables_folder
 from mcaptrack.sources.ingest.labels.yolo import read_yolo
 

@@ -17,8 +17,15 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.notices import Code
 from mcaptrack.sources.ingest.bags import plain_yaml
-from mcaptrack.sources.ingest.labels.content import NO_ID, UNKNOWN_FIRST, Labels, WantedClasses, numbers_of_names
-from mcaptrack.sources.ingest.labels.number_table import NumberTable, lines_of
+from mcaptrack.sources.ingest.labels.content import (
+    NO_ID,
+    UNKNOWN_FIRST,
+    Labels,
+    NumberTable,
+    WantedClasses,
+    lines_of,
+    numbers_of_names,
+)
 from mcaptrack.sources.video.image_folder import IMAGE_SUFFIXES, natural_order
 
 _NAMES: Final = ("classes.txt", "obj.names", "_classes.txt", "labels.txt")
