@@ -148,7 +148,7 @@ def _boxes_3d(
     options = IngestOptions(fps=fps, ground_plane=ground_plane, frame_id=FRAME, classes=classes_3d)
     with Boxes3DJob([("tracks", tracks), ("truth", ground_truth)], options) as job:
         job.report_assumptions()
-        classes = (job.classes("truth"), job.classes("tracks"))
+        classes = (job.boxes["truth"].classes, job.boxes["tracks"].classes)
         return AlignedFiles(job.all_frames("truth"), job.all_frames("tracks"), job.report.remarks, classes)
 
 

@@ -35,6 +35,7 @@ from mcaptrack.sources.ingest.calibration import Calibrated, GivenCalibration
 from mcaptrack.sources.ingest.labels.content import (
     ONLY_PEOPLE,
     OTHERS,
+    BoxTable,
     Format,
     Labels,
     NumberTable,
@@ -317,11 +318,7 @@ class IngestJob:
             )
         for role, labels in self.labels.items():
             path = labels.path
-            self.report.remarks += labels.remarks
-            for text, code in labels.doubts:
-                warn(text, code)
-            if labels.left_out:
-                warn(f"{path} also holds {labels.left_out}; left out of {role}", "left-out")
+            self.report_table(role, labels)
             if labels.step > 1:
                 text = f"{path} has labels every {labels.step} frames, from {labels.labelled[0]} on"
                 self.report.remarks.append(f"{text}; the frames in between are left out")
@@ -329,6 +326,14 @@ class IngestJob:
             if len(kinds) > 1:
                 text = describe_classes(kinds, counts, labels.classes)
                 self.report.remarks.append(f"{path} has several classes; class_id is {text}")
+
+    def report_table(self, role: Role, labels: BoxTable) -> None:
+        """Report how a label file was understood, and what of it is left out."""
+        self.report.remarks += labels.remarks
+        for text, code in labels.doubts:
+            warn(text, code)
+        if labels.left_out:
+            warn(f"{labels.path} also holds {labels.left_out}; left out of {role}", "left-out")
 
     def __enter__(self) -> Self:
         return self
@@ -366,11 +371,9 @@ class IngestJob:
     def hint_other_topic(self, topics: Collection[str]) -> str:
         """A hint for topics that exist already: the option that chooses others."""
         ends = [topic.removeprefix(self.prefix) for topic in self.topics() if topic.startswith(self.prefix)]
-        name = free = self.other_camera.format(camera=self.prefix.strip("/"))
-        number = 1
-        while any(f"/{free}{end}" in topics for end in ends):
-            number += 1
-            free = f"{name}{number}"
+        name = self.other_camera.format(camera=self.prefix.strip("/"))
+        names = (name, *(f"{name}{number}" for number in range(2, len(topics) + 3)))
+        free = next(name for name in names if not any(f"/{name}{end}" in topics for end in ends))
         return f"`camera={free!r}` puts these beside them"
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:

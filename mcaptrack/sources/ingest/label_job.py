@@ -16,7 +16,7 @@ import numpy as np
 
 from mcaptrack import log
 from mcaptrack.choices import Point, Role
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
 from mcaptrack.geometry.oriented_boxes import COLUMNS
@@ -403,12 +403,8 @@ def _holds_boxes(opened: log.Log, channel: log.Channel) -> bool:
     provenance = Provenance.from_metadata(channel.metadata)
     if provenance is None:
         return holds_boxes_3d(opened, channel.topic)
-    is_truth = channel.topic.endswith(f"/{_TRUTH}")
-    return (
-        provenance.transform == INGEST
-        and channel.schema_name in (DETECTIONS.name, TRACKS.name)
-        and bool(provenance.frame_id and not is_truth)
-    )
+    is_ingested = provenance.transform == INGEST and channel.schema_name in (DETECTIONS.name, TRACKS.name)
+    return is_ingested and bool(provenance.frame_id) and not channel.topic.endswith(f"/{_TRUTH}")
 
 
 def box_times(opened: log.Log, topic: str) -> Ints:
@@ -429,12 +425,10 @@ def root_frame(opened: log.Log) -> str:
 def warn_of_frame(opened: log.Log, frame_id: str, labels: Path) -> None:
     """Warn if a log has frames of reference, and not the one of labels."""
     tree = transforms_of(opened)
-    frames = set(tree.frames() if tree else ()) | {
-        frame_id_of(channel.metadata) for channel in opened.channels.values()
-    } - {""}
+    of_channels = {frame_id_of(channel.metadata) for channel in opened.channels.values()} - {""}
+    frames = sorted({*(tree.frames() if tree else ()), *of_channels})
     if frames and plain_frame(frame_id) not in frames:
-        listed = sorted(frames)
-        some = ", ".join(listed[:_LISTED]) + (", ..." if len(listed) > _LISTED else "")
+        some = list_names(frames, _LISTED)
         text = f"there is no frame {frame_id} in {opened.path} (but {some}), so that its tracks can't be compared"
         warn(f"{labels}: {text} with these boxes", "transforms")
 
@@ -466,8 +460,9 @@ class Boxes3DJob(IngestJob):
         self._topic = boxes_topic(into, options.camera) if into else ""
         if self._topic and options.camera == DEFAULT:
             self.prefix = self._topic.rpartition("/")[0] or self.prefix
-        self._frame_ids = {role: self._frame_id(rows) for role, rows in self.boxes.items()}
-        self._timed = {role: self._at_times(role, rows) for role, rows in self.boxes.items()}
+        for rows in self.boxes.values():
+            rows.frame_id = self._frame_id(rows)
+        self.boxes = {role: self._at_times(role, rows) for role, rows in self.boxes.items()}
 
     @property
     def roles(self) -> Set[Role]:
@@ -497,10 +492,7 @@ class Boxes3DJob(IngestJob):
         frame_id = rows.frame_id or root or FRAME
         reason = "by its format" if rows.frame_id else "the root of the log's transforms" if root else "assumed"
         text = f": boxes are taken as those of the frame {frame_id!r} ({reason}); `frame=` names another"
-        if reason == "assumed":
-            rows.doubt(text)
-        else:
-            rows.remark(text)
+        (rows.doubt if reason == "assumed" else rows.remark)(text)
         return frame_id
 
     def _at_times(self, role: Role, rows: BoxRows3D) -> BoxRows3D:
@@ -561,33 +553,19 @@ class Boxes3DJob(IngestJob):
     def report_assumptions(self) -> None:
         """Report how the boxes were understood, and what of them is left out."""
         for role, rows in self.boxes.items():
-            self.report.remarks += rows.remarks
-            for text, code in rows.doubts:
-                warn(text, code)
-            if rows.left_out:
-                warn(f"{rows.path} also holds {rows.left_out}; left out of {role}", "left-out")
-            timed = self._timed[role]
-            text = describe_classes(*np.unique(timed.class_id, return_counts=True), timed.classes)
+            self.report_table(role, rows)
+            text = describe_classes(*np.unique(rows.class_id, return_counts=True), rows.classes)
             self.report.remarks.append(f"{rows.path}: class_id is {text}")
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
         """Write the boxes."""
         if self.into is None and not has_clock:
-            start = min(int(timed.labelled[0]) for timed in self._timed.values())
+            start = min(int(rows.labelled[0]) for rows in self.boxes.values())
             writer.add_metadata(CLOCK, {"start_ns": str(start)})
         for role, rows in self.boxes.items():
-            timed = self._timed[role]
-            frames = self.all_frames(role)
             parameters: dict[str, Any] = {"file": rows.path.name, "format": rows.format} | self._parameters(role)
-            self.write_rows(
-                writer,
-                role,
-                SCHEMA_OF[role],
-                lambda frames=frames: iter(frames),  # type: ignore[misc]
-                parameters,
-                timed.classes,
-                self._frame_ids[role],
-            )
+            frames = partial(iter, self.all_frames(role))
+            self.write_rows(writer, role, SCHEMA_OF[role], frames, parameters, rows.classes, rows.frame_id)
 
     def _parameters(self, role: Role) -> dict[str, Any]:
         options = self.options
@@ -600,15 +578,11 @@ class Boxes3DJob(IngestJob):
         }
         return {name: value for name, value in parameters.items() if value is not None}
 
-    def classes(self, role: Role) -> Mapping[int, str]:
-        """The names of the classes of a role by class id."""
-        return self._timed[role].classes
-
     def all_frames(self, role: Role) -> list[Frame]:
         """The boxes of a role as frames, at all times that the file describes."""
-        timed = self._timed[role]
-        ends = np.searchsorted(timed.frame, timed.labelled, "right")
-        return split_rows(timed.labelled, range(len(ends)), label_rows_3d(timed, role), ends)
+        rows = self.boxes[role]
+        ends = np.searchsorted(rows.frame, rows.labelled, "right")
+        return split_rows(rows.labelled, range(len(ends)), label_rows_3d(rows, role), ends)
 
 
 def label_rows_3d(labels: BoxRows3D, role: Role) -> Rows:
@@ -616,14 +590,7 @@ def label_rows_3d(labels: BoxRows3D, role: Role) -> Rows:
     columns = dict(zip(COLUMNS, labels.boxes.T, strict=True))
     if labels.velocity is not None:
         columns |= dict(zip(("vx_m_per_s", "vy_m_per_s"), labels.velocity.T, strict=True))
-    none = np.full(len(labels.boxes), -1)
+    columns |= {"score": labels.score, "class_id": labels.class_id, "source_id": np.full(len(labels.boxes), -1)}
     if role == "detections":
-        return DETECTIONS.rows(score=labels.score, class_id=labels.class_id, source_id=none, **columns)
-    return TRACKS.rows(
-        track_id=labels.id,
-        score=labels.score,
-        observed=np.ones(len(none), bool),
-        source_id=none,
-        class_id=labels.class_id,
-        **columns,
-    )
+        return DETECTIONS.rows(**columns)
+    return TRACKS.rows(track_id=labels.id, observed=np.ones(len(labels.boxes), bool), **columns)
