@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import takewhile
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -20,7 +19,7 @@ from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.geometry.transform_tree import OTHER_CLOCK_S, Poses, TransformTree
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import INGEST
-from mcaptrack.sources.cameras import Camera, provenance_of
+from mcaptrack.sources.cameras import Camera, provenance_of, shared_parts
 from mcaptrack.sources.fixed_frame import poses_at, transforms_of
 from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name, stamp_of
 from mcaptrack.sources.foreign.flatten import message_type_of
@@ -93,7 +92,7 @@ def find_calibration(opened: log.Log, source: str, frame_id: str) -> str:
     if not fitting:
         frames = ", ".join(f"{topic} (frame {named or 'without a name'})" for topic, named in sorted(frame_at.items()))
         raise McaptrackError(f"no calibration is of the frame {frame_id!r} of {source}; there is {frames or 'none'}")
-    alike = {topic: _shared_parts(topic, source) for topic in fitting}
+    alike = {topic: shared_parts(topic, source) for topic in fitting}
     nearest = sorted(topic for topic in fitting if alike[topic] == max(alike.values()))
     usable = [topic for topic in nearest if len(nearest) == 1 or _is_usable(opened, topic)]
     if len(usable) != 1:
@@ -283,12 +282,6 @@ def frame_of(opened: log.Log, topic: str) -> str:
         return next((str(decode(message.payload)) for message in opened.messages(topic)), "")
     except McaptrackError:
         return ""
-
-
-def _shared_parts(topic: str, other: str) -> int:
-    """Return the number of parts that the names of two topics begin with together."""
-    pairs = zip(topic.split("/"), other.split("/"), strict=False)
-    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
 def _is_usable(opened: log.Log, topic: str) -> bool:

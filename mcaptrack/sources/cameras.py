@@ -375,11 +375,12 @@ def _only(topics: list[str]) -> str | None:
 
 def _nearest(name: str, others: set[str]) -> str | None:
     """Return the other name with the longest common part; None if there are several."""
-
-    def shared(other: str) -> int:
-        pairs = zip(name.split("/"), other.split("/"), strict=False)
-        return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
-
-    most = max(map(shared, others), default=0)
-    nearest = [other for other in others if shared(other) == most]
+    shared = {other: shared_parts(name, other) for other in others}
+    nearest = [other for other in others if shared[other] == max(shared.values())]
     return nearest[0] if len(nearest) == 1 else None
+
+
+def shared_parts(topic: str, other: str) -> int:
+    """Return the number of parts that the names of two topics begin with together."""
+    pairs = zip(topic.split("/"), other.split("/"), strict=False)
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))

@@ -33,13 +33,13 @@ _BACK: Final = 2
 
 def size_of_pictures(opened: log.Log, topic: str) -> tuple[int, int] | None:
     """Return width and height in pixels of the first picture of a channel that can be decoded; None if none can."""
-    decoded = foreign.pictures(opened, topic)
-    pictures = (
-        EncodedPicture(
-            m.t_ns, number, picture.format, picture.data, picture.layout, f"{opened.path}: {topic} at {m.t_ns} ns"
-        )
-        for number, (m, picture) in enumerate(decoded)
-    )
+    decoded = enumerate(foreign.pictures(opened, topic))
+    where = f"{opened.path}: {topic}"
+    return size_of((picture.encoded(m.t_ns, n, f"{where} at {m.t_ns} ns") for n, (m, picture) in decoded))
+
+
+def size_of(pictures: Iterable[EncodedPicture]) -> tuple[int, int] | None:
+    """Return width and height in pixels of the first picture that can be decoded; None if none can."""
     first = next(decode_gray(pictures), None)
     return None if first is None else (first.rows.shape[1], first.rows.shape[0])
 
@@ -169,12 +169,8 @@ class Pictures:
             for number, message in enumerate(self._opened.messages(self._topic, *span), before):
                 if first <= number < until:
                     read = number + 1
-                    picture = self._picture(message)
                     where = f"{self._opened.path}: {self._topic} at {message.t_ns} ns"
-                    yield (
-                        number,
-                        EncodedPicture(message.t_ns, number, picture.format, picture.data, picture.layout, where),
-                    )
+                    yield number, self._picture(message).encoded(message.t_ns, number, where)
             if read < until:
                 raise DamagedError(
                     f"{self._opened.path} is damaged: messages of {self._topic} lie outside of the times that their "

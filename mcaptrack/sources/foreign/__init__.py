@@ -25,7 +25,7 @@ from mcaptrack.sources.foreign.boxes_3d import BOXES_3D_READ, DRAWINGS, Message3
 from mcaptrack.sources.foreign.decoding import MessageType as MessageType
 from mcaptrack.sources.foreign.decoding import decoder_with_errors, integer, plain_name, stamp_of, text, to_bytes
 from mcaptrack.sources.foreign.flatten import message_type_of
-from mcaptrack.sources.video import PixelLayout
+from mcaptrack.sources.video import EncodedPicture, PixelLayout
 
 _COMPRESSED: Final = (foxglove.VIDEO, foxglove.IMAGE, "sensor_msgs/CompressedImage")
 _RAW: Final = ("foxglove.RawImage", "sensor_msgs/Image")
@@ -47,6 +47,10 @@ class Picture(NamedTuple):
     format: str
     data: bytes
     layout: PixelLayout | None = None
+
+    def encoded(self, t_ns: int, number: int, where: str) -> EncodedPicture:
+        """The picture for decoders: with its time, its number and its place for errors."""
+        return EncodedPicture(t_ns, number, self.format, self.data, self.layout, where)
 
 
 class NamedFrames(NamedTuple):
@@ -201,12 +205,6 @@ def _format(text: str) -> str:
 
 
 def _raw(message: Any) -> Picture:
-    layout = PixelLayout(
-        integer(message.width),
-        integer(message.height),
-        integer(message.step),
-        bool(
-            getattr(message, "is_bigendian", False)
-        ),  # foxglove.RawImage has no such field: it is always little-endian
-    )
+    is_bigendian = bool(getattr(message, "is_bigendian", False))  # foxglove.RawImage is always little-endian
+    layout = PixelLayout(integer(message.width), integer(message.height), integer(message.step), is_bigendian)
     return Picture(stamp_of(message), text(message.encoding).lower(), to_bytes(message.data), layout)

@@ -401,15 +401,9 @@ class IngestJob:
         is otherwise no more than the extent of boxes.
         """
         if self.calibration is not None:
-            self._calibrated = self.calibration.calibrated(
-                self.prefix,
-                self.pictures,
-                (width_px, height_px),
-                is_stated,
-                self.frame_id or self.prefix.lstrip("/"),
-                self.options.point,
-                is_rectified_topic(self.pictures),
-            )
+            frame_id, is_rectified = self.frame_id or self.prefix.lstrip("/"), is_rectified_topic(self.pictures)
+            of_pictures = (self.prefix, self.pictures, (width_px, height_px), is_stated, frame_id)
+            self._calibrated = self.calibration.calibrated(*of_pictures, self.options.point, is_rectified)
             self.report.remarks += self._calibrated.remarks
             if self._calibrated.plane is not None:
                 return self._calibrated.plane

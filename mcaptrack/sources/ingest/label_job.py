@@ -28,7 +28,7 @@ from mcaptrack.schema.framing import frame_times, split_rows, unique_values
 from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance, frame_id_of
 from mcaptrack.sources.calibrations import frame_of
 from mcaptrack.sources.camera_motion import planes_in
-from mcaptrack.sources.cameras import camera_at
+from mcaptrack.sources.cameras import DEFAULT_CAMERA, camera_at
 from mcaptrack.sources.corrections import CORRECTED, CORRECTED_FROM
 from mcaptrack.sources.fixed_frame import holds_boxes_3d, named_detections, transforms_of
 from mcaptrack.sources.foreign import holds_pictures
@@ -36,7 +36,6 @@ from mcaptrack.sources.ingest.job import SCHEMA_OF, IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.content import BoxRows3D, Format, Labels, WantedClasses, describe_classes
 from mcaptrack.sources.ingest.labels.reading import read_boxes_3d
 from mcaptrack.sources.ingest.labels.timeline import (
-    DEFAULT,
     MAX_FRAMES,
     ExistingLabels,
     Placed,
@@ -387,7 +386,7 @@ def boxes_topic(opened: log.Log, camera: str) -> str:
     topics = sorted(
         channel.topic for channel in opened.channels.values() if channel.messages and _holds_boxes(opened, channel)
     )
-    if camera != DEFAULT:
+    if camera != DEFAULT_CAMERA:
         topics = [topic for topic in topics if camera_prefix(topic) == "/" + camera.strip("/")]
         return topics[0] if topics else ""
     prefixes = sorted({camera_prefix(topic) for topic in topics})
@@ -458,7 +457,7 @@ class Boxes3DJob(IngestJob):
                 )
             self.boxes[role] = rows
         self._topic = boxes_topic(into, options.camera) if into else ""
-        if self._topic and options.camera == DEFAULT:
+        if self._topic and options.camera == DEFAULT_CAMERA:
             self.prefix = self._topic.rpartition("/")[0] or self.prefix
         for rows in self.boxes.values():
             rows.frame_id = self._frame_id(rows)

@@ -24,7 +24,8 @@ from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, Re
 from mcaptrack.sources.ingest.job import IngestJob, IngestOptions, Progress
 from mcaptrack.sources.ingest.labels.timeline import Timeline, choose_camera, picture_predicate, timeline_of
 from mcaptrack.sources.ingest.sidecar import encoding_for
-from mcaptrack.sources.video import EncodedPicture, decode_gray
+from mcaptrack.sources.pictures import size_of
+from mcaptrack.sources.video import EncodedPicture
 
 #: A larger message would need a chunk that readers with a size limit refuse.
 _MAX_MESSAGE_BYTES: Final = 2**28 - 2**24
@@ -178,10 +179,7 @@ class RecordingJob(IngestJob):
 
     def _holds_picture(self) -> Callable[[Connection, bytes], bool]:
         """A predicate: whether a message is one of the pictures that labels belong to."""
-        kinds = {
-            connection: picture_predicate(foreign.MessageType(*connection.schema, connection.encoding))
-            for connection in self._connections
-        }
+        kinds = {connection: picture_predicate(connection.kind) for connection in self._connections}
         return lambda connection, payload: connection in kinds and kinds[connection](payload)
 
     def _write_messages(self, writer: log.LogWriter) -> Timeline:
@@ -253,26 +251,21 @@ class RecordingJob(IngestJob):
         """The frame of reference of the pictures that labels belong to, by the first of them; "" if it names none."""
         for connection, message in self._recorded.messages(ReadingNotes()):
             if connection in self._connections:
-                kind = foreign.MessageType(*connection.schema, connection.encoding)
+                kind = connection.kind
                 return str(decoder_with_errors(kind, frame_named)(message.payload))
         return ""
 
     def _picture_size(self) -> tuple[int, int]:
         """Width and height of the pictures that labels belong to."""
-        first = next(decode_gray(self._encoded()), None)
-        if first is None:
+        size = size_of(self._encoded())
+        if size is None:
             raise McaptrackError(f"{self.source}: {self.pictures} has no picture that can be decoded")
-        height, width = first.rows.shape
-        return width, height
+        return size
 
     def _encoded(self) -> Iterator[EncodedPicture]:
         """The pictures that labels belong to, lazily."""
-        decoders = {
-            connection: foreign.picture_decoder(foreign.MessageType(*connection.schema, connection.encoding))
-            for connection in self._connections
-        }
+        decoders = {connection: foreign.picture_decoder(connection.kind) for connection in self._connections}
         for index, (connection, message) in enumerate(self._recorded.messages(ReadingNotes())):
             if connection in decoders:
-                picture = decoders[connection](message.payload)
                 where = f"{self.source}: {self.pictures} at {message.t_ns} ns"
-                yield EncodedPicture(message.t_ns, index, picture.format, picture.data, picture.layout, where)
+                yield decoders[connection](message.payload).encoded(message.t_ns, index, where)

@@ -70,24 +70,20 @@ def decode_gray(
     McaptrackError
         For a format that can't be decoded, and for damaged pictures.
     """
-    return _decoded(pictures, raw_gray, _luma, wanted, damaged, is_grey=True)
+    return _decoded(pictures, wanted, damaged, is_grey=True)
 
 
 def decode_bgr(
     pictures: Iterable[EncodedPicture], wanted: Container[int] | None = None, damaged: list[int] | None = None
 ) -> Iterator[Frame]:
     """Decode pictures to BGR: as ``decode_gray``, but ``rows`` is (height, width, 3) uint8 (blue, green, red)."""
-    return _decoded(pictures, raw_bgr, _bgr_of_frame(), wanted, damaged, is_grey=False)
+    return _decoded(pictures, wanted, damaged, is_grey=False)
 
 
 def _decoded(
-    pictures: Iterable[EncodedPicture],
-    of_pixels: Callable[[str, bytes, PixelLayout], Image],
-    of_frame: Callable[[Any], Image],
-    wanted: Container[int] | None,
-    damaged: list[int] | None,
-    is_grey: bool,
+    pictures: Iterable[EncodedPicture], wanted: Container[int] | None, damaged: list[int] | None, is_grey: bool
 ) -> Iterator[Frame]:
+    of_pixels, of_frame = (raw_gray, _luma) if is_grey else (raw_bgr, _bgr_of_frame())
     decoder: _VideoDecoder | None = None
     for picture in pictures:
         if picture.is_video:

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 from mcaptrack import log
+from mcaptrack.sources.foreign.decoding import MessageType
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,6 +18,11 @@ class Connection:
     schema: tuple[str, str, bytes]
     encoding: str
     metadata: Mapping[str, str]
+
+    @property
+    def kind(self) -> MessageType:
+        """The type of its messages."""
+        return MessageType(*self.schema, self.encoding)
 
 
 @dataclass

@@ -456,17 +456,6 @@ class Calibrated(NamedTuple):
         return foxglove.pack_stamped(self.message, t_ns)
 
 
-class _Whole(NamedTuple):
-    """The intrinsics of a camera for pictures of ``size``; the other fields are as in ``CameraFile``."""
-
-    matrix: Floats
-    size: tuple[int, int]
-    model: str
-    bent: tuple[float, ...]
-    rectified: Floats | None
-    projection: Floats | None
-
-
 @dataclass(frozen=True)
 class GivenCalibration:
     """The calibration that a user gave: intrinsics and, perhaps in another file, the pose of a camera.
@@ -544,6 +533,7 @@ class GivenCalibration:
             return Calibrated(message, None, (*remarks, f"{names}: {_in_words(whole)}"), parameters)
         unit = _unit(camera.rotation, camera.translation, self.unit, names)
         rotation, translation = read.turn @ camera.rotation, read.turn @ camera.translation * _METRES[unit]
+        assert whole.size is not None
         plane = _plane(read.lens, rotation, translation, whole.size, point, names)
         height_m = float(-(rotation.T @ translation)[2])
         text = f"{names}: {_in_words(whole)}; the camera is {abs(height_m):.2f} m from the ground (lengths in {unit})"
@@ -597,12 +587,14 @@ def _listed(cameras: Sequence[CameraFile]) -> str:
     return ", ".join(camera.name + (f" ({camera.topic})" if camera.topic else "") for camera in cameras)
 
 
-def _in_words(whole: _Whole) -> str:
+def _in_words(whole: CameraFile) -> str:
+    assert whole.matrix is not None
+    assert whole.size is not None
     bent = f"{len(whole.bent)} coefficients of distortion ({whole.model})" if any(whole.bent) else "no distortion"
     return f"focal length {whole.matrix[0, 0]:.0f} px in pictures of {whole.size[0]} x {whole.size[1]}, {bent}"
 
 
-def _fitted(camera: CameraFile, final: tuple[int, int]) -> tuple[_Whole, tuple[str, ...]]:
+def _fitted(camera: CameraFile, final: tuple[int, int]) -> tuple[CameraFile, tuple[str, ...]]:
     """The calibration for pictures of this size, and what was done.
 
     Raises McaptrackError if it is for pictures of another shape, or if no size is known.
@@ -630,11 +622,13 @@ def _fitted(camera: CameraFile, final: tuple[int, int]) -> tuple[_Whole, tuple[s
         if off > _OUTSIDE and camera.size is None:
             raise McaptrackError(f"{text}: the calibration, which states no size, is for pictures of another one")
         warn(text + ("; it may be for pictures of another size, which it doesn't state" if camera.size is None else ""))
-    return _Whole(matrix, final, camera.model, camera.bent, camera.rectified, projection), remarks
+    return replace(camera, matrix=matrix, size=final, projection=projection), remarks
 
 
-def _message(whole: _Whole, frame_id: str) -> Any:
+def _message(whole: CameraFile, frame_id: str) -> Any:
     """The message for viewers, without its time."""
+    assert whole.matrix is not None
+    assert whole.size is not None
     message = foxglove.message_class(foxglove.CALIBRATION)(frame_id=frame_id, distortion_model=whole.model)
     message.width, message.height = whole.size
     message.D.extend(whole.bent)

@@ -112,17 +112,9 @@ class _Rows:
         except (ValueError, KeyError, TypeError) as error:
             text = str(error).strip('"')
             self.refuse(number, f"has a wrong image_id: {text}" if "column" in text else text)
-        self._values.extend(
-            (
-                frame,
-                *map(_float, box),
-                math.nan if score is None else _float(score),
-                NO_CLASS if category is None else _float(category),
-                NO_ID if track_id is None else _float(track_id),
-                bool(crowd),
-                isinstance(inner, dict) and inner.get("observed") is False,
-            )
-        )
+        unseen = isinstance(inner, dict) and inner.get("observed") is False
+        numbers = (_float(score, math.nan), _float(category, NO_CLASS), _float(track_id, NO_ID))
+        self._values.extend((frame, *map(_float, box), *numbers, bool(crowd), unseen))
 
     def _around(self, number: int, outline: Any) -> list[float] | None:
         """The box around polygons, [x, y, x, y, ...] each; None without any."""
@@ -164,9 +156,9 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _float(value: Any) -> float:
+def _float(value: Any, missing: float = math.nan) -> float:
     try:
-        return float(value)
+        return missing if value is None else float(value)
     except OverflowError:
         return math.inf
 

@@ -30,8 +30,8 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Rows
 from mcaptrack.schema.framing import joined_parts
-from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
+from mcaptrack.sources.cameras import DEFAULT_CAMERA, provenance_of
 from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.ingest.labels.content import Labels
 from mcaptrack.sources.pictures import size_of_pictures
@@ -306,10 +306,6 @@ def frames_of_labels(
 # Find the pictures that labels belong to. A camera is the part of a topic before its last "/".
 
 
-#: The default camera name.
-DEFAULT: Final = "camera"
-
-
 class CameraTopics(NamedTuple):
     """The prefix of all topics of a camera, and the topic of its pictures, "" if there are none."""
 
@@ -337,7 +333,7 @@ def choose_camera(where: object, camera: str, topics: Collection[str]) -> Camera
                 f"{where}: {at} has several topics of pictures, {', '.join(fitting)}; name one with "
                 f"`camera={fitting[0].strip('/')!r}`"
             )
-    if camera != DEFAULT or not topics:
+    if camera != DEFAULT_CAMERA or not topics:
         return CameraTopics(prefix, "")
     if len(topics) > 1:
         names = sorted({camera_prefix(topic).strip("/") for topic in topics})
@@ -359,7 +355,7 @@ def _above(prefix: str) -> Iterator[str]:
 def camera_prefix(topic: str) -> str:
     """The prefix of the camera that a topic belongs to."""
     folder, slash, _ = topic.strip("/").rpartition("/")
-    return f"/{folder}" if slash else f"/{DEFAULT}"
+    return f"/{folder}" if slash else f"/{DEFAULT_CAMERA}"
 
 
 def camera_of(opened: log.Log, camera: str) -> CameraTopics:
@@ -388,7 +384,7 @@ def timeline_of(opened: log.Log, topic: str) -> Timeline:
     """The pictures of a channel. Raises McaptrackError if it is damaged, or holds no pictures."""
     t_ns: NDArray[np.int64] = opened.times(topic)
     index, every, of = np.arange(len(t_ns)), 1, f"the pictures of {topic}"
-    provenance = Provenance.from_metadata(opened.channel(topic).metadata)
+    provenance = provenance_of(opened, topic)
     if provenance:
         value = provenance.parameters.get("every")
         every = value if isinstance(value, int) and value > 0 else 1
@@ -406,8 +402,7 @@ def timeline_of(opened: log.Log, topic: str) -> Timeline:
 
 def detections_topic(opened: log.Log, prefix: str) -> str:
     """The topic of detections made from pictures that were dropped since; "" if there is none."""
-    channel = opened.channels.get(f"{prefix}/detections")
-    provenance = Provenance.from_metadata(channel.metadata) if channel else None
+    channel, provenance = opened.channels.get(f"{prefix}/detections"), provenance_of(opened, f"{prefix}/detections")
     stage = STAGES.get(provenance.transform) if provenance else None
     is_of_pictures = stage is not None and stage.default.reads is VIDEO
     return channel.topic if channel and channel.messages and is_of_pictures else ""
@@ -436,8 +431,7 @@ def labels_of(opened: log.Log, prefix: str) -> dict[str, ExistingLabels]:
     """The ingested labels of a camera in a log, by topic."""
     out = {}
     for role in get_args(Role):
-        channel = opened.channels.get(f"{prefix}/{role}")
-        provenance = Provenance.from_metadata(channel.metadata) if channel else None
+        channel, provenance = opened.channels.get(f"{prefix}/{role}"), provenance_of(opened, f"{prefix}/{role}")
         if channel and channel.messages and provenance and provenance.transform == "ingest":
             t_ns = opened.times(channel.topic)
             value = provenance.parameters.get("fps")
