@@ -45,7 +45,8 @@ class Version(NamedTuple):
 
 
 #: A request that fails is sent again so often, and within so many seconds; one without an answer fails after a while.
-_RETRIES, _PATIENCE_S, _CONNECT_S, _READ_S, _REQUEST_S = 9, 60, 5, 20, 300
+_RETRIES: Final = 9
+_PATIENCE, _CONNECT, _READ, _REQUEST = (timedelta(seconds=seconds) for seconds in (60, 5, 20, 300))
 #: The first and the longest pause. Each is up to so many times as long as the one before; with 2 all nine would take
 #: less than three seconds.
 _FIRST, _LONGEST = timedelta(milliseconds=100), timedelta(seconds=5)
@@ -77,17 +78,10 @@ def _made_store(scheme: str, bucket: str, settings: tuple[tuple[str, str], ...])
     from obstore.store import AzureStore, GCSStore, S3Store
 
     env = dict(settings)
+    backoff = {"init_backoff": _FIRST, "max_backoff": _LONGEST, "base": _GROWTH}
     common: dict[str, Any] = {
-        "client_options": {
-            "connect_timeout": timedelta(seconds=_CONNECT_S),
-            "read_timeout": timedelta(seconds=_READ_S),
-            "timeout": timedelta(seconds=_REQUEST_S),
-        },
-        "retry_config": {
-            "max_retries": _RETRIES,
-            "backoff": {"init_backoff": _FIRST, "max_backoff": _LONGEST, "base": _GROWTH},
-            "retry_timeout": timedelta(seconds=_PATIENCE_S),
-        },
+        "client_options": {"connect_timeout": _CONNECT, "read_timeout": _READ, "timeout": _REQUEST},
+        "retry_config": {"max_retries": _RETRIES, "backoff": backoff, "retry_timeout": _PATIENCE},
     }
     if scheme == "gs":
         return GCSStore(bucket, **common)

@@ -6,7 +6,7 @@ import json
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import resources
 from pathlib import Path
@@ -426,7 +426,7 @@ def demo_scene(seed: int = 2) -> SyntheticScene:
         Pedestrian(10, ((0, 3.0, 20.0), (9, 2.5, 12.5), (17, 8.0, 8.0)), (225, 240, 235)),
         Pedestrian(11, ((28, 8.5, 14.5), (40, -5.0, 10.0)), (35, 20, 60)),
     )
-    return SyntheticScene(people, 40.0, blocks=_KIOSK, tree_at_m=_TREE_AT_M, shake_px=0.8, seed=seed)
+    return _square(people, seed)
 
 
 def walkers_scene(seed: int = 1) -> SyntheticScene:
@@ -516,20 +516,8 @@ def three_cameras(seed: int = 1) -> dict[str, SyntheticScene]:
         route = ((begin, start[0], float(start[1])), (begin + seconds, end[0], float(end[1])))
         people.append(Pedestrian(number, route, _random_colour(rng)))
     poses = {"left": Pose(-12.0, 2.0, 30.0), "right": Pose(12.0, 2.0, -30.0), "back": Pose(0.0, 25.0, 180.0)}
-    return {
-        name: SyntheticScene(
-            tuple(people),
-            _PLACE_S,
-            fps=10,
-            width_px=640,
-            height_px=360,
-            mast_m=6.0,
-            tilt_deg=24.0,
-            seed=seed + n,
-            pose=pose,
-        )
-        for n, (name, pose) in enumerate(poses.items())
-    }
+    scene = SyntheticScene(tuple(people), _PLACE_S, fps=10, width_px=640, height_px=360, mast_m=6.0, tilt_deg=24.0)
+    return {name: replace(scene, seed=seed + n, pose=pose) for n, (name, pose) in enumerate(poses.items())}
 
 
 #: The scenes that several cameras see, by name: for each a function of a seed that gives the scene of each camera.

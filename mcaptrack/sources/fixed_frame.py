@@ -17,9 +17,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from mcaptrack import log
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.angles import headings
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.oriented_boxes import COLUMNS
 from mcaptrack.geometry.transform_tree import Poses, PoseSamples, Recorded, TransformTree, plain_frame, turned
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, SCORES_NEEDED, Frame, Rows
@@ -263,7 +264,7 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
     rows = rows_of_boxes(boxes, rotation[is_taken], shift[is_taken], f"{opened.path}: {topic}")
     names = foreign.settle_classes(opened, topic, boxes.classes, [rows])
     if nameless := boxes.classes.nameless(np.unique(rows["class_id"]).tolist()):
-        listed = ", ".join(map(str, nameless[:_LISTED])) + (", ..." if len(nameless) > _LISTED else "")
+        listed = list_names([*map(str, nameless)], _LISTED)
         remark = "1 counts as people, and others move as objects of unknown class do"
         warn(f"{opened.path}: classes of {topic} are numbers without names ({listed}): {remark}", "classes")
     if unclassed := int((rows["class_id"] == UNKNOWN).sum()):
@@ -307,7 +308,7 @@ def _fixed_frame(opened: log.Log, topic: str, boxes: Recorded3d, wanted: str) ->
     frames = set(tree.frames() if tree else ()) | set(boxes.names)
     if wanted:
         if boxes.names and wanted not in frames:
-            listed = ", ".join(sorted(frames)[:_LISTED]) or "none"
+            listed = list_names(sorted(frames), _LISTED)
             raise McaptrackError(
                 f"{opened.path}: there is no frame {wanted} for the boxes of {topic}; there are {listed}"
             )
@@ -340,9 +341,7 @@ def _frame_before(opened: log.Log, topic: str) -> str:
 
 
 def _unknown(tree: TransformTree, frame: str) -> str:
-    listed = tree.frames()
-    more = ", ..." if len(listed) > _LISTED else ""
-    return f"no transform has the frame {frame!r} (but {', '.join(listed[:_LISTED])}{more})"
+    return f"no transform has the frame {frame!r} (but {list_names(tree.frames(), _LISTED)})"
 
 
 def _poses(opened: log.Log, topic: str, boxes: Recorded3d, fixed: str) -> tuple[Bools, Floats, Floats]:
@@ -364,7 +363,7 @@ def _poses(opened: log.Log, topic: str, boxes: Recorded3d, fixed: str) -> tuple[
         stamps = np.where(boxes.stamp_ns > 0, boxes.stamp_ns, boxes.log_ns)[mine]
         times, place = np.unique(np.stack([stamps, boxes.log_ns[mine]]), axis=1, return_inverse=True)
         what = "messages" if len(boxes.names) == 1 else f"messages have boxes in {name} that"
-        poses = poses_at(opened, topic, fixed, name, *_rows_of(times), what)
+        poses = poses_at(opened, topic, fixed, name, times[0], times[1], what)
         place = place.reshape(-1)
         is_known[mine] = poses.is_known[place]
         rotation[mine], shift[mine] = poses.rotation[place], poses.translation[place]
@@ -376,14 +375,10 @@ def _poses(opened: log.Log, topic: str, boxes: Recorded3d, fixed: str) -> tuple[
     return is_known, rotation, shift
 
 
-def _rows_of(times: Ints) -> tuple[Ints, Ints]:
-    return times[0], times[1]
-
-
 def _connected(opened: log.Log, boxes: Recorded3d) -> str:
     transforms = transforms_of(opened)
-    frames = ", ".join((transforms.frames() if transforms else [])[:_LISTED]) or "none"
-    return f"boxes are in {', '.join(boxes.names[:_LISTED])}, and transforms have {frames};"
+    frames = list_names(transforms.frames() if transforms else [], _LISTED)
+    return f"boxes are in {list_names(boxes.names, _LISTED)}, and transforms have {frames};"
 
 
 def _warn_odd(opened: log.Log, topic: str, boxes: Recorded3d) -> None:
@@ -418,17 +413,8 @@ def rows_of_boxes(boxes: Recorded3d, rotation: Floats, shift: Floats, where: str
     if lying:
         text = "boxes stand on another side than that of their z axis: their height is along the axis that is upright"
         warn(f"{where}: {lying:,} {text}")
-    return DETECTIONS.rows(
-        x_m=centre[:, 0],
-        y_m=centre[:, 1],
-        z_m=np.where(has_z, centre[:, 2], np.nan),
-        length_m=boxes.size[here, along],
-        width_m=boxes.size[here, across],
-        height_m=boxes.size[here, up],
-        heading_rad=np.where(boxes.has_heading, heading, np.nan),
-        vx_m_per_s=velocity[:, 0],
-        vy_m_per_s=velocity[:, 1],
-        score=boxes.score,
-        class_id=boxes.class_id,
-        source_id=boxes.source_id,
-    )
+    centre[~has_z, 2], heading[~boxes.has_heading] = np.nan, np.nan
+    size = [boxes.size[here, axis] for axis in (along, across, up)]
+    columns = dict(zip(COLUMNS, [*centre.T, *size, heading], strict=True))
+    columns |= {"vx_m_per_s": velocity[:, 0], "vy_m_per_s": velocity[:, 1]}
+    return DETECTIONS.rows(score=boxes.score, class_id=boxes.class_id, source_id=boxes.source_id, **columns)

@@ -90,15 +90,9 @@ def boxes_decoder(kind: MessageType, classes: Classes) -> Callable[[bytes], Rows
 
 def _boxes(message: Any, classes: Classes) -> Rows:
     rows = [_box(detection, classes) for detection in message.detections]
-    x, y, w, h, score, class_id = (list(column) for column in zip(*rows, strict=True)) if rows else [[]] * 6
-    return DETECTIONS.rows(
-        x_px=np.array(x, float),
-        y_px=np.array(y, float),
-        w_px=np.array(w, float),
-        h_px=np.array(h, float),
-        score=np.array(score, float),
-        class_id=np.array(class_id, np.uint32),
-    )
+    *numbers, class_id = np.array(rows, float).reshape(-1, 6).T
+    columns = dict(zip(("x_px", "y_px", "w_px", "h_px", "score"), numbers, strict=True))
+    return DETECTIONS.rows(class_id=class_id.astype(np.uint32), **columns)
 
 
 def _box(detection: Any, classes: Classes) -> tuple[float, float, float, float, float, int]:

@@ -93,7 +93,10 @@ class VideoJob(IngestJob):
         parameters: dict[str, str | int | float] = {"file": video.path.name, "image_format": video.format}
         if options.fps is not None:
             parameters["fps"] = str(options.fps)
-            self._warn_fps(options.fps)
+            own = video.fps
+            if own and abs(options.fps - own) > _SAME_FPS * own:
+                rates = f"{float(own):g} frames a second; its pictures are written at {float(options.fps):g}"
+                warn(f"{video.path} has {rates} by `fps=`", "clock")
         if video.every > 1:
             parameters["every"] = video.every
         if video.why_transcode:
@@ -139,13 +142,6 @@ class VideoJob(IngestJob):
         self.write_plane(writer, self._plane, times[0])
         self.write_labels(writer, self._plane, timeline)
         self.write_motion(writer, timeline, (self.video.width_px, self.video.height_px))
-
-    def _warn_fps(self, fps: Fraction) -> None:
-        """Warn if the given frame rate differs from that of the video."""
-        own = self.video.fps
-        if own and abs(fps - own) > _SAME_FPS * own:
-            text = f"{self.video.path} has {float(own):g} frames a second; its pictures are written at {float(fps):g}"
-            warn(f"{text} by `fps=`", "clock")
 
     def _check_existing(self, timeline: Timeline) -> None:
         """Check that existing labels in the log have the times of these pictures."""

@@ -346,7 +346,6 @@ def label_frames(
     fps: Fraction | None,
     ground_plane: Path | None,
     point: Point,
-    label_format: Format = "auto",
     classes: WantedClasses | None = None,
 ) -> dict[Role, list[Frame]]:
     """Read label files with a common clock as frames, without writing a log.
@@ -354,7 +353,7 @@ def label_frames(
     Raises McaptrackError as ``ingest`` does. For comparisons only the order and intervals of times matter, so files
     without a frame rate get one frame per second unless ``fps`` is given.
     """
-    options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point, label_format=label_format, classes=classes)
+    options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point, classes=classes)
     job = LabelJob([(role, path) for role, path in files.items()], options, default_fps=Fraction(1))
     job.report_assumptions()
     return {role: job.all_frames(role) for role in files}

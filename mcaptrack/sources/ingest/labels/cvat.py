@@ -23,7 +23,7 @@ from typing import IO, Any, Final
 import numpy as np
 
 from mcaptrack.choices import Role
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.files import read_beginning
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.schema.classes import PERSON, is_person
@@ -109,8 +109,7 @@ def _member(path: Path, names: list[str]) -> str:
 
 
 def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(name[:60] for name in names[:_SHOWN]) + more
+    return list_names([name[:60] for name in names], _SHOWN)
 
 
 @dataclass
@@ -393,7 +392,7 @@ def _ids(path: Path, tracks: list[_Track], counts: Any) -> tuple[Ints, Ints | No
     new = np.flatnonzero(ids < 0)
     ids[new] = max(taken) + 1 + np.arange(len(new))
     if split:
-        shown = ", ".join(map(str, sorted(split)[:8])) + (", ..." if len(split) > 8 else "")
+        shown = list_names([*map(str, sorted(split))], 8)
         remarks.append(f"{path}: several tracks state one track_id ({shown}): {split.total()} of them get new ids")
     drawn = sum(number is None for number in stated)
     if drawn:

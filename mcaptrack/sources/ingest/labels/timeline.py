@@ -258,19 +258,11 @@ def label_rows(labels: Labels, role: Role, plane: GroundPlane | None) -> Rows:
     xy_m = labels.xy_m
     if xy_m is None:
         xy_m = plane.boxes_to_metres(boxes) if plane else nowhere[:, :2]
-    return TRACKS.rows(
-        track_id=labels.id,
-        x_px=boxes[:, 0],
-        y_px=boxes[:, 1],
-        w_px=boxes[:, 2],
-        h_px=boxes[:, 3],
-        x_m=xy_m[:, 0],
-        y_m=xy_m[:, 1],
-        score=labels.score,
-        observed=np.ones(len(labels.frame), bool) if role != "tracks" or labels.observed is None else labels.observed,
-        source_id=np.full(len(labels.frame), -1),
-        class_id=labels.class_id,
-    )
+    columns = dict(zip(("x_px", "y_px", "w_px", "h_px", "x_m", "y_m"), [*boxes.T, *xy_m.T], strict=True))
+    is_stated = role == "tracks" and labels.observed is not None
+    columns["observed"] = labels.observed if is_stated else np.ones(len(labels.frame), bool)
+    columns |= {"score": labels.score, "source_id": np.full(len(labels.frame), -1), "class_id": labels.class_id}
+    return TRACKS.rows(track_id=labels.id, **columns)
 
 
 def frames_of_labels(
