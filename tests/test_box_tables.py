@@ -190,7 +190,7 @@ def test_the_id_of_a_track_is_under_several_keys(tmp_path):
 
 
 def test_eight_classes_without_a_name_are_listed(tmp_path):
-    for count, shown in ((8, "10, 11, 12, 13, 14, 15, 16, 17"), (9, "10, 11, 12, 13, 14, 15, 16, 17, ...")):
+    for count, shown in ((8, "10, 11, 12, 13, 14, 15, 16, 17"), (9, "10, 11, 12, 13, 14, 15, 16, 17 and 1 more")):
         labels = read(tmp_path, coco([0], [box(0, (n, 2, 3, 4), category_id=10 + n) for n in range(count)] + [box(0)]))
         assert said(tmp_path, labels) == [f": {count} boxes have classes without a name ({shown}); their class_id is 0"]
         assert labels.class_id.tolist() == [0] * count + [1]
@@ -203,7 +203,7 @@ def test_eight_classes_with_another_number_are_listed(count, tmp_path):
     labels = read(tmp_path, coco([0], [box(0, category_id=one["id"]) for one in kinds], categories=kinds))
     last = count - 1
     moved = [f"n0 (0) is {last + 1}", f"n1 (1) is {last + 2}", *(f"Person ({n}) is 1" for n in range(2, count))]
-    words = ", ".join(moved[:8]) + (", ..." if count > 8 else "")
+    words = ", ".join(moved[:8]) + (" and 1 more" if count > 8 else "")
     assert labels.remarks[-1] == f"{tmp_path / 'a'}: in class_id 1 is a person: {words}"
     assert labels.class_id.tolist() == [last + 1, last + 2, *[1] * (count - 2)]
     assert labels.classes == {last + 1: "n0", last + 2: "n1", 1: "Person"}
