@@ -65,6 +65,11 @@ TOPIC_OF: Final[Mapping[Role, str]] = {"corrections": CORRECTED}
 MOTION: Final = "motion"
 
 
+#: Options that apply only to videos, and options that are written otherwise than they are named here.
+FOR_VIDEOS: Final = ("image_format", "quality", "keyframe_interval_s")
+_WRITTEN: Final[Mapping[str, str]] = {"start_ns": "start_time"}
+
+
 @dataclass(frozen=True, kw_only=True)
 class IngestOptions:
     """Options of making a log. ``labels`` are label files by role; ``role`` is that of an input that is a label file.
@@ -113,14 +118,11 @@ class IngestOptions:
             fps=self.fps,
         )
 
-    def for_videos(self) -> str:
-        """The first given option that applies only to videos; "" if there is none."""
-        is_option_given = {
-            "`image_format=`": self.image_format != "auto",
-            "`quality=`": self.quality is not None,
-            "`keyframe_interval_s=`": self.keyframe_interval_s is not None,
-        }
-        return next((name for name, is_given in is_option_given.items() if is_given), "")
+    def given(self, *names: str) -> str:
+        """The first of these options that was given, as a user writes it; "" if none was."""
+        defaults = IngestOptions()
+        given = next((name for name in names if getattr(self, name) != getattr(defaults, name)), "")
+        return given and f"`{_WRITTEN.get(given, given)}=`"
 
 
 @dataclass

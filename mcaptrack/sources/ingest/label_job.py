@@ -32,7 +32,7 @@ from mcaptrack.sources.cameras import DEFAULT_CAMERA, camera_at
 from mcaptrack.sources.corrections import CORRECTED, CORRECTED_FROM
 from mcaptrack.sources.fixed_frame import holds_boxes_3d, named_detections, transforms_of
 from mcaptrack.sources.foreign import holds_pictures
-from mcaptrack.sources.ingest.job import SCHEMA_OF, IngestJob, IngestOptions
+from mcaptrack.sources.ingest.job import FOR_VIDEOS, SCHEMA_OF, IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.content import BoxRows3D, Format, Labels, WantedClasses, describe_classes
 from mcaptrack.sources.ingest.labels.reading import read_boxes_3d
 from mcaptrack.sources.ingest.labels.timeline import (
@@ -125,8 +125,8 @@ class LabelJob(IngestJob):
         for role, path in reversed(inputs):
             self._add(role, path)
         self.check_labels()
-        if options.for_videos():
-            raise McaptrackError(f"{self.source} is a label file; {options.for_videos()} is for videos")
+        if name := options.given(*FOR_VIDEOS):
+            raise McaptrackError(f"{self.source} is a label file; {name} is for videos")
         if options.frames is not None and not 0 < options.frames <= MAX_FRAMES:
             raise McaptrackError(f"`frames=` is a number from 1 to {MAX_FRAMES}, not {options.frames}")
         if "corrections" in self.labels and into is None:
@@ -199,9 +199,8 @@ class LabelJob(IngestJob):
                 f"{into.path}: {timeline.of} are {timeline.fps:.6g} a second, not {float(options.fps):g}; labels take "
                 "the times of their pictures, so leave `fps=` out"
             )
-        for value, name in ((options.start_ns, "`start_time=`"), (options.frames, "`frames=`")):
-            if value is not None:
-                raise McaptrackError(f"{into.path}: labels take the times of {timeline.of}; leave {name} out")
+        if name := options.given("start_ns", "frames"):
+            raise McaptrackError(f"{into.path}: labels take the times of {timeline.of}; leave {name} out")
         return timeline
 
     def _of_rate(self, default: Fraction | None) -> Timeline:
@@ -441,7 +440,8 @@ class Boxes3DJob(IngestJob):
         self, inputs: Sequence[tuple[Role | None, Path]], options: IngestOptions, into: log.Log | None = None
     ) -> None:
         super().__init__(inputs[0][1], replace(options, labels={}), into)
-        self._refuse_options(options)
+        if name := options.given(*FOR_VIDEOS, "ground_plane", "calibration", "motion", "size", "frames"):
+            raise McaptrackError(f"{self.source} holds 3D boxes; {name} is for pictures and boxes in them")
         self.boxes: dict[Role, BoxRows3D] = {}
         for stated, path in (*inputs, *options.labels.items()):
             if stated == "corrections":
@@ -466,19 +466,6 @@ class Boxes3DJob(IngestJob):
     def roles(self) -> Set[Role]:
         """The roles of label files."""
         return self.boxes.keys()
-
-    def _refuse_options(self, options: IngestOptions) -> None:
-        is_option_given = {
-            options.for_videos(): bool(options.for_videos()),
-            "`ground_plane=`": options.ground_plane is not None,
-            "`calibration=`": bool(options.calibration),
-            "`motion=`": options.motion is not None,
-            "`size=`": options.size is not None,
-            "`frames=`": options.frames is not None,
-        }
-        for name, is_given in is_option_given.items():
-            if is_given:
-                raise McaptrackError(f"{self.source} holds 3D boxes; {name} is for pictures and boxes in them")
 
     def _frame_id(self, rows: BoxRows3D) -> str:
         """The frame of reference of rows: as the user says, as the format says, or the root of the log's transforms."""
@@ -510,9 +497,8 @@ class Boxes3DJob(IngestJob):
         """The times of rows (N,) and of labelled frames (F,), by their own times, a frame rate, or the log."""
         options = self.options
         if rows.is_timed:
-            for name, value in (("fps", options.fps), ("first_frame", options.first_frame)):
-                if value is not None:
-                    raise McaptrackError(f"{rows.path} has times; leave `{name}=` out")
+            if name := options.given("fps", "first_frame"):
+                raise McaptrackError(f"{rows.path} has times; leave {name} out")
             shift = 0 if options.start_ns is None else options.start_ns - int(labelled[0])
             return number + shift, labelled + shift
         first = options.first_frame

@@ -21,7 +21,7 @@ from mcaptrack.sources import foreign
 from mcaptrack.sources.calibrations import frame_named
 from mcaptrack.sources.foreign.decoding import decoder_with_errors
 from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
-from mcaptrack.sources.ingest.job import IngestJob, IngestOptions, Progress
+from mcaptrack.sources.ingest.job import FOR_VIDEOS, IngestJob, IngestOptions, Progress
 from mcaptrack.sources.ingest.labels.timeline import Timeline, choose_camera, picture_predicate, timeline_of
 from mcaptrack.sources.ingest.sidecar import encoding_for
 from mcaptrack.sources.pictures import size_of
@@ -36,26 +36,14 @@ class RecordingJob(IngestJob):
     """A recording, with labels for its pictures."""
 
     def __init__(
-        self,
-        source: Path,
-        options: IngestOptions,
-        recorded: RecordingReader,
-        progress: Progress,
-        into: log.Log | None,
+        self, source: Path, options: IngestOptions, recorded: RecordingReader, progress: Progress, into: log.Log | None
     ) -> None:
         self._recorded, self._progress = recorded, progress
         try:
-            for is_option_given, name in (
-                (options.fps, "`fps=`"),
-                (options.start_ns is not None, "`start_time=`"),
-                (options.for_videos(), options.for_videos()),
-                (options.role, "`role=`"),
-                (options.frames is not None, "`frames=`"),
-            ):
-                if is_option_given:
-                    raise McaptrackError(
-                        f"{source} is a log: its messages stay as they are, and so do their times; leave {name} out"
-                    )
+            if name := options.given("fps", "start_ns", *FOR_VIDEOS, "role", "frames"):
+                raise McaptrackError(
+                    f"{source} is a log: its messages stay as they are, and so do their times; leave {name} out"
+                )
             super().__init__(source, options, into)
             #: The MCAP file that is copied as a whole, if the recording is one.
             self._copied_log: log.Log | None = None
