@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Sequence
 from enum import IntEnum
 from functools import cached_property
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -284,8 +284,6 @@ _OTHERS, _AS_ONE, _SECOND_MOTION_MIN_AREA = 0.3, 0.25, 0.1
 _MIN_FEATURES: Final = 24
 # In pixels of the reduced picture: from here on features move otherwise, and up to here alike.
 _OTHERWISE_PX, _ALIKE_PX = 1.0, 0.75
-# Flow is searched in windows of this size, on so many reduced copies of the picture.
-_SECOND_MOTION_WINDOW_PX, _SECOND_MOTION_LEVELS = 11, 4
 
 
 class SecondMotion:
@@ -328,23 +326,12 @@ class SecondMotion:
 
 def _is_divided(before: Image, now: Image, motion: Floats, boxes: Floats | None) -> bool:
     """Whether a part of two pictures moves as a whole, otherwise than ``motion`` (2, 3)."""
-    import cv2
-
     (first, to_small), (second, _) = reduced(before), reduced(now)
     points, _ = features(first.image, None if boxes is None else move_boxes(to_small, boxes))
     if len(points) < _MIN_FEATURES:
         return False
-    # Called without a type: the stubs of OpenCV 4 and 5 differ on what may be None.
-    moved, status, _ = cv2.calcOpticalFlowPyrLK(
-        first.image,
-        second.image,
-        points,
-        points.copy(),
-        winSize=(_SECOND_MOTION_WINDOW_PX,) * 2,
-        maxLevel=_SECOND_MOTION_LEVELS,
-    )
-    is_followed = np.asarray(status).ravel() == 1
-    then, now_at = points[is_followed, 0], np.asarray(moved, np.float32)[is_followed, 0]
+    moved, is_followed = _followed(first.image, second.image, points, points.copy(), _WIDE_LEVELS)
+    then, now_at = points[is_followed, 0], moved[is_followed]
     if len(then) < _MIN_FEATURES:
         return False
     small = compose(to_small, compose(motion, invert(to_small)))
@@ -352,10 +339,7 @@ def _is_divided(before: Image, now: Image, motion: Floats, boxes: Floats | None)
     others = off > _OTHERWISE_PX
     if np.count_nonzero(others) < _OTHERS * len(then):
         return False
-    _, agree = cv2.estimateAffinePartial2D(
-        then[others], now_at[others], method=cv2.RANSAC, ransacReprojThreshold=_ALIKE_PX, maxIters=200, refineIters=0
-    )
-    as_one = np.asarray(agree, np.bool_).ravel()
+    _, as_one = _agreeing(then[others], now_at[others], _ALIKE_PX)
     if np.count_nonzero(as_one) < _AS_ONE * len(then):
         return False
     return bool(np.ptp(now_at[others][as_one], axis=0).prod() >= _SECOND_MOTION_MIN_AREA * first.image.size)
@@ -598,29 +582,17 @@ class MotionEstimator:
         if len(key.points) < _MIN_INLIERS:
             return None
         near = move_points(compose(self._to_small, compose(guess, self._from_small)), key.points[:, 0].astype(float))
-        # Called without a type: the stubs of OpenCV 4 and 5 differ on what may be None.
-        moved, status, _ = cv2.calcOpticalFlowPyrLK(
-            key.picture.image,
-            _in_light_of(key.picture, picture),
-            key.points,
-            np.ascontiguousarray(near[:, None], np.float32),
-            winSize=(_WINDOW_PX, _WINDOW_PX),
-            maxLevel=levels,
-            criteria=_ITERATIONS,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )
-        now_at, then = np.asarray(moved, np.float32)[:, 0], key.points[:, 0]
-        is_followed = (np.asarray(status).ravel() == 1) & _inside(now_at, picture.image)
+        second, start = _in_light_of(key.picture, picture), np.ascontiguousarray(near[:, None], np.float32)
+        how = {"criteria": _ITERATIONS, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+        now_at, is_followed = _followed(key.picture.image, second, key.points, start, levels, **how)
+        then, is_followed = key.points[:, 0], is_followed & _inside(now_at, picture.image)
         if hidden is not None:
             is_followed &= ~_within(now_at, hidden)
         then, now_at, weight = then[is_followed], now_at[is_followed], key.weight[is_followed]
         least = max(_MIN_INLIERS, _MIN_SHARE * len(then))
         if len(then) < least:
             return None
-        matrix, agree = cv2.estimateAffinePartial2D(
-            then, now_at, method=cv2.RANSAC, ransacReprojThreshold=_INLIER_PX, maxIters=200, refineIters=0
-        )
-        inliers = np.asarray(agree, np.bool_).ravel()
+        matrix, inliers = _agreeing(then, now_at, _INLIER_PX)
         fitted = IDENTITY if matrix is None else _similarity(then[inliers], now_at[inliers], weight[inliers])
         if (at_rest := _at_rest(then, now_at, fitted)) is not None:
             return IDENTITY, at_rest
@@ -628,6 +600,27 @@ class MotionEstimator:
         if matrix is None or np.count_nonzero(inliers) < least or area < _MIN_AREA * picture.image.size:
             return None
         return compose(self._from_small, compose(fitted, self._to_small)), int(np.count_nonzero(inliers))
+
+
+def _followed(
+    first: Image, second: Image, points: Points, start: Points, levels: int, **how: Any
+) -> tuple[Points, Bools]:
+    """Where points (N, 1, 2) of a picture are in another, (N, 2), and which were found; ``start`` is about where."""
+    import cv2
+
+    # Called without a type: the stubs of OpenCV 4 and 5 differ on what may be None.
+    window = (_WINDOW_PX, _WINDOW_PX)
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(first, second, points, start, winSize=window, maxLevel=levels, **how)
+    return np.asarray(moved, np.float32)[:, 0], np.asarray(status).ravel() == 1
+
+
+def _agreeing(then: Points, targets: Points, most_px: float) -> tuple[Any, Bools]:
+    """The similarity that most points (N, 2) agree on, within a distance, None if there is none; and which agree."""
+    import cv2
+
+    how = {"method": cv2.RANSAC, "ransacReprojThreshold": most_px, "maxIters": 200, "refineIters": 0}
+    matrix, agree = cv2.estimateAffinePartial2D(then, targets, **how)  # type: ignore[call-overload]
+    return matrix, np.asarray(agree, np.bool_).ravel()
 
 
 def reduced(image: Image) -> tuple[_Picture, Floats]:
