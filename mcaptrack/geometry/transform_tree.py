@@ -428,14 +428,6 @@ class TransformTree:
         """A tree of the same transforms that uses log times instead of stamps."""
         return TransformTree(self._recorded, on_log_time=True)
 
-    @cached_property
-    def span_ns(self) -> tuple[int, int] | None:
-        """The first and last time of the frames that move; None if none does."""
-        moving = [series for series in self.series.values() if not series.is_static]
-        if not moving:
-            return None
-        return min(int(series.t_ns[0]) for series in moving), max(int(series.t_ns[-1]) for series in moving)
-
     def frames(self) -> list[str]:
         """Return the names of all frames."""
         return sorted(self.series.keys() | {series.parent for series in self.series.values()})

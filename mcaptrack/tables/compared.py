@@ -129,7 +129,7 @@ def compare_files(
             {"tracks": tracks, "truth": ground_truth}, fps, ground_plane, point, classes=wanted
         )
         return AlignedFiles(frames["truth"], frames["tracks"], classes=_names_of(both))
-    notes = [f"{path} also holds {labels.left_out}" for path, labels in both.values() if labels.left_out]
+    notes = [f"{labels.path} also holds {labels.left_out}" for labels in both.values() if labels.left_out]
     if fps is not None:
         notes.append("frames are compared by their numbers, whatever the frames per second")
     return _by_number(both, ground_plane, point, notes)

@@ -113,13 +113,8 @@ def stamps(opened: log.Log, topic: str) -> Ints:
     return np.array([picture.stamp_ns for _, picture in pictures(opened, topic)], np.int64)
 
 
-def detections(opened: log.Log, topic: str) -> Sequence[Frame]:
-    """The boxes of another detector, one frame for each message. Raises McaptrackError as ``pictures`` does."""
-    return named_detections(opened, topic).frames
-
-
 def named_detections(opened: log.Log, topic: str) -> NamedFrames:
-    """The boxes of another detector as ``detections`` gives them, with the names of their classes.
+    """The boxes of another detector, one frame for each message, with the names of their classes.
 
     Class names are converted to ids (see ``boxes.Classes``), which a warning lists.
     """

@@ -164,8 +164,8 @@ class NumberTable(CheckedRows):
                 )
         self.values: Floats = np.frombuffer(values, np.float64).reshape(-1, columns)
         self.line: Ints = np.frombuffer(numbers, np.int64)
-        line = self.line  # places don't keep the values in memory
-        self.at = lambda row: f"{path}:{line[row]}"
+        places = self.line  # a place doesn't keep the values in memory
+        self.at = lambda row: f"{path}:{places[row]}"
 
 
 _SHOWN: Final = 8
@@ -209,21 +209,19 @@ class BoxTable(CheckedRows):
 
     def take(self, rows: Ints | Bools | slice) -> Self:
         """Select or reorder rows; facts about the file stay."""
-        columns = {name: getattr(self, name) for name in self.COLUMNS}
         where, at = np.arange(len(self.frame))[rows], self.at
-        return replace(
-            self,
-            at=lambda row: at(int(where[row])),
-            **{name: None if values is None else values[rows] for name, values in columns.items()},
-        )
+        columns: dict[str, Any] = {name: getattr(self, name) for name in self.COLUMNS}
+        columns = {name: None if values is None else values[rows] for name, values in columns.items()}
+        return replace(self, at=lambda row: at(int(where[row])), **columns)
 
     def keep(self, rows: Ints | Bools) -> Self:
         """Select rows, and of the names of classes those that occur in them."""
         occurring = set(np.unique(self.class_id[rows]).tolist())
         return replace(self.take(rows), classes={n: name for n, name in self.classes.items() if n in occurring})
 
-    def with_boxes(self, has_box: Bools) -> Self:
-        """Leave out rows without a box; their frames stay labelled, as frames without boxes."""
+    def with_boxes(self, numbers: Floats) -> Self:
+        """Leave out rows of which all numbers (N, K) are missing; their frames stay labelled, without boxes."""
+        has_box: Bools = np.asarray(~np.isnan(numbers).all(axis=1))
         if has_box.all():
             return self
         self.labelled = np.unique(self.frame)

@@ -261,7 +261,7 @@ def _read_table(table: _Opened, role: Role, chosen: Mapping[str, str], name: For
         rows.times_s, rows.frame = np.unique(seconds, return_inverse=True)
         rows.first_frame = 0
     rows.frame = rows.whole(rows.frame, FRAME, 0, MAX_FRAME)
-    rows = rows.with_boxes(~np.isnan(cells.stacked(key for key in _OF_BOXES if key in at)).all(axis=1))
+    rows = rows.with_boxes(cells.stacked(key for key in _OF_BOXES if key in at))
     if name == "csv":
         rows.take_shares()
     if name == "supervision" and header[at.get("frame", 0)].lower() == _FRAME_INDEX:
@@ -548,7 +548,7 @@ def read_table_3d(path: Path, chosen: Mapping[str, str]) -> BoxRows3D:
     rows.names = (cells.names if "name" in at else cells.classes).names
     rows.velocity, rows.is_timed = cells.stacked(_VELOCITY), "t" in at
     rows.labelled = np.unique(frame)
-    return rows.with_boxes(~np.isnan(boxes[:, :6]).all(axis=1))
+    return rows.with_boxes(boxes[:, :6])
 
 
 def _choose_columns_3d(where: str, header: Sequence[str], chosen: Mapping[str, str]) -> dict[str, int]:
