@@ -21,14 +21,13 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
 from mcaptrack.schema.provenance import CLOCK, Provenance
-from mcaptrack.sources.ingest import IngestOptions, IngestReport, ingest, label_frames
+from mcaptrack.sources.ingest import IngestOptions, IngestReport, RecordingJob, ingest, label_frames
 from mcaptrack.sources.ingest.bags import decompression, plain_yaml
 from mcaptrack.sources.ingest.bags.metadata_yaml import read_metadata
 from mcaptrack.sources.ingest.bags.plain_yaml import UnsupportedYamlError
 from mcaptrack.sources.ingest.bags.rosbag2 import known_definition
 from mcaptrack.sources.ingest.job import FOR_VIDEOS
 from mcaptrack.sources.ingest.labels.timeline import CameraTopics, camera_prefix, choose_camera
-from mcaptrack.sources.ingest.recording_job import RecordingJob
 from tests.bags import ROS1, STRING1, T0, bag1
 from tests.worlds import ns
 

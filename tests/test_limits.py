@@ -56,7 +56,7 @@ LIMITS = {
         "_MAX_NAMES": 65_536,
         "KITTI_HEIGHT_PX": 25.0,
     },
-    "mcaptrack.sources.ingest.recording_job": {"_MAX_MESSAGE_BYTES": 240 * MIB},
+    "mcaptrack.sources.ingest": {"_MAX_MESSAGE_BYTES": 240 * MIB},
     f"{LABELS}.cvat": {
         "_MAX_BYTES": 512 * MIB,
         "_MAX_ROWS": 10_000_000,

@@ -17,9 +17,8 @@ from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.pipeline import find_views
 from mcaptrack.sources.video import write_clip
-from mcaptrack.sources.video.decode import EncodedPicture, decode_bgr
+from mcaptrack.sources.video.decode import EncodedPicture, PixelLayout, decode_bgr
 from mcaptrack.sources.video.encode import encode_image
-from mcaptrack.sources.video.raw_pixels import PixelLayout
 from mcaptrack.viewing import from_above
 from mcaptrack.viewing.from_above import Sight
 from mcaptrack.viewing.rendering import draw

@@ -18,10 +18,9 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.notices import warn
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.sources.foreign.boxes import DETECTIONS_READ
+from mcaptrack.sources.foreign.boxes import BOXES_3D_READ, DETECTIONS_READ, DRAWINGS, Message3d, boxes_3d_decoder
 from mcaptrack.sources.foreign.boxes import Classes as Classes
 from mcaptrack.sources.foreign.boxes import boxes_decoder as boxes_decoder
-from mcaptrack.sources.foreign.boxes_3d import BOXES_3D_READ, DRAWINGS, Message3d, boxes_3d_decoder
 from mcaptrack.sources.foreign.decoding import MessageType as MessageType
 from mcaptrack.sources.foreign.decoding import decoder_with_errors, integer, plain_name, stamp_of, text, to_bytes
 from mcaptrack.sources.foreign.flatten import message_type_of
