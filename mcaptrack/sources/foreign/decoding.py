@@ -54,12 +54,14 @@ def plain_name(schema_name: str) -> str:
     return f"foxglove.{name}" if package == "foxglove_msgs" else f"{package}/{name}"
 
 
-def decoder_with_errors(kind: MessageType, convert: Callable[[Any], Any]) -> Callable[[bytes], Any]:
+def decoder_with_errors(
+    kind: MessageType, convert: Callable[[Any], Any], unpack: Unpack | None = None
+) -> Callable[[bytes], Any]:
     """A function that decodes a payload and applies ``convert``; all failures become McaptrackError.
 
-    Raises McaptrackError as ``unpacker`` does.
+    ``unpack`` decodes payloads in another way than ``unpacker``. Raises McaptrackError as that does.
     """
-    unpack = unpacker(kind)
+    unpack = unpack or unpacker(kind)
 
     def decode(payload: bytes) -> Any:
         try:
@@ -69,7 +71,8 @@ def decoder_with_errors(kind: MessageType, convert: Callable[[Any], Any]) -> Cal
         except Exception as error:  # untrusted bytes in third-party parsers, which raise various exceptions
             why = f"it has no field {error.name!r}" if isinstance(error, AttributeError) else str(error)
             why = " ".join(why.split())[:120] or type(error).__name__
-            raise McaptrackError(f"{len(payload)} bytes are not a {kind.name} message ({why})") from None
+            name = kind.name or kind.encoding
+            raise McaptrackError(f"{len(payload)} bytes are not a {name} message ({why})") from None
 
     return decode
 

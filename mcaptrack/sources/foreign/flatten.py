@@ -54,22 +54,7 @@ def flattener(kind: MessageType) -> Callable[[bytes], dict[Path, Value]]:
     Raises McaptrackError if messages of this type are not supported; the returned function raises McaptrackError for
     malformed payloads.
     """
-    unpack = _unpacker(kind)
-
-    def flatten(payload: bytes) -> dict[Path, Value]:
-        try:
-            message = unpack(payload)
-            row = dict(_walk(message, ()))
-        except McaptrackError:
-            raise
-        except Exception as error:  # untrusted bytes in third-party parsers, which raise various exceptions
-            why = " ".join(str(error).split())[:120] or type(error).__name__
-            raise McaptrackError(
-                f"{len(payload)} bytes are not a {kind.name or kind.encoding} message ({why})"
-            ) from None
-        return row
-
-    return flatten
+    return decoder_with_errors(kind, lambda message: dict(_walk(message, ())), _unpacker(kind))
 
 
 def _unpacker(kind: MessageType) -> Callable[[bytes], Any]:

@@ -130,8 +130,16 @@ class _Files(RecordingReader):
     def messages(self, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
         """All messages, file by file, in their order there."""
         self._message_counts = {}
-        for number in range(len(self.paths)):
-            yield from self._messages(number, report)
+        for number, path in enumerate(self.paths):
+            left = decompression.limit_of(path.stat().st_size)
+            for connection, message in self._messages(number):
+                payload = message.payload
+                if self.bag.packed or self._is_packed(connection, payload):
+                    payload = _unpack_message(payload, path, message.t_ns, left)
+                    left -= len(payload)
+                    yield connection, message._replace(payload=payload)
+                else:
+                    yield connection, message
 
     def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool) -> None:
         """Write metadata.yaml, which a copied MCAP file doesn't contain."""
@@ -141,8 +149,13 @@ class _Files(RecordingReader):
     def _open(self, number: int) -> None:
         raise NotImplementedError
 
-    def _messages(self, number: int, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
-        yield from ()
+    def _messages(self, number: int) -> Iterator[tuple[Connection, log.Message]]:
+        """The messages of a file as they are stored."""
+        raise NotImplementedError
+
+    def _is_packed(self, connection: Connection, payload: bytes) -> bool:
+        """Whether a message is compressed, where metadata.yaml doesn't say it of all."""
+        return False
 
     def _connection(self, repeats: dict[object, int], described: Connection, messages: int) -> Connection:
         """The connection that a part of the recording describes: the parts have the same ones.
@@ -284,20 +297,17 @@ class Databases(_Files):
         text, self._undefined[kind] = known_definition(kind, self._distro.lower(), digest)
         return (kind, "ros2msg", text.encode()) if self._undefined[kind] else (kind, "", b"")
 
-    def _messages(self, number: int, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
+    def _is_packed(self, connection: Connection, payload: bytes) -> bool:
+        return payload.startswith(_ZSTD) and connection.encoding == "cdr"  # CDR starts with a zero byte
+
+    def _messages(self, number: int) -> Iterator[tuple[Connection, log.Message]]:
         connections, path = self._topics[number], self.paths[number]
-        left = decompression.limit_of(path.stat().st_size)
         for key, t_ns, data in self._databases[number].rows("messages", ["topic_id", "timestamp", "data"]):
             connection = connections.get(key)
             if connection is None:
                 continue
             if not isinstance(t_ns, int) or not isinstance(data, bytes):
                 raise McaptrackError(f"{path} is damaged: a message without time or data")
-            if self.bag.packed or (
-                data.startswith(_ZSTD) and connection.encoding == "cdr"
-            ):  # CDR starts with a zero byte
-                data = _unpack_message(data, path, t_ns, left)  # noqa: PLW2901
-                left -= len(data)
             count = self._message_counts.get(connection, 0)
             self._message_counts[connection] = count + 1
             yield connection, log.Message(t_ns, count % 2**32, t_ns, data)
@@ -335,16 +345,8 @@ class Logs(_Files):
             connections[channel.id] = self._connection(repeats, described, opened.index.counts.get(channel.id, 0))
         self._channels.append(connections)
 
-    def _messages(self, number: int, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
-        connections, path = self._channels[number], self.paths[number]
-        left = decompression.limit_of(path.stat().st_size)
-        for channel, message in log.stream(self.logs[number]):
-            if self.bag.packed:
-                payload = _unpack_message(message.payload, path, message.t_ns, left)
-                left -= len(payload)
-                yield connections[channel], message._replace(payload=payload)
-            else:
-                yield connections[channel], message
+    def _messages(self, number: int) -> Iterator[tuple[Connection, log.Message]]:
+        return ((self._channels[number][channel], message) for channel, message in log.stream(self.logs[number]))
 
 
 def _text(value: Any) -> str:
