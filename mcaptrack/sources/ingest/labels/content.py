@@ -91,6 +91,11 @@ def lines_of(path: Path, most: int = _MAX_LINE, has_comments: bool = False) -> L
         raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
 
 
+def is_count(text: str, digits: int) -> bool:
+    """Whether a text is a whole number from 0 on, with at most so many digits."""
+    return text.isascii() and text.isdecimal() and len(text) <= digits
+
+
 def split(line: str) -> list[str]:
     """Split a line at commas, or at blanks if it has no commas."""
     return [part.strip() for part in line.split(",")] if "," in line else line.split()
@@ -734,7 +739,7 @@ class BoxRows3D(BoxTable):
             return np.full(len(kind), UNKNOWN, np.uint32), {}
         if not stated.all():
             self.doubt(f": {int((~stated).sum())} boxes without a class have class_id 0", "classes")
-        if all(name.isascii() and name.isdecimal() and len(name) < 10 for name in self.names):
+        if all(is_count(name, 9) for name in self.names):
             self.doubt(" has no class names; class 1 is taken as people", "classes")
             ids, classes = [int(name) for name in self.names], {}
         else:
@@ -766,7 +771,7 @@ class BoxRows3D(BoxTable):
 def numbered(texts: list[str]) -> tuple[Ints, bool]:
     """Track ids (N,): the texts as numbers if all are, otherwise numbered from 1 on as they come; and which it is."""
     whole = [text.removesuffix(".0") for text in texts]
-    if all(text.isascii() and text.isdecimal() and len(text) < 17 for text in whole):
+    if all(is_count(text, 16) for text in whole):
         return np.array([int(text) for text in whole], np.int64), True
     numbers: dict[str, int] = {}
     return np.array([numbers.setdefault(text, len(numbers) + 1) for text in texts], np.int64), False

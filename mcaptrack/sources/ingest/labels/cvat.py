@@ -28,7 +28,7 @@ from mcaptrack.files import read_beginning
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.schema.classes import PERSON, is_person
 from mcaptrack.sources.ingest.bags.plain_yaml import XmlReader
-from mcaptrack.sources.ingest.labels.content import NO_CLASS, NO_ID, Labels, WantedClasses
+from mcaptrack.sources.ingest.labels.content import NO_CLASS, NO_ID, Labels, WantedClasses, is_count
 
 _MAX_BYTES: Final = 512 * 2**20
 _MAX_ROWS: Final = 10_000_000
@@ -212,7 +212,7 @@ class _Parser(XmlReader):
         """Take the attribute ``track_id`` of a box."""
         if not text:
             return
-        if not _is_id(text):
+        if not is_count(text, 15):
             self.unread[text] += 1
         elif self._track is not None:
             self._track.is_renamed |= self._track.stated not in ("", text)
@@ -227,7 +227,7 @@ class _Parser(XmlReader):
         return self.labels.setdefault(name, len(self.labels))
 
     def _whole(self, text: str, what: str) -> int:
-        if not (text.isascii() and text.isdecimal() and len(text) < 16):
+        if not is_count(text, 15):
             self.fail(f"{what} is a whole number from 0 on, not {text[:40]!r}")
         return int(text)
 
@@ -279,10 +279,10 @@ class _Parser(XmlReader):
 
     def span(self) -> tuple[int, int, int]:
         """The first and the last frame of the task and the step between them, by its description; -1: not known."""
-        meta = {name: int(text) for name, text in self.meta.items() if _is_count(text)}
+        meta = {name: int(text) for name, text in self.meta.items() if is_count(text, 9)}
         first = meta.get("start_frame", 0)
         key, _, step = self.meta.get("frame_filter", "").partition("=")
-        every = int(step) if key.strip() == "step" and _is_count(step.strip()) and int(step) else 1
+        every = int(step) if key.strip() == "step" and is_count(step.strip(), 9) and int(step) else 1
         last = meta.get("stop_frame", first + (meta.get("size", 0) - 1) * every if "size" in meta else -1)
         return first, last, every
 
@@ -360,10 +360,6 @@ def _frames(parser: _Parser, frame: Floats) -> tuple[Ints, str]:
     return np.unique(frame.astype(np.int64)), f"{text}; frames are taken as they are, and only those with boxes count"
 
 
-def _is_count(text: str) -> bool:
-    return text.isascii() and text.isdecimal() and len(text) < 10
-
-
 def _ids(path: Path, tracks: list[_Track], counts: Any) -> tuple[Ints, Ints | None, list[str]]:
     """The id of each track, those that are new, and remarks: the id that its attribute states, or its number.
 
@@ -398,7 +394,3 @@ def _ids(path: Path, tracks: list[_Track], counts: Any) -> tuple[Ints, Ints | No
     if drawn:
         remarks.append(f"{path}: {drawn} tracks state no track_id and get new ids")
     return ids, ids[new] if len(new) else None, remarks
-
-
-def _is_id(text: str) -> bool:
-    return text.isascii() and text.isdecimal() and len(text) < 16

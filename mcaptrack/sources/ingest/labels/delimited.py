@@ -42,7 +42,7 @@ from mcaptrack.sources.ingest.labels.content import (
     headings,
     lines_of,
     numbered,
-)  # fmt: skip
+)
 from mcaptrack.sources.ingest.labels.formats import ClassNames
 
 #: Columns that supervision writes before those of the user.
@@ -243,7 +243,12 @@ def _read_table(table: _Opened, role: Role, chosen: Mapping[str, str], name: For
     remarks = [cells.remark]
     track_id, said = ids.of(path, cells.column("id"))
     remarks += said
-    if "id" in at and header[at["id"]].lower() == "id" and "id" not in chosen and _are_row_numbers(track_id):
+    if (
+        "id" in at
+        and header[at["id"]].lower() == "id"
+        and "id" not in chosen
+        and len(np.unique(track_id)) == len(track_id) > 1
+    ):
         remarks.append(f"{path}: every box has another {header[at['id']]}, so it numbers rows, not tracks")
         track_id = np.full(len(track_id), float(NO_ID))
     kind, class_names = _classes(cells)
@@ -267,10 +272,6 @@ def _read_table(table: _Opened, role: Role, chosen: Mapping[str, str], name: For
     if name == "supervision" and header[at.get("frame", 0)].lower() == _FRAME_INDEX:
         rows.first_frame = 0
     return rows.settled(role, wanted, class_names)
-
-
-def _are_row_numbers(track_id: Floats) -> bool:
-    return len(track_id) > 1 and len(np.unique(track_id)) == len(track_id)
 
 
 def _boxes(columns: Mapping[str, Floats]) -> Floats:

@@ -28,8 +28,9 @@ from mcaptrack.sources.ingest.labels.content import (
     Labels,
     TrackIds,
     WantedClasses,
+    is_count,
     numbers_of_names,
-)  # fmt: skip
+)
 from mcaptrack.sources.ingest.labels.delimited import read_rows
 
 _MAX_BYTES: Final = 512 * 2**20
@@ -149,7 +150,7 @@ class _Rows:
 
 def _whole_of_text(value: Any) -> Any:
     """Return the whole number that a text holds; anything else as it is."""
-    return int(value) if isinstance(value, str) and value.isascii() and value.isdecimal() and len(value) < 16 else value
+    return int(value) if isinstance(value, str) and is_count(value, 15) else value
 
 
 def _is_number(value: Any) -> bool:
