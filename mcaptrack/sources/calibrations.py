@@ -23,7 +23,7 @@ from mcaptrack.sources.cameras import Camera, provenance_of, shared_parts
 from mcaptrack.sources.fixed_frame import poses_at, transforms_of
 from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name, stamp_of
 from mcaptrack.sources.foreign.flatten import message_type_of
-from mcaptrack.sources.pictures import size_of_pictures
+from mcaptrack.sources.pictures import picture_size
 
 #: Schemas of calibrations, by their names in ROS 1 and Foxglove; ROS 2 adds "/msg/".
 CALIBRATIONS_READ: Final = ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration")
@@ -131,7 +131,7 @@ def see_ground(opened: log.Log, camera: Camera, frame: str = "", ground_frame: s
         return None
     log_ns, stamp_ns, frame_id = _headers(opened, sources)
     topic = find_calibration(opened, sources[0], frame_id)
-    size = _picture_size(opened, camera.pictures)
+    size = picture_size(opened, camera.pictures)
     calibrations = read_calibrations(opened, topic, is_rectified_topic(sources[0]))
     fitted = [(since_ns, _fitted(calibration, size, topic)) for since_ns, calibration in calibrations]
     eye = fitted[0][1].frame_id or frame_id
@@ -161,7 +161,7 @@ def moving_camera(opened: log.Log, topic: str, frame: str) -> MovingCamera:
     log_ns, stamp_ns, frame_id = _headers(opened, [topic])
     source = find_calibration(opened, topic, frame_id)
     calibrations = read_calibrations(opened, source, is_rectified_topic(topic))
-    size = _picture_size(opened, topic)
+    size = picture_size(opened, topic)
     fitted = [(since_ns, _fitted(calibration, size, source)) for since_ns, calibration in calibrations]
     first = fitted[0][1]
     poses = poses_at(opened, topic, first.frame_id or frame_id, frame, stamp_ns, log_ns)
@@ -265,14 +265,6 @@ def _headers(opened: log.Log, topics: Sequence[str]) -> tuple[Ints, Ints, str]:
             times += [(t_ns, t_ns) for t_ns in opened.times(topic).tolist()]
     log_ns, stamp_ns = np.array(sorted(times), np.int64).reshape(-1, 2).T
     return log_ns, stamp_ns, frame_id
-
-
-def _picture_size(opened: log.Log, topic: str | None) -> tuple[int, int] | None:
-    """Return width and height of the pictures of a channel; None if there are none that can be decoded."""
-    try:
-        return size_of_pictures(opened, topic) if topic else None
-    except McaptrackError:
-        return None
 
 
 def frame_of(opened: log.Log, topic: str) -> str:

@@ -394,7 +394,7 @@ def _write_text(path: Path, text: str) -> None:
         part.write_text(text, encoding="utf-8")
 
 
-# The scenes of the demonstration (painted by ``synthetic``): who walks where, and which cameras look at it.
+# The scenes of the demonstration: who walks where, and which cameras look at it.
 
 
 #: The objects on the square.

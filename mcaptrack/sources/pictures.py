@@ -38,6 +38,14 @@ def size_of_pictures(opened: log.Log, topic: str) -> tuple[int, int] | None:
     return size_of((picture.encoded(m.t_ns, n, f"{where} at {m.t_ns} ns") for n, (m, picture) in decoded))
 
 
+def picture_size(opened: log.Log, topic: str | None) -> tuple[int, int] | None:
+    """Return width and height of the pictures of a channel; None if there are none, or none that can be read."""
+    try:
+        return size_of_pictures(opened, topic) if topic else None
+    except McaptrackError:
+        return None
+
+
 def size_of(pictures: Iterable[EncodedPicture]) -> tuple[int, int] | None:
     """Return width and height in pixels of the first picture that can be decoded; None if none can."""
     first = next(decode_gray(pictures), None)

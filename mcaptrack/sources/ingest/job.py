@@ -165,7 +165,7 @@ def read_motions(path: Path) -> Floats:
 
     Raises McaptrackError, with the line, for anything else.
     """
-    table = NumberTable(path, lines_of(path), _MOTION, _MOTION_COLUMNS, _parse_motion)
+    table = NumberTable(path, lines_of(path), _MOTION, _MOTION_COLUMNS)
     if not len(table.values):
         raise McaptrackError(f"{path} holds no camera motion")
     frame, motions = table.values[:, 0], table.values[:, 1:].reshape(-1, 2, 3)
@@ -181,12 +181,6 @@ def read_motions(path: Path) -> Floats:
         lambda row: f"the motion enlarges the picture {scale[row]:.3g} times; no camera does that in a frame",
     )
     return motions
-
-
-def _parse_motion(parts: list[str]) -> list[float]:
-    if len(parts) != _MOTION_COLUMNS:
-        raise ValueError(f"{len(parts)} columns")
-    return [float(part) for part in parts]
 
 
 def motion_frames(motions: Floats, index: Ints, t_ns: Ints, size: tuple[int, int]) -> list[Frame]:

@@ -126,7 +126,7 @@ def blurred_pictures(
             picture = read(message)
             waiting[number] = message, picture
             where = f"{opened.path}: {topic} at {message.t_ns} ns"
-            yield EncodedPicture(message.t_ns, number, picture.format, picture.data, picture.layout, where)
+            yield picture.encoded(message.t_ns, number, where)
 
     left_out = 0
     for frame in decode_bgr(encoded()):

@@ -101,6 +101,12 @@ def split(line: str) -> list[str]:
     return [part.strip() for part in line.split(",")] if "," in line else line.split()
 
 
+def check_columns(parts: Sequence[str], least: int, most: int) -> None:
+    """Raise ValueError if a line has fewer or more parts."""
+    if not least <= len(parts) <= most:
+        raise ValueError(f"{len(parts)} column{'s' * (len(parts) != 1)}")
+
+
 class CheckedRows:
     """Rows of a file whose faults are reported with the place of the row in the file, by ``at``."""
 
@@ -141,8 +147,9 @@ class CheckedRows:
 class NumberTable(CheckedRows):
     """Rows of numbers: ``values`` (N, C), and their line numbers ``line`` (N,).
 
-    ``parse`` converts the parts of a line to C numbers, and raises ValueError if they are not a valid row. ``what``
-    names the format and its columns. Raises McaptrackError, with the line, for an invalid row and for too many rows.
+    ``parse`` converts the parts of a line to C numbers, and raises ValueError if they are not a valid row; without it
+    they are the numbers. ``what`` names the format and its columns. Raises McaptrackError, with the line, for an
+    invalid row and for too many rows.
     """
 
     def __init__(
@@ -151,13 +158,16 @@ class NumberTable(CheckedRows):
         lines: Lines,
         what: str,
         columns: int,
-        parse: Callable[[list[str]], Sequence[float]],
+        parse: Callable[[list[str]], Sequence[float]] | None = None,
         split: Callable[[str], list[str]] = split,
     ) -> None:
         values, numbers = array("d"), array("q")
         for number, line in lines:
             try:
-                values.extend(parse(split(line)))
+                parts = split(line)
+                if parse is None:
+                    check_columns(parts, columns, columns)
+                values.extend(parse(parts) if parse else map(float, parts))
             except ValueError as error:
                 why = str(error) if "column" in str(error) else "not all are numbers"
                 raise McaptrackError(f"{path}:{number}: not {what}, {why}: {line.strip()[:_LINE_SHOWN]}") from None

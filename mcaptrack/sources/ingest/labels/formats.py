@@ -18,7 +18,7 @@ Letters: N rows, F frames.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -41,6 +41,7 @@ from mcaptrack.sources.ingest.labels.content import (
     Lines,
     NumberTable,
     WantedClasses,
+    check_columns,
     lines_of,
 )
 
@@ -119,16 +120,11 @@ def _ids(table: NumberTable, frame: int, track: int, least: int = NO_ID) -> tupl
     return frames, table.whole(table.values[:, track], "the id", least)
 
 
-def _columns(parts: Sequence[str], least: int, most: int) -> None:
-    if not least <= len(parts) <= most:
-        raise ValueError(f"{len(parts)} column{'s' * (len(parts) != 1)}")
-
-
 def read_mot(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Labels:
     """MOTChallenge."""
 
     def parse(parts: list[str]) -> list[float]:
-        _columns(parts, 6, 10)
+        check_columns(parts, 6, 10)
         # With 10 columns it is MOT15, where column 8 is not a class.
         more = parts[6:8] if len(parts) < 10 else parts[6:7]
         return [*map(float, parts[:6]), *map(float, more), *[np.nan] * (2 - len(more))]
@@ -181,7 +177,7 @@ def _kitti(path: Path, lines: Lines) -> tuple[NumberTable, ClassNames]:
     names = ClassNames()
 
     def parse(parts: list[str]) -> list[float]:
-        _columns(parts, 17, 18)
+        check_columns(parts, 17, 18)
         numbers = [float(part) if place != 2 else names.number(part) for place, part in enumerate(parts)]
         return numbers + [np.nan] * (18 - len(parts))
 
@@ -255,7 +251,7 @@ def read_sdd(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Lab
     names = ClassNames()
 
     def parse(parts: list[str]) -> list[float]:
-        _columns(parts, 10, 10)
+        check_columns(parts, 10, 10)
         return [*map(float, parts[:9]), names.number(parts[9].strip('"'))]
 
     columns = 'id xmin ymin xmax ymax frame lost occluded generated "label"'
@@ -282,12 +278,7 @@ def _positions(
     name: Format, what: str, columns: int, place: slice, path: Path, lines: Lines, role: Role, wanted: WantedClasses
 ) -> Labels:
     """Positions in metres of people."""
-
-    def parse(parts: list[str]) -> list[float]:
-        _columns(parts, columns, columns)
-        return [float(part) for part in parts]
-
-    table = NumberTable(path, lines, what, columns, parse)
+    table = NumberTable(path, lines, what, columns)
     frame, track_id = _ids(table, 0, 1, least=0)
     xy_m, none, people = table.values[:, place], np.full(len(frame), np.nan), np.full(len(frame), PERSON, np.uint32)
     table.refuse(~np.isfinite(xy_m).all(axis=1), lambda _: "a number is not finite")
