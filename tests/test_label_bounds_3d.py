@@ -289,7 +289,7 @@ def test_eight_classes_that_are_left_out_are_listed(kinds, tmp_path):
     more = sum(20 - k for k in range(8, kinds))
     assert rows.left_out == listed + (f", {more} of other classes" if more else "")
     rows = read_boxes_3d(path, "detections")
-    assert len(timed(rows, "detections", "person").frame) == 1
+    assert timed(rows, "detections", "person").labelled.tolist() == [1000]
     assert not rows.left_out
 
 

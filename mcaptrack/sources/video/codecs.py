@@ -81,9 +81,9 @@ def nal_starts(data: bytes) -> Iterator[int]:
 
 
 class NalFormat(NamedTuple):
-    """How a codec of NAL units (Annex B) marks them.
+    """The marks of NAL units (Annex B) of a codec.
 
-    The type is ``mask`` applied to the first byte of ``header_bytes``, shifted right by ``shift`` bits. ``sets`` are
+    The type is the first byte of ``header_bytes``, shifted right by ``shift`` bits, within ``mask``. ``sets`` are
     the types of parameter sets, ``pictures`` those of slices, ``random_access`` those that decoding can begin with.
     """
 

@@ -108,7 +108,7 @@ def check_columns(parts: Sequence[str], least: int, most: int) -> None:
 
 
 class CheckedRows:
-    """Rows of a file whose faults are reported with the place of the row in the file, by ``at``."""
+    """Rows of a file, with errors that name the place of a row in the file, by ``at``."""
 
     at: Callable[[int], str]
 

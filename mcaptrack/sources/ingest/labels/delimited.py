@@ -111,7 +111,7 @@ def split_row(path: Path, delimiter: str, line: str) -> list[str]:
 
 
 class _Opened(NamedTuple):
-    """A table whose header was read: its place, the names of columns, the rows, and what separates their cells."""
+    """A table after its header was read: its place, the names of columns, the rows, and what separates their cells."""
 
     path: Path
     number: int
