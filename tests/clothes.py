@@ -8,7 +8,7 @@ import numpy as np
 
 from mcaptrack.geometry.colour_histograms import LENGTH, at_border, describe, is_clear
 from mcaptrack.schema import TRACKS, Frame
-from mcaptrack.sources.synthetic import Pedestrian, SyntheticFrame, SyntheticScene
+from mcaptrack.sources.demo import Pedestrian, SyntheticFrame, SyntheticScene
 from mcaptrack.transforms.retrack.appearance import Descriptors
 
 WIDTH, HEIGHT = 208, 117

@@ -174,12 +174,12 @@ def store(server, monkeypatch, tmp_path) -> Any:
 @pytest.fixture
 def impatient(monkeypatch) -> Iterator[None]:
     """Failed requests to stores are sent again once only."""
-    from mcaptrack.objects import stores
+    from mcaptrack import objects
 
-    monkeypatch.setattr(stores, "_RETRIES", 1)
-    stores._made_store.cache_clear()
+    monkeypatch.setattr(objects, "_RETRIES", 1)
+    objects._made_store.cache_clear()
     yield
-    stores._made_store.cache_clear()
+    objects._made_store.cache_clear()
 
 
 @pytest.fixture(scope="session")

@@ -10,10 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.sources.fixed_frame import recorded
 from mcaptrack.sources.foreign import MessageType
-from mcaptrack.sources.foreign.boxes_3d import boxes_3d_decoder
-from mcaptrack.sources.foreign.boxes_3d.box import Message3d
-from mcaptrack.sources.foreign.boxes_3d.recorded import recorded
+from mcaptrack.sources.foreign.boxes import Message3d, boxes_3d_decoder
 from tests.ros_messages import BAR, Ros
 from tests.space_logs import (
     SEEN,

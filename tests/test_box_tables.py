@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.ingest.labels import box_rows, delimited, json_boxes, yolo
-from mcaptrack.sources.ingest.labels.box_rows import fitted
+from mcaptrack.sources.ingest.labels import content, delimited, json_boxes, yolo
 from mcaptrack.sources.ingest.labels.content import Labels
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline
@@ -191,7 +190,7 @@ def test_the_id_of_a_track_is_under_several_keys(tmp_path):
 
 
 def test_eight_classes_without_a_name_are_listed(tmp_path):
-    for count, shown in ((8, "10, 11, 12, 13, 14, 15, 16, 17"), (9, "10, 11, 12, 13, 14, 15, 16, 17, ...")):
+    for count, shown in ((8, "10, 11, 12, 13, 14, 15, 16, 17"), (9, "10, 11, 12, 13, 14, 15, 16, 17 and 1 more")):
         labels = read(tmp_path, coco([0], [box(0, (n, 2, 3, 4), category_id=10 + n) for n in range(count)] + [box(0)]))
         assert said(tmp_path, labels) == [f": {count} boxes have classes without a name ({shown}); their class_id is 0"]
         assert labels.class_id.tolist() == [0] * count + [1]
@@ -293,17 +292,18 @@ def test_a_box_is_outside_where_no_pixel_of_it_or_less_than_half_is_inside(place
     assert [words.removeprefix(": ") for words in said(tmp_path, labels)] == wanted
     path = tmp_path / "a"
     labels = read(tmp_path, table(f"0,{','.join(map(str, place))}", "1,1,1,1.5,1"))
-    made = fitted(path, labels, (100, 50))
-    assert [words.removeprefix(f"{path}: ") for words, _ in made.doubts] == wanted
-    assert made.boxes_px.tolist() == labels.boxes_px.tolist()
+    before = labels.boxes_px.tolist()
+    labels.fit((100, 50))
+    assert [words.removeprefix(f"{path}: ") for words, _ in labels.doubts] == wanted
+    assert labels.boxes_px.tolist() == before
 
 
 def test_shares_become_pixels_once(tmp_path):
     labels = read(tmp_path, table("0,0.25,0.5,0.125,1"))
     assert labels.is_normalised
-    once = fitted(tmp_path / "a", labels, (64, 32))
-    assert once.boxes_px.tolist() == [[16, 16, 8, 32]]
-    assert fitted(tmp_path / "a", once, (64, 32)).boxes_px.tolist() == once.boxes_px.tolist()
+    for _ in range(2):
+        labels.fit((64, 32))
+        assert labels.boxes_px.tolist() == [[16, 16, 8, 32]]
     assert read(tmp_path, table("0,0.25,0.5,0.125,2")).is_normalised
     assert not read(tmp_path, table("0,0.25,0.5,0.125,2.01")).is_normalised
     assert not read(tmp_path, table("0,1,0,1,2")).is_normalised  # whole numbers
@@ -425,7 +425,7 @@ def test_a_header_has_four_names_and_no_number(tmp_path):
 
 
 def test_names_of_pictures_are_numbered_in_one_sequence():
-    numbers = box_rows.numbers_of_names
+    numbers = content.numbers_of_names
     assert numbers(["d/x12_a.jpg", "e\\x007_a.png"]) == [12, 7]
     assert numbers(["1_2.jpg", "1_3.jpg"]) == [2, 3]
     assert numbers(["x1.jpg", "y2.jpg"]) is None
@@ -436,7 +436,7 @@ def test_names_of_pictures_are_numbered_in_one_sequence():
     assert numbers([f"{2**31 - 1}"]) == [2**31 - 1]
     assert numbers([f"{2**31}"]) is None
     with pytest.raises(ValueError, match=r"names of several sequences, 'a.b' and 'c'"):
-        reader = box_rows.FrameNames()
+        reader = content.FrameNames()
         assert (reader.number("a.3b.jpg"), reader.number("4c")) == (3, 4)
 
 
@@ -562,7 +562,7 @@ def test_pictures_by_times_have_limits():
 def placed(folder: Path, made: Timeline, *seconds: float) -> list[int]:
     """The row of labels at these times that each picture has; -1 for none."""
     labels = read(folder, table(*(f"{s},1,2,3,4" for s in seconds), header="t,x,y,w,h"))
-    return made.place(folder / "a", labels, []).number.tolist()
+    return made.place(labels, []).number.tolist()
 
 
 def test_times_of_labels_belong_to_the_nearest_picture_that_is_near(tmp_path):

@@ -18,11 +18,9 @@ from mcaptrack.geometry.transform_tree import Poses, PoseSamples, Recorded, Tran
 from mcaptrack.notices import collected
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.sources import camera_motion
-from mcaptrack.sources.fixed_frame import named_detections, rows_of_boxes
+from mcaptrack.sources.fixed_frame import named_detections, recorded, rows_of_boxes
 from mcaptrack.sources.foreign import MessageType
-from mcaptrack.sources.foreign.boxes_3d import boxes_3d_decoder
-from mcaptrack.sources.foreign.boxes_3d.box import Box3d, Message3d
-from mcaptrack.sources.foreign.boxes_3d.recorded import recorded
+from mcaptrack.sources.foreign.boxes import Box3d, Message3d, boxes_3d_decoder
 from tests.ros_messages import Ros
 from tests.space_logs import (
     NAMES,

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from mcaptrack.geometry.affine import IDENTITY, compose, invert, move_boxes, move_points, shift_px
-from mcaptrack.geometry.camera_motion import MotionEstimator
-from mcaptrack.geometry.camera_path import CameraPath, CameraPose, Verdict, poses_of
+from mcaptrack.geometry.camera_path import CameraPath, CameraPose, MotionEstimator, Verdict, poses_of
 from mcaptrack.notices import collected
 from mcaptrack.schema import CAMERA_MOTION, Frame
 from mcaptrack.schema.camera_motion import frames_to_path, pose_to_rows, rows_to_verdict

@@ -13,7 +13,7 @@ from mcaptrack.geometry.boxes import columns_to_boxes, iou
 from mcaptrack.geometry.clocks import FrameClock
 from mcaptrack.notices import collected
 from mcaptrack.schema import Frame
-from mcaptrack.sources.synthetic import SyntheticScene
+from mcaptrack.sources.demo import SyntheticScene
 from mcaptrack.transforms import STAGES, KnnDetector
 from mcaptrack.transforms.detect.background import _BackgroundModel, _PersonHeight, clear_border, halve
 from mcaptrack.transforms.detect.registration import Registration

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from mcaptrack import foxglove, log
 from mcaptrack.geometry.transform_tree import PoseSamples, Reason, Recorded, TransformTree
 from mcaptrack.notices import collected
-from mcaptrack.sources import frames
+from mcaptrack.sources import fixed_frame
 from mcaptrack.sources.foreign import MessageType
 from tests.commands import done
 from tests.ros_messages import BAR, Ros
@@ -331,7 +331,7 @@ MESSAGES = {
     "TransformStamped of ROS 1": of_ros("geometry_msgs/TransformStamped", ros1=True),
     "FrameTransform": of_protobuf("foxglove.FrameTransform"),
     "FrameTransforms": of_protobuf("foxglove.FrameTransforms"),
-    **{f"{name} in JSON": of_json(name) for name in frames.TRANSFORMS_READ},
+    **{f"{name} in JSON": of_json(name) for name in fixed_frame.TRANSFORMS_READ},
 }
 
 
@@ -354,7 +354,7 @@ class TestReading:
     def test_all_encodings(self, name, tmp_path):
         kind, payload = MESSAGES[name]
         with log.read(write(tmp_path / "a.mcap", ("/tf_static", kind, [(START_NS + 5, payload)]))) as opened:
-            tree = frames.transforms_of(opened)
+            tree = fixed_frame.transforms_of(opened)
         assert tree is not None
         assert [str(one) for one in tree.series.values()] == ["map -> robot"]
         poses = tree.lookup("map", "robot", at(0))
@@ -366,7 +366,7 @@ class TestReading:
         kind, _ = MESSAGES["FrameTransform"]
         empty = FrameTransform(parent_frame_id="a", child_frame_id="b")
         with log.read(write(tmp_path / "a.mcap", ("/tf", kind, [(START_NS, empty.SerializeToString())]))) as opened:
-            tree = frames.transforms_of(opened)
+            tree = fixed_frame.transforms_of(opened)
         assert tree.lookup("a", "b", at(0)).rotation[0].tolist() == np.eye(3).tolist()
 
     def test_damaged_messages_are_counted(self, tmp_path):
@@ -377,9 +377,9 @@ class TestReading:
             ("/other/tf", MessageType("tf2_msgs/msg/TFMessage", "", b"", "xml"), [(START_NS, b"")]),
         )
         with log.read(path) as opened:
-            found = frames.read_frames(opened)
+            found = fixed_frame.read_frames(opened)
             with collected() as warnings:
-                poses = frames.poses_at(opened, "/boxes", "map", "lidar", at(0, 1), at(0, 1))
+                poses = fixed_frame.poses_at(opened, "/boxes", "map", "lidar", at(0, 1), at(0, 1))
         assert found.tree.frames() == ["map", "robot"]
         assert len(found.unread) == 2
         assert any("/tf: 1 message can't be read" in words for words in found.unread)
@@ -398,14 +398,14 @@ class TestReading:
             one.translation.x = number
             messages.append((int(at(number / 10)[0]), one.SerializeToString()))
         with log.read(write(tmp_path / "a.mcap", ("/tf", kind, messages))) as opened, collected() as warnings:
-            poses = frames.poses_at(opened, "/boxes", "a", "b", at(0.45), at(0.55))
+            poses = fixed_frame.poses_at(opened, "/boxes", "a", "b", at(0.45), at(0.55))
         assert poses.translation[0, 0] == pytest.approx(5.5)
         assert [one.code for one in warnings] == ["clock"]
 
     def test_a_log_without(self, tmp_path):
         kind, _ = MESSAGES["FrameTransform"]
         with log.read(write(tmp_path / "a.mcap", ("/tf", kind, []))) as opened:
-            assert frames.transforms_of(opened) is None
+            assert fixed_frame.transforms_of(opened) is None
 
 
 def data(*words: object) -> list[dict]:

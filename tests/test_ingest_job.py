@@ -11,8 +11,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.sources.ingest.job import IngestJob, IngestOptions
-from mcaptrack.sources.ingest.labels.camera import boxes_extent
 from mcaptrack.sources.ingest.labels.content import WantedClasses
+from mcaptrack.sources.ingest.labels.timeline import boxes_extent
 from tests.logs import add_rows
 from tests.worlds import boxes_at, tracks_at
 
@@ -55,7 +55,7 @@ def test_what_is_assumed_and_left_out_is_said(place):
 
 def test_parameters_of_labels(place):
     one = job(labels={"truth": "gt.txt"})
-    labels = one.labels["truth"][1]
+    labels = one.labels["truth"]
     assert one.label_parameters("truth", labels) == {}
     other = job(labels={"truth": "gt.txt"}, first_frame=1, classes=WantedClasses("all"), size=(640, 480))
     assert other.label_parameters("truth", labels) == {"first_frame": 1, "classes": "all"}
@@ -64,7 +64,7 @@ def test_parameters_of_labels(place):
     table = job(
         labels={"tracks": "a.csv"}, size=(640, 480), columns={"x": "x", "y": "y"}, classes=WantedClasses("person")
     )
-    found = table.label_parameters("tracks", table.labels["tracks"][1])
+    found = table.label_parameters("tracks", table.labels["tracks"])
     assert (found["columns"], found.get("size", "640x480")) == ("x=x,y=y", "640x480")
     assert "classes" not in found
 
@@ -75,10 +75,10 @@ def test_boxes_in_shares_of_the_picture_need_its_size(place):
         Path(f"yolo/{n:06}.txt").write_text("0 0.5 0.5 0.25 0.5 0.9\n")
     made = job(labels={"detections": "yolo"}, size=(640, 480))
     made.fit_to_pictures(lambda: (640, 480))
-    assert made.labels["detections"][1].boxes_px[0].tolist() == [240, 120, 160, 240]
+    assert made.labels["detections"].boxes_px[0].tolist() == [240, 120, 160, 240]
     again = job(labels={"detections": "yolo"}, size=(100, 200))
     again.fit_to_pictures(None)
-    assert again.labels["detections"][1].boxes_px[0].tolist() == [37.5, 50, 25, 100]
+    assert again.labels["detections"].boxes_px[0].tolist() == [37.5, 50, 25, 100]
     with pytest.raises(McaptrackError, match=r"a.mp4: the pictures are 640x480, not 100x200; leave `size=` out"):
         job(labels={"detections": "yolo"}, size=(100, 200)).fit_to_pictures(lambda: (640, 480))
     with pytest.raises(McaptrackError, match=r"has boxes in shares of the picture's size; give it with `size="):

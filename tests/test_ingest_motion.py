@@ -13,7 +13,7 @@ from mcaptrack.geometry.camera_path import Verdict
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.camera_motion import frames_to_path
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.sources.ingest.labels.number_table import motion_frames, read_motions
+from mcaptrack.sources.ingest.job import motion_frames, read_motions
 from tests.commands import call, done
 from tests.logs import add_rows
 from tests.worlds import boxes_at, ns, write_clip

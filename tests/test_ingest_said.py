@@ -20,16 +20,12 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
 from mcaptrack.schema.provenance import CLOCK, Provenance
-from mcaptrack.sources.ingest import IngestOptions, IngestReport, ingest
+from mcaptrack.sources.ingest import IngestOptions, IngestReport, RecordingJob, ingest
 from mcaptrack.sources.ingest.bags import decompression, plain_yaml
 from mcaptrack.sources.ingest.bags.metadata_yaml import read_metadata
 from mcaptrack.sources.ingest.bags.plain_yaml import UnsupportedYamlError
-from mcaptrack.sources.ingest.labels.camera import (
-    CameraTopics,
-    camera_prefix,
-    choose_camera,
-)
-from mcaptrack.sources.ingest.recording_job import RecordingJob
+from mcaptrack.sources.ingest.job import FOR_VIDEOS
+from mcaptrack.sources.ingest.labels.timeline import CameraTopics, camera_prefix, choose_camera
 from tests.bags import ROS1, STRING1, T0, bag1
 from tests.worlds import ns
 
@@ -149,8 +145,8 @@ def test_options_of_videos_and_roles_are_refused_by_name(tmp_path):
         with pytest.raises(McaptrackError) as error:
             made(labels, fps=Fraction(1), **{name: value})
         assert str(error.value) == f"{labels} is a label file; `{name}=` is for videos"
-        assert IngestOptions(**dict([*given.items()][at:])).for_videos() == f"`{name}=`"
-    assert IngestOptions(fps=Fraction(1)).for_videos() == ""
+        assert IngestOptions(**dict([*given.items()][at:])).given(*FOR_VIDEOS) == f"`{name}=`"
+    assert IngestOptions(fps=Fraction(1)).given(*FOR_VIDEOS) == ""
     other = write(tmp_path / "b.txt", "1,1,1,1,2,2\n")
     with pytest.raises(McaptrackError) as error:
         made(labels, fps=Fraction(1), labels={"tracks": other})

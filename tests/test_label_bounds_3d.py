@@ -16,9 +16,8 @@ from scipy.spatial.transform import Rotation
 from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest import IngestOptions, ingest
-from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d, read_boxes_3d
-from mcaptrack.sources.ingest.labels.boxes_3d.rows import BoxRows3D, TimedLabels, headings, numbered
-from mcaptrack.sources.ingest.labels.content import WantedClasses
+from mcaptrack.sources.ingest.labels.content import BoxRows3D, WantedClasses, headings, numbered
+from mcaptrack.sources.ingest.labels.reading import is_3d, read_boxes_3d
 
 USUAL = {
     "t_ns": "1000",
@@ -47,9 +46,8 @@ def usual(**changes: object) -> dict[str, object]:
     return {key: value for key, value in (USUAL | changes).items() if value is not None}
 
 
-def timed(rows: BoxRows3D, role: str = "truth", classes: str | None = None) -> TimedLabels:
-    labelled = rows.labelled if rows.labelled is not None else np.unique(rows.number)
-    return rows.timed(rows.number, labelled, role, WantedClasses(classes) if classes else None)
+def timed(rows: BoxRows3D, role: str = "truth", classes: str | None = None) -> BoxRows3D:
+    return rows.settled(rows.frame, rows.labelled, role, WantedClasses(classes) if classes else None)
 
 
 def framed(**changes: object) -> dict[str, object]:
@@ -73,7 +71,12 @@ BOUNDS = [
     ("score", ("1e9", "-1e9", ""), ("1.1e9", "-1.1e9"), "a score can't be 1.1e+09"),
     ("t_ns", ("0", str(2**63 - 1)), ("-1", str(2**63)), "-1 in the column of times is not from 1970 to 2262"),
     ("t_ns", ("999.4",), ("", "noon", "inf"), "'' in the column of times is no number"),
-    ("frame", ("0", str(2**31 - 1)), (str(2**31), "-1", "0.5", ""), "a frame can be 0 to 2147483647, not 2147483648"),
+    (
+        "frame",
+        ("0", str(2**31 - 1)),
+        (str(2**31), "-1", "0.5", ""),
+        "has to be a whole number from 0 to 2147483647, not 2.14748e+09",
+    ),
 ]
 TRIED = [(column, value, "") for column, taken, _, _ in BOUNDS for value in taken] + [
     (column, value, words if value == refused[0] else ":3: ")
@@ -97,7 +100,7 @@ def test_a_number_is_taken_up_to_its_bound_and_no_further(column, value, words, 
     if column == "score":
         np.testing.assert_equal(rows.score, [0.5, float(value or "nan"), 0.5])
     elif column in ("t_ns", "frame"):
-        assert rows.number[1] == int(value.partition(".")[0])
+        assert rows.frame[1] == int(value.partition(".")[0])
     else:
         found = rows.boxes[1, ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "heading_rad").index(column)]
         assert found == pytest.approx(
@@ -133,7 +136,7 @@ def test_rows_without_sizes_or_heights_are_boxes_too(tmp_path):
     found = read_boxes_3d(table(tmp_path, *rows), "truth")
     assert found.boxes[:, :2].tolist() == [[0, 0], [1, -1], [2, -2]]
     assert np.isnan(found.boxes[:, 2:]).all()
-    assert found.t_ns.tolist() == [0, 250_000_000, 500_000_000]
+    assert found.frame.tolist() == [0, 250_000_000, 500_000_000]
     assert not found.doubts
 
 
@@ -178,11 +181,11 @@ def test_each_id_is_there_once_in_a_frame(rows, words, tmp_path):
         read_boxes_3d(path, "truth")
     assert str(refused.value) == f"{path.parent}/{words}"
     found = read_boxes_3d(path, "detections")
-    assert timed(found, "detections").track_id.tolist() == [-1] * len(rows)
+    assert timed(found, "detections").id.tolist() == [-1] * len(rows)
 
 
 def test_every_id_may_be_there_once_in_a_single_frame(tmp_path):
-    assert read_boxes_3d(table(tmp_path, usual(id=4), usual(id=9)), "truth").track_id.tolist() == [4, 9]
+    assert read_boxes_3d(table(tmp_path, usual(id=4), usual(id=9)), "truth").id.tolist() == [4, 9]
 
 
 # Doubts about the axes
@@ -388,7 +391,7 @@ def test_of_columns_that_say_the_same_one_is_read(header, used, unused, tmp_path
 def test_a_column_that_is_named_is_read_although_others_say_the_same(tmp_path):
     row = {"t": 5, "frame": 9, "id": 1, "x_m": 2, "y_m": 3, "heading_rad": 0.5, "heading_deg": 90}
     rows = read_boxes_3d(table(tmp_path, row), "truth", columns={"frame": "frame", "heading_deg": "heading_deg"})
-    assert rows.t_ns is None
+    assert not rows.is_timed
     assert rows.frame.tolist() == [9]
     assert rows.boxes[0, 6] == pytest.approx(math.pi / 2)
     with pytest.raises(McaptrackError, match=r"a\.csv:1: 2 columns are named t, as `columns=` says for x_m"):
@@ -430,7 +433,7 @@ def test_times_are_exact_in_every_unit(tmp_path):
         ("t_ns", "1000000001.9"),
     ):
         row = {name: text, "id": 1, "x_m": 0, "y_m": 0}
-        assert read_boxes_3d(table(tmp_path, row), "truth").t_ns.tolist() == [1_000_000_002], name
+        assert read_boxes_3d(table(tmp_path, row), "truth").frame.tolist() == [1_000_000_002], name
 
 
 # KITTI
@@ -453,7 +456,7 @@ def test_a_line_of_kitti_by_hand(tmp_path):
         rows.boxes, [[9, -3, -0.5, 4, 2, 1.5, -0.5 - half], [9, 3, -0.1, 0.6, 0.5, 1.8, 0.5 - half]], atol=1e-12
     )
     np.testing.assert_equal(rows.score, [np.nan, 0.75])
-    assert (rows.frame.tolist(), rows.track_id.tolist(), rows.labelled.tolist()) == ([3, 1], [7, 2], [1, 3])
+    assert (rows.frame.tolist(), rows.id.tolist(), rows.labelled.tolist()) == ([3, 1], [7, 2], [1, 3])
 
 
 @pytest.mark.parametrize(
@@ -461,8 +464,8 @@ def test_a_line_of_kitti_by_hand(tmp_path):
     [
         (" ".join(CAR.split()[:16]), "0001.txt:2: not KITTI tracking (frame id type "),
         (f"{CAR} 1 2", "score), 19 columns: 3 7 Car"),
-        (CAR.replace("3 7", "-1 7"), "0001.txt:2: the frame (a count of pictures, no time) has to be a whole number from 0 on"),
-        (CAR.replace("3 7", "3 -2"), "0001.txt:2: the id has to be a whole number from -1 on, not -2"),
+        (CAR.replace("3 7", "-1 7"), "0001.txt:2: the frame (a count of pictures, no time) has to be a whole number from 0 to"),
+        (CAR.replace("3 7", "3 -2"), "0001.txt:2: the id has to be a whole number from -1 to 9007199254740991, not -2"),
         (CAR.replace("1.25 9", "nan 9"), "0001.txt:2: a number of the box is missing or not finite"),
     ],
 )  # fmt: skip
@@ -591,7 +594,7 @@ def poses(folder: Path, t_ns: list[int], quaternions: list[np.ndarray], x_m: lis
 def test_boxes_of_argoverse_by_hand(tmp_path):
     rows = read_boxes_3d(argoverse(tmp_path), "truth")
     np.testing.assert_allclose(rows.boxes[1], [2, 2, 2, 1, 1, 1, math.pi / 2])
-    assert (rows.t_ns.tolist(), rows.track_id.tolist(), rows.labelled.tolist()) == ([5, 5, 9], [1, 2, 1], [5, 9])
+    assert (rows.frame.tolist(), rows.id.tolist(), rows.labelled.tolist()) == ([5, 5, 9], [1, 2, 1], [5, 9])
     assert timed(rows).classes == {1: "PEDESTRIAN", 2: "BUS"}
     # A pose of another length is the same rotation; of two poses at one time the first is taken.
     poses(tmp_path, [5, 9, 5], [turned(z=90) * 2, turned(), turned(z=10)], [100.0, 0.0, 7.0])

@@ -24,12 +24,11 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest import IngestOptions, ingest, label_frames
-from mcaptrack.sources.ingest.labels.box_rows import OTHERS
-from mcaptrack.sources.ingest.labels.camera import timeline_of
-from mcaptrack.sources.ingest.labels.content import FORMATS_3D, Format
+from mcaptrack.sources.ingest.labels.content import FORMATS_3D, OTHERS, Format
 from mcaptrack.sources.ingest.labels.formats import READERS
+from mcaptrack.sources.ingest.labels.timeline import timeline_of
 from mcaptrack.sources.video import H264Encoder
-from mcaptrack.sources.video.h264 import inspect
+from mcaptrack.sources.video.codecs import CODECS
 from mcaptrack.tables.compared import compare_files, detections_and_ground_truth
 from tests.bags import camera_bag
 from tests.robots import FPS, PICTURES, ROBOT_NS, lines, robot_log
@@ -358,7 +357,7 @@ def test_parameter_sets_that_stand_alone_in_a_message_are_no_pictures(tmp_path):
         channel = writer.register_channel("/front/h264", "protobuf", writer.register_schema(name, encoding, data))
         for k in range(6):
             unit = encoder.encode(np.full((48, 64, 3), 20 * k, np.uint8))
-            alone = b"".join(b"\0\0\0\1" + nal for nal in inspect(unit).sets)
+            alone = b"".join(b"\0\0\0\1" + nal for nal in CODECS["h264"].inspect(unit).sets)
             parts = [alone, unit] if k in (0, 3) else [unit]
             assert (k == 0) == bool(alone)
             for number, part in enumerate(parts):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import FPS_RANGE
-from mcaptrack.sources.ingest.labels import formats, number_table
+from mcaptrack.sources.ingest.labels import content, formats
 from mcaptrack.sources.ingest.labels.content import Labels, WantedClasses
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline, count_frames
@@ -212,7 +212,7 @@ def test_a_line_of_4096_characters_is_read_and_ids_may_repeat_in_detections(tmp_
 
 
 def test_a_table_is_no_longer_than_its_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(number_table, "_MAX_ROWS", 2)
+    monkeypatch.setattr(content, "_MAX_ROWS", 2)
     path = written(tmp_path / "a.txt", "1 1 1 1\n2 1 1 1\n")
     assert len(read_labels(path).frame) == 2
     with pytest.raises(McaptrackError, match="has more than 2 rows; give it in parts"):
@@ -313,7 +313,7 @@ def test_labels_are_put_to_the_pictures_with_their_number(index, frames, first, 
     path, labels = labels_of(frames, tmp_path, first)
     lost: list[str] = []
     with notices.listening(lambda _: None), notices.collected() as warned:
-        placed = timeline(index, **more).place(path, labels, lost)
+        placed = timeline(index, **more).place(labels, lost)
     assert list(zip(placed.index.tolist(), placed.number.tolist(), strict=True)) == wanted
     assert placed.t_ns.tolist() == [10 * at for at, _ in wanted]
     assert lost == [f"{path}: {words}" for words in said]
@@ -323,9 +323,9 @@ def test_labels_are_put_to_the_pictures_with_their_number(index, frames, first, 
 
 
 def test_one_label_of_the_first_picture_counts_in_no_way(tmp_path):
-    path, labels = labels_of([1], tmp_path)
+    _, labels = labels_of([1], tmp_path)
     with notices.listening(lambda _: None), notices.collected() as warned:
-        placed = timeline([0, 1], every=3).place(path, labels, [])
+        placed = timeline([0, 1], every=3).place(labels, [])
     assert (placed.number.tolist(), warned) == ([1, 4], [])
 
 
@@ -346,7 +346,7 @@ NOT_PLACED: dict[str, tuple[list[int], int | None, dict[str, Any], str]] = {
 def test_labels_without_a_picture_say_what_to_do(frames, first, more, words, tmp_path):
     path, labels = labels_of(frames, tmp_path, first)
     with pytest.raises(McaptrackError) as error:
-        timeline([0, 1, 2], **more).place(path, labels, [])
+        timeline([0, 1, 2], **more).place(labels, [])
     assert str(error.value) == f"{path}: {words}"
 
 
@@ -391,19 +391,19 @@ def test_a_file_without_pictures_counts_no_more_empty_frames_than_are_likely(tmp
     for last, ok in ((100_000, True), (100_001, False)):
         path, labels = labels_of([1, 2, last], tmp_path)
         if ok:
-            assert count_frames(path, labels) == last
+            assert count_frames(labels) == last
             continue
         with pytest.raises(McaptrackError) as error:
-            count_frames(path, labels)
+            count_frames(labels)
         assert str(error.value) == (
             f"{path}: frame {last} would be the last of {last} frames, of which 3 are labelled; `frames={last}` takes "
             "it so, or give the number of the first picture with `first_frame=1`"
         )
     path, labels = labels_of([5, 6, 20_000_000], tmp_path, first=3)
     with pytest.raises(McaptrackError, match=r"of 19999998 frames, .*; at most 10000000 are read, or .*first_frame=5`"):
-        count_frames(path, labels)
+        count_frames(labels)
     sparse = [1 + 50 * n for n in range(30)] + [1 + 50 * 2990]
-    assert count_frames(*labels_of(sparse, tmp_path)) == 1 + 50 * 2990  # 31 labelled, a step of 50: up to 155 000
+    assert count_frames(labels_of(sparse, tmp_path)[1]) == 1 + 50 * 2990  # 31 labelled, a step of 50: up to 155 000
     sparse[-1] = 1 + 50 * 3100
     with pytest.raises(McaptrackError):
-        count_frames(*labels_of(sparse, tmp_path))
+        count_frames(labels_of(sparse, tmp_path)[1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -11,10 +12,11 @@ from hypothesis import strategies as st
 
 import mcaptrack
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.ingest.labels import long_files
+from mcaptrack.sources.ingest.labels import reading
 from mcaptrack.sources.ingest.labels.content import Labels
-from mcaptrack.sources.ingest.labels.long_files import LongLabels, read_labels_of_any_length
-from mcaptrack.sources.ingest.labels.reading import read_labels
+from mcaptrack.sources.ingest.labels.reading import LongLabels, read_labels
+
+read_labels_of_any_length = partial(read_labels, in_parts=True)
 
 
 @pytest.fixture
@@ -22,8 +24,8 @@ def in_parts(monkeypatch):
     """Read every file in parts of so many rows."""
 
     def set_rows(rows: int) -> None:
-        monkeypatch.setattr(long_files, "_LONG_BYTES", 0)
-        monkeypatch.setattr(long_files, "_PART_ROWS", rows)
+        monkeypatch.setattr(reading, "_LONG_BYTES", 0)
+        monkeypatch.setattr(reading, "_PART_ROWS", rows)
 
     return set_rows
 
@@ -69,8 +71,8 @@ def test_parts_together_are_the_whole_file(tmp_path_factory, frames, rows, name,
     role = "tracks" if with_ids == "all" or name == "trajnet" else "detections"
     whole = read_labels(path, role=role, first_frame=first_frame)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(long_files, "_LONG_BYTES", 0)
-        patch.setattr(long_files, "_PART_ROWS", rows)
+        patch.setattr(reading, "_LONG_BYTES", 0)
+        patch.setattr(reading, "_PART_ROWS", rows)
         long = read_labels_of_any_length(path, role=role, first_frame=first_frame)
     assert isinstance(long, LongLabels)
     parts = [part() for part in long.parts]
@@ -95,14 +97,14 @@ def test_parts_together_are_the_whole_file(tmp_path_factory, frames, rows, name,
 
 def test_short_files_are_in_memory(tmp_path):
     (tmp_path / "a.txt").write_text(lines([1, 2], [1, 1]))
-    assert isinstance(read_labels_of_any_length(tmp_path / "a.txt"), Labels)
+    assert type(read_labels_of_any_length(tmp_path / "a.txt")) is Labels
 
 
 def test_rows_that_are_not_in_the_order_of_frames_are_read_as_a_whole(tmp_path, in_parts):
     (tmp_path / "a.txt").write_text(lines([1, 2, 5, 6, 4, 7], [1] * 6))
     in_parts(2)
     labels = read_labels_of_any_length(tmp_path / "a.txt")
-    assert isinstance(labels, Labels)
+    assert type(labels) is Labels
     assert labels.frame.tolist() == [1, 2, 4, 5, 6, 7]
 
 
@@ -111,7 +113,7 @@ def test_rows_that_are_not_in_the_order_of_frames_are_read_as_a_whole(tmp_path, 
     [
         (lines([1, 2, 3, 3, 3], [1, 1, 5, 4, 5]), "id 5 appears twice in frame 3"),
         (lines([1, 2, 3], [1, 1, 1]) + "4,1,x,2,3,4\n", ":4: not MOTChallenge"),
-        (lines([1, 2, 3], [1, 1, 1]) + "4,1,1,2,inf,4\n", ":4: a number is not finite"),
+        (lines([1, 2, 3], [1, 1, 1]) + "4,1,1,2,inf,4\n", ":4: a number of the box is missing or not finite"),
     ],
 )
 def test_errors_name_the_line_of_the_file(tmp_path, in_parts, text, words):
@@ -126,5 +128,5 @@ def test_errors_name_the_line_of_the_file(tmp_path, in_parts, text, words):
 def test_what_depends_on_all_rows_is_read_as_a_whole(tmp_path, in_parts, role, classes):
     (tmp_path / "a.txt").write_text(lines([1, 2, 3], [1, 1, 1]))
     in_parts(1)
-    wanted = long_files.WantedClasses(classes)
-    assert isinstance(read_labels_of_any_length(tmp_path / "a.txt", role=role, wanted=wanted), Labels)
+    wanted = reading.WantedClasses(classes)
+    assert type(read_labels_of_any_length(tmp_path / "a.txt", role=role, wanted=wanted)) is Labels

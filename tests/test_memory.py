@@ -20,7 +20,7 @@ from mcaptrack.pipeline.plan import spaces_of_boxes
 from mcaptrack.pipeline.run import Stopwatch
 from mcaptrack.schema import TRACKS, Frame, frame_columns, framing
 from mcaptrack.schema.frame_columns import FrameColumns, collect
-from mcaptrack.sources.ingest.labels.camera import boxes_extent
+from mcaptrack.sources.ingest.labels.timeline import boxes_extent
 from mcaptrack.tables import build, rows
 from mcaptrack.transforms import PROFILES, Retrack
 from mcaptrack.transforms.retrack import identity_swaps, likelihood

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from mcaptrack.geometry.affine import IDENTITY
-from mcaptrack.geometry.camera_motion import CameraPose
-from mcaptrack.geometry.camera_path import Verdict
+from mcaptrack.geometry.camera_path import CameraPose, Verdict
 from mcaptrack.notices import collected
 from mcaptrack.pipeline.rebuild import differing
 from mcaptrack.schema import Frame

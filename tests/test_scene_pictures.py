@@ -19,8 +19,7 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
 from mcaptrack.pipeline.scene_views import PictureClock, SceneCamera, SceneOnPictures
 from mcaptrack.schema import DETECTIONS, SIGHTINGS, TRACKS, Frame
-from mcaptrack.sources.demo import PLACES, three_cameras
-from mcaptrack.sources.synthetic import Pedestrian, Pose, SyntheticScene
+from mcaptrack.sources.demo import PLACES, Pedestrian, Pose, SyntheticScene, three_cameras
 from mcaptrack.sources.video import write_mp4
 from mcaptrack.transforms.fuse import CameraView
 from tests.commands import done

@@ -172,7 +172,7 @@ READERS = (
     "cli/settings.py",
     "cli/plugins.py",
     "fleet/child.py",
-    "objects/stores.py",
+    "objects/__init__.py",
     "api/health.py",
 )
 

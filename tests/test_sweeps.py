@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mcaptrack.sources.foreign.boxes_3d.box import Box3d, Message3d
-from mcaptrack.sources.foreign.boxes_3d.recorded import Recorded3d, recorded
+from mcaptrack.sources.fixed_frame import Recorded3d, recorded
+from mcaptrack.sources.foreign.boxes import Box3d, Message3d
 
 START_NS, MS = 1_700_000_000_000_000_000, 1_000_000
 OBJECTS, SWEEPS, PERIOD_MS = 12, 20, 100

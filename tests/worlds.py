@@ -17,7 +17,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance, digest
-from mcaptrack.sources.synthetic import Block, Pedestrian, SyntheticScene
+from mcaptrack.sources.demo import Block, Pedestrian, SyntheticScene
 
 Positions = Mapping[int, tuple[float, float]]
 

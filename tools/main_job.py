@@ -23,7 +23,7 @@ import av
 import numpy as np
 
 import mcaptrack
-from mcaptrack.sources.synthetic import Pedestrian, SyntheticScene
+from mcaptrack.sources.demo import Pedestrian, SyntheticScene
 
 ROOT = Path(__file__).resolve().parent.parent
 FPS, SECONDS = 10, 12.0

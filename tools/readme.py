@@ -126,7 +126,7 @@ def run(words: list[object], work: Path, folder: Path, also_good: set[int] = fro
 @cache
 def shots():
     """A scene of three people who walk, picture by picture."""
-    from mcaptrack.sources.synthetic import Pedestrian, SyntheticScene
+    from mcaptrack.sources.demo import Pedestrian, SyntheticScene
 
     people = (
         Pedestrian(1, ((0.0, -6.0, 9.0), (SECONDS, 6.0, 11.0)), (30, 30, 30)),

@@ -12,12 +12,12 @@ from mcaptrack.api.common import as_location, warnings_about
 from mcaptrack.api.declared import declared
 from mcaptrack.api.options import EachLog
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.geometry.transform_series import TransformSeries
+from mcaptrack.geometry.transform_tree import TransformSeries
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice, warn
 from mcaptrack.schema.provenance import Provenance, frame_id_of
 from mcaptrack.sources.cameras import names_by_topic
-from mcaptrack.sources.frames import read_frames
+from mcaptrack.sources.fixed_frame import read_frames
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from mcaptrack.api.scoring import Scores, evaluate
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import Notice, collected
 from mcaptrack.sources import demo as drawing
-from mcaptrack.sources.demo import PLACES, SCENES
-from mcaptrack.sources.synthetic import SyntheticScene
+from mcaptrack.sources.demo import PLACES, SCENES, SyntheticScene
 from mcaptrack.tables.export import default_folder
 
 SceneName = Literal["square", "walkers", "crowd", "side-by-side", "standing", "three-cameras"]

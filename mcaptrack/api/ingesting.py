@@ -237,8 +237,8 @@ def ingest(
     from mcaptrack.sources.ingest import IngestOptions
     from mcaptrack.sources.ingest import ingest as make_log
     from mcaptrack.sources.ingest.bags.metadata_yaml import update_metadata
-    from mcaptrack.sources.ingest.labels.columns import check_keys, parse_columns
     from mcaptrack.sources.ingest.labels.content import WantedClasses
+    from mcaptrack.sources.ingest.labels.delimited import check_keys, parse_columns
     from mcaptrack.sources.ingest.sidecar import SidecarChoice
 
     if into is not None and output is not None:

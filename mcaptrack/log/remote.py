@@ -20,8 +20,7 @@ from mcaptrack.location import Url
 from mcaptrack.log.byte_source import GAP_BYTES, MIN_AHEAD, Signature
 from mcaptrack.log.recording_files import RESULTS_SUFFIX
 from mcaptrack.log.records import Damaged
-from mcaptrack.objects import AbsentError, Version
-from mcaptrack.objects.stores import replaced
+from mcaptrack.objects import AbsentError, Version, replaced
 
 #: The bytes at the end of an object that are read when it is opened. The index of most logs fits in.
 _END_BYTES: Final = 128 * 2**10

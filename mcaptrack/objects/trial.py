@@ -12,8 +12,17 @@ from uuid import uuid4
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import SCHEMES, Url, hide_secrets, parse
-from mcaptrack.objects import Version, delete, find, library, list_objects, put_if_unchanged, read_end, read_ranges
-from mcaptrack.objects.stores import described
+from mcaptrack.objects import (
+    Version,
+    delete,
+    described,
+    find,
+    library,
+    list_objects,
+    put_if_unchanged,
+    read_end,
+    read_ranges,
+)
 
 #: The operations, and the consequence of one that fails.
 _TRIED: Final = {

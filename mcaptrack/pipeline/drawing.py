@@ -25,9 +25,9 @@ from mcaptrack.schema.provenance import VIEW, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.calibrations import holds_calibrations, moving_camera
 from mcaptrack.sources.cameras import camera_at, chain_of, scenes_of
+from mcaptrack.sources.fixed_frame import transforms_of
 from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name
 from mcaptrack.sources.foreign.flatten import message_decoder, message_type_of
-from mcaptrack.sources.frames import transforms_of
 from mcaptrack.transforms import FULL, STAGES
 
 #: Endings of channels without a view: another channel shows the same tracks at more times.

@@ -173,7 +173,7 @@ def pictures_of(
                 total.update(message.t_ns.to_bytes(8, "little") + message.payload)
                 stamps.append(picture.stamp_ns)
             where = f"{opened.path}: {channel.topic} at {message.t_ns} ns: frame {index}"
-            yield EncodedPicture(message.t_ns, index, picture.format, picture.data, picture.layout, where)
+            yield picture.encoded(message.t_ns, index, where)
 
     stamps.clear()
     max_bytes = MAX_BYTES if traits_of(job.transform).passes > 1 else 0

@@ -32,7 +32,6 @@ from mcaptrack.pipeline.planes import (
     Channels,
     PlaneChoice,
     is_poor,
-    picture_size,
     plane_in_words,
     planes_for,
     read_planes,
@@ -53,6 +52,7 @@ from mcaptrack.schema.provenance import CLOCK, FUSE, VIEW, Provenance
 from mcaptrack.sources.camera_motion import tracks_topic
 from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead
+from mcaptrack.sources.pictures import picture_size
 from mcaptrack.transforms import FULL, STAGES, Sample, Transform
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.motion_limits import ClassNames, unknown_limits

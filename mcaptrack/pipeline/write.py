@@ -54,7 +54,7 @@ from mcaptrack.schema.framing import has_any, join_frames, joined_parts, thinned
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, digest, frame_id_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import Camera, camera_at
-from mcaptrack.sources.frames import transforms_of
+from mcaptrack.sources.fixed_frame import transforms_of
 from mcaptrack.sources.ingest.sidecar import check_topics, encoding_for
 
 #: Log time in ns, channel number, sequence number and payload of a message.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import takewhile
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -17,16 +16,14 @@ from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.pinhole import Lens, ground_homography
 from mcaptrack.geometry.plane import GroundPlane, Planes
-from mcaptrack.geometry.transform_series import OTHER_CLOCK_S
-from mcaptrack.geometry.transform_tree import Poses, TransformTree
+from mcaptrack.geometry.transform_tree import OTHER_CLOCK_S, Poses, TransformTree
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import INGEST
-from mcaptrack.sources.cameras import Camera, provenance_of
-from mcaptrack.sources.foreign import stamp_of
-from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name
+from mcaptrack.sources.cameras import Camera, provenance_of, shared_parts
+from mcaptrack.sources.fixed_frame import poses_at, transforms_of
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name, stamp_of
 from mcaptrack.sources.foreign.flatten import message_type_of
-from mcaptrack.sources.frames import poses_at, transforms_of
-from mcaptrack.sources.pictures import size_of_pictures
+from mcaptrack.sources.pictures import picture_size
 
 #: Schemas of calibrations, by their names in ROS 1 and Foxglove; ROS 2 adds "/msg/".
 CALIBRATIONS_READ: Final = ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration")
@@ -95,7 +92,7 @@ def find_calibration(opened: log.Log, source: str, frame_id: str) -> str:
     if not fitting:
         frames = ", ".join(f"{topic} (frame {named or 'without a name'})" for topic, named in sorted(frame_at.items()))
         raise McaptrackError(f"no calibration is of the frame {frame_id!r} of {source}; there is {frames or 'none'}")
-    alike = {topic: _shared_parts(topic, source) for topic in fitting}
+    alike = {topic: shared_parts(topic, source) for topic in fitting}
     nearest = sorted(topic for topic in fitting if alike[topic] == max(alike.values()))
     usable = [topic for topic in nearest if len(nearest) == 1 or _is_usable(opened, topic)]
     if len(usable) != 1:
@@ -134,7 +131,7 @@ def see_ground(opened: log.Log, camera: Camera, frame: str = "", ground_frame: s
         return None
     log_ns, stamp_ns, frame_id = _headers(opened, sources)
     topic = find_calibration(opened, sources[0], frame_id)
-    size = _picture_size(opened, camera.pictures)
+    size = picture_size(opened, camera.pictures)
     calibrations = read_calibrations(opened, topic, is_rectified_topic(sources[0]))
     fitted = [(since_ns, _fitted(calibration, size, topic)) for since_ns, calibration in calibrations]
     eye = fitted[0][1].frame_id or frame_id
@@ -164,7 +161,7 @@ def moving_camera(opened: log.Log, topic: str, frame: str) -> MovingCamera:
     log_ns, stamp_ns, frame_id = _headers(opened, [topic])
     source = find_calibration(opened, topic, frame_id)
     calibrations = read_calibrations(opened, source, is_rectified_topic(topic))
-    size = _picture_size(opened, topic)
+    size = picture_size(opened, topic)
     fitted = [(since_ns, _fitted(calibration, size, source)) for since_ns, calibration in calibrations]
     first = fitted[0][1]
     poses = poses_at(opened, topic, first.frame_id or frame_id, frame, stamp_ns, log_ns)
@@ -270,14 +267,6 @@ def _headers(opened: log.Log, topics: Sequence[str]) -> tuple[Ints, Ints, str]:
     return log_ns, stamp_ns, frame_id
 
 
-def _picture_size(opened: log.Log, topic: str | None) -> tuple[int, int] | None:
-    """Return width and height of the pictures of a channel; None if there are none that can be decoded."""
-    try:
-        return size_of_pictures(opened, topic) if topic else None
-    except McaptrackError:
-        return None
-
-
 def frame_of(opened: log.Log, topic: str) -> str:
     """Return the frame of the first message of a channel; "" if there is none, or it can't be read."""
     try:
@@ -285,12 +274,6 @@ def frame_of(opened: log.Log, topic: str) -> str:
         return next((str(decode(message.payload)) for message in opened.messages(topic)), "")
     except McaptrackError:
         return ""
-
-
-def _shared_parts(topic: str, other: str) -> int:
-    """Return the number of parts that the names of two topics begin with together."""
-    pairs = zip(topic.split("/"), other.split("/"), strict=False)
-    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
 def _is_usable(opened: log.Log, topic: str) -> bool:

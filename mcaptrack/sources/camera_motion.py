@@ -20,7 +20,7 @@ from mcaptrack.schema.framing import join_frames, split_rows
 from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.schema.provenance import Provenance, frame_id_of
 from mcaptrack.sources.cameras import camera_at, lineage, provenance_of
-from mcaptrack.sources.frames import poses_at
+from mcaptrack.sources.fixed_frame import poses_at
 from mcaptrack.transforms import STAGES
 from mcaptrack.transforms.sort.tracker import used_path
 

@@ -80,9 +80,13 @@ def find_camera(opened: log.Log, name: str | None = None, topic: str | None = No
             )
         return prefix
     if name:
-        _refuse_unknown(opened, name)
+        names = [prefix.strip("/") for camera in cameras(opened) for prefix in camera.names]
+        if names and name.strip("/") not in names:
+            raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(names))}")
         return camera_at(opened, "/" + name.strip("/")).prefix
-    shown = _with_pictures_first(opened, cameras(opened))
+    # Cameras that are only boxes in space are left out, unless all are.
+    others = [camera for camera in cameras(opened) if not camera.in_space or has_own_channels(opened, camera)]
+    shown = others or cameras(opened)
     # Recorded cameras without results count only if no camera has any.
     chosen = [camera for camera in shown if has_own_channels(opened, camera)]
     if not chosen:
@@ -92,13 +96,13 @@ def find_camera(opened: log.Log, name: str | None = None, topic: str | None = No
         return shown[0].prefix if len(shown) == 1 else f"/{DEFAULT_CAMERA}"
     if len(chosen) == 1:
         return chosen[0].prefix
-    names = ", ".join(camera.prefix for camera in chosen)
+    prefixes = ", ".join(camera.prefix for camera in chosen)
     scenes = list(scenes_of(opened))
     kind = "sensors" if any(camera.in_space and camera.prefix not in scenes for camera in chosen) else "cameras"
     usual = scenes if len(scenes) == 1 else [camera.prefix for camera in chosen if f"/{DEFAULT_CAMERA}" in camera.names]
     if not usual:
-        raise McaptrackError(f"{opened.path} has several {kind}, {names}; choose one with `camera=`")
-    warn(f"several {kind}, {names}: taking {usual[0]}; `camera=` chooses another", "chosen-camera")
+        raise McaptrackError(f"{opened.path} has several {kind}, {prefixes}; choose one with `camera=`")
+    warn(f"several {kind}, {prefixes}: taking {usual[0]}; `camera=` chooses another", "chosen-camera")
     return usual[0]
 
 
@@ -107,22 +111,10 @@ def camera_to_name(opened: log.Log, topic: str) -> str:
     return _prefix_of_topic(opened, topic)[1:] if len(cameras(opened)) > 1 else ""
 
 
-def _with_pictures_first(opened: log.Log, all_cameras: list[Camera]) -> list[Camera]:
-    """Leave out cameras that are only boxes in space, unless all are."""
-    return [camera for camera in all_cameras if not camera.in_space or has_own_channels(opened, camera)] or all_cameras
-
-
 def _refuse_several(opened: log.Log, topics: list[str]) -> None:
     """Raise McaptrackError if there are several channels of boxes in space."""
     if len(topics) > 1:
         raise McaptrackError(f"{opened.path} has boxes in space in {', '.join(topics)}; choose one with `topic=`")
-
-
-def _refuse_unknown(opened: log.Log, name: str) -> None:
-    """Raise McaptrackError if the log has cameras, but none of this name."""
-    names = [prefix.strip("/") for camera in cameras(opened) for prefix in camera.names]
-    if names and name.strip("/") not in names:
-        raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(names))}")
 
 
 def _prefix_of_topic(opened: log.Log, topic: str) -> str:
@@ -333,7 +325,11 @@ class _Channels:
 
     def _result_topics(self, names: list[str]) -> list[str]:
         """Return the topics below these names that stages made; the motion of a camera is part of its pictures."""
-        return [topic for name in names for topic in self._select([name], _is_result) if topic.startswith(name + "/")]
+
+        def is_result(channel: log.Channel) -> bool:
+            return is_made_by_stage(channel) and channel.schema_name != CAMERA_MOTION.name
+
+        return [topic for name in names for topic in self._select([name], is_result) if topic.startswith(name + "/")]
 
     def _label_topic(self, names: list[str], label: str) -> str | None:
         """Return the first topic below one of the names for a label, unless a stage made it; None if there is none."""
@@ -361,10 +357,6 @@ def _is_ours(channel: log.Channel, is_in_space: bool) -> bool:
     return is_recorded and bool(frame_id_of(channel.metadata)) == is_in_space
 
 
-def _is_result(channel: log.Channel) -> bool:
-    return is_made_by_stage(channel) and channel.schema_name != CAMERA_MOTION.name
-
-
 def _is_label(topic: str) -> bool:
     return topic.rpartition("/")[2] in (TRUTH, GROUND_PLANE)
 
@@ -375,11 +367,12 @@ def _only(topics: list[str]) -> str | None:
 
 def _nearest(name: str, others: set[str]) -> str | None:
     """Return the other name with the longest common part; None if there are several."""
-
-    def shared(other: str) -> int:
-        pairs = zip(name.split("/"), other.split("/"), strict=False)
-        return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
-
-    most = max(map(shared, others), default=0)
-    nearest = [other for other in others if shared(other) == most]
+    shared = {other: shared_parts(name, other) for other in others}
+    nearest = [other for other in others if shared[other] == max(shared.values())]
     return nearest[0] if len(nearest) == 1 else None
+
+
+def shared_parts(topic: str, other: str) -> int:
+    """Return the number of parts that the names of two topics begin with together."""
+    pairs = zip(topic.split("/"), other.split("/"), strict=False)
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))

@@ -8,29 +8,587 @@ Letters: N boxes.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Final
+from typing import Any, Final, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from mcaptrack import log
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.angles import headings
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.transform_tree import TransformTree, plain_frame, turned
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.oriented_boxes import COLUMNS
+from mcaptrack.geometry.transform_tree import (
+    OTHER_CLOCK_S,
+    Poses,
+    PoseSamples,
+    Recorded,
+    TransformTree,
+    plain_frame,
+    turned,
+)
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, SCORES_NEEDED, Frame, Rows
 from mcaptrack.schema.classes import UNKNOWN
-from mcaptrack.schema.provenance import frame_id_of, input_of
+from mcaptrack.schema.provenance import Provenance, frame_id_of, input_of
 from mcaptrack.sources import foreign
-from mcaptrack.sources.foreign.boxes_3d.recorded import Recorded3d, recorded
-from mcaptrack.sources.frames import poses_at, transforms_of, warn_of_remarks
+from mcaptrack.sources.foreign.boxes import Box3d, Classes, Message3d
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name, stamp_of
+from mcaptrack.sources.foreign.flatten import message_type_of
+
+# All 3D boxes of a channel as arrays, in the frames that they were recorded in.
+#
+# Letters: M messages, N boxes, F frames (times).
+
+
+#: Messages with stamps this close are one measurement, as where each box is a message.
+_SAME_NS: Final = 1_000_000
+#: Centres that are farther away are no positions.
+_FARTHEST_M: Final = 1e9
+_NUMBER: Final = re.compile(r"\d{1,18}", re.ASCII)
+
+
+# Find the sweeps of a sensor where a detector writes several messages for each, such as one for each object.
+#
+# These messages have nearly the same stamp, or were written in a burst. So the gaps between their times are of two
+# kinds: short ones within a sweep, long ones between two. An object is in a sweep once, so a box is nearer to a box
+# of the next sweep, the same object, than to the others of its own.
+#
+# Letters: T times, N boxes.
+
+
+#: The objects of a sweep are measured, and written, within this time.
+_LONGEST_NS: Final = NS_PER_S // 4
+#: Shorter gaps count as this.
+_SHORTEST_NS: Final = 1_000_000
+#: Gaps between sweeps are longer by this factor than those within.
+_MIN_RATIO: Final = 1.5
+#: The number of ways of dividing gaps that are tried, and that of sweeps by which a way is judged.
+_RECORDED_TRIED: Final = 5
+_JUDGED: Final = 300
+#: With fewer sweeps, gaps say nothing.
+_MIN_SWEEPS: Final = 3
+#: No object is faster, in m/s.
+_FASTEST: Final = 100.0
+
+
+def find_sweeps(t_ns: Ints, log_ns: Ints, place: Ints, centre_m: Floats, class_id: Ints) -> Ints | None:
+    """The sweep of each of T times, as numbers that rise with time; None if there is no sign of longer sweeps.
+
+    ``t_ns`` and ``log_ns`` (T,) are when boxes were measured and written, ``place`` (N,) is the time of each box by its
+    number. Centres (N, 3) are in the frame of the sensor.
+    """
+    for times in (t_ns, log_ns):
+        gaps = np.maximum(np.diff(np.sort(times)), _SHORTEST_NS)
+        for limit in _limits(gaps):
+            sweep = _chains(times, limit)
+            if _are_sweeps(sweep, t_ns, log_ns, place, centre_m, class_id):
+                return sweep
+    return None
+
+
+def are_mixed(t_ns: Ints, place: Ints, centre_m: Floats) -> bool:
+    """Whether most of T rising times have a single box, of another object than the box before it."""
+    counts = np.bincount(place, minlength=len(t_ns))
+    if len(t_ns) < 4 * _MIN_SWEEPS or not len(place) or (counts[counts > 0] == 1).mean() < 0.9:
+        return False
+    order = np.argsort(place, kind="stable")
+    way = np.linalg.norm(np.diff(np.nan_to_num(centre_m[order]), axis=0), axis=1)
+    passed_s = np.diff(t_ns[place[order]]) / NS_PER_S
+    return bool((way > 1.0 + _FASTEST * passed_s).mean() > 0.5)
+
+
+def _limits(gaps: Ints) -> list[int]:
+    """Lengths of gaps up to which times may belong together, the most distinct first."""
+    lengths = np.sort(gaps)
+    if len(lengths) < 2 * _MIN_SWEEPS:
+        return []
+    ratio = lengths[1:] / lengths[:-1]
+    ratio[-1] = 0  # one gap alone may be a pause
+    likely = np.argsort(-ratio, kind="stable")[:_RECORDED_TRIED]
+    return [int(lengths[place]) for place in likely.tolist() if ratio[place] >= _MIN_RATIO]
+
+
+def _chains(times: Ints, limit: int) -> Ints:
+    """The chain of each of T times: times that are at most ``limit`` apart are in one."""
+    order = np.argsort(times, kind="stable")
+    chain = np.empty(len(times), np.int64)
+    chain[order] = np.concatenate([[0], np.cumsum(np.maximum(np.diff(times[order]), _SHORTEST_NS) > limit)])
+    return chain
+
+
+def _are_sweeps(sweep: Ints, t_ns: Ints, log_ns: Ints, place: Ints, centre_m: Floats, class_id: Ints) -> bool:
+    """Whether groups of T times are sweeps: short, of several times mostly, and without an object twice."""
+    count = np.bincount(sweep)
+    with_boxes = np.bincount(sweep[np.unique(place)])
+    if len(count) < _MIN_SWEEPS or not (with_boxes > 1).sum() >= (with_boxes == 1).sum():
+        return False
+    for times in (t_ns, log_ns):
+        first, last = np.full(len(count), np.iinfo(np.int64).max), np.full(len(count), np.iinfo(np.int64).min)
+        np.minimum.at(first, sweep, times)
+        np.maximum.at(last, sweep, times)
+        if (last - first).max() > _LONGEST_NS:
+            return False
+    return _share_repeated(sweep[place], centre_m, class_id) < 0.5
+
+
+def _share_repeated(sweep: Ints, centre_m: Floats, class_id: Ints) -> float:
+    """The share of boxes (N,) that are nearer to another of their own sweep than to all of the next one."""
+    order = np.argsort(sweep, kind="stable")
+    numbers, begins = np.unique(sweep[order], return_index=True)
+    if len(numbers) < _MIN_SWEEPS:
+        return 1.0
+    parts = np.split(order, begins[1:])
+    judged = np.unique(np.linspace(0, len(numbers) - 2, min(len(numbers) - 1, _JUDGED)).astype(int))
+    compared = repeated = 0
+    for number in judged.tolist():
+        own = _nearest(parts[number], parts[number], centre_m, class_id)
+        later = _nearest(parts[number], parts[number + 1], centre_m, class_id)
+        compared += int(np.isfinite(later).sum())
+        repeated += int((own < later).sum() - (np.isfinite(own) & np.isinf(later)).sum())
+    return repeated / compared if compared else 1.0
+
+
+def _nearest(some: Ints, others: Ints, centre_m: Floats, class_id: Ints) -> Floats:
+    """The distance (S,) of boxes to the nearest other box of their class, except boxes at the same place."""
+    places = np.nan_to_num(centre_m)
+    away = np.linalg.norm(places[some][:, None] - places[others], axis=2)
+    is_other = (class_id[some][:, None] == class_id[others]) & (away > 0)
+    return np.asarray(np.where(is_other, away, np.inf).min(axis=1, initial=np.inf))
+
+
+@dataclass(frozen=True)
+class Recorded3d:
+    """The boxes of a channel.
+
+    Attributes
+    ----------
+    names : list of str
+        Names of frames; ``frame`` (N,) are indices of these.
+    message : (N,) of int64
+        Index of the message of each box.
+    stamp_ns, log_ns : (N,) of int64
+        Stamp of each box, 0 where it has none; and log time.
+    centre, orientation, size, velocity : (N, 3), (N, 4), (N, 3) and (N, 3)
+        In the frame of each box; sizes, velocities and z of centres are NaN where they are unknown.
+    has_heading : (N,) of bool
+        Whether the orientation is known.
+    score : (N,)
+        NaN where there is none.
+    class_id, source_id : (N,) of int64
+        Ids of classes as ``classes.class_id`` gives them; ids of the detector, -1 where there is none.
+    message_ns, message_stamp_ns : (M,) of int64
+        Log time and stamp of each message.
+    is_measured : (M,) of bool
+        False for messages that only take drawings away.
+    remarks : dict of str to int
+        What is odd, in words, and how often.
+    """
+
+    names: list[str]
+    frame: Ints
+    message: Ints
+    stamp_ns: Ints
+    log_ns: Ints
+    centre: Floats
+    orientation: Floats
+    size: Floats
+    velocity: Floats
+    has_heading: Bools
+    score: Floats
+    class_id: Ints
+    source_id: Ints
+    classes: Classes
+    message_ns: Ints
+    message_stamp_ns: Ints
+    is_measured: Bools
+    remarks: dict[str, int]
+
+    def select(self, kept: Bools) -> Recorded3d:
+        """The boxes of a mask (N,); messages stay."""
+        names = ("frame", "message", "stamp_ns", "log_ns", "centre", "orientation", "size", "velocity", "has_heading")
+        return replace(self, **{name: getattr(self, name)[kept] for name in (*names, "score", "class_id", "source_id")})
+
+    def times(self) -> tuple[Ints, int]:
+        """When each box was measured (N,), in ns: its stamp, or the log time; and the number of log times."""
+        is_off = _is_off(self.stamp_ns, self.log_ns)
+        return np.where(is_off, self.log_ns, self.stamp_ns), int(is_off.sum())
+
+    def in_usual_frame(self) -> tuple[Recorded3d, int]:
+        """Put boxes without a frame into the frame that most boxes name; also returns their number."""
+        counts = np.bincount(self.frame, minlength=len(self.names))
+        unnamed = [number for number, name in enumerate(self.names) if not name]
+        counts[unnamed] = 0
+        if not unnamed or not counts.any():
+            return self, 0
+        is_unnamed = np.isin(self.frame, unnamed)
+        return replace(self, frame=np.where(is_unnamed, counts.argmax(), self.frame)), int(is_unnamed.sum())
+
+    def is_repeated(self, frame: Ints) -> Bools:
+        """Mark boxes (N,) that repeat an earlier box of their frame (N,), as in messages recorded twice."""
+        out = np.zeros(len(frame), bool)
+        many = max(len(self.message_ns), 1)
+        several = np.bincount(np.unique(frame * many + self.message) // many) > 1  # frames of several messages
+        some = np.flatnonzero(several[frame]) if several.any() else np.empty(0, np.intp)
+        states = (frame[:, None], self.frame[:, None], self.class_id[:, None], self.score[:, None])
+        state = np.concatenate([*states, self.centre, self.size, self.orientation], axis=1)[some]
+        order = np.lexsort(state.T)
+        before, after = state[order[:-1]], state[order[1:]]
+        out[some[order[1:]]] = ((before == after) | (np.isnan(before) & np.isnan(after))).all(axis=1)
+        return out
+
+    def of_several_messages(self, frame: Ints) -> int:
+        """Count frames with boxes of several messages, if most have one; ``frame`` (N,) is by box.
+
+        0 where each message has one box: then they are parts of a frame.
+        """
+        many = max(len(self.message_ns), 1)
+        if np.bincount(self.message, minlength=1).max() < 2:
+            return 0
+        counts = np.unique(np.unique(frame * many + self.message) // many, return_counts=True)[1]
+        return int((counts > 1).sum()) if np.median(counts) < 2 else 0
+
+    def frames(self) -> tuple[Ints, Ints, str]:
+        """The times of F frames in ns (F,), increasing, the frame of each box (N,), and what was assumed, in words.
+
+        A message is a frame, unless the stamps of its boxes are far apart; so are messages with one stamp, and those of
+        one sweep. Messages without boxes are frames, too. One that only takes drawings away is none next to a frame
+        with boxes: then it makes room for these.
+        """
+        box_ns, _ = self.times()
+        count = len(self.message_ns)
+        is_off = _is_off(self.message_stamp_ns, self.message_ns)
+        # A message without boxes may have no stamp: it is as late as the others.
+        late = self.message_ns[~is_off] - self.message_stamp_ns[~is_off]
+        own_ns = self.message_ns - np.int64(np.median(late) if len(late) else 0)
+        own_ns = np.where(is_off, own_ns, self.message_stamp_ns)
+        middle, apart = own_ns.copy(), np.zeros(count, np.int64)
+        for number, some in _groups(self.message, box_ns):
+            middle[number], apart[number] = np.sort(some)[(len(some) - 1) // 2], some.max() - some.min()
+        has_boxes = np.bincount(self.message, minlength=count).astype(bool)
+        usual = _usual_step(middle[has_boxes])
+        at = np.where((apart <= usual / 2)[self.message], middle[self.message], box_ns)
+        empty = middle[~has_boxes & self.is_measured]
+        starts = _starts(np.concatenate([at, empty]))
+        gone = middle[~has_boxes & ~self.is_measured]
+        if len(starts) and len(gone):
+            near = np.searchsorted(starts, gone)
+            away = [np.abs(starts[np.clip(near + side, 0, len(starts) - 1)] - gone) for side in (-1, 0)]
+            gone = gone[np.minimum(*away) > usual / 2]
+        starts = _starts(np.concatenate([starts, gone]))
+        return self._gathered(starts, np.searchsorted(starts, at, "right") - 1, box_ns)
+
+    def _gathered(self, starts: Ints, frame: Ints, box_ns: Ints) -> tuple[Ints, Ints, str]:
+        """Frames (F,) as ``frames`` returns them, those of one sweep of the sensor as one."""
+        # Messages without boxes may have no stamp: they were written as late as others.
+        log_ns = starts + np.int64(np.median(self.log_ns - box_ns) if len(box_ns) else 0)
+        log_ns[frame[::-1]] = self.log_ns[::-1]
+        sweep = find_sweeps(starts, log_ns, frame, self.centre, self.class_id)
+        if sweep is None:
+            text = "messages have one box each, and their times don't show which are of one sweep: each is a frame"
+            return starts, frame, text if are_mixed(starts, frame, self.centre) else ""
+        t_ns = starts[np.unique(sweep, return_index=True)[1]]
+        for number, some in _groups(sweep[frame], box_ns):
+            t_ns[number] = np.sort(some)[(len(some) - 1) // 2]
+        order = np.argsort(t_ns, kind="stable")
+        place = np.empty(len(order), np.int64)
+        place[order] = np.arange(len(order))
+        apart_ms = max(int(np.ptp(some)) for _, some in _groups(sweep[frame], box_ns)) / 1e6
+        text = f"messages are gathered to {len(order):,} frames, one for each sweep"
+        return t_ns[order], place[sweep][frame], f"{text}: times up to {apart_ms:.0f} ms apart, then longer gaps"
+
+
+def _is_off(stamp_ns: Ints, log_ns: Ints) -> Bools:
+    """Whether stamps are of another clock than the log time, or missing."""
+    # In floating-point numbers, since stamps may be anywhere.
+    away = np.abs(stamp_ns.astype(np.float64) - log_ns)
+    return np.asarray((stamp_ns <= 0) | (away > OTHER_CLOCK_S * NS_PER_S))
+
+
+def _groups(group: Ints, values: Ints) -> Iterable[tuple[int, Ints]]:
+    """Each group (message or sweep) that has boxes, with the values (N,) of its boxes."""
+    order = np.argsort(group, kind="stable")
+    numbers, begins = np.unique(group[order], return_index=True)
+    return zip(numbers.tolist(), np.split(values[order], begins[1:]), strict=False) if len(numbers) else ()
+
+
+def _usual_step(t_ns: Ints) -> float:
+    steps = np.diff(np.unique(t_ns))
+    steps = steps[steps > _SAME_NS]
+    return float(np.median(steps)) if len(steps) else 0.0
+
+
+def _starts(t_ns: Ints) -> Ints:
+    """The first times of groups, each within ``_SAME_NS``."""
+    out: list[int] = []
+    for time_ns in np.unique(t_ns).tolist():
+        if not out or time_ns - out[-1] > _SAME_NS:
+            out.append(time_ns)
+    return np.array(out, np.int64)
+
+
+def recorded(messages: Iterable[tuple[int, Message3d]]) -> Recorded3d:
+    """The boxes of messages, each with its log time in ns, as arrays.
+
+    Boxes without a position are left out; sizes that can't be are unknown. ``remarks`` counts both.
+    """
+    boxes: list[Box3d] = []
+    owner: list[int] = []
+    heads: list[tuple[int, int, bool]] = []
+    remarks: Counter[str] = Counter()
+    for number, (t_ns, of_message) in enumerate(messages):
+        boxes += of_message.boxes
+        owner += [number] * len(of_message.boxes)
+        heads.append((t_ns, of_message.stamp_ns, of_message.is_measured))
+        remarks.update({f"{remark} are left out": count for remark, count in of_message.ignored.items()})
+    head_ns = np.array([head[:2] for head in heads], np.int64).reshape(-1, 2)
+    names = sorted({plain_frame(box.frame_id) for box in boxes})
+    place = {name: number for number, name in enumerate(names)}
+    classes = Classes()
+    message = np.array(owner, np.int64)
+    out = Recorded3d(
+        names,
+        np.array([place[plain_frame(box.frame_id)] for box in boxes], np.int64),
+        message,
+        np.array([box.stamp_ns for box in boxes], np.int64),
+        head_ns[message, 0],
+        _columns([box.centre for box in boxes], 3),
+        _columns([box.orientation for box in boxes], 4),
+        _columns([box.size for box in boxes], 3),
+        _columns([box.velocity for box in boxes], 3),
+        np.array([box.has_heading for box in boxes], bool),
+        np.array([box.score for box in boxes], np.float64),
+        np.array([classes.class_id(box.class_name) for box in boxes], np.int64),
+        _ids([box.source_id for box in boxes]),
+        classes,
+        head_ns[:, 0],
+        head_ns[:, 1],
+        np.array([head[2] for head in heads], bool),
+        dict(remarks),
+    )
+    return _checked(out)
+
+
+def _columns(values: Sequence[tuple[float, ...]], width: int) -> Floats:
+    return np.array(values, np.float64).reshape(-1, width)
+
+
+def _ids(ids: Sequence[int | str | None]) -> Ints:
+    """Ids of boxes: numbers as they are, also as text; other texts are numbered in alphabetical order after these."""
+    numbers: list[int] = []
+    texts: dict[int, str] = {}
+    for at, own in enumerate(ids):
+        text = str(own if own is not None else "").strip()
+        is_number = _NUMBER.fullmatch(text)
+        numbers.append(int(text) if is_number else -1)
+        if text and not is_number and not isinstance(own, int):
+            texts[at] = text
+    first = max(numbers, default=-1) + 1
+    place = {name: first + order for order, name in enumerate(sorted(set(texts.values())))}
+    for at, name in texts.items():
+        numbers[at] = place[name]
+    return np.array(numbers, np.int64)
+
+
+def _checked(boxes: Recorded3d) -> Recorded3d:
+    """The boxes that have a position; sizes and orientations that can't be are unknown, and counted as remarks."""
+    with np.errstate(invalid="ignore"):
+        # Radars know no height: x and y are a position.
+        is_there = (np.abs(boxes.centre) < _FARTHEST_M) | (np.isnan(boxes.centre) & [False, False, True])
+        is_far: Bools = ~np.asarray(is_there.all(axis=1))
+        boxes = boxes.select(~is_far)
+        size, turn = boxes.size, boxes.orientation
+        odd_turn: Bools = ~np.asarray(np.isfinite(turn).all(axis=1))
+        length = np.linalg.norm(np.where(odd_turn[:, None], 0.0, turn), axis=1)
+        is_unturned = ~odd_turn & (length < np.finfo(np.float64).tiny)
+        kinds = {
+            "boxes have no position (no finite number) and are left out": is_far,
+            "boxes have no z: it is unknown, and 0 in their frame for x and y": np.isnan(boxes.centre[:, 2]),
+            "boxes have a size that is no finite number: it is unknown": ~np.isfinite(size).all(axis=1),
+            "boxes have a negative size: it is unknown": (size < 0).any(axis=1),
+            "boxes have a size of 0: it is unknown": (size == 0).any(axis=1),
+            "boxes have an orientation that is no finite number: it is unknown": odd_turn,
+            "boxes have an orientation of zeros: they count as not turned": is_unturned,
+        }
+        velocity = boxes.velocity
+        # Programs that don't measure velocities leave them at 0; objects that move can't all have one of 0.
+        if (is_stated := np.isfinite(velocity).all(axis=1)).any() and not velocity[is_stated].any():
+            kinds["boxes have a velocity of 0, and no box has another: it is unknown"] = is_stated
+            velocity = np.full_like(velocity, np.nan)
+        score = boxes.score
+        if (is_scored := np.isfinite(score)).any() and not score[is_scored].any():
+            kinds["boxes have a score of 0, and no box has another: it is unknown"] = is_scored
+            score = np.full_like(score, np.nan)
+        size = np.where(np.isfinite(size) & (size > 0), size, np.nan)
+    turn = np.where((odd_turn | is_unturned)[:, None], [0.0, 0.0, 0.0, 1.0], turn)
+    remarks = boxes.remarks | {remark: int(which.sum()) for remark, which in kinds.items() if which.any()}
+    has_heading = boxes.has_heading & ~odd_turn
+    return replace(
+        boxes, size=size, orientation=turn, velocity=velocity, score=score, has_heading=has_heading, remarks=remarks
+    )
+
 
 #: Messages of a channel of drawings in which boxes are looked for.
 _TRIED: Final = 50
 _LISTED: Final = 8
+
+
+# Read the transforms of a recording: frames of reference, and how they move.
+
+
+#: Schemas of transforms, by their names in ROS 1 and Foxglove; ROS 2 adds "/msg/".
+TRANSFORMS_READ: Final = (
+    "tf2_msgs/TFMessage",
+    "tf/tfMessage",
+    "geometry_msgs/TransformStamped",
+    "foxglove.FrameTransform",
+    "foxglove.FrameTransforms",
+)
+#: The end of topics where a transform holds until the next one.
+_LATCHED: Final = "tf_static"
+
+
+class _Transform(NamedTuple):
+    """A recorded transform, from points of ``child`` to points of ``parent``."""
+
+    parent: str
+    child: str
+    stamp_ns: int
+    translation: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+
+
+class FramesRead(NamedTuple):
+    """The transforms of a log: their tree, the topics that they are from, and those that can't be read, with why."""
+
+    tree: TransformTree | None
+    topics: tuple[str, ...]
+    unread: tuple[str, ...]
+
+
+_FRAMES_CACHE: Final[WeakKeyDictionary[log.Log, FramesRead]] = WeakKeyDictionary()
+
+
+def holds_transforms(channel: log.Channel) -> bool:
+    """Return whether a channel has recorded transforms; those of views of mcaptrack are none."""
+    is_recorded = Provenance.from_metadata(channel.metadata) is None
+    return is_recorded and plain_name(channel.schema_name) in TRANSFORMS_READ
+
+
+def transforms_of(opened: log.Log) -> TransformTree | None:
+    """Return the transforms of a log as a tree over time; None if it has none. See ``read_frames``."""
+    return read_frames(opened).tree
+
+
+def read_frames(opened: log.Log) -> FramesRead:
+    """Read all transforms of a log. Messages that can't be read are left out, and counted in ``unread``."""
+    if opened not in _FRAMES_CACHE:
+        _FRAMES_CACHE[opened] = _read(opened)
+    return _FRAMES_CACHE[opened]
+
+
+def warn_of_remarks(opened: log.Log, tree: TransformTree | None, target: str, source: str) -> None:
+    """Warn of what is odd in the transforms between two frames."""
+    for remark in tree.remarks_between(target, source) if tree else ():
+        warn(f"{opened.path}: transforms: {remark.text}", "transforms")
+
+
+def poses_at(
+    opened: log.Log, topic: str, target: str, source: str, stamps_ns: Ints, log_ns: Ints, what: str = "messages"
+) -> Poses:
+    """Return the poses of a frame in another for messages (N,) of a topic, by their stamps, and warn of gaps.
+
+    If no stamp is within the transforms, and log times are, the stamps are of another clock than those of the
+    transforms: poses are looked up by log time. Poses that aren't known are counted in a warning, as those of ``what``.
+    """
+    tree, _, unread = read_frames(opened)
+    tree = tree or TransformTree([])
+    for text in unread:
+        warn(f"{opened.path}: {text}", "lost")
+    poses = tree.lookup(target, source, stamps_ns)
+    if len(stamps_ns) and not poses.is_known.any():
+        by_log_time = tree.on_log_time.lookup(target, source, log_ns)
+        if by_log_time.is_known.any():
+            poses, tree = by_log_time, tree.on_log_time
+            text = "no stamp is within those of the transforms: they are looked up by log time"
+            warn(f"{opened.path}: {topic}: {text}", "clock")
+    warn_of_remarks(opened, tree, target, source)
+    if poses.unknown:
+        why = "; ".join(f"{count:,} {where}" for where, count in poses.unknown.items())
+        count = f"{sum(poses.unknown.values()):,} of {len(stamps_ns):,}"
+        text = f"{count} {what} are left out, since the pose of {source} in {target} isn't known: {why}"
+        warn(f"{opened.path}: {topic}: {text}", "transforms")
+    return poses
+
+
+def _read(opened: log.Log) -> FramesRead:
+    by_edge: dict[tuple[str, str, bool], list[tuple[_Transform, int]]] = {}
+    topics = [topic for topic, channel in sorted(opened.channels.items()) if holds_transforms(channel)]
+    unread: list[str] = []
+    for topic in topics:
+        is_latched = topic.endswith(_LATCHED)
+        bad, why = 0, ""
+        try:
+            decode = decoder_with_errors(message_type_of(opened, topic), lambda message: list(_transforms(message)))
+            for message in opened.timed(topic):
+                try:
+                    for transform in decode(message.payload):
+                        edge = (transform.parent, transform.child, is_latched)
+                        by_edge.setdefault(edge, []).append((transform, message.t_ns))
+                except McaptrackError as error:
+                    bad, why = bad + 1, why or str(error)
+        except McaptrackError as error:
+            unread.append(f"{topic} can't be read: {error}")
+        if bad:
+            unread.append(f"{topic}: {bad:,} message{'' if bad == 1 else 's'} can't be read; the first: {why}")
+    recorded = [
+        Recorded(parent, child, is_latched, _samples(those)) for (parent, child, is_latched), those in by_edge.items()
+    ]
+    return FramesRead(TransformTree(recorded) if recorded else None, tuple(topics), tuple(unread))
+
+
+def _samples(those: list[tuple[_Transform, int]]) -> PoseSamples:
+    return PoseSamples(
+        np.array([transform.stamp_ns for transform, _ in those], np.int64),
+        np.array([t_ns for _, t_ns in those], np.int64),
+        np.array([transform.translation for transform, _ in those], np.float64),
+        np.array([transform.quaternion for transform, _ in those], np.float64),
+    )
+
+
+def _transforms(message: Any) -> Iterator[_Transform]:
+    """Yield the transforms of a message of any of the schemas."""
+    if hasattr(message, "transforms"):
+        for transform in message.transforms:
+            yield from _transforms(transform)
+        return
+    if hasattr(message, "parent_frame_id"):
+        parent, inner = message.parent_frame_id, message
+    else:
+        parent, inner = message.header.frame_id, message.transform
+    child = message.child_frame_id
+    if not isinstance(parent, str) or not isinstance(child, str):
+        raise ValueError("names of frames are text")
+    x, y, z = (float(getattr(inner.translation, axis)) for axis in "xyz") if _has(inner, "translation") else (0.0,) * 3
+    turn = (
+        [float(getattr(inner.rotation, axis)) for axis in "xyzw"] if _has(inner, "rotation") else [0.0, 0.0, 0.0, 1.0]
+    )
+    yield _Transform(parent, child, stamp_of(message), (x, y, z), (turn[0], turn[1], turn[2], turn[3]))
+
+
+def _has(message: Any, name: str) -> bool:
+    """Return whether an optional field of a message is set: in protobuf and JSON it may be missing."""
+    if hasattr(message, "HasField"):
+        return bool(message.HasField(name))
+    return getattr(message, name, None) is not None
+
+
 _CACHE: Final[WeakKeyDictionary[log.Log, dict[str, bool]]] = WeakKeyDictionary()
 
 
@@ -109,7 +667,7 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
     rows = rows_of_boxes(boxes, rotation[is_taken], shift[is_taken], f"{opened.path}: {topic}")
     names = foreign.settle_classes(opened, topic, boxes.classes, [rows])
     if nameless := boxes.classes.nameless(np.unique(rows["class_id"]).tolist()):
-        listed = ", ".join(map(str, nameless[:_LISTED])) + (", ..." if len(nameless) > _LISTED else "")
+        listed = list_names([*map(str, nameless)], _LISTED)
         remark = "1 counts as people, and others move as objects of unknown class do"
         warn(f"{opened.path}: classes of {topic} are numbers without names ({listed}): {remark}", "classes")
     if unclassed := int((rows["class_id"] == UNKNOWN).sum()):
@@ -153,7 +711,7 @@ def _fixed_frame(opened: log.Log, topic: str, boxes: Recorded3d, wanted: str) ->
     frames = set(tree.frames() if tree else ()) | set(boxes.names)
     if wanted:
         if boxes.names and wanted not in frames:
-            listed = ", ".join(sorted(frames)[:_LISTED]) or "none"
+            listed = list_names(sorted(frames), _LISTED)
             raise McaptrackError(
                 f"{opened.path}: there is no frame {wanted} for the boxes of {topic}; there are {listed}"
             )
@@ -186,9 +744,7 @@ def _frame_before(opened: log.Log, topic: str) -> str:
 
 
 def _unknown(tree: TransformTree, frame: str) -> str:
-    listed = tree.frames()
-    more = ", ..." if len(listed) > _LISTED else ""
-    return f"no transform has the frame {frame!r} (but {', '.join(listed[:_LISTED])}{more})"
+    return f"no transform has the frame {frame!r} (but {list_names(tree.frames(), _LISTED)})"
 
 
 def _poses(opened: log.Log, topic: str, boxes: Recorded3d, fixed: str) -> tuple[Bools, Floats, Floats]:
@@ -210,7 +766,7 @@ def _poses(opened: log.Log, topic: str, boxes: Recorded3d, fixed: str) -> tuple[
         stamps = np.where(boxes.stamp_ns > 0, boxes.stamp_ns, boxes.log_ns)[mine]
         times, place = np.unique(np.stack([stamps, boxes.log_ns[mine]]), axis=1, return_inverse=True)
         what = "messages" if len(boxes.names) == 1 else f"messages have boxes in {name} that"
-        poses = poses_at(opened, topic, fixed, name, *_rows_of(times), what)
+        poses = poses_at(opened, topic, fixed, name, times[0], times[1], what)
         place = place.reshape(-1)
         is_known[mine] = poses.is_known[place]
         rotation[mine], shift[mine] = poses.rotation[place], poses.translation[place]
@@ -222,14 +778,10 @@ def _poses(opened: log.Log, topic: str, boxes: Recorded3d, fixed: str) -> tuple[
     return is_known, rotation, shift
 
 
-def _rows_of(times: Ints) -> tuple[Ints, Ints]:
-    return times[0], times[1]
-
-
 def _connected(opened: log.Log, boxes: Recorded3d) -> str:
     transforms = transforms_of(opened)
-    frames = ", ".join((transforms.frames() if transforms else [])[:_LISTED]) or "none"
-    return f"boxes are in {', '.join(boxes.names[:_LISTED])}, and transforms have {frames};"
+    frames = list_names(transforms.frames() if transforms else [], _LISTED)
+    return f"boxes are in {list_names(boxes.names, _LISTED)}, and transforms have {frames};"
 
 
 def _warn_odd(opened: log.Log, topic: str, boxes: Recorded3d) -> None:
@@ -264,17 +816,8 @@ def rows_of_boxes(boxes: Recorded3d, rotation: Floats, shift: Floats, where: str
     if lying:
         text = "boxes stand on another side than that of their z axis: their height is along the axis that is upright"
         warn(f"{where}: {lying:,} {text}")
-    return DETECTIONS.rows(
-        x_m=centre[:, 0],
-        y_m=centre[:, 1],
-        z_m=np.where(has_z, centre[:, 2], np.nan),
-        length_m=boxes.size[here, along],
-        width_m=boxes.size[here, across],
-        height_m=boxes.size[here, up],
-        heading_rad=np.where(boxes.has_heading, heading, np.nan),
-        vx_m_per_s=velocity[:, 0],
-        vy_m_per_s=velocity[:, 1],
-        score=boxes.score,
-        class_id=boxes.class_id,
-        source_id=boxes.source_id,
-    )
+    centre[~has_z, 2], heading[~boxes.has_heading] = np.nan, np.nan
+    size = [boxes.size[here, axis] for axis in (along, across, up)]
+    columns = dict(zip(COLUMNS, [*centre.T, *size, heading], strict=True))
+    columns |= {"vx_m_per_s": velocity[:, 0], "vy_m_per_s": velocity[:, 1]}
+    return DETECTIONS.rows(score=boxes.score, class_id=boxes.class_id, source_id=boxes.source_id, **columns)

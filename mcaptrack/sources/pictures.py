@@ -9,8 +9,8 @@ Letters: M messages.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Container, Iterable, Iterator
-from typing import Final, Protocol
+from collections.abc import Callable, Container, Iterable, Iterator
+from typing import Final
 
 import numpy as np
 
@@ -37,22 +37,27 @@ _MOST_IN_A_ROW: Final = 20
 
 def size_of_pictures(opened: log.Log, topic: str) -> tuple[int, int] | None:
     """Return width and height in pixels of the first picture of a channel that can be decoded; None if none can."""
-    decoded = foreign.pictures(opened, topic)
-    pictures = (
-        EncodedPicture(
-            m.t_ns, number, picture.format, picture.data, picture.layout, f"{opened.path}: {topic} at {m.t_ns} ns"
-        )
-        for number, (m, picture) in enumerate(decoded)
-    )
+    decoded = enumerate(foreign.pictures(opened, topic))
+    where = f"{opened.path}: {topic}"
+    return size_of((picture.encoded(m.t_ns, n, f"{where} at {m.t_ns} ns") for n, (m, picture) in decoded))
+
+
+def picture_size(opened: log.Log, topic: str | None) -> tuple[int, int] | None:
+    """Return width and height of the pictures of a channel; None if there are none, or none that can be read."""
+    try:
+        return size_of_pictures(opened, topic) if topic else None
+    except McaptrackError:
+        return None
+
+
+def size_of(pictures: Iterable[EncodedPicture]) -> tuple[int, int] | None:
+    """Return width and height in pixels of the first picture that can be decoded; None if none can."""
     first = next(decode_gray(pictures), None)
     return None if first is None else (first.rows.shape[1], first.rows.shape[0])
 
 
-class Pixels(Protocol):
-    """The interface of ``video.decode_bgr`` and ``video.decode_gray``."""
-
-    def __call__(self, pictures: Iterable[EncodedPicture], wanted: Container[int] | None = None, /) -> Iterator[Frame]:
-        """Decode the wanted pictures."""
+#: The interface of ``video.decode_bgr`` and ``video.decode_gray``: pictures, and which of them are wanted.
+Pixels = Callable[[Iterable[EncodedPicture], Container[int]], Iterator[Frame]]
 
 
 def find_pictures(opened: log.Log, topic: str) -> str:
@@ -203,12 +208,8 @@ class Pictures:
             for number, message in enumerate(self._opened.messages(self._topic, *span), before):
                 if first <= number < until:
                     read = number + 1
-                    picture = self._picture(message)
                     where = f"{self._opened.path}: {self._topic} at {message.t_ns} ns"
-                    yield (
-                        number,
-                        EncodedPicture(message.t_ns, number, picture.format, picture.data, picture.layout, where),
-                    )
+                    yield number, self._picture(message).encoded(message.t_ns, number, where)
             if read < until:
                 raise DamagedError(
                     f"{self._opened.path} is damaged: messages of {self._topic} lie outside of the times that their "

@@ -252,28 +252,6 @@ def zones_from_json(values: object) -> tuple[Zone, ...]:
         return ()
 
 
-def to_geojson(zones: Sequence[Zone]) -> dict[str, Any]:
-    """Return zones as GeoJSON, which ``parse_zones`` reads back."""
-    features = []
-    for zone in zones:
-        parts = [[_closed(ring, zone.is_line) for ring in part] for part in zone.parts]
-        geometry: dict[str, Any] = {"type": "MultiPolygon", "coordinates": parts}
-        if zone.is_line:
-            geometry = {"type": "LineString", "coordinates": parts[0][0]}
-        elif len(parts) == 1:
-            geometry = {"type": "Polygon", "coordinates": parts[0]}
-        own: dict[str, Any] = {"name": zone.name, "units": zone.units}
-        own |= ({"camera": zone.camera} if zone.camera else {}) | (
-            {"classes": list(zone.classes)} if zone.classes else {}
-        )
-        features.append({"type": "Feature", "properties": own, "geometry": geometry})
-    return {"type": "FeatureCollection", "features": features}
-
-
-def _closed(ring: Sequence[tuple[float, float]], is_line: bool) -> list[list[float]]:
-    return [list(point) for point in (ring if is_line else (*ring, ring[0]))]
-
-
 def _words(value: object) -> str:
     """Describe a value of JSON."""
     for kind, text in ((dict, "an object"), (list, "a list"), (str, "a text"), (bool, "true or false")):

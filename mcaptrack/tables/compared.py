@@ -28,16 +28,13 @@ from mcaptrack.schema import Frame
 from mcaptrack.schema.classes import PERSON
 from mcaptrack.schema.framing import split_rows
 from mcaptrack.sources import ingest
-from mcaptrack.sources.ingest.bags.opening import is_mcap
-from mcaptrack.sources.ingest.boxes_3d_job import FRAME, Boxes3DJob
+from mcaptrack.sources.ingest.bags.rosbag2 import is_mcap
 from mcaptrack.sources.ingest.job import IngestOptions
-from mcaptrack.sources.ingest.label_job import LabelJob
-from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
+from mcaptrack.sources.ingest.label_job import FRAME, Boxes3DJob, LabelJob
 from mcaptrack.sources.ingest.labels.content import ONLY_PEOPLE, IgnoredBoxes, Labels, WantedClasses
 from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX
-from mcaptrack.sources.ingest.labels.label_rows import label_rows
-from mcaptrack.sources.ingest.labels.long_files import LabelFile
-from mcaptrack.sources.ingest.labels.reading import in_order, read_homography, read_labels
+from mcaptrack.sources.ingest.labels.reading import in_order, is_3d, read_homography, read_labels
+from mcaptrack.sources.ingest.labels.timeline import label_rows
 
 #: Formats that give the frame number of each row.
 _COUNTING: Final = ("mot", "kitti", "parquet")
@@ -119,11 +116,11 @@ def compare_files(
     if any(have_3d):
         text = f"{tracks if have_3d[0] else ground_truth} holds 3D boxes, and {tracks if have_3d[1] else ground_truth}"
         raise McaptrackError(f"{text} does not; they can't be compared")
-    both: dict[Role, tuple[Path, Labels]] = {
-        "truth": (ground_truth, _read(ground_truth, "truth", topics, WantedClasses(classes or ONLY_PEOPLE.text))),
-        "tracks": (tracks, _read(tracks, "tracks", topics, WantedClasses(classes or ONLY_PEOPLE.text, may_lack=True))),
+    both: dict[Role, Labels] = {
+        "truth": _read(ground_truth, "truth", topics, WantedClasses(classes or ONLY_PEOPLE.text)),
+        "tracks": _read(tracks, "tracks", topics, WantedClasses(classes or ONLY_PEOPLE.text, may_lack=True)),
     }
-    formats = [labels.format for _, labels in both.values()]
+    formats = [labels.format for labels in both.values()]
     if not all(name in _COUNTING for name in formats) and len(set(formats)) > 1:
         if "parquet" in formats:
             raise McaptrackError(f"{tracks} and {ground_truth} share no clock: one counts frames, the other does not")
@@ -132,15 +129,15 @@ def compare_files(
             {"tracks": tracks, "truth": ground_truth}, fps, ground_plane, point, classes=wanted
         )
         return AlignedFiles(frames["truth"], frames["tracks"], classes=_names_of(both))
-    notes = [f"{path} also holds {labels.left_out}" for path, labels in both.values() if labels.left_out]
+    notes = [f"{labels.path} also holds {labels.left_out}" for labels in both.values() if labels.left_out]
     if fps is not None:
         notes.append("frames are compared by their numbers, whatever the frames per second")
     return _by_number(both, ground_plane, point, notes)
 
 
-def _names_of(both: Mapping[Role, tuple[Path, Labels]]) -> tuple[Mapping[int, str], Mapping[int, str]]:
+def _names_of(both: Mapping[Role, Labels]) -> tuple[Mapping[int, str], Mapping[int, str]]:
     """The names of the classes of ground truth and tracks."""
-    return both["truth"][1].classes, both["tracks"][1].classes
+    return both["truth"].classes, both["tracks"].classes
 
 
 def _boxes_3d(
@@ -151,7 +148,7 @@ def _boxes_3d(
     options = IngestOptions(fps=fps, ground_plane=ground_plane, frame_id=FRAME, classes=classes_3d)
     with Boxes3DJob([("tracks", tracks), ("truth", ground_truth)], options) as job:
         job.report_assumptions()
-        classes = (job.classes("truth"), job.classes("tracks"))
+        classes = (job.boxes["truth"].classes, job.boxes["tracks"].classes)
         return AlignedFiles(job.all_frames("truth"), job.all_frames("tracks"), job.report.remarks, classes)
 
 
@@ -173,7 +170,7 @@ def detections_and_ground_truth(
     """
     options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point)
     with _PairJob([("detections", detections), ("truth", ground_truth)], options) as job:
-        if not all(labels.has_boxes for _, labels in job.labels.values()):
+        if not all(labels.has_boxes for labels in job.labels.values()):
             raise McaptrackError(f"{detections} and {ground_truth} have to hold boxes in pixels, both")
         planes = ((0, job.ground),) if job.ground else ()
         return AlignedDetections(job.all_frames("detections"), job.all_frames("truth"), planes)
@@ -182,7 +179,7 @@ def detections_and_ground_truth(
 class _PairJob(LabelJob):
     """Labels of detections and of ground truth, which may be a table."""
 
-    def read(self, path: Path, role: Role) -> LabelFile:
+    def read(self, path: Path, role: Role) -> Labels:
         return _read(path, role, (), ONLY_PEOPLE) if role == "truth" else super().read(path, role)
 
 
@@ -190,7 +187,7 @@ def _read(path: Path, role: Role, topics: Sequence[str], wanted: WantedClasses) 
     if path.suffix.lower() in (".parquet", ".pq"):
         return _read_parquet(path, role, topics)
     if role == "tracks" and path.is_file() and _is_blank(path):
-        return _no_tracks()
+        return _no_tracks(path)
     labels = read_labels(path, role=role, wanted=wanted)
     if labels.times_s is not None or labels.is_normalised:
         what = "times instead of frames" if labels.times_s is not None else "boxes in shares of the picture's size"
@@ -204,10 +201,11 @@ def _is_blank(path: Path) -> bool:
     return path.stat().st_size < _BLANK_BYTES and not path.read_bytes().strip()
 
 
-def _no_tracks() -> Labels:
+def _no_tracks(path: Path) -> Labels:
     """A file of tracks without rows: of a tracker that found no people."""
     none = np.empty(0, np.int64)
-    return Labels("mot", 1, none, none, np.empty((0, 4)), None, np.empty(0), none, np.empty(0, np.uint32))
+    kinds = np.empty(0, np.uint32)
+    return Labels(path, "mot", str, none, none, np.empty((0, 4)), np.empty(0), kinds, first_frame=1)
 
 
 def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
@@ -231,36 +229,35 @@ def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
     xy_m = np.stack([table["x_m"][mine], table["y_m"][mine]], axis=-1)
     people = np.full(len(frame), PERSON, np.uint32)
     name: Any = "parquet"
-    labels = Labels(name, 0, frame, track_id, boxes, xy_m, table["score"][mine], np.unique(frame), people)
+    labels = Labels(path, name, str, frame, track_id, boxes, table["score"][mine], people, xy_m=xy_m)
+    labels.labelled = np.unique(frame)
     return in_order(labels, has_ids=True)
 
 
-def _by_number(
-    both: dict[Role, tuple[Path, Labels]], ground_plane: Path | None, point: Point, notes: list[str]
-) -> AlignedFiles:
+def _by_number(both: dict[Role, Labels], ground_plane: Path | None, point: Point, notes: list[str]) -> AlignedFiles:
     """The frames with rows in either file, by their numbers, both counted from 0."""
-    ground_truth, tracks = both["truth"][1], both["tracks"][1]
+    ground_truth, tracks = both["truth"], both["tracks"]
     plane = _plane(ground_plane, point, ground_truth, tracks)
-    numbers_of = {role: labels.frame - labels.first_frame for role, (_, labels) in both.items()}
+    numbers_of = {role: labels.frame - labels.first_frame for role, labels in both.items()}
     if ground_truth.first_frame != tracks.first_frame and len(tracks.frame):
-        first = {role: f"{path} counts frames from {labels.first_frame}" for role, (path, labels) in both.items()}
+        first = {role: f"{labels.path} counts frames from {labels.first_frame}" for role, labels in both.items()}
         notes.append(f"{first['tracks']}, {first['truth']}: their first frames are taken as the same")
     if len(tracks.frame):
         spans = {role: (int(numbers.min()), int(numbers.max())) for role, numbers in numbers_of.items()}
         (a, b), (c, d) = spans["truth"], spans["tracks"]
         if b < c or d < a:
-            spans_as_text = [f"{both[role][0]} ({low} to {high})" for role, (low, high) in spans.items()]
+            spans_as_text = [f"{both[role].path} ({low} to {high})" for role, (low, high) in spans.items()]
             raise McaptrackError(f"the frames of {' and '.join(spans_as_text)} never overlap, counted from 0")
     step = max(ground_truth.step, tracks.step) if len(tracks.frame) else ground_truth.step
     sparse = ground_truth if ground_truth.step >= tracks.step or not len(tracks.frame) else tracks
     start = int(sparse.labelled[0] - sparse.first_frame) % step
     numbers = np.unique(np.concatenate([*numbers_of.values()]))  # frames without rows do not change any score
     numbers = numbers[numbers % step == start]
-    frames = {role: _frames(labels, numbers, numbers_of[role], plane, role) for role, (_, labels) in both.items()}
+    frames = {role: _frames(labels, numbers, numbers_of[role], plane, role) for role, labels in both.items()}
     if ground_truth.ignored is not None and ground_truth.boxes_px is not None:
         frames["tracks"], gone = _without_ignored(frames["truth"], frames["tracks"], ground_truth)
         if gone:
-            notes.append(f"{gone} boxes of {both['tracks'][0]} match labels that don't count; they are ignored")
+            notes.append(f"{gone} boxes of {both['tracks'].path} match labels that don't count; they are ignored")
     return AlignedFiles(frames["truth"], frames["tracks"], notes, _names_of(both))
 
 

@@ -22,7 +22,7 @@ from mcaptrack.location import sibling
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.framing import join_frames
 from mcaptrack.sources.ingest import label_frames
-from mcaptrack.sources.ingest.labels.box_rows import OTHERS
+from mcaptrack.sources.ingest.labels.content import OTHERS
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.training.recipe import Recipe
 from mcaptrack.training.walks import walks

@@ -8,8 +8,7 @@ from types import MappingProxyType
 from typing import ClassVar, Final
 
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.geometry.camera_motion import MotionEstimator, SecondMotion
-from mcaptrack.geometry.camera_path import Verdict
+from mcaptrack.geometry.camera_path import MotionEstimator, SecondMotion, Verdict
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.schema import CAMERA_MOTION, VIDEO, Frame, Schema

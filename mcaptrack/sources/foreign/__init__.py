@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -18,47 +18,13 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.notices import warn
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.sources.foreign.boxes import DETECTIONS_READ, Classes, boxes_decoder
-from mcaptrack.sources.foreign.boxes_3d import BOXES_3D_READ, DRAWINGS, Message3d, boxes_3d_decoder
-from mcaptrack.sources.foreign.decoding import (
-    MessageType,
-    decoder_with_errors,
-    integer,
-    plain_name,
-    stamp_of,
-    text,
-    to_bytes,
-)
-
-if TYPE_CHECKING:
-    from mcaptrack.sources.video import PixelLayout
-
-__all__ = [
-    "BOXES_3D_READ",
-    "BOXES_READ",
-    "DETECTIONS_READ",
-    "PICTURES_READ",
-    "Classes",
-    "MessageType",
-    "NamedFrames",
-    "Picture",
-    "boxes_3d",
-    "boxes_decoder",
-    "detections",
-    "holds_detections",
-    "holds_pictures",
-    "is_compressed",
-    "is_drawing",
-    "is_picture",
-    "may_hold_boxes_3d",
-    "named_detections",
-    "picture_decoder",
-    "picture_reader",
-    "pictures",
-    "settle_classes",
-    "stamp_of",
-    "stamps",
-]
+from mcaptrack.sources.foreign.boxes import BOXES_3D_READ, DETECTIONS_READ, DRAWINGS, Message3d, boxes_3d_decoder
+from mcaptrack.sources.foreign.boxes import Classes as Classes
+from mcaptrack.sources.foreign.boxes import boxes_decoder as boxes_decoder
+from mcaptrack.sources.foreign.decoding import MessageType as MessageType
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, integer, plain_name, stamp_of, text, to_bytes
+from mcaptrack.sources.foreign.flatten import message_type_of
+from mcaptrack.sources.video import EncodedPicture, PixelLayout
 
 _COMPRESSED: Final = (foxglove.VIDEO, foxglove.IMAGE, "sensor_msgs/CompressedImage")
 _RAW: Final = ("foxglove.RawImage", "sensor_msgs/Image")
@@ -80,6 +46,10 @@ class Picture(NamedTuple):
     format: str
     data: bytes
     layout: PixelLayout | None = None
+
+    def encoded(self, t_ns: int, number: int, where: str) -> EncodedPicture:
+        """The picture for decoders: with its time, its number and its place for errors."""
+        return EncodedPicture(t_ns, number, self.format, self.data, self.layout, where)
 
 
 class NamedFrames(NamedTuple):
@@ -142,13 +112,8 @@ def stamps(opened: log.Log, topic: str) -> Ints:
     return np.array([picture.stamp_ns for _, picture in pictures(opened, topic)], np.int64)
 
 
-def detections(opened: log.Log, topic: str) -> Sequence[Frame]:
-    """The boxes of another detector, one frame for each message. Raises McaptrackError as ``pictures`` does."""
-    return named_detections(opened, topic).frames
-
-
 def named_detections(opened: log.Log, topic: str) -> NamedFrames:
-    """The boxes of another detector as ``detections`` gives them, with the names of their classes.
+    """The boxes of another detector, one frame for each message, with the names of their classes.
 
     Class names are converted to ids (see ``boxes.Classes``), which a warning lists.
     """
@@ -184,12 +149,8 @@ def _decoded(
 def _reader(
     opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]]
 ) -> Callable[[log.Message], Any]:
-    channel = opened.channel(topic)
-    index = opened.part(channel.topic).index
-    schema = index.schemas.get(index.channels[channel.id].schema_id)
-    fields = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
     try:
-        decode = make(MessageType(*fields, channel.message_encoding))
+        decode = make(message_type_of(opened, topic))
     except McaptrackError as error:
         raise McaptrackError(f"{opened.path}: {topic}: {error}") from None
 
@@ -238,14 +199,6 @@ def _format(text: str) -> str:
 
 
 def _raw(message: Any) -> Picture:
-    from mcaptrack.sources.video import PixelLayout
-
-    layout = PixelLayout(
-        integer(message.width),
-        integer(message.height),
-        integer(message.step),
-        bool(
-            getattr(message, "is_bigendian", False)
-        ),  # foxglove.RawImage has no such field: it is always little-endian
-    )
+    is_bigendian = bool(getattr(message, "is_bigendian", False))  # foxglove.RawImage is always little-endian
+    layout = PixelLayout(integer(message.width), integer(message.height), integer(message.step), is_bigendian)
     return Picture(stamp_of(message), text(message.encoding).lower(), to_bytes(message.data), layout)

@@ -1,4 +1,4 @@
-"""Convert boxes of other detectors to rows of detections, and their class names to class ids.
+"""Boxes of other software, as messages state them: those in pictures as rows of detections, those in space one by one.
 
 Letters: N boxes.
 """
@@ -6,17 +6,29 @@ Letters: N boxes.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import islice
-from math import cos, isfinite, nan, sin
-from typing import Any, Final
+from math import cos, isfinite, isnan, nan, sin
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, Rows
 from mcaptrack.schema.classes import PERSON, UNKNOWN, is_person
-from mcaptrack.sources.foreign.decoding import MessageType, decoder_with_errors, plain_name
+from mcaptrack.sources.foreign.decoding import (
+    MessageType,
+    decoder_with_errors,
+    integer,
+    number,
+    plain_name,
+    stamp_of,
+    text,
+    to_bytes,
+)
 
 #: Schemas of boxes of other software.
 DETECTIONS_READ: Final = ("vision_msgs/Detection2DArray",)
@@ -90,15 +102,9 @@ def boxes_decoder(kind: MessageType, classes: Classes) -> Callable[[bytes], Rows
 
 def _boxes(message: Any, classes: Classes) -> Rows:
     rows = [_box(detection, classes) for detection in message.detections]
-    x, y, w, h, score, class_id = (list(column) for column in zip(*rows, strict=True)) if rows else [[]] * 6
-    return DETECTIONS.rows(
-        x_px=np.array(x, float),
-        y_px=np.array(y, float),
-        w_px=np.array(w, float),
-        h_px=np.array(h, float),
-        score=np.array(score, float),
-        class_id=np.array(class_id, np.uint32),
-    )
+    *numbers, class_id = np.array(rows, float).reshape(-1, 6).T
+    columns = dict(zip(("x_px", "y_px", "w_px", "h_px", "score"), numbers, strict=True))
+    return DETECTIONS.rows(class_id=class_id.astype(np.uint32), **columns)
 
 
 def _box(detection: Any, classes: Classes) -> tuple[float, float, float, float, float, int]:
@@ -113,14 +119,493 @@ def _box(detection: Any, classes: Classes) -> tuple[float, float, float, float, 
         raise ValueError(f"a box can't be {w:g} x {h:g} at ({x:g}, {y:g})")
     if theta:
         w, h = (abs(w * cos(theta)) + abs(h * sin(theta)), abs(w * sin(theta)) + abs(h * cos(theta)))
-    guesses = [getattr(result, "hypothesis", result) for result in detection.results]
-    scored = [(float(guess.score), guess) for guess in guesses]
+    name, score = best_hypothesis(detection.results)
+    return x - w / 2, y - h / 2, w, h, score, UNKNOWN if name is None else classes.class_id(name)
+
+
+def best_hypothesis(results: Any) -> tuple[str | None, float]:
+    """The class with the highest score of results of vision_msgs, None if there is none, and its score, or NaN.
+
+    Before ROS 2 Humble a result is its own hypothesis, with ``id`` in the place of ``class_id``.
+    """
+    guesses = [getattr(result, "hypothesis", result) for result in results]
+    scored = [(number(guess.score), guess) for guess in guesses]
     finite = [(score, guess) for score, guess in scored if isfinite(score)]
     score, best = max(finite or scored, key=lambda pair: pair[0], default=(nan, None))
-    return x - w / 2, y - h / 2, w, h, score if finite else nan, _class_id(best, classes)
+    if best is None:
+        return None, nan
+    return str(best.class_id if hasattr(best, "class_id") else best.id).strip(), score if finite else nan
 
 
-def _class_id(guess: Any, classes: Classes) -> int:
-    if guess is None:
-        return UNKNOWN
-    return classes.class_id(str(guess.class_id if hasattr(guess, "class_id") else guess.id).strip())
+# 3D boxes of other software, as messages state them: what the families of messages share, then each family.
+#
+# A family is a function that takes a decoded message to a ``Message3d``; ``recorded`` makes arrays of all messages
+# of a channel.
+
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+_ORIGIN: Final[Vector] = (0.0, 0.0, 0.0)
+#: A velocity or size that isn't stated.
+UNKNOWN_VECTOR: Final[Vector] = (nan, nan, nan)
+#: A quaternion of zeros: the orientation isn't stated.
+UNSTATED: Final[Quaternion] = (0.0, 0.0, 0.0, 0.0)
+_WORD: Final = re.compile(r"[^\W\d_][\w-]*")
+_PERCENT: Final = re.compile(r"(?<![\w.])(\d{1,3}(?:\.\d+)?)\s*%")
+#: A number from 0 to 1 that isn't a distance, speed or angle.
+_SHARE: Final = re.compile(r"(?<![\w.-])(?:0?\.\d+|1\.0+|[01]\.)(?![\w.])(?!\s*(?:c?m|km|m?s|deg|rad|kph)\b|\s*°)")
+
+
+class Box3d(NamedTuple):
+    """A box in a frame: its centre, size along its own axes in metres, and orientation (x, y, z, w).
+
+    ``stamp_ns`` is 0 and ``frame_id`` "" where the message states none. ``source_id`` is a number or a text, None where
+    there is none. ``velocity`` is along the axes of the frame in m/s. ``has_heading`` is false where the message says
+    that the orientation is not known.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    centre: Vector
+    orientation: Quaternion
+    size: Vector
+    class_name: str = ""
+    score: float = nan
+    source_id: int | str | None = None
+    velocity: Vector = UNKNOWN_VECTOR
+    has_heading: bool = True
+
+
+@dataclass
+class Message3d:
+    """The boxes of a message, and a count of its other parts for each description of them.
+
+    ``is_measured`` is false for a message that only takes boxes away from a viewer: nothing was measured then.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    boxes: list[Box3d] = field(default_factory=list)
+    ignored: Counter[str] = field(default_factory=Counter)
+    is_measured: bool = True
+
+
+def head_of(message: Any) -> tuple[int, str]:
+    """Stamp in ns and frame of a message with a ROS header."""
+    return stamp_of(message), text(message.header.frame_id)
+
+
+def own_head(message: Any, around: tuple[int, str]) -> tuple[int, str]:
+    """Stamp and frame of a part of a message: its own, or, where it states no frame, those of the message around it."""
+    stamp_ns, frame_id = head_of(message)
+    return (stamp_ns or around[0], frame_id) if frame_id else around
+
+
+def vector(value: Any) -> Vector:
+    """A point or vector; the origin where it is missing, as protobuf leaves out zeros."""
+    return _ORIGIN if value is None else (number(value.x), number(value.y), number(value.z))
+
+
+def quaternion(value: Any) -> Quaternion:
+    """A quaternion; zeros where it is missing."""
+    return UNSTATED if value is None else (number(value.x), number(value.y), number(value.z), number(value.w))
+
+
+def part(message: Any, name: str) -> Any:
+    """A field of a message; None where it is missing, as optional fields of JSON are."""
+    return getattr(message, name, None)
+
+
+def rotated(orientation: Quaternion, point: Vector) -> Vector:
+    """A point turned by a quaternion; as it is by one of zeros."""
+    x, y, z, w = orientation
+    norm = x * x + y * y + z * z + w * w
+    if not norm or not isfinite(norm):
+        return point
+    a, b, c = point
+    # p + 2 w (q x p) + 2 q x (q x p), for a quaternion that need not have length 1
+    u, v, t = y * c - z * b, z * a - x * c, x * b - y * a
+    return (
+        a + 2 * (w * u + y * t - z * v) / norm,
+        b + 2 * (w * v + z * u - x * t) / norm,
+        c + 2 * (w * t + x * v - y * u) / norm,
+    )
+
+
+def moved(centre: Vector, orientation: Quaternion, point: Vector) -> Vector:
+    """A point of a box or group, given along its axes, in the frame of the box."""
+    x, y, z = rotated(orientation, point)
+    return centre[0] + x, centre[1] + y, centre[2] + z
+
+
+def around(points: Sequence[Vector]) -> tuple[Vector, Vector]:
+    """Middle and size of the box around points, along their axes. There has to be one at least."""
+    low, high = (tuple(pick(point[axis] for point in points) for axis in range(3)) for pick in (min, max))
+    middle = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2)
+    return middle, (high[0] - low[0], high[1] - low[1], high[2] - low[2])
+
+
+def named(names: Mapping[int, str], label: Any) -> str:
+    """The name of a class by its number in an enumeration; the number where it has none."""
+    return names.get(integer(label), str(integer(label)))
+
+
+def enumeration(message: Any, prefix: str = "") -> Mapping[int, str]:
+    """The names of classes by number that the recorded definition of a message states, as constants with a prefix.
+
+    Names are in lower case, without the prefix; "unknown" is "". Empty where there are no constants, as in JSON.
+    """
+    kind: Any = type(message)
+    return _constants(kind, prefix)
+
+
+@lru_cache(maxsize=64)
+def _constants(kind: Any, prefix: str) -> Mapping[int, str]:
+    whole = {name: value for name, value in vars(kind).items() if name.isupper() and isinstance(value, int)}
+    names = {value: name.removeprefix(prefix).lower() for name, value in whole.items() if name.startswith(prefix)}
+    return {value: "" if name == "unknown" else name for value, name in names.items()}
+
+
+def words_of(said: str) -> tuple[str, float]:
+    """The class and the score in a text beside a box: "car 0.93" -> "car", 0.93; "" and NaN where there are none."""
+    word = _WORD.search(said)
+    percent, share = _PERCENT.search(said), _SHARE.search(said)
+    score = float(percent.group(1)) / 100 if percent else float(share.group()) if share else nan
+    return (word.group() if word else ""), score if score <= 1 else nan
+
+
+# vision_msgs/Detection3DArray, in its forms before ROS 2 Humble and since.
+
+
+def _detections(message: Any) -> Message3d:
+    """The boxes of a message."""
+    head = head_of(message)
+    return Message3d(*head, [_detection(detection, head) for detection in message.detections])
+
+
+def _stated_pose(centre: Any, results: Any) -> Any:
+    """The pose of a box; that of its first result where only this one is filled in."""
+    stated = [result.pose.pose for result in results if part(part(result, "pose"), "pose") is not None]
+    is_unset = not any(vector(centre.position)) and bool(stated) and any(vector(stated[0].position))
+    return stated[0] if is_unset else centre
+
+
+def _detection(detection: Any, around: tuple[int, str]) -> Box3d:
+    class_name, score = best_hypothesis(detection.results)
+    pose = _stated_pose(detection.bbox.center, detection.results)
+    return Box3d(
+        *own_head(detection, around),
+        vector(pose.position),
+        quaternion(part(pose, "orientation")),
+        vector(detection.bbox.size),
+        class_name or "",
+        score,
+        part(detection, "id") or part(detection, "tracking_id") or None,
+    )
+
+
+# foxglove.SceneUpdate: the cubes of its entities.
+#
+# Entities are drawings: they stay until they are deleted, replaced or ``lifetime`` is over. As measurements they count
+# once, at their timestamp; ``frame_locked`` says where a drawing is later, which makes no difference then.
+
+
+#: Keys of metadata, in lower case and without separators, the first that there is.
+_CLASS_KEYS: Final = ("class", "classname", "label", "category", "type", "objectclass", "classification", "objecttype")
+_SCORE_KEYS: Final = ("score", "confidence", "probability", "existenceprobability")
+_ID_KEYS: Final = ("trackid", "trackingid", "objectid", "instanceid")
+_OTHERS: Final = ("arrows", "spheres", "cylinders", "lines", "triangles", "texts", "models")
+
+
+def _scene_cubes(message: Any) -> Message3d:
+    """The cubes of a message."""
+    entities, deletions = list(part(message, "entities") or ()), list(part(message, "deletions") or ())
+    first = next(iter([*entities, *deletions]), None)
+    out = Message3d(_stamp(first), text(part(first, "frame_id") or ""))
+    for entity in entities:
+        cubes = list(part(entity, "cubes") or ())
+        if not cubes and any(part(entity, name) for name in _OTHERS):
+            out.ignored["entities without cubes"] += 1
+        out.boxes += [_cube(entity, cube, is_alone=len(cubes) == 1) for cube in cubes]
+    out.is_measured = bool(out.boxes) or not (deletions or out.ignored)
+    return out
+
+
+def _stamp(entity: Any) -> int:
+    return stamp_of(entity) if part(entity, "timestamp") is not None else 0
+
+
+def _cube(entity: Any, cube: Any, is_alone: bool) -> Box3d:
+    said = {
+        "".join(filter(str.isalnum, text(pair.key).lower())): _words(pair.value)
+        for pair in part(entity, "metadata") or ()
+    }
+    texts = list(part(entity, "texts") or []) if is_alone else []
+    word, share = words_of(text(texts[0].text)) if texts else ("", nan)
+    score = _first(said, _SCORE_KEYS)
+    pose = part(cube, "pose")
+    return Box3d(
+        _stamp(entity),
+        text(part(entity, "frame_id") or ""),
+        vector(part(pose, "position")),
+        quaternion(part(pose, "orientation")),
+        vector(part(cube, "size")),
+        _first(said, _CLASS_KEYS).strip() or word,
+        _score(score) if score else share,
+        # The id of several cubes is that of none of them.
+        _first(said, _ID_KEYS) or (_words(part(entity, "id")) if is_alone else "") or None,
+    )
+
+
+def _first(said: dict[str, str], keys: tuple[str, ...]) -> str:
+    return next((said[key] for key in keys if said.get(key)), "")
+
+
+def _words(value: Any) -> str:
+    """A text; numbers count as theirs, since writers of JSON give ids and scores as numbers."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return repr(value) if is_number else text("" if value is None else value)
+
+
+def _score(written: str) -> float:
+    try:
+        return number(written)
+    except ValueError:
+        return words_of(written)[1]
+
+
+# visualization_msgs/MarkerArray and Marker: cubes, and lists of cubes. They are drawings, as entities of scenes are: a
+# cube counts when it is added.
+
+
+_CUBE, _CUBE_LIST, _TEXT, _ADD = 1, 6, 9, 0
+#: Namespaces that say nothing about the class of their markers.
+_GENERIC: Final = re.compile(
+    r"((b(ounding)?_?box(es)?|(basic_?)?shapes?|(box|cluster|cube|detection|id|marker|object|obstacle|track)(e?s)?|ns)"
+    r"(_?array)?[\W_]*\d*|[\W\d_]*)"
+)
+
+
+def _marker_cubes(message: Any) -> Message3d:
+    """The cubes of a message."""
+    markers = list(message.markers) if hasattr(message, "markers") else [message]
+    out = Message3d(*(head_of(markers[0]) if markers else (0, "")))
+    # Deletions say nothing about what is measured.
+    added = [marker for marker in markers if integer(part(marker, "action") or 0) == _ADD]
+    labels = _labels(added)
+    for marker in added:
+        kind = integer(marker.type)
+        if kind == _CUBE:
+            name, score = _marker_class(marker)
+            label, share = words_of(labels.get(integer(marker.id), ""))
+            name, score = name or label, share if isnan(score) else score
+            pose = _marker_pose(marker)
+            box = Box3d(*head_of(marker), *pose, vector(marker.scale), name, score, integer(marker.id))
+            out.boxes.append(box)
+        elif kind == _CUBE_LIST:
+            name, score = _marker_class(marker)
+            centre, orientation = _marker_pose(marker)
+            out.boxes += [
+                Box3d(*head_of(marker), moved(centre, orientation, vector(point)), orientation, size, name, score)
+                for size in [vector(marker.scale)]
+                for point in part(marker, "points") or ()
+            ]
+        elif kind != _TEXT or integer(marker.id) not in labels:
+            out.ignored["markers that are no cubes"] += 1
+    out.is_measured = bool(out.boxes) or not (markers and (out.ignored or not added))
+    return out
+
+
+def _labels(markers: list[Any]) -> dict[int, str]:
+    """The texts of markers beside cubes, by the id that they share with one cube."""
+    cubes, texts = (
+        Counter(integer(marker.id) for marker in markers if integer(marker.type) == kind) for kind in (_CUBE, _TEXT)
+    )
+    return {
+        integer(marker.id): text(part(marker, "text") or "")
+        for marker in markers
+        if integer(marker.type) == _TEXT and cubes[integer(marker.id)] == texts[integer(marker.id)] == 1
+    }
+
+
+def _marker_pose(marker: Any) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
+    return vector(marker.pose.position), quaternion(part(marker.pose, "orientation"))
+
+
+def _marker_class(marker: Any) -> tuple[str, float]:
+    """The class, which is the namespace or, if that says nothing, a word of the text; and the score in the text."""
+    space = text(part(marker, "ns") or "").strip().rpartition("/")[2]
+    word, score = words_of(text(part(marker, "text") or ""))
+    return (word, score) if _GENERIC.fullmatch(space.lower()) else (space, score)
+
+
+# jsk_recognition_msgs/BoundingBoxArray.
+
+
+def _jsk_boxes(message: Any) -> Message3d:
+    """The boxes of a message."""
+    head = head_of(message)
+    return Message3d(*head, [_jsk_box(box, head) for box in message.boxes])
+
+
+def _jsk_box(box: Any, around: tuple[int, str]) -> Box3d:
+    return Box3d(
+        *own_head(box, around),
+        vector(box.pose.position),
+        quaternion(part(box.pose, "orientation")),
+        vector(box.dimensions),
+        str(integer(box.label)),
+        number(box.value) or nan,  # 0 where no value is set
+    )
+
+
+# derived_object_msgs/ObjectArray.
+
+
+#: The classes of derived_object_msgs/Object, for messages without their definition (JSON).
+_OBJECT_NAMES: Final = (
+    ",unknown_small,unknown_medium,unknown_big,pedestrian,bike,car,truck,motorcycle,other_vehicle,barrier,sign"
+)
+_OBJECT_CLASSES: Final = dict(enumerate(_OBJECT_NAMES.split(",")))
+_PREFIX: Final = "CLASSIFICATION_"
+#: The largest certainty of a classification.
+_CERTAIN: Final = 255
+#: The level of detection from which the velocity is known.
+_TRACKED: Final = 1
+#: The types of shape_msgs/SolidPrimitive.
+_BOX, _SPHERE, _CYLINDER, _CONE = 1, 2, 3, 4
+
+
+def _derived_objects(message: Any) -> Message3d:
+    """The objects of a message. Those without a shape, as of radars, have the size of their polygon, or none."""
+    head = head_of(message)
+    return Message3d(*head, [_object_box(seen, head) for seen in message.objects])
+
+
+def _shape_size(shape: Any) -> Vector:
+    """The size of the box around a shape; NaN if it has none."""
+    kind, lengths = integer(shape.type), [number(dimension) for dimension in shape.dimensions]
+    if kind == _BOX and len(lengths) >= 3:
+        return lengths[0], lengths[1], lengths[2]
+    if kind == _SPHERE and lengths:
+        return 2 * lengths[0], 2 * lengths[0], 2 * lengths[0]
+    if kind in (_CYLINDER, _CONE) and len(lengths) >= 2:  # height and radius
+        return 2 * lengths[1], 2 * lengths[1], lengths[0]
+    return UNKNOWN_VECTOR
+
+
+def _object_box(seen: Any, head: tuple[int, str]) -> Box3d:
+    certainty = integer(seen.classification_certainty)
+    centre, size = vector(seen.pose.position), _shape_size(seen.shape)
+    orientation = quaternion(part(seen.pose, "orientation"))
+    if isnan(size[0]) and (points := [vector(point) for point in part(part(seen, "polygon"), "points") or ()]):
+        x, y, z, w = orientation
+        along = [rotated((-x, -y, -z, w), point) for point in points]  # the polygon is in the frame of the message
+        middle, (length, width, _) = around(along)
+        centre, size = rotated(orientation, middle), (length, width, nan)
+    return Box3d(
+        *own_head(seen, head),
+        centre,
+        orientation,
+        size,
+        named(enumeration(seen, _PREFIX) or _OBJECT_CLASSES, seen.classification),
+        certainty / _CERTAIN if certainty else nan,
+        integer(seen.id),
+        vector(seen.twist.linear) if integer(seen.detection_level) == _TRACKED else UNKNOWN_VECTOR,
+    )
+
+
+# DetectedObjects and TrackedObjects of Autoware (autoware_perception_msgs, autoware_auto_perception_msgs).
+
+
+#: The labels of ObjectClassification, for messages without their definition (JSON). Earlier ones had no bus.
+_AUTOWARE_NAMES: Final = (
+    ",car,truck,bus,trailer,motorcycle,bicycle,pedestrian,animal,hazard,over_drivable,under_drivable"
+)
+_AUTOWARE_CLASSES: Final = dict(enumerate(_AUTOWARE_NAMES.split(",")))
+_AUTOWARE_CYLINDER, _AUTOWARE_POLYGON = 1, 2
+_HEADING_UNKNOWN: Final = 0
+
+
+def _autoware_objects(message: Any) -> Message3d:
+    """The objects of a message."""
+    head = head_of(message)
+    return Message3d(*head, [_autoware_box(item, head) for item in message.objects])
+
+
+def _autoware_box(item: Any, head: tuple[int, str]) -> Box3d:
+    kinematics, shape = item.kinematics, item.shape
+    pose = kinematics.pose_with_covariance.pose
+    centre, orientation, size = vector(pose.position), quaternion(part(pose, "orientation")), vector(shape.dimensions)
+    if integer(shape.type) == _AUTOWARE_CYLINDER:  # x is the diameter
+        size = (size[0], size[0], size[2])
+    elif integer(shape.type) == _AUTOWARE_POLYGON:
+        middle, size = _footprint([vector(point) for point in shape.footprint.points], size[2])
+        centre = moved(centre, orientation, middle)
+    velocity = UNKNOWN_VECTOR
+    if getattr(kinematics, "has_twist", True):  # along the axes of the object
+        velocity = rotated(orientation, vector(kinematics.twist_with_covariance.twist.linear))
+    name, probability = _likeliest(item)
+    existence = number(item.existence_probability)
+    return Box3d(
+        *head,
+        centre,
+        orientation,
+        size,
+        name,
+        existence if existence > 0 else probability,
+        _uuid(item),
+        velocity,
+        integer(kinematics.orientation_availability) != _HEADING_UNKNOWN,
+    )
+
+
+def _likeliest(item: Any) -> tuple[str, float]:
+    """The likeliest class, and its probability; "" and NaN if there is none."""
+    guesses = [(number(guess.probability), guess) for guess in item.classification]
+    shares = [(share if isfinite(share) else -1.0, guess) for share, guess in guesses]
+    if not shares:
+        return "", nan
+    share, guess = max(shares, key=lambda pair: pair[0])
+    return named(enumeration(guess) or _AUTOWARE_CLASSES, guess.label), share if share > 0 else nan
+
+
+def _footprint(points: list[Vector], height: float) -> tuple[Vector, Vector]:
+    """Middle and size of the upright box around a footprint, along the axes of the object."""
+    if not points:
+        return (0.0, 0.0, 0.0), (nan, nan, height)
+    (x, y, _), (length, width, _) = around(points)
+    return (x, y, 0.0), (length, width, height)
+
+
+def _uuid(item: Any) -> str | None:
+    """The UUID of a tracked object, in hexadecimal; None for a detected one."""
+    uuid = part(item, "object_id")
+    return None if uuid is None else to_bytes(uuid.uuid).hex()
+
+
+_FAMILIES: Final[Mapping[str, Callable[[Any], Message3d]]] = {
+    "vision_msgs/Detection3DArray": _detections,
+    "foxglove.SceneUpdate": _scene_cubes,
+    "visualization_msgs/MarkerArray": _marker_cubes,
+    "visualization_msgs/Marker": _marker_cubes,
+    "jsk_recognition_msgs/BoundingBoxArray": _jsk_boxes,
+    "derived_object_msgs/ObjectArray": _derived_objects,
+} | {
+    f"{package}/{name}": _autoware_objects
+    for package in ("autoware_perception_msgs", "autoware_auto_perception_msgs")
+    for name in ("DetectedObjects", "TrackedObjects")
+}
+#: Schemas of 3D boxes, by their names in ROS 1 and Foxglove; ROS 2 adds "/msg/".
+BOXES_3D_READ: Final = tuple(_FAMILIES)
+#: Those that are drawings: a channel with such messages need not hold boxes.
+DRAWINGS: Final = ("foxglove.SceneUpdate", "visualization_msgs/MarkerArray", "visualization_msgs/Marker")
+
+
+def boxes_3d_decoder(kind: MessageType) -> Callable[[bytes], Message3d]:
+    """A function that decodes payloads of a channel to 3D boxes; raises as ``picture_decoder`` does."""
+    family = _FAMILIES.get(plain_name(kind.name))
+    if family is None:
+        raise McaptrackError(f"it holds {kind.name or 'no schema'}, not 3D boxes; {', '.join(BOXES_3D_READ)} are read")
+    return decoder_with_errors(kind, family)

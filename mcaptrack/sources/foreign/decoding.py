@@ -13,6 +13,7 @@ from collections.abc import Callable
 from copy import copy
 from datetime import UTC, datetime
 from functools import lru_cache
+from math import nan
 from types import SimpleNamespace
 from typing import Any, Final, NamedTuple
 
@@ -53,12 +54,14 @@ def plain_name(schema_name: str) -> str:
     return f"foxglove.{name}" if package == "foxglove_msgs" else f"{package}/{name}"
 
 
-def decoder_with_errors(kind: MessageType, convert: Callable[[Any], Any]) -> Callable[[bytes], Any]:
+def decoder_with_errors(
+    kind: MessageType, convert: Callable[[Any], Any], unpack: Unpack | None = None
+) -> Callable[[bytes], Any]:
     """A function that decodes a payload and applies ``convert``; all failures become McaptrackError.
 
-    Raises McaptrackError as ``unpacker`` does.
+    ``unpack`` decodes payloads in another way than ``unpacker``. Raises McaptrackError as that does.
     """
-    unpack = unpacker(kind)
+    unpack = unpack or unpacker(kind)
 
     def decode(payload: bytes) -> Any:
         try:
@@ -68,7 +71,8 @@ def decoder_with_errors(kind: MessageType, convert: Callable[[Any], Any]) -> Cal
         except Exception as error:  # untrusted bytes in third-party parsers, which raise various exceptions
             why = f"it has no field {error.name!r}" if isinstance(error, AttributeError) else str(error)
             why = " ".join(why.split())[:120] or type(error).__name__
-            raise McaptrackError(f"{len(payload)} bytes are not a {kind.name} message ({why})") from None
+            name = kind.name or kind.encoding
+            raise McaptrackError(f"{len(payload)} bytes are not a {name} message ({why})") from None
 
     return decode
 
@@ -175,6 +179,13 @@ def integer(value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not -_LIMIT_NS <= value < _LIMIT_NS:
         raise ValueError(f"{str(value)[:40]!r} where a whole number belongs")
     return int(value)
+
+
+def number(value: Any) -> float:
+    """A number, also from the texts that stand for NaN and infinity in JSON; null is NaN."""
+    if isinstance(value, bool):
+        raise ValueError("true or false where a number belongs")
+    return nan if value is None else float(value)
 
 
 def text(value: Any) -> str:

@@ -34,7 +34,7 @@ class _Messages(tuple[Any, ...]):
 def message_type_of(opened: log.Log, topic: str) -> MessageType:
     """The message type of a channel of a log."""
     channel = opened.channel(topic)
-    index = opened.part(topic).index
+    index = opened.part(channel.topic).index
     schema = index.schemas.get(index.channels[channel.id].schema_id)
     fields = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
     return MessageType(*fields, channel.message_encoding)
@@ -54,22 +54,7 @@ def flattener(kind: MessageType) -> Callable[[bytes], dict[Path, Value]]:
     Raises McaptrackError if messages of this type are not supported; the returned function raises McaptrackError for
     malformed payloads.
     """
-    unpack = _unpacker(kind)
-
-    def flatten(payload: bytes) -> dict[Path, Value]:
-        try:
-            message = unpack(payload)
-            row = dict(_walk(message, ()))
-        except McaptrackError:
-            raise
-        except Exception as error:  # untrusted bytes in third-party parsers, which raise various exceptions
-            why = " ".join(str(error).split())[:120] or type(error).__name__
-            raise McaptrackError(
-                f"{len(payload)} bytes are not a {kind.name or kind.encoding} message ({why})"
-            ) from None
-        return row
-
-    return flatten
+    return decoder_with_errors(kind, lambda message: dict(_walk(message, ())), _unpacker(kind))
 
 
 def _unpacker(kind: MessageType) -> Callable[[bytes], Any]:

@@ -12,12 +12,18 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, Self
 
+import numpy as np
+
 from mcaptrack import foxglove, log
 from mcaptrack.choices import ImageFormat, InputRole, LengthUnit, Point, Role
 from mcaptrack.errors import McaptrackError, call
+from mcaptrack.geometry.affine import IDENTITY, compose, scale_of
+from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.camera_path import Verdict, poses_of
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import Notice, warn
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, TRACKS, Frame, Schema
+from mcaptrack.schema.camera_motion import is_motion, pose_to_rows
 from mcaptrack.schema.classes import classes_beside_rows, only_class, without_class
 from mcaptrack.schema.encodings import PROTOBUF, Encoding, encoded, record_of
 from mcaptrack.schema.ground_plane import plane_to_rows
@@ -26,14 +32,19 @@ from mcaptrack.sources.calibrations import is_rectified_topic
 from mcaptrack.sources.cameras import corrected_plane
 from mcaptrack.sources.corrections import CORRECTED
 from mcaptrack.sources.ingest.calibration import Calibrated, GivenCalibration
-from mcaptrack.sources.ingest.labels.box_rows import OTHERS, fitted
-from mcaptrack.sources.ingest.labels.boxes_3d.reading import is_3d
-from mcaptrack.sources.ingest.labels.content import ONLY_PEOPLE, Format, Labels, WantedClasses, describe_classes
-from mcaptrack.sources.ingest.labels.label_rows import frames_of_labels
-from mcaptrack.sources.ingest.labels.long_files import LabelFile, read_labels_of_any_length
-from mcaptrack.sources.ingest.labels.number_table import motion_frames, read_motions
-from mcaptrack.sources.ingest.labels.reading import read_homography
-from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline
+from mcaptrack.sources.ingest.labels.content import (
+    ONLY_PEOPLE,
+    OTHERS,
+    BoxTable,
+    Format,
+    Labels,
+    NumberTable,
+    WantedClasses,
+    describe_classes,
+    lines_of,
+)
+from mcaptrack.sources.ingest.labels.reading import is_3d, read_homography, read_labels
+from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline, frames_of_labels
 from mcaptrack.sources.ingest.sidecar import encoding_for
 from mcaptrack.sources.video import VideoOptions
 
@@ -52,6 +63,11 @@ SCHEMA_OF: Final[Mapping[Role, Schema]] = {
 TOPIC_OF: Final[Mapping[Role, str]] = {"corrections": CORRECTED}
 #: The role of a file with the motion of the camera, and the last part of its topic.
 MOTION: Final = "motion"
+
+
+#: Options that apply only to videos, and options that are written otherwise than they are named here.
+FOR_VIDEOS: Final = ("image_format", "quality", "keyframe_interval_s")
+_WRITTEN: Final[Mapping[str, str]] = {"start_ns": "start_time"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,14 +110,11 @@ class IngestOptions:
             fps=self.fps,
         )
 
-    def for_videos(self) -> str:
-        """The first given option that applies only to videos; "" if there is none."""
-        is_option_given = {
-            "`image_format=`": self.image_format != "auto",
-            "`quality=`": self.quality is not None,
-            "`keyframe_interval_s=`": self.keyframe_interval_s is not None,
-        }
-        return next((name for name, is_given in is_option_given.items() if is_given), "")
+    def given(self, *names: str) -> str:
+        """The first of these options that was given, as a user writes it; "" if none was."""
+        defaults = IngestOptions()
+        given = next((name for name in names if getattr(self, name) != getattr(defaults, name)), "")
+        return given and f"`{_WRITTEN.get(given, given)}=`"
 
 
 @dataclass
@@ -126,83 +139,63 @@ class IngestReport:
     holds_boxes_3d: bool = False
 
 
-# The ground plane and the calibration that a user gave for a camera: read, fitted to its pictures, and written.
-
-
-#: The last parts of the topics.
+#: The last parts of the topics of the ground plane and the calibration that a user gave.
 PLANE, CALIBRATION = "ground_plane", "calibration"
 
 
-class GivenGround:
-    """A homography, or a calibration, or neither. Raises McaptrackError for files that can't be read."""
+# Read published motions of cameras: a 2x3 transform per frame, from pixels of the frame before. Letters: F frames.
 
-    def __init__(self, homography: Path | None, calibration: GivenCalibration | None, point: Point) -> None:
-        self._path, self._calibration, self._point = homography, calibration, point
-        self._homography = read_homography(homography) if homography else None
-        self._calibrated: Calibrated | None = None
-        if homography and calibration and calibration.has_pose:
-            raise McaptrackError(
-                f"{homography} and {', '.join(map(str, calibration.paths))} are both a ground plane; give one"
-            )
 
-    @property
-    def is_given(self) -> bool:
-        """Whether there is a homography or a calibration."""
-        return self._homography is not None or self._calibration is not None
+_MOTION_COLUMNS: Final = 7
+#: The largest zoom from one frame to the next.
+_MOST_ZOOM: Final = 4.0
+_MOTION: Final = "a camera motion (frame,m00,m01,m02,m10,m11,m12: 7 columns)"
 
-    @property
-    def has_plane(self) -> bool:
-        """Whether there is a ground plane."""
-        return self._homography is not None or (self._calibration is not None and self._calibration.has_pose)
 
-    def suffixes(self) -> Iterator[str]:
-        """The last parts of the topics that will be written."""
-        if self._calibration is not None:
-            yield CALIBRATION
-        if self.has_plane:
-            yield PLANE
+def read_motions(path: Path) -> Floats:
+    """Read the motions (F, 2, 3) of frames 0 to F - 1 from a text file.
 
-    def plane(
-        self, size: tuple[int, int], prefix: str, pictures: str, frame_id: str, is_stated: bool, remarks: list[str]
-    ) -> GroundPlane | None:
-        """The ground plane for pictures of this size in this topic; None if none follows from what was given.
+    Raises McaptrackError, with the line, for anything else.
+    """
+    table = NumberTable(path, lines_of(path), _MOTION, _MOTION_COLUMNS)
+    if not len(table.values):
+        raise McaptrackError(f"{path} holds no camera motion")
+    frame, motions = table.values[:, 0], table.values[:, 1:].reshape(-1, 2, 3)
+    table.refuse(
+        frame != np.arange(len(frame)),
+        lambda row: f"frame {frame[row]:g} is not {row}: frames count from 0, without gaps",
+    )
+    wrong = np.array([not is_motion(motion) for motion in motions])
+    table.refuse(wrong, lambda row: "the motion is not finite, or can't be inverted")
+    scale = np.array([scale_of(motion) for motion in motions])
+    table.refuse(
+        (scale > _MOST_ZOOM) | (scale < 1 / _MOST_ZOOM),
+        lambda row: f"the motion enlarges the picture {scale[row]:.3g} times; no camera does that in a frame",
+    )
+    return motions
 
-        ``is_stated`` is false if the size is no more than the extent of boxes. Lines about it are added to ``remarks``.
-        """
-        if self._calibration is not None:
-            is_rectified = is_rectified_topic(pictures)
-            self._calibrated = self._calibration.calibrated(
-                prefix, pictures, size, is_stated, frame_id, self._point, is_rectified
-            )
-            remarks += self._calibrated.remarks
-            if self._calibrated.plane is not None:
-                return self._calibrated.plane
-        if self._homography is None:
-            return None
-        try:
-            return GroundPlane(self._homography, *size, self._point)
-        except McaptrackError as error:
-            raise McaptrackError(f"{self._path}: {error}") from None
 
-    def parameters(self) -> dict[str, Any]:
-        """The parameters of the ground plane in its provenance."""
-        if self._path is not None:
-            return {"file": self._path.name, "point": self._point}
-        return {**(self._calibrated.parameters if self._calibrated else {}), "point": self._point}
+def motion_frames(motions: Floats, index: Ints, t_ns: Ints, size: tuple[int, int]) -> list[Frame]:
+    """The motions (F, 2, 3) of a file as frames of pictures ``index`` (P,) at ``t_ns`` (P,), of this width and height.
 
-    def write_calibration(
-        self, writer: log.LogWriter, prefix: str, pictures: str, t_ns: int, encoding: Encoding
-    ) -> dict[str, int]:
-        """Write the calibration as viewers read it, from a time on. Returns the number of messages by topic."""
-        if self._calibrated is None:
-            return {}
-        topic, message = f"{prefix}/{CALIBRATION}", (t_ns, 0, self._calibrated.at(t_ns))
-        provenance = Provenance(INGEST, self._calibrated.parameters, pictures, digest=digest(iter([message])))
-        record = foxglove.record_in(foxglove.CALIBRATION, encoding)
-        channel = writer.add_channel(topic, record, encoding, provenance.to_metadata())
-        for packed in foxglove.messages_in(foxglove.CALIBRATION, [message], encoding):
-            writer.add_message(channel, *packed)
-        return {topic: 1}
+    The motion of a picture that follows on missing ones is that of all of them together. Pictures beyond the last
+    motion are lost.
+    """
+    kept: list[Floats] = []
+    last = -1
+    for number in index.tolist():
+        motion = IDENTITY
+        for at in range(last + 1, min(number + 1, len(motions))):
+            motion = compose(motions[at], motion) if at else IDENTITY
+        kept.append(motion)
+        last = number
+    poses = poses_of(np.array(kept), *size)
+    frames = []
+    for pose, number, t in zip(poses, index.tolist(), t_ns.tolist(), strict=True):
+        judged = pose if number < len(motions) else pose._replace(verdict=Verdict.LOST)
+        reference = judged._replace(reference=int(index[judged.reference]))
+        frames.append(Frame(t, number, pose_to_rows(reference, *size)))
+    return frames
 
 
 class IngestJob:
@@ -224,16 +217,18 @@ class IngestJob:
         #: The topic of the pictures that labels belong to; "" if there is none.
         self.pictures = ""
         source_options = (options.calibration, options.calibration_name, options.calibration_unit)
-        calibration = GivenCalibration.read(*source_options) if options.calibration else None
-        #: The ground plane and the calibration that were given.
-        self.ground_given = GivenGround(options.ground_plane, calibration, options.point)
-        self.labels: dict[Role, tuple[Path, LabelFile]] = {
-            role: (path, self.read(path, role)) for role, path in options.labels.items()
-        }
+        #: The calibration and the homography of the ground plane that were given.
+        self.calibration = GivenCalibration.read(*source_options) if options.calibration else None
+        self._calibrated: Calibrated | None = None
+        self._homography = read_homography(options.ground_plane) if options.ground_plane else None
+        if self._homography and self.calibration and self.calibration.has_pose:
+            names = ", ".join(map(str, self.calibration.paths))
+            raise McaptrackError(f"{options.ground_plane} and {names} are both a ground plane; give one")
+        self.labels: dict[Role, Labels] = {role: self.read(path, role) for role, path in options.labels.items()}
         self.motions = read_motions(options.motion) if options.motion else None
         self.check_labels()
 
-    def read(self, path: Path, role: Role) -> LabelFile:
+    def read(self, path: Path, role: Role) -> Labels:
         """Read a label file with the format options."""
         options = self.options
         wanted = options.classes or (WantedClasses("all") if role == "corrections" else ONLY_PEOPLE)
@@ -242,7 +237,18 @@ class IngestJob:
                 f"{path} holds 3D boxes, and {self.source} does not; add them with "
                 f"{call('ingest', path, role=role, into='LOG')}"
             )
-        return read_labels_of_any_length(path, options.label_format, role, options.first_frame, options.columns, wanted)
+        given = (options.label_format, role, options.first_frame, options.columns, wanted)
+        return read_labels(path, *given, in_parts=True)
+
+    @property
+    def has_ground_given(self) -> bool:
+        """Whether a homography or a calibration was given."""
+        return self._homography is not None or self.calibration is not None
+
+    @property
+    def _has_plane(self) -> bool:
+        """Whether a ground plane follows from what was given."""
+        return self._homography is not None or (self.calibration is not None and self.calibration.has_pose)
 
     @property
     def has_labels(self) -> bool:
@@ -261,8 +267,8 @@ class IngestJob:
         not known, or isn't the given one.
         """
         stated = self.options.size
-        paths = [path for path, labels in self.labels.values() if labels.is_normalised]
-        if not any(labels.format in OTHERS for _, labels in self.labels.values()):
+        paths = [labels.path for labels in self.labels.values() if labels.is_normalised]
+        if not any(labels.format in OTHERS for labels in self.labels.values()):
             return
         actual = size() if size else stated
         if stated and actual and actual != stated:
@@ -277,37 +283,45 @@ class IngestJob:
             )
         if actual is None:
             return
-        for role, (path, labels) in self.labels.items():
-            if isinstance(labels, Labels) and labels.format in OTHERS:
-                self.labels[role] = path, fitted(path, labels, actual)
+        for labels in self.labels.values():
+            if labels.format in OTHERS:
+                labels.fit(actual)
 
     def check_labels(self) -> None:
         """Refuse labels that don't suit their role."""
-        for role, (path, labels) in self.labels.items():
+        for role, labels in self.labels.items():
             if role == "detections" and not labels.has_boxes:
-                raise McaptrackError(f"{path} holds positions, not boxes; detections are boxes")
+                raise McaptrackError(f"{labels.path} holds positions, not boxes; detections are boxes")
             if role != "detections" and not labels.has_ids:
-                raise McaptrackError(f"{path} has no ids (all are -1); {role} need ids")
+                raise McaptrackError(f"{labels.path} has no ids (all are -1); {role} need ids")
 
     def report_assumptions(self) -> None:
         """Report what is assumed about the labels, and what of them is left out."""
-        firsts = {labels.first_frame: f"frame {labels.first_frame} of {path}" for path, labels in self.labels.values()}
+        all_labels = self.labels.values()
+        firsts = {labels.first_frame: f"frame {labels.first_frame} of {labels.path}" for labels in all_labels}
         if len(firsts) > 1:
             warn(
                 f"{' and '.join(firsts.values())} are assumed to be the same picture; `first_frame=` sets the number",
                 "clock",
             )
-        for role, (path, labels) in self.labels.items():
-            self.report.remarks += labels.remarks
-            for text, code in labels.doubts:
-                warn(text, code)
-            if labels.left_out:
-                warn(f"{path} also holds {labels.left_out}; left out of {role}", "left-out")
+        for role, labels in self.labels.items():
+            path = labels.path
+            self.report_table(role, labels)
             if labels.step > 1:
                 text = f"{path} has labels every {labels.step} frames, from {labels.labelled[0]} on"
                 self.report.remarks.append(f"{text}; the frames in between are left out")
-            if text := describe_classes(*labels.class_counts(), labels.classes):
+            kinds, counts = labels.class_counts()
+            if len(kinds) > 1:
+                text = describe_classes(kinds, counts, labels.classes)
                 self.report.remarks.append(f"{path} has several classes; class_id is {text}")
+
+    def report_table(self, role: Role, labels: BoxTable) -> None:
+        """Report how a label file was understood, and what of it is left out."""
+        self.report.remarks += labels.remarks
+        for text, code in labels.doubts:
+            warn(text, code)
+        if labels.left_out:
+            warn(f"{labels.path} also holds {labels.left_out}; left out of {role}", "left-out")
 
     def __enter__(self) -> Self:
         return self
@@ -345,11 +359,9 @@ class IngestJob:
     def hint_other_topic(self, topics: Collection[str]) -> str:
         """A hint for topics that exist already: the option that chooses others."""
         ends = [topic.removeprefix(self.prefix) for topic in self.topics() if topic.startswith(self.prefix)]
-        name = free = self.other_camera.format(camera=self.prefix.strip("/"))
-        number = 1
-        while any(f"/{free}{end}" in topics for end in ends):
-            number += 1
-            free = f"{name}{number}"
+        name = self.other_camera.format(camera=self.prefix.strip("/"))
+        names = (name, *(f"{name}{number}" for number in range(2, len(topics) + 3)))
+        free = next(name for name in names if not any(f"/{name}{end}" in topics for end in ends))
         return f"`camera={free!r}` puts these beside them"
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
@@ -362,7 +374,10 @@ class IngestJob:
     def topics(self) -> Iterator[str]:
         """The topics that will be written."""
         yield from (f"{self.prefix}/{TOPIC_OF.get(role, role)}" for role in self.labels)
-        yield from (f"{self.prefix}/{suffix}" for suffix in self.ground_given.suffixes())
+        if self.calibration is not None:
+            yield f"{self.prefix}/{CALIBRATION}"
+        if self._has_plane:
+            yield f"{self.prefix}/{PLANE}"
         if self.motions is not None:
             yield f"{self.prefix}/{MOTION}"
 
@@ -370,27 +385,48 @@ class IngestJob:
     frame_id = ""
 
     def plane(self, width_px: int, height_px: int, is_stated: bool = True) -> GroundPlane | None:
-        """The ground plane for pictures of this size; None if none was given. ``is_stated``: they have this size."""
-        frame_id, remarks = self.frame_id or self.prefix.lstrip("/"), self.report.remarks
-        return self.ground_given.plane((width_px, height_px), self.prefix, self.pictures, frame_id, is_stated, remarks)
+        """The ground plane for pictures of this size; None if none was given. ``is_stated``: they have this size, which
+        is otherwise no more than the extent of boxes.
+        """
+        if self.calibration is not None:
+            frame_id, is_rectified = self.frame_id or self.prefix.lstrip("/"), is_rectified_topic(self.pictures)
+            of_pictures = (self.prefix, self.pictures, (width_px, height_px), is_stated, frame_id)
+            self._calibrated = self.calibration.calibrated(*of_pictures, self.options.point, is_rectified)
+            self.report.remarks += self._calibrated.remarks
+            if self._calibrated.plane is not None:
+                return self._calibrated.plane
+        if self._homography is None:
+            return None
+        try:
+            return GroundPlane(self._homography, width_px, height_px, self.options.point)
+        except McaptrackError as error:
+            raise McaptrackError(f"{self.options.ground_plane}: {error}") from None
 
     def write_plane(self, writer: log.LogWriter, plane: GroundPlane | None, t_ns: int) -> None:
         """Write the ground plane and the calibration, if they were given, valid from a time on."""
-        ground = self.ground_given
-        if plane is not None and ground.has_plane:
+        calibrated, file = self._calibrated, self.options.ground_plane
+        if plane is not None and self._has_plane:
             frame = Frame(t_ns, 0, plane_to_rows(plane))
-            self.write_rows(writer, PLANE, GROUND_PLANE, lambda: iter([frame]), ground.parameters())
-        self.report.messages |= ground.write_calibration(writer, self.prefix, self.pictures, t_ns, self.encoding)
+            parameters = {"file": file.name} if file else calibrated.parameters if calibrated else {}
+            parameters = parameters | {"point": self.options.point}
+            self.write_rows(writer, PLANE, GROUND_PLANE, lambda: iter([frame]), parameters)
+        if calibrated is None:
+            return
+        topic, message = f"{self.prefix}/{CALIBRATION}", (t_ns, 0, calibrated.at(t_ns))
+        provenance = Provenance(INGEST, calibrated.parameters, self.pictures, digest=digest(iter([message])))
+        record = foxglove.record_in(foxglove.CALIBRATION, self.encoding)
+        channel = writer.add_channel(topic, record, self.encoding, provenance.to_metadata())
+        for packed in foxglove.messages_in(foxglove.CALIBRATION, [message], self.encoding):
+            writer.add_message(channel, *packed)
+        self.report.messages[topic] = 1
 
     def write_labels(self, writer: log.LogWriter, plane: GroundPlane | None, timeline: Timeline) -> None:
         """Write the labels, each frame at the time of its picture."""
-        for role, (path, labels) in self.labels.items():
-            placed = timeline.place(path, labels, self.report.lost)
+        for role, labels in self.labels.items():
+            placed = timeline.place(labels, self.report.lost)
             if role == "corrections":  # frames beyond those that were looked at stay as they are
                 placed = placed.between(int(labels.labelled[0]), int(labels.labelled[-1]))
-            parameters: dict[str, Any] = {"file": path.name, "format": labels.format} | self.label_parameters(
-                role, labels
-            )
+            parameters = {"file": labels.path.name, "format": labels.format} | self.label_parameters(role, labels)
             frames = self.frames(role, plane, placed)
             self.write_rows(writer, TOPIC_OF.get(role, role), SCHEMA_OF[role], frames, parameters, labels.classes)
 
@@ -406,7 +442,7 @@ class IngestJob:
         frames = motion_frames(self.motions, timeline.index, timeline.t_ns, size)
         self.write_rows(writer, MOTION, CAMERA_MOTION, lambda: iter(frames), {"file": path.name})
 
-    def label_parameters(self, role: Role, labels: LabelFile) -> dict[str, Any]:
+    def label_parameters(self, role: Role, labels: Labels) -> dict[str, Any]:
         """Additional parameters in the provenance of labels."""
         out: dict[str, Any] = {} if self.options.first_frame is None else {"first_frame": labels.first_frame}
         if self.options.columns and labels.format in ("csv", "supervision"):
@@ -419,7 +455,7 @@ class IngestJob:
 
     def frames(self, role: Role, plane: GroundPlane | None, placed: Placed) -> Frames:
         """The labels of these frames, including empty frames."""
-        return frames_of_labels(self.labels[role][1].parts, role, plane, placed)
+        return frames_of_labels(self.labels[role].parts, role, plane, placed)
 
     def write_rows(
         self,

@@ -5,7 +5,7 @@ Letters: N rows.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
@@ -16,31 +16,39 @@ import numpy as np
 
 from mcaptrack import log
 from mcaptrack.choices import Point, Role
-from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.arrays import Floats
+from mcaptrack.errors import McaptrackError, list_names
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
+from mcaptrack.geometry.oriented_boxes import COLUMNS
 from mcaptrack.geometry.plane import GroundPlane
-from mcaptrack.notices import warn
-from mcaptrack.schema import TRACKS, Frame
-from mcaptrack.schema.framing import frame_times, unique_values
-from mcaptrack.schema.provenance import CLOCK
+from mcaptrack.geometry.transform_tree import plain_frame
+from mcaptrack.notices import collected, warn
+from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Rows
+from mcaptrack.schema.framing import frame_times, split_rows, unique_values
+from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance, frame_id_of
 from mcaptrack.sources.calibrations import frame_of
 from mcaptrack.sources.camera_motion import planes_in
-from mcaptrack.sources.cameras import camera_at
+from mcaptrack.sources.cameras import DEFAULT_CAMERA, camera_at
 from mcaptrack.sources.corrections import CORRECTED, CORRECTED_FROM
+from mcaptrack.sources.fixed_frame import holds_boxes_3d, named_detections, transforms_of
 from mcaptrack.sources.foreign import holds_pictures
-from mcaptrack.sources.ingest.job import IngestJob, IngestOptions
-from mcaptrack.sources.ingest.labels.camera import (
+from mcaptrack.sources.ingest.job import FOR_VIDEOS, SCHEMA_OF, IngestJob, IngestOptions
+from mcaptrack.sources.ingest.labels.content import BoxRows3D, Format, Labels, WantedClasses, describe_classes
+from mcaptrack.sources.ingest.labels.reading import read_boxes_3d
+from mcaptrack.sources.ingest.labels.timeline import (
+    MAX_FRAMES,
     ExistingLabels,
+    Placed,
+    Timeline,
     camera_of,
+    camera_prefix,
+    count_frames,
     detections_topic,
+    frame_times_ns,
     labels_of,
     picture_size,
     timeline_of,
 )
-from mcaptrack.sources.ingest.labels.content import Format, Labels, WantedClasses
-from mcaptrack.sources.ingest.labels.long_files import LabelFile
-from mcaptrack.sources.ingest.labels.timeline import MAX_FRAMES, Placed, Timeline, count_frames
 from mcaptrack.sources.video import SEQINFO, find_seqinfo
 
 _SDD_FPS: Final = Fraction(30)
@@ -117,8 +125,8 @@ class LabelJob(IngestJob):
         for role, path in reversed(inputs):
             self._add(role, path)
         self.check_labels()
-        if options.for_videos():
-            raise McaptrackError(f"{self.source} is a label file; {options.for_videos()} is for videos")
+        if name := options.given(*FOR_VIDEOS):
+            raise McaptrackError(f"{self.source} is a label file; {name} is for videos")
         if options.frames is not None and not 0 < options.frames <= MAX_FRAMES:
             raise McaptrackError(f"`frames=` is a number from 1 to {MAX_FRAMES}, not {options.frames}")
         if "corrections" in self.labels and into is None:
@@ -130,9 +138,7 @@ class LabelJob(IngestJob):
         if into is not None:
             self.prefix, self.pictures = camera_of(into, options.camera)
         if into is not None and "corrections" in self.labels:
-            path, labels = self.labels["corrections"]
-            if isinstance(labels, Labels):  # corrections are never read in parts
-                self.labels = {**self.labels, "corrections": (path, with_new_ids(into, self.prefix, labels))}
+            self.labels["corrections"] = with_new_ids(into, self.prefix, self.labels["corrections"])
             self.frame_id = frame_of(into, self.pictures) if self.pictures else ""
         seen = detections_topic(into, self.prefix) if into is not None and not self.pictures else ""
         pictures_of = partial(picture_size, into, self.pictures) if into is not None and self.pictures else None
@@ -140,7 +146,7 @@ class LabelJob(IngestJob):
         size = self._boxes_extent()
         if into is not None and (self.pictures or seen):
             self.timeline = self._of_pictures(into, self.pictures or seen)
-            needs_size = self.ground_given.is_given or self.motions is not None
+            needs_size = self.has_ground_given or self.motions is not None
             size = pictures_of() if needs_size and pictures_of else size
         else:
             self.timeline = self._of_rate(default_fps)
@@ -165,13 +171,13 @@ class LabelJob(IngestJob):
         labels = self.read(path, role)
         if role in self.labels:
             raise McaptrackError(
-                f"{path} and {self.labels[role][0]} are both {role}; give the role of {path} with `role=`"
+                f"{path} and {self.labels[role].path} are both {role}; give the role of {path} with `role=`"
             )
-        self.labels = {role: (path, labels), **self.labels}
+        self.labels = {role: labels, **self.labels}
 
     def _boxes_extent(self) -> tuple[int, int]:
         """The image size that contains all boxes, (width, height) in pixels."""
-        corners = [labels.corner_px() for _, labels in self.labels.values() if labels.has_boxes]
+        corners = [labels.corner_px() for labels in self.labels.values() if labels.has_boxes]
         if not corners:
             return 0, 0
         x_px, y_px = np.ceil(np.max(corners, axis=0)).tolist()
@@ -193,20 +199,19 @@ class LabelJob(IngestJob):
                 f"{into.path}: {timeline.of} are {timeline.fps:.6g} a second, not {float(options.fps):g}; labels take "
                 "the times of their pictures, so leave `fps=` out"
             )
-        for value, name in ((options.start_ns, "`start_time=`"), (options.frames, "`frames=`")):
-            if value is not None:
-                raise McaptrackError(f"{into.path}: labels take the times of {timeline.of}; leave {name} out")
+        if name := options.given("start_ns", "frames"):
+            raise McaptrackError(f"{into.path}: labels take the times of {timeline.of}; leave {name} out")
         return timeline
 
     def _of_rate(self, default: Fraction | None) -> Timeline:
         """The times of missing pictures, by the frame rate from the options, the files or the log."""
         existing = labels_of(self.into, self.prefix) if self.into else {}
-        timed = {path: labels.times_s for path, labels in self.labels.values() if labels.times_s is not None}
+        timed = {labels.path: labels.times_s for labels in self.labels.values() if labels.times_s is not None}
         if timed and self.options.frames is not None:
             raise McaptrackError(f"{next(iter(timed))} has times; leave `frames=` out")
         if timed:
             return self._of_times(timed)
-        counted = [_known(path, labels) for path, labels in self.labels.values()]
+        counted = [_known(labels) for labels in self.labels.values()]
         rates = {clock.fps: clock.of for clock in counted if clock.fps}
         if self.options.fps:
             self._other_rates = [
@@ -233,7 +238,7 @@ class LabelJob(IngestJob):
         timeline = Timeline.spaced(count, fps, self._start_ns, f"the frames that {counted_by} counts")
         if self.into and any(part.index.counts for part in self.into.parts):
             self._check_overlap(self.into, timeline)
-        first = next(iter(self.labels.values()))[1].first_frame
+        first = next(iter(self.labels.values())).first_frame
         self._clock = (
             f"{self.source}: {count} frames (by {counted_by}) from {first} on, {float(fps):g} a second (by {of})",
             of in (*_BY_FORMAT.values(), _ASSUMED),
@@ -279,7 +284,7 @@ class LabelJob(IngestJob):
         frame_counts = {entry.frames: entry.of for entry in counted if entry.frames}
         if frame_counts:
             return max(frame_counts), frame_counts[max(frame_counts)]
-        counts = [count_frames(path, labels) for path, labels in self.labels.values()]
+        counts = [count_frames(labels) for labels in self.labels.values()]
         return max(*counts, *(label.frames for label in existing.values()), 1), "the last label"
 
     def _check_overlap(self, into: log.Log, timeline: Timeline) -> None:
@@ -289,7 +294,7 @@ class LabelJob(IngestJob):
             raise McaptrackError(
                 f"{into.path} is from {_seconds(into.start_ns)} to {_seconds(into.end_ns)}, the labels would be "
                 f"from {_seconds(first)} to {_seconds(last)}, and {self.prefix} has no pictures to take times from; "
-                f"say when frame {next(iter(self.labels.values()))[1].first_frame} was with `start_time=`"
+                f"say when frame {next(iter(self.labels.values())).first_frame} was with `start_time=`"
             )
 
     def _no_clock(self) -> str:
@@ -306,33 +311,32 @@ class LabelJob(IngestJob):
             writer.add_metadata(CLOCK, {"start_ns": str(self._start_ns)})
         self.write_plane(writer, self.ground, int(self.timeline.t_ns[0]))
         if self.into is not None and "corrections" in self.labels:
-            path, labels = self.labels["corrections"]
-            placed = self.timeline.place(path, labels, []).between(int(labels.labelled[0]), int(labels.labelled[-1]))
+            labels = self.labels["corrections"]
+            placed = self.timeline.place(labels, []).between(int(labels.labelled[0]), int(labels.labelled[-1]))
             warn_uncovered(self.into, f"{self.prefix}/{CORRECTED}", placed)
         self.write_labels(writer, self.ground, self.timeline)
         self.write_motion(writer, self.timeline, self._size)
 
-    def label_parameters(self, role: Role, labels: LabelFile) -> dict[str, Any]:
+    def label_parameters(self, role: Role, labels: Labels) -> dict[str, Any]:
         """The frame rate, if there were no pictures."""
         return super().label_parameters(role, labels) | ({} if self._fps is None else {"fps": str(self._fps)})
 
     def all_frames(self, role: Role) -> list[Frame]:
         """The labels of a role as frames, including empty frames."""
-        path, labels = self.labels[role]
-        return list(self.frames(role, self.ground, self.timeline.place(path, labels, self.report.lost))())
+        return list(self.frames(role, self.ground, self.timeline.place(self.labels[role], self.report.lost))())
 
 
 def _seconds(t_ns: int) -> str:
     return f"{t_ns / NS_PER_S:.3f} s"
 
 
-def _known(path: Path, labels: LabelFile) -> _Known:
+def _known(labels: Labels) -> _Known:
     """Frame rate and number of frames by the format of a label file, or by seqinfo.ini."""
     if labels.format == "sdd":
         return _Known(_SDD_FPS, None, _BY_FORMAT[labels.format])
     if labels.format in ("trajnet", "obsmat"):  # annotated at 2.5 Hz, whatever the video's rate
         return _Known(labels.step / _LABEL_STEP_S, None, _BY_FORMAT[labels.format])
-    info = find_seqinfo(path.parent)
+    info = find_seqinfo(labels.path.parent)
     return _Known(info.fps, info.frames, SEQINFO) if info else _Known(None, None, "")
 
 
@@ -341,7 +345,6 @@ def label_frames(
     fps: Fraction | None,
     ground_plane: Path | None,
     point: Point,
-    label_format: Format = "auto",
     classes: WantedClasses | None = None,
 ) -> dict[Role, list[Frame]]:
     """Read label files with a common clock as frames, without writing a log.
@@ -349,7 +352,229 @@ def label_frames(
     Raises McaptrackError as ``ingest`` does. For comparisons only the order and intervals of times matter, so files
     without a frame rate get one frame per second unless ``fps`` is given.
     """
-    options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point, label_format=label_format, classes=classes)
+    options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point, classes=classes)
     job = LabelJob([(role, path) for role, path in files.items()], options, default_fps=Fraction(1))
     job.report_assumptions()
     return {role: job.all_frames(role) for role in files}
+
+
+# Ingest label files with 3D boxes: for a recorded log, or as a log of their own.
+#
+# Letters: N rows, F frames.
+
+
+#: The frame of reference of boxes, if neither the user nor the format nor the log names one.
+FRAME: Final = "map"
+#: Stamps may differ from the times of a log by this much.
+_MARGIN_NS: Final = 60 * NS_PER_S
+
+
+# Find the 3D boxes of a log that labels belong to.
+
+
+_TRUTH: Final = "truth"
+_LISTED: Final = 8
+
+
+def boxes_topic(opened: log.Log, camera: str) -> str:
+    """The topic of the 3D boxes below the name of a camera, or the only one of the log; "" if there is none.
+
+    Raises McaptrackError if there are several, and no name is given.
+    """
+    topics = sorted(
+        channel.topic for channel in opened.channels.values() if channel.messages and _holds_boxes(opened, channel)
+    )
+    if camera != DEFAULT_CAMERA:
+        topics = [topic for topic in topics if camera_prefix(topic) == "/" + camera.strip("/")]
+        return topics[0] if topics else ""
+    prefixes = sorted({camera_prefix(topic) for topic in topics})
+    if len(prefixes) > 1:
+        raise McaptrackError(
+            f"{opened.path} has 3D boxes in several places, {', '.join(topics)}; labels belong to those of one: choose "
+            f"with `camera={prefixes[0].strip('/')!r}`"
+        )
+    return topics[0] if topics else ""
+
+
+def _holds_boxes(opened: log.Log, channel: log.Channel) -> bool:
+    provenance = Provenance.from_metadata(channel.metadata)
+    if provenance is None:
+        return holds_boxes_3d(opened, channel.topic)
+    is_ingested = provenance.transform == INGEST and channel.schema_name in (DETECTIONS.name, TRACKS.name)
+    return is_ingested and bool(provenance.frame_id) and not channel.topic.endswith(f"/{_TRUTH}")
+
+
+def box_times(opened: log.Log, topic: str) -> Ints:
+    """The times of the frames of 3D boxes (F,): the stamps of recorded messages."""
+    if Provenance.from_metadata(opened.channel(topic).metadata) is not None:
+        return np.asarray(opened.times(topic), np.int64)
+    with collected():  # the command that tracks the boxes says it
+        return frame_times(named_detections(opened, topic).frames)
+
+
+def root_frame(opened: log.Log) -> str:
+    """The only root of the transforms of a log; "" if it has none, or several."""
+    tree = transforms_of(opened)
+    roots = tree.roots() if tree is not None else []
+    return roots[0] if len(roots) == 1 else ""
+
+
+def warn_of_frame(opened: log.Log, frame_id: str, labels: Path) -> None:
+    """Warn if a log has frames of reference, and not the one of labels."""
+    tree = transforms_of(opened)
+    of_channels = {frame_id_of(channel.metadata) for channel in opened.channels.values()} - {""}
+    frames = sorted({*(tree.frames() if tree else ()), *of_channels})
+    if frames and plain_frame(frame_id) not in frames:
+        some = list_names(frames, _LISTED)
+        text = f"there is no frame {frame_id} in {opened.path} (but {some}), so that its tracks can't be compared"
+        warn(f"{labels}: {text} with these boxes", "transforms")
+
+
+class Boxes3DJob(IngestJob):
+    """Label files with 3D boxes. The first of ``inputs`` is the input itself.
+
+    If its role is None, it depends on whether the file has ids.
+    """
+
+    def __init__(
+        self, inputs: Sequence[tuple[Role | None, Path]], options: IngestOptions, into: log.Log | None = None
+    ) -> None:
+        super().__init__(inputs[0][1], replace(options, labels={}), into)
+        if name := options.given(*FOR_VIDEOS, "ground_plane", "calibration", "motion", "size", "frames"):
+            raise McaptrackError(f"{self.source} holds 3D boxes; {name} is for pictures and boxes in them")
+        self.boxes: dict[Role, BoxRows3D] = {}
+        for stated, path in (*inputs, *options.labels.items()):
+            if stated == "corrections":
+                raise McaptrackError(f"{path} holds 3D boxes; corrections are boxes in pictures")
+            rows = read_boxes_3d(path, stated or "detections", options.label_format, options.columns, options.scene)
+            role = stated or ("tracks" if rows.has_ids else "detections")
+            if role != "detections":
+                rows.check(role)
+            if role in self.boxes:
+                raise McaptrackError(
+                    f"{path} and {self.boxes[role].path} are both {role}; give the role of {path} with `role=`"
+                )
+            self.boxes[role] = rows
+        self._topic = boxes_topic(into, options.camera) if into else ""
+        if self._topic and options.camera == DEFAULT_CAMERA:
+            self.prefix = self._topic.rpartition("/")[0] or self.prefix
+        for rows in self.boxes.values():
+            rows.frame_id = self._frame_id(rows)
+        self.boxes = {role: self._at_times(role, rows) for role, rows in self.boxes.items()}
+
+    @property
+    def roles(self) -> Set[Role]:
+        """The roles of label files."""
+        return self.boxes.keys()
+
+    def _frame_id(self, rows: BoxRows3D) -> str:
+        """The frame of reference of rows: as the user says, as the format says, or the root of the log's transforms."""
+        if self.options.frame_id is not None:
+            if self.into:
+                warn_of_frame(self.into, self.options.frame_id, rows.path)
+            return self.options.frame_id
+        root = root_frame(self.into) if self.into else ""
+        frame_id = rows.frame_id or root or FRAME
+        reason = "by its format" if rows.frame_id else "the root of the log's transforms" if root else "assumed"
+        text = f": boxes are taken as those of the frame {frame_id!r} ({reason}); `frame=` names another"
+        (rows.doubt if reason == "assumed" else rows.remark)(text)
+        return frame_id
+
+    def _at_times(self, role: Role, rows: BoxRows3D) -> BoxRows3D:
+        t_ns, labelled = self._times(rows, rows.frame, rows.labelled)
+        timed = rows.settled(t_ns, labelled, role, self.options.classes)
+        if self.into is not None and any(part.index.counts for part in self.into.parts):
+            first, last = int(timed.labelled[0]), int(timed.labelled[-1])
+            if first > self.into.end_ns + _MARGIN_NS or last < self.into.start_ns - _MARGIN_NS:
+                raise McaptrackError(
+                    f"{rows.path} is from {first / NS_PER_S:.3f} to {last / NS_PER_S:.3f} s, {self.into.path} from "
+                    f"{self.into.start_ns / NS_PER_S:.3f} to {self.into.end_ns / NS_PER_S:.3f} s; give the time of the "
+                    "first labels with `start_time=`"
+                )
+        return timed
+
+    def _times(self, rows: BoxRows3D, number: Ints, labelled: Ints) -> tuple[Ints, Ints]:
+        """The times of rows (N,) and of labelled frames (F,), by their own times, a frame rate, or the log."""
+        options = self.options
+        if rows.is_timed:
+            if name := options.given("fps", "first_frame"):
+                raise McaptrackError(f"{rows.path} has times; leave {name} out")
+            shift = 0 if options.start_ns is None else options.start_ns - int(labelled[0])
+            return number + shift, labelled + shift
+        first = options.first_frame
+        if first is None:
+            first = rows.assume_first(int(labelled[0])) if rows.format == "csv" else 0
+        if int(labelled[0]) < first:
+            raise McaptrackError(f"{rows.path}: its first frame is {labelled[0]}, before `first_frame={first}`")
+        if options.fps is not None:
+            start = options.start_ns if options.start_ns is not None else self._log_start_ns()
+            rows.remark(f": frame {first} is at {start / NS_PER_S:.3f} s")
+            both = (start + frame_times_ns(numbers - first, options.fps) for numbers in (number, labelled))
+            return next(both), next(both)
+        if self.into is None or not self._topic:
+            raise McaptrackError(
+                f"{rows.path} counts frames and has no clock; give the frames per second with `fps=`, or add it to the "
+                "log of its boxes with `into=`"
+            )
+        times = box_times(self.into, self._topic)
+        if int(labelled[-1]) - first >= len(times):
+            raise McaptrackError(
+                f"{rows.path}: its last frame is {labelled[-1]}, and {self._topic} has {len(times)} messages, from "
+                f"frame {first} on; give the number of the first with `first_frame=`, or the rate with `fps=`"
+            )
+        rows.remark(f": frame {first} is the first message of {self._topic}")
+        return times[number - first], times[labelled - first]
+
+    def _log_start_ns(self) -> int:
+        if self.into is None:
+            return 0
+        return int(box_times(self.into, self._topic)[0]) if self._topic else self.into.start_ns
+
+    def topics(self) -> Iterator[str]:
+        """The topics that will be written."""
+        yield from (f"{self.prefix}/{role}" for role in self.boxes)
+
+    def report_assumptions(self) -> None:
+        """Report how the boxes were understood, and what of them is left out."""
+        for role, rows in self.boxes.items():
+            self.report_table(role, rows)
+            text = describe_classes(*np.unique(rows.class_id, return_counts=True), rows.classes)
+            self.report.remarks.append(f"{rows.path}: class_id is {text}")
+
+    def write(self, writer: log.LogWriter, has_clock: bool) -> None:
+        """Write the boxes."""
+        if self.into is None and not has_clock:
+            start = min(int(rows.labelled[0]) for rows in self.boxes.values())
+            writer.add_metadata(CLOCK, {"start_ns": str(start)})
+        for role, rows in self.boxes.items():
+            parameters: dict[str, Any] = {"file": rows.path.name, "format": rows.format} | self._parameters(role)
+            frames = partial(iter, self.all_frames(role))
+            self.write_rows(writer, role, SCHEMA_OF[role], frames, parameters, rows.classes, rows.frame_id)
+
+    def _parameters(self, role: Role) -> dict[str, Any]:
+        options = self.options
+        parameters: Mapping[str, Any] = {
+            "first_frame": options.first_frame,
+            "columns": ",".join(f"{key}={name}" for key, name in (options.columns or {}).items()) or None,
+            "classes": options.classes.text if options.classes and role != "detections" else None,
+            "scene": options.scene,
+            "fps": None if options.fps is None else str(options.fps),
+        }
+        return {name: value for name, value in parameters.items() if value is not None}
+
+    def all_frames(self, role: Role) -> list[Frame]:
+        """The boxes of a role as frames, at all times that the file describes."""
+        rows = self.boxes[role]
+        ends = np.searchsorted(rows.frame, rows.labelled, "right")
+        return split_rows(rows.labelled, range(len(ends)), label_rows_3d(rows, role), ends)
+
+
+def label_rows_3d(labels: BoxRows3D, role: Role) -> Rows:
+    """Convert the N rows of labels to rows of detections or tracks."""
+    columns = dict(zip(COLUMNS, labels.boxes.T, strict=True))
+    if labels.velocity is not None:
+        columns |= dict(zip(("vx_m_per_s", "vy_m_per_s"), labels.velocity.T, strict=True))
+    columns |= {"score": labels.score, "class_id": labels.class_id, "source_id": np.full(len(labels.boxes), -1)}
+    if role == "detections":
+        return DETECTIONS.rows(**columns)
+    return TRACKS.rows(track_id=labels.id, observed=np.ones(len(labels.boxes), bool), **columns)

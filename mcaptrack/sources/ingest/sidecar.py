@@ -66,7 +66,7 @@ class SidecarChoice:
             return True
         if not recording:
             return False
-        if any(Provenance.from_metadata(channel.metadata) for channel in opened.recorded):
+        if _ours(opened):
             self.why = f"earlier results are in it; {_for_ros_tools(opened, recording)}"
             return False
         self.why = (
@@ -79,9 +79,14 @@ class SidecarChoice:
         return f"results are in {written_to}: {self.why}"
 
 
+def _ours(opened: log.Log) -> list[log.Channel]:
+    """The channels of a log itself that hold results."""
+    return [channel for channel in opened.recorded if Provenance.from_metadata(channel.metadata)]
+
+
 def _warn_twice(opened: log.Log, results: Path) -> None:
     """Warn of results that stand in a log and beside it."""
-    ours = {channel.topic for channel in opened.recorded if Provenance.from_metadata(channel.metadata)}
+    ours = {channel.topic for channel in _ours(opened)}
     with log.read(results) as beside:
         twice = sorted(ours & beside.channels.keys())
     if twice:
@@ -96,8 +101,7 @@ def _warn_twice(opened: log.Log, results: Path) -> None:
 
 def _for_ros_tools(opened: log.Log, recording: str) -> str:
     """Say whether ROS tools can read the results in a recording, as text."""
-    ours = [channel for channel in opened.recorded if Provenance.from_metadata(channel.metadata)]
-    if encoding_for(opened) == CDR and all(channel.message_encoding == CDR for channel in ours):
+    if encoding_for(opened) == CDR and all(channel.message_encoding == CDR for channel in _ours(opened)):
         return f"they are ROS messages, for it is {recording}"
     return f"ROS tools may stumble over them, for it is {recording}"
 

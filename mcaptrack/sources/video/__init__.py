@@ -4,10 +4,9 @@ FFmpeg does the work, through PyAV (its wheels include FFmpeg).
 """
 
 from mcaptrack.sources.video.codecs import is_video_codec, read_head
-from mcaptrack.sources.video.decode import EncodedPicture, decode_bgr, decode_gray
+from mcaptrack.sources.video.decode import RAW_ENCODINGS, EncodedPicture, PixelLayout, decode_bgr, decode_gray
 from mcaptrack.sources.video.encode import H264Encoder, VideoOptions, encode_image, write_clip, write_mp4
 from mcaptrack.sources.video.image_folder import IMAGE_SUFFIXES, SEQINFO, SeqInfo, find_seqinfo
-from mcaptrack.sources.video.raw_pixels import RAW_ENCODINGS, PixelLayout
 from mcaptrack.sources.video.reader import PictureMessage, Video, open_video
 
 __all__ = [

@@ -5,8 +5,9 @@ The size is read from the first bytes, before anything is decoded, so that overs
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Final, NamedTuple, Protocol
+import re
+from mmap import mmap
+from typing import Final, NamedTuple
 
 from mcaptrack import environment
 from mcaptrack.errors import McaptrackError
@@ -37,16 +38,6 @@ class StillHeader(NamedTuple):
     width_px: int
     height_px: int
     bytes_a_pixel: int = 4
-
-
-class Buffer(Protocol):
-    """Bytes, or a file that is mapped into memory."""
-
-    def __getitem__(self, key: slice, /) -> bytes:
-        """Some of the bytes."""
-
-    def __len__(self) -> int:
-        """The number of bytes."""
 
 
 def max_pixels() -> int:
@@ -82,7 +73,7 @@ def check_still(still: StillHeader, where: object) -> None:
         raise McaptrackError(f"{where} has {width} x {height} pixels of {size} bytes; {too_large()} of {_BYTES} bytes")
 
 
-def still_size(data: Buffer) -> StillHeader | None:
+def still_size(data: bytes | mmap) -> StillHeader | None:
     """The size in the header of a still image; None for other formats, and for headers that are cut off."""
     head = bytes(data[:32])
     if head.startswith(_PNG):
@@ -111,7 +102,7 @@ def _little_endian(data: bytes) -> int:
     return int.from_bytes(data, "little")
 
 
-def _jpeg(data: Buffer) -> StillHeader | None:
+def _jpeg(data: bytes | mmap) -> StillHeader | None:
     at = 2
     while at + 9 <= len(data):
         head = bytes(data[at : at + 9])
@@ -136,7 +127,7 @@ def _webp(head: bytes) -> StillHeader | None:
     return StillHeader(_little_endian(head[24:27]) + 1, _little_endian(head[27:30]) + 1) if kind == b"VP8X" else None
 
 
-def _tiff(data: Buffer, order: str) -> StillHeader | None:
+def _tiff(data: bytes | mmap, order: str) -> StillHeader | None:
     """The size of a TIFF image, and the bytes of its pixels, because a whole strip is decoded in memory."""
 
     def number(at: int, size: int) -> int:
@@ -159,15 +150,6 @@ def _tiff(data: Buffer, order: str) -> StillHeader | None:
 
 def _avif(head: bytes) -> StillHeader | None:
     """The largest size of the images in an AVIF file, which may be composed of tiles."""
-    sizes = [
-        StillHeader(_big_endian(head[at + 8 : at + 12]), _big_endian(head[at + 12 : at + 16]))
-        for at in _places(head, b"ispe")
-    ]
+    places = [match.start() for match in re.finditer(b"ispe", head)]
+    sizes = [StillHeader(_big_endian(head[at + 8 : at + 12]), _big_endian(head[at + 12 : at + 16])) for at in places]
     return max(sizes, key=lambda size: size.width_px * size.height_px, default=None)
-
-
-def _places(head: bytes, name: bytes) -> Iterator[int]:
-    at = head.find(name)
-    while at >= 0:
-        yield at
-        at = head.find(name, at + 1)

@@ -15,11 +15,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Ints
-from mcaptrack.sources.video import av1, h264
-from mcaptrack.sources.video.codecs import CODECS
+from mcaptrack.sources.video.codecs import CODECS, FrameNumber, FrameNumbers, is_interlaced, sequence_headers
 from mcaptrack.sources.video.container import fraction, has_slots, is_transport, reading, videos
 from mcaptrack.sources.video.encode import VideoOptions
-from mcaptrack.sources.video.h264 import FrameNumber, FrameNumbers
 
 _PIXELS: Final = ("yuv420p", "yuvj420p")
 _WORDS: Final = {"h264": "H.264", "h265": "H.265", "vp9": "VP9", "av1": "AV1"}
@@ -231,7 +229,9 @@ def check_stream(path: Path, options: VideoOptions) -> StreamCheck:
         why_not = _rejected_by_codec(image_format, name, options, context)
         if why_not:
             return StreamCheck(image_format, why_not)
-        stream_check = StreamCheck(image_format, "", _container_sets(image_format, context))
+        # Sequence headers may stand outside of packets; for H.264 and H.265 the filter inserts them.
+        sets = sequence_headers(bytes(context.extradata or b"")) if image_format == "av1" else ()
+        stream_check = StreamCheck(image_format, "", sets)
         stream_check.why_not = _check_packets(
             packets(opened, image_format), stream_check, options.fps, Fraction(options.key_within_s)
         )
@@ -253,11 +253,6 @@ def _rejected_by_codec(image_format: str, name: str, options: VideoOptions, cont
     if context.pix_fmt not in _PIXELS:
         return f"its pixels are {context.pix_fmt}, not 8-bit 4:2:0"
     return "it has B-frames" if context.has_b_frames else ""
-
-
-def _container_sets(image_format: str, context: Any) -> tuple[bytes, ...]:
-    """Sequence headers that the container stores outside of packets; for H.264 and H.265 the filter inserts them."""
-    return av1.sequence_headers(bytes(context.extradata or b"")) if image_format == "av1" else ()
 
 
 def _check_packets(
@@ -310,7 +305,7 @@ def _check_packets(
         if not set(unit.sets) <= set(sets) or (size and unit.size and size != unit.size):
             return "it changes its size or its parameters on the way"
         size = size or unit.size
-        if count == 0 and stream.format == "h264" and h264.is_interlaced(sets):
+        if count == 0 and stream.format == "h264" and is_interlaced(sets):
             return "it is interlaced"
     if holes.count:
         return _DAMAGED

@@ -13,8 +13,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from fractions import Fraction
+from io import FileIO
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -75,17 +76,9 @@ _RIFF_HEAD, _CHUNK_HEAD, _IVF_FRAME_HEAD = 12, 8, 12
 _LISTS: Final = (b"movi", b"rec ")
 
 
-class _File(Protocol):
-    """An unbuffered file: only the heads of chunks are read, far apart."""
-
-    def read(self, size: int, /) -> bytes: ...
-
-    def seek(self, at: int, /) -> int: ...
-
-
 def count_slots(path: Path, stream: int) -> int | None:
     """The number of slots of a stream that the file really holds; None for other containers."""
-    with path.open("rb", buffering=0) as file:
+    with path.open("rb", buffering=0) as file:  # only the heads of chunks are read, far apart
         head = file.read(_RIFF_HEAD)
         if head[:4] == b"RIFF" and head[8:12] == b"AVI ":
             return _avi(file, path.stat().st_size, b"%02d" % stream)
@@ -94,7 +87,7 @@ def count_slots(path: Path, stream: int) -> int | None:
     return None
 
 
-def _avi(file: _File, size: int, name: bytes) -> int:
+def _avi(file: FileIO, size: int, name: bytes) -> int:
     """Count the chunks "00dc" and "00db" in all lists of all RIFF parts of the file."""
     count, at = 0, 0
     while at + _CHUNK_HEAD <= size:
@@ -109,7 +102,7 @@ def _avi(file: _File, size: int, name: bytes) -> int:
     return count
 
 
-def _ivf(file: _File, size: int, first: int) -> int:
+def _ivf(file: FileIO, size: int, first: int) -> int:
     count, at = 0, first
     while at + _IVF_FRAME_HEAD <= size:
         file.seek(at)

@@ -28,7 +28,7 @@ from mcaptrack.schema import DETECTIONS, PREDICTIONS, SCHEMAS, TRACKS, Frame, Sc
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import frame_id_of, input_of
 from mcaptrack.sources.cameras import cameras
-from mcaptrack.sources.frames import transforms_of
+from mcaptrack.sources.fixed_frame import transforms_of
 from mcaptrack.tables.rosbag2 import messages
 from mcaptrack.tables.rosbag2.messages import message, typestore
 

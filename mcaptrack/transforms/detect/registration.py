@@ -10,8 +10,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.affine import IDENTITY, compose, invert, shift_px
 from mcaptrack.geometry.arrays import Floats, Image
-from mcaptrack.geometry.camera_motion import MotionEstimator
-from mcaptrack.geometry.camera_path import FAR, CameraPose, Verdict
+from mcaptrack.geometry.camera_path import FAR, CameraPose, MotionEstimator, Verdict
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 

@@ -27,7 +27,7 @@ from mcaptrack.sources.cameras import Camera, cameras
 from mcaptrack.sources.foreign.decoding import MessageType, ros_types
 from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.video import EncodedPicture, H264Encoder, decode_bgr, encode_image
-from mcaptrack.sources.video.raw_pixels import raw_with
+from mcaptrack.sources.video.decode import raw_with
 from mcaptrack.viewing.blur.mosaic import hide
 from mcaptrack.viewing.blur.people import HiddenPeople
 
@@ -126,7 +126,7 @@ def blurred_pictures(
             picture = read(message)
             waiting[number] = message, picture
             where = f"{opened.path}: {topic} at {message.t_ns} ns"
-            yield EncodedPicture(message.t_ns, number, picture.format, picture.data, picture.layout, where)
+            yield picture.encoded(message.t_ns, number, where)
 
     left_out = 0
     for frame in decode_bgr(encoded()):

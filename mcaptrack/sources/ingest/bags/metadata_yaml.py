@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any, Final, NamedTuple
@@ -106,7 +106,6 @@ def _name(entry: Any) -> str:
 
 #: Files of one recording may be written at once, each by a process that counts all of them: the last one counts again.
 _MOST_TRIES: Final = 5
-Counts = dict[str, int]
 #: The versions of metadata.yaml since which topics have profiles of quality of service, as text and as a list, and the
 #: hash of their type.
 _QOS_TEXT: Final = 4
@@ -121,7 +120,7 @@ class _Content(NamedTuple):
     """
 
     topics: set[str]
-    messages: Counts
+    messages: Counter[str]
     kinds: dict[str, str]
     results: set[str]
     start_ns: int
@@ -151,7 +150,7 @@ def _update(metadata: Path) -> bool:
     whole = plain_yaml.load(bag.text)
     before, info = plain_yaml.dump(whole), whole[ROOT]
     old = [(name, count) for name, *_, count in bag.topics]
-    totals = _totals(files.values())
+    totals = sum((file.messages for file in files.values()), Counter[str]())
     kinds = {topic: kind for file in files.values() for topic, kind in file.kinds.items()}
     results = {topic for file in files.values() for topic in file.results}
     entries = [
@@ -165,7 +164,7 @@ def _update(metadata: Path) -> bool:
     info["topics_with_message_count"] = entries
     new = [(str(entry["topic_metadata"]["name"]), int(entry["message_count"])) for entry in entries]
     if "message_count" in info and str(info["message_count"]).isdecimal():
-        info["message_count"] = _number(int(info["message_count"]) + _sum(new) - _sum(old))
+        info["message_count"] = _number(int(info["message_count"]) + sum(n for _, n in new) - sum(n for _, n in old))
     _set_times(info, [file for file in files.values() if file.messages])
     for entry in info.get("files") or []:
         file = files.get(str(entry.get("path", ""))) if isinstance(entry, dict) else None
@@ -183,25 +182,13 @@ def _read(path: Path) -> _Content:
     with log.read(path, sidecar=False) as opened:
         # ROS tools refuse a recording that names other encodings.
         recorded = [channel for channel in opened.recorded if channel.message_encoding == CDR and channel.messages]
-        messages: Counts = {}
+        messages = Counter[str]()
         for channel in recorded:
-            messages[channel.topic] = messages.get(channel.topic, 0) + channel.messages
+            messages[channel.topic] += channel.messages
         kinds = {channel.topic: opened.record_name(channel) for channel in recorded}
         results = {channel.topic for channel in recorded if Provenance.from_metadata(channel.metadata)}
         topics = {channel.topic for channel in opened.recorded}
         return _Content(topics, messages, kinds, results, opened.start_ns, opened.end_ns)
-
-
-def _sum(topics: Iterable[tuple[str, int]]) -> int:
-    return sum(count for _, count in topics)
-
-
-def _totals(files: Iterable[_Content]) -> Counts:
-    out: Counts = {}
-    for file in files:
-        for topic, count in file.messages.items():
-            out[topic] = out.get(topic, 0) + count
-    return out
 
 
 def _entry(topic: str, kind: str, count: int, version: int) -> dict[str, Any]:

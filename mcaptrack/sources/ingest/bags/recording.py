@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from mcaptrack import log
+from mcaptrack.sources.foreign.decoding import MessageType
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,6 +19,11 @@ class Connection:
     encoding: str
     metadata: Mapping[str, str]
 
+    @property
+    def kind(self) -> MessageType:
+        """The type of its messages."""
+        return MessageType(*self.schema, self.encoding)
+
 
 @dataclass
 class ReadingNotes:
@@ -27,34 +33,31 @@ class ReadingNotes:
     lost: list[str] = field(default_factory=list)
 
 
-class RecordingReader(Protocol):
-    """A recording, open for reading."""
+class RecordingReader:
+    """A recording, open for reading.
 
-    @property
-    def profile(self) -> str:
-        """The profile in the MCAP registry: ros1, ros2."""
+    ``profile`` is that of the MCAP registry. ``findings`` are those before any message is read. ``declared_counts`` is
+    the number of messages of each connection, None if the recording doesn't declare it. ``as_log`` is the recording as
+    a log if it is a single MCAP file. ``closing`` closes its files.
+    """
 
-    @property
-    def findings(self) -> ReadingNotes:
-        """Findings before any message is read."""
+    profile = "ros2"
+    as_log: log.Log | None = None
+    declared_counts: Mapping[Connection, int] | None = None
+    #: All connections, including those without messages.
+    connections: Sequence[Connection]
 
-    @property
-    def connections(self) -> list[Connection]:
-        """All connections, including those without messages."""
-
-    @property
-    def declared_counts(self) -> Mapping[Connection, int] | None:
-        """The declared number of messages of each connection; None if the recording doesn't declare it."""
-
-    @property
-    def as_log(self) -> log.Log | None:
-        """The recording as a log, if it is a single MCAP file; else None."""
-
-    def messages(self, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
-        """All messages in the order of the recording; every call starts from the beginning."""
-
-    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:
-        """Write attachments and metadata; if ``is_copied``, only those that ``as_log`` does not contain."""
+    def __init__(self) -> None:
+        self.findings = ReadingNotes()
+        self.closing = ExitStack()
 
     def close(self) -> None:
         """Close its files."""
+        self.closing.close()
+
+    def messages(self, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
+        """All messages in the order of the recording; every call starts from the beginning."""
+        raise NotImplementedError
+
+    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool) -> None:
+        """Write attachments and metadata; if ``is_copied``, only those that ``as_log`` does not contain."""

@@ -9,13 +9,13 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import BinaryIO, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.sources.ingest.bags import decompression
-from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes
+from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
 
 _MESSAGE, _BAG, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7
 _MAGIC: Final = b"#ROSBAG V2.0\n"
@@ -39,19 +39,17 @@ class _Record(NamedTuple):
     end: int
 
 
-class Bag1:
+class Bag1(RecordingReader):
     """A ROS 1 bag, open for reading."""
 
     profile = "ros1"
-    as_log: log.Log | None = None
 
     def __init__(self, path: Path) -> None:
+        super().__init__()
         self.path = path
-        self._file: BinaryIO = path.open("rb")
+        self._file = self.closing.enter_context(path.open("rb"))
         self._size = path.stat().st_size
         self._known: dict[int, Connection] = {}
-        self.declared_counts: Mapping[Connection, int] | None = None
-        self.findings = ReadingNotes()
         try:
             self._end, self._why_unindexed = self._read_index()
             if self._why_unindexed:
@@ -64,13 +62,6 @@ class Bag1:
             self.close()
             raise
         self.connections = list(self._known.values())
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:
-        """A bag holds nothing but messages."""
 
     def messages(self, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
         """All messages in the order of the bag. Parts that can't be read are reported in ``report``."""

@@ -1,4 +1,4 @@
-"""Read rosbag2 recordings: folders with metadata.yaml, SQLite databases and MCAP files, also single ones.
+"""Open recordings, and read those of rosbag2: folders with metadata.yaml, SQLite databases and MCAP files.
 
 The databases are read as rosbag2's sqlite3 storage plugin lays them out (schema versions 1 to 4): nothing that they
 hold is made sense of, so nothing is refused. rosbags knows the definitions of ROS's own messages, for databases that
@@ -16,15 +16,17 @@ from typing import Any, Final
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import follow_links, read_beginning, temporary_folder
+from mcaptrack.files import follow_links, read_beginning, refuse_special, temporary_folder
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.ingest.bags import decompression
 from mcaptrack.sources.ingest.bags.metadata_yaml import METADATA, Bag, holds_metadata, read_metadata
 from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
+from mcaptrack.sources.ingest.bags.rosbag1 import Bag1
 from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables
+from mcaptrack.sources.video import IMAGE_SUFFIXES
 
-_MCAP_MAGIC, _SQLITE_MAGIC, _ZSTD_MAGIC = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
+_MCAP, _ROS1, _SQLITE, _ZSTD = b"\x89MCAP0\r\n", b"#ROSBAG V", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
 #: A message that is larger decompressed is not read.
 _MAX_MESSAGE_BYTES: Final = 2**28
 #: At most this many unknown topic ids are named.
@@ -75,13 +77,12 @@ def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> Re
         parts = [_decompressed_file(path, opened) for path in paths]
         heads = [read_beginning(path, 16) for path in parts]
         source: _Files
-        if all(head.startswith(_SQLITE_MAGIC) for head in heads):
+        if all(head.startswith(_SQLITE) for head in heads):
             source = Databases(parts, whole, bag)
-        elif all(head.startswith(_MCAP_MAGIC) for head in heads):
+        elif all(head.startswith(_MCAP) for head in heads):
             source = Logs(parts, whole, bag)
         else:
-            magics = (_MCAP_MAGIC, _SQLITE_MAGIC)
-            wrong = [path for path, head in zip(paths, heads, strict=True) if not head.startswith(magics)]
+            wrong = [path for path, head in zip(paths, heads, strict=True) if not head.startswith((_MCAP, _SQLITE))]
             if not wrong:
                 raise McaptrackError(f"{whole} holds both MCAP files and databases; one bag is made of either")
             raise McaptrackError(f"{wrong[0]} is neither an MCAP file nor a rosbag2 database; it may be damaged")
@@ -91,7 +92,7 @@ def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> Re
 
 def _decompressed_file(path: Path, opened: ExitStack) -> Path:
     """The file, or its decompressed copy if it is compressed as a whole."""
-    if not read_beginning(path, 16).startswith(_ZSTD_MAGIC):
+    if not read_beginning(path, 16).startswith(_ZSTD):
         return path
     out = Path(opened.enter_context(temporary_folder())) / path.name.removesuffix(".zstd")
     decompression.unzstd_file(path, out)
@@ -108,16 +109,12 @@ def _own_metadata(paths: Sequence[Path]) -> Bag:
     return Bag()
 
 
-class _Files:
-    """Common parts of databases and MCAP files. ``findings`` is known before any message is read."""
-
-    profile = "ros2"
-    as_log: log.Log | None = None
+class _Files(RecordingReader):
+    """Common parts of databases and MCAP files."""
 
     def __init__(self, paths: Sequence[Path], whole: Path, bag: Bag) -> None:
+        super().__init__()
         self.paths, self.whole, self.bag = paths, whole, bag
-        self.findings = ReadingNotes()
-        self.closing = ExitStack()
         self.declared_counts: dict[Connection, int] = {}
         self._known_connections: dict[tuple[object, ...], Connection] = {}
         self._message_counts: dict[Connection, int] = {}
@@ -128,23 +125,23 @@ class _Files:
             self.close()
             raise
         self._compare()
-
-    @property
-    def connections(self) -> list[Connection]:
-        """All connections, also those without messages."""
-        return list(self.declared_counts)
-
-    def close(self) -> None:
-        """Close the files."""
-        self.closing.close()
+        self.connections = list(self.declared_counts)
 
     def messages(self, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
         """All messages, file by file, in their order there."""
         self._message_counts = {}
-        for number in range(len(self.paths)):
-            yield from self._messages(number, report)
+        for number, path in enumerate(self.paths):
+            left = decompression.limit_of(path.stat().st_size)
+            for connection, message in self._messages(number):
+                payload = message.payload
+                if self.bag.packed or self._is_packed(connection, payload):
+                    payload = _unpack_message(payload, path, message.t_ns, left)
+                    left -= len(payload)
+                    yield connection, message._replace(payload=payload)
+                else:
+                    yield connection, message
 
-    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:
+    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool) -> None:
         """Write metadata.yaml, which a copied MCAP file doesn't contain."""
         if self.bag.text:
             writer.add_attachment(METADATA, "application/yaml", self.bag.text)
@@ -152,8 +149,13 @@ class _Files:
     def _open(self, number: int) -> None:
         raise NotImplementedError
 
-    def _messages(self, number: int, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
-        yield from ()
+    def _messages(self, number: int) -> Iterator[tuple[Connection, log.Message]]:
+        """The messages of a file as they are stored."""
+        raise NotImplementedError
+
+    def _is_packed(self, connection: Connection, payload: bytes) -> bool:
+        """Whether a message is compressed, where metadata.yaml doesn't say it of all."""
+        return False
 
     def _connection(self, repeats: dict[object, int], described: Connection, messages: int) -> Connection:
         """The connection that a part of the recording describes: the parts have the same ones.
@@ -219,7 +221,7 @@ class Databases(_Files):
             text = f"its definition is that of {where}" if where else "its definition is not known: it has no schema"
             self.findings.notes.append(f"{whole} does not say what {kind} is; {text}")
 
-    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:
+    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool) -> None:
         """Write metadata.yaml and the metadata in the databases, as rosbag2 writes them to MCAP files."""
         super().extras(writer, has_clock, is_copied)
         if self._distro:
@@ -295,20 +297,17 @@ class Databases(_Files):
         text, self._undefined[kind] = known_definition(kind, self._distro.lower(), digest)
         return (kind, "ros2msg", text.encode()) if self._undefined[kind] else (kind, "", b"")
 
-    def _messages(self, number: int, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
+    def _is_packed(self, connection: Connection, payload: bytes) -> bool:
+        return payload.startswith(_ZSTD) and connection.encoding == "cdr"  # CDR starts with a zero byte
+
+    def _messages(self, number: int) -> Iterator[tuple[Connection, log.Message]]:
         connections, path = self._topics[number], self.paths[number]
-        left = decompression.limit_of(path.stat().st_size)
         for key, t_ns, data in self._databases[number].rows("messages", ["topic_id", "timestamp", "data"]):
             connection = connections.get(key)
             if connection is None:
                 continue
             if not isinstance(t_ns, int) or not isinstance(data, bytes):
                 raise McaptrackError(f"{path} is damaged: a message without time or data")
-            if self.bag.packed or (
-                data.startswith(_ZSTD_MAGIC) and connection.encoding == "cdr"
-            ):  # CDR starts with a zero byte
-                data = _unpack_message(data, path, t_ns, left)  # noqa: PLW2901
-                left -= len(data)
             count = self._message_counts.get(connection, 0)
             self._message_counts[connection] = count + 1
             yield connection, log.Message(t_ns, count % 2**32, t_ns, data)
@@ -325,7 +324,7 @@ class Logs(_Files):
         self.profile = profiles.pop() if len(profiles) == 1 else ""
         self.as_log = self.logs[0] if len(self.logs) == 1 and not bag.packed else None
 
-    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool = False) -> None:
+    def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool) -> None:
         """Write metadata.yaml, and all attachments and metadata records of the files."""
         super().extras(writer, has_clock, is_copied)
         for opened in [] if is_copied else self.logs:
@@ -346,16 +345,8 @@ class Logs(_Files):
             connections[channel.id] = self._connection(repeats, described, opened.index.counts.get(channel.id, 0))
         self._channels.append(connections)
 
-    def _messages(self, number: int, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
-        connections, path = self._channels[number], self.paths[number]
-        left = decompression.limit_of(path.stat().st_size)
-        for channel, message in log.stream(self.logs[number]):
-            if self.bag.packed:
-                payload = _unpack_message(message.payload, path, message.t_ns, left)
-                left -= len(payload)
-                yield connections[channel], message._replace(payload=payload)
-            else:
-                yield connections[channel], message
+    def _messages(self, number: int) -> Iterator[tuple[Connection, log.Message]]:
+        return ((self._channels[number][channel], message) for channel, message in log.stream(self.logs[number]))
 
 
 def _text(value: Any) -> str:
@@ -374,3 +365,53 @@ def _unpack_message(data: bytes, path: Path, t_ns: int, left: int) -> bytes:
         return decompression.unzstd(data, min(left, _MAX_MESSAGE_BYTES))
     except decompression.NotUnpackedError as error:
         raise McaptrackError(f"{path}: the message at {t_ns} ns can't be decompressed: {error}") from None
+
+
+# Open a recording: its kind is detected by its first bytes, not by the name of the file.
+
+
+_SUFFIXES: Final = {".mcap": "an MCAP file", ".bag": "a ROS bag", ".db3": "a rosbag2 database"}
+
+
+def open_recording(path: Path) -> RecordingReader | None:
+    """Open the recording at ``path``; None if it is something else.
+
+    Raises McaptrackError for a recording that can't be read.
+    """
+    if path.is_dir():
+        return _open_folder(path)
+    head = read_beginning(path, 16)
+    if head.startswith(_ROS1):
+        return Bag1(path)
+    if head.startswith((_ZSTD, _MCAP, _SQLITE)):
+        return open_files([path], path)
+    if path.suffix.lower() in _SUFFIXES:
+        what = "is empty" if not head else "does not begin as one does"
+        raise McaptrackError(f"{path} can't be read as {_SUFFIXES[path.suffix.lower()]}: it {what}")
+    return None
+
+
+def is_mcap(path: Path) -> bool:
+    """Whether a file begins with the magic bytes of MCAP; False if it can't be read."""
+    refuse_special(path)
+    try:
+        with path.open("rb") as stream:
+            return stream.read(len(_MCAP)) == _MCAP
+    except OSError:
+        return False
+
+
+def _open_folder(path: Path) -> RecordingReader | None:
+    if holds_metadata(path / METADATA):
+        return open_bag(path)
+    names = sorted(entry.name for entry in path.iterdir())
+    if any(Path(name).suffix.lower() in IMAGE_SUFFIXES for name in names):
+        return None
+    if parts := log.split_files_in(path):
+        return open_files(parts, path) if len(parts) > 1 else open_recording(parts[0])
+    logs = [name for name in names if Path(name).suffix.lower() in _SUFFIXES]
+    if logs:
+        raise McaptrackError(
+            f"{path} has no {METADATA}, and its {len(logs)} logs are no parts of one; give {logs[0]} and so on by name"
+        )
+    return None

@@ -98,15 +98,8 @@ class SqliteTables:
             raise McaptrackError(f"{self.path} can't be opened: {error}") from None
         self._close.callback(database.close)
         database.text_factory = bytes
-        limits = {
-            "LENGTH": _MAX_VALUE_BYTES,
-            "SQL_LENGTH": _MAX_SQL_BYTES,
-            "EXPR_DEPTH": 50,
-            "COMPOUND_SELECT": 2,
-            "ATTACHED": 0,
-            "WORKER_THREADS": 0,
-            "TRIGGER_DEPTH": 1,
-        }
+        limits = {"LENGTH": _MAX_VALUE_BYTES, "SQL_LENGTH": _MAX_SQL_BYTES, "EXPR_DEPTH": 50, "COMPOUND_SELECT": 2}
+        limits |= {"ATTACHED": 0, "WORKER_THREADS": 0, "TRIGGER_DEPTH": 1}
         for name, most in limits.items():
             database.setlimit(getattr(sqlite3, f"SQLITE_LIMIT_{name}"), most)
         if hasattr(database, "setconfig"):  # from Python 3.12 on

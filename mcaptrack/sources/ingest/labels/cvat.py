@@ -23,13 +23,12 @@ from typing import IO, Any, Final
 import numpy as np
 
 from mcaptrack.choices import Role
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.files import read_beginning
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.schema.classes import PERSON, is_person
-from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows
-from mcaptrack.sources.ingest.labels.content import NO_ID, Labels, WantedClasses
-from mcaptrack.sources.ingest.xml_reader import XmlReader
+from mcaptrack.sources.ingest.bags.plain_yaml import XmlReader
+from mcaptrack.sources.ingest.labels.content import NO_CLASS, NO_ID, Labels, WantedClasses, is_count
 
 _MAX_BYTES: Final = 512 * 2**20
 _MAX_ROWS: Final = 10_000_000
@@ -110,8 +109,7 @@ def _member(path: Path, names: list[str]) -> str:
 
 
 def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(name[:60] for name in names[:_SHOWN]) + more
+    return list_names([name[:60] for name in names], _SHOWN)
 
 
 @dataclass
@@ -214,7 +212,7 @@ class _Parser(XmlReader):
         """Take the attribute ``track_id`` of a box."""
         if not text:
             return
-        if not _is_id(text):
+        if not is_count(text, 15):
             self.unread[text] += 1
         elif self._track is not None:
             self._track.is_renamed |= self._track.stated not in ("", text)
@@ -229,7 +227,7 @@ class _Parser(XmlReader):
         return self.labels.setdefault(name, len(self.labels))
 
     def _whole(self, text: str, what: str) -> int:
-        if not (text.isascii() and text.isdecimal() and len(text) < 16):
+        if not is_count(text, 15):
             self.fail(f"{what} is a whole number from 0 on, not {text[:40]!r}")
         return int(text)
 
@@ -281,10 +279,10 @@ class _Parser(XmlReader):
 
     def span(self) -> tuple[int, int, int]:
         """The first and the last frame of the task and the step between them, by its description; -1: not known."""
-        meta = {name: int(text) for name, text in self.meta.items() if _is_count(text)}
+        meta = {name: int(text) for name, text in self.meta.items() if is_count(text, 9)}
         first = meta.get("start_frame", 0)
         key, _, step = self.meta.get("frame_filter", "").partition("=")
-        every = int(step) if key.strip() == "step" and _is_count(step.strip()) and int(step) else 1
+        every = int(step) if key.strip() == "step" and is_count(step.strip(), 9) and int(step) else 1
         last = meta.get("stop_frame", first + (meta.get("size", 0) - 1) * every if "size" in meta else -1)
         return first, last, every
 
@@ -304,21 +302,15 @@ def read_cvat(path: Path, role: Role, wanted: WantedClasses) -> Labels:
         raise McaptrackError(f"{path} holds no boxes{f', only {others}' if others else ''}")
     values: Floats = np.frombuffer(parser.values, np.float64).reshape(-1, _COLUMNS)
     number, names = _classes(parser.labels)
-    rows = BoxRows(
-        path,
-        "cvat",
-        lambda row: f"{path}:{values[row, 8]:.0f}",
-        values[:, 0],
-        values[:, 1:5],
-        values[:, _ID],
-        np.full(len(values), np.nan),
-        number[values[:, 6].astype(int)],
-        names,
-        first_frame=0,
-        observed=values[:, 7] == 0,
-    )
+    none, kind, is_seen = np.full(len(values), np.nan), number[values[:, 6].astype(int)], values[:, 7] == 0
+
+    def at(row: int) -> str:
+        return f"{path}:{values[row, 8]:.0f}"
+
+    rows = Labels(path, "cvat", at, values[:, 0], values[:, _ID], values[:, 1:5], none, kind, observed=is_seen)
     rows.labelled, doubt = _frames(parser, values[:, 0])
-    rows.doubts += [(f"{path}: {doubt}", "clock")] if doubt else []
+    if doubt:
+        rows.doubt(f": {doubt}", "clock")
     if parser.tracks:
         own = values[:, _ID].astype(int)
         ids, new_ids, remarks = _ids(path, parser.tracks, np.bincount(own, minlength=len(parser.tracks)))
@@ -326,16 +318,15 @@ def read_cvat(path: Path, role: Role, wanted: WantedClasses) -> Labels:
         rows.remarks += remarks
     if parser.unread:
         shown = ", ".join(repr(text) for text in list(parser.unread)[:3])
-        unread = f"{path}: {parser.unread.total()} boxes have a track_id that is not a whole number ({shown})"
-        rows.doubts.append((f"{unread}; these are not read", "other"))
+        unread = f": {parser.unread.total()} boxes have a track_id that is not a whole number ({shown})"
+        rows.doubt(f"{unread}; these are not read")
     if parser.interpolated:
-        rows.remarks.append(f"{path}: {parser.interpolated} boxes are interpolated between others of their tracks")
+        rows.remark(f": {parser.interpolated} boxes are interpolated between others of their tracks")
     if parser.rotated:
-        rows.doubts.append((f"{path}: {parser.rotated} boxes are rotated, and taken without their rotation", "other"))
-    left = _counted(parser.others)
-    if left:
-        rows.doubts.append((f"{path} also holds {left}; they are left out, because they are no boxes", "left-out"))
-    return rows.labels(role, wanted)
+        rows.doubt(f": {parser.rotated} boxes are rotated, and taken without their rotation")
+    if left := _counted(parser.others):
+        rows.doubt(f" also holds {left}; they are left out, because they are no boxes", "left-out")
+    return rows.settled(role, wanted, names)
 
 
 def _counted(others: Counter[str]) -> str:
@@ -369,10 +360,6 @@ def _frames(parser: _Parser, frame: Floats) -> tuple[Ints, str]:
     return np.unique(frame.astype(np.int64)), f"{text}; frames are taken as they are, and only those with boxes count"
 
 
-def _is_count(text: str) -> bool:
-    return text.isascii() and text.isdecimal() and len(text) < 10
-
-
 def _ids(path: Path, tracks: list[_Track], counts: Any) -> tuple[Ints, Ints | None, list[str]]:
     """The id of each track, those that are new, and remarks: the id that its attribute states, or its number.
 
@@ -401,13 +388,9 @@ def _ids(path: Path, tracks: list[_Track], counts: Any) -> tuple[Ints, Ints | No
     new = np.flatnonzero(ids < 0)
     ids[new] = max(taken) + 1 + np.arange(len(new))
     if split:
-        shown = ", ".join(map(str, sorted(split)[:8])) + (", ..." if len(split) > 8 else "")
+        shown = list_names([*map(str, sorted(split))], 8)
         remarks.append(f"{path}: several tracks state one track_id ({shown}): {split.total()} of them get new ids")
     drawn = sum(number is None for number in stated)
     if drawn:
         remarks.append(f"{path}: {drawn} tracks state no track_id and get new ids")
     return ids, ids[new] if len(new) else None, remarks
-
-
-def _is_id(text: str) -> bool:
-    return text.isascii() and text.isdecimal() and len(text) < 16

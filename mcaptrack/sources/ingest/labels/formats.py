@@ -18,7 +18,8 @@ Letters: N rows, F frames.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -28,13 +29,21 @@ from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.schema.classes import PERSON
-from mcaptrack.sources.ingest.labels.content import NO_ID, ClassIds, Format, IgnoredBoxes, Labels, WantedClasses
-from mcaptrack.sources.ingest.labels.number_table import Lines, NumberTable
-
-#: Coordinates, in pixels or metres, and scores can't be larger.
-MAX_PLACE: Final = 1e8
-MAX_SCORE: Final = 1e9
-MAX_FRAME: Final = 2**31 - 1
+from mcaptrack.sources.ingest.labels.content import (
+    FRAME,
+    MAX_FRAME,
+    NO_ID,
+    BoxRows3D,
+    ClassIds,
+    Format,
+    IgnoredBoxes,
+    Labels,
+    Lines,
+    NumberTable,
+    WantedClasses,
+    check_columns,
+    lines_of,
+)
 
 #: The classes of MOT16, 17 and 20.
 _MOT_NAMES: Final = (
@@ -54,6 +63,8 @@ _KITTI_NAMES: Final = ("pedestrian", "cyclist", "car", "van", "truck", "tram", "
 _KITTI_CLASSES: Final = {name: number for number, name in enumerate(_KITTI_NAMES, start=PERSON)} | {"person": 7}
 _SDD_CLASSES: Final = {"pedestrian": PERSON, "biker": 2, "skater": 3, "cart": 4, "car": 5, "bus": 6}
 _KITTI_REGION: Final = "dontcare"
+#: The frame of reference: of the camera, with z up.
+CAMERA_FRAME: Final = "camera_link"
 #: The number of class names of a column, at most: there are data sets with 21,841 classes.
 _MAX_NAMES: Final = 65_536
 
@@ -91,54 +102,37 @@ class ClassNames:
         places = {**usual, **{name: number for number, name in enumerate(others, start=max(usual.values()) + 1)}}
         ids = np.array([places[name.lower()] for name in self._numbers], np.uint32)
         names = dict(zip(ids.tolist(), self._numbers, strict=True))
-        column = ids[numbers.astype(int)]
-        return column, {number: names[number] for number in np.unique(column).tolist()}
-
-
-def _all_persons(count: int) -> ClassIds:
-    return np.full(count, PERSON, np.uint32)
+        return ids[numbers.astype(int)], names
 
 
 def _boxes(table: NumberTable, columns: slice, corners: bool = False) -> Floats:
     """Boxes (N, 4) of left, top, width, height; ``corners``: the columns are left, top, right, bottom."""
-    boxes = table.within(columns, "a coordinate", MAX_PLACE)
+    boxes = table.values[:, columns]
     if corners:
         boxes = np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1)
-    table.refuse(
-        (boxes[:, 2] < 0) | (boxes[:, 3] < 0),
-        lambda row: f"a box can't be {boxes[row, 2]:g} wide and {boxes[row, 3]:g} high",
-    )
+    table.check_boxes(boxes)
     return boxes
 
 
-def _frame(table: NumberTable, column: int) -> Ints:
-    return table.whole(column, "the frame (a count of pictures, no time)", 0, MAX_FRAME)
-
-
-def _score(table: NumberTable, column: int) -> Floats:
-    """A column of scores, NaN for missing ones."""
-    score = table.values[:, column]
-    table.refuse(np.abs(score) > MAX_SCORE, lambda row: f"a score can't be {score[row]:g}")
-    return score
-
-
-def _columns(parts: Sequence[str], least: int, most: int) -> None:
-    if not least <= len(parts) <= most:
-        raise ValueError(f"{len(parts)} column{'s' * (len(parts) != 1)}")
+def _ids(table: NumberTable, frame: int, track: int, least: int = NO_ID) -> tuple[Ints, Ints]:
+    """The frame and the track (N,) of rows, from these columns."""
+    frames = table.whole(table.values[:, frame], FRAME, 0, MAX_FRAME)
+    return frames, table.whole(table.values[:, track], "the id", least)
 
 
 def read_mot(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Labels:
     """MOTChallenge."""
 
     def parse(parts: list[str]) -> list[float]:
-        _columns(parts, 6, 10)
+        check_columns(parts, 6, 10)
         # With 10 columns it is MOT15, where column 8 is not a class.
         more = parts[6:8] if len(parts) < 10 else parts[6:7]
         return [*map(float, parts[:6]), *map(float, more), *[np.nan] * (2 - len(more))]
 
     table = NumberTable(path, lines, "MOTChallenge (frame, id, left, top, width, height, score, ...)", 8, parse)
-    frame, track_id = _frame(table, 0), table.whole(1, "the id", NO_ID)
-    boxes, score, kind = _boxes(table, slice(2, 6)), _score(table, 6), table.values[:, 7]
+    frame, track_id = _ids(table, 0, 1)
+    boxes, score, kind = _boxes(table, slice(2, 6)), table.values[:, 6], table.values[:, 7]
+    table.check_scores(score)
     named = np.isfinite(kind)
     kept = np.ones(len(frame), bool)
     has_others = role != "detections" and not wanted.is_people
@@ -155,7 +149,7 @@ def read_mot(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Lab
         kept = (score != 0) & ((kind == PERSON) | (kind == NO_ID) | np.isnan(kind))
         if not kept.any():
             raise McaptrackError(f"{path}: all {len(kept)} boxes are marked as not counting (score 0 or a class but 1)")
-    class_id = _all_persons(len(frame))
+    class_id = np.full(len(frame), PERSON, np.uint32)
     if role == "detections":
         table.refuse(
             named & ~((kind == np.rint(kind)) & (kind >= NO_ID) & (kind < 2**32)),
@@ -170,41 +164,39 @@ def read_mot(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Lab
     elif role == "tracks" and ((kind > 0) & (kind != PERSON)).any():
         others = f"the classes of {int(((kind > 0) & (kind != PERSON)).sum())} boxes that aren't people (column 8)"
     ignored = IgnoredBoxes(frame[gone], boxes[gone], np.isin(kind[gone], _DISTRACTORS), np.zeros(int(gone.sum()), bool))
-    return Labels(
-        "mot",
-        0 if (frame == 0).any() else 1,  # some programs number frames from 0 in this format, too
-        frame[kept],
-        track_id[kept],
-        boxes[kept],
-        None,
-        score[kept] if role != "truth" else np.full(int(kept.sum()), np.nan),
-        np.unique(frame),
-        class_id[kept],
-        {kind: MOT_CLASSES[kind] for kind in np.unique(class_id[kept]).tolist() if has_others and kind in MOT_CLASSES},
-        left_out=others,
-        ignored=ignored if (kind > 0).any() else None,
-    )
+    classes = {number: name for number, name in MOT_CLASSES.items() if has_others}
+    score = np.full(len(frame), np.nan) if role == "truth" else score
+    out = Labels(path, "mot", table.at, frame, track_id, boxes, score, class_id, classes, others, np.unique(frame))
+    out.ignored = ignored if (kind > 0).any() else None
+    out.first_frame = 0 if (frame == 0).any() else 1  # some programs number frames from 0 in this format, too
+    return out.keep(kept)
 
 
-def read_kitti(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Labels:
-    """KITTI tracking. Column 18 is the score of a tracker, if there is one."""
+def _kitti(path: Path, lines: Lines) -> tuple[NumberTable, ClassNames]:
+    """Rows of KITTI tracking, with the type as the number of a name. Column 18 is the score of a tracker, if any."""
     names = ClassNames()
 
     def parse(parts: list[str]) -> list[float]:
-        _columns(parts, 17, 18)
-        score = float(parts[17]) if len(parts) == 18 else np.nan
-        return [*(float(parts[at]) for at in (0, 1, 3, 4, 6, 7, 8, 9)), score, names.number(parts[2])]
+        check_columns(parts, 17, 18)
+        numbers = [float(part) if place != 2 else names.number(part) for place, part in enumerate(parts)]
+        return numbers + [np.nan] * (18 - len(parts))
 
     columns = "frame id type truncated occluded alpha left top right bottom height width length x y z rotation score"
-    table = NumberTable(path, lines, f"KITTI tracking ({columns})", 10, parse)
-    frame, track_id = _frame(table, 0), table.whole(1, "the id", NO_ID)
-    boxes, score, kind = _boxes(table, slice(4, 8), corners=True), _score(table, 8), table.values[:, 9]
-    truncated, occluded = table.values[:, 2], table.values[:, 3]
+    return NumberTable(path, lines, f"KITTI tracking ({columns})", 18, parse), names
+
+
+def read_kitti(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Labels:
+    """KITTI tracking."""
+    table, names = _kitti(path, lines)
+    frame, track_id = _ids(table, 0, 1)
+    boxes, score, kind = _boxes(table, slice(6, 10), corners=True), table.values[:, 17], table.values[:, 2]
+    table.check_scores(score)
+    truncated, occluded = table.values[:, 3], table.values[:, 4]
     people, region = names.are(kind, "pedestrian"), names.are(kind, _KITTI_REGION)
+    class_id, classes = names.ids(kind, _KITTI_CLASSES)
     if role != "detections" and not wanted.is_people:
-        ids, class_names = names.ids(kind, _KITTI_CLASSES)
         people = ~region
-        people[~region] = wanted.mask(path, ids[~region], class_names)
+        people[~region] = wanted.mask(path, class_id[~region], classes)
     if role == "detections":
         kept = ~region
         if not kept.any():
@@ -221,21 +213,37 @@ def read_kitti(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> L
     left += [f"{hidden} {who}, hidden or cut off"] if hidden else []
     sitting = (names.are(kind, "person_sitting") | names.are(kind, "person")) & wanted.is_people
     ignored = ~kept & (people | sitting | region)
-    class_id, classes = names.ids(kind[kept], _KITTI_CLASSES)
-    return Labels(
-        "kitti",
-        0,
-        frame[kept],
-        track_id[kept],
-        boxes[kept],
-        None,
-        score[kept],
-        np.unique(frame),
-        class_id,
-        classes,
-        " and ".join(left),
-        IgnoredBoxes(frame[ignored], boxes[ignored], ~region[ignored], region[ignored]) if role == "truth" else None,
-    )
+    left_out, labelled = " and ".join(left), np.unique(frame)
+    out = Labels(path, "kitti", table.at, frame, track_id, boxes, score, class_id, classes, left_out, labelled)
+    if role == "truth":
+        out.ignored = IgnoredBoxes(frame[ignored], boxes[ignored], ~region[ignored], region[ignored])
+    return out.keep(kept)
+
+
+def read_kitti_3d(path: Path) -> BoxRows3D:
+    """Read a file of one sequence.
+
+    In the file, x is right, y down and z forward, the position is the centre of the box's bottom, and the rotation
+    about y is 0 for an object that faces right. Here x is forward, y left and z up.
+    """
+    table, names = _kitti(path, lines_of(path))
+    frame, track_id = _ids(table, 0, 1)
+    kind, is_region = table.values[:, 2].astype(np.int64), names.are(table.values[:, 2], _KITTI_REGION)
+    has_no_box = ~is_region & (table.values[:, 10:13] <= 0).any(axis=1)  # results of detectors in pictures
+    kept = np.flatnonzero(~is_region & ~has_no_box)
+    if not len(kept):
+        raise McaptrackError(f"{path} holds no 3D boxes")
+    height, width, length, x, y, z, rotation = table.values[kept, 10:17].T
+    heading = -rotation - np.pi / 2
+    left = [f"{int(is_region.sum())} regions (DontCare)"] if is_region.any() else []
+    left += [f"{int(has_no_box.sum())} rows without a 3D box"] if has_no_box.any() else []
+    axes = "x is forward, y left, z up (in the file x is right, y down, z forward); positions are centres of boxes"
+    boxes, score = np.full((len(frame), 7), np.nan), table.values[:, 17]
+    boxes[kept] = np.stack([z, -x, -y + height / 2, length, width, height, heading], axis=-1)
+    rows = BoxRows3D(path, "kitti-3d", table.at, frame, track_id, boxes, score, kind, frame_id=CAMERA_FRAME)
+    rows.names, rows.left_out, rows.labelled = names.names, " and ".join(left), np.unique(frame)
+    rows.remark(f": {axes}")
+    return rows.take(kept)
 
 
 def read_sdd(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Labels:
@@ -243,67 +251,46 @@ def read_sdd(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Lab
     names = ClassNames()
 
     def parse(parts: list[str]) -> list[float]:
-        _columns(parts, 10, 10)
+        check_columns(parts, 10, 10)
         return [*map(float, parts[:9]), names.number(parts[9].strip('"'))]
 
     columns = 'id xmin ymin xmax ymax frame lost occluded generated "label"'
     table = NumberTable(path, lines, f"Stanford Drone annotations ({columns})", 10, parse)
-    frame, track_id = _frame(table, 5), table.whole(0, "the id", 0)
+    frame, track_id = _ids(table, 5, 0, least=0)
     boxes, kind = _boxes(table, slice(1, 5), corners=True), table.values[:, 9]
     lost = table.values[:, 6] != 0
     other = ~names.are(kind, "pedestrian") & (role != "detections")
+    class_id, classes = names.ids(kind, _SDD_CLASSES)
     if role != "detections" and not wanted.is_people:
-        other = ~wanted.mask(path, *names.ids(kind, _SDD_CLASSES))
+        other = ~wanted.mask(path, class_id, classes)
     kept = ~lost & ~other
     if not kept.any():
         what = ("pedestrians" if wanted.is_people else "such boxes") if other.any() else "boxes in sight"
         raise McaptrackError(f"{path} holds no {what}, only {names.count(kind)}")
     left = [names.count(kind[other & ~lost])] if (other & ~lost).any() else []
     left += [f"{int(lost.sum())} boxes out of sight (lost)"] if lost.any() else []
-    class_id, classes = names.ids(kind[kept], _SDD_CLASSES)
-    return Labels(
-        "sdd",
-        0,
-        frame[kept],
-        track_id[kept],
-        boxes[kept],
-        None,
-        np.full(int(kept.sum()), np.nan),
-        np.unique(frame),
-        class_id,
-        classes,
-        " and ".join(left),
-    )
-
-
-def read_trajnet(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Labels:
-    """TrajNet text."""
-    return _positions(path, lines, "trajnet", "TrajNet (frame id x y)", 4, slice(2, 4), wanted)
-
-
-def read_obsmat(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Labels:
-    """ETH's obsmat."""
-    return _positions(path, lines, "obsmat", "an ETH obsmat (frame id x z y vx vz vy)", 8, slice(2, 5, 2), wanted)
+    none, left_out, labelled = np.full(len(frame), np.nan), " and ".join(left), np.unique(frame)
+    out = Labels(path, "sdd", table.at, frame, track_id, boxes, none, class_id, classes, left_out, labelled)
+    return out.keep(kept)
 
 
 def _positions(
-    path: Path, lines: Lines, name: Format, what: str, columns: int, place: slice, wanted: WantedClasses
+    name: Format, what: str, columns: int, place: slice, path: Path, lines: Lines, role: Role, wanted: WantedClasses
 ) -> Labels:
-    def parse(parts: list[str]) -> list[float]:
-        _columns(parts, columns, columns)
-        return [float(part) for part in parts]
-
-    table = NumberTable(path, lines, what, columns, parse)
-    frame, track_id = _frame(table, 0), table.whole(1, "the id", 0)
-    xy_m, none = table.within(place, "a position", MAX_PLACE), np.full(len(frame), np.nan)
-    wanted.mask(path, _all_persons(len(frame)), {})  # all are people
-    return Labels(name, 0, frame, track_id, None, xy_m, none, np.unique(frame), _all_persons(len(frame)))
+    """Positions in metres of people."""
+    table = NumberTable(path, lines, what, columns)
+    frame, track_id = _ids(table, 0, 1, least=0)
+    xy_m, none, people = table.values[:, place], np.full(len(frame), np.nan), np.full(len(frame), PERSON, np.uint32)
+    table.refuse(~np.isfinite(xy_m).all(axis=1), lambda _: "a number is not finite")
+    table.check_places(xy_m, "a position")
+    wanted.mask(path, people, {})
+    return Labels(path, name, table.at, frame, track_id, None, none, people, labelled=np.unique(frame), xy_m=xy_m)
 
 
 READERS: Final[Mapping[str, Callable[[Path, Lines, Role, WantedClasses], Labels]]] = {
     "mot": read_mot,
     "kitti": read_kitti,
     "sdd": read_sdd,
-    "trajnet": read_trajnet,
-    "obsmat": read_obsmat,
+    "trajnet": partial(_positions, "trajnet", "TrajNet (frame id x y)", 4, slice(2, 4)),
+    "obsmat": partial(_positions, "obsmat", "an ETH obsmat (frame id x z y vx vz vy)", 8, slice(2, 5, 2)),
 }

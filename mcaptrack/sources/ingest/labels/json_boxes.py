@@ -19,8 +19,18 @@ from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import read_beginning
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.sources.ingest.labels.box_rows import NO_CLASS, BoxRows, FrameNames, TrackIds, numbers_of_names
-from mcaptrack.sources.ingest.labels.content import NO_ID, Format, Labels, WantedClasses
+from mcaptrack.sources.ingest.labels.content import (
+    NO_CLASS,
+    NO_ID,
+    UNKNOWN_FIRST,
+    Format,
+    FrameNames,
+    Labels,
+    TrackIds,
+    WantedClasses,
+    is_count,
+    numbers_of_names,
+)
 from mcaptrack.sources.ingest.labels.delimited import read_rows
 
 _MAX_BYTES: Final = 512 * 2**20
@@ -57,9 +67,9 @@ def _read_content(path: Path, content: Any, role: Role, chosen: Mapping[str, str
         raise McaptrackError(f"{path}: `columns=` is for tables with a header, not for COCO")
     first = content[0] if isinstance(content, list) and isinstance(content[0], dict) else {}
     if isinstance(content, dict) and isinstance(content.get("annotations"), list):
-        return _annotations(path, content).labels(role, wanted)
+        return _annotations(path, content).settled(role, wanted, _categories(path, content.get("categories")))
     if "bbox" in first and "image_id" in first:
-        return _results(path, content).labels(role, wanted)
+        return _results(path, content).settled(role, wanted)
     if "x_min" in first:
         return read_rows(path, content, role, chosen, wanted)
     kind = f"an object with {', '.join(content) or 'nothing'}"[:100] if isinstance(content, dict) else "a list"
@@ -103,17 +113,9 @@ class _Rows:
         except (ValueError, KeyError, TypeError) as error:
             text = str(error).strip('"')
             self.refuse(number, f"has a wrong image_id: {text}" if "column" in text else text)
-        self._values.extend(
-            (
-                frame,
-                *map(_float, box),
-                math.nan if score is None else _float(score),
-                NO_CLASS if category is None else _float(category),
-                NO_ID if track_id is None else _float(track_id),
-                bool(crowd),
-                isinstance(inner, dict) and inner.get("observed") is False,
-            )
-        )
+        unseen = isinstance(inner, dict) and inner.get("observed") is False
+        numbers = (_float(score, math.nan), _float(category, NO_CLASS), _float(track_id, NO_ID))
+        self._values.extend((frame, *map(_float, box), *numbers, bool(crowd), unseen))
 
     def _around(self, number: int, outline: Any) -> list[float] | None:
         """The box around polygons, [x, y, x, y, ...] each; None without any."""
@@ -133,38 +135,36 @@ class _Rows:
     def at(self, number: int) -> str:
         return f"{self._path}: {self._kind} {number}"
 
-    def done(self, names: Mapping[int, str] | None) -> BoxRows:
+    def done(self) -> Labels:
         """All rows."""
         values: Floats = np.frombuffer(self._values, np.float64).reshape(-1, _COLUMNS)
         frame, score, number, track_id, crowd, unseen = (values[:, at] for at in (0, 5, 6, 7, 8, 9))
-        boxes, is_crowd = values[:, 1:5], crowd != 0
         track_id, said = self._texts.of(self._path, track_id)
-        rows = BoxRows(self._path, "coco", self.at, frame, boxes, track_id, score, number, names, is_crowd)
-        rows.observed = unseen == 0
-        rows.remarks += said
+        rows = Labels(self._path, "coco", self.at, frame, track_id, values[:, 1:5], score, number, remarks=said)
+        rows.first_frame, rows.crowd, rows.observed = UNKNOWN_FIRST, crowd != 0, unseen == 0
         if self.outlined:
-            rows.remarks.append(f"{self._path}: {self.outlined} boxes are those around polygons, which have no bbox")
+            rows.remark(f": {self.outlined} boxes are those around polygons, which have no bbox")
         rows.take_shares()
         return rows
 
 
 def _whole_of_text(value: Any) -> Any:
     """Return the whole number that a text holds; anything else as it is."""
-    return int(value) if isinstance(value, str) and value.isascii() and value.isdecimal() and len(value) < 16 else value
+    return int(value) if isinstance(value, str) and is_count(value, 15) else value
 
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _float(value: Any) -> float:
+def _float(value: Any, missing: float = math.nan) -> float:
     try:
-        return float(value)
+        return missing if value is None else float(value)
     except OverflowError:
         return math.inf
 
 
-def _results(path: Path, content: list[Any]) -> BoxRows:
+def _results(path: Path, content: list[Any]) -> Labels:
     """Results: a list of image_id, category_id, bbox, score. The number of an image is that of its frame."""
     _check_count(path, content)
     rows, names = _Rows(path, "result"), FrameNames()
@@ -178,12 +178,12 @@ def _results(path: Path, content: list[Any]) -> BoxRows:
 
     for number, entry in enumerate(content):
         rows.add(number, entry, frame_of)
-    out = rows.done(None)
-    out.remarks.append(f"{path}: the number in image_id is taken as the frame")
+    out = rows.done()
+    out.remark(": the number in image_id is taken as the frame")
     return out
 
 
-def _annotations(path: Path, content: Mapping[str, Any]) -> BoxRows:
+def _annotations(path: Path, content: Mapping[str, Any]) -> Labels:
     """Annotations: images, annotations and categories."""
     images, entries = content.get("images"), content["annotations"]
     if not isinstance(images, list) or not all(isinstance(image, dict) and "id" in image for image in images):
@@ -207,16 +207,16 @@ def _annotations(path: Path, content: Mapping[str, Any]) -> BoxRows:
 
     for number, entry in enumerate(entries):
         rows.add(number, entry, frame_of)
-    out = rows.done(_categories(path, content.get("categories")))
+    out = rows.done()
     out.labelled = np.unique(np.array(frames, np.int64))
     out.first_frame = int(out.labelled[0]) if len(frames) else 0
-    out.remarks.append(f"{path}: {len(images)} images, in order of {order}")
+    out.remark(f": {len(images)} images, in order of {order}")
     if order == _BY_LIST and len(images) > 1:
-        text = f"{path}: its images have neither frame_id nor names with numbers of one sequence; the order in `images`"
-        out.doubts.append((f"{text} is taken as that of the pictures", "clock"))
+        text = ": its images have neither frame_id nor names with numbers of one sequence; the order in `images`"
+        out.doubt(f"{text} is taken as that of the pictures", "clock")
     if out.first_frame > 1:
-        text = f"{path}: its first image has the number {out.first_frame}, and is assumed to be the first picture"
-        out.doubts.append((f"{text}; `first_frame=` sets the number", "clock"))
+        text = f": its first image has the number {out.first_frame}, and is assumed to be the first picture"
+        out.doubt(f"{text}; `first_frame=` sets the number", "clock")
     if not out.is_normalised:
         _doubt_outside(out, images, frames)
     return out
@@ -263,7 +263,7 @@ def _categories(path: Path, categories: Any) -> dict[int, str] | None:
     return out
 
 
-def _doubt_outside(rows: BoxRows, images: list[dict[str, Any]], frames: list[int]) -> None:
+def _doubt_outside(rows: Labels, images: list[dict[str, Any]], frames: list[int]) -> None:
     """Count boxes that lie outside of their image."""
     sizes = {
         frame: (_float(image["width"]), _float(image["height"]))

@@ -1,24 +1,48 @@
-"""Read label files, with detection of their format, and homographies."""
+"""Read label files, of boxes in pictures and in space, with detection of their format; and homographies."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain, islice
 from pathlib import Path
-from typing import Final, get_args
+from typing import Any, Final, TypeVar, get_args
 
 import numpy as np
 
 from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
-from mcaptrack.sources.ingest.labels.columns import choose_columns
-from mcaptrack.sources.ingest.labels.content import FORMATS_3D, ONLY_PEOPLE, Format, Labels, WantedClasses
+from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.schema.spill import SpillFile, Stored
+from mcaptrack.sources.ingest.labels.argoverse import is_argoverse, read_argoverse
+from mcaptrack.sources.ingest.labels.content import (
+    FORMATS_3D,
+    ONLY_PEOPLE,
+    BoxRows3D,
+    ClassIds,
+    Format,
+    Labels,
+    WantedClasses,
+    lines_of,
+    split,
+)
 from mcaptrack.sources.ingest.labels.cvat import is_cvat, read_cvat
-from mcaptrack.sources.ingest.labels.delimited import MAX_LINE, SUPERVISION, comment_header, header_of, read_csv
-from mcaptrack.sources.ingest.labels.formats import READERS
+from mcaptrack.sources.ingest.labels.delimited import (
+    MAX_LINE,
+    SUPERVISION,
+    choose_columns,
+    comment_header,
+    header_of,
+    holds_boxes_3d,
+    read_csv,
+    read_table_3d,
+)
+from mcaptrack.sources.ingest.labels.formats import READERS, read_kitti_3d
 from mcaptrack.sources.ingest.labels.json_boxes import is_json, read_json
-from mcaptrack.sources.ingest.labels.number_table import lines_of, split
+from mcaptrack.sources.ingest.labels.nuscenes import read_nuscenes, tables_folder
 from mcaptrack.sources.ingest.labels.yolo import read_yolo
 
 _MOT_COLUMNS: Final = {"frame": 0, "id": 1, "x": 2, "y": 3, "w": 4, "h": 5}
@@ -32,6 +56,7 @@ def read_labels(
     first_frame: int | None = None,
     columns: Mapping[str, str] | None = None,
     wanted: WantedClasses = ONLY_PEOPLE,
+    in_parts: bool = False,
 ) -> Labels:
     """Read a label file.
 
@@ -49,25 +74,35 @@ def read_labels(
         Names of the columns of a table with a header, by what they hold.
     wanted : WantedClasses
         The classes of tracks and ground truth; detections keep all.
+    in_parts : bool
+        Read a long file in parts, if it is detections, or tracks of people, in a format without names of classes, and
+        sorted by frame.
 
     Returns
     -------
     Labels
-        Sorted by frame and id.
+        Sorted by frame and id; ``LongLabels`` if they were read in parts.
 
     Raises
     ------
     McaptrackError
         With the line, if the file doesn't have this format, or none of the known ones.
     """
-    labels = _read(path, label_format, role, columns or {}, wanted)
-    if labels.has_ids and role != "detections":
-        refuse_repeated_ids(path, labels)
-    return replace(
-        in_order(labels, labels.has_ids),
-        first_frame=labels.first_frame if first_frame is None else first_frame,
-        doubts=tuple(doubt for doubt in labels.doubts if first_frame is None or doubt[1] != "clock"),
-    )
+    is_alike = role == "detections" or (role == "tracks" and wanted.is_people)
+    labels: Labels | None = None
+    if in_parts and is_alike and not columns and path.is_file() and path.stat().st_size >= _LONG_BYTES:
+        if label_format == "auto" and not is_json(path) and not is_cvat(path):
+            label_format = text_format(path)
+        labels = _read_in_parts(path, label_format, role, wanted) if label_format in _FORMATS else None
+    if labels is None:
+        labels = _read(path, label_format, role, columns or {}, wanted)
+        if labels.has_ids and role != "detections":
+            refuse_repeated_ids(labels)
+        labels = in_order(labels, labels.has_ids)
+    if first_frame is not None:
+        labels.first_frame = first_frame
+        labels.doubts = [doubt for doubt in labels.doubts if doubt[1] != "clock"]
+    return labels
 
 
 def in_order(labels: Labels, has_ids: bool) -> Labels:
@@ -141,14 +176,10 @@ def _has_other_columns(path: Path, number: int, line: str) -> bool:
     return any(columns.get(key) != place for key, place in _MOT_COLUMNS.items())
 
 
-def refuse_repeated_ids(path: Path, labels: Labels) -> None:
+def refuse_repeated_ids(labels: Labels) -> None:
     """Raise McaptrackError if an id appears twice in a frame."""
-    order = np.lexsort((labels.id, labels.frame))
-    frame, track_id = labels.frame[order], labels.id[order]
-    repeats = np.flatnonzero((frame[1:] == frame[:-1]) & (track_id[1:] == track_id[:-1]))
-    if len(repeats):
-        at = repeats[0]
-        raise McaptrackError(f"{path}: id {track_id[at]} appears twice in frame {frame[at]}")
+    if (row := labels.repeated_id()) >= 0:
+        raise McaptrackError(f"{labels.path}: id {labels.id[row]} appears twice in frame {labels.frame[row]}")
 
 
 def read_homography(path: Path) -> tuple[float, ...]:
@@ -169,3 +200,211 @@ def read_homography(path: Path) -> tuple[float, ...]:
         shape = " + ".join(str(len(row)) for row in rows) or "no"
         raise McaptrackError(f"{text}, not {shape}{' + ...' if len(rows) > 3 else ''} numbers")
     return tuple(number for row in rows for number in row)
+
+
+# Label files that are too long for memory: their rows in a temporary file, in parts of whole frames.
+#
+# Formats in which a row says all about itself are read so if their rows come in the order of their frames, as
+# programs write detections and tracks. Others are in memory as a whole.
+#
+# Letters: N rows, F frames, C classes.
+
+
+_Values = TypeVar("_Values", Ints, ClassIds)
+
+#: Files from this size on are read in parts, of about so many rows.
+_LONG_BYTES: Final = 20_000_000
+_PART_ROWS: Final = 200_000
+_FORMATS: Final[tuple[Format, ...]] = ("mot", "trajnet", "obsmat")
+
+
+@dataclass(kw_only=True)
+class LongLabels(Labels):
+    """A label file with its rows in a temporary file; ``parts`` reads them. The rows here are none.
+
+    ``stored`` are the places of the columns of each part in ``file``. ``of_frames`` and ``of_classes`` are values,
+    sorted, and how many rows have them; ``corner`` is the largest x and y of boxes.
+    """
+
+    any_ids: bool
+    of_frames: tuple[Ints, Ints]
+    of_classes: tuple[ClassIds, Ints]
+    corner: Floats
+    file: SpillFile
+    stored: Sequence[Mapping[str, Stored]]
+
+    @property
+    def has_ids(self) -> bool:
+        """Whether any row has a track id."""
+        return self.any_ids
+
+    def frame_counts(self) -> tuple[Ints, Ints]:
+        """The frames with rows (F,), sorted, and the number of rows of each."""
+        return self.of_frames
+
+    def class_counts(self) -> tuple[ClassIds, Ints]:
+        """The classes of rows (C,), sorted, and the number of rows of each."""
+        return self.of_classes
+
+    def corner_px(self) -> Floats:
+        """The largest x and y (2,) of boxes."""
+        return self.corner
+
+    @property
+    def parts(self) -> Sequence[Callable[[], Labels]]:
+        """The rows in parts of whole frames, in their order."""
+        return [partial(self._part, columns) for columns in self.stored]
+
+    def _part(self, stored: Mapping[str, Stored]) -> Labels:
+        columns: dict[str, Any] = {name: getattr(self, name) for name in self.COLUMNS}
+        for name, place in stored.items():
+            like = columns[name]
+            columns[name] = np.frombuffer(self.file.get(place), like.dtype).reshape(-1, *like.shape[1:])
+        return in_order(Labels(self.path, self.format, self.at, **columns), self.has_ids)
+
+
+def _read_in_parts(path: Path, name: Format, role: Role, wanted: WantedClasses) -> LongLabels | None:
+    """Read a label file in parts; None if it isn't sorted by frame."""
+    lines, file, stored = lines_of(path), SpillFile(), list[Mapping[str, Stored]]()
+    frames, classes = list[tuple[Ints, Ints]](), list[tuple[ClassIds, Ints]]()
+    corner, has_ids, left_out, first_frame = np.full(2, -np.inf), False, list[str](), 1
+    rest: Labels | None = None  # the last frame, which may go on
+    while (line := next(lines, None)) is not None:
+        read = READERS[name](path, chain([line], islice(lines, _PART_ROWS - 1)), role, wanted)
+        if rest is not None and read.frame.min() < rest.frame[0]:
+            return None
+        frames.append(read.frame_counts())
+        classes.append(read.class_counts())
+        corner = np.maximum(corner, read.corner_px()) if read.has_boxes else corner
+        has_ids, first_frame = has_ids or read.has_ids, min(first_frame, read.first_frame)
+        left_out += [read.left_out] if read.left_out else []
+        read = in_order(read if rest is None else _joined(rest, read), has_ids=False)
+        last = int(np.searchsorted(read.frame, read.frame[-1]))
+        if last:
+            stored.append(_put(file, read.take(slice(last))))
+        rest = read.take(slice(last, None))
+    if rest is None:
+        return None
+    stored.append(_put(file, rest))
+    of_frames = _merged(frames)
+    about = {"first_frame": first_frame, "left_out": _summed(left_out), "labelled": of_frames[0]}
+    out = LongLabels(
+        **(vars(rest.take(slice(0))) | about | {"ignored": None}),
+        any_ids=has_ids, of_frames=of_frames, of_classes=_merged(classes), corner=corner, file=file, stored=stored,
+    )  # fmt: skip
+    if has_ids and role != "detections":
+        for part in out.parts:
+            refuse_repeated_ids(part())
+    return out
+
+
+def _merged(counts: Sequence[tuple[_Values, Ints]]) -> tuple[_Values, Ints]:
+    """The values of parts, sorted, and how many rows have each."""
+    values, which = np.unique(np.concatenate([part for part, _ in counts]), return_inverse=True)
+    return values, np.bincount(which, np.concatenate([count for _, count in counts])).astype(np.int64)
+
+
+def _joined(first: Labels, second: Labels) -> Labels:
+    """The rows of both, one after the other."""
+    columns: dict[str, Any] = {}
+    for name in Labels.COLUMNS:
+        before, other = getattr(first, name), getattr(second, name)
+        columns[name] = None if other is None else np.concatenate([before, other])
+    return replace(second, **columns)
+
+
+def _put(file: SpillFile, part: Labels) -> dict[str, Stored]:
+    columns = {name: getattr(part, name) for name in Labels.COLUMNS}
+    return {name: file.put(values.tobytes()) for name, values in columns.items() if values is not None}
+
+
+def _summed(texts: Sequence[str]) -> str:
+    """Merge texts that differ only in their first number, which is summed; "" if there are none."""
+    total = sum(int(number[0]) for text in texts if (number := re.search(r"\d+", text)))
+    return re.sub(r"\d+", str(total), texts[0], count=1) if texts else ""
+
+
+# Recognise label files with 3D boxes, and read them.
+
+
+_BEGIN_BYTES: Final = 4096
+
+
+def is_3d(path: Path, label_format: Format = "auto", columns: Mapping[str, str] | None = None) -> bool:
+    """Whether a label file holds 3D boxes, by the format that is given, or by its content."""
+    if label_format in FORMATS_3D:
+        return True
+    if label_format not in ("auto", "csv") or not path.exists():
+        return False
+    if path.is_dir():
+        return tables_folder(path) is not None or is_argoverse(path)
+    if is_argoverse(path):
+        return True
+    return path.is_file() and not _is_binary(path) and holds_boxes_3d(path, _first_line(path), columns or {})
+
+
+def _is_binary(path: Path) -> bool:
+    try:
+        with path.open("rb") as stream:
+            return b"\0" in stream.read(_BEGIN_BYTES)
+    except OSError:
+        return True  # the reader of other labels says why
+
+
+def _first_line(path: Path) -> str:
+    try:
+        return next(lines_of(path, MAX_LINE), (0, ""))[1]
+    except McaptrackError:
+        return ""
+
+
+def read_boxes_3d(
+    path: Path,
+    role: Role,
+    label_format: Format = "auto",
+    columns: Mapping[str, str] | None = None,
+    scene: str | None = None,
+) -> BoxRows3D:
+    """Read a label file with 3D boxes.
+
+    Parameters
+    ----------
+    path : Path
+        A text file, a table in Feather format, or the folder of a data set.
+    role : str
+        "detections", "tracks" or "truth" (ground truth).
+    label_format : str
+        "auto" detects it from the content.
+    columns : dict, optional
+        Names of the columns of a table with a header, by what they hold.
+    scene : str, optional
+        Name of the scene, in nuScenes.
+
+    Returns
+    -------
+    BoxRows3D
+
+    Raises
+    ------
+    McaptrackError
+        With the place in the file, if it doesn't have this format, or if it can't be boxes in metres with z up.
+    """
+    refuse_special(path)
+    if label_format == "auto" and path.is_dir():
+        label_format = "argoverse" if is_argoverse(path) else "nuscenes"
+    elif label_format == "auto":
+        label_format = "argoverse" if is_argoverse(path) else "csv"
+    if columns and label_format != "csv":
+        raise McaptrackError(f"{path}: `columns=` is for tables with a header, not for {label_format}")
+    if scene is not None and label_format != "nuscenes":
+        raise McaptrackError(f"{path}: `scene=` is for nuScenes, not for {label_format}")
+    if path.is_dir() and label_format in ("csv", "kitti-3d"):
+        raise McaptrackError(f"{path} is a folder, and {label_format} labels are a file")
+    if label_format == "nuscenes":
+        rows = read_nuscenes(path, scene)
+    elif label_format == "argoverse":
+        rows = read_argoverse(path)
+    else:
+        rows = read_kitti_3d(path) if label_format == "kitti-3d" else read_table_3d(path, columns or {})
+    rows.check(role)
+    return rows

@@ -9,18 +9,34 @@ Letters: P pictures, F labelled frames.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import lru_cache
+from itertools import islice
 from pathlib import Path
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple, Self, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
+from mcaptrack import log
+from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats, Ints
-from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
+from mcaptrack.geometry.boxes import columns_to_boxes
+from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S, parse_fps
+from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import warn
-from mcaptrack.sources.ingest.labels.long_files import LabelFile
+from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Rows
+from mcaptrack.schema.framing import joined_parts
+from mcaptrack.sources import foreign
+from mcaptrack.sources.cameras import DEFAULT_CAMERA, provenance_of
+from mcaptrack.sources.foreign.flatten import message_type_of
+from mcaptrack.sources.ingest.labels.content import Labels
+from mcaptrack.sources.pictures import size_of_pictures
+from mcaptrack.sources.video import is_video_codec, read_head
+from mcaptrack.transforms import STAGES
 
 #: The largest frame number: more than three days at 30 frames a second.
 MAX_FRAMES: Final = 10_000_000
@@ -112,15 +128,16 @@ class Timeline:
         gaps = np.diff(self.t_ns) / np.diff(self.index)
         return NS_PER_S / float(np.median(gaps)) if len(gaps) else 0.0
 
-    def place(self, path: Path, labels: LabelFile, lost: list[str]) -> Placed:
+    def place(self, labels: Labels, lost: list[str]) -> Placed:
         """Assign the labelled frames of a file to pictures, including frames without labels in between.
 
         Raises McaptrackError if there are labels before the first or after the last picture. If pictures are known to
         be lost, such labels are reported in ``lost`` instead.
         """
+        path = labels.path
         if labels.times_s is not None:
             return self._place_by_time(path, labels.times_s)
-        every = self._every(path, labels)
+        every = self._every(labels)
         frame, count = labels.frame_counts()
         at = (frame - labels.first_frame) // every
         end = int(self.index[-1]) + 1
@@ -131,7 +148,7 @@ class Timeline:
             )
         beyond = int(count[at >= end].sum())
         if beyond and (self.is_complete or (at >= end).all()):
-            raise McaptrackError(self._beyond(path, labels, beyond, every * (end - 1) + labels.first_frame))
+            raise McaptrackError(self._beyond(labels, beyond, every * (end - 1) + labels.first_frame))
         if beyond:
             lost.append(f"{path}: {beyond} labels are of frames after the last picture that could be read, {end - 1}")
         missing = int(count[(at < end) & ~np.isin(at, self.index)].sum())
@@ -174,21 +191,21 @@ class Timeline:
         number[nearest] = np.arange(len(seconds))
         return Placed(number, self.index, self.t_ns)
 
-    def _every(self, path: Path, labels: LabelFile) -> int:
+    def _every(self, labels: Labels) -> int:
         """The step of frame numbers in a label file, which may use the numbers in the names of images."""
         if self.every == 1 or ((labels.labelled - labels.first_frame) % self.every).any():
             return 1
         if int(labels.labelled[-1]) > labels.first_frame:
-            warn(f"{path} counts frames as the names of {self.of} do, every {self.every}", "clock")
+            warn(f"{labels.path} counts frames as the names of {self.of} do, every {self.every}", "clock")
         return self.every
 
-    def _beyond(self, path: Path, labels: LabelFile, beyond: int, end: int) -> str:
+    def _beyond(self, labels: Labels, beyond: int, end: int) -> str:
         """The error for labels after frame ``end`` of the file, the last picture."""
         frame, count = labels.frame_counts()
         first, last = int(frame[0]), int(frame[-1])
         some = "all" if beyond == count.sum() else beyond
         text = (
-            f"{path}: {some} labels are of frames after the last picture: {self.of} end with frame "
+            f"{labels.path}: {some} labels are of frames after the last picture: {self.of} end with frame "
             f"{end}, the labels with frame {last}"
         )
         if last - first <= end - labels.first_frame and first != labels.first_frame:
@@ -206,7 +223,7 @@ def frame_times_ns(index: Ints, fps: Fraction) -> Ints:
     return rounded
 
 
-def count_frames(path: Path, labels: LabelFile) -> int:
+def count_frames(labels: Labels) -> int:
     """The number of frames up to the last one that a file labels.
 
     Raises McaptrackError if nearly all of them would be empty, which means that the numbers are wrong.
@@ -218,7 +235,220 @@ def count_frames(path: Path, labels: LabelFile) -> int:
         first = f"give the number of the first picture with `first_frame={labels.labelled[0]}`"
         mend = f"`frames={count}` takes it so" if count <= MAX_FRAMES else f"at most {MAX_FRAMES} are read"
         raise McaptrackError(
-            f"{path}: frame {last} would be the last of {count} frames, of which {len(labels.labelled)} are labelled; "
-            f"{mend}, or {first}"
+            f"{labels.path}: frame {last} would be the last of {count} frames, of which {len(labels.labelled)} are "
+            f"labelled; {mend}, or {first}"
         )
     return count
+
+
+# Labels as rows of detections and tracks. Letters: N rows.
+
+
+#: The number of frames of a block, for which times are converted together.
+_BLOCK: Final = 4096
+
+
+def label_rows(labels: Labels, role: Role, plane: GroundPlane | None) -> Rows:
+    """Convert the N rows of labels to rows of detections or tracks, with positions in metres if a plane is given."""
+    if role == "detections" and labels.boxes_px is not None:
+        x, y, w, h = labels.boxes_px.T
+        return DETECTIONS.rows(x_px=x, y_px=y, w_px=w, h_px=h, score=labels.score, class_id=labels.class_id)
+    nowhere = np.full((len(labels.frame), 4), np.nan)
+    boxes = nowhere if labels.boxes_px is None else labels.boxes_px
+    xy_m = labels.xy_m
+    if xy_m is None:
+        xy_m = plane.boxes_to_metres(boxes) if plane else nowhere[:, :2]
+    columns = dict(zip(("x_px", "y_px", "w_px", "h_px", "x_m", "y_m"), [*boxes.T, *xy_m.T], strict=True))
+    is_stated = role == "tracks" and labels.observed is not None
+    columns["observed"] = labels.observed if is_stated else np.ones(len(labels.frame), bool)
+    columns |= {"score": labels.score, "source_id": np.full(len(labels.frame), -1), "class_id": labels.class_id}
+    return TRACKS.rows(track_id=labels.id, **columns)
+
+
+def frames_of_labels(
+    parts: Sequence[Callable[[], Labels]], role: Role, plane: GroundPlane | None, placed: Placed
+) -> Callable[[], Iterator[Frame]]:
+    """The rows of labels, in parts of whole frames, as frames: those that are ``placed``, also empty ones.
+
+    They are made as often as the result is called, and converted once if there is one part.
+    """
+
+    @lru_cache(maxsize=1)
+    def converted(number: int) -> tuple[Ints, Rows]:
+        labels = parts[number]()
+        return labels.frame, label_rows(labels, role, plane)
+
+    def frames() -> Iterator[Frame]:
+        low = 0
+        for number in range(len(parts)):
+            frame, rows = converted(number)
+            is_last = number == len(parts) - 1
+            high = len(placed.number) if is_last else int(np.searchsorted(placed.number, frame[-1], "right"))
+            for start in range(low, high, _BLOCK):
+                some = slice(start, min(start + _BLOCK, high))
+                ends = (np.searchsorted(frame, placed.number[some], side) for side in ("left", "right"))
+                columns = (column.tolist() for column in (placed.t_ns[some], placed.index[some], *ends))
+                for t_ns, index, first, last in zip(*columns, strict=True):
+                    yield Frame(t_ns, index, rows[first:last])
+            low = high
+
+    return frames
+
+
+# Find the pictures that labels belong to. A camera is the part of a topic before its last "/".
+
+
+class CameraTopics(NamedTuple):
+    """The prefix of all topics of a camera, and the topic of its pictures, "" if there are none."""
+
+    prefix: str
+    pictures: str
+
+
+def choose_camera(where: object, camera: str, topics: Collection[str]) -> CameraTopics:
+    """The camera with this name, among topics of pictures.
+
+    The name may also be a topic of pictures itself, or be below a camera: a second set of labels for the pictures of
+    ``front`` goes to ``front/labels``. With the default name it is the only camera with pictures. Raises
+    McaptrackError, with the names, if a camera has several topics of pictures, or if there are several cameras and none
+    is named.
+    """
+    prefix = "/" + camera.strip("/")
+    for at in (prefix, *_above(prefix)):
+        if at in topics:
+            return CameraTopics(camera_prefix(at) if at == prefix else prefix, at)
+        fitting = sorted(topic for topic in topics if camera_prefix(topic) == at)
+        if len(fitting) == 1 or f"{at}/video" in fitting:
+            return CameraTopics(prefix, f"{at}/video" if len(fitting) > 1 else fitting[0])
+        if fitting:
+            raise McaptrackError(
+                f"{where}: {at} has several topics of pictures, {', '.join(fitting)}; name one with "
+                f"`camera={fitting[0].strip('/')!r}`"
+            )
+    if camera != DEFAULT_CAMERA or not topics:
+        return CameraTopics(prefix, "")
+    if len(topics) > 1:
+        names = sorted({camera_prefix(topic).strip("/") for topic in topics})
+        names = names if len(names) == len(topics) else sorted(topic.strip("/") for topic in topics)
+        raise McaptrackError(
+            f"{where} has pictures of several cameras, {', '.join(sorted(topics))}; labels and ground planes belong to "
+            f"those of one: choose with `camera={names[0]!r}`"
+        )
+    (topic,) = topics
+    return CameraTopics(camera_prefix(topic), topic)
+
+
+def _above(prefix: str) -> Iterator[str]:
+    while "/" in prefix[1:]:
+        prefix = prefix.rpartition("/")[0]
+        yield prefix
+
+
+def camera_prefix(topic: str) -> str:
+    """The prefix of the camera that a topic belongs to."""
+    folder, slash, _ = topic.strip("/").rpartition("/")
+    return f"/{folder}" if slash else f"/{DEFAULT_CAMERA}"
+
+
+def camera_of(opened: log.Log, camera: str) -> CameraTopics:
+    """The camera with this name in a log. Raises McaptrackError as ``choose_camera`` does."""
+    topics = [c.topic for c in opened.channels.values() if foreign.holds_pictures(c) and c.messages]
+    return choose_camera(opened.path, camera, topics)
+
+
+def picture_predicate(kind: foreign.MessageType) -> Callable[[bytes], bool]:
+    """A predicate: whether a message of a channel has a picture; video messages may have parameter sets alone."""
+    if not foreign.is_compressed(kind.name):
+        return lambda _: True
+    decode = foreign.picture_decoder(kind)
+
+    def test(payload: bytes) -> bool:
+        try:
+            picture = decode(payload)
+        except McaptrackError:
+            return True  # a damaged picture counts; decoding it reports what is wrong
+        return read_head(picture.format, picture.data).has_picture
+
+    return test
+
+
+def timeline_of(opened: log.Log, topic: str) -> Timeline:
+    """The pictures of a channel. Raises McaptrackError if it is damaged, or holds no pictures."""
+    t_ns: NDArray[np.int64] = opened.times(topic)
+    index, every, of = np.arange(len(t_ns)), 1, f"the pictures of {topic}"
+    provenance = provenance_of(opened, topic)
+    if provenance:
+        value = provenance.parameters.get("every")
+        every = value if isinstance(value, int) and value > 0 else 1
+        last = max(message.sequence for message in opened.messages(topic, int(t_ns[-1])))
+        if last + 1 != len(t_ns):  # some pictures could not be read; the others keep their numbers
+            index = np.array([message.sequence for message in opened.messages(topic)], np.int64)
+    elif _may_be_video(opened, topic):
+        is_picture = picture_predicate(message_type_of(opened, topic))
+        t_ns = np.array([m.t_ns for m in opened.messages(topic) if is_picture(m.payload)], np.int64)
+        index = np.arange(len(t_ns))
+    if not len(t_ns):
+        raise McaptrackError(f"{opened.path}: {topic} has no pictures that labels could be of")
+    return Timeline(index, t_ns, of, len(index) == index[-1] + 1, every)
+
+
+def detections_topic(opened: log.Log, prefix: str) -> str:
+    """The topic of detections made from pictures that were dropped since; "" if there is none."""
+    channel, provenance = opened.channels.get(f"{prefix}/detections"), provenance_of(opened, f"{prefix}/detections")
+    stage = STAGES.get(provenance.transform) if provenance else None
+    is_of_pictures = stage is not None and stage.reads is VIDEO
+    return channel.topic if channel and channel.messages and is_of_pictures else ""
+
+
+def _may_be_video(opened: log.Log, topic: str) -> bool:
+    """Whether the first picture of a channel is video, or can't be read."""
+    if not foreign.is_compressed(opened.channel(topic).schema_name):
+        return False
+    decode = foreign.picture_decoder(message_type_of(opened, topic))
+    try:
+        return any(is_video_codec(decode(message.payload).format) for message in islice(opened.messages(topic), 1))
+    except McaptrackError:
+        return True
+
+
+class ExistingLabels(NamedTuple):
+    """Labels in a log: their sorted times, the number of frames, and the frame rate if it is known."""
+
+    t_ns: NDArray[np.int64]
+    frames: int
+    fps: Fraction | None
+
+
+def labels_of(opened: log.Log, prefix: str) -> dict[str, ExistingLabels]:
+    """The ingested labels of a camera in a log, by topic."""
+    out = {}
+    for role in get_args(Role):
+        channel, provenance = opened.channels.get(f"{prefix}/{role}"), provenance_of(opened, f"{prefix}/{role}")
+        if channel and channel.messages and provenance and provenance.transform == "ingest":
+            t_ns = opened.times(channel.topic)
+            value = provenance.parameters.get("fps")
+            fps = parse_fps(value) if isinstance(value, str) else None
+            frames = 1 + max(message.sequence for message in opened.messages(channel.topic, int(t_ns[-1])))
+            out[channel.topic] = ExistingLabels(t_ns, frames, fps)
+    return out
+
+
+def boxes_extent(opened: log.Log, topic: str) -> tuple[int, int]:
+    """Width and height, at least 1, of pictures that contain all boxes of a channel; (0, 0) if it has no detections."""
+    channel = opened.channels.get(topic)
+    if channel is None or not channel.messages or channel.schema_name != DETECTIONS.name:
+        return 0, 0
+    corner = np.ones(2)
+    for _, _, part in joined_parts(DETECTIONS, opened.frame_columns(topic, DETECTIONS)):
+        boxes = columns_to_boxes(part.rows)
+        corner = np.maximum(corner, (boxes[:, :2] + boxes[:, 2:]).max(axis=0, initial=1.0))
+    right, bottom = np.ceil(corner).tolist()
+    return int(right), int(bottom)
+
+
+def picture_size(opened: log.Log, topic: str) -> tuple[int, int]:
+    """Width and height of the pictures of a channel. Raises McaptrackError if none of them can be decoded."""
+    size = size_of_pictures(opened, topic)
+    if size is None:
+        raise McaptrackError(f"{opened.path}: {topic} has no picture that can be decoded")
+    return size

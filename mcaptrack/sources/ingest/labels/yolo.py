@@ -17,22 +17,21 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.notices import Code
 from mcaptrack.sources.ingest.bags import plain_yaml
-from mcaptrack.sources.ingest.labels.box_rows import BoxRows, numbers_of_names
-from mcaptrack.sources.ingest.labels.content import NO_ID, Labels, WantedClasses
-from mcaptrack.sources.ingest.labels.number_table import NumberTable, lines_of
+from mcaptrack.sources.ingest.labels.content import (
+    NO_ID,
+    UNKNOWN_FIRST,
+    Labels,
+    NumberTable,
+    WantedClasses,
+    lines_of,
+    numbers_of_names,
+)
 from mcaptrack.sources.video.image_folder import IMAGE_SUFFIXES, natural_order
 
 _NAMES: Final = ("classes.txt", "obj.names", "_classes.txt", "labels.txt")
 _DATA: Final = ("data.yaml", "data.yml", "dataset.yaml")
-_NOT_LABELS: Final = (
-    *_NAMES,
-    "readme.txt",
-    "readme.roboflow.txt",
-    "readme.dataset.txt",
-    "train.txt",
-    "val.txt",
-    "test.txt",
-)
+_READMES: Final = ("readme.txt", "readme.roboflow.txt", "readme.dataset.txt")
+_NOT_LABELS: Final = (*_NAMES, *_READMES, "train.txt", "val.txt", "test.txt")
 _MAX_FILES: Final = 1_000_000
 _MAX_ROWS: Final = 10_000_000
 _MAX_CLASSES: Final = 65536
@@ -92,30 +91,17 @@ def read_yolo(folder: Path, role: Role, wanted: WantedClasses) -> Labels:
     if np.isfinite(rows[:, 6]).any() and not np.isfinite(rows[:, 7]).any():
         remarks.append(f"{folder}: column 6 holds {'confidences' if np.isfinite(score).any() else 'track ids'}")
     centre, size = rows[:, 2:4], rows[:, 4:6]
-    doubts: list[tuple[str, Code]] = []
-    names, named_by = _class_names(folder, files[0].parent, doubts)
-    out = BoxRows(
-        folder,
-        "yolo",
-        at,
-        rows[:, 0],
-        np.concatenate([centre - size / 2, size], axis=1),
-        track_id,
-        score,
-        rows[:, 1],
-        names,
-        labelled=np.array(sorted(numbers), np.int64),
-        is_normalised=True,
-        remarks=remarks,
-        doubts=doubts,
-    )
+    boxes = np.concatenate([centre - size / 2, size], axis=1)
+    out = Labels(folder, "yolo", at, rows[:, 0], track_id, boxes, score, rows[:, 1], remarks=remarks)
+    out.labelled, out.is_normalised, out.first_frame = np.array(sorted(numbers), np.int64), True, UNKNOWN_FIRST
+    names, named_by = _class_names(folder, files[0].parent, out.doubts)
     if named_by is not None:
-        out.remarks.append(f"{folder}: class names by {named_by}")
+        out.remark(f": class names by {named_by}")
     largest = np.abs(rows[:, 2:6]).max(axis=1, initial=0)
     out.refuse(
         largest > _MOST, lambda row: f"{largest[row]:g} is no share of the picture's size, as boxes of YOLO are in"
     )
-    return out.labels(role, wanted)
+    return out.settled(role, wanted, names)
 
 
 def _parse(parts: list[str]) -> list[float]:

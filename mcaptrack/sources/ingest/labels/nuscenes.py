@@ -9,8 +9,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.ingest.labels.boxes_3d.rows import BoxRows3D, headings, numbered
+from mcaptrack.errors import McaptrackError, list_names
+from mcaptrack.sources.ingest.labels.content import BoxRows3D, headings, numbered
 from mcaptrack.sources.ingest.labels.formats import ClassNames
 
 TABLES: Final = ("scene", "sample", "sample_annotation", "instance", "category")
@@ -103,22 +103,12 @@ def read_nuscenes(path: Path, scene: str | None) -> BoxRows3D:
     remarks = [f"{folder}: {len(samples)} samples; tracks are numbered from 1 on, a number for each instance"]
     if unseen:
         remarks.append(f"{folder}: {unseen} of {len(boxes)} boxes have no points of lidar or radar; they stay")
-    return BoxRows3D(
-        path,
-        "nuscenes",
-        at,
-        values,
-        numbered([f"#{track}" for track in ids])[0],
-        np.array(kinds, np.int64),
-        names.names,
-        np.full(len(boxes), np.nan),
-        np.full((len(boxes), 2), np.nan),
-        t_ns=np.array(times, np.int64),
-        labelled=np.unique(np.array(list(samples.values()), np.int64)),
-        frame_id=FRAME,
-        usual=frozenset(_CLASSES),
-        remarks=remarks,
-    )
+    t_ns, track_id = np.array(times, np.int64), numbered([f"#{track}" for track in ids])[0]
+    none, kind = np.full(len(boxes), np.nan), np.array(kinds, np.int64)
+    rows = BoxRows3D(path, "nuscenes", at, t_ns, track_id, values, none, kind, remarks=remarks, frame_id=FRAME)
+    rows.names, rows.is_timed, rows.usual = names.names, True, frozenset(_CLASSES)
+    rows.labelled = np.unique(np.array(list(samples.values()), np.int64))
+    return rows
 
 
 def _scene(folder: Path, scenes: list[dict[str, Any]], wanted: str | None) -> str:
@@ -126,11 +116,8 @@ def _scene(folder: Path, scenes: list[dict[str, Any]], wanted: str | None) -> st
     if wanted is None and len(tokens) == 1:
         return next(iter(tokens.values()))
     if wanted is None or wanted not in tokens:
-        names = ", ".join(sorted(tokens)[:_SHOWN]) + (
-            f" and {len(tokens) - _SHOWN} more" if len(tokens) > _SHOWN else ""
-        )
         what = f"no scene {wanted!r:.60}" if wanted else f"{len(tokens)} scenes"
-        raise McaptrackError(f"{folder} has {what}; choose one with `scene=`: {names or 'there is none'}")
+        raise McaptrackError(f"{folder} has {what}; choose one with `scene=`: {list_names(sorted(tokens), _SHOWN)}")
     return tokens[wanted]
 
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats, Ints
-from mcaptrack.notices import Code
-from mcaptrack.sources.ingest.labels.boxes_3d.rows import BoxRows3D, headings, numbered
+from mcaptrack.sources.ingest.labels.content import BoxRows3D, headings, numbered
 from mcaptrack.sources.ingest.labels.formats import ClassNames
 
 BOXES: Final = "annotations.feather"
@@ -62,26 +61,14 @@ def read_argoverse(path: Path) -> BoxRows3D:
         )
     except ValueError as error:
         raise McaptrackError(f"{path}: {error}") from None
-    doubts: list[tuple[str, Code]] = []
-    if unknown:
-        doubts.append((f"{path}: {unknown} of {count} boxes have no category: their class is unknown", "classes"))
     remarks.append(f"{path}: tracks are numbered from 1 on, a number for each track_uuid")
-    return BoxRows3D(
-        path,
-        "argoverse",
-        at,
-        np.column_stack([place, _floats(path, table, _SIZE), heading]),
-        numbered([f"#{track}" for track in table["track_uuid"]])[0],
-        kind,
-        names.names,
-        np.full(count, np.nan),
-        np.full((count, 2), np.nan),
-        t_ns=t_ns,
-        labelled=np.unique(t_ns),
-        frame_id=frame_id,
-        remarks=remarks,
-        doubts=doubts,
-    )
+    boxes, none = np.column_stack([place, _floats(path, table, _SIZE), heading]), np.full(count, np.nan)
+    track_id, _ = numbered([f"#{track}" for track in table["track_uuid"]])
+    rows = BoxRows3D(path, "argoverse", at, t_ns, track_id, boxes, none, kind, remarks=remarks, frame_id=frame_id)
+    rows.names, rows.is_timed, rows.labelled = names.names, True, np.unique(t_ns)
+    if unknown:
+        rows.doubt(f": {unknown} of {count} boxes have no category: their class is unknown", "classes")
+    return rows
 
 
 def _in_city(path: Path, t_ns: Ints, place: Floats, quaternions: Floats) -> tuple[Floats, Floats]:

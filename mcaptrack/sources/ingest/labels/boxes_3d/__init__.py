@@ -1,1 +1,0 @@
-"""3D boxes of label files: tables, KITTI tracking, nuScenes and Argoverse 2."""
