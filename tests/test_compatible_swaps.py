@@ -13,6 +13,7 @@ from mcaptrack.notices import collected
 from mcaptrack.transforms.retrack import identity_swaps, offline
 from mcaptrack.transforms.retrack.identity_swaps import compatible
 from mcaptrack.transforms.retrack.motion_model import MotionModel
+from tests.test_offline_reference import tracks_of
 
 ENCOUNTERS = st.lists(
     st.tuples(
@@ -108,8 +109,10 @@ def test_who_meets_six_others_in_a_row_keeps_one_identity():
     xy = people + rng.normal(0, noise_m, people.shape)
     step = np.tile(steps, count + 1)
     track = name.ravel()
-    model = MotionModel(noise_m, 1.0, 0.1, 0.1)
-    found = offline._without_swaps(model, step, track, track, xy.reshape(-1, 2), 0.4).reshape(name.shape)
+    model = MotionModel(noise_m, 1.0, 0.1, 0.1, 0.4)
+    found = offline._without_swaps(model, tracks_of(step, track, track, xy.reshape(-1, 2)), None).track.reshape(
+        name.shape
+    )
     assert all(len(set(one.tolist())) == 1 for one in found)
 
 

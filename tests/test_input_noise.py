@@ -87,9 +87,8 @@ def test_ids_of_any_size_give_the_same_limit():
 def test_the_estimate_keeps_the_limit_at_once():
     """Forty people jump about by metres: all of them are outside of their circles at the same step."""
     tracker = OnlineTracker(
-        model=MotionModel(0.2, 1.5, 0.12, 0.08),
+        model=MotionModel(0.2, 1.5, 0.12, 0.08, 0.4),
         association=Association(same_id=12.0, same_id_crowded=4.0, merge_distance_m=0.0, merge_timeout_s=0.0),
-        step_s=STEP_S,
         max_age=5,
         confirm_hits=2,
         max_age_tentative=2,

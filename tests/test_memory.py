@@ -87,7 +87,7 @@ def test_online_retracking_of_crowds_is_done_in_parts(monkeypatch):
         run = LikelihoodPass(Retrack())
         for frame in walks(frames, 200):
             run.step(frame)
-        for _ in run.outputs():
+        for _ in zip(*run.outputs(), strict=True):
             pass
 
     online(10)

@@ -13,17 +13,16 @@ from mcaptrack.geometry.assignment import assign_by_gain, assign_pairs_by_gain
 from mcaptrack.transforms import PROFILES
 from mcaptrack.transforms.retrack.identity_swaps import _continuity, find_swaps
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
-from mcaptrack.transforms.retrack.linking import link_tracks, misfits
+from mcaptrack.transforms.retrack.linking import Gaps, TrackEnds, link_tracks, misfits
 from mcaptrack.transforms.retrack.motion_model import (
     MotionModel,
     State,
-    smooth,
     to_trajectories,
 )
 from tests.worlds import places, walk
 
-MODEL = MotionModel(noise_m=0.1, speed_m_per_s=1.5, drift_m_per_s=0.15, drift_ratio=0.0)
 STEP_S = 0.4
+MODEL = MotionModel(noise_m=0.1, speed_m_per_s=1.5, drift_m_per_s=0.15, drift_ratio=0.0, step_s=STEP_S)
 DEFAULT = PROFILES["default"]
 
 
@@ -67,9 +66,8 @@ class TestLinks:
     def follows(self, *people: tuple[int, np.ndarray]) -> list[int]:
         step = np.concatenate([start + np.arange(len(xy)) for start, xy in people])
         track = np.repeat(np.arange(len(people)), [len(xy) for _, xy in people])
-        _, _, paths = to_trajectories(step, track, np.concatenate([xy for _, xy in people]), MODEL.noise_m)
-        forward, backward, _ = smooth(MODEL, paths, STEP_S)
-        return link_tracks(MODEL, paths, forward, backward, STEP_S, 14.0, 0.5).tolist()
+        _, _, paths = to_trajectories(step, track, np.concatenate([xy for _, xy in people]))
+        return link_tracks(TrackEnds.of(MODEL, paths), 14.0, 0.5).tolist()
 
     def walking(self, x: float, y: float, steps: int = 12, speed: float = 0.5) -> np.ndarray:
         return np.stack([x + speed * np.arange(steps), np.full(steps, y)], axis=-1)
@@ -109,17 +107,21 @@ class TestEncounters:
 
     @pytest.mark.parametrize("since", [5, 18, 22, 30])
     def test_a_swap_is_found_at_its_exact_step(self, since):
-        course, gain = find_swaps(self.apart(slice(since, None), 0.05), np.full((1, 40), 5.0), STEP_S, 0.05, 1.5)
+        course, gain = find_swaps(
+            replace(MODEL, noise_m=0.05), self.apart(slice(since, None), 0.05), np.full((1, 40), 5.0)
+        )
         assert np.flatnonzero(course[0]).tolist() == list(range(since, 40))
         assert gain[0] > 3
 
     def test_a_swap_and_its_reversal_are_found(self):
-        course, _ = find_swaps(self.apart(slice(8, 15), 0.05), np.full((1, 40), 5.0), STEP_S, 0.05, 1.5)
+        course, _ = find_swaps(replace(MODEL, noise_m=0.05), self.apart(slice(8, 15), 0.05), np.full((1, 40), 5.0))
         assert np.flatnonzero(course[0]).tolist() == list(range(8, 15))
 
     def test_without_a_swap_none_is_found(self):
         for seed in range(20):
-            course, gain = find_swaps(self.apart(slice(0, 0), 0.1, seed), np.full((1, 40), 5.0), STEP_S, 0.1, 1.5)
+            course, gain = find_swaps(
+                replace(MODEL, noise_m=0.1), self.apart(slice(0, 0), 0.1, seed), np.full((1, 40), 5.0)
+            )
             assert not course.any()
             assert gain[0] <= 0
 
@@ -255,5 +257,5 @@ def test_the_misfit_of_a_continuation_by_hand():
     before[:, 2:], after[:, :2] = (1.0, 0.0), [(5.0, 1.0), (0.5, 0.0), (4.0, 3.0)]
     after[:, 2:] = (3.0, 0.0)
     cov = np.zeros((3, 3))
-    found = misfits(State(before, cov), State(after, cov), np.array([2.0, 2.0, 2.0]))
+    found = misfits(Gaps(State(before, cov), State(after, cov), np.array([2.0, 2.0, 2.0])))
     np.testing.assert_allclose(found, [np.sqrt(2), 0.5, 3.0])

@@ -11,14 +11,15 @@ from mcaptrack.transforms.retrack import offline
 from mcaptrack.transforms.retrack.identity_swaps import swapped_by_pace
 from mcaptrack.transforms.retrack.motion_model import MotionModel
 from tests.references.offline import by_pace
-from tests.test_offline_reference import laid_out, models, with_gaps
+from tests.test_offline_reference import laid_out, models, tracks_of, with_gaps
 
 STEP_S = 0.4
 
 
 def ratio(paths: dict[int, dict[int, tuple[float, float]]], met: int, parted: int, noise_m: float = 0.0) -> float:
     out, _ = laid_out(paths, noise_m)
-    (found,) = swapped_by_pace(out, np.array([[0], [1]]), np.array([met]), np.array([parted]), STEP_S, noise_m)
+    model = MotionModel(noise_m, 1.0, 0.4, 0.3, STEP_S)
+    (found,) = swapped_by_pace(model, out, np.array([[0], [1]]), np.array([met]), np.array([parted]))
     return float(found)
 
 
@@ -63,9 +64,9 @@ def test_paces_equal_the_reference_and_exchanging_the_tracks_changes_nothing(see
     paths = {name: with_gaps(rng, start, places) for name, start, places in zip((3, 8), starts, walk, strict=True)}
     met, parted = np.sort(rng.integers(20, 60, 2)).tolist()
     out, _ = laid_out(paths, model.noise_m)
-    given_all = np.array([met]), np.array([parted]), 0.4, model.noise_m
-    found = swapped_by_pace(out, np.array([[0], [1]]), *given_all)
-    assert found.tolist() == swapped_by_pace(out, np.array([[1], [0]]), *given_all).tolist()
+    times = np.array([met]), np.array([parted])
+    found = swapped_by_pace(model, out, np.array([[0], [1]]), *times)
+    assert found.tolist() == swapped_by_pace(model, out, np.array([[1], [0]]), *times).tolist()
     assert found[0] == pytest.approx(by_pace(motion, paths[3], paths[8], met, parted), abs=1e-9)
 
 
@@ -82,8 +83,9 @@ def goes_on_as(rng: np.random.Generator) -> list[int]:
     track = np.array([[0], [1]]) ^ (steps >= 28)
     xy = (people + rng.normal(0, 0.1, people.shape)).reshape(-1, 2)
     ids = track + np.where(steps < 28, 10, 20)  # new ones: they say nothing
-    model = MotionModel(0.1, 1.0, 0.4, 0.3)
-    found = offline._without_swaps(model, np.tile(steps, 2), track.ravel(), ids.ravel(), xy, STEP_S).reshape(2, -1)
+    model = MotionModel(0.1, 1.0, 0.4, 0.3, 0.4)
+    found = offline._without_swaps(model, tracks_of(np.tile(steps, 2), track.ravel(), ids.ravel(), xy), None)
+    found = found.track.reshape(2, -1)
     before, after = found[:, :20], found[:, 38:]
     assert (before == before[:, :1]).all()
     assert (after == after[:, :1]).all()

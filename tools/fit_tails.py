@@ -111,7 +111,7 @@ def distances(true: Positions, samples: list[Frame]) -> Iterator[tuple[str, np.n
     kept = run._forecasts._predictor = _Kept(run._forecasts._predictor)
     for frame in samples:
         run.step(frame)
-    online = [tracks for tracks, _ in run.outputs()]
+    online = list(run.outputs()[0])
     joined = join_frames(TRACKS, online)
     step = np.rint((joined.row_ns - start) / (STEP_S * NS_PER_S)).astype(int)
     after = step, joined.rows["track_id"].astype(int), np.concatenate(kept.pasts), ~joined.rows["observed"]

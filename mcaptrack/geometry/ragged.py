@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,18 @@ def ragged_range(starts: ArrayLike, counts: ArrayLike, step: int = 1) -> Ints:
     before = np.cumsum(sizes) - sizes
     offset = np.asarray(starts, np.int64) - step * before
     return np.repeat(np.broadcast_to(offset, sizes.shape), sizes) + step * np.arange(int(sizes.sum()))
+
+
+def batches(counts: Ints, size: int) -> list[slice]:
+    """Consecutive groups (G,) that have about ``size`` members together: all at once would take much memory.
+
+    Examples
+    --------
+    >>> batches(np.array([2, 1, 3]), 3)
+    [slice(0, 1, None), slice(1, 2, None), slice(2, 3, None)]
+    """
+    starts = np.flatnonzero(run_starts(np.cumsum(counts) // size))
+    return [slice(low, high) for low, high in pairwise([*starts.tolist(), len(counts)])]
 
 
 def run_starts(*keys: NDArray[Any], times: Ints | None = None, max_gap: int = 0) -> Bools:

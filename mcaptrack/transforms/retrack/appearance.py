@@ -24,6 +24,7 @@ from mcaptrack.transforms.retrack.appearance_calibration import (
     calibrate,
     usual_distance,
 )
+from mcaptrack.transforms.retrack.assignments import Tracks
 
 #: The log likelihood ratio that the end of one track and the beginning of another are one person, for pairs of tracks
 #: (E,) that are numbered by ascending id.
@@ -66,31 +67,24 @@ class Descriptors(NamedTuple):
 
 
 class Appearance(NamedTuple):
-    """The appearance of assignments: the row of ``descriptors`` of each (C,), or -1, and what distances mean."""
+    """What tracks look like, and what distances between ``descriptors`` mean. Steps have ``step_s`` seconds."""
 
     descriptors: Descriptors
-    sample: Ints
     calibration: AppearanceCalibration
+    step_s: float
 
     @classmethod
-    def of(
-        cls, descriptors: Descriptors | None, t_ns: Ints, step: Ints, source: Ints, xy_m: Floats, step_s: float
-    ) -> Appearance | None:
-        """The appearance of assignments (C,) of samples of input tracks (``source``); None if none was seen."""
-        if descriptors is None or len(descriptors.t_ns) == 0 or len(t_ns) == 0:
+    def of(cls, descriptors: Descriptors | None, tracks: Tracks, step_s: float) -> Appearance | None:
+        """The appearance of tracks with these descriptors; None if none was seen."""
+        if descriptors is None or len(descriptors.t_ns) == 0 or len(tracks.look) == 0:
             return None
-        sample = descriptors.find(t_ns, source)
-        which = np.where((sample >= 0) & descriptors.is_clear[sample], sample, -1)
-        calibration = calibrate(descriptors.values, which, step, source, xy_m, step_s)
-        return None if calibration is None else cls(descriptors, sample, calibration)
+        which = np.where((tracks.look >= 0) & descriptors.is_clear[tracks.look], tracks.look, -1)
+        calibration = calibrate(descriptors.values, tracks._replace(look=which), step_s)
+        return None if calibration is None else cls(descriptors, calibration, step_s)
 
-    def take(self, order: Ints) -> Appearance:
-        """The appearance of these assignments, in this order."""
-        return self._replace(sample=self.sample[order])
-
-    def between(self, step: Ints, track: Ints, step_s: float) -> Sides:
-        """Compare parts of tracks (C,); assignments are the same as in ``of``."""
-        return Sides(self, step, track, step_s)
+    def between(self, tracks: Tracks) -> Sides:
+        """Compare parts of tracks."""
+        return Sides(self, tracks)
 
 
 class Sides:
@@ -99,21 +93,21 @@ class Sides:
     Tracks are numbered by ascending id.
     """
 
-    def __init__(self, appearance: Appearance, step: Ints, track: Ints, step_s: float) -> None:
-        descriptors = appearance.descriptors
-        order = np.lexsort((step, track))
+    def __init__(self, appearance: Appearance, tracks: Tracks) -> None:
+        descriptors, order = appearance.descriptors, tracks.order
+        step, starts = tracks.step[order], run_starts(tracks.track[order])
         self._place = np.empty_like(order)
         self._place[order] = np.arange(len(order))
-        self._calibration, self._values, self._step_s = appearance.calibration, descriptors.values, step_s
-        starts = run_starts(track[order])
+        self._calibration, self._values = appearance.calibration, descriptors.values
+        self._step_s = appearance.step_s
         self._starts = np.append(np.flatnonzero(starts), len(order))
         self._number = np.cumsum(starts) - 1  # of the track of each assignment
         self._first_step, self._steps = int(step.min(initial=0)), int(np.ptp(step)) + 2 if len(step) else 2
-        self._when = self._number * self._steps + step[order] - self._first_step
-        sample = appearance.sample[order]
+        self._when = self._number * self._steps + step - self._first_step
+        sample = tracks.look[order]
         is_seen = (sample >= 0) & descriptors.is_clear[sample]
         self._at_border = (sample >= 0) & descriptors.at_border[sample]
-        self._seen, self._which = step[order][is_seen], sample[is_seen]
+        self._seen, self._which = step[is_seen], sample[is_seen]
         self._known = np.append(0, np.cumsum(is_seen))  # the number of descriptors before each assignment
 
     def of_tracks(self, end: Ints, begin: Ints) -> Floats:

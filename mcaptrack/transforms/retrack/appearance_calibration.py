@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
+from mcaptrack.transforms.retrack.assignments import Tracks
 
 #: Log likelihood ratios are no larger than this, and this share of comparisons is of something else than two people:
 #: of a pole before one of them, or of the person beside. So looking different says less than looking alike.
@@ -122,18 +123,16 @@ class _Blocks(NamedTuple):
     ends: Ints
 
 
-def calibrate(
-    values: NDArray[np.uint8], which: Ints, step: Ints, source: Ints, xy_m: Floats, step_s: float
-) -> AppearanceCalibration | None:
-    """Measure how the descriptors of samples (C,), rows of ``values`` (S, D) or -1, tell input tracks apart.
+def calibrate(values: NDArray[np.uint8], tracks: Tracks, step_s: float) -> AppearanceCalibration | None:
+    """Measure how descriptors, rows of ``values`` (S, D), tell the input tracks of samples (C,) apart.
 
     None if no two tracks that are there at one time were seen before and after a gap.
     """
-    seen = np.flatnonzero(which >= 0)
-    seen = seen[np.lexsort((step[seen], source[seen]))]
-    if len(seen) < 2:
+    tracks = tracks.take(tracks.look >= 0)
+    tracks = tracks.take(np.lexsort((tracks.step, tracks.source)))
+    if len(tracks.look) < 2:
         return None
-    blocks, noise = _blocks(values, which[seen], step[seen], source[seen], xy_m[seen], step_s)
+    blocks, noise = _blocks(values, tracks, step_s)
     which, has = blocks.which, blocks.has
     parts = [
         (part, usual_distance(values, which[part.before], has[part.before], which[part.after], has[part.after]))
@@ -169,10 +168,9 @@ class _Pairs(NamedTuple):
     gap_s: Floats
 
 
-def _blocks(
-    values: NDArray[np.uint8], which: Ints, step: Ints, source: Ints, xy_m: Floats, step_s: float
-) -> tuple[_Blocks, float]:
+def _blocks(values: NDArray[np.uint8], tracks: Tracks, step_s: float) -> tuple[_Blocks, float]:
     """The blocks of descriptors, ordered by track, then step, and the squared distance of those within one."""
+    which, step, source, xy_m = tracks.look, tracks.step, tracks.source, tracks.xy_m
     starts = run_starts(source)
     begin = np.flatnonzero(starts)
     track = np.cumsum(starts) - 1

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.ragged import group_index
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.classes import first_classes
@@ -16,6 +16,28 @@ from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.framing import frame_numbers, has_any, joined_parts, row_ends, spans_of, split_rows, unique_values
 from mcaptrack.transforms.motion_limits import ClassNames, limits_by_class, units_m
 from mcaptrack.transforms.retrack.samples import LogSamples
+
+
+class Tracks(NamedTuple):
+    """Samples that are assigned to tracks, (C,) each: step, track, input id, sample, position (C, 2) in units, and the
+    descriptor of what is seen of it, or -1.
+    """
+
+    step: Ints
+    track: Ints
+    source: Ints
+    sample: Ints
+    xy_m: Floats
+    look: Ints
+
+    def take(self, which: Ints | Bools) -> Tracks:
+        """Some of the assignments, in this order."""
+        return Tracks(*(column[which] for column in self))
+
+    @property
+    def order(self) -> Ints:
+        """The order by track, then step."""
+        return np.lexsort((self.step, self.track))
 
 
 @dataclass

@@ -21,7 +21,8 @@ from mcaptrack.geometry.assignment import assign
 from mcaptrack.geometry.clocks import steps_passed
 from mcaptrack.geometry.histories import Histories, Holt, rebuild_positions
 from mcaptrack.predictors import Forecast, Predictor, make, predict_together
-from mcaptrack.schema import Frame
+from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
+from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, Movers
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
@@ -31,7 +32,7 @@ from mcaptrack.transforms.retrack.options import (
     position_distances,
     prediction_distances,
 )
-from mcaptrack.transforms.retrack.samples import LogSamples, OnlineOutputs
+from mcaptrack.transforms.retrack.samples import LogSamples
 
 #: Cost of a pair with priority: lower than any sum of other costs.
 _PRIORITY_COST: Final = -100.0
@@ -165,7 +166,7 @@ class ConsistencyPass:
         self.samples = LogSamples()
         self.steps: list[int] = []
         self.noise_m = DEFAULT_NOISE_M if options.noise_m is None else options.noise_m
-        self._outputs = OnlineOutputs()
+        self._online = FrameCollector(TRACKS), FrameCollector(PREDICTIONS)
         self._next_id = 1
         self._last_ns: int | None = None
 
@@ -198,14 +199,15 @@ class ConsistencyPass:
         new = np.setdiff1d(np.arange(len(row_at)), observation)
         raw = Forecast(predictions.mean[new], predictions.cov[new])
         self._start(step, past[new], valid[new], raw, sources[row_at[new]])
-        online = self._online(frame, np.concatenate([row_at[observation], row_at[new]]), track, len(new))
+        online = self._shown(frame, np.concatenate([row_at[observation], row_at[new]]), track, len(new))
         is_over = (step - self._tracks.last_step) / self._options.rate_hz > self._options.max_age_s + 1e-9
         self._tracks = self._tracks[~is_over]
-        self._outputs.add(*online)
+        for collector, rows in zip(self._online, online, strict=True):
+            collector.append(rows)
 
-    def outputs(self) -> Iterator[tuple[Frame, Frame]]:
-        """For each step the online tracks and their predictions, from the past alone."""
-        return iter(self._outputs)
+    def outputs(self) -> tuple[FrameColumns, FrameColumns]:
+        """The online tracks and their predictions, from the past alone, a frame for each step."""
+        return self._online[0].done(), self._online[1].done()
 
     def _match(self, step: int, xy_m: Floats, predictions: Forecast, sources: Ints) -> tuple[Indices, Indices]:
         """Data association: pairs of tracks and observations within the gates (line 4 of Algorithm 1)."""
@@ -255,7 +257,7 @@ class ConsistencyPass:
             track, back = np.nonzero(valid[:, :-1][:, ::-1][:, : max(self._options.min_history, 4) - 1])
             self.assignments.add(step - 1 - back, ids[track], sources[track])
 
-    def _online(self, frame: Frame, row_at: Indices, track: Indices, started: int) -> tuple[Frame, Frame]:
+    def _shown(self, frame: Frame, row_at: Indices, track: Indices, started: int) -> tuple[Frame, Frame]:
         """The tracks of this step with enough matches, where they were observed, and their predictions."""
         total = len(self._tracks.ids)
         at = np.concatenate([track, np.arange(total - started, total)])

@@ -19,8 +19,9 @@ from mcaptrack.geometry.ragged import run_ends, run_starts
 from mcaptrack.transforms.retrack import linking
 from mcaptrack.transforms.retrack.appearance import Evidence
 from mcaptrack.transforms.retrack.appearance_calibration import MOST
+from mcaptrack.transforms.retrack.assignments import Tracks
 from mcaptrack.transforms.retrack.joins import Cuts
-from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
+from mcaptrack.transforms.retrack.linking import TrackEnds
 from mcaptrack.transforms.retrack.weights import weights_of
 
 #: The features of a link at a cut: those of a link; whether both are pieces of one track, and if so the log odds of
@@ -65,19 +66,20 @@ class CutTracks(NamedTuple):
     odds_after: Floats
 
     @classmethod
-    def of(cls, step: Ints, track: Ints, source: Ints, cuts: Cuts) -> CutTracks:
-        """The tracks of assignments (C,)."""
-        order = np.lexsort((step, track))
-        starts = run_starts(track[order])
+    def of(cls, tracks: Tracks, cuts: Cuts) -> CutTracks:
+        """The tracks, and where they were cut."""
+        order = tracks.order
+        track, source = tracks.track[order], tracks.source[order]
+        starts = run_starts(track)
         first, last = np.flatnonzero(starts), np.flatnonzero(run_ends(starts))
-        ids = track[order][first]
+        ids = track[first]
         before, after = np.searchsorted(ids, cuts.before), np.searchsorted(ids, cuts.after)
         likely = np.clip(cuts.probability, _CLOSEST, 1 - _CLOSEST)
         went_on = np.full(len(ids), -1)
         odds = np.full((2, len(ids)), np.nan)
         went_on[before] = after
         odds[0, after] = odds[1, before] = np.log(likely / (1 - likely))
-        return cls(source[order][first], source[order][last], last - first + 1, went_on, *odds)
+        return cls(source[first], source[last], last - first + 1, went_on, *odds)
 
 
 class CandidateLinks(NamedTuple):
@@ -96,22 +98,15 @@ class CandidateLinks(NamedTuple):
 
 
 def find_candidates(
-    model: MotionModel,
-    trajectories: Trajectories,
-    forward: State,
-    backward: State,
-    step_s: float,
-    max_gap_s: float,
-    pieces: CutTracks,
-    evidence: Evidence | None = None,
+    sides: TrackEnds, max_gap_s: float, pieces: CutTracks, evidence: Evidence | None = None
 ) -> CandidateLinks:
     """Candidate links: plausible ones as without cuts, and at cuts those within one track or input id.
 
     ``evidence`` is what else tells whether both sides are one person.
     """
-    i, j, gap_s = linking.candidates(trajectories, forward, backward, step_s, max_gap_s)
-    first, last = trajectories.first[:-1], trajectories.first[1:] - 1
-    usual = linking.features(model, forward.take(last[i]), backward.take(first[j]), gap_s)
+    i, j = linking.candidates(sides, max_gap_s)
+    gaps = sides.gaps(i, j)
+    usual, gap_s = linking.features(sides.model, gaps), gaps.seconds
     cut_before, cut_after = np.isfinite(pieces.odds_after[i]), np.isfinite(pieces.odds_before[j])
     same_track, same_id = pieces.went_on[i] == j, pieces.last_source[i] == pieces.first_source[j]
     is_known = same_track | (same_id & (cut_before | cut_after) & (gap_s < _SAME_ID_S))
@@ -131,7 +126,7 @@ def find_candidates(
         cut_after,
         np.log(pieces.length[i]),
         np.log(pieces.length[j]),
-        gap_s < 1.5 * step_s,
+        gap_s < 1.5 * sides.model.step_s,
         gap_s < _SHORT_S,
     )
     features = np.column_stack([usual, *extra]).astype(np.float64)
@@ -140,20 +135,12 @@ def find_candidates(
 
 
 def link_pieces(
-    model: MotionModel,
-    trajectories: Trajectories,
-    forward: State,
-    backward: State,
-    step_s: float,
-    max_gap_s: float,
-    min_confidence: float,
-    pieces: CutTracks,
-    evidence: Evidence | None = None,
+    sides: TrackEnds, max_gap_s: float, min_confidence: float, pieces: CutTracks, evidence: Evidence | None = None
 ) -> Ints:
     """For each of the tracks after cutting the one that continues it, or -1; (K,)."""
-    count = len(trajectories.first) - 1
+    count = len(sides.begins)
     continued_by = np.full(count, -1)
-    candidates = find_candidates(model, trajectories, forward, backward, step_s, max_gap_s, pieces, evidence)
+    candidates = find_candidates(sides, max_gap_s, pieces, evidence)
     if len(candidates.ends) == 0:
         return continued_by
     at_cut = candidates.features @ _RELINKS_WEIGHTS + _RELINKS_BIAS + candidates.evidence

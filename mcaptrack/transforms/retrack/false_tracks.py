@@ -60,7 +60,7 @@ _MISSED_S, _BORDER_SHARE, _SHORTEST_S = 2.0, 0.1, 10.0
 _DOUBLE: Final = 1.0
 
 
-def features(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
+def features(model: MotionModel, trajectories: Trajectories, smoothed: State) -> Floats:
     """The features that distinguish people from false tracks, (K, F): see ``FEATURES``."""
     first, last = trajectories.first[:-1], trajectories.first[1:] - 1
     length = last - first + 1
@@ -74,7 +74,7 @@ def features(model: MotionModel, trajectories: Trajectories, smoothed: State, st
     mean_speed = np.add.reduceat(speed, first) / length
     return np.column_stack(
         [
-            np.log(length * step_s),
+            np.log(length * model.step_s),
             np.log(count),
             np.log(extent + 0.3),
             np.log(mean_speed + 0.1),
@@ -211,9 +211,7 @@ def probability(log_odds: Floats) -> Floats:
     return np.asarray(1 / (1 + np.exp(-log_odds)))
 
 
-def log_odds_in_log(
-    model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float, log: tuple[int, int]
-) -> Floats:
+def log_odds_in_log(model: MotionModel, trajectories: Trajectories, smoothed: State, log: tuple[int, int]) -> Floats:
     """The log odds that each track is a person, (K,), by weights that follow the log.
 
     ``log`` are the first and last step of the log.
@@ -225,11 +223,11 @@ def log_odds_in_log(
     """
     from scipy.optimize import minimize
 
-    values = features(model, trajectories, smoothed, step_s)
+    values = features(model, trajectories, smoothed)
     standard = (values - _MEAN) / _SPREAD
     columns = np.column_stack([standard, np.ones(len(standard))])
     # not a feature: its weight doesn't follow the log, and is no reason to think less of others who stand
-    extra = _THROUGHOUT * stand_throughout(trajectories, smoothed, values, log, step_s)
+    extra = _THROUGHOUT * stand_throughout(trajectories, smoothed, values, log, model.step_s)
     counts = _EACH_STEP * np.minimum(np.diff(trajectories.first), _MOST_STEPS)
     fitted = np.append(_WEIGHTS * _SPREAD, _BIAS + _WEIGHTS @ _MEAN)
 

@@ -9,16 +9,17 @@ Letters: C assignments, K tracks, J joins, F features.
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
+from mcaptrack.geometry.ragged import batches, group_index, ragged_range, run_starts
 from mcaptrack.transforms.retrack import linking
 from mcaptrack.transforms.retrack.appearance import Appearance
+from mcaptrack.transforms.retrack.assignments import Tracks
 from mcaptrack.transforms.retrack.false_tracks import probability
+from mcaptrack.transforms.retrack.linking import Gaps
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, filtered, to_trajectories
 from mcaptrack.transforms.retrack.weights import weights_of
 
@@ -54,16 +55,20 @@ _CUTS_BIAS: Final = float(_CUTS_FITTED["bias"])
 
 
 class Tracked(NamedTuple):
-    """Tracks as assignments (C,), ordered by track, then step: ``step``, ``track`` and input id (``source``) of each.
+    """Tracks (C,), ordered by track, then step, and the filtered states of each assignment.
 
-    ``forward`` and ``backward`` are the filtered states there: from all samples of the track up to it, and from it on.
+    ``forward`` is from all samples of the track up to it, ``backward`` from it on.
     """
 
-    step: Ints
-    track: Ints
-    source: Ints
+    tracks: Tracks
     forward: State
     backward: State
+
+    def gaps(self, before: Ints, after: Ints, step_s: float) -> Gaps:
+        """The gaps (J,) from assignments ``before`` to ``after``."""
+        steps = self.tracks.step[after] - self.tracks.step[before]
+        seconds = np.asarray(steps * step_s, np.float64)
+        return Gaps(self.forward.take(before), self.backward.take(after), seconds)
 
 
 class Joins(NamedTuple):
@@ -84,54 +89,44 @@ class Cuts(NamedTuple):
 
 
 def cut_joins(
-    model: MotionModel,
-    step: Ints,
-    track: Ints,
-    source: Ints,
-    xy_m: Floats,
-    step_s: float,
-    min_confidence: float,
-    appearance: Appearance | None = None,
-) -> tuple[Ints, Cuts]:
-    """The track of each assignment (C,) after tracks are cut at questionable joins, and where they are cut.
+    model: MotionModel, tracks: Tracks, min_confidence: float, appearance: Appearance | None = None
+) -> tuple[Tracks, Cuts]:
+    """Tracks (C,) that are cut at questionable joins, and where they are cut.
 
     Those are joins that are right with a smaller probability than ``_QUESTIONED`` or ``min_confidence``. What comes
     after a cut is a track of its own, for linking to decide about, with an id above all others. The probability at cuts
     is that by motion alone: linking looks at ``appearance``, too.
     """
-    order = np.lexsort((step, track))
-    tracked = tracked_of(model, step[order], track[order], source[order], xy_m[order], step_s)
-    joins = find_joins(tracked, model, step_s)
+    ordered = tracks.take(order := tracks.order)
+    joins = find_joins(tracked_of(model, ordered), model)
     is_right = cut_probability(joins.features)
-    seen = None if appearance is None else appearance.take(order)
-    questioned = with_appearance(is_right, joins, tracked, seen, step_s) < max(_QUESTIONED, min_confidence)
-    begins = np.zeros(len(track), bool)
+    questioned = with_appearance(is_right, joins, ordered, appearance) < max(_QUESTIONED, min_confidence)
+    begins = np.zeros(len(order), bool)
     begins[joins.after[questioned]] = True
-    piece = np.maximum.accumulate(np.where(begins | run_starts(tracked.track), np.arange(len(track)), 0))
-    name = np.where(begins, int(track.max(initial=0)) + np.cumsum(begins), tracked.track)[piece]
-    out = np.empty_like(track)
+    piece = np.maximum.accumulate(np.where(begins | run_starts(ordered.track), np.arange(len(order)), 0))
+    name = np.where(begins, int(ordered.track.max(initial=0)) + np.cumsum(begins), ordered.track)[piece]
+    out = np.empty_like(name)
     out[order] = name
-    return out, Cuts(name[joins.before[questioned]], name[joins.after[questioned]], is_right[questioned])
+    cuts = Cuts(name[joins.before[questioned]], name[joins.after[questioned]], is_right[questioned])
+    return tracks._replace(track=out), cuts
 
 
-def with_appearance(
-    is_right: Floats, joins: Joins, tracked: Tracked, appearance: Appearance | None, step_s: float
-) -> Floats:
+def with_appearance(is_right: Floats, joins: Joins, tracks: Tracks, appearance: Appearance | None) -> Floats:
     """The probability that joins are right (J,), from that by motion and from what tracks look like."""
     if appearance is None:
         return is_right
-    _, part = np.unique(np.stack([tracked.track, tracked.source]), axis=1, return_inverse=True)
-    sides = appearance.between(tracked.step, part.ravel(), step_s)
+    _, part = np.unique(np.stack([tracks.track, tracks.source]), axis=1, return_inverse=True)
+    sides = appearance.between(tracks._replace(track=part.ravel()))
     odds = is_right / np.maximum(1 - is_right, np.finfo(float).tiny)
     odds = odds * np.exp(sides.of_assignments(joins.before, joins.after))
     return np.asarray(odds / (1 + odds))
 
 
-def tracked_of(model: MotionModel, step: Ints, track: Ints, source: Ints, xy_m: Floats, step_s: float) -> Tracked:
-    """Assignments (C,) of positions (C, 2), ordered by track, then step, with their states."""
-    _, row, trajectories = to_trajectories(step, track, xy_m, model.noise_m)
-    forward, backward = filtered(model, trajectories, step_s)
-    return Tracked(step, track, source, forward.take(row), backward.take(row))
+def tracked_of(model: MotionModel, tracks: Tracks) -> Tracked:
+    """Tracks (C,), ordered by track, then step, with their states."""
+    _, row, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
+    forward, backward = filtered(model, trajectories)
+    return Tracked(tracks, forward.take(row), backward.take(row))
 
 
 def cut_probability(features: Floats) -> Floats:
@@ -139,14 +134,15 @@ def cut_probability(features: Floats) -> Floats:
     return probability(features @ _CUTS_WEIGHTS + _CUTS_BIAS)
 
 
-def find_joins(tracked: Tracked, model: MotionModel, step_s: float) -> Joins:
+def find_joins(tracked: Tracked, model: MotionModel) -> Joins:
     """Where tracks go on with another input track."""
-    first, last = _runs(tracked, step_s)
+    tracks = tracked.tracks
+    first, last = _runs(tracks, model.step_s)
     log_length = np.log(last - first + 1)
-    goes_on = np.flatnonzero(tracked.track[first[1:]] == tracked.track[first[:-1]])
+    goes_on = np.flatnonzero(tracks.track[first[1:]] == tracks.track[first[:-1]])
     before, after = last[goes_on], first[goes_on + 1]
-    margin, alternative = _alternatives(tracked, model, before, after, step_s)
-    elsewhere = _elsewhere(tracked, before, after)
+    margin, alternative = _alternatives(tracked, model, before, after)
+    elsewhere = _elsewhere(tracks, before, after)
     count = len(before)
     extra = (
         margin,
@@ -154,37 +150,29 @@ def find_joins(tracked: Tracked, model: MotionModel, step_s: float) -> Joins:
         *elsewhere,
         log_length[goes_on],
         log_length[goes_on + 1],
-        np.full(count, np.log((count + 1) / (len(tracked.track) + _RATE_SAMPLES))),
+        np.full(count, np.log((count + 1) / (len(tracks.track) + _RATE_SAMPLES))),
         np.full(count, np.log((np.count_nonzero(elsewhere) + 0.5) / (count + 1))),
     )
-    usual = linking.features(model, *_sides(tracked, before, after, step_s))
+    usual = linking.features(model, tracked.gaps(before, after, model.step_s))
     return Joins(before, after, alternative, np.column_stack([usual, *extra]).astype(np.float64))
 
 
-def _runs(tracked: Tracked, step_s: float) -> tuple[Ints, Ints]:
+def _runs(tracks: Tracks, step_s: float) -> tuple[Ints, Ints]:
     """Runs of samples of one track with one input id: their first and last assignments.
 
     Brief ones between two of the same input id belong to these, as in events.
     """
-    starts = np.flatnonzero(run_starts(tracked.track, tracked.source))
-    track, source, step = tracked.track[starts], tracked.source[starts], tracked.step[starts]
+    starts = np.flatnonzero(run_starts(tracks.track, tracks.source))
+    track, source, step = tracks.track[starts], tracks.source[starts], tracks.step[starts]
     is_brief = np.zeros(len(starts), bool)
     lasts_s = (step[2:] - step[1:-1]) * step_s
     is_brief[1:-1] = (track[2:] == track[:-2]) & (source[2:] == source[:-2]) & (lasts_s < _BRIEF_S)
     starts = starts[~is_brief]
-    starts = starts[run_starts(tracked.track[starts], tracked.source[starts])]
-    return starts, np.append(starts[1:], len(tracked.track))[: len(starts)] - 1
+    starts = starts[run_starts(tracks.track[starts], tracks.source[starts])]
+    return starts, np.append(starts[1:], len(tracks.track))[: len(starts)] - 1
 
 
-def _sides(tracked: Tracked, before: Ints, after: Ints, step_s: float) -> tuple[State, State, Floats]:
-    """The states at both sides of gaps from assignments ``before`` to ``after``, and the seconds between them."""
-    gap_s = np.asarray((tracked.step[after] - tracked.step[before]) * step_s, np.float64)
-    return tracked.forward.take(before), tracked.backward.take(after), gap_s
-
-
-def _alternatives(
-    tracked: Tracked, model: MotionModel, before: Ints, after: Ints, step_s: float
-) -> tuple[Floats, Ints]:
+def _alternatives(tracked: Tracked, model: MotionModel, before: Ints, after: Ints) -> tuple[Floats, Ints]:
     """By how much each join (J,) is likelier than the best alternative, as a log likelihood; its assignment, or -1.
 
     An alternative is another track with a sample at the time of the join: the track would go on with these samples, and
@@ -192,18 +180,19 @@ def _alternatives(
     """
 
     def fit(earlier: Ints, other: Ints) -> Floats:
-        return linking.log_likelihood(model, *_sides(tracked, earlier, other, step_s))
+        return linking.log_likelihood(model, tracked.gaps(earlier, other, model.step_s))
 
-    by_step = np.argsort(tracked.step, kind="stable")
-    low, high = (np.searchsorted(tracked.step[by_step], tracked.step[after], side) for side in ("left", "right"))
+    step, track = tracked.tracks.step, tracked.tracks.track
+    by_step = np.argsort(step, kind="stable")
+    low, high = (np.searchsorted(step[by_step], step[after], side) for side in ("left", "right"))
     best, which = np.full(len(after), _MARGIN), np.full(len(after), -1)
     own = fit(before, after)
-    previous = np.where(run_starts(tracked.track), -1, np.arange(len(tracked.track)) - 1)
+    previous = np.where(run_starts(track), -1, np.arange(len(track)) - 1)
     count = high - low
-    for part in _batches(count):
+    for part in batches(count, _BATCH):
         join = part.start + group_index(count[part])
         other = by_step[ragged_range(low[part], count[part])]
-        reach_m = linking.reach_m((tracked.step[after] - tracked.step[before])[join] * step_s)
+        reach_m = linking.reach_m((step[after] - step[before])[join] * model.step_s)
         off = tracked.backward.mean[other, :2] - tracked.forward.mean[before[join], :2]
         near = (np.hypot(off[:, 0], off[:, 1]) <= reach_m) & (other != after[join])
         join, other = join[near], other[near]
@@ -211,24 +200,18 @@ def _alternatives(
         has_previous = np.flatnonzero(previous[other] >= 0)
         theirs = previous[other[has_previous]]
         margin[has_previous] += fit(theirs, other[has_previous]) - fit(theirs, after[join[has_previous]])
-        order = np.lexsort((tracked.source[other], margin, join))
+        order = np.lexsort((tracked.tracks.source[other], margin, join))
         order = order[run_starts(join[order])]
         order = order[margin[order] < _MARGIN]
         best[join[order]], which[join[order]] = margin[order], other[order]
     return np.maximum(best, -_MARGIN), which
 
 
-def _batches(count: Ints) -> list[slice]:
-    """Groups of joins (J,) that have about ``_BATCH`` pairs together."""
-    starts = np.flatnonzero(run_starts(np.cumsum(count) // _BATCH))
-    return [slice(a, b) for a, b in pairwise([*starts.tolist(), len(count)])]
-
-
-def _elsewhere(tracked: Tracked, before: Ints, after: Ints) -> tuple[Bools, Bools]:
+def _elsewhere(tracks: Tracks, before: Ints, after: Ints) -> tuple[Bools, Bools]:
     """Whether another track had the last samples of the new input id before each join (J,); and whether one has the
     next samples of the old input id after it.
     """
-    order = np.lexsort((tracked.step, tracked.source))
+    order = np.lexsort((tracks.step, tracks.source))
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
 
@@ -236,7 +219,7 @@ def _elsewhere(tracked: Tracked, before: Ints, after: Ints) -> tuple[Bools, Bool
         beside = place[at] + way
         row = order[np.clip(beside, 0, len(order) - 1)]
         inside = (beside >= 0) & (beside < len(order))
-        same = inside & (tracked.source[row] == tracked.source[at])
-        return np.asarray(same & (tracked.track[row] != tracked.track[at]))
+        same = inside & (tracks.source[row] == tracks.source[at])
+        return np.asarray(same & (tracks.track[row] != tracks.track[at]))
 
     return other(after, -1), other(before, 1)

@@ -5,7 +5,6 @@ Letters: R rows of online tracks, L past positions.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -18,6 +17,7 @@ from mcaptrack.predictors.position_noise import PAST, PositionNoise
 from mcaptrack.predictors.tail_calibration import TailCalibration
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
+from mcaptrack.schema.framing import JoinedFrames, mapped_rows
 from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, Movers
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M, MotionModel, State, StateRows
@@ -159,9 +159,9 @@ class OnlineForecasts:
         self._name, self._predictor, self._unit_m = name, predictor, unit_m
         self._calibration = TailCalibration.of(name, predictor, adapt)
         self._out = FrameCollector(PREDICTIONS)
-        self._waiting: list[Unpredicted] = []
         nothing = np.empty((0, predictor.steps, 2, 2))
         ids, past, coasts = np.empty(0, np.int64), np.empty((0, predictor.past, 2)), np.empty(0, bool)
+        self._waiting = [Unpredicted(ids, past, np.isfinite(past[..., 0]), coasts, ids)]
         self._left = _Predicted(ids, past, coasts, nothing[..., 0], nothing)  # of a frame that is not complete
         self._frames: list[tuple[int, int, int, int]] = []  # time, number, step and tracks of frames in neither
 
@@ -238,14 +238,13 @@ class LikelihoodPass:
                 merge_distance_m=options.merge_distance_m / movers.unit_m,
                 merge_timeout_s=options.merge_timeout_s,
             ),
-            step_s=1 / rate,
             max_age=max_age,
             confirm_hits=confirm_hits,
             max_age_tentative=min(confirm_hits, max_age),
             estimate_noise=options.noise_m is None,
         )
         self._shown = ShownTracks(confirm_hits, round(options.coast_s * rate), max_age, options.adapt_online)
-        self._links = OnlineLinks(self._tracker.model, 1 / rate, options.link_s, options.link_confidence, confirm_hits)
+        self._links = OnlineLinks(self._tracker.model, options.link_s, options.link_confidence, confirm_hits)
         self._assignments = Assignments()
         self._samples = LogSamples()
         self.steps: list[int] = []
@@ -293,25 +292,24 @@ class LikelihoodPass:
         if len(self._frames) >= _STEPS or self._unread >= _SAMPLES:
             self._track()
 
-    def outputs(self) -> Iterator[tuple[Frame, Frame]]:
-        """For each step the online tracks and their predictions, from the past alone."""
-        if not self.steps:
-            return
+    def outputs(self) -> tuple[FrameColumns, FrameColumns]:
+        """The online tracks and their predictions, from the past alone, a frame for each step."""
         self._track()
         online, predictions = self._online.done(), self._forecasts.done()
         # All at once, because the last digits of a product of matrices depend on their size.
         nothing = np.empty(0, np.int64), np.empty((0, 2)), np.empty(0, np.int64)
         places, xy_m, t_ns = (np.concatenate(parts) for parts in zip(nothing, *self._coasting, strict=True))
         coasting = move_rows(online.take(places), xy_m, self._options.ground_planes, t_ns)
-        bounds = np.searchsorted(places, online.ends).tolist()
-        edges = zip(online.ends.tolist(), bounds[:-1], bounds[1:], strict=False)
-        for (start, low, high), tracks, forecast in zip(edges, online, predictions, strict=True):
-            if low == high:
-                yield tracks, forecast
-                continue
-            rows = tracks.rows.copy()
-            rows[places[low:high] - start] = coasting[low:high]
-            yield tracks._replace(rows=rows), forecast
+        done = 0
+
+        def moved(joined: JoinedFrames) -> Rows:
+            nonlocal done
+            here = slice(*np.searchsorted(places, [done, done + len(joined.rows)]))
+            joined.rows[places[here] - done] = coasting[here]
+            done += len(joined.rows)
+            return joined.rows
+
+        return (mapped_rows(TRACKS, online, moved) if len(places) else online), predictions
 
     def _track(self) -> None:
         """Track through the frames that are not read yet, and write these steps."""
@@ -407,5 +405,5 @@ def motion_model(options: RetrackOptions, noise_m: float, movers: Movers = PEOPL
     """The motion model of the options, with this noise of measured positions."""
     noise_m, speed_m_per_s = max(noise_m, _MIN_SPREAD), max(options.speed_m_per_s, _MIN_SPREAD)
     if movers.drift_m_per_s is not None:
-        return MotionModel(noise_m, speed_m_per_s, movers.drift_m_per_s / movers.unit_m, 0.0)
-    return MotionModel(noise_m, speed_m_per_s, options.drift_m_per_s, options.drift_ratio)
+        return MotionModel(noise_m, speed_m_per_s, movers.drift_m_per_s / movers.unit_m, 0.0, 1 / options.rate_hz)
+    return MotionModel(noise_m, speed_m_per_s, options.drift_m_per_s, options.drift_ratio, 1 / options.rate_hz)

@@ -9,16 +9,16 @@ Letters: K tracks, E candidate links, F features.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.assignment import Pairs, assign_by_gain, assign_pairs_by_gain
-from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
+from mcaptrack.geometry.ragged import batches, group_index, ragged_range, run_starts
 from mcaptrack.transforms.retrack.appearance import Evidence
 from mcaptrack.transforms.retrack.false_tracks import probability
-from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
+from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories, filtered
 from mcaptrack.transforms.retrack.weights import weights_of
 
 #: A track that continues another begins no farther from its end than this, and so much more for each second between.
@@ -47,12 +47,44 @@ _FEW: Final = 50
 _TABLE_CELLS: Final = 2_000_000
 
 
+class Gaps(NamedTuple):
+    """Gaps (E,): the states before them, filtered forward, those after them, filtered backward, and their seconds."""
+
+    before: State
+    after: State
+    seconds: Floats
+
+    def take(self, which: Bools | Ints) -> Gaps:
+        """Some of the gaps."""
+        return Gaps(self.before.take(which), self.after.take(which), self.seconds[which])
+
+
+class TrackEnds(NamedTuple):
+    """The first and last steps of tracks (K,), and their states there: filtered backward, and forward."""
+
+    model: MotionModel
+    trajectories: Trajectories
+    begins: Ints
+    ends: Ints
+    begun: State
+    ended: State
+
+    @classmethod
+    def of(cls, model: MotionModel, trajectories: Trajectories) -> TrackEnds:
+        """The ends of trajectories."""
+        forward, backward = filtered(model, trajectories)
+        first, last = trajectories.first[:-1], trajectories.first[1:] - 1
+        steps = trajectories.step[first], trajectories.step[last]
+        return cls(model, trajectories, *steps, backward.take(first), forward.take(last))
+
+    def gaps(self, i: Ints, j: Ints) -> Gaps:
+        """The gaps (E,) from the ends of tracks ``i`` to the beginnings of tracks ``j``."""
+        seconds = np.asarray((self.begins[j] - self.ends[i]) * self.model.step_s, np.float64)
+        return Gaps(self.ended.take(i), self.begun.take(j), seconds)
+
+
 def link_tracks(
-    model: MotionModel,
-    trajectories: Trajectories,
-    forward: State,
-    backward: State,
-    step_s: float,
+    ends: TrackEnds,
     max_gap_s: float,
     min_confidence: float,
     max_misfit: tuple[float, float] = (np.inf, 0.0),
@@ -65,18 +97,18 @@ def link_tracks(
     occluded for long. That share is estimated from the links themselves (expectation maximisation). ``evidence`` is
     what else tells whether both sides are one person.
     """
-    first, last = trajectories.first[:-1], trajectories.first[1:] - 1
-    continued_by = np.full(len(first), -1)
-    i, j, gap_s = candidates(trajectories, forward, backward, step_s, max_gap_s)
+    continued_by = np.full(len(ends.begins), -1)
+    i, j = candidates(ends, max_gap_s)
+    gaps = ends.gaps(i, j)
     if np.isfinite(max_misfit[0]):
-        fits = misfits(forward.take(last[i]), backward.take(first[j]), gap_s) <= max_misfit[0] + max_misfit[1] * gap_s
-        i, j, gap_s = i[fits], j[fits], gap_s[fits]
+        fits = misfits(gaps) <= max_misfit[0] + max_misfit[1] * gaps.seconds
+        i, j, gaps = i[fits], j[fits], gaps.take(fits)
     if len(i) == 0:
         return continued_by
-    gain = log_odds(features(model, forward.take(last[i]), backward.take(first[j]), gap_s))
+    gain = log_odds(features(ends.model, gaps))
     if evidence is not None:
         gain = gain + evidence(i, j)
-    links = best_links(i, j, gain, len(first))
+    links = best_links(i, j, gain, len(continued_by))
     shift = prior_shift(gain[links])
     links = links[gain[links] + shift > np.log(min_confidence / (1 - min_confidence))]
     continued_by[i[links]] = j[links]
@@ -108,24 +140,20 @@ def best_links(i: Ints, j: Ints, log_odds: Floats, count: int) -> Ints:
     return np.asarray(links[np.argsort(i[links], kind="stable")])
 
 
-def candidates(
-    trajectories: Trajectories, forward: State, backward: State, step_s: float, max_gap_s: float
-) -> tuple[Ints, Ints, Floats]:
-    """Pairs (E,) of a track and a later one within reach of its end, and the seconds between them."""
-    first, last = trajectories.first[:-1], trajectories.first[1:] - 1
-    begins, ends = trajectories.step[first], trajectories.step[last]
-    order = np.argsort(begins, kind="stable")
-    low = np.searchsorted(begins[order], ends + 1)
-    count = np.searchsorted(begins[order], ends + round(max_gap_s / step_s), "right") - low
-    parts: list[tuple[Ints, Ints, Floats]] = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))]
-    for part in _batches(count):
+def candidates(ends: TrackEnds, max_gap_s: float) -> tuple[Ints, Ints]:
+    """Pairs (E,) of a track and a later one within reach of its end."""
+    order = np.argsort(ends.begins, kind="stable")
+    begins = ends.begins[order]
+    low = np.searchsorted(begins, ends.ends + 1)
+    count = np.searchsorted(begins, ends.ends + round(max_gap_s / ends.model.step_s), "right") - low
+    parts: list[tuple[Ints, Ints]] = [(np.empty(0, np.int64), np.empty(0, np.int64))]
+    for part in batches(count, _BATCH):
         i = part.start + group_index(count[part])
         j: Ints = order[ragged_range(low[part], count[part])]
-        gap_s = np.asarray((begins[j] - ends[i]) * step_s, np.float64)
-        near = are_in_reach(forward.take(last[i]), backward.take(first[j]), gap_s)
-        parts.append((i[near], j[near], gap_s[near]))
-    i, j, gap_s = (np.concatenate(members) for members in zip(*parts, strict=True))
-    return i, j, gap_s
+        near = are_in_reach(ends.gaps(i, j))
+        parts.append((i[near], j[near]))
+    i, j = (np.concatenate(members) for members in zip(*parts, strict=True))
+    return i, j
 
 
 def reach_m(gap_s: Floats) -> Floats:
@@ -133,15 +161,9 @@ def reach_m(gap_s: Floats) -> Floats:
     return np.asarray(_REACH_M + _MAX_SPEED_M_PER_S * gap_s)
 
 
-def are_in_reach(before: State, after: State, gap_s: Floats) -> Bools:
-    """Whether people may get from the one to the other within the gaps (E,)."""
-    return np.asarray(_length(before.mean[:, :2] - after.mean[:, :2]) <= reach_m(gap_s))
-
-
-def _batches(count: Ints) -> list[slice]:
-    """Groups of tracks (K,) that have about ``_BATCH`` pairs together; pairs of all tracks would take much memory."""
-    starts = np.flatnonzero(run_starts(np.cumsum(count) // _BATCH))
-    return [slice(a, b) for a, b in zip(starts.tolist(), [*starts[1:].tolist(), len(count)], strict=True)]
+def are_in_reach(gaps: Gaps) -> Bools:
+    """Whether people may get from the one side to the other within the gaps (E,)."""
+    return np.asarray(_length(gaps.before.mean[:, :2] - gaps.after.mean[:, :2]) <= reach_m(gaps.seconds))
 
 
 def _assigned(pairs: Pairs, gain: Floats, shape: tuple[int, int]) -> Pairs:
@@ -204,20 +226,20 @@ def _components(i: Ints, j: Ints, count: int) -> list[Ints]:
     return list(np.split(order, starts[1:])) if len(order) else []
 
 
-def features(model: MotionModel, before: State, after: State, gap_s: Floats) -> Floats:
+def features(model: MotionModel, gaps: Gaps) -> Floats:
     """The features that distinguish right links from wrong ones, (E, F): see ``FEATURES``.
 
-    ``before`` are the states at the beginning of each gap, filtered forward; ``after`` those at its end, filtered
-    backward. The miss is the distance from one side to where the other, extrapolated at its own velocity, expects it
-    (the smaller of the two); the misfit is that distance with the mean of both velocities.
+    The miss is the distance from one side to where the other, extrapolated at its own velocity, expects it (the smaller
+    of the two); the misfit is that distance with the mean of both velocities.
     """
+    before, after, gap_s = gaps
     span = gap_s[:, None]
     way = after.mean[:, :2] - before.mean[:, :2]
     left, came = before.mean[:, 2:], after.mean[:, 2:]
     miss = np.minimum(_length(way - left * span), _length(way - came * span))
     misfit, stay = _length(way - (left + came) / 2 * span), _length(way)
     speed = np.maximum(_length(left), _length(came))
-    spread = _spread(model, before, after, gap_s)
+    spread = _spread(model, gaps)
     log_speed = np.log(speed + _SPEED_M_PER_S)
     return np.stack(
         [
@@ -233,17 +255,17 @@ def features(model: MotionModel, before: State, after: State, gap_s: Floats) -> 
     )
 
 
-def log_likelihood(model: MotionModel, before: State, after: State, gap_s: Floats) -> Floats:
+def log_likelihood(model: MotionModel, gaps: Gaps) -> Floats:
     """The log likelihood (E,) of states after gaps if they are of the same person as those before.
 
     The misfit has Student's distribution with two degrees of freedom, because people also turn and stop.
     """
-    misfit = features(model, before, after, gap_s)[:, FEATURES.index("misfit")]
-    return np.asarray(-2 * misfit - np.log(_spread(model, before, after, gap_s)))
+    return np.asarray(-2 * features(model, gaps)[:, FEATURES.index("misfit")] - np.log(_spread(model, gaps)))
 
 
-def _spread(model: MotionModel, before: State, after: State, gap_s: Floats) -> Floats:
+def _spread(model: MotionModel, gaps: Gaps) -> Floats:
     """The variance (E,) of the misfit per axis."""
+    before, after, gap_s = gaps
     speed = np.maximum(_length(before.mean[:, 2:]), _length(after.mean[:, 2:]))
     power = (model.drift_m_per_s + model.drift_ratio * speed) ** 2
     spread = before.cov[:, 0] + after.cov[:, 0] + gap_s**2 / 4 * (before.cov[:, 2] + after.cov[:, 2])
@@ -251,8 +273,9 @@ def _spread(model: MotionModel, before: State, after: State, gap_s: Floats) -> F
     return np.asarray(spread)
 
 
-def misfits(before: State, after: State, gap_s: Floats) -> Floats:
+def misfits(gaps: Gaps) -> Floats:
     """The distances (E,) of ends of tracks to continuations, extrapolated at the mean velocity or at rest."""
+    before, after, gap_s = gaps
     way = after.mean[:, :2] - before.mean[:, :2]
     return np.minimum(_length(way - (before.mean[:, 2:] + after.mean[:, 2:]) / 2 * gap_s[:, None]), _length(way))
 

@@ -31,7 +31,7 @@ from mcaptrack.transforms.retrack.consistency import ConsistencyPass
 from mcaptrack.transforms.retrack.in_pictures import link_in_picture
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
-from mcaptrack.transforms.retrack.offline import Offline, appearance_rows, offline_tracks
+from mcaptrack.transforms.retrack.offline import appearance_rows, offline_tracks
 from mcaptrack.transforms.retrack.options import ConsistencyOptions, LikelihoodOptions, RetrackOptions
 from mcaptrack.transforms.retrack.samples import LogSamples
 
@@ -65,8 +65,8 @@ class OnlinePass(Protocol):
         """One step."""
         ...
 
-    def outputs(self) -> Iterator[tuple[Frame, Frame]]:
-        """For each step the online tracks and their predictions."""
+    def outputs(self) -> tuple[FrameColumns, FrameColumns]:
+        """The online tracks and their predictions, a frame for each step."""
         ...
 
 
@@ -187,13 +187,9 @@ class KeptIds:
             self._number.setdefault(number, len(self._number) + 1)
         return np.array([self._number[number] for number in ids.tolist()], np.int64)[which]
 
-    def predictions(self) -> FrameColumns:
-        """The predictions of the online tracks, from the past alone."""
-        return self._forecaster.predict_all(self.online)
-
-    def outputs(self) -> Iterator[tuple[Frame, Frame]]:
-        """For each step the online tracks and their predictions."""
-        return zip(self.online, self.predictions(), strict=True)
+    def outputs(self) -> tuple[FrameColumns, FrameColumns]:
+        """The online tracks and their predictions, from the past alone."""
+        return self.online, self._forecaster.predict_all(self.online)
 
 
 def _retrack(
@@ -211,18 +207,14 @@ def _retrack(
         yield from _keep_ids(options, frames, calibrations)
         return
     frames = collect(TRACKS, frames)
-    parts = [frames] if options.across_classes else split_classes(frames)
+    classes = [frames] if options.across_classes else split_classes(frames)
     score = usual_score(frames)
-
-    def passes(part: FrameColumns) -> tuple[OnlinePass | KeptIds, Offline]:
-        run, offline = _passes(options, new_pass, part, score)
-        calibrations.extend([] if offline.calibration is None else [offline.calibration])
-        return run, offline
-
-    if len(parts) == 1:
-        yield from _frame_by_frame(options, frames, *passes(frames))
-    else:
-        yield from join_classes([_whole(options, part, *passes(part)) for part in parts])
+    outputs = [_retracked(options, new_pass, part, score, calibrations) for part in classes]
+    if len(classes) > 1:
+        yield from join_classes([list(map(collect, options.writes.values(), part)) for part in outputs])
+        return
+    for parts in zip(*outputs[0], strict=True):
+        yield tuple(frame._replace(rows=frame.rows.copy()) for frame in parts)  # what is kept can't be written to
 
 
 def _keep_ids(
@@ -249,10 +241,14 @@ def _keep_ids(
     forecaster.warn()
 
 
-def _passes(
-    options: Options, new_pass: Callable[[Options, Movers], OnlinePass], frames: FrameColumns, score: float
-) -> tuple[OnlinePass | KeptIds, Offline]:
-    """Re-track frames without regard to classes; ``score`` is the usual one of the log."""
+def _retracked(
+    options: Options,
+    new_pass: Callable[[Options, Movers], OnlinePass],
+    frames: FrameColumns,
+    score: float,
+    seen: list[AppearanceCalibration],
+) -> list[Iterable[Frame]]:
+    """The outputs of re-tracking without regard to classes; ``score`` is the usual one of the log."""
     movers = movers_of(frames, options.class_names, score, options.class_limits)
     run: OnlinePass | KeptIds
     if movers.on_ground:
@@ -262,33 +258,11 @@ def _passes(
         for frame in frames:
             run.step(frame)
     model = motion_model(options, run.noise_m, movers)
-    return run, offline_tracks(options, model, run.assignments, run.samples, run.steps, frames.t_ns, movers)
-
-
-def _frame_by_frame(
-    options: Options, frames: FrameColumns, run: OnlinePass | KeptIds, offline: Offline
-) -> Iterator[tuple[Frame, ...]]:
-    """The outputs of re-tracking for each frame."""
-    further = zip(offline.decisions, offline.looks, strict=True)
-    for frame, rows, causal, others in zip(frames, offline.tracks, run.outputs(), further, strict=True):
-        # copies, because what is kept can't be written to
-        outputs = rows, *(part.rows.copy() for part in causal), *others
-        yield tuple(frame._replace(rows=output) for output in outputs[: len(options.writes)])
-
-
-def _whole(options: Options, frames: FrameColumns, run: OnlinePass | KeptIds, offline: Offline) -> list[FrameColumns]:
-    """The outputs of re-tracking, each with all of its frames."""
-    collectors = [FrameCollector(schema) for schema in options.writes.values()]
-    if not isinstance(run, KeptIds):
-        for outputs in _frame_by_frame(options, frames, run, offline):
-            for collector, frame in zip(collectors, outputs, strict=True):
-                collector.append(frame)
-        return [collector.done() for collector in collectors]
-    offline_rows = zip(offline.tracks, offline.decisions, offline.looks, strict=True)
-    for frame, all_rows in zip(frames, offline_rows, strict=True):
-        for collector, rows in zip((collectors[0], *collectors[3:]), all_rows, strict=False):
-            collector.append(frame._replace(rows=rows))
-    return [collectors[0].done(), run.online, run.predictions(), *(collector.done() for collector in collectors[3:])]
+    offline = offline_tracks(options, model, run.assignments, run.samples, run.steps, frames.t_ns, movers)
+    seen.extend([] if offline.calibration is None else [offline.calibration])
+    times = frames.t_ns.tolist(), frames.numbers.tolist()
+    tracks, decisions, looks = (map(Frame, *times, rows) for rows in (offline.tracks, offline.decisions, offline.looks))
+    return [tracks, *run.outputs(), decisions, looks][: len(options.writes)]
 
 
 _PAPER: Final = RetrackByConsistency(

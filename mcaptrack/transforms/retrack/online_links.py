@@ -79,8 +79,6 @@ class OnlineLinks:
     ----------
     model : MotionModel
         How people move.
-    step_s : float
-        The seconds between steps.
     max_gap_s : float
         Links are made over gaps of at most so many seconds; 0 for none.
     min_confidence : float
@@ -90,10 +88,8 @@ class OnlineLinks:
         Only tracks with so many observations are continued by one that is not written otherwise.
     """
 
-    def __init__(
-        self, model: MotionModel, step_s: float, max_gap_s: float, min_confidence: float, confirm_hits: int
-    ) -> None:
-        self._model, self._step_s, self._max_gap_s = model, step_s, max_gap_s
+    def __init__(self, model: MotionModel, max_gap_s: float, min_confidence: float, confirm_hits: int) -> None:
+        self._model, self._step_s, self._max_gap_s = model, model.step_s, max_gap_s
         self._confirm_hits = confirm_hits
         self._sure = float(np.log(min_confidence / (1 - min_confidence)))
         self._least = self._sure + float(np.log(linking.ENOUGH))
@@ -170,14 +166,14 @@ class OnlineLinks:
             fits &= (lost.last < new.began[part, None]) & (is_written[part, None] | (lost.hits >= self._confirm_hits))
             row, candidate = np.nonzero(fits)
             row, gap_s = row + low, np.asarray(gaps_s[row, candidate], np.float64)
-            before, after = lost.state.take(candidate), new.state.take(row)
-            is_near = linking.are_in_reach(before, after, gap_s)
-            candidate, row, gap_s = candidate[is_near], row[is_near], gap_s[is_near]
-            before, after = before.take(is_near), after.take(is_near)
+            gaps = linking.Gaps(lost.state.take(candidate), new.state.take(row), gap_s)
+            is_near = linking.are_in_reach(gaps)
+            candidate, row, gaps = candidate[is_near], row[is_near], gaps.take(is_near)
+            before, after, gap_s = gaps
             # nothing is known of the velocity of what was observed once: it may be that of the lost one
             single = new.hits[row] == 1
             after.mean[single, 2:], after.cov[single, 2] = before.mean[single, 2:], before.cov[single, 2]
-            log_odds = linking.log_odds(linking.features(self._model, before, after, gap_s))
+            log_odds = linking.log_odds(linking.features(self._model, gaps))
             parts.append(_Links(candidate, row, gap_s, log_odds).take(linking.has_chance(log_odds)))
         return _Links(*(np.concatenate(members) for members in zip(*parts, strict=True)))
 

@@ -84,7 +84,6 @@ class OnlineTracker:
 
     model: MotionModel
     association: Association
-    step_s: float
     max_age: int
     confirm_hits: int
     max_age_tentative: int
@@ -112,7 +111,7 @@ class OnlineTracker:
             kept = (~is_over).nonzero()[0]
             self.tracks, self.state = self.tracks[:, kept], self.state.take(kept)
         if self.tracks.shape[1]:
-            self.model.predict(self.state, passed * self.step_s, self.state)
+            self.model.predict(self.state, passed * self.model.step_s, self.state)
         track, row = self._assigned(xy_m, source)
         observed = xy_m[:, row]
         occluded, occluder = self._merged_detections(track, observed)
@@ -141,7 +140,7 @@ class OnlineTracker:
         """
         tracks, (p, _, _) = self.tracks, self.state.cov
         is_confirmed = tracks[HITS] >= self.confirm_hits
-        is_lost = is_confirmed & (tracks[MERGED] * self.step_s < self.association.merge_timeout_s)
+        is_lost = is_confirmed & (tracks[MERGED] * self.model.step_s < self.association.merge_timeout_s)
         is_lost[track] = False
         lost = is_lost.nonzero()[0]
         if len(lost) == 0:

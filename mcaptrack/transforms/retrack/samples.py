@@ -9,7 +9,6 @@ part by part, and kept as ``FrameColumns``, most of which is not in memory. Lett
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator
 from functools import cached_property
 from typing import Any, Final
 
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Ints
-from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
+from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.framing import joined_parts
 
@@ -69,18 +68,3 @@ class LogSamples:
     def take(self, places: Ints) -> Rows:
         """The rows of samples, as many as there are ``places``; nothing can be added any more."""
         return self._frames.take(places)
-
-
-class OnlineOutputs:
-    """Online tracks and their predictions, frame by frame: ``add``, then iterate."""
-
-    def __init__(self) -> None:
-        self._tracks, self._predictions = FrameCollector(TRACKS), FrameCollector(PREDICTIONS)
-
-    def add(self, tracks: Frame, predictions: Frame) -> None:
-        """Add the outputs of one step."""
-        self._tracks.append(tracks)
-        self._predictions.append(predictions)
-
-    def __iter__(self) -> Iterator[tuple[Frame, Frame]]:
-        return zip(self._tracks.done(), self._predictions.done(), strict=True)
