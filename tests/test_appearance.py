@@ -334,7 +334,7 @@ IN_PICTURES = Retrack(poor_scale=True)
 
 @pytest.mark.parametrize(("second", "least", "are_linked"), [(BLUE, 0.6, False), (RED, 0.6, True), (BLUE, 1.1, True)])
 def test_links_in_the_picture_look_at_colours_where_these_tell_people_apart(monkeypatch, second, least, are_linked):
-    monkeypatch.setattr("mcaptrack.transforms.retrack.appearance_calibration.LEAST_SEPARATION", least)
+    monkeypatch.setattr("mcaptrack.transforms.retrack.appearance.LEAST_SEPARATION", least)
     frames, descriptors = two_who_turn_back(RED, second)
     linked, alone = {frozenset({1, 11}), frozenset({2, 12})}, {frozenset({one}) for one in (1, 2, 11, 12)}
     for looks, wanted in ((None, linked), (descriptors, linked), (exchanged(descriptors, 11, 12), alone)):

@@ -17,7 +17,7 @@ from mcaptrack.geometry.plane import GroundPlane, moved_planes, plane_at
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.transforms import TRACKERS
 from mcaptrack.transforms.sort.ocsort import _CENTRES, _LAST_BOX, _LAST_STATE, OcSort
-from mcaptrack.transforms.sort.state import Measurements
+from mcaptrack.transforms.sort.tracker import Measurements
 from tests.worlds import detections, ids, ns
 
 every_tracker = pytest.mark.parametrize("kind", TRACKERS.values(), ids=TRACKERS)

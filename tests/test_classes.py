@@ -16,8 +16,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
 from mcaptrack.transforms import PROFILES, ByteTrack, OcSort, Sort
-from mcaptrack.transforms.retrack.offline_rows import settle_classes
-from mcaptrack.transforms.sort.state import CandidatePairs, associate
+from mcaptrack.transforms.retrack.offline import settle_classes
+from mcaptrack.transforms.sort.tracker import CandidatePairs, associate
 from mcaptrack.transforms.to_video_rate import to_video_rate
 from tests.worlds import assert_same_rows, noisy_tracks, ns
 

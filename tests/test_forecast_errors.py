@@ -17,7 +17,7 @@ from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
 from mcaptrack.evaluation.forecasts import find_forecast_errors
-from mcaptrack.evaluation.metrics.pairing import pair_forecasts
+from mcaptrack.evaluation.metrics.displacement import pair_forecasts
 from mcaptrack.predictors import Forecast
 from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.predictions import forecast_to_rows
@@ -265,7 +265,7 @@ def test_pairing_is_independent_of_batches(monkeypatch):
     truth = {who: {n: tuple(rng.normal(0, 3, 2)) for n in range(30)} for who in range(5)}
     made = forecasts(*(predicted(n, who, [(0.0, 0.0)]) for n in range(4, 29) for who in truth))
     once = pair_forecasts(positions(truth), positions(truth), made)
-    monkeypatch.setattr("mcaptrack.evaluation.metrics.pairing._PAIRS_AT_ONCE", 60)
+    monkeypatch.setattr("mcaptrack.evaluation.metrics.displacement._PAIRS_AT_ONCE", 60)
     again = pair_forecasts(positions(truth), positions(truth), made)
     assert len(once.forecast) == 25 * 5
     assert all(np.array_equal(a, b) for a, b in zip(once, again, strict=True))

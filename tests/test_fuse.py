@@ -21,8 +21,7 @@ from mcaptrack.notices import collected
 from mcaptrack.schema import SIGHTINGS, Frame
 from mcaptrack.testing import check_transform
 from mcaptrack.transforms.fuse import CameraView, FootFuser, agreement
-from mcaptrack.transforms.fuse.grouping import Places, group, means
-from mcaptrack.transforms.fuse.view import places_of
+from mcaptrack.transforms.fuse.view import Places, group, means, places_of
 from tests.places import CAMERAS, HEIGHT, NS, PEOPLE, SECONDS, WIDTH, errors, fused, said, write_log
 from tests.references.joining import joined
 

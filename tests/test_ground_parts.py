@@ -7,10 +7,8 @@ import pytest
 
 from mcaptrack.geometry.neighbours import Pairing
 from mcaptrack.schema import Frame
-from mcaptrack.transforms.ground import state
-from mcaptrack.transforms.ground.output import Waiting
-from mcaptrack.transforms.ground.state import Covariances
-from mcaptrack.transforms.ground.tracker import _Apart, associate
+from mcaptrack.transforms import ground as tracker
+from mcaptrack.transforms.ground import Covariances, Waiting, _Apart, associate
 from tests.worlds import ns
 
 #: Of a state of x, its velocity and acceleration, then the same of y, the position.
@@ -26,12 +24,16 @@ def along_one_axis(rng: np.random.Generator, count: int) -> np.ndarray:
 
 def tables(rng: np.random.Generator, tracks: int, found: int) -> tuple[np.ndarray, np.ndarray]:
     """Tracks, and detections with covariances; one score isn't known."""
-    table, rows = np.zeros((len(state.no_tracks()), tracks)), np.zeros((state.DETECTION_ROWS + 3, found))
-    table[state.PLACE], rows[state.PLACE] = rng.uniform(0, 4, (2, tracks)), rng.uniform(0, 4, (2, found))
-    table[state.NOISE], table[state.GATE_M] = rng.uniform(0.1, 0.4, tracks), rng.uniform(1.5, 4, tracks)
-    table[state.MISSED_S] = rng.uniform(0, 1, tracks)
-    rows[state.COVARIANCE] = [rng.uniform(0.1, 0.5, found), rng.uniform(-0.1, 0.1, found), rng.uniform(0.1, 0.5, found)]
-    rows[state.SCORE] = rng.choice([0.0, 0.3, 0.9, 1.0, np.nan], found)
+    table, rows = np.zeros((len(tracker.no_tracks()), tracks)), np.zeros((tracker.DETECTION_ROWS + 3, found))
+    table[tracker.PLACE], rows[tracker.PLACE] = rng.uniform(0, 4, (2, tracks)), rng.uniform(0, 4, (2, found))
+    table[tracker.NOISE], table[tracker.GATE_M] = rng.uniform(0.1, 0.4, tracks), rng.uniform(1.5, 4, tracks)
+    table[tracker.MISSED_S] = rng.uniform(0, 1, tracks)
+    rows[tracker.COVARIANCE] = [
+        rng.uniform(0.1, 0.5, found),
+        rng.uniform(-0.1, 0.1, found),
+        rng.uniform(0.1, 0.5, found),
+    ]
+    rows[tracker.SCORE] = rng.choice([0.0, 0.3, 0.9, 1.0, np.nan], found)
     return table, rows
 
 
@@ -42,16 +44,16 @@ class TestAssociation:
         table, rows = tables(rng, 4, 5)
         known = Covariances(along_one_axis(rng, 4))
         reach = rng.uniform(0.5, 4, 4)
-        apart = _Apart(table, rows, known, Pairing(table[state.PLACE], rows[state.PLACE], reach))
+        apart = _Apart(table, rows, known, Pairing(table[tracker.PLACE], rows[tracker.PLACE], reach))
         within, (k, n) = apart.within(4.0, reach), np.indices((4, 5)).reshape(2, -1)
         gain = apart.gain(np.ones((4, 5), bool), k, n).reshape(4, 5)
         for i, j in np.ndindex(4, 5):
-            xx, xy, yy = rows[state.COVARIANCE, j]
-            spread = SEEN @ known.values[i] @ SEEN.T + [[xx, xy], [xy, yy]] + table[state.NOISE, i] ** 2 * np.eye(2)
-            off = rows[state.PLACE, j] - table[state.PLACE, i]
+            xx, xy, yy = rows[tracker.COVARIANCE, j]
+            spread = SEEN @ known.values[i] @ SEEN.T + [[xx, xy], [xy, yy]] + table[tracker.NOISE, i] ** 2 * np.eye(2)
+            off = rows[tracker.PLACE, j] - table[tracker.PLACE, i]
             squared = off @ np.linalg.inv(spread) @ off
             assert within[i, j] == (squared <= 4 and np.linalg.norm(off) <= reach[i])
-            score = rows[state.SCORE, j]
+            score = rows[tracker.SCORE, j]
             share = 0.5 if np.isnan(score) else min(max(score, 0.02), 0.98)
             odds = 2 * np.log(share / (1 - share))
             assert gain[i, j] == pytest.approx(30 - squared - np.log(np.linalg.det(spread)) + odds)
@@ -59,13 +61,13 @@ class TestAssociation:
     def test_without_covariances_both_axes_have_the_variance_of_the_track(self):
         rng = np.random.default_rng(7)
         table, rows = tables(rng, 3, 4)
-        table[state.PLACE], rows[state.PLACE] = 0.0, np.arange(8).reshape(2, 4) / 4
-        spread = state.variance(table)
-        np.testing.assert_allclose(spread, table[state._PP] + table[state.NOISE] ** 2)
+        table[tracker.PLACE], rows[tracker.PLACE] = 0.0, np.arange(8).reshape(2, 4) / 4
+        spread = tracker.variance(table)
+        np.testing.assert_allclose(spread, table[tracker._PP] + table[tracker.NOISE] ** 2)
         reach = np.array([1.2, 0.7, 9.0])
-        apart = _Apart(table, rows, None, Pairing(table[state.PLACE], rows[state.PLACE], reach))
+        apart = _Apart(table, rows, None, Pairing(table[tracker.PLACE], rows[tracker.PLACE], reach))
         for i, j in np.ndindex(3, 4):
-            squared = (rows[state.PLACE, j] ** 2).sum()
+            squared = (rows[tracker.PLACE, j] ** 2).sum()
             assert apart.within(9.0, reach)[i, j] == (squared <= 9.0 * spread[i] and squared <= reach[i] ** 2)
             which = np.zeros((3, 4), bool)
             which[i, j] = True
@@ -73,7 +75,7 @@ class TestAssociation:
             assert gain == pytest.approx(30 - squared / spread[i] - 2 * np.log(spread[i]))
 
     def test_nothing_is_associated_with_nothing(self):
-        table, rows = np.zeros((len(state.no_tracks()), 2)), np.zeros((state.DETECTION_ROWS, 3))
+        table, rows = np.zeros((len(tracker.no_tracks()), 2)), np.zeros((tracker.DETECTION_ROWS, 3))
         for pair in ((table[:, :0], rows), (table, rows[:, :0])):
             assert [len(part) for part in associate(*pair, "metres", 0.1, across_classes=False)] == [0, 0, 0]
 
@@ -102,10 +104,10 @@ GATES = [
 def test_gates_at_their_ends():
     for case in GATES:
         noise, variance, gate_m, missed_s, hits, kind, x, is_near = case
-        table, rows = np.zeros((len(state.no_tracks()), 1)), np.zeros((state.DETECTION_ROWS, 1))
-        table[state.NOISE], table[state._PP], table[state.GATE_M] = noise, variance, gate_m
-        table[state.MISSED_S], table[state.HITS], table[state.CLASS] = missed_s, hits, 2
-        rows[state.X], rows[state.CLASS] = x, kind
+        table, rows = np.zeros((len(tracker.no_tracks()), 1)), np.zeros((tracker.DETECTION_ROWS, 1))
+        table[tracker.NOISE], table[tracker._PP], table[tracker.GATE_M] = noise, variance, gate_m
+        table[tracker.MISSED_S], table[tracker.HITS], table[tracker.CLASS] = missed_s, hits, 2
+        rows[tracker.X], rows[tracker.CLASS] = x, kind
         found = associate(table, rows, "metres", 0.1, across_classes=False)
         wanted = [(0, 0, kind == 2)] * is_near
         assert [*zip(*(part.tolist() for part in found), strict=True)] == wanted, case
@@ -114,9 +116,9 @@ def test_gates_at_their_ends():
 
 
 def tracks(**columns: list[float]) -> np.ndarray:
-    table = np.zeros((len(state.no_tracks()), len(next(iter(columns.values())))))
+    table = np.zeros((len(tracker.no_tracks()), len(next(iter(columns.values())))))
     for name, values in columns.items():
-        table[getattr(state, name.upper())] = values
+        table[getattr(tracker, name.upper())] = values
     return table
 
 
@@ -129,8 +131,8 @@ def test_gaps_are_interpolated_in_frames_that_wait(is_written_at_once):
         waiting.add(Frame(ns(t_s), number, np.empty(0)), tracks(id=[1, 256] if number == 0 else [256]))
     before = tracks(id=[1, 256], last_frame=[0, 2], missed_s=[2.0, 0.5], vx=[2.0, 0.0], vy=[0.0, 1.0])
     after = tracks(id=[1, 256], x=[8.0, 0.0], heading=[-3.0, 0.0], length=[5.0, 0.0], vx=[4.0, 0.0], vy=[-1.0, 1.0])
-    before[state.LAST.start + state.HEADING, 0] = 3.0  # by less than half a turn, over the back
-    before[state.LAST.start + state.LENGTH, 0] = 3.0
+    before[tracker.LAST.start + tracker.HEADING, 0] = 3.0  # by less than half a turn, over the back
+    before[tracker.LAST.start + tracker.LENGTH, 0] = 3.0
     waiting.confirm(np.array([1.0, 256.0]), np.array([1.0, 2.0]))
     waiting.release(ns(0.5))
     written = waiting.written() if is_written_at_once else []

@@ -8,7 +8,7 @@ import pytest
 from mcaptrack.notices import collected
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.transforms import GroundTracker
-from mcaptrack.transforms.ground import tracker
+from mcaptrack.transforms import ground as tracker
 from mcaptrack.transforms.motion_limits import LIMITS
 from tests.references import ground
 

@@ -9,8 +9,8 @@ import pytest
 
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import TRACKS, Frame, framing
-from mcaptrack.transforms.retrack.offline_rows import TrackRows, move_rows, moved_to, rows_by_step
-from mcaptrack.transforms.retrack.samples import LogSamples
+from mcaptrack.transforms.retrack.assignments import LogSamples
+from mcaptrack.transforms.retrack.offline import TrackRows, move_rows, moved_to, rows_by_step
 from tests.worlds import ns
 
 LINEAR = ("x_px", "y_px", "w_px", "h_px", "score", "x_m", "y_m", "z_m", "vx_m_per_s")

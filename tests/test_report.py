@@ -18,8 +18,7 @@ from jinja2 import UndefinedError
 from mcaptrack import foxglove, log
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
 from mcaptrack.evaluation.events import MatchRule, find_events
-from mcaptrack.evaluation.metrics.displacement import combine_displacements, displacement
-from mcaptrack.evaluation.metrics.pairing import Forecasts, Positions
+from mcaptrack.evaluation.metrics.displacement import Forecasts, Positions, combine_displacements, displacement
 from mcaptrack.evaluation.people import Interval, Intervals
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance

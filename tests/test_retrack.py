@@ -20,7 +20,7 @@ from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import PROFILES, Retrack
 from mcaptrack.transforms.retrack.assignments import PEOPLE, Movers, join_classes, movers_of, split_classes, usual_score
 from mcaptrack.transforms.retrack.methods import KeptIds
-from mcaptrack.transforms.retrack.shown_tracks import GrowingHull
+from mcaptrack.transforms.retrack.online_tracker import GrowingHull
 from tests.commands import call
 from tests.tiers import one_in
 from tests.worlds import assert_same_rows, ids, ns, places, tracks_at, walk

@@ -25,8 +25,7 @@ from corruptions import CORRUPTIONS, STEP_S, Corruption, corrupt
 from reproduce import on_clock
 
 from mcaptrack import __version__
-from mcaptrack.evaluation.metrics.displacement import TAU_M2
-from mcaptrack.evaluation.metrics.pairing import Forecasts, Positions, pair_forecasts
+from mcaptrack.evaluation.metrics.displacement import TAU_M2, Forecasts, Positions, pair_forecasts
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories
 from mcaptrack.geometry.mixtures import Tails, mahalanobis_squared

@@ -29,10 +29,13 @@ from mcaptrack.evaluation.aligned import (
     compare_rows,
     explain_no_match,
     has_positions,
+    ids_of_class,
+    of_class,
     refuse_sides_without,
+    share_classes,
     sides_without,
+    with_ids,
 )
-from mcaptrack.evaluation.by_class import ids_of_class, of_class, share_classes, with_ids
 from mcaptrack.evaluation.forecasts import FORECAST_INPUTS, score_forecasts
 from mcaptrack.evaluation.metrics import Rules, Score, ScoredMatchup, average_over_recalls
 from mcaptrack.evaluation.metrics.displacement import Displacement, combine_displacements
@@ -67,7 +70,7 @@ class EvaluateOptions:
     min_iou : float
         The least overlap of a match, for the similarities that are overlaps.
     rules : {"trackeval", "motmetrics"}
-        Rules of CLEAR, see `mcaptrack.evaluation.metrics.clear.clear`.
+        Rules of CLEAR, see `mcaptrack.evaluation.metrics.clear`.
     topics : tuple of str
         The channels to score. Empty: all tracks of the camera.
     """

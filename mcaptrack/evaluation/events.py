@@ -29,10 +29,10 @@ from mcaptrack.evaluation.aligned import (
     has_positions,
     have_same_times,
     refuse_sides_without,
+    share_classes,
     sides_without,
 )
-from mcaptrack.evaluation.by_class import share_classes
-from mcaptrack.evaluation.metrics.clear import is_switch, matches
+from mcaptrack.evaluation.metrics import is_switch, matches
 from mcaptrack.evaluation.metrics.matchup import RowPairs
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns

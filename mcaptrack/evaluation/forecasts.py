@@ -21,10 +21,13 @@ from mcaptrack.evaluation.metrics.displacement import (
     RELIABILITY_LEVELS,
     TAU_M2,
     Displacement,
+    Forecasts,
+    PairedForecasts,
+    Positions,
     displacement,
     forecast_errors,
+    pair_forecasts,
 )
-from mcaptrack.evaluation.metrics.pairing import Forecasts, PairedForecasts, Positions, pair_forecasts
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.histories import Holt

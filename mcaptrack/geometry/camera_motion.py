@@ -43,12 +43,12 @@ _MIN_SHARE: Final = 0.35
 _EVERY, _APART = 10, 3
 #: Of the features, so large a share moves otherwise than the scene, and so large a share as one, over this share of
 #: the picture.
-_OTHERS, _AS_ONE, _SECOND_MOTION_MIN_AREA = 0.3, 0.25, 0.1
+_OTHERS, _AS_ONE, _LEAST_SHARE_OF_PICTURE = 0.3, 0.25, 0.1
 _MIN_FEATURES: Final = 24
 # In pixels of the reduced picture: from here on features move otherwise, and up to here alike.
 _OTHERWISE_PX, _ALIKE_PX = 1.0, 0.75
 # Flow is searched in windows of this size, on so many reduced copies of the picture.
-_SECOND_MOTION_WINDOW_PX, _SECOND_MOTION_LEVELS = 11, 4
+_FLOW_WINDOW_PX, _FLOW_LEVELS = 11, 4
 
 
 class SecondMotion:
@@ -103,8 +103,8 @@ def _is_divided(before: Image, now: Image, motion: Floats, boxes: Floats | None)
         second.image,
         points,
         points.copy(),
-        winSize=(_SECOND_MOTION_WINDOW_PX,) * 2,
-        maxLevel=_SECOND_MOTION_LEVELS,
+        winSize=(_FLOW_WINDOW_PX,) * 2,
+        maxLevel=_FLOW_LEVELS,
     )
     is_followed = np.asarray(status).ravel() == 1
     then, now_at = points[is_followed, 0], np.asarray(moved, np.float32)[is_followed, 0]
@@ -121,7 +121,7 @@ def _is_divided(before: Image, now: Image, motion: Floats, boxes: Floats | None)
     as_one = np.asarray(agree, np.bool_).ravel()
     if np.count_nonzero(as_one) < _AS_ONE * len(then):
         return False
-    return bool(np.ptp(now_at[others][as_one], axis=0).prod() >= _SECOND_MOTION_MIN_AREA * first.image.size)
+    return bool(np.ptp(now_at[others][as_one], axis=0).prod() >= _LEAST_SHARE_OF_PICTURE * first.image.size)
 
 
 _MIN_AREA: Final = 0.06

@@ -122,7 +122,7 @@ BINS: Final = len(_CENTRES)
 _SUMS: Final = np.stack([np.ones(BINS), _CENTRES], axis=1)
 #: So many independent comparisons count as much as the table, for the size of errors at all steps together; as much as
 #: the size at all steps, for that at one step; and as much as the table, for the share of large errors.
-_TAILS_ALL_STEPS, _ONE_STEP, _WEIGHT = 1.0, 4.0, 20.0
+_TOGETHER, _ONE_STEP, _WEIGHT = 1.0, 4.0, 20.0
 #: Large errors are rare and their size varies: for it the table counts so many times as much.
 _LARGE: Final = 20.0
 #: This share of the forecasts of tracks that are no longer observed is taken to have large errors, as in the table:
@@ -131,7 +131,7 @@ _LOST: Final = 0.005
 #: Errors of measured positions are no smaller than this share of the least ones of true positions.
 _LEAST_MEASURED: Final = 0.1
 #: Limits of the weight of the wide part.
-_LEAST_WIDE, _TAILS_MOST_WIDE = 0.02, 0.6
+_LEAST_WIDE, _WIDEST_SHARE = 0.02, 0.6
 
 
 class TailTable(NamedTuple):
@@ -182,7 +182,7 @@ def fit_mixture(counts: Floats, start: Tails, iterations: int) -> Tails:
         sums = of_wide.sum(axis=1, keepdims=True)
         wide = (of_wide @ _CENTRES)[:, None] / np.maximum(sums, 1e-9)
         narrow = ((counts - of_wide) @ _CENTRES)[:, None] / np.maximum(total - sums, 1e-9)
-        weight = np.clip(sums / total, _LEAST_WIDE, _TAILS_MOST_WIDE)
+        weight = np.clip(sums / total, _LEAST_WIDE, _WIDEST_SHARE)
     return Tails(weight[:, 0], narrow[:, 0], wide[:, 0])
 
 
@@ -239,12 +239,12 @@ def follow(table: Tails, before: Tails, learned: Learned, iterations: int) -> Ta
         sums, total = np.stack([all_sums - of_wide, of_wide], axis=1).transpose(2, 1, 0)
         change = np.log(np.maximum(total / np.maximum(sums, 1e-9) - learned.noise, least) / scales) * (sums > 1e-6)
         mass, said = sums + lost, sums * change
-        shared = said.sum(axis=1, keepdims=True) / (trust * _TAILS_ALL_STEPS + mass.sum(axis=1, keepdims=True))
+        shared = said.sum(axis=1, keepdims=True) / (trust * _TOGETHER + mass.sum(axis=1, keepdims=True))
         scale = scales * np.exp((trust * _ONE_STEP * shared + said) / (trust * _ONE_STEP + mass))
         many, few = mass
         odds = (_WEIGHT * mean + few.sum()) / (_WEIGHT * (1 - mean) + many.sum()) * ((1 - mean) / mean)
         share[1] = (_WEIGHT / (1 + odds_of_table / odds) + few) / (_WEIGHT + few + many)
-        share[1] = np.minimum(np.maximum(share[1], _LEAST_WIDE), _TAILS_MOST_WIDE)
+        share[1] = np.minimum(np.maximum(share[1], _LEAST_WIDE), _WIDEST_SHARE)
         share[0] = 1 - share[1]
         np.maximum(scale, learned.least, out=scale)
         np.maximum(scale[1], scale[0], out=scale[1])

@@ -54,9 +54,9 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "median": "mcaptrack.transforms.detect.median:MedianDetector",
             "knn": "mcaptrack.transforms.detect.background:KnnDetector",
             "onnx": "mcaptrack.transforms.detect.onnx.detector:OnnxDetector",
-            "yolox-nano": "mcaptrack.transforms.detect.onnx.catalogued:YoloxNano",
-            "yolox-tiny": "mcaptrack.transforms.detect.onnx.catalogued:YoloxTiny",
-            "yolox-s": "mcaptrack.transforms.detect.onnx.catalogued:YoloxS",
+            "yolox-nano": "mcaptrack.transforms.detect.onnx.detector:YoloxNano",
+            "yolox-tiny": "mcaptrack.transforms.detect.onnx.detector:YoloxTiny",
+            "yolox-s": "mcaptrack.transforms.detect.onnx.detector:YoloxS",
         },
         "tracker": {
             "sort": "mcaptrack.transforms.sort:Sort",

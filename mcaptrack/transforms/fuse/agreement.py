@@ -14,8 +14,7 @@ import numpy as np
 from mcaptrack.geometry.arrays import Floats, Indices, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.ragged import group_index, table_of
-from mcaptrack.transforms.fuse.grouping import Places, means
-from mcaptrack.transforms.fuse.view import SHARES, CameraView, Joined, Views, places_of
+from mcaptrack.transforms.fuse.view import SHARES, CameraView, Joined, Places, Views, means, places_of
 
 #: A place that so many other cameras see is taken for true; others are false if so many should see them.
 _OTHERS, _EXPECTED = 2, 1.5

@@ -15,8 +15,7 @@ from mcaptrack.geometry.neighbours import squared_sigmas
 from mcaptrack.geometry.ragged import ragged_range
 from mcaptrack.schema import DETECTIONS, SIGHTINGS, Frame, Schema
 from mcaptrack.schema.framing import split_rows
-from mcaptrack.transforms.fuse.grouping import Places, pairs_along_x
-from mcaptrack.transforms.fuse.view import Joined, Views, joined
+from mcaptrack.transforms.fuse.view import Joined, Places, Views, joined, pairs_along_x
 from mcaptrack.transforms.protocol import Suited, check_options, context, option
 
 # Evidence of the frame before: people stand near a place for longer than one frame, most false boxes do not.
@@ -25,13 +24,13 @@ from mcaptrack.transforms.protocol import Suited, check_options, context, option
 
 
 #: How often a person was detected in the frame before, and how often something was detected near a false box.
-_STAYS, _PERSISTENCE_CHANCE = 0.85, 0.3
+_STAYS, _NEAR_BY_CHANCE = 0.85, 0.3
 #: How far people walk, in metres per second; and how far at most they seem to be from where they were.
 _PACE_M_PER_S, _FARTHEST_M = 1.0, 2.5
 #: A frame longer ago than this is ignored.
 _MOST_S: Final = 1.0
 #: Groups that are less probable than this are no people of the frame before.
-_PERSISTENCE_LEAST: Final = 0.02
+_LEAST_PROBABLE: Final = 0.02
 
 
 class LastFrame(NamedTuple):
@@ -79,7 +78,7 @@ def persistence(
     step_s = np.diff(times, prepend=begun.t_ns) / NS_PER_S
     counts = np.append([begun.is_known], block.counts > 0)[:-1] & (step_s > 0) & (step_s <= _MOST_S)
     # Each group is looked for with those of its own frame, and again with those of the next one.
-    likely = np.flatnonzero(probable >= _PERSISTENCE_LEAST)
+    likely = np.flatnonzero(probable >= _LEAST_PROBABLE)
     first, second = pairs_along_x(
         np.tile(xy_m[likely], (2, 1)), np.append(frame[likely], frame[likely] + 1), _FARTHEST_M
     )
@@ -100,7 +99,7 @@ def persistence(
             continued.add(other)
             stays[new] = probable[other]
     stays = stays[extra:]
-    odds = np.log(stays * (_STAYS / _PERSISTENCE_CHANCE) + (1 - stays) * ((1 - _STAYS) / (1 - _PERSISTENCE_CHANCE)))
+    odds = np.log(stays * (_STAYS / _NEAR_BY_CHANCE) + (1 - stays) * ((1 - _STAYS) / (1 - _NEAR_BY_CHANCE)))
     return np.where(counts[block.frame], odds, 0.0), after
 
 

@@ -24,7 +24,7 @@ from mcaptrack.predictors import Forecast, Predictor, make, predict_together
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.predictions import forecast_to_rows
-from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, Movers
+from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, LogSamples, Movers
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
 from mcaptrack.transforms.retrack.options import (
     ConsistencyOptions,
@@ -32,7 +32,6 @@ from mcaptrack.transforms.retrack.options import (
     position_distances,
     prediction_distances,
 )
-from mcaptrack.transforms.retrack.samples import LogSamples
 
 #: Cost of a pair with priority: lower than any sum of other costs.
 _PRIORITY_COST: Final = -100.0

@@ -17,8 +17,7 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.ragged import run_ends, run_starts
 from mcaptrack.transforms.retrack import linking
-from mcaptrack.transforms.retrack.appearance import Evidence
-from mcaptrack.transforms.retrack.appearance_calibration import MOST
+from mcaptrack.transforms.retrack.appearance import MOST, Evidence
 from mcaptrack.transforms.retrack.assignments import Tracks
 from mcaptrack.transforms.retrack.joins import Cuts
 from mcaptrack.transforms.retrack.linking import TrackEnds

@@ -26,8 +26,7 @@ from mcaptrack.schema import TRACKS, Rows
 from mcaptrack.schema.frame_columns import FrameColumns
 from mcaptrack.schema.framing import joined_parts
 from mcaptrack.schema.resampling import LINEAR
-from mcaptrack.transforms.retrack.appearance import Appearance, Descriptors, Evidence
-from mcaptrack.transforms.retrack.appearance_calibration import AppearanceCalibration
+from mcaptrack.transforms.retrack.appearance import Appearance, AppearanceCalibration, Descriptors, Evidence
 from mcaptrack.transforms.retrack.assignments import Tracks
 
 #: The longest gap of a link, and the mean one: how often gaps are as long falls off exponentially. In seconds.

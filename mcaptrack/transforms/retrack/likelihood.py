@@ -19,14 +19,11 @@ from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.framing import JoinedFrames, mapped_rows
 from mcaptrack.schema.predictions import forecast_to_rows
-from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, Movers
+from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, LogSamples, Movers
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M, MotionModel, State, StateRows
-from mcaptrack.transforms.retrack.offline_rows import move_rows
-from mcaptrack.transforms.retrack.online_links import OnlineLinks
-from mcaptrack.transforms.retrack.online_tracker import HITS, IDS, Association, OnlineTracker
+from mcaptrack.transforms.retrack.offline import move_rows
+from mcaptrack.transforms.retrack.online_tracker import HITS, IDS, Association, OnlineLinks, OnlineTracker, ShownTracks
 from mcaptrack.transforms.retrack.options import LikelihoodOptions, RetrackOptions
-from mcaptrack.transforms.retrack.samples import LogSamples
-from mcaptrack.transforms.retrack.shown_tracks import ShownTracks
 
 #: So many frames are read at once, and online tracks written, or fewer with so many samples.
 _STEPS, _SAMPLES = 256, 2**14

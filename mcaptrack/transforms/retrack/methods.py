@@ -18,9 +18,10 @@ from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns, collect
 from mcaptrack.schema.framing import joined_parts
 from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.protocol import ModelCard
-from mcaptrack.transforms.retrack.appearance_calibration import AppearanceCalibration
+from mcaptrack.transforms.retrack.appearance import AppearanceCalibration
 from mcaptrack.transforms.retrack.assignments import (
     Assignments,
+    LogSamples,
     Movers,
     join_classes,
     movers_of,
@@ -33,7 +34,6 @@ from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
 from mcaptrack.transforms.retrack.offline import appearance_rows, offline_tracks
 from mcaptrack.transforms.retrack.options import ConsistencyOptions, LikelihoodOptions, RetrackOptions
-from mcaptrack.transforms.retrack.samples import LogSamples
 
 Options = TypeVar("Options", bound=RetrackOptions)
 

@@ -8,8 +8,7 @@ import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Indices
 from mcaptrack.transforms.protocol import setting
-from mcaptrack.transforms.sort.state import SINCE_UPDATE, Measurements, associate
-from mcaptrack.transforms.sort.tracker import AssociationInput, Sort
+from mcaptrack.transforms.sort.tracker import SINCE_UPDATE, AssociationInput, Measurements, Sort, associate
 
 
 @dataclass(frozen=True, kw_only=True)

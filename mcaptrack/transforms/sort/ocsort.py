@@ -19,8 +19,16 @@ from mcaptrack.geometry import kalman
 from mcaptrack.geometry.affine import move_boxes, move_points
 from mcaptrack.geometry.arrays import Floats, Indices
 from mcaptrack.transforms.protocol import setting
-from mcaptrack.transforms.sort.state import SHARED_ROWS, CandidatePairs, Measurements, Tracks, associate, iou_pairs
-from mcaptrack.transforms.sort.tracker import AssociationInput, Sort
+from mcaptrack.transforms.sort.tracker import (
+    SHARED_ROWS,
+    AssociationInput,
+    CandidatePairs,
+    Measurements,
+    Sort,
+    Tracks,
+    associate,
+    iou_pairs,
+)
 
 # Rows of the table below the shared ones: corners of the last detection; state of the filter after it; frames since
 # then; and centres of the detections in the last frames, oldest first, NaN where the track was missed.

@@ -16,9 +16,8 @@ from mcaptrack import environment
 from mcaptrack.environment import threads
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.networks import Device, NetworkFile, NetworkLimitError, NetworkLimits, OnnxNetwork, Value
-from mcaptrack.transforms.detect.onnx.layouts import NetworkSignature
+from mcaptrack.transforms.detect.onnx.layouts import NetworkSignature, Outputs
 from mcaptrack.transforms.detect.onnx.nms import Size
-from mcaptrack.transforms.detect.onnx.outputs import Outputs
 
 #: What the sides of an input are multiples of, unless a network was made for another size.
 _STEP: Final = 32
