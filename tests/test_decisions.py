@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -107,7 +108,8 @@ def test_joins_and_cuts_equal_the_reference(seed):
 
 @pytest.mark.parametrize(("least", "wanted"), [(0.5, [(5, 6)]), (0.2, [(5, 6)]), (0.72, [(5, 6), (6, 7)])])
 def test_joins_below_70_percent_are_cut_or_below_what_links_need(monkeypatch, least, wanted):
-    monkeypatch.setattr(join_steps, "cut_probability", lambda features: np.array([0.69, 0.71, 0.73]))
+    likely = SimpleNamespace(probability=lambda features: np.array([0.69, 0.71, 0.73]))
+    monkeypatch.setattr(join_steps, "_CUTS", likely)
     step = np.arange(40)
     xy = np.column_stack([0.5 * step, np.zeros(40)])
     tracks, cuts = cut_joins(MODEL, assigned(step, np.full(40, 5), step // 10, xy), least)

@@ -125,7 +125,7 @@ def test_the_two_evaluators_differ_where_they_are_known_to():
 def test_people_of_other_parts_of_a_sequence_are_in_no_count():
     """The ids of a matchup may be those of a whole sequence, of which it has a part."""
     first = np.array([0])
-    found = metrics(Matchup((first,), (first,), (np.ones((1, 1)),), 0.5, n_ground_truth=3, n_tracks=2))
+    found = metrics.clear(Matchup((first,), (first,), (np.ones((1, 1)),), 0.5, n_ground_truth=3, n_tracks=2))
     assert [int(found[name]) for name in ("MT", "PT", "ML", "GT")] == [1, 0, 0, 1]
 
 

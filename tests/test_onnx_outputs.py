@@ -171,7 +171,7 @@ def test_conventions_that_are_not_known_are_refused_with_the_reason(case, layout
     ],
 )
 def test_other_layouts_are_refused_for_the_same_reasons(outputs, words, tmp_path):
-    assert words in refused(giving(layouts), tmp_path)
+    assert words in refused(giving(outputs), tmp_path)
 
 
 def test_boxes_of_rtdetr_in_shares_are_refused_without_naming_what_is_the_same(tmp_path):

@@ -11,7 +11,7 @@ import pytest
 import mcaptrack
 from mcaptrack.predictors.weights import load
 from mcaptrack.transforms.retrack import cut_links, false_tracks, joins, linking
-from mcaptrack.transforms.retrack.weights import WEIGHTS, weights_of
+from mcaptrack.transforms.retrack.weights import WEIGHTS, Logistic
 from tools import crowds
 from tools.fit_retrack import (
     logistic,
@@ -40,7 +40,7 @@ def test_everything_that_was_fitted_says_that_it_was_fitted_on_synthetic_data():
 def test_weights_go_by_the_names_of_features_in_any_order():
     names = ("gap", "miss")
     found = json.loads(WEIGHTS.read_text())["links"]["weights"]
-    assert weights_of("links", names)[0].tolist() == [found["gap"], found["miss"]]
+    assert Logistic.of("links", names).weights.tolist() == [found["gap"], found["miss"]]
     models = {"links": linking, "people": false_tracks, "cuts": joins, "relinks": cut_links, "joins": joins}
     for model, features in ((name, module.FEATURES) for name, module in models.items()):
         assert set(json.loads(WEIGHTS.read_text())[model]["weights"]) == set(features)

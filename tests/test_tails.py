@@ -14,13 +14,14 @@ from mcaptrack.geometry.mixtures import Tails, squared_radius
 from mcaptrack.notices import Notice, listening
 from mcaptrack.predictors import NAMES, Forecast, make, vehicle_tails
 from mcaptrack.predictors.position_noise import PositionNoise
-from mcaptrack.predictors.tail_calibration import Learned, TailCalibration, counts_of, fit_mixture, follow, table_of
+from mcaptrack.predictors.tail_calibration import Learned, TailCalibration, counts_of, follow, table_of
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.predictions import tails_of
 from mcaptrack.transforms import PROFILES, forecasts
 from mcaptrack.transforms.motion_limits import LIMITS
 from mcaptrack.transforms.predict import Predict
 from tests.worlds import ns, tracks_at
+from tools.regression import fit_mixture
 
 STEP_NS = 400_000_000
 

@@ -22,6 +22,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 from corruptions import CORRUPTIONS, STEP_S, Corruption, corrupt
+from regression import fit_mixture
 from reproduce import on_clock
 
 from mcaptrack import __version__
@@ -30,7 +31,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories
 from mcaptrack.geometry.mixtures import Tails, mahalanobis_squared
 from mcaptrack.predictors import NAMES, Forecast, PeopleSeen, Predictor, make, predict_among
-from mcaptrack.predictors.tail_calibration import TABLES, counts_of, fit_mixture
+from mcaptrack.predictors.tail_calibration import TABLES, counts_of
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.framing import join_frames
 from mcaptrack.training.walks import walks

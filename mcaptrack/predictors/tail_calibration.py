@@ -116,10 +116,10 @@ _MIDDLE, _OUTER = 0.5, 0.9
 TABLES: Final = Path(__file__).parent / "trained" / "tails.json"
 #: Edges and centres of bins of half the squared Mahalanobis distance, in which comparisons are counted.
 _EDGES: Final = np.geomspace(1e-4, 1e4, 49)
-_CENTRES: Final = np.sqrt(_EDGES[1:] * _EDGES[:-1])
-BINS: Final = len(_CENTRES)
+CENTRES: Final = np.sqrt(_EDGES[1:] * _EDGES[:-1])
+BINS: Final = len(CENTRES)
 #: Counts (T, B) times this are their sums, and those of half the squared distances.
-_SUMS: Final = np.stack([np.ones(BINS), _CENTRES], axis=1)
+_SUMS: Final = np.stack([np.ones(BINS), CENTRES], axis=1)
 #: So many independent comparisons count as much as the table, for the size of errors at all steps together; as much as
 #: the size at all steps, for that at one step; and as much as the table, for the share of large errors.
 _TOGETHER, _ONE_STEP, _WEIGHT = 1.0, 4.0, 20.0
@@ -131,7 +131,7 @@ _LOST: Final = 0.005
 #: Errors of measured positions are no smaller than this share of the least ones of true positions.
 _LEAST_MEASURED: Final = 0.1
 #: Limits of the weight of the wide part.
-_LEAST_WIDE, _WIDEST_SHARE = 0.02, 0.6
+LEAST_WIDE, MOST_WIDE = 0.02, 0.6
 
 
 class TailTable(NamedTuple):
@@ -168,27 +168,9 @@ def table_of(name: str) -> TailTable | None:
     return None if table is None else TailTable(**{key: np.array(table[key], np.float64) for key in TailTable._fields})
 
 
-def fit_mixture(counts: Floats, start: Tails, iterations: int) -> Tails:
-    """The mixtures (T,) under which counts (T, B) of half the squared distances are likeliest.
-
-    By expectation and maximisation, ``iterations`` times from ``start``.
-    """
-    weight, narrow, wide = (part[:, None] for part in start)
-    total = counts.sum(axis=1, keepdims=True)
-    for _ in range(iterations):
-        of_narrow = (1 - weight) / narrow * np.exp(-_CENTRES / narrow)
-        two = weight / wide * np.exp(-_CENTRES / wide)
-        of_wide = counts * two / np.maximum(of_narrow + two, 1e-300)
-        sums = of_wide.sum(axis=1, keepdims=True)
-        wide = (of_wide @ _CENTRES)[:, None] / np.maximum(sums, 1e-9)
-        narrow = ((counts - of_wide) @ _CENTRES)[:, None] / np.maximum(total - sums, 1e-9)
-        weight = np.clip(sums / total, _LEAST_WIDE, _WIDEST_SHARE)
-    return Tails(weight[:, 0], narrow[:, 0], wide[:, 0])
-
-
 def counts_of(step: Ints, half_squared: Floats, steps: int) -> Floats:
     """The number (T, B) of half squared distances (M,) of each step (M,), the first of which is 0, in each bin."""
-    column = np.clip(np.searchsorted(_EDGES, half_squared) - 1, 0, len(_CENTRES) - 1)
+    column = np.clip(np.searchsorted(_EDGES, half_squared) - 1, 0, len(CENTRES) - 1)
     flat = np.bincount(step * BINS + column, minlength=steps * BINS)
     return np.asarray(flat.reshape(steps, BINS), np.float64)
 
@@ -234,7 +216,7 @@ def follow(table: Tails, before: Tails, learned: Learned, iterations: int) -> Ta
     least, least_seen = np.maximum(learned.least, 1e-4), learned.least_measured
     for _ in range(iterations):
         seen = np.maximum(scale + learned.noise, least_seen)
-        density = np.exp(-_CENTRES / seen[..., None]) * (share / seen)[..., None]
+        density = np.exp(-CENTRES / seen[..., None]) * (share / seen)[..., None]
         of_wide = (learned.counts * (density[1] / np.maximum(density[0] + density[1], 1e-300))) @ _SUMS
         sums, total = np.stack([all_sums - of_wide, of_wide], axis=1).transpose(2, 1, 0)
         change = np.log(np.maximum(total / np.maximum(sums, 1e-9) - learned.noise, least) / scales) * (sums > 1e-6)
@@ -244,7 +226,7 @@ def follow(table: Tails, before: Tails, learned: Learned, iterations: int) -> Ta
         many, few = mass
         odds = (_WEIGHT * mean + few.sum()) / (_WEIGHT * (1 - mean) + many.sum()) * ((1 - mean) / mean)
         share[1] = (_WEIGHT / (1 + odds_of_table / odds) + few) / (_WEIGHT + few + many)
-        share[1] = np.minimum(np.maximum(share[1], _LEAST_WIDE), _WIDEST_SHARE)
+        share[1] = np.minimum(np.maximum(share[1], LEAST_WIDE), MOST_WIDE)
         share[0] = 1 - share[1]
         np.maximum(scale, learned.least, out=scale)
         np.maximum(scale[1], scale[0], out=scale[1])

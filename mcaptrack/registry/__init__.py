@@ -78,7 +78,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "consistency": "mcaptrack.transforms.retrack:RetrackByConsistency",
         },
         "fuser": {
-            "feet": "mcaptrack.transforms.fuse.fuser:FootFuser",
+            "feet": "mcaptrack.transforms.fuse:FootFuser",
         },
     }
 )

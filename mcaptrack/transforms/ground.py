@@ -6,7 +6,6 @@ Letters: N detections, K tracks.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import islice
 from types import MappingProxyType
 from typing import ClassVar, Final, Literal, NamedTuple
@@ -31,7 +30,7 @@ from mcaptrack.transforms.motion_limits import (
     limits_by_class,
     read_limits,
 )
-from mcaptrack.transforms.protocol import check_options, context, option, setting
+from mcaptrack.transforms.protocol import check_options, context, option, parameters, setting
 
 _ASSOCIATION: Final = "Association"
 _DETECTIONS: Final = "Detections"
@@ -740,7 +739,7 @@ def _assigned(
     return track, row
 
 
-@dataclass(frozen=True, kw_only=True)
+@parameters
 class GroundTracker:
     """Track detections in metres, such as the 3D boxes of a robot's detector.
 
@@ -753,6 +752,33 @@ class GroundTracker:
 
     Rows are written ``delay_s`` late: a track is written from its first detection on if it is confirmed in that time,
     and gaps that end in it are interpolated.
+
+    Parameters
+    ----------
+    max_age_s : float
+        A track ends after this many seconds without a detection.
+    delay_s : float
+        Rows are written this many seconds late, so that false births are taken back and short gaps are filled;
+        0 for results that depend on the past alone.
+    link_s : float
+        A new track continues a lost one that it fits, up to this many seconds after its last detection; 0 for
+        never.
+    confirm_score : float
+        A track is confirmed once the scores of its detections add up to this; detections without a score count
+        0.5.
+    birth_score : float
+        Detections with a lower score continue tracks, but start none.
+    cost : str
+        How detections and tracks are compared: distance of their centres, or overlap of their boxes seen from
+        above.
+    min_iou : float
+        With cost iou: least overlap (IoU) of a detection with a track's predicted box.
+    min_score : float or None
+        Ignore detections with a lower score.
+    class_id : int or None
+        Ignore detections of other classes.
+    across_classes : bool
+        A track may continue with a detection of another class; it then has the class of most of its detections.
 
     Examples
     --------
@@ -776,58 +802,16 @@ class GroundTracker:
     "Estimating Optimal Tracking Filter Performance for Manned Maneuvering Targets", IEEE T-AES 1970.
     """
 
-    max_age_s: float = option(
-        1.6, "a track ends after this many seconds without a detection", least=0.0, search=(0.2, 4.0), theme=_LIFE
-    )
-    delay_s: float = setting(
-        1.0,
-        "rows are written this many seconds late, so that false births are taken back and short gaps are filled; 0 for "
-        "results that depend on the past alone",
-        least=0.0,
-        theme=_LIFE,
-    )
-    link_s: float = setting(
-        8.0,
-        "a new track continues a lost one that it fits, up to this many seconds after its last detection; 0 for never",
-        least=0.0,
-        theme=_LIFE,
-    )
-    confirm_score: float = setting(
-        0.9,
-        "a track is confirmed once the scores of its detections add up to this; detections without a score count 0.5",
-        least=0.0,
-        search=(0.3, 4.0),
-        theme=_LIFE,
-    )
-    birth_score: float = setting(
-        0.2,
-        "detections with a lower score continue tracks, but start none",
-        least=0.0,
-        most=1.0,
-        search=(0.0, 0.8),
-        theme=_LIFE,
-    )
-    cost: Cost = setting(
-        "metres",
-        "how detections and tracks are compared: distance of their centres, or overlap of their boxes seen from above",
-        theme=_ASSOCIATION,
-    )
-    min_iou: float = option(
-        0.05,
-        "with cost iou: least overlap (IoU) of a detection with a track's predicted box",
-        least=0.0,
-        most=1.0,
-        theme=_ASSOCIATION,
-    )
-    min_score: float | None = option(None, "ignore detections with a lower score", theme=_DETECTIONS)
-    class_id: int | None = setting(
-        None, "ignore detections of other classes", least=0, most=2**31 - 1, theme=_DETECTIONS
-    )
-    across_classes: bool = option(
-        False,
-        "a track may continue with a detection of another class; it then has the class of most of its detections",
-        theme=_DETECTIONS,
-    )
+    max_age_s: float = option(1.6, least=0.0, search=(0.2, 4.0), theme=_LIFE)
+    delay_s: float = setting(1.0, least=0.0, theme=_LIFE)
+    link_s: float = setting(8.0, least=0.0, theme=_LIFE)
+    confirm_score: float = setting(0.9, least=0.0, search=(0.3, 4.0), theme=_LIFE)
+    birth_score: float = setting(0.2, least=0.0, most=1.0, search=(0.0, 0.8), theme=_LIFE)
+    cost: Cost = setting("metres", theme=_ASSOCIATION)
+    min_iou: float = option(0.05, least=0.0, most=1.0, theme=_ASSOCIATION)
+    min_score: float | None = option(None, theme=_DETECTIONS)
+    class_id: int | None = setting(None, least=0, most=2**31 - 1, theme=_DETECTIONS)
+    across_classes: bool = option(False, theme=_DETECTIONS)
     class_limits: str = option("", LIMITS_HELP, pattern=LIMITS_PATTERN, theme=_ASSOCIATION)
     class_names: ClassNames = context(tuple, is_recorded=False)
 

@@ -25,18 +25,34 @@ All transforms obey these laws; ``mcaptrack.testing.check_transform`` tests them
 
 from __future__ import annotations
 
+import inspect
 import math
+import re
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from functools import cache
 from types import MappingProxyType, UnionType
-from typing import Any, ClassVar, Final, Literal, NamedTuple, Protocol, get_args, get_origin, get_type_hints
+from typing import (
+    Any,
+    ClassVar,
+    Final,
+    Literal,
+    NamedTuple,
+    Protocol,
+    TypeVar,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.ranges import limits
 from mcaptrack.registry import KINDS, Kind
 from mcaptrack.schema import Frame, Schema
+
+T = TypeVar("T")
 
 
 class WithOptions(Protocol):
@@ -168,7 +184,7 @@ LARGEST: Final = 1e6
 
 def option(
     default: Any,
-    help: str,  # noqa: A002
+    help: str = "",  # noqa: A002
     *,
     least: float = -math.inf,
     most: float | None = None,
@@ -185,7 +201,7 @@ def option(
     default
         Its default value.
     help : str
-        What it means, in lower case and without a full stop.
+        What it means, in lower case and without a full stop; ``parameters`` takes it from the docstring instead.
     least, most : float
         The range of a number. With ``least`` alone, ``most`` is ``LARGEST``, so that times in nanoseconds and counts of
         steps fit 64 bits.
@@ -221,9 +237,25 @@ def option(
     return field(default=default, metadata=about)
 
 
-def setting(default: Any, help: str, **about: Any) -> Any:  # noqa: A002
+def setting(default: Any, help: str = "", **about: Any) -> Any:  # noqa: A002
     """Declare a parameter as ``option`` does that only ``--set`` sets: the command has no option of its own for it."""
     return option(default, help, flag=False, **about)
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True)
+def parameters(cls: type[T]) -> type[T]:
+    """Make a frozen, keyword-only dataclass of a transform, as commands are declared: each parameter that is made with
+    ``option`` has its help in the section Parameters of the docstring.
+    """
+    _, *sections = re.split(r"^(\w+)\n-+\n", inspect.cleandoc(cls.__doc__ or ""), flags=re.M)
+    text = dict(zip(sections[::2], sections[1::2], strict=True)).get("Parameters", "")
+    for name, lines in re.findall(r"^(\w+) : .+\n((?: +.+\n?)+)", text, flags=re.M):
+        meaning = " ".join(lines.split()).removesuffix(".")
+        if not meaning[1:2].isupper():  # an abbreviation
+            meaning = meaning[:1].lower() + meaning[1:]
+        declared = vars(cls)[name]
+        setattr(cls, name, field(default=declared.default, metadata={**declared.metadata, "help": meaning}))
+    return dataclass(frozen=True, kw_only=True)(cls)
 
 
 def context(factory: Callable[[], Any], *, is_recorded: bool = True) -> Any:

@@ -270,16 +270,8 @@ def combine_displacements(parts: list[Displacement]) -> Displacement:
     longest = max(part.error_m.shape[1] for part in parts)
     away = [np.pad(p.error_m, ((0, 0), (0, longest - p.error_m.shape[1])), constant_values=np.nan) for p in parts]
     return Displacement(
-        d_obs_m2=pooled("d_obs_m2"),
-        ade_m=pooled("ade_m"),
-        fde_m=pooled("fde_m"),
-        ade_squared_m2=pooled("ade_squared_m2"),
-        covered=pooled("covered"),
-        nll=pooled("nll"),
-        people=sum(part.people for part in parts),
-        false_forecasts=sum(part.false_forecasts for part in parts),
-        frames=sum(part.frames for part in parts),
-        consistency_m=pooled("consistency_m"),
+        **{name: pooled(name) for name in ("d_obs_m2", "consistency_m", *ForecastErrors._fields) if name != "error_m"},
+        **{name: sum(getattr(part, name) for part in parts) for name in ("people", "false_forecasts", "frames")},
         error_m=np.concatenate(away),
     )
 
@@ -534,16 +526,11 @@ def displacement(
     errors = forecast_errors(pairs.offset_m[is_known], forecasts.cov_m2[number], forecasts.shapes(number))
     return Displacement(
         d_obs_m2=pairs.d_obs_m2[is_known],
-        ade_m=errors.ade_m,
-        fde_m=errors.fde_m,
-        ade_squared_m2=errors.ade_squared_m2,
-        covered=errors.covered,
-        nll=errors.nll,
         people=pairs.people,
         false_forecasts=int(pairs.is_judged.sum() - (pairs.d_obs_m2 < tau_m2).sum()),
         frames=pairs.frames,
         consistency_m=_consistency_m(forecasts),
-        error_m=errors.error_m,
+        **errors._asdict(),
     )
 
 

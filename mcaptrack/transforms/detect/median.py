@@ -27,6 +27,8 @@ from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.transforms.detect.background import (
     MAX_FOREGROUND,
     KnnDetector,
+    Registration,
+    Steadiness,
     boxes_to_rows,
     clear_border,
     halve,
@@ -34,8 +36,7 @@ from mcaptrack.transforms.detect.background import (
     warp,
 )
 from mcaptrack.transforms.detect.people import Learner, Person, Separator, region_boxes, typical_heights
-from mcaptrack.transforms.detect.registration import Registration, Steadiness
-from mcaptrack.transforms.protocol import Colour, check_options, option, setting
+from mcaptrack.transforms.protocol import Colour, check_options, option, parameters, setting
 
 #: A shorter view, or one of fewer pictures, has no background of its own: people hardly move in that time.
 _MIN_SPAN_S: Final = 1.8
@@ -291,12 +292,29 @@ def _outside(image: Image, lowest: Image, highest: Image) -> Image:
     return largest(np.asarray(cv2.max(cv2.subtract(image, highest), cv2.subtract(lowest, image)), np.uint8))
 
 
-@dataclass(frozen=True, kw_only=True)
+@parameters
 class MedianDetector:
     """Detect who differs from the median of the recording, in colour; shadows are removed, groups separated.
 
     Reads video twice, writes detections: one box for each person. People who stand still are found as long as they
     stand for less than half of ``history_s``.
+
+    Parameters
+    ----------
+    threshold : float
+        Difference of colour (0 to 255) that counts as motion at least.
+    history_s : float
+        Length of the blocks of time that have one background, in seconds.
+    max_pixels : int
+        Pictures are halved until they have no more pixels than this.
+    stabilise : bool
+        Compensate the motion of a shaking camera.
+    remove_shadows : bool
+        Leave out what is darker than the background, but of the same colour.
+    separate : bool
+        Separate people who are one region, by the height and shape of people in the scene.
+    least_visible : float
+        Share of a person that has to be seen for a box of their own beside others.
 
     Examples
     --------
@@ -319,19 +337,13 @@ class MedianDetector:
 
     """
 
-    threshold: float = option(
-        MIN_THRESHOLD, "difference of colour (0 to 255) that counts as motion at least", least=0.0
-    )
-    history_s: float = setting(600.0, "length of the blocks of time that have one background, in seconds", least=0.1)
-    max_pixels: int = setting(
-        1_000_000, "pictures are halved until they have no more pixels than this", least=1_000, most=1_000_000_000
-    )
-    stabilise: bool = setting(True, "compensate the motion of a shaking camera")
-    remove_shadows: bool = setting(True, "leave out what is darker than the background, but of the same colour")
-    separate: bool = setting(True, "separate people who are one region, by the height and shape of people in the scene")
-    least_visible: float = setting(
-        0.5, "share of a person that has to be seen for a box of their own beside others", least=0.05, most=1.0
-    )
+    threshold: float = option(MIN_THRESHOLD, least=0.0)
+    history_s: float = setting(600.0, least=0.1)
+    max_pixels: int = setting(1_000_000, least=1_000, most=1_000_000_000)
+    stabilise: bool = setting(True)
+    remove_shadows: bool = setting(True)
+    separate: bool = setting(True)
+    least_visible: float = setting(0.5, least=0.05, most=1.0)
 
     colour: ClassVar[Colour] = "bgr"
     passes: ClassVar[int] = 2

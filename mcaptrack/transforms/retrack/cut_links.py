@@ -21,7 +21,7 @@ from mcaptrack.transforms.retrack.appearance import MOST, Evidence
 from mcaptrack.transforms.retrack.assignments import Tracks
 from mcaptrack.transforms.retrack.joins import Cuts
 from mcaptrack.transforms.retrack.linking import TrackEnds
-from mcaptrack.transforms.retrack.weights import weights_of
+from mcaptrack.transforms.retrack.weights import Logistic
 
 #: The features of a link at a cut: those of a link; whether both are pieces of one track, and if so the log odds of
 #: that join; whether they have one input id; the log odds of the joins that it would replace; whether the one was cut
@@ -48,8 +48,7 @@ _SAME_ID_S: Final = 6.0
 _ENOUGH_AT_CUTS: Final = 1 / 11
 #: Probabilities of joins are taken for no closer to 0 and 1 than this.
 _CLOSEST: Final = 1e-6
-_RELINKS_WEIGHTS, _RELINKS_FITTED = weights_of("relinks", FEATURES)
-_RELINKS_BIAS: Final = float(_RELINKS_FITTED["bias"])
+_RELINKS: Final = Logistic.of("relinks", FEATURES)
 
 
 class CutTracks(NamedTuple):
@@ -142,7 +141,7 @@ def link_pieces(
     candidates = find_candidates(sides, max_gap_s, pieces, evidence)
     if len(candidates.ends) == 0:
         return continued_by
-    at_cut = candidates.features @ _RELINKS_WEIGHTS + _RELINKS_BIAS + candidates.evidence
+    at_cut = _RELINKS.log_odds(candidates.features) + candidates.evidence
     log_odds = np.where(candidates.at_cut, at_cut, candidates.log_odds)
     shift = np.zeros(len(log_odds))
     links = np.empty(0, np.int64)

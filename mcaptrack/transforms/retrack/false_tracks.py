@@ -13,7 +13,7 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.neighbours import near_pairs
 from mcaptrack.geometry.ragged import group_index, run_starts
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
-from mcaptrack.transforms.retrack.weights import weights_of
+from mcaptrack.transforms.retrack.weights import Logistic, probability
 
 # The features that tell people from false tracks: how long, where and how regularly a track was seen.
 #
@@ -189,12 +189,11 @@ def _rare_gaps(trajectories: Trajectories, goes: Bools) -> Floats:
     return np.asarray(total / np.maximum(count, 1))
 
 
-#: Weight of each feature as a log odds ratio, and the log odds without any; means and spreads of features.
-_WEIGHTS, _FITTED = weights_of("people", FEATURES)
-_BIAS: Final = float(_FITTED["bias"])
-_MEAN, _SPREAD = (np.array([_FITTED[what][name] for name in FEATURES]) for what in ("mean", "spread"))
+#: Whether a track is a person; means and spreads of features.
+_PEOPLE: Final = Logistic.of("people", FEATURES)
+_MEAN, _SPREAD = (np.array([_PEOPLE.numbers[what][name] for name in FEATURES]) for what in ("mean", "spread"))
 #: What is added to the log odds of tracks that stand for the whole log.
-_THROUGHOUT: Final = float(_FITTED["stands throughout"])
+_THROUGHOUT: Final = float(_PEOPLE.numbers["stands throughout"])
 #: How strongly weights stay as they were fitted while they follow a log, and how much each step of a track counts
 #: against that, up to so many steps. (Chosen on synthetic scenes and crowds.)
 _STAYS: Final = 30.0
@@ -204,11 +203,6 @@ _EACH_STEP, _MOST_STEPS = 1 / 8, 20
 SCORED: Final = (-3.1, 0.8, 1.1, 5.1, 1.6)
 _LOW: Final = 0.6
 _ENOUGH: Final = 10
-
-
-def probability(log_odds: Floats) -> Floats:
-    """Log odds as probabilities."""
-    return np.asarray(1 / (1 + np.exp(-log_odds)))
 
 
 def log_odds_in_log(model: MotionModel, trajectories: Trajectories, smoothed: State, log: tuple[int, int]) -> Floats:
@@ -229,7 +223,7 @@ def log_odds_in_log(model: MotionModel, trajectories: Trajectories, smoothed: St
     # not a feature: its weight doesn't follow the log, and is no reason to think less of others who stand
     extra = _THROUGHOUT * stand_throughout(trajectories, smoothed, values, log, model.step_s)
     counts = _EACH_STEP * np.minimum(np.diff(trajectories.first), _MOST_STEPS)
-    fitted = np.append(_WEIGHTS * _SPREAD, _BIAS + _WEIGHTS @ _MEAN)
+    fitted = np.append(_PEOPLE.weights * _SPREAD, _PEOPLE.bias + _PEOPLE.weights @ _MEAN)
 
     def loss(weights: Floats) -> tuple[float, Floats]:
         value, off = columns @ weights + extra, weights - fitted

@@ -18,10 +18,9 @@ from mcaptrack.geometry.ragged import batches, group_index, ragged_range, run_st
 from mcaptrack.transforms.retrack import linking
 from mcaptrack.transforms.retrack.appearance import Appearance
 from mcaptrack.transforms.retrack.assignments import Tracks
-from mcaptrack.transforms.retrack.false_tracks import probability
 from mcaptrack.transforms.retrack.linking import Gaps
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, filtered, to_trajectories
-from mcaptrack.transforms.retrack.weights import weights_of
+from mcaptrack.transforms.retrack.weights import Logistic
 
 #: The features of a join: those of a link, and by how much it is likelier than the best alternative (see
 #: ``_alternatives``); whether there is one; whether another track had the samples of the new input id just before, and
@@ -50,8 +49,7 @@ _RATE_SAMPLES: Final = 50
 #: The number of pairs that are examined at once.
 _BATCH: Final = 500_000
 #: Weights of joins of online tracks, which may be cut.
-_CUTS_WEIGHTS, _CUTS_FITTED = weights_of("cuts", FEATURES)
-_CUTS_BIAS: Final = float(_CUTS_FITTED["bias"])
+_CUTS: Final = Logistic.of("cuts", FEATURES)
 
 
 class Tracked(NamedTuple):
@@ -99,7 +97,7 @@ def cut_joins(
     """
     ordered = tracks.take(order := tracks.order)
     joins = find_joins(tracked_of(model, ordered), model)
-    is_right = cut_probability(joins.features)
+    is_right = _CUTS.probability(joins.features)
     questioned = with_appearance(is_right, joins, ordered, appearance) < max(_QUESTIONED, min_confidence)
     begins = np.zeros(len(order), bool)
     begins[joins.after[questioned]] = True
@@ -127,11 +125,6 @@ def tracked_of(model: MotionModel, tracks: Tracks) -> Tracked:
     _, row, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
     forward, backward = filtered(model, trajectories)
     return Tracked(tracks, forward.take(row), backward.take(row))
-
-
-def cut_probability(features: Floats) -> Floats:
-    """The probability (J,) that joins of online tracks with these features (J, F) are right."""
-    return probability(features @ _CUTS_WEIGHTS + _CUTS_BIAS)
 
 
 def find_joins(tracked: Tracked, model: MotionModel) -> Joins:

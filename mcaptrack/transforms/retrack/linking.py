@@ -17,9 +17,8 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.assignment import Pairs, assign_by_gain, assign_pairs_by_gain
 from mcaptrack.geometry.ragged import batches, group_index, ragged_range, run_starts
 from mcaptrack.transforms.retrack.appearance import Evidence
-from mcaptrack.transforms.retrack.false_tracks import probability
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories, filtered
-from mcaptrack.transforms.retrack.weights import weights_of
+from mcaptrack.transforms.retrack.weights import Logistic, probability
 
 #: A track that continues another begins no farther from its end than this, and so much more for each second between.
 _REACH_M, _MAX_SPEED_M_PER_S = 1.0, 2.5
@@ -27,12 +26,12 @@ _REACH_M, _MAX_SPEED_M_PER_S = 1.0, 2.5
 FEATURES: Final = ("miss", "misfit", "gap", "misfit or stay", "turn", "distance and speed", "misfit and speed")
 #: Weight of each feature as a log odds ratio; and the log odds without any, in logs where a share of ``_PRIOR`` of the
 #: best links is right. Links with log odds below ``_MIN_LOG_ODDS`` are not considered.
-_WEIGHTS, _FITTED = weights_of("links", FEATURES)
-_BIAS, _PRIOR, _MIN_LOG_ODDS = (float(_FITTED[name]) for name in ("bias", "usual", "least"))
+_LINKS: Final = Logistic.of("links", FEATURES)
+_PRIOR, _MIN_LOG_ODDS = (float(_LINKS.numbers[name]) for name in ("usual", "least"))
 #: Gaps are of classes with these bounds in seconds; the mean probability of the best links of each, where as many are
 #: right as usual; and with how many links more this is taken to be so in a log.
 _GAPS_S: Final = (0.9, 1.7, 3.3, 6.5, 13.0)
-_BY_GAP: Final = np.array(_FITTED["usual by gap"])
+_BY_GAP: Final = np.array(_LINKS.numbers["usual by gap"])
 _GAP_LINKS: Final = 5.0
 #: Added to distances and speeds before taking logarithms: differences below these mean nothing.
 _NEAR_M, _SPEED_M_PER_S = 0.3, 0.15
@@ -117,7 +116,7 @@ def link_tracks(
 
 def log_odds(values: Floats) -> Floats:
     """The log odds that links with these features (E, F) are right, where as many are as usual."""
-    return np.asarray(values @ _WEIGHTS + _BIAS)
+    return _LINKS.log_odds(values)
 
 
 def has_chance(log_odds: Floats) -> Bools:

@@ -27,13 +27,13 @@ from mcaptrack.schema.resampling import ANGLES, LINEAR
 from mcaptrack.transforms.retrack.appearance import Appearance, AppearanceCalibration, Descriptors
 from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, LogSamples, Movers, Tracks
 from mcaptrack.transforms.retrack.cut_links import CutTracks, link_pieces
-from mcaptrack.transforms.retrack.false_tracks import log_odds_in_log, probability, scored_log_odds
+from mcaptrack.transforms.retrack.false_tracks import log_odds_in_log, scored_log_odds
 from mcaptrack.transforms.retrack.identity_swaps import resolve_swaps
 from mcaptrack.transforms.retrack.joins import FEATURES, Joins, Tracked, cut_joins, find_joins, with_appearance
 from mcaptrack.transforms.retrack.linking import TrackEnds, link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, smooth, to_trajectories
 from mcaptrack.transforms.retrack.options import RetrackOptions
-from mcaptrack.transforms.retrack.weights import weights_of
+from mcaptrack.transforms.retrack.weights import Logistic, probability
 
 #: Links of tracks in metres miss by at most so much, and so much more for each second of the gap.
 MAX_MISFIT: Final = (0.6, 0.2)
@@ -129,11 +129,9 @@ def _runs(is_fixed: Bools) -> list[tuple[int, int]]:
 # Letters: C assignments, K tracks, J joins, D decisions.
 
 
-_JOINS_WEIGHTS, _JOINS_FITTED = weights_of("joins", FEATURES)
-_JOINS_BIAS: Final = float(_JOINS_FITTED["bias"])
+JOINS: Final = Logistic.of("joins", FEATURES)
 #: The log odds that a track is a person, from those of the test of false tracks: that one weighs rows, not tracks.
-_PERSON_WEIGHTS, _PERSON_FITTED = weights_of("decided", ("log odds",))
-_PERSON_BIAS: Final = float(_PERSON_FITTED["bias"])
+PERSON: Final = Logistic.of("decided", ("log odds",))
 _NO_ID: Final = -1
 
 
@@ -172,23 +170,13 @@ def find_kept_joins(decided: Decided, model: MotionModel) -> Joins:
     return Joins(*(values[kept] for values in joins))
 
 
-def join_probability(features: Floats) -> Floats:
-    """The probability (J,) that joins with these features (J, F) are right."""
-    return probability(features @ _JOINS_WEIGHTS + _JOINS_BIAS)
-
-
-def person_probability(log_odds: Floats) -> Floats:
-    """The probability (K,) that tracks with these log odds, of the test of false tracks, are people."""
-    return probability(log_odds * _PERSON_WEIGHTS[0] + _PERSON_BIAS)
-
-
 def _joined(decided: Decided, joins: Joins, step_s: float) -> tuple[Ints, Rows]:
     """The assignment of each join (J,), and its row."""
     step, track, source = decided.tracked.tracks[:3]
     rows = DECISIONS.empty(len(joins.after))
     rows["kind"], rows["track_id"] = DecisionKind.JOINED, track[joins.after]
     rows["previous_id"], rows["source_id"] = source[joins.before], source[joins.after]
-    by_motion = join_probability(joins.features)
+    by_motion = JOINS.probability(joins.features)
     rows["probability"] = with_appearance(by_motion, joins, decided.tracked.tracks, decided.appearance)
     rows["alternative_id"] = np.where(joins.alternative >= 0, source[joins.alternative], _NO_ID)
     rows["duration_s"] = (step[joins.after] - step[joins.before]) * step_s
@@ -205,7 +193,7 @@ def _persons(decided: Decided, step_s: float) -> tuple[Ints, Rows]:
     rows["track_id"] = np.where(decided.kept, track[first], _NO_ID)
     rows["previous_id"] = rows["alternative_id"] = _NO_ID
     rows["source_id"] = _usual(track, source)
-    is_person = person_probability(decided.log_odds)
+    is_person = PERSON.probability(decided.log_odds[:, None])
     rows["probability"] = np.where(decided.kept, is_person, 1 - is_person)
     rows["duration_s"] = (step[last] - step[first]) * step_s
     rows["frames"] = last - first + 1

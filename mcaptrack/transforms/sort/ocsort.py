@@ -10,7 +10,6 @@ Letters: N detections, K tracks, P pairs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -18,7 +17,7 @@ import numpy as np
 from mcaptrack.geometry import kalman
 from mcaptrack.geometry.affine import move_boxes, move_points
 from mcaptrack.geometry.arrays import Floats, Indices
-from mcaptrack.transforms.protocol import setting
+from mcaptrack.transforms.protocol import parameters, setting
 from mcaptrack.transforms.sort.tracker import (
     SHARED_ROWS,
     AssociationInput,
@@ -38,12 +37,23 @@ _FRAMES_SINCE: Final = _LAST_STATE.stop
 _CENTRES: Final = _FRAMES_SINCE + 1
 
 
-@dataclass(frozen=True, kw_only=True)
+@parameters
 class OcSort(Sort):
     """OC-SORT: observations count for more than the filter.
 
     Matches that keep a track's direction of motion are preferred, lost tracks are matched once more by their last
     detection, and a track that is found again has its filter recomputed over the gap.
+
+    Parameters
+    ----------
+    inertia : float
+        Weight of the direction of motion, beside overlap.
+    direction_frames : int
+        Number of frames over which the direction of motion is measured.
+    recover : bool
+        Match lost tracks once more by their last detection.
+    reupdate : bool
+        Recompute the filter over the gap when a track is found again.
 
     Examples
     --------
@@ -62,12 +72,10 @@ class OcSort(Sort):
     J. Cao et al., "Observation-Centric SORT: Rethinking SORT for Robust Multi-Object Tracking", CVPR 2023.
     """
 
-    inertia: float = setting(0.2, "weight of the direction of motion, beside overlap", least=0.0, search=(0.0, 0.6))
-    direction_frames: int = setting(
-        3, "number of frames over which the direction of motion is measured", least=2, most=100, search=(2, 10)
-    )
-    recover: bool = setting(True, "match lost tracks once more by their last detection")
-    reupdate: bool = setting(True, "recompute the filter over the gap when a track is found again")
+    inertia: float = setting(0.2, least=0.0, search=(0.0, 0.6))
+    direction_frames: int = setting(3, least=2, most=100, search=(2, 10))
+    recover: bool = setting(True)
+    reupdate: bool = setting(True)
 
     def _empty_tracks(self) -> Tracks:
         return Tracks(_CENTRES - SHARED_ROWS + 2 * (self.direction_frames + 1))

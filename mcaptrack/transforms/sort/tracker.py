@@ -30,7 +30,7 @@ from mcaptrack.geometry.plane import GroundPlane, Planes, moved_planes, plane_at
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.framing import join_frames
-from mcaptrack.transforms.protocol import check_options, context, option, setting
+from mcaptrack.transforms.protocol import check_options, context, option, parameters, setting
 
 #: Number of frames that are converted at once.
 _BLOCK_FRAMES = 64
@@ -293,12 +293,40 @@ _DETECTIONS: Final = "Detections"
 _LIFE: Final = "Begin and end of tracks"
 
 
-@dataclass(frozen=True, kw_only=True)
+@parameters
 class Sort:
     """Track detections over time.
 
     Reads detections, writes tracks: one row per frame for each person who is tracked and detected in it. SORT matches
     detections with the positions that Kalman filters predict for the tracks.
+
+    Parameters
+    ----------
+    max_age_s : float
+        A track ends after this many seconds without a detection.
+    max_age_frames : int or None
+        A track ends after this many frames without a detection, instead of --max-age-s.
+    min_hits_s : float
+        A track is written once it was detected without a break for this many seconds.
+    min_hits_frames : int or None
+        A track is written once it was detected in this many frames in a row, instead of --min-hits-s.
+    cost : str
+        How detections and tracks are compared: overlap of boxes (iou), or distance in pixels or in metres.
+    min_iou : float
+        Least overlap (IoU) of a detection with a track's predicted box.
+    max_distance_px : float
+        With cost pixels: largest distance of a box's centre from the predicted one, in pixels.
+    max_distance_m : float
+        With cost metres: largest distance on the ground from the predicted position, in metres.
+    min_score : float or None
+        Ignore detections with a lower score.
+    class_id : int or None
+        Ignore detections of other classes.
+    across_classes : bool
+        A track may continue with a detection of another class; it then has the class of most of its detections.
+    camera_motion : str
+        Move predictions with the camera: if it moves or has cuts (auto), also if it only shakes (on), or never
+        (off).
 
     Examples
     --------
@@ -317,64 +345,18 @@ class Sort:
     A. Bewley et al., "Simple Online and Realtime Tracking", ICIP 2016.
     """
 
-    max_age_s: float = option(
-        1.4, "a track ends after this many seconds without a detection", least=0.0, search=(0.2, 4.0), theme=_LIFE
-    )
-    max_age_frames: int | None = setting(
-        None, "a track ends after this many frames without a detection, instead of --max-age-s", least=0, theme=_LIFE
-    )
-    min_hits_s: float = option(
-        0.3,
-        "a track is written once it was detected without a break for this many seconds",
-        least=0.0,
-        search=(0.0, 1.0),
-        theme=_LIFE,
-    )
-    min_hits_frames: int | None = option(
-        None,
-        "a track is written once it was detected in this many frames in a row, instead of --min-hits-s",
-        least=0,
-        theme=_LIFE,
-    )
-    cost: Cost = setting(
-        "iou",
-        "how detections and tracks are compared: overlap of boxes (iou), or distance in pixels or in metres",
-        theme=_ASSOCIATION,
-    )
-    min_iou: float = option(
-        0.2,
-        "least overlap (IoU) of a detection with a track's predicted box",
-        least=0.0,
-        most=1.0,
-        search=(0.05, 0.6),
-        theme=_ASSOCIATION,
-    )
-    max_distance_px: float = setting(
-        60.0,
-        "with cost pixels: largest distance of a box's centre from the predicted one, in pixels",
-        least=0.0,
-        theme=_ASSOCIATION,
-    )
-    max_distance_m: float = setting(
-        1.0,
-        "with cost metres: largest distance on the ground from the predicted position, in metres",
-        least=0.0,
-        theme=_ASSOCIATION,
-    )
-    min_score: float | None = option(None, "ignore detections with a lower score", theme=_DETECTIONS)
-    class_id: int | None = setting(
-        None, "ignore detections of other classes", least=0, most=2**31 - 1, theme=_DETECTIONS
-    )
-    across_classes: bool = option(
-        False,
-        "a track may continue with a detection of another class; it then has the class of most of its detections",
-        theme=_DETECTIONS,
-    )
-    camera_motion: CameraMotionUse = option(
-        "auto",
-        "move predictions with the camera: if it moves or has cuts (auto), also if it only shakes (on), or never (off)",
-        theme=_ASSOCIATION,
-    )
+    max_age_s: float = option(1.4, least=0.0, search=(0.2, 4.0), theme=_LIFE)
+    max_age_frames: int | None = setting(None, least=0, theme=_LIFE)
+    min_hits_s: float = option(0.3, least=0.0, search=(0.0, 1.0), theme=_LIFE)
+    min_hits_frames: int | None = option(None, least=0, theme=_LIFE)
+    cost: Cost = setting("iou", theme=_ASSOCIATION)
+    min_iou: float = option(0.2, least=0.0, most=1.0, search=(0.05, 0.6), theme=_ASSOCIATION)
+    max_distance_px: float = setting(60.0, least=0.0, theme=_ASSOCIATION)
+    max_distance_m: float = setting(1.0, least=0.0, theme=_ASSOCIATION)
+    min_score: float | None = option(None, theme=_DETECTIONS)
+    class_id: int | None = setting(None, least=0, most=2**31 - 1, theme=_DETECTIONS)
+    across_classes: bool = option(False, theme=_DETECTIONS)
+    camera_motion: CameraMotionUse = option("auto", theme=_ASSOCIATION)
     ground_planes: Planes = context(tuple)
     camera_path: CameraPath | None = context(lambda: None, is_recorded=False)
 

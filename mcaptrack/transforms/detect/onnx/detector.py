@@ -41,7 +41,7 @@ from mcaptrack.transforms.detect.onnx.layouts import (
 )
 from mcaptrack.transforms.detect.onnx.nms import Boxes, Size, Tile, join_tiles, place, suppress, tiles_of
 from mcaptrack.transforms.detect.onnx.session import DetectorNetwork, check, find, stored, workers
-from mcaptrack.transforms.protocol import Colour, ModelCard, Suited, check_options, option, setting
+from mcaptrack.transforms.protocol import Colour, ModelCard, Suited, check_options, option, parameters, setting
 
 LayoutChoice = Literal["auto", "yolox", "yolox-legacy", "nanodet", "rtdetr", "dfine", "rfdetr", "ultralytics"]
 
@@ -155,11 +155,35 @@ def _people(names: Mapping[int, str]) -> int | None:
     return next((by_name[name] for name in PEOPLE if name in by_name), None)
 
 
-@dataclass(frozen=True, kw_only=True)
+@parameters
 class OnnxDetector:
     """With `--detector onnx:FILE` a network in ONNX format finds objects in each picture.
 
     Reads video, writes detections: one box for each object of the chosen classes.
+
+    Parameters
+    ----------
+    file : str
+        ONNX file of the network; `onnx:FILE` names it, too.
+    layout : str
+        Family of the network, which says what it takes and gives; `auto` tells it by names, shapes and a trial.
+    input_size : str
+        Width and height of the network's input, as in 960x736, or `picture` for about those of the picture;
+        otherwise the network's own.
+    device : str
+        Where the network runs; `auto` takes a GPU if ONNX Runtime can use one.
+    max_memory_mb : int
+        Most memory that the network may take, in MB.
+    tiles : str
+        Columns and rows of tiles that each picture is cut into, as in 3x2, for small objects.
+    overlap : float
+        How much of its width or height a tile shares with the next one.
+    classes : str
+        Classes to detect, by name or index with commas between them; `all` for every one.
+    min_score : float
+        Boxes with a lower score are left out.
+    max_iou : float
+        Boxes of one class that overlap more are one object.
 
     Examples
     --------
@@ -170,44 +194,16 @@ class OnnxDetector:
     []
     """
 
-    file: str = option("", "ONNX file of the network; `onnx:FILE` names it, too", theme=NETWORK)
-    layout: LayoutChoice = option(
-        "auto",
-        "family of the network, which says what it takes and gives; `auto` tells it by names, shapes and a trial",
-        theme=NETWORK,
-    )
-    input_size: str = option(
-        "",
-        "width and height of the network's input, as in 960x736, or `picture` for about those of the picture; "
-        "otherwise the network's own",
-        theme=NETWORK,
-    )
-    device: Device = option(
-        "auto", "where the network runs; `auto` takes a GPU if ONNX Runtime can use one", theme=NETWORK
-    )
-    max_memory_mb: int = option(
-        1000, "most memory that the network may take, in MB", least=10, most=1_000_000, theme=NETWORK
-    )
-    tiles: str = option(
-        "1x1", "columns and rows of tiles that each picture is cut into, as in 3x2, for small objects", theme=_BOXES
-    )
-    overlap: float = setting(
-        0.2, "how much of its width or height a tile shares with the next one", least=0.0, most=0.5, theme=_BOXES
-    )
-    classes: str = option(
-        "person", "classes to detect, by name or index with commas between them; `all` for every one", theme=_BOXES
-    )
-    min_score: float = option(
-        0.1, "boxes with a lower score are left out", least=0.0, most=1.0, search=(0.05, 0.6), theme=_BOXES
-    )
-    max_iou: float = setting(
-        0.45,
-        "boxes of one class that overlap more are one object",
-        least=0.0,
-        most=1.0,
-        search=(0.3, 0.8),
-        theme=_BOXES,
-    )
+    file: str = option("", theme=NETWORK)
+    layout: LayoutChoice = option("auto", theme=NETWORK)
+    input_size: str = option("", theme=NETWORK)
+    device: Device = option("auto", theme=NETWORK)
+    max_memory_mb: int = option(1000, least=10, most=1_000_000, theme=NETWORK)
+    tiles: str = option("1x1", theme=_BOXES)
+    overlap: float = setting(0.2, least=0.0, most=0.5, theme=_BOXES)
+    classes: str = option("person", theme=_BOXES)
+    min_score: float = option(0.1, least=0.0, most=1.0, search=(0.05, 0.6), theme=_BOXES)
+    max_iou: float = setting(0.45, least=0.0, most=1.0, search=(0.3, 0.8), theme=_BOXES)
 
     reads: ClassVar[Schema] = VIDEO
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": DETECTIONS})
@@ -590,16 +586,20 @@ def size_for(width: int, height: int) -> Size:
 # The detectors of the catalogue, each with the settings that suit it.
 
 
-@dataclass(frozen=True, kw_only=True)
+@parameters
 class CataloguedDetector(OnnxDetector):
-    """Base of the detectors of the catalogue: YOLOX, with an input of about the size of the picture."""
+    """Base of the detectors of the catalogue: YOLOX, with an input of about the size of the picture.
 
-    layout: LayoutChoice = option("yolox", "family of the network", theme=NETWORK)
-    input_size: str = option(
-        "picture",
-        "width and height of the network's input, as in 416x416, or `picture` for about those of the picture",
-        theme=NETWORK,
-    )
+    Parameters
+    ----------
+    layout : str
+        Family of the network.
+    input_size : str
+        Width and height of the network's input, as in 416x416, or `picture` for about those of the picture.
+    """
+
+    layout: LayoutChoice = option("yolox", theme=NETWORK)
+    input_size: str = option("picture", theme=NETWORK)
 
     #: False boxes score up to 0.6 and begin no tracks, so that those that begin need no confirmation.
     suits: ClassVar[Mapping[str, Suited]] = MappingProxyType(
