@@ -15,8 +15,8 @@ from mcaptrack import log
 from mcaptrack.evaluation.events import lifecycle_of
 from mcaptrack.schema import DECISIONS, DecisionKind, EventKind, Frame
 from mcaptrack.transforms import PROFILES, Retrack
-from mcaptrack.transforms.retrack import joins as join_steps
-from mcaptrack.transforms.retrack.joins import cut_joins, find_joins, tracked_of
+from mcaptrack.transforms.retrack import linking as join_steps
+from mcaptrack.transforms.retrack.linking import cut_joins, find_joins, tracked_of
 from mcaptrack.transforms.retrack.motion_model import MotionModel
 from mcaptrack.viewing.report.doubts import Doubt, find_doubtful_tracks
 from mcaptrack.viewing.report.identity_events import IdentityEvent

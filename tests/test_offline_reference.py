@@ -9,10 +9,8 @@ from hypothesis import strategies as st
 
 from mcaptrack.transforms.retrack import linking, offline
 from mcaptrack.transforms.retrack.assignments import Tracks
-from mcaptrack.transforms.retrack.cut_links import CutTracks, find_candidates, link_pieces
 from mcaptrack.transforms.retrack.identity_swaps import find_swaps, resolve_swaps
-from mcaptrack.transforms.retrack.joins import Cuts
-from mcaptrack.transforms.retrack.linking import TrackEnds, link_tracks
+from mcaptrack.transforms.retrack.linking import Cuts, CutTracks, TrackEnds, find_candidates, link_pieces, link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
 from tests.memory import held
 from tests.references import cut_links

@@ -10,7 +10,7 @@ import pytest
 
 import mcaptrack
 from mcaptrack.predictors.weights import load
-from mcaptrack.transforms.retrack import cut_links, false_tracks, joins, linking
+from mcaptrack.transforms.retrack import false_tracks, linking
 from mcaptrack.transforms.retrack.weights import WEIGHTS, Logistic
 from tools import crowds
 from tools.fit_retrack import (
@@ -41,8 +41,9 @@ def test_weights_go_by_the_names_of_features_in_any_order():
     names = ("gap", "miss")
     found = json.loads(WEIGHTS.read_text())["links"]["weights"]
     assert Logistic.of("links", names).weights.tolist() == [found["gap"], found["miss"]]
-    models = {"links": linking, "people": false_tracks, "cuts": joins, "relinks": cut_links, "joins": joins}
-    for model, features in ((name, module.FEATURES) for name, module in models.items()):
+    of_joins = linking.JOIN_FEATURES
+    models = {"links": linking.FEATURES, "people": false_tracks.FEATURES, "cuts": of_joins, "joins": of_joins}
+    for model, features in (models | {"relinks": linking.RELINK_FEATURES}).items():
         assert set(json.loads(WEIGHTS.read_text())[model]["weights"]) == set(features)
 
 

@@ -37,10 +37,10 @@ from mcaptrack.evaluation.metrics import combine, score, summary
 from mcaptrack.geometry.assignment import assign, solve
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES, Sample
-from mcaptrack.transforms.retrack import cut_links, false_tracks, joins, linking, offline
+from mcaptrack.transforms.retrack import false_tracks, linking, offline
 from mcaptrack.transforms.retrack.assignments import Tracks
-from mcaptrack.transforms.retrack.joins import Joins, find_joins, tracked_of
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
+from mcaptrack.transforms.retrack.linking import Joins, find_joins, tracked_of
 from mcaptrack.transforms.retrack.motion_model import Trajectories
 from mcaptrack.transforms.retrack.weights import WEIGHTS, Logistic, probability
 
@@ -243,7 +243,7 @@ def cuts_of(run: Run) -> Judged:
 def relinks_of(run: Run) -> Judged:
     """The candidate links at the cuts of a scene: right are those that are nearest in time from both sides."""
     sides, max_gap_s, _, pieces, _ = reached("link_pieces", *run.args)
-    found, paths = cut_links.find_candidates(sides, max_gap_s, pieces), sides.trajectories
+    found, paths = linking.find_candidates(sides, max_gap_s, pieces), sides.trajectories
     owner = owners_of(run, paths)
     ends, begins = usual(owner, paths, -1)[found.ends], usual(owner, paths, 1)[found.begins]
     same = np.flatnonzero((ends >= 0) & (ends == begins))
@@ -280,10 +280,10 @@ def fit_judged(names: tuple[str, ...], parts: Iterable[Judged]) -> dict[str, Any
 
 def fit_cuts(scenes: list[Run]) -> dict[str, Any]:
     """The weights of joins that may be cut, then of links at cuts."""
-    cuts = fit_judged(joins.FEATURES, told(cuts_of, scenes, "joins that may be cut"))
-    install(joins, "_CUTS", cuts)
-    relinks = fit_judged(cut_links.FEATURES, told(relinks_of, scenes, "links at cuts"))
-    install(cut_links, "_RELINKS", relinks)
+    cuts = fit_judged(linking.JOIN_FEATURES, told(cuts_of, scenes, "joins that may be cut"))
+    install(linking, "_CUTS", cuts)
+    relinks = fit_judged(linking.RELINK_FEATURES, told(relinks_of, scenes, "links at cuts"))
+    install(linking, "_RELINKS", relinks)
     return {"cuts": cuts, "relinks": relinks}
 
 
@@ -291,7 +291,7 @@ def fit_decisions(scenes: list[Run]) -> dict[str, Any]:
     """The weights of joins that are made, and of tracks."""
     of_joins, of_people = zip(*told(decisions_of, scenes, "decisions"), strict=True)
     return {
-        "joins": fit_judged(joins.FEATURES, of_joins),
+        "joins": fit_judged(linking.JOIN_FEATURES, of_joins),
         "decided": fit_judged(("log odds",), of_people),
     }
 
@@ -376,7 +376,7 @@ def main() -> None:
     if given.held:
         held(seeds, given.steps)
         return
-    joins._CUTS = joins._CUTS._replace(bias=np.inf)  # links don't depend on what is cut
+    linking._CUTS = linking._CUTS._replace(bias=np.inf)  # links don't depend on what is cut
     scenes = list(runs(seeds, given.steps))
     pairs = list(told(pairs_of, scenes, "links"))
     links = fit_links(pairs)

@@ -293,17 +293,13 @@ def combined(results: Sequence[EvaluationRow]) -> list[EvaluationRow]:
         key = (row.group or row.tracks, row.mode, row.similarity, row.gate, row.rules, row.of_class)
         groups.setdefault(key, []).append(row)
     out = []
-    for (tracks, mode, similarity, gate, rules, one_class), members in groups.items():
+    for (*key, one_class), members in groups.items():
         forecasts = [member.displacement for member in members if member.displacement is not None]
         scored = [part for member in members for part in member.scored] if all(m.scored for m in members) else []
         out.append(
             EvaluationRow(
                 COMBINED,
-                tracks,
-                mode,
-                similarity,
-                gate,
-                rules,
+                *key,
                 metrics.combine([member.score for member in members]),
                 combine_displacements(forecasts) if len(forecasts) == len(members) else None,
                 of_class=one_class,
@@ -342,22 +338,11 @@ def _score(
             scored = {name: scored_matchups(part) for name, part in compared.items()} if is_averaged else {}
             if gate == gates[-1] and whole.hota["HOTA_TP"][0] == 0:
                 notes += explain_no_match(sequence.name, candidate.name, ground_truth, tracks, similarity)
-            results += [
-                EvaluationRow(
-                    sequence.name,
-                    candidate.name,
-                    candidate.mode,
-                    similarity,
-                    gate,
-                    options.rules,
-                    score,
-                    group=candidate.group,
-                    of_class=name,
-                    is_3d=is_3d,
-                    scored=scored.get(name, ()),
-                )
-                for name, score in ((None, whole), *scores.items())
-            ]
+            key = sequence.name, candidate.name, candidate.mode, similarity, gate, options.rules
+            for name, score in ((None, whole), *scores.items()):
+                row = EvaluationRow(*key, score, group=candidate.group, of_class=name, is_3d=is_3d)
+                row.scored = scored.get(name, ())
+                results.append(row)
     if is_3d and results and not any(row.averages or row.scored for row in results):
         notes.append(f"{sequence.name}: {candidate.name} has no scores; there is no AMOTA and no sAMOTA")
     if not results:

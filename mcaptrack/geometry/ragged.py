@@ -75,6 +75,25 @@ def batches(counts: Ints, size: int) -> list[slice]:
     return [slice(low, high) for low, high in pairwise([*starts.tolist(), len(counts)])]
 
 
+def find_rows(have: tuple[Ints, ...], wanted: tuple[Ints, ...]) -> Ints:
+    """The row of ``have`` (N,) with the same keys as each of ``wanted`` (M,), the first of several; -1 for none.
+
+    Examples
+    --------
+    >>> find_rows((np.array([3, 3, 5]), np.array([0, 1, 0])), (np.array([5, 3, 4]), np.array([0, 1, 1]))).tolist()
+    [2, 1, -1]
+    """
+    count = len(have[0])
+    key = np.zeros(count + len(wanted[0]), np.int64)
+    for pair in zip(have, wanted, strict=True):
+        names, number = np.unique(np.concatenate(pair), return_inverse=True)
+        key = key * len(names) + number
+    order = np.argsort(key[:count], kind="stable")
+    place = np.searchsorted(key[:count][order], key[count:])
+    row = np.append(order, -1)[place]
+    return np.where((row >= 0) & (key[row] == key[count:]), row, -1)
+
+
 def run_starts(*keys: NDArray[Any], times: Ints | None = None, max_gap: int = 0) -> Bools:
     """Mask the members where a run of equal keys begins: the first, and those with another key than the one before.
 

@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, joined, taken
 from mcaptrack.geometry.mixtures import Tails, half_radius, mahalanobis_squared, squared_radius
 from mcaptrack.notices import warn
 from mcaptrack.predictors.forecast import Forecast, Predictor
@@ -51,12 +51,6 @@ class _Issued(NamedTuple):
     cov: Floats
     fit: Ints
 
-    def copied(self, which: slice) -> _Issued:
-        """A part in arrays of its own, so that the larger ones can be freed."""
-        step, ids, is_seen, past, mean, cov, fit = self
-        numbers = step[which].copy(), ids[which].copy(), is_seen[which].copy()
-        return _Issued(*numbers, past[which].copy(), mean[which].copy(), cov[which].copy(), fit[which].copy())
-
 
 class _Compared(NamedTuple):
     """Comparisons in the order of time, (M,): times in steps, steps ahead from 0, fits, and errors.
@@ -69,11 +63,6 @@ class _Compared(NamedTuple):
     fit: Ints
     half: Floats
     size_m2: Floats
-
-    def chosen(self, which: Bools) -> _Compared:
-        """Some of them."""
-        step, ahead, fit, half, size_m2 = self
-        return _Compared(step[which], ahead[which], fit[which], half[which], size_m2[which])
 
 
 # Corrects mixtures by what their ellipses have held in a log.
@@ -392,7 +381,7 @@ class TailCalibration:
 
     def _learn(self, refits: Ints) -> None:
         """Fit mixtures again at some steps (R,), each by what became known since the fit before."""
-        issued = _Issued(*(np.concatenate(parts) for parts in zip(*self._issued, strict=True)))
+        issued = joined(self._issued)
         compared, lost = self._compare(issued, refits)
         passed = np.diff(refits, prepend=self._fitted_at)
         kept = np.exp(-passed * self._step_s / _MEMORY_S)
@@ -426,7 +415,7 @@ class TailCalibration:
 
         self._fitted_at = int(refits[-1])
         left = int(np.searchsorted(issued.step, self._fitted_at - self._steps, "right"))
-        self._issued = [issued.copied(slice(left, None))]
+        self._issued = [taken(issued, np.arange(left, len(issued.step)))]
 
     def _compare(self, issued: _Issued, refits: Ints) -> tuple[_Compared, Floats]:
         """Compare forecasts with where their tracks are observed after the last fit, up to the last of ``refits``.
@@ -452,7 +441,8 @@ class TailCalibration:
         with np.errstate(invalid="ignore", divide="ignore"):
             half = mahalanobis_squared(off, cov) / 2
             size_m2 = np.sqrt(cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] ** 2)
-        return _Compared(issued.step[row], ahead, issued.fit[source], half, size_m2).chosen(np.isfinite(half)), lost
+        compared = _Compared(issued.step[row], ahead, issued.fit[source], half, size_m2)
+        return taken(compared, np.isfinite(half)), lost
 
     def _drop_fits(self) -> None:
         """Drop the fits that no forecast has any more."""

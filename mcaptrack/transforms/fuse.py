@@ -18,7 +18,7 @@ from mcaptrack.geometry.plane import GroundPlane, Planes, plane_at, runs_of_plan
 from mcaptrack.geometry.ragged import group_index, ragged_range, table_of
 from mcaptrack.schema import BOX_PX, COVARIANCE_M2, DETECTIONS, SIGHTINGS, Frame, Rows, Schema
 from mcaptrack.schema.framing import split_rows
-from mcaptrack.transforms.protocol import Suited, check_options, context, option, parameters
+from mcaptrack.transforms.protocol import Suited, context, option, parameters
 
 # One camera of a scene: where its boxes stand, and which places it sees. Letters: N boxes, G places.
 
@@ -570,9 +570,6 @@ class FootFuser:
     #: Scores are probabilities, so that few tracks need begin by mistake; people who stand are seen all the time; and
     #: positions are exact enough to expect steady walks.
     suits: ClassVar[Mapping[str, Suited]] = MappingProxyType({"tracker": Suited("ground", _TRACKED)})
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     @property
     def latency_s(self) -> Mapping[str, float]:

@@ -419,16 +419,6 @@ def _move(t: Floats, place: Floats, velocity: Floats, acceleration: Floats) -> N
 
 def _follow_box(t: Floats, detections: Floats, weight: Floats) -> None:
     """Correct z, size and heading of tracks (rows, N), in place; sizes and headings with ``weight`` 0 don't count."""
-    if weight.all() and np.isfinite(detections[_SHAPE]).all() and not np.isnan(t[_SHAPE]).any():
-        # What nearly all detections are. All else comes to the same then.
-        t[Z] += _HEIGHT_RATE * (detections[Z] - t[Z])
-        t[_SIZED] += 1
-        before = t[_SIZE]
-        limit = np.where(t[_SIZED] <= _FIRST_SIZES, np.inf, _SIZE_LIMIT * before)
-        change = np.minimum(np.maximum(detections[_SIZE] - before, -limit), limit)
-        before += np.maximum(_SIZE_RATE, 1 / t[_SIZED]) * change
-        _follow_heading(t, detections[HEADING], weight)
-        return
     has_height = np.isfinite(detections[Z])
     step = np.where(has_height, _HEIGHT_RATE * (detections[Z] - np.where(np.isnan(t[Z]), detections[Z], t[Z])), 0.0)
     t[Z] = np.where(np.isnan(t[Z]), detections[Z], t[Z] + step)

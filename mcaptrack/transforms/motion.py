@@ -13,7 +13,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.schema import CAMERA_MOTION, VIDEO, Frame, Schema
 from mcaptrack.schema.camera_motion import pose_to_rows
-from mcaptrack.transforms.protocol import check_options, context, option, parameters
+from mcaptrack.transforms.protocol import context, option, parameters
 
 #: Warn from this share of lost pictures on.
 _LEAST_LOST: Final = 0.02
@@ -52,9 +52,6 @@ class EstimateMotion:
     reads: ClassVar[Schema] = VIDEO
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": CAMERA_MOTION})
     latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": 0.0})
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
         camera, boxes = MotionEstimator(), self.known_boxes if self.mask_boxes else {}

@@ -245,7 +245,7 @@ def setting(default: Any, help: str = "", **about: Any) -> Any:  # noqa: A002
 @dataclass_transform(kw_only_default=True, frozen_default=True)
 def parameters(cls: type[T]) -> type[T]:
     """Make a frozen, keyword-only dataclass of a transform, as commands are declared: each parameter that is made with
-    ``option`` has its help in the section Parameters of the docstring.
+    ``option`` has its help in the section Parameters of the docstring. Objects check their values.
     """
     _, *sections = re.split(r"^(\w+)\n-+\n", inspect.cleandoc(cls.__doc__ or ""), flags=re.M)
     text = dict(zip(sections[::2], sections[1::2], strict=True)).get("Parameters", "")
@@ -255,6 +255,8 @@ def parameters(cls: type[T]) -> type[T]:
             meaning = meaning[:1].lower() + meaning[1:]
         declared = vars(cls)[name]
         setattr(cls, name, field(default=declared.default, metadata={**declared.metadata, "help": meaning}))
+    if not hasattr(cls, "__post_init__"):
+        cls.__post_init__ = check_options  # type: ignore[attr-defined]
     return dataclass(frozen=True, kw_only=True)(cls)
 
 

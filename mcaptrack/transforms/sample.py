@@ -21,7 +21,7 @@ from mcaptrack.schema import TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_numbers, frame_times, split_rows
 from mcaptrack.schema.resampling import resample_parts
-from mcaptrack.transforms.protocol import check_options, context, option, parameters
+from mcaptrack.transforms.protocol import context, option, parameters
 
 
 @parameters
@@ -59,9 +59,6 @@ class Sample:
 
     reads: ClassVar[Schema] = TRACKS
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": TRACKS})
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     @property
     def latency_s(self) -> MappingProxyType[str, float]:

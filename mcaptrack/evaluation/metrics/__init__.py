@@ -9,6 +9,7 @@ average_over_recalls([ScoredMatchup(matchup, scores_of_tracks)])   AMOTA, AMOTP 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -592,15 +593,5 @@ def _of_tracks(matchup: Matchup, kept: Bools) -> Matchup:
     """A matchup with some of its tracks (H,)."""
     if kept.all():
         return matchup
-    masks = [kept[tracks] for tracks in matchup.tracks]
-    alike = matchup.similarity
-    return Matchup(
-        matchup.ground_truth,
-        tuple(tracks[mask] for tracks, mask in zip(matchup.tracks, masks, strict=True)),
-        alike.of_columns(kept[matchup.all_tracks])
-        if isinstance(alike, SparseTables)
-        else tuple(similarity[:, mask] for similarity, mask in zip(alike, masks, strict=True)),
-        matchup.threshold,
-        matchup.n_ground_truth,
-        matchup.n_tracks,
-    )
+    tracks = tuple(tracks[kept[tracks]] for tracks in matchup.tracks)
+    return replace(matchup, tracks=tracks, similarity=matchup.tables.of_columns(kept[matchup.all_tracks]))

@@ -14,7 +14,7 @@ from typing import NamedTuple, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.geometry.arrays import Floats, Indices
+from mcaptrack.geometry.arrays import Floats, Indices, joined, taken
 from mcaptrack.geometry.assignment import LARGE_TABLE, assign_pairs_by_gain, solve
 from mcaptrack.geometry.ragged import cross_pairs
 
@@ -35,8 +35,7 @@ class RowPairs(NamedTuple):
 
     def where(self, kept: NDArray[np.bool_] | Indices) -> RowPairs:
         """A selection of the pairs."""
-        frame, row, column, person, track, similarity = self
-        return RowPairs(frame[kept], row[kept], column[kept], person[kept], track[kept], similarity[kept])
+        return taken(self, kept)
 
     def contested(self) -> NDArray[np.bool_]:
         """Whether a pair (P,) shares its row or its column with another pair."""
@@ -251,7 +250,7 @@ class Matchup:
         row = (np.cumsum(people) - people)[frame] + rows
         column = (np.cumsum(tracks) - tracks)[frame] + columns
         assigned = RowPairs(frame, row, column, self.all_ground_truth[row], self.all_tracks[column], similarity)
-        return RowPairs(*(np.concatenate(both) for both in zip(easy, assigned, strict=True)))
+        return joined([easy, assigned])
 
 
 def _joined(ids: Sequence[Indices]) -> Indices:

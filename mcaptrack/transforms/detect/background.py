@@ -25,7 +25,7 @@ from mcaptrack.geometry.camera_path import FAR, CameraPose, Verdict
 from mcaptrack.geometry.clocks import NS_PER_S, FrameClock
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
-from mcaptrack.transforms.protocol import Colour, check_options, option, parameters, setting
+from mcaptrack.transforms.protocol import Colour, option, parameters, setting
 
 # In units of the height of a person as measured in the picture: one body often gives several regions above each other,
 # which are joined over this distance; regions with a smaller area than this (times the height squared) are left out.
@@ -205,9 +205,6 @@ class KnnDetector:
     reads: ClassVar[Schema] = VIDEO
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": DETECTIONS})
     latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": 0.0})
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
         steadiness = Steadiness()

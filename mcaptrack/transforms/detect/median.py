@@ -36,7 +36,7 @@ from mcaptrack.transforms.detect.background import (
     warp,
 )
 from mcaptrack.transforms.detect.people import Learner, Person, Separator, region_boxes, typical_heights
-from mcaptrack.transforms.protocol import Colour, check_options, option, parameters, setting
+from mcaptrack.transforms.protocol import Colour, option, parameters, setting
 
 #: A shorter view, or one of fewer pictures, has no background of its own: people hardly move in that time.
 _MIN_SPAN_S: Final = 1.8
@@ -351,9 +351,6 @@ class MedianDetector:
     reads: ClassVar[Schema] = VIDEO
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": DETECTIONS})
     latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": inf})
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
         if iter(frames) is frames:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
+from mcaptrack.geometry.ragged import find_rows, group_index, ragged_range, run_starts
 from mcaptrack.transforms.retrack.assignments import Tracks
 
 #: The log likelihood ratio that the end of one track and the beginning of another are one person, for pairs of tracks
@@ -39,23 +39,7 @@ class Descriptors(NamedTuple):
 
     def find(self, t_ns: Ints, track_id: Ints) -> Ints:
         """The descriptor of each sample (C,), or -1."""
-        if len(self.t_ns) == 0:
-            return np.full(len(t_ns), -1)
-        times, ids = np.unique(self.t_ns), np.unique(self.track_id)
-        have = np.searchsorted(times, self.t_ns) * len(ids) + np.searchsorted(ids, self.track_id)
-        at = np.minimum(np.searchsorted(times, t_ns), len(times) - 1)
-        who = np.minimum(np.searchsorted(ids, track_id), len(ids) - 1)
-        want = at * len(ids) + who
-        row = np.minimum(np.searchsorted(have, want), len(have) - 1)
-        is_stored = (have[row] == want) & (times[at] == t_ns) & (ids[who] == track_id)
-        return np.where(is_stored, row, -1)
-
-    def tracks_of(self, t_ns: Ints, track_id: Ints, track: Ints) -> Ints:
-        """The ``track`` of each descriptor (S,), or -1, by those of samples (C,)."""
-        row = self.find(t_ns, track_id)
-        out = np.full(len(self.t_ns), -1)
-        out[row[row >= 0]] = track[row >= 0]
-        return out
+        return find_rows((self.t_ns, self.track_id), (t_ns, track_id))
 
 
 # Log likelihood ratios of distances between descriptors, calibrated in the log itself.

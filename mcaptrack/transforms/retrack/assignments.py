@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.ragged import group_index
+from mcaptrack.geometry.ragged import find_rows, group_index
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.classes import first_classes
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
@@ -125,7 +125,8 @@ class Assignments:
         ``samples`` are those of all ``steps``. A track has one sample a step.
         """
         step, track, source = (np.frombuffer(bytes(h), np.int64) for h in (self._steps, self._tracks, self._sources))
-        row = _find(samples.column("track_id"), np.repeat(np.array(steps, np.int64), samples.counts), source, step)
+        have = samples.column("track_id"), np.repeat(np.array(steps, np.int64), samples.counts)
+        row = find_rows(have, (source, step))
         kept = np.flatnonzero((row >= 0) & self._is_confirmed(step, track))
         return step[kept], track[kept], source[kept], row[kept]
 
@@ -137,27 +138,6 @@ class Assignments:
         for when, tracks in self._confirmed:  # rising
             until[tracks] = when
         return step <= until[track]
-
-
-def _find(ids: Ints, steps: Ints, wanted_ids: Ints, wanted_steps: Ints) -> Ints:
-    """The row with each wanted id and step; -1 where there is none."""
-    if len(ids) == 0:
-        return np.full(len(wanted_ids), -1)
-    names = np.unique(ids)
-    low = min(int(steps.min()), int(wanted_steps.min(initial=0)))
-    high = int(max(steps.max(), wanted_steps.max(initial=0)))
-    width = high - low + 1
-
-    def key(id_: Ints, step: Ints) -> Ints:
-        return np.searchsorted(names, id_) * width + (step - low)
-
-    have = key(ids, steps)
-    order = np.argsort(have, kind="stable")
-    want = key(wanted_ids, wanted_steps)
-    at = np.minimum(np.searchsorted(have[order], want), len(have) - 1)
-    rows = order[at]
-    is_there = np.isin(wanted_ids, names) & (have[rows] == want)
-    return np.where(is_there, rows, -1)
 
 
 # Re-tracking of each class by itself: links, swaps and gaps never join tracks of different classes.

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
 from mcaptrack.geometry.neighbours import near_pairs
 from mcaptrack.geometry.ragged import group_index, run_ends, run_starts
 from mcaptrack.notices import warn
@@ -152,10 +152,6 @@ class Encounters(NamedTuple):
     meet: Ints
     part_ways: Ints
 
-    def take(self, which: Bools) -> Encounters:
-        """Some of the encounters."""
-        return Encounters(*(column[which] for column in self))
-
 
 def swapped_by_pace(model: MotionModel, trajectories: Trajectories, pair: Ints, meet: Ints, part_ways: Ints) -> Floats:
     """The log likelihood ratio (C,) that two tracks are swapped after an encounter, by their paces before and after it.
@@ -212,7 +208,7 @@ def resolve_swaps(
     if len(encounters.i) == 0:
         return track, 0
     if examined is not None:
-        encounters = encounters.take(examined[encounters.i] | examined[encounters.j])
+        encounters = taken(encounters, examined[encounters.i] | examined[encounters.j])
     i, j, low, high, meet, part_ways = encounters
     evidence = swapped_by_pace(model, trajectories, np.stack([i, j]), meet, part_ways)
     if seen is not None:

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, joined, taken
 from mcaptrack.geometry.clocks import steps_passed
 from mcaptrack.geometry.ragged import group_index
 from mcaptrack.predictors import Forecast, PeopleSeen, Predictor, make, predict_among, uses_people
@@ -128,10 +128,6 @@ class Unpredicted(NamedTuple):
     coasts: Bools
     step: Ints
 
-    def part(self, which: slice | Ints) -> Unpredicted:
-        ids, past, is_known, coasts, step = self
-        return Unpredicted(ids[which], past[which], is_known[which], coasts[which], step[which])
-
 
 class _Predicted(NamedTuple):
     """Predictions as the predictor made them: ids, past positions, whether tracks coast, means and covariances."""
@@ -141,12 +137,6 @@ class _Predicted(NamedTuple):
     coasts: Bools
     mean: Floats
     cov: Floats
-
-    def part(self, which: slice) -> _Predicted:
-        return _Predicted(self.ids[which], self.past[which], self.coasts[which], self.mean[which], self.cov[which])
-
-    def copied(self) -> _Predicted:
-        return _Predicted(self.ids.copy(), self.past.copy(), self.coasts.copy(), self.mean.copy(), self.cov.copy())
 
 
 class OnlineForecasts:
@@ -177,34 +167,30 @@ class OnlineForecasts:
 
     def _predict(self, least: int) -> None:
         """Predict in batches, as long as at least so many tracks wait, and write the frames that are complete."""
-        waiting = Unpredicted(*(np.concatenate(parts) for parts in zip(*self._waiting, strict=True)))
+        waiting = joined(self._waiting)
         done = 0
         while len(waiting.ids) - done >= least:
             end = done + _BATCH
             if uses_people(self._predictor):  # whole steps, because their tracks are predicted together
                 end = int(np.searchsorted(waiting.step, waiting.step[min(end, len(waiting.ids)) - 1], "right"))
-            ids, past, is_known, coasts, steps = waiting.part(slice(done, end))
+            ids, past, is_known, coasts, steps = taken(waiting, slice(done, end))
             units = past / self._unit_m
             people = PeopleSeen(units, is_known, steps, np.arange(len(ids)))
             mean, cov = predict_among(self._predictor, units, is_known, people)
             self._write(_Predicted(ids, past, coasts, mean * self._unit_m, cov * self._unit_m**2))
             done += len(ids)
-        self._waiting = [waiting.part(slice(done, None))]
-        self._write(self._left.part(slice(0)))  # frames without tracks
+        self._waiting = [taken(waiting, slice(done, None))]
+        self._write(taken(self._left, slice(0)))  # frames without tracks
 
     def _write(self, new: _Predicted) -> None:
         """Write the frames that are complete with these predictions."""
-        waiting = (
-            new
-            if new is self._left
-            else _Predicted(*(np.concatenate(both) for both in zip(self._left, new, strict=True)))
-        )
+        waiting = joined([self._left, new])
         ends = np.cumsum([0, *(count for *_, count in self._frames)])
         count = int(np.searchsorted(ends, len(waiting.ids), "right")) - 1
-        self._left = waiting.part(slice(ends[count], None)).copied()  # so that the larger arrays are not held
+        self._left = taken(waiting, np.arange(ends[count], len(waiting.ids)))  # so that the larger arrays are not held
         if not count:
             return
-        ids, past, coasts, mean, cov = waiting.part(slice(ends[count]))
+        ids, past, coasts, mean, cov = taken(waiting, slice(ends[count]))
         tails = None
         if self._calibration is not None:  # by the predictions of the steps before
             step = np.repeat([step for _, _, step, _ in self._frames[:count]], np.diff(ends[: count + 1]))
@@ -299,12 +285,12 @@ class LikelihoodPass:
         coasting = move_rows(online.take(places), xy_m, self._options.ground_planes, t_ns)
         done = 0
 
-        def moved(joined: JoinedFrames) -> Rows:
+        def moved(part: JoinedFrames) -> Rows:
             nonlocal done
-            here = slice(*np.searchsorted(places, [done, done + len(joined.rows)]))
-            joined.rows[places[here] - done] = coasting[here]
-            done += len(joined.rows)
-            return joined.rows
+            here = slice(*np.searchsorted(places, [done, done + len(part.rows)]))
+            part.rows[places[here] - done] = coasting[here]
+            done += len(part.rows)
+            return part.rows
 
         return (mapped_rows(TRACKS, online, moved) if len(places) else online), predictions
 
@@ -381,7 +367,7 @@ class LikelihoodPass:
         ticks = np.arange(len(steps) + 1)
         self._online.extend(read.t_ns, read.numbers, np.searchsorted(tick[shown], ticks), rows)
         confirmed = np.flatnonzero(tracks[HITS, shown] >= self._confirm_hits)  # before, little is known of velocities
-        waiting = Unpredicted(names[shown], past, is_known, coasts, steps[tick[shown]]).part(confirmed)
+        waiting = taken(Unpredicted(names[shown], past, is_known, coasts, steps[tick[shown]]), confirmed)
         self._forecasts.add(read.t_ns, read.numbers, steps, np.searchsorted(tick[shown[confirmed]], ticks), waiting)
         self._written += len(rows)
         is_last = tick == len(steps) - 1

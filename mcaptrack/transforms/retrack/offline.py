@@ -26,11 +26,20 @@ from mcaptrack.schema.framing import JoinedFrames, joined_parts, mapped_rows, sp
 from mcaptrack.schema.resampling import ANGLES, LINEAR
 from mcaptrack.transforms.retrack.appearance import Appearance, AppearanceCalibration, Descriptors
 from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, LogSamples, Movers, Tracks
-from mcaptrack.transforms.retrack.cut_links import CutTracks, link_pieces
 from mcaptrack.transforms.retrack.false_tracks import log_odds_in_log, scored_log_odds
 from mcaptrack.transforms.retrack.identity_swaps import resolve_swaps
-from mcaptrack.transforms.retrack.joins import FEATURES, Joins, Tracked, cut_joins, find_joins, with_appearance
-from mcaptrack.transforms.retrack.linking import TrackEnds, link_tracks
+from mcaptrack.transforms.retrack.linking import (
+    JOIN_FEATURES,
+    CutTracks,
+    Joins,
+    Tracked,
+    TrackEnds,
+    cut_joins,
+    find_joins,
+    link_pieces,
+    link_tracks,
+    with_appearance,
+)
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, smooth, to_trajectories
 from mcaptrack.transforms.retrack.options import RetrackOptions
 from mcaptrack.transforms.retrack.weights import Logistic, probability
@@ -129,7 +138,7 @@ def _runs(is_fixed: Bools) -> list[tuple[int, int]]:
 # Letters: C assignments, K tracks, J joins, D decisions.
 
 
-JOINS: Final = Logistic.of("joins", FEATURES)
+JOINS: Final = Logistic.of("joins", JOIN_FEATURES)
 #: The log odds that a track is a person, from those of the test of false tracks: that one weighs rows, not tracks.
 PERSON: Final = Logistic.of("decided", ("log odds",))
 _NO_ID: Final = -1

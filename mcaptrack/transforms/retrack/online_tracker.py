@@ -18,7 +18,7 @@ from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, joined, taken
 from mcaptrack.geometry.assignment import LARGE_TABLE, assign_by_gain, assign_pairs_by_gain
 from mcaptrack.geometry.neighbours import Pairing, near_pairs
 from mcaptrack.geometry.ragged import run_ends, run_starts
@@ -70,15 +70,6 @@ class _Known(NamedTuple):
     hits: Ints
     state: State
 
-    def take(self, which: Bools | Ints) -> _Known:
-        ids, began, last, over, hits, state = self
-        return _Known(ids[which], began[which], last[which], over[which], hits[which], state.take(which))
-
-    def joined(self, other: _Known) -> _Known:
-        ids, began, last, over, hits = (np.concatenate(both) for both in zip(self[:5], other[:5], strict=True))
-        mean, cov = (np.concatenate(both) for both in zip(self.state, other.state, strict=True))
-        return _Known(ids, began, last, over, hits, State(mean, cov))
-
 
 _NONE: Final = np.empty(0, np.int64)
 _NO_TRACKS: Final = _Known(_NONE, _NONE, _NONE, _NONE, _NONE, State(np.empty((0, 4)), np.empty((0, 3))))
@@ -91,10 +82,6 @@ class _Links(NamedTuple):
     new: Ints
     gap_s: Floats
     log_odds: Floats
-
-    def take(self, which: Bools | Ints) -> _Links:
-        lost, new, gap_s, log_odds = self
-        return _Links(lost[which], new[which], gap_s[which], log_odds[which])
 
 
 _NO_LINKS: Final = _Links(_NONE, _NONE, np.empty(0), np.empty(0))
@@ -150,13 +137,13 @@ class OnlineLinks:
             (is_written | is_observed) & (np.arange(count) <= first[which]) & ~self._are_named(alive.ids)[which]
         )
         of = which[rows]
-        new = alive.take(of)._replace(last=steps[tick[rows]], hits=tracks[HITS, rows], state=state.take(rows))
+        new = taken(alive, of)._replace(last=steps[tick[rows]], hits=tracks[HITS, rows], state=state.take(rows))
         over = np.flatnonzero(alive.over < _NEVER)
-        lost = self._lost.joined(alive.take(over))
+        lost = joined([self._lost, taken(alive, over)])
         # a lost track was written before it was over; or else it has to continue another one
         was_written = np.append(np.ones(len(self._lost.ids), bool), first[over] < count)
         order = np.argsort(lost.ids)  # however many steps are read at once, links of equal odds are chosen by ids
-        lost, was_written = lost.take(order), was_written[order]
+        lost, was_written = taken(lost, order), was_written[order]
         is_first = rows == first[of]
         links = self._candidates(lost, new, is_first)
         since = np.full(len(alive.ids), count)  # those that continue another one are written whenever they are observed
@@ -165,7 +152,7 @@ class OnlineLinks:
         for at_once in np.split(np.arange(len(links.new)), np.flatnonzero(np.diff(tick[rows[links.new]])) + 1):
             may_be = ~used[links.lost[at_once]] & (since[of[links.new[at_once]]] == count)
             may_be &= was_written[links.lost[at_once]] | self._are_named(lost.ids[links.lost[at_once]])
-            edges = links.take(at_once[may_be])
+            edges = taken(links, at_once[may_be])
             chosen = self._decide(edges, is_first[edges.new])
             for ended, other in zip(edges.lost[chosen].tolist(), edges.new[chosen].tolist(), strict=True):
                 self._names[int(new.ids[other])] = self._names.get(int(lost.ids[ended]), int(lost.ids[ended]))
@@ -173,8 +160,8 @@ class OnlineLinks:
         for track in alive.ids[first < count].tolist():
             self._names.setdefault(track, track)
         reached = lost.last >= steps[-1] - self._max_gap_s / self._step_s
-        self._lost = lost.take(reached & ~used & self._are_named(lost.ids))
-        self._alive = alive.take(alive.over == _NEVER)
+        self._lost = taken(lost, reached & ~used & self._are_named(lost.ids))
+        self._alive = taken(alive, alive.over == _NEVER)
         names = np.array([self._names.get(track, track) for track in alive.ids.tolist()], np.int64)
         kept = {*self._alive.ids.tolist(), *self._lost.ids.tolist()}
         self._names = {track: name for track, name in self._names.items() if track in kept}
@@ -199,14 +186,14 @@ class OnlineLinks:
             row, gap_s = row + low, np.asarray(gaps_s[row, candidate], np.float64)
             gaps = linking.Gaps(lost.state.take(candidate), new.state.take(row), gap_s)
             is_near = linking.are_in_reach(gaps)
-            candidate, row, gaps = candidate[is_near], row[is_near], gaps.take(is_near)
+            candidate, row, gaps = candidate[is_near], row[is_near], taken(gaps, is_near)
             before, after, gap_s = gaps
             # nothing is known of the velocity of what was observed once: it may be that of the lost one
             single = new.hits[row] == 1
             after.mean[single, 2:], after.cov[single, 2] = before.mean[single, 2:], before.cov[single, 2]
             log_odds = linking.log_odds(linking.features(self._model, gaps))
-            parts.append(_Links(candidate, row, gap_s, log_odds).take(linking.has_chance(log_odds)))
-        return _Links(*(np.concatenate(members) for members in zip(*parts, strict=True)))
+            parts.append(taken(_Links(candidate, row, gap_s, log_odds), linking.has_chance(log_odds)))
+        return joined(parts)
 
     def _decide(self, links: _Links, is_written: Bools) -> Bools:
         """Which of the links (E,) at one step are made, to tracks that are written in any case or not."""

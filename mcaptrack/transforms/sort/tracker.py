@@ -30,7 +30,7 @@ from mcaptrack.geometry.plane import GroundPlane, Planes, moved_planes, plane_at
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.framing import join_frames
-from mcaptrack.transforms.protocol import check_options, context, option, parameters, setting
+from mcaptrack.transforms.protocol import context, option, parameters, setting
 
 #: Number of frames that are converted at once.
 _BLOCK_FRAMES = 64
@@ -363,9 +363,6 @@ class Sort:
     reads: ClassVar[Schema] = DETECTIONS
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": TRACKS})
     latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": 0.0})
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
         run, report = _Run(self, self._empty_tracks()), _FilterReport(self)

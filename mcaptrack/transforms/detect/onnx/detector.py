@@ -7,7 +7,6 @@ Letters: N boxes.
 
 from __future__ import annotations
 
-import difflib
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -22,7 +21,7 @@ from typing import ClassVar, Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, did_you_mean
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.boxes import parse_size
 from mcaptrack.networks import Device, NetworkFile, NetworkLimits, digest_of, read_file
@@ -130,9 +129,9 @@ def wanted(names: Mapping[int, str], classes: str, where: str) -> list[int]:
         if not indices and word.isdecimal() and int(word) in names:
             indices = [int(word)]
         if not indices:
-            close = difflib.get_close_matches(word, by_name, 1)
-            meant = f"did you mean {close[0]}? " if close else ""
-            raise McaptrackError(f"{where} has no class {word!r}; {meant}`classes=` takes {_known(names)}")
+            raise McaptrackError(
+                f"{where} has no class {word!r}; {did_you_mean(word, by_name)}`classes=` takes {_known(names)}"
+            )
         out.update(indices)
     if not out:
         raise McaptrackError(f"`classes=` names none; {where} has {_known(names)}")
