@@ -71,6 +71,7 @@ def test_people_merged_into_one_detection_are_not_taken_for_noise():
     run = LikelihoodPass(PROFILES["default"])
     for (frame,) in Sample(start_ns=round(clock[0] * STEP_S * 1e9))(on_clock(rows, clock)):
         run.step(frame)
+    run.finish()
     assert run.noise_m < 0.5
 
 

@@ -189,6 +189,7 @@ class TestOffline:
             run = LikelihoodPass(DEFAULT)
             for frame in frames:
                 run.step(frame)
+            run.finish()
             assert run.noise_m == pytest.approx(noise_m, rel=0.25)
 
     @pytest.mark.parametrize(("spread_m", "found_m"), [(0.0, 0.03), (4.0, 0.8)])
@@ -197,6 +198,7 @@ class TestOffline:
         run = LikelihoodPass(DEFAULT)
         for frame in walk(lambda n: {k: tuple([0.0, 900.0 * k] + rng.normal(0, spread_m, 2)) for k in range(9)}, 250):
             run.step(frame)
+        run.finish()
         assert run.noise_m == pytest.approx(found_m)
 
     def test_three_identity_switches_in_a_row_are_undone(self):

@@ -82,6 +82,7 @@ def prepare(truth: np.ndarray, made: np.ndarray) -> Run:
     run = LikelihoodPass(DEFAULT)
     for frame in samples:
         run.step(frame)
+    run.finish()
     times = np.array([frame.t_ns for frame in samples])
     return Run(
         true, samples, (DEFAULT, motion_model(DEFAULT, run.noise_m), run.assignments, run.samples, run.steps, times)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.clocks import steps_passed
 from mcaptrack.geometry.ragged import find_rows, group_index
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.classes import first_classes
@@ -138,6 +139,40 @@ class Assignments:
         for when, tracks in self._confirmed:  # rising
             until[tracks] = when
         return step <= until[track]
+
+
+class OnlinePass:
+    """Online re-tracking of one log: ``step`` for each frame, ``finish``, then ``outputs``.
+
+    It leaves for ``offline`` which track had which sample, the samples, the steps, and the noise of measured positions.
+    It may hold for the whole log what ``LogSamples`` says, and no rows.
+    """
+
+    noise_m: float
+
+    def __init__(self, rate_hz: float, bridged_s: float) -> None:
+        self.assignments, self.samples = Assignments(), LogSamples()
+        self.steps: list[int] = []
+        self._rate_hz, self._bridged_s = rate_hz, bridged_s
+        self._last_ns: int | None = None
+
+    def advance(self, t_ns: int) -> int:
+        """Add the step of a time; returns by how many steps time advances."""
+        last_ns, self._last_ns = self._last_ns, t_ns
+        passed = 1 if last_ns is None else steps_passed(t_ns - last_ns, self._rate_hz, self._bridged_s)
+        self.steps.append(self.steps[-1] + passed if self.steps else 0)
+        return passed
+
+    def step(self, frame: Frame) -> None:
+        """One step: association, update, birth and termination of tracks."""
+        raise NotImplementedError
+
+    def finish(self) -> None:
+        """No more steps come."""
+
+    def outputs(self) -> tuple[FrameColumns, FrameColumns]:
+        """The online tracks and their predictions, from the past alone, a frame for each step."""
+        raise NotImplementedError
 
 
 # Re-tracking of each class by itself: links, swaps and gaps never join tracks of different classes.

@@ -16,13 +16,12 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Indices, Ints, joined, taken
 from mcaptrack.geometry.assignment import assign
-from mcaptrack.geometry.clocks import steps_passed
 from mcaptrack.geometry.histories import Histories, Holt, rebuild_positions
 from mcaptrack.predictors import Forecast, Predictor, make, predict_together
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.predictions import forecast_to_rows
-from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, LogSamples, Movers
+from mcaptrack.transforms.retrack.assignments import PEOPLE, Movers, OnlinePass
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
 from mcaptrack.transforms.retrack.options import (
     ConsistencyOptions,
@@ -118,7 +117,7 @@ class ActiveTracks(NamedTuple):
         return cls(nothing, nothing, nothing, nothing, history, prediction)
 
 
-class ConsistencyPass:
+class ConsistencyPass(OnlinePass):
     """Algorithm 1 over one log: ``step`` for each frame, then ``outputs``."""
 
     def __init__(self, options: ConsistencyOptions, movers: Movers = PEOPLE) -> None:
@@ -129,28 +128,21 @@ class ConsistencyPass:
                 f'"{options.distance}" compares predictions of one time made at different steps, which takes '
                 f'{2 / options.rate_hz:g} s at least; the distance "now" needs one step'
             )
+        super().__init__(options.rate_hz, options.bridged_s)
         self._options = options
         self._predictor: Predictor = make(options.predictor, horizon, 1 / options.rate_hz)
         self._holt = Holt(options.alpha, options.beta)
         self._length = max(self._predictor.past, options.min_history, 2)
         self._histories = Histories(self._length)
         self._tracks = ActiveTracks.none(self._length, horizon)
-        self.assignments = Assignments()
-        self.samples = LogSamples()
-        self.steps: list[int] = []
         self.noise_m = DEFAULT_NOISE_M if options.noise_m is None else options.noise_m
         self._online = FrameCollector(TRACKS), FrameCollector(PREDICTIONS)
         self._next_id = 1
-        self._last_ns: int | None = None
 
     def step(self, frame: Frame) -> None:
         """One step: associate, update, age, start and terminate tracks."""
-        passed = 1
-        if self._last_ns is not None:
-            passed = steps_passed(frame.t_ns - self._last_ns, self._options.rate_hz, self._options.bridged_s)
-        self._last_ns = frame.t_ns
-        step = self.steps[-1] + passed if self.steps else 0
-        self.steps.append(step)
+        passed = self.advance(frame.t_ns)
+        step = self.steps[-1]
         self.samples.add(frame)
 
         sources = frame.rows["track_id"]
@@ -179,7 +171,6 @@ class ConsistencyPass:
             collector.append(rows)
 
     def outputs(self) -> tuple[FrameColumns, FrameColumns]:
-        """The online tracks and their predictions, from the past alone, a frame for each step."""
         return self._online[0].done(), self._online[1].done()
 
     def _match(self, step: int, xy_m: Floats, predictions: Forecast, sources: Ints) -> tuple[Indices, Indices]:

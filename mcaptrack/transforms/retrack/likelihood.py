@@ -10,7 +10,6 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, joined, taken
-from mcaptrack.geometry.clocks import steps_passed
 from mcaptrack.geometry.ragged import group_index
 from mcaptrack.predictors import Forecast, PeopleSeen, Predictor, make, predict_among, uses_people
 from mcaptrack.predictors.position_noise import PAST, PositionNoise
@@ -19,7 +18,7 @@ from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.framing import JoinedFrames, mapped_rows
 from mcaptrack.schema.predictions import forecast_to_rows
-from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, LogSamples, Movers
+from mcaptrack.transforms.retrack.assignments import PEOPLE, Movers, OnlinePass
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M, MotionModel, State, StateRows
 from mcaptrack.transforms.retrack.offline import move_rows
 from mcaptrack.transforms.retrack.online_tracker import HITS, IDS, Association, OnlineLinks, OnlineTracker, ShownTracks
@@ -201,7 +200,7 @@ class OnlineForecasts:
         self._frames = self._frames[count:]
 
 
-class LikelihoodPass:
+class LikelihoodPass(OnlinePass):
     """Online tracking over one log: ``step`` for each frame, then ``outputs``.
 
     Frames are read some at once (``_track``), and rows of online tracks are made of as many (``_write``), because one
@@ -209,6 +208,7 @@ class LikelihoodPass:
     """
 
     def __init__(self, options: LikelihoodOptions, movers: Movers = PEOPLE) -> None:
+        super().__init__(options.rate_hz, options.bridged_s)
         rate, self._options, self._unit_m = options.rate_hz, options, movers.unit_m
         confirm_hits = self._confirm_hits = round(options.confirm_s * rate) + 1
         max_age = max(1, round(options.max_age_s * rate))
@@ -228,10 +228,6 @@ class LikelihoodPass:
         )
         self._shown = ShownTracks(confirm_hits, round(options.coast_s * rate), max_age, options.adapt_online)
         self._links = OnlineLinks(self._tracker.model, options.link_s, options.link_confidence, confirm_hits)
-        self._assignments = Assignments()
-        self._samples = LogSamples()
-        self.steps: list[int] = []
-        self._last_ns = 0
         self._frames: list[Frame] = []  # those that are not read yet, and their number of samples
         self._unread = 0
         # what is known of earlier ones: tracks and their last samples
@@ -245,38 +241,18 @@ class LikelihoodPass:
         self._input = InputNoise(1 / rate) if options.noise_m is None else None
         self._written = 0
 
-    @property
-    def noise_m(self) -> float:
-        """The noise of measured positions: as given, or as estimated so far; in the unit of the objects."""
-        self._track()
-        return self._tracker.noise_m
-
-    @property
-    def assignments(self) -> Assignments:
-        """Which track had which sample so far."""
-        self._track()
-        return self._assignments
-
-    @property
-    def samples(self) -> LogSamples:
-        """The samples so far."""
-        self._track()
-        return self._samples
-
     def step(self, frame: Frame) -> None:
-        """One step: association, update, birth and termination of tracks."""
-        passed = 1
-        if self.steps:
-            passed = steps_passed(frame.t_ns - self._last_ns, self._options.rate_hz, self._options.bridged_s)
-        self.steps.append(self.steps[-1] + passed if self.steps else 0)
-        self._last_ns = frame.t_ns
+        self.advance(frame.t_ns)
         self._frames.append(frame)
         self._unread += len(frame.rows)
         if len(self._frames) >= _STEPS or self._unread >= _SAMPLES:
             self._track()
 
+    def finish(self) -> None:
+        self._track()
+        self.noise_m = self._tracker.noise_m
+
     def outputs(self) -> tuple[FrameColumns, FrameColumns]:
-        """The online tracks and their predictions, from the past alone, a frame for each step."""
         self._track()
         online, predictions = self._online.done(), self._forecasts.done()
         # All at once, because the last digits of a product of matrices depend on their size.
@@ -302,7 +278,7 @@ class LikelihoodPass:
         t_ns, numbers = (np.array(values, np.int64) for values in zip(*(frame[:2] for frame in frames), strict=True))
         ends = np.cumsum([0, *(len(frame.rows) for frame in frames)])
         samples = TRACKS.joined([frame.rows for frame in frames])
-        self._samples.extend(t_ns, numbers, ends, samples)
+        self.samples.extend(t_ns, numbers, ends, samples)
         steps = np.array(self.steps[-len(frames) :], np.int64)
         before = self.steps[-len(frames) - 1] if len(self.steps) > len(frames) else steps[0] - 1
         # observations of each step, ordered by their input ids
@@ -324,7 +300,7 @@ class LikelihoodPass:
         tick = group_index([len(result.row) for result in results])
         has = row >= 0
         row[has] = observed[bounds[tick[has]] + row[has]]
-        self._assignments.add(steps[tick[has]], tracks[IDS, has], samples["track_id"][row[has]])
+        self.assignments.add(steps[tick[has]], tracks[IDS, has], samples["track_id"][row[has]])
         self._write(_Read(t_ns, numbers, steps, passed, samples), tick, row, tracks, StateRows(mean, cov))
 
     def _write(self, read: _Read, tick: Ints, row: Ints, tracks: Ints, state: StateRows) -> None:

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import repeat
 from types import MappingProxyType
-from typing import ClassVar, Final, Protocol, TypeAlias, TypeVar
+from typing import ClassVar, Final, TypeAlias, TypeVar
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Ints
-from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.predictors import warn_if_weak
 from mcaptrack.schema import APPEARANCE, DECISIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns, collect
@@ -20,9 +20,8 @@ from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.protocol import ModelCard
 from mcaptrack.transforms.retrack.appearance import AppearanceCalibration
 from mcaptrack.transforms.retrack.assignments import (
-    Assignments,
-    LogSamples,
     Movers,
+    OnlinePass,
     join_classes,
     movers_of,
     split_classes,
@@ -36,38 +35,6 @@ from mcaptrack.transforms.retrack.offline import appearance_rows, offline_tracks
 from mcaptrack.transforms.retrack.options import ConsistencyOptions, LikelihoodOptions, RetrackOptions
 
 Options = TypeVar("Options", bound=RetrackOptions)
-
-
-class OnlinePass(Protocol):
-    """Online re-tracking of one log: ``step`` for each frame, then ``outputs``; and what it leaves for ``offline``.
-
-    It may hold for the whole log what the module ``samples`` says, and no rows.
-    """
-
-    steps: list[int]
-
-    @property
-    def assignments(self) -> Assignments:
-        """Which track had which sample so far."""
-        ...
-
-    @property
-    def samples(self) -> LogSamples:
-        """The samples so far."""
-        ...
-
-    @property
-    def noise_m(self) -> float:
-        """The noise of measured positions."""
-        ...
-
-    def step(self, frame: Frame) -> None:
-        """One step."""
-        ...
-
-    def outputs(self) -> tuple[FrameColumns, FrameColumns]:
-        """The online tracks and their predictions, a frame for each step."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,7 +98,7 @@ Retracking: TypeAlias = Retrack | RetrackByConsistency
 # tracks.
 
 
-class KeptIds:
+class KeptIds(OnlinePass):
     """Online re-tracking that keeps the ids of the input.
 
     Parameters
@@ -143,11 +110,8 @@ class KeptIds:
     """
 
     def __init__(self, options: RetrackOptions, movers: Movers, frames: FrameColumns) -> None:
-        self._options = options
+        super().__init__(options.rate_hz, LAST_NS / NS_PER_S)
         self.noise_m = (DEFAULT_NOISE_M if options.noise_m is None else options.noise_m) / movers.unit_m
-        self.assignments = Assignments()
-        self.samples = LogSamples()
-        self.steps: list[int] = []
         self._number: dict[int, int] = {}
         self._forecaster = Forecaster(
             options.predictor,
@@ -163,12 +127,9 @@ class KeptIds:
     def _read(self, frames: FrameColumns) -> FrameColumns:
         """The online tracks: frames with the samples under numbers of their own."""
         out = FrameCollector(TRACKS)
-        last_ns: int | None = None
         for low, high, joined in joined_parts(TRACKS, frames):
             for t_ns in joined.t_ns.tolist():
-                passed = 1 if last_ns is None else round((t_ns - last_ns) * self._options.rate_hz / NS_PER_S)
-                self.steps.append(self.steps[-1] + max(1, passed) if self.steps else 0)
-                last_ns = t_ns
+                self.advance(t_ns)
             rows = joined.rows.take(np.lexsort((joined.rows["track_id"], joined.frame)))
             numbers = frames.numbers[low:high]
             self.samples.extend(joined.t_ns, numbers, joined.ends, rows)
@@ -188,7 +149,6 @@ class KeptIds:
         return np.array([self._number[number] for number in ids.tolist()], np.int64)[which]
 
     def outputs(self) -> tuple[FrameColumns, FrameColumns]:
-        """The online tracks and their predictions, from the past alone."""
         return self.online, self._forecaster.predict_all(self.online)
 
 
@@ -250,13 +210,10 @@ def _retracked(
 ) -> list[Iterable[Frame]]:
     """The outputs of re-tracking without regard to classes; ``score`` is the usual one of the log."""
     movers = movers_of(frames, options.class_names, score, options.class_limits)
-    run: OnlinePass | KeptIds
-    if movers.on_ground:
-        run = KeptIds(options, movers, frames)
-    else:
-        run = new_pass(options, movers)
-        for frame in frames:
-            run.step(frame)
+    run = KeptIds(options, movers, frames) if movers.on_ground else new_pass(options, movers)
+    for frame in () if movers.on_ground else frames:
+        run.step(frame)
+    run.finish()
     model = motion_model(options, run.noise_m, movers)
     offline = offline_tracks(options, model, run.assignments, run.samples, run.steps, frames.t_ns, movers)
     seen.extend([] if offline.calibration is None else [offline.calibration])
