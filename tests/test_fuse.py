@@ -21,7 +21,7 @@ from mcaptrack.notices import collected
 from mcaptrack.schema import SIGHTINGS, Frame
 from mcaptrack.testing import check_transform
 from mcaptrack.transforms import fuse
-from mcaptrack.transforms.fuse import CameraView, FootFuser, Places, fuser, group, means, places_of
+from mcaptrack.transforms.fuse import CameraView, FootFuser, Places, group, means, places_of
 from tests.places import CAMERAS, HEIGHT, NS, PEOPLE, SECONDS, WIDTH, errors, fused, said, write_log
 from tests.references.joining import joined
 
@@ -539,7 +539,7 @@ class TestAgreement:
         frames, fuser, offset_ns = self.frames(seed), self.fuser(), [0, 30_000_000, 0, 10_000_000]
         for taken_ns in (offset_ns, ()):
             rates, false, shared, off, late = self.slowly(frames, fuser, taken_ns or [0] * 4)
-            views, offsets, found = fuser.compare(fuser.joined(frames), fuser.views, taken_ns)
+            views, offsets, found = fuse.compare(fuser.joined(frames), fuser.views, taken_ns)
             assert tuple(found) == shared
             for c, (view, offset) in enumerate(zip(views, offsets, strict=True)):
                 assert view.detects == pytest.approx(rates[c])
@@ -554,12 +554,12 @@ class TestAgreement:
         ("expected", "seen", "strangers"), [(50, 12, True), (50, 13, False), (49, 0, False), (100, 25, False)]
     )
     def test_cameras_of_other_places(self, expected: int, seen: int, strangers: bool) -> None:
-        shared = fuser.Shared(expected, seen)
+        shared = fuse.Shared(expected, seen)
         assert shared.are_strangers is strangers
         assert f"of {expected} people that two cameras should see, two see {seen}; " in str(shared)
 
     def test_nothing_says_nothing(self) -> None:
-        views, offsets, shared = fuser.compare([], self.fuser().views)
+        views, offsets, shared = fuse.compare([], self.fuser().views)
         assert shared == (0, 0)
         assert [view.false_share for view in views] == pytest.approx([0.1, 0.2, 0.3, 0.4])
         assert views[0].detects == pytest.approx((0.2, 0.5, 0.6, 0.8))
