@@ -173,10 +173,9 @@ def positions_of(
 
     ``planes`` are those of the reference picture where the camera moves by ``path``, otherwise those of all pictures.
     """
-    parts: list[tuple[Ints, ...]] = []
-    places: list[tuple[Floats, ...]] = []
+    none, nowhere = np.zeros(0, np.int64), np.zeros((0, 2))
+    parts = [(none, none, none, none, nowhere, nowhere, nowhere, np.zeros(0), np.zeros(0))]
     since = np.array([start for start, _ in planes[1:]], np.int64)
-    heights: list[Floats] = []
     for first, _, joined in joined_parts(TRACKS, frames):
         rows, t_ns = joined.rows, joined.row_ns
         boxes = columns_to_boxes(rows)
@@ -189,31 +188,16 @@ def positions_of(
             feet[of], seen[of] = plane.feet(in_scene[of]), plane.feet(boxes[of])
             unknown = of & ~np.isfinite(metres).all(axis=1) & np.isfinite(feet).all(axis=1)
             metres[unknown] = plane.pixels_to_metres(feet[unknown])
-        parts.append((rows["track_id"].astype(np.int64), joined.frame + first, t_ns, rows["class_id"].astype(np.int64)))
-        places.append((metres, feet, seen, rows["z_m"] - np.nan_to_num(rows["height_m"]) / 2))
-        heights.append(boxes[:, 3])
-    if not parts:
-        none, nowhere = np.zeros(0, np.int64), np.zeros((0, 2))
-        no_height = np.zeros(0)
-        both = {"metres": nowhere, "pixels": nowhere}
-        return TrackPositions(both, nowhere, none, none, none, np.nan, no_height, none, classes)
-    track, frame, t_ns, kind = (np.concatenate(column) for column in zip(*parts, strict=True))
-    order = np.lexsort((frame, track))
-    metres, feet, seen, low = (np.concatenate(column)[order] for column in zip(*places, strict=True))
-    high = np.concatenate(heights)
+        ids, low = rows["track_id"].astype(np.int64), rows["z_m"] - np.nan_to_num(rows["height_m"]) / 2
+        of_class = rows["class_id"].astype(np.int64)
+        parts.append((ids, joined.frame + first, t_ns, of_class, metres, feet, seen, low, boxes[:, 3]))
+    *columns, high = (np.concatenate(column[1:] or column) for column in zip(*parts, strict=True))
     high = high[np.isfinite(high)]
+    order = np.lexsort((columns[1], columns[0]))
+    track, frame, t_ns, kind, metres, feet, seen, low = (column[order] for column in columns)
     height_px = float(np.median(high)) if len(high) else np.nan
-    return TrackPositions(
-        {"metres": metres, "pixels": feet},
-        seen,
-        track[order],
-        frame[order],
-        t_ns[order],
-        height_px,
-        low,
-        kind[order],
-        classes,
-    )
+    both = {"metres": metres, "pixels": feet}
+    return TrackPositions(both, seen, track, frame, t_ns, height_px, low, kind, classes)
 
 
 def is_counted(positions: TrackPositions, zone: Zone) -> Bools:

@@ -63,7 +63,7 @@ class PeopleSeen(NamedTuple):
 
     def copied(self) -> PeopleSeen:
         """A copy in arrays of its own."""
-        return PeopleSeen(*(part.copy() for part in self))
+        return PeopleSeen(self.xy_m.copy(), self.valid.copy(), self.moment.copy(), self.row.copy())
 
 
 def uses_people(predictor: Any) -> bool:

@@ -9,14 +9,14 @@ Letters: T future steps, P matched pairs.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.assignment import solve
 from mcaptrack.geometry.mixtures import Tails, log_density, mahalanobis_squared, mass_within, normal_tails
-from mcaptrack.geometry.ragged import cross_pairs, group_index, ragged_range, run_ends, run_starts
+from mcaptrack.geometry.ragged import cross_pairs, find_rows, group_index, ragged_range, run_ends, run_starts
 
 #: The association threshold in m^2 at which single numbers are reported (tau in the paper).
 TAU_M2: Final = 2.0
@@ -269,11 +269,10 @@ def combine_displacements(parts: list[Displacement]) -> Displacement:
 
     longest = max(part.error_m.shape[1] for part in parts)
     away = [np.pad(p.error_m, ((0, 0), (0, longest - p.error_m.shape[1])), constant_values=np.nan) for p in parts]
-    return Displacement(
-        **{name: pooled(name) for name in ("d_obs_m2", "consistency_m", *ForecastErrors._fields) if name != "error_m"},
-        **{name: sum(getattr(part, name) for part in parts) for name in ("people", "false_forecasts", "frames")},
-        error_m=np.concatenate(away),
-    )
+    arrays = [name for name in ("d_obs_m2", "consistency_m", *ForecastErrors._fields) if name != "error_m"]
+    counts = {name: sum(getattr(part, name) for part in parts) for name in ("people", "false_forecasts", "frames")}
+    values: dict[str, Any] = {name: pooled(name) for name in arrays} | counts
+    return Displacement(**values, error_m=np.concatenate(away))
 
 
 # Pairing of forecasts with people: at each time tracks and people are assigned by their last positions.
@@ -322,15 +321,7 @@ class _SortedPositions(NamedTuple):
 
     def find(self, ids: Ints, step: Ints) -> Ints:
         """The rows of these ids at these steps (M,); -1 where there is none."""
-        if not len(self.slot):
-            return np.full(len(ids), -1)
-        first, width = int(self.step.min()), int(np.ptp(self.step)) + 1
-        place = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
-        wanted = place * width + (step - first)
-        keys = self.slot * width + (self.step - first)
-        at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-        exists = (self.ids[place] == ids) & (step >= first) & (step < first + width) & (keys[at] == wanted)
-        return np.where(exists, at, -1)
+        return find_rows((self.ids[self.slot], self.step), (ids, step))
 
     def window(self, at: Ints, first: int, last: int) -> Floats:
         """The positions (M, last - first + 1, 2) from ``first`` to ``last`` steps after the rows ``at`` (M,)."""

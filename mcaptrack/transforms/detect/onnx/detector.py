@@ -325,14 +325,14 @@ class Contest:
         if not any(layout.name in boxes for layout in self.layouts):
             why = "; ".join(f"read as {layout.name}, {results[layout.name]}" for layout in self.layouts)
             raise McaptrackError(f"{self._path} fits no layout: {why}")
-        self._keep([layout for layout in self.layouts if layout.name in boxes])
+        self.layouts = [layout for layout in self.layouts if layout.name in boxes]
         for layout in self.layouts:
             self._sums[layout.name] += evidence(boxes[layout.name])
         ordered = sorted(self.layouts, key=lambda layout: -self._sums[layout.name])
         best, second = (self._sums[layout.name] for layout in (ordered * 2)[:2])
         self._pictures += best > 0
         if len(ordered) == 1 or (best > 0 and best >= _CLEAR * second):
-            self._keep(ordered[:1])
+            self.layouts = ordered[:1]
         elif self._pictures >= _PATIENCE:
             raise McaptrackError(self._unclear())
 
@@ -340,10 +340,7 @@ class Contest:
         """Settle on what is left, after the last picture. Raises McaptrackError if it can't be told."""
         if not self.is_settled and self._pictures:
             raise McaptrackError(self._unclear())
-        self._keep(self.layouts[:1])
-
-    def _keep(self, layouts: list[Layout]) -> None:
-        self.layouts = layouts
+        self.layouts = self.layouts[:1]
 
     def _unclear(self) -> str:
         names = " and ".join(layout.name for layout in self.layouts)
