@@ -592,7 +592,7 @@ def _to_frames(frames: Sequence[Frame], table: Floats, number: Ints) -> list[Fra
     return split_rows([f.t_ns for f in frames], [f.index for f in frames], out, ends)
 
 
-#: Columns of detections in the order of the rows of ``state``.
+#: Columns of detections in the order of their rows.
 _COLUMNS: Final = (
     "x_m",
     "y_m",

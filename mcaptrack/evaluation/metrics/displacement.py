@@ -1,6 +1,6 @@
 """Scores of forecasts made from tracks: displacement errors over recall, and calibration.
 
-Each forecast is compared with the future of the person that its track is paired with (``pairing``). The running mean of
+Each forecast is compared with the future of the person that its track is paired with. The running mean of
 the errors, sorted by the distance of the pasts, over the share of people matched so far is the exact curve.
 
 Letters: T future steps, P matched pairs.

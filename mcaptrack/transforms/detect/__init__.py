@@ -1,8 +1,8 @@
 """Pictures -> detections.
 
-``background`` and ``median`` have the motion detectors, for cameras that stand still or nearly. ``registration``
-registers pictures of a shaking camera and warns where it moves, ``people`` learns how people look and separates those
-who are one region. ``onnx`` has learned detectors.
+``background`` and ``median`` have the motion detectors, for cameras that stand still or nearly; ``background`` also
+registers the pictures of a shaking camera. ``people`` learns how people look and separates those who are one region.
+``onnx`` has learned detectors.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Appearance: whether two parts of tracks look like one person, as a log likelihood ratio that the log itself gives.
 
 It is one more likelihood beside that of motion, where tracks are linked, cut and exchanged offline. In a log in which
-it doesn't tell people apart, as in pictures of people in uniforms, it isn't used (see ``appearance_calibration``).
+it doesn't tell people apart, as in pictures of people in uniforms, it isn't used (see ``AppearanceCalibration``).
 
 Letters: C assignments, S descriptors, D bytes of one, E pairs of tracks.
 """

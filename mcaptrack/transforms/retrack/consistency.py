@@ -118,7 +118,7 @@ class ActiveTracks(NamedTuple):
 
 
 class ConsistencyPass(OnlinePass):
-    """Algorithm 1 over one log: ``step`` for each frame, then ``outputs``."""
+    """Algorithm 1 over one log."""
 
     def __init__(self, options: ConsistencyOptions, movers: Movers = PEOPLE) -> None:
         horizon = max(1, round(options.horizon_s * options.rate_hz))

@@ -201,7 +201,7 @@ class OnlineForecasts:
 
 
 class LikelihoodPass(OnlinePass):
-    """Online tracking over one log: ``step`` for each frame, then ``outputs``.
+    """Online tracking over one log.
 
     Frames are read some at once (``_track``), and rows of online tracks are made of as many (``_write``), because one
     frame has few of them. What later steps need is kept: the last sample of each track, and its past positions.

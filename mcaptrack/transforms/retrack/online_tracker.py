@@ -486,7 +486,7 @@ def _squared(off: Floats) -> Floats:
 # A track that is lost is written for a while, because most come back. Those that don't have left, or were false.
 # Which is likelier is learned in the same way, for each number of steps without an observation, for tracks that
 # have not lasted yet, and for those that would be outside of the area in which tracks were seen so far: most of
-# these have left it. It also depends on where the track was lost (``places``).
+# these have left it. It also depends on where the track was lost (``PlacesOfLosses``).
 #
 # Letters: F steps, R tracks of all steps, end to end; H levels of observations, the last one of tracks that have
 # lasted; A levels of steps without an observation.
