@@ -70,7 +70,7 @@ class EvaluateOptions:
     min_iou : float
         The least overlap of a match, for the similarities that are overlaps.
     rules : {"trackeval", "motmetrics"}
-        Rules of CLEAR, see `mcaptrack.evaluation.metrics.clear`.
+        Rules of CLEAR, see `mcaptrack.evaluation.metrics`.
     topics : tuple of str
         The channels to score. Empty: all tracks of the camera.
     """

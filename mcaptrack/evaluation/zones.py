@@ -243,7 +243,7 @@ def find_zone_events(
     ----------
     frames : sequence of Frame
         Rows of Tracks.
-    found : TrackPositions
+    positions : TrackPositions
         Of these rows.
     zones : sequence of PlacedZone
     options : ZoneOptions
