@@ -293,13 +293,13 @@ def combined(results: Sequence[EvaluationRow]) -> list[EvaluationRow]:
         key = (row.group or row.tracks, row.mode, row.similarity, row.gate, row.rules, row.of_class)
         groups.setdefault(key, []).append(row)
     out = []
-    for (*key, one_class), members in groups.items():
+    for (*same, one_class), members in groups.items():
         forecasts = [member.displacement for member in members if member.displacement is not None]
         scored = [part for member in members for part in member.scored] if all(m.scored for m in members) else []
         out.append(
             EvaluationRow(
                 COMBINED,
-                *key,
+                *same,
                 metrics.combine([member.score for member in members]),
                 combine_displacements(forecasts) if len(forecasts) == len(members) else None,
                 of_class=one_class,

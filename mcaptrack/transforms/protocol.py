@@ -40,7 +40,6 @@ from typing import (
     Literal,
     NamedTuple,
     Protocol,
-    TypeVar,
     dataclass_transform,
     get_args,
     get_origin,
@@ -51,8 +50,6 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.ranges import limits
 from mcaptrack.registry import KINDS, Kind
 from mcaptrack.schema import Frame, Schema
-
-T = TypeVar("T")
 
 
 class WithOptions(Protocol):
@@ -242,8 +239,14 @@ def setting(default: Any, help: str = "", **about: Any) -> Any:  # noqa: A002
     return option(default, help, flag=False, **about)
 
 
+def _typed(decorator: Any) -> Callable[[type[Any]], type[Any]]:
+    """The same decorator. Type checkers know this type of it wherever modules import each other in a circle."""
+    return decorator  # type: ignore[no-any-return]
+
+
+@_typed
 @dataclass_transform(kw_only_default=True, frozen_default=True)
-def parameters(cls: type[T]) -> type[T]:
+def parameters(cls: type[Any]) -> type[Any]:
     """Make a frozen, keyword-only dataclass of a transform, as commands are declared: each parameter that is made with
     ``option`` has its help in the section Parameters of the docstring. Objects check their values.
     """
@@ -256,7 +259,7 @@ def parameters(cls: type[T]) -> type[T]:
         declared = vars(cls)[name]
         setattr(cls, name, field(default=declared.default, metadata={**declared.metadata, "help": meaning}))
     if not hasattr(cls, "__post_init__"):
-        cls.__post_init__ = check_options  # type: ignore[attr-defined]
+        cls.__post_init__ = check_options
     return dataclass(frozen=True, kw_only=True)(cls)
 
 

@@ -177,11 +177,11 @@ def calibrate(values: NDArray[np.uint8], tracks: Tracks, step_s: float) -> Appea
     distance = np.concatenate([distances for _, distances in parts])
     lag = np.searchsorted(_LAGS_S, pairs.gap_s, "right") - 1
     is_same = blocks.track[pairs.before] == blocks.track[pairs.after]
-    tracks = len(np.unique(blocks.track[pairs.before[is_same]]))
-    if tracks < 2 or is_same.all():  # nothing to compare with
+    count = len(np.unique(blocks.track[pairs.before[is_same]]))
+    if count < 2 or is_same.all():  # nothing to compare with
         return None
     drift = _drift(distance - noise, lag, blocks.track[pairs.before], is_same, noise)
-    calibration = AppearanceCalibration(noise, drift, 0.0, 0.0, 0.5, 0.5, tracks)
+    calibration = AppearanceCalibration(noise, drift, 0.0, 0.0, 0.5, 0.5, count)
     excess = calibration.excess(distance, pairs.gap_s)
     low = np.minimum(blocks.track[pairs.before], blocks.track[pairs.after])
     high = np.maximum(blocks.track[pairs.before], blocks.track[pairs.after])

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
 from mcaptrack.geometry.clocks import steps_passed
 from mcaptrack.geometry.ragged import find_rows, group_index
 from mcaptrack.schema import TRACKS, Frame, Rows
@@ -35,7 +35,7 @@ class Tracks(NamedTuple):
 
     def take(self, which: Ints | Bools) -> Tracks:
         """Some of the assignments, in this order."""
-        return Tracks(*(column[which] for column in self))
+        return taken(self, which)
 
     @property
     def order(self) -> Ints:

@@ -293,7 +293,7 @@ def _length(vector: Floats) -> Floats:
 #: ``_alternatives``); whether there is one; whether another track had the samples of the new input id just before, and
 #: has those of the old one just after; and the logarithms of the numbers of samples that both last. Two are the same
 #: for all joins of a log: how often input ids change in it, and how often other tracks have samples of the same ids.
-JOIN_FEATURES: Final = (
+JOIN_FEATURES: Final[tuple[str, ...]] = (
     *FEATURES,
     "margin",
     "alternative",

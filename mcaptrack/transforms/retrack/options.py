@@ -207,11 +207,11 @@ class LikelihoodOptions(RetrackOptions):
     )
 
     @property
-    def links_in_picture(self) -> bool:
+    def links_in_picture(self) -> bool:  # type: ignore[override]
         return self.link_s > 0 or self.store_appearance
 
     @property
-    def follows_log(self) -> bool:
+    def follows_log(self) -> bool:  # type: ignore[override]
         return self.adapt
 
     merge_distance_m: float = setting(1.0, least=0.0, theme=_ASSOCIATION)
@@ -225,11 +225,11 @@ class LikelihoodOptions(RetrackOptions):
     descriptors: Descriptors | None = context(lambda: None, is_recorded=False)
 
     @property
-    def looks(self) -> Descriptors | None:
+    def looks(self) -> Descriptors | None:  # type: ignore[override]
         return None if self.appearance is False else self.descriptors
 
     @property
-    def stored_looks(self) -> Descriptors | None:
+    def stored_looks(self) -> Descriptors | None:  # type: ignore[override]
         return self.descriptors if self.store_appearance else None
 
 
@@ -357,5 +357,5 @@ class ConsistencyOptions(RetrackOptions):
     backfill: Literal["none", "unclaimed", "all"] = setting("unclaimed", theme=_OFFLINE)
 
     @property
-    def shares_samples(self) -> bool:
+    def shares_samples(self) -> bool:  # type: ignore[override]
         return self.backfill == "all"
