@@ -521,6 +521,7 @@ _WALKS: Final = "person=:0.4::1.2"
 _TRACKED: Final = MappingProxyType({"birth_score": 0.8, "confirm_score": 2.0, "max_age_s": 1.0, "class_limits": _WALKS})
 
 
+@dataclass(frozen=True, kw_only=True)
 @parameters
 class FootFuser:
     """Fuse boxes of several cameras that stand at the same place on the ground.

@@ -6,6 +6,7 @@ Letters: N detections, K tracks.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from types import MappingProxyType
 from typing import ClassVar, Final, Literal, NamedTuple
@@ -729,6 +730,7 @@ def _assigned(
     return track, row
 
 
+@dataclass(frozen=True, kw_only=True)
 @parameters
 class GroundTracker:
     """Track detections in metres, such as the 3D boxes of a robot's detector.

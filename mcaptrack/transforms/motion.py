@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar, Final
 
@@ -21,6 +22,7 @@ _LEAST_LOST: Final = 0.02
 _LEAST_DIVIDED, _LEAST_EXAMINED = 0.4, 4
 
 
+@dataclass(frozen=True, kw_only=True)
 @parameters
 class EstimateMotion:
     """Estimate how the camera moves, from picture to picture.

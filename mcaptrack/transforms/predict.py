@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, Field, field, fields, is_dataclass, make_dataclass
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, make_dataclass
 from functools import cache
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, NamedTuple, get_type_hints
@@ -62,6 +62,7 @@ def own_options(predictor: Callable[..., Any]) -> list[OwnOption]:
     return out
 
 
+@dataclass(frozen=True, kw_only=True)
 @parameters
 class Predict:
     """Predict where tracked people go.

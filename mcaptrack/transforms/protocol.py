@@ -40,7 +40,7 @@ from typing import (
     Literal,
     NamedTuple,
     Protocol,
-    dataclass_transform,
+    TypeVar,
     get_args,
     get_origin,
     get_type_hints,
@@ -50,6 +50,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.ranges import limits
 from mcaptrack.registry import KINDS, Kind
 from mcaptrack.schema import Frame, Schema
+
+T = TypeVar("T")
 
 
 class WithOptions(Protocol):
@@ -239,16 +241,9 @@ def setting(default: Any, help: str = "", **about: Any) -> Any:  # noqa: A002
     return option(default, help, flag=False, **about)
 
 
-def _typed(decorator: Any) -> Callable[[type[Any]], type[Any]]:
-    """The same decorator. Type checkers know this type of it wherever modules import each other in a circle."""
-    return decorator  # type: ignore[no-any-return]
-
-
-@_typed
-@dataclass_transform(kw_only_default=True, frozen_default=True)
-def parameters(cls: type[Any]) -> type[Any]:
-    """Make a frozen, keyword-only dataclass of a transform, as commands are declared: each parameter that is made with
-    ``option`` has its help in the section Parameters of the docstring. Objects check their values.
+def parameters(cls: type[T]) -> type[T]:
+    """Take the help of parameters from the section Parameters of the docstring, as commands are declared; objects check
+    their values. This is for a class that becomes a dataclass.
     """
     _, *sections = re.split(r"^(\w+)\n-+\n", inspect.cleandoc(cls.__doc__ or ""), flags=re.M)
     text = dict(zip(sections[::2], sections[1::2], strict=True)).get("Parameters", "")
@@ -259,8 +254,8 @@ def parameters(cls: type[Any]) -> type[Any]:
         declared = vars(cls)[name]
         setattr(cls, name, field(default=declared.default, metadata={**declared.metadata, "help": meaning}))
     if not hasattr(cls, "__post_init__"):
-        cls.__post_init__ = check_options
-    return dataclass(frozen=True, kw_only=True)(cls)
+        cls.__post_init__ = check_options  # type: ignore[attr-defined]
+    return cls
 
 
 def context(factory: Callable[[], Any], *, is_recorded: bool = True) -> Any:

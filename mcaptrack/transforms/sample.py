@@ -7,6 +7,7 @@ depend neither on the frame rate nor on pixels.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar
 
@@ -24,6 +25,7 @@ from mcaptrack.schema.resampling import resample_parts
 from mcaptrack.transforms.protocol import context, option, parameters
 
 
+@dataclass(frozen=True, kw_only=True)
 @parameters
 class Sample:
     """Resample tracks to a fixed rate, in metres on the ground.

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Literal
 
@@ -159,6 +160,7 @@ class Steadiness:
         return f"from {first:.1f} s to {last:.1f} s"
 
 
+@dataclass(frozen=True, kw_only=True)
 @parameters
 class KnnDetector:
     """Detect what moves, by subtracting a background model (k nearest neighbours).

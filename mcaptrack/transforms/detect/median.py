@@ -292,6 +292,7 @@ def _outside(image: Image, lowest: Image, highest: Image) -> Image:
     return largest(np.asarray(cv2.max(cv2.subtract(image, highest), cv2.subtract(lowest, image)), np.uint8))
 
 
+@dataclass(frozen=True, kw_only=True)
 @parameters
 class MedianDetector:
     """Detect who differs from the median of the recording, in colour; shadows are removed, groups separated.

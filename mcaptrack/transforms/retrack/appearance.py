@@ -307,7 +307,7 @@ def _fit(excess: Floats, is_same: Bools, weight: Floats) -> tuple[float, float, 
 
 
 class Appearance(NamedTuple):
-    """What tracks look like, and what distances between ``descriptors`` mean. Steps have ``step_s`` seconds."""
+    """The looks of tracks, and the meaning of distances between ``descriptors``. Steps have ``step_s`` seconds."""
 
     descriptors: Descriptors
     calibration: AppearanceCalibration

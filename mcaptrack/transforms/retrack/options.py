@@ -6,6 +6,7 @@ They are apart from ``methods``, which run the steps of re-tracking, because the
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar, Final, Generic, Literal, TypeVar
 
@@ -45,6 +46,7 @@ def longest_track_s(frames: Sequence[Frame]) -> float:
     return float((t_ns[run_ends(starts)] - t_ns[starts]).max()) / NS_PER_S
 
 
+@dataclass(frozen=True, kw_only=True)
 @parameters
 class RetrackOptions:
     """The options that the methods of re-tracking share: input, outputs, and all that is done offline.
@@ -173,6 +175,7 @@ class _OfOutputs(Generic[Value]):
         return self._of_all if options is None or options.store_appearance else self._usual
 
 
+@dataclass(frozen=True, kw_only=True)
 @parameters
 class LikelihoodOptions(RetrackOptions):
     """The options of re-tracking by likelihood.
@@ -309,6 +312,7 @@ def position_distances(tracks: Forecast, age: Ints, xy_m: Floats, noise_m: float
     return np.where(np.isnan(distance), np.inf, distance)
 
 
+@dataclass(frozen=True, kw_only=True)
 @parameters
 class ConsistencyOptions(RetrackOptions):
     """The options of re-tracking by prediction consistency (Algorithm 1 of the paper).

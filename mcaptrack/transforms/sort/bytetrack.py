@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Indices
@@ -9,6 +11,7 @@ from mcaptrack.transforms.protocol import parameters, setting
 from mcaptrack.transforms.sort.tracker import SINCE_UPDATE, AssociationInput, Measurements, Sort, associate
 
 
+@dataclass(frozen=True, kw_only=True)
 @parameters
 class ByteTrack(Sort):
     """ByteTrack: association in two steps.

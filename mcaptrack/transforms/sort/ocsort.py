@@ -10,6 +10,7 @@ Letters: N detections, K tracks, P pairs.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -21,10 +22,10 @@ from mcaptrack.transforms.protocol import parameters, setting
 from mcaptrack.transforms.sort.tracker import (
     SHARED_ROWS,
     AssociationInput,
+    BoxTracks,
     CandidatePairs,
     Measurements,
     Sort,
-    Tracks,
     associate,
     iou_pairs,
 )
@@ -37,6 +38,7 @@ _FRAMES_SINCE: Final = _LAST_STATE.stop
 _CENTRES: Final = _FRAMES_SINCE + 1
 
 
+@dataclass(frozen=True, kw_only=True)
 @parameters
 class OcSort(Sort):
     """OC-SORT: observations count for more than the filter.
@@ -77,8 +79,8 @@ class OcSort(Sort):
     recover: bool = setting(True)
     reupdate: bool = setting(True)
 
-    def _empty_tracks(self) -> Tracks:
-        return Tracks(_CENTRES - SHARED_ROWS + 2 * (self.direction_frames + 1))
+    def _empty_tracks(self) -> BoxTracks:
+        return BoxTracks(_CENTRES - SHARED_ROWS + 2 * (self.direction_frames + 1))
 
     def _associate(self, step: AssociationInput) -> tuple[Indices, Indices]:
         table = step.tracks.table
@@ -133,7 +135,7 @@ class OcSort(Sort):
         pairs = CandidatePairs(detections[near.detection], tracks[near.track], near.similarity, shape)
         return self._of_same_class(step, pairs)
 
-    def _move(self, tracks: Tracks, motion: Floats) -> None:
+    def _move(self, tracks: BoxTracks, motion: Floats) -> None:
         super()._move(tracks, motion)
         table = tracks.table
         kalman.move(table[_LAST_STATE], motion)
@@ -143,12 +145,12 @@ class OcSort(Sort):
         for row in range(_CENTRES, len(table), 2):
             table[row : row + 2] = move_points(motion, table[row : row + 2].T).T
 
-    def _initiate(self, tracks: Tracks, first_id: int, detections: Measurements) -> None:
+    def _initiate(self, tracks: BoxTracks, first_id: int, detections: Measurements) -> None:
         tracks.initiate(first_id, detections)
         new = np.arange(len(tracks) - len(detections), len(tracks))
         self._store(tracks, new, detections)
 
-    def _update(self, tracks: Tracks, at: Indices, detections: Measurements, hit: float, frames: int) -> None:
+    def _update(self, tracks: BoxTracks, at: Indices, detections: Measurements, hit: float, frames: int) -> None:
         frames_since = tracks.table[_FRAMES_SINCE, at]
         lost = np.flatnonzero(frames_since > frames) if self.reupdate else at[:0]
         if len(lost):
@@ -157,7 +159,7 @@ class OcSort(Sort):
         self._store(tracks, at, detections)
 
     @staticmethod
-    def _store(tracks: Tracks, at: Indices, detections: Measurements) -> None:
+    def _store(tracks: BoxTracks, at: Indices, detections: Measurements) -> None:
         table = tracks.table
         table[_LAST_BOX, at] = detections.corners
         table[_LAST_STATE, at] = table[: kalman.STATE_ROWS, at]

@@ -116,7 +116,7 @@ def frames_to_measurements(
     return columns, ends
 
 
-class Tracks:
+class BoxTracks:
     """K tracks, one column of ``table`` each: the filter's state, the rows named above, then ``extra_rows``."""
 
     def __init__(self, extra_rows: int = 0) -> None:
@@ -261,7 +261,7 @@ class AssociationInput(NamedTuple):
     Attributes
     ----------
     detections : Measurements
-    tracks : Tracks
+    tracks : BoxTracks
         After the prediction of the filters.
     predicted : (4, K) of float, in px
         Predicted boxes of the tracks: left, top, right, bottom.
@@ -276,7 +276,7 @@ class AssociationInput(NamedTuple):
     """
 
     detections: Measurements
-    tracks: Tracks
+    tracks: BoxTracks
     predicted: Floats
     age: float
     frames: int
@@ -293,6 +293,7 @@ _DETECTIONS: Final = "Detections"
 _LIFE: Final = "Begin and end of tracks"
 
 
+@dataclass(frozen=True, kw_only=True)
 @parameters
 class Sort:
     """Track detections over time.
@@ -428,7 +429,7 @@ class Sort:
         for _ in range(frames if len(tracks) else 0):  # predict through missing frames, too
             kalman.predict(tracks.state)
 
-    def _compensate(self, tracks: Tracks, motion: Floats | None) -> None:
+    def _compensate(self, tracks: BoxTracks, motion: Floats | None) -> None:
         """Move predictions (2, 3) with the camera. At a cut, where there is no motion, all tracks end."""
         if motion is None:
             tracks.keep(np.zeros(len(tracks), bool))
@@ -457,10 +458,10 @@ class Sort:
 
     # What derived trackers override.
 
-    def _empty_tracks(self) -> Tracks:
-        return Tracks()
+    def _empty_tracks(self) -> BoxTracks:
+        return BoxTracks()
 
-    def _move(self, tracks: Tracks, motion: Floats) -> None:
+    def _move(self, tracks: BoxTracks, motion: Floats) -> None:
         """Move all that is remembered of tracks by the motion (2, 3) of the camera."""
         kalman.move(tracks.state, motion)
 
@@ -472,11 +473,11 @@ class Sort:
         """Mask the detections that may start a track if they are assigned to none. Returns a new array."""
         return np.ones(len(detections), bool)
 
-    def _initiate(self, tracks: Tracks, first_id: int, detections: Measurements) -> None:
+    def _initiate(self, tracks: BoxTracks, first_id: int, detections: Measurements) -> None:
         """Start a track at each of these detections."""
         tracks.initiate(first_id, detections)
 
-    def _update(self, tracks: Tracks, at: Indices, detections: Measurements, hit: float, frames: int) -> None:
+    def _update(self, tracks: BoxTracks, at: Indices, detections: Measurements, hit: float, frames: int) -> None:
         """Correct track ``at[i]`` with detection i, ``frames`` after the previous frame."""
         tracks.update(at, detections, hit)
 
@@ -526,7 +527,7 @@ class _Run:
     true while the log is shorter than ``min_hits``: all detected tracks are written then.
     """
 
-    def __init__(self, options: Sort, tracks: Tracks) -> None:
+    def __init__(self, options: Sort, tracks: BoxTracks) -> None:
         self.tracks, self.clock, self.next_id = tracks, FrameClock(), 1
         self.age = self.frame_age = self.max_age = self.hit = self.min_hits = 0.0
         self.is_starting = True

@@ -154,6 +154,7 @@ def _people(names: Mapping[int, str]) -> int | None:
     return next((by_name[name] for name in PEOPLE if name in by_name), None)
 
 
+@dataclass(frozen=True, kw_only=True)
 @parameters
 class OnnxDetector:
     """With `--detector onnx:FILE` a network in ONNX format finds objects in each picture.
@@ -582,6 +583,7 @@ def size_for(width: int, height: int) -> Size:
 # The detectors of the catalogue, each with the settings that suit it.
 
 
+@dataclass(frozen=True, kw_only=True)
 @parameters
 class CataloguedDetector(OnnxDetector):
     """Base of the detectors of the catalogue: YOLOX, with an input of about the size of the picture.
