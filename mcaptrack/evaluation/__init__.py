@@ -293,16 +293,21 @@ def combined(results: Sequence[EvaluationRow]) -> list[EvaluationRow]:
         key = (row.group or row.tracks, row.mode, row.similarity, row.gate, row.rules, row.of_class)
         groups.setdefault(key, []).append(row)
     out = []
-    for (*same, one_class), members in groups.items():
+    for members in groups.values():
+        first = members[0]
         forecasts = [member.displacement for member in members if member.displacement is not None]
         scored = [part for member in members for part in member.scored] if all(m.scored for m in members) else []
         out.append(
             EvaluationRow(
                 COMBINED,
-                *same,
+                first.group or first.tracks,
+                first.mode,
+                first.similarity,
+                first.gate,
+                first.rules,
                 metrics.combine([member.score for member in members]),
                 combine_displacements(forecasts) if len(forecasts) == len(members) else None,
-                of_class=one_class,
+                of_class=first.of_class,
                 is_3d=all(member.is_3d for member in members),
                 scored=tuple(scored),
             )
