@@ -7,7 +7,7 @@ shows the option instead, and a command instead of a call.
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,14 @@ class McaptrackError(Exception):
 
 class DamagedError(McaptrackError):
     """A damaged log; `mcaptrack.recover` saves what is intact."""
+
+
+def did_you_mean(name: str, names: Iterable[str]) -> str:
+    """A question for a message, about the name that is meant; "" if none is close."""
+    from difflib import get_close_matches
+
+    close = get_close_matches(name, list(names), 1)
+    return f"did you mean {close[0]}? " if close else ""
 
 
 def call(function: str, *values: str | Path, **parameters: Any) -> str:

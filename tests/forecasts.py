@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mcaptrack.evaluation.metrics.pairing import Forecasts, Positions
+from mcaptrack.evaluation.metrics.displacement import Forecasts, Positions
 
 
 def positions(people: dict[int, dict[int, tuple[float, float]]]) -> Positions:

@@ -20,6 +20,7 @@ from mcaptrack.sources.cameras import provenance_of
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.transforms import Retrack, RetrackByConsistency, Sample
 from mcaptrack.transforms.retrack.appearance import Appearance, Descriptors
+from mcaptrack.transforms.retrack.assignments import Tracks
 from tests.clothes import BLUE, RED, UNTIL_S, two_who_turn_back
 
 
@@ -53,7 +54,8 @@ def test_tracks_at_the_border_of_the_picture_are_not_joined_for_looking_alike():
     ratios = []
     for is_there in (False, True):
         placed = descriptors._replace(at_border=np.full(len(t_ns), is_there))
-        seen = Appearance.of(placed, t_ns, step, track, nowhere, 0.4).between(step, track, 0.4)
+        tracks = Tracks(step, track, track, np.arange(len(step)), nowhere, placed.find(t_ns, track))
+        seen = Appearance.of(placed, tracks, 0.4).between(tracks)
         ratios.append(seen.of_tracks(np.array([0, 0]), np.array([2, 3])).tolist())  # 1 goes on as 11, and as 12
     (alike, different), (alike_at_border, different_at_border) = ratios
     assert alike > 1.5
@@ -282,7 +284,7 @@ IN_PICTURES = Retrack(poor_scale=True)
 
 @pytest.mark.parametrize(("second", "least", "are_linked"), [(BLUE, 0.6, False), (RED, 0.6, True), (BLUE, 1.1, True)])
 def test_links_in_the_picture_look_at_colours_where_these_tell_people_apart(monkeypatch, second, least, are_linked):
-    monkeypatch.setattr("mcaptrack.transforms.retrack.appearance_calibration.LEAST_SEPARATION", least)
+    monkeypatch.setattr("mcaptrack.transforms.retrack.appearance.LEAST_SEPARATION", least)
     frames, descriptors = two_who_turn_back(RED, second)
     linked, alone = {frozenset({1, 11}), frozenset({2, 12})}, {frozenset({one}) for one in (1, 2, 11, 12)}
     for looks, wanted in ((None, linked), (descriptors, linked), (exchanged(descriptors, 11, 12), alone)):

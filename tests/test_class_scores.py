@@ -10,7 +10,7 @@ import pytest
 import mcaptrack
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
-from mcaptrack.evaluation.by_class import of_class
+from mcaptrack.evaluation.aligned import of_class
 from mcaptrack.evaluation.events import EventOptions, find_events
 from mcaptrack.schema import EVENTS, TRACKS, EventKind, Frame
 from tests.commands import call

@@ -16,7 +16,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
 from mcaptrack.transforms import PROFILES, ByteTrack, OcSort, Sort
-from mcaptrack.transforms.retrack.offline_rows import settle_classes
+from mcaptrack.transforms.retrack.offline import settle_classes
 from tests.worlds import assert_same_rows, noisy_tracks, ns
 
 TRACKERS = {"sort": Sort(), "metres apart": Sort(cost="pixels"), "bytetrack": ByteTrack(), "ocsort": OcSort()}

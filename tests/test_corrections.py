@@ -24,6 +24,7 @@ from mcaptrack.transforms import Retrack
 from mcaptrack.transforms.retrack.offline import fix_tracks
 from mcaptrack.viewing.report import gather
 from tests.commands import done
+from tests.test_offline_reference import tracks_of as assigned
 
 STEP_NS = 400_000_000
 
@@ -48,13 +49,13 @@ class TestFixTracks:
         step = np.arange(8)
         source = np.array([1, 1, 9, 9, 9, 9, 2, 2])
         track = np.array([5, 5, 5, 5, 6, 6, 6, 6])
-        assert fix_tracks(step, track, source, [9]).tolist() == [5] * 8
+        assert fix_tracks(assigned(step, track, source), [9]).track.tolist() == [5] * 8
 
     def test_all_else_stays_as_it_is(self):
         step, source = np.array([0, 0, 1, 1]), np.array([1, 2, 1, 2])
         track = np.array([5, 6, 5, 6])
-        assert fix_tracks(step, track, source, []) is track
-        assert fix_tracks(step, track, source, [7]) is track
+        assert fix_tracks(assigned(step, track, source), []).track is track
+        assert fix_tracks(assigned(step, track, source), [7]).track is track
 
     @settings(max_examples=40, deadline=None)
     @given(st.data())
@@ -66,7 +67,7 @@ class TestFixTracks:
         _, first = np.unique(np.stack([step, track]), axis=1, return_index=True)
         step, source, track = step[first], source[first], track[first]
         fixed = data.draw(st.sets(st.integers(0, 4)))
-        found = fix_tracks(step, track, source, fixed)
+        found = fix_tracks(assigned(step, track, source), fixed).track
         owners = {one: set(found[source == one].tolist()) for one in fixed if (source == one).any()}
         assert all(len(tracks) == 1 for tracks in owners.values())
         assert len({next(iter(tracks)) for tracks in owners.values()}) == len(owners)

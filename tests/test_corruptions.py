@@ -11,8 +11,8 @@ import pytest
 
 import mcaptrack
 from mcaptrack.predictors.weights import load
-from mcaptrack.transforms.retrack import cut_links, false_tracks, joins, linking
-from mcaptrack.transforms.retrack.weights import WEIGHTS, weights_of
+from mcaptrack.transforms.retrack import false_tracks, linking
+from mcaptrack.transforms.retrack.weights import WEIGHTS, Logistic
 from tests.tiers import one_in
 from tools.corruptions import CORRUPTIONS, STEP_S, Corruption, corrupt
 from tools.fit_retrack import (
@@ -92,9 +92,10 @@ def test_everything_that_was_fitted_says_that_it_was_fitted_on_synthetic_data():
 def test_weights_go_by_the_names_of_features_in_any_order():
     names = ("gap", "miss")
     found = json.loads(WEIGHTS.read_text())["links"]["weights"]
-    assert weights_of("links", names)[0].tolist() == [found["gap"], found["miss"]]
-    models = {"links": linking, "people": false_tracks, "cuts": joins, "relinks": cut_links, "joins": joins}
-    for model, features in ((name, module.FEATURES) for name, module in models.items()):
+    assert Logistic.of("links", names).weights.tolist() == [found["gap"], found["miss"]]
+    of_joins = linking.JOIN_FEATURES
+    models = {"links": linking.FEATURES, "people": false_tracks.FEATURES, "cuts": of_joins, "joins": of_joins}
+    for model, features in (models | {"relinks": linking.RELINK_FEATURES}).items():
         assert set(json.loads(WEIGHTS.read_text())[model]["weights"]) == set(features)
 
 

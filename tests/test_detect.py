@@ -15,8 +15,7 @@ from mcaptrack.notices import collected
 from mcaptrack.schema import Frame
 from mcaptrack.sources.demo import SyntheticScene
 from mcaptrack.transforms import STAGES, KnnDetector
-from mcaptrack.transforms.detect.background import _BackgroundModel, _PersonHeight, clear_border, halve
-from mcaptrack.transforms.detect.registration import Registration
+from mcaptrack.transforms.detect.background import Registration, _BackgroundModel, _PersonHeight, clear_border, halve
 from tests.tiers import one_in
 from tests.worlds import ns, small_scene
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mcaptrack.evaluation.aligned import make_matchup
 from mcaptrack.evaluation.events import find_events
-from mcaptrack.evaluation.metrics.clear import matches
+from mcaptrack.evaluation.metrics import matches
 from mcaptrack.schema import EventKind, Frame, framing
 from tests.worlds import ns, tracks_at
 

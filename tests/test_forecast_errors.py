@@ -20,8 +20,7 @@ from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
 from mcaptrack.evaluation.forecasts import find_forecast_errors, smoothed_predictions
-from mcaptrack.evaluation.metrics.displacement import displacement
-from mcaptrack.evaluation.metrics.pairing import pair_forecasts
+from mcaptrack.evaluation.metrics.displacement import displacement, pair_forecasts
 from mcaptrack.predictors import Forecast
 from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.predictions import forecast_to_rows

@@ -22,10 +22,8 @@ from mcaptrack.notices import collected
 from mcaptrack.registry import names
 from mcaptrack.schema import SIGHTINGS, Frame
 from mcaptrack.testing import check_transform
-from mcaptrack.transforms import FUSION
-from mcaptrack.transforms.fuse import CameraView, FootFuser, agreement
-from mcaptrack.transforms.fuse.grouping import group
-from mcaptrack.transforms.fuse.view import places_of
+from mcaptrack.transforms import FUSION, fuse
+from mcaptrack.transforms.fuse import CameraView, FootFuser, group, places_of
 from tests.commands import call
 from tests.places import CAMERAS, HEIGHT, NS, PEOPLE, SECONDS, WIDTH, errors, fused, said, write_log
 from tests.references.joining import joined
@@ -213,7 +211,7 @@ def test_what_is_kept_of_comparing_changes_nothing(tmp_path: Path, monkeypatch: 
     mcaptrack.fuse(path)
     kept = fused(path)
     monkeypatch.setattr("mcaptrack.pipeline.gathering._KEPT_BYTES", 1500)  # some frames only
-    monkeypatch.setattr("mcaptrack.transforms.fuse.view._BLOCK", 40)
+    monkeypatch.setattr("mcaptrack.transforms.fuse._BLOCK", 40)
     monkeypatch.setattr("mcaptrack.pipeline.gathering._TOGETHER", 3)
     mcaptrack.fuse(path)
     for t_ns, rows in fused(path).items():
@@ -344,7 +342,7 @@ class TestPersistence:
     def test_blocks_of_frames_are_seamless(self, monkeypatch: pytest.MonkeyPatch) -> None:
         drawn = [[0.0, 9.0], [0.4], [0.9, 9.3, 30.0], [], [1.0], [1.1, 9.0]]
         together = self.scores(drawn)
-        monkeypatch.setattr("mcaptrack.transforms.fuse.view._BLOCK", 1)
+        monkeypatch.setattr("mcaptrack.transforms.fuse._BLOCK", 1)
         assert self.scores(drawn) == together
 
 
@@ -453,11 +451,11 @@ class TestAgreement:
 
     @pytest.mark.parametrize("seed", range(3))
     def test_rates_and_offsets(self, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(agreement, "LEAST_COMPARED", 5)  # fewer say nothing of a clock
+        monkeypatch.setattr(fuse, "LEAST_COMPARED", 5)  # fewer say nothing of a clock
         frames, fuser, offset_ns = self.frames(seed), self.fuser(), [0, 30_000_000, 0, 10_000_000]
         for taken_ns in (offset_ns, ()):
             rates, false, shared, off, late = self.slowly(frames, fuser, taken_ns or [0] * 4)
-            views, offsets, found = agreement.compare(fuser.joined(frames), fuser.views, taken_ns)
+            views, offsets, found = fuse.compare(fuser.joined(frames), fuser.views, taken_ns)
             assert tuple(found) == shared
             for c, (view, offset) in enumerate(zip(views, offsets, strict=True)):
                 assert view.detects == pytest.approx(rates[c])
@@ -472,12 +470,12 @@ class TestAgreement:
         ("expected", "seen", "strangers"), [(50, 12, True), (50, 13, False), (49, 0, False), (100, 25, False)]
     )
     def test_cameras_of_other_places(self, expected: int, seen: int, strangers: bool) -> None:
-        shared = agreement.Shared(expected, seen)
+        shared = fuse.Shared(expected, seen)
         assert shared.are_strangers is strangers
         assert f"of {expected} people that two cameras should see, two see {seen}; " in str(shared)
 
     def test_nothing_says_nothing(self) -> None:
-        views, offsets, shared = agreement.compare([], self.fuser().views)
+        views, offsets, shared = fuse.compare([], self.fuser().views)
         assert shared == (0, 0)
         assert [view.false_share for view in views] == pytest.approx([0.1, 0.2, 0.3, 0.4])
         assert views[0].detects == pytest.approx((0.2, 0.5, 0.6, 0.8))

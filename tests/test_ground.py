@@ -14,7 +14,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.testing import check_transform
 from mcaptrack.transforms import GroundTracker, Predict, Retrack, RetrackByConsistency, Sample
-from mcaptrack.transforms.ground.state import VX, VY, GroundTracks, X, Y
+from mcaptrack.transforms.ground import VX, VY, GroundTracks, X, Y
 from mcaptrack.transforms.motion_limits import LIMITS, limits_of, limits_row, read_limits
 from mcaptrack.transforms.to_video_rate import to_video_rate
 from tests.commands import call

@@ -9,10 +9,9 @@ from mcaptrack.geometry.neighbours import Pairing
 from mcaptrack.notices import collected
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.transforms import GroundTracker
-from mcaptrack.transforms.ground import state, tracker
-from mcaptrack.transforms.ground.output import Waiting
-from mcaptrack.transforms.ground.state import Covariances
-from mcaptrack.transforms.ground.tracker import _Apart, associate
+from mcaptrack.transforms import ground as state
+from mcaptrack.transforms import ground as tracker
+from mcaptrack.transforms.ground import Covariances, Waiting, _Apart, associate
 from mcaptrack.transforms.motion_limits import LIMITS
 from tests.references import ground
 from tests.worlds import ns

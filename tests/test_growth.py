@@ -17,9 +17,8 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.evaluation.aligned import compare_rows
 from mcaptrack.evaluation.events import MatchRule
-from mcaptrack.evaluation.metrics import hota, identity
+from mcaptrack.evaluation.metrics import clear, hota, identity
 from mcaptrack.evaluation.metrics import matchup as matchups
-from mcaptrack.evaluation.metrics.clear import clear
 from mcaptrack.evaluation.people import person_scores
 from mcaptrack.geometry import assignment, boxes, neighbours
 from mcaptrack.geometry.neighbours import near_pairs, touching_pairs

@@ -10,8 +10,8 @@ from scipy.stats import multivariate_normal
 
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import GroundTracker
-from mcaptrack.transforms.ground import state
-from mcaptrack.transforms.ground.tracker import LostTracks, continuations
+from mcaptrack.transforms import ground as tracker
+from mcaptrack.transforms.ground import LostTracks, continuations
 from tests.effects.ground import NAMES, Box, boxes
 
 GAP = range(20, 50)
@@ -59,14 +59,14 @@ def test_a_continued_track_keeps_its_size():
 
 def odds(lost: np.ndarray, new: np.ndarray) -> float:
     """The log odds that a new track continues a lost one, by densities of normal distributions; -inf where it can't."""
-    gap = lost[state.MISSED_S] - new[state.AGE_S]
-    if gap <= 0 or lost[state.CLASS] != new[state.CLASS]:
+    gap = lost[tracker.MISSED_S] - new[tracker.AGE_S]
+    if gap <= 0 or lost[tracker.CLASS] != new[tracker.CLASS]:
         return -np.inf
-    begin, end, velocity = new[state.FIRST], lost[state.LAST][:2], lost[state.LAST_VELOCITY]
-    speed, usual = np.linalg.norm(velocity), lost[state.SPEED]
-    noise = 2 * lost[state.NOISE] ** 2
+    begin, end, velocity = new[tracker.FIRST], lost[tracker.LAST][:2], lost[tracker.LAST_VELOCITY]
+    speed, usual = np.linalg.norm(velocity), lost[tracker.SPEED]
+    noise = 2 * lost[tracker.NOISE] ** 2
     drift = 0.07 * usual + 0.1 * speed
-    goes = noise + lost[state.LAST_SPREAD] * gap**2 + drift**2 * gap**3 / 3
+    goes = noise + lost[tracker.LAST_SPREAD] * gap**2 + drift**2 * gap**3 / 3
     density = multivariate_normal.pdf(begin, end + velocity * gap, goes * np.eye(2))
     if speed < 0.12 * usual:
         stays = multivariate_normal.pdf(begin, end, (noise + 0.15**2 * gap) * np.eye(2))
@@ -78,13 +78,13 @@ def odds(lost: np.ndarray, new: np.ndarray) -> float:
 def test_new_tracks_continue_lost_ones_as_is_most_likely_for_all(seed):
     """Beside all ways of pairing them, one by one."""
     rng = np.random.default_rng(seed)
-    lost, new = (np.zeros((len(state.no_tracks()), count)) for count in (3, 2))
-    lost[state.LAST][:2], new[state.FIRST] = rng.uniform(-4, 4, (2, 3)), rng.uniform(-4, 4, (2, 2))
-    lost[state.LAST_VELOCITY] = rng.normal(0, 1.5, (2, 3)) * (rng.random(3) < 0.6)
-    lost[state.MISSED_S], new[state.AGE_S] = rng.uniform(0.5, 4, 3), rng.uniform(0, 1, 2)
-    lost[state.SPEED], lost[state.NOISE] = rng.choice([2.0, 7.0], 3), rng.uniform(0.1, 0.4, 3)
-    lost[state.LAST_SPREAD] = rng.uniform(0.01, 0.3, 3)
-    lost[state.CLASS], new[state.CLASS] = rng.integers(0, 2, 3), rng.integers(0, 2, 2)
+    lost, new = (np.zeros((len(tracker.no_tracks()), count)) for count in (3, 2))
+    lost[tracker.LAST][:2], new[tracker.FIRST] = rng.uniform(-4, 4, (2, 3)), rng.uniform(-4, 4, (2, 2))
+    lost[tracker.LAST_VELOCITY] = rng.normal(0, 1.5, (2, 3)) * (rng.random(3) < 0.6)
+    lost[tracker.MISSED_S], new[tracker.AGE_S] = rng.uniform(0.5, 4, 3), rng.uniform(0, 1, 2)
+    lost[tracker.SPEED], lost[tracker.NOISE] = rng.choice([2.0, 7.0], 3), rng.uniform(0.1, 0.4, 3)
+    lost[tracker.LAST_SPREAD] = rng.uniform(0.01, 0.3, 3)
+    lost[tracker.CLASS], new[tracker.CLASS] = rng.integers(0, 2, 3), rng.integers(0, 2, 2)
     gain = np.array([[odds(one, other) for other in new.T] for one in lost.T])
     best = max(
         (
@@ -103,11 +103,11 @@ def test_new_tracks_continue_lost_ones_as_is_most_likely_for_all(seed):
 @pytest.mark.parametrize(("speed", "which"), [(0.239, "stayed"), (0.241, "went")])
 def test_what_is_slow_may_have_stood_still(speed, which):
     """At a usual speed of 2 m/s. Two begin after 3 s: one where it was, and one where it has gone at its speed."""
-    lost = np.zeros((len(state.no_tracks()), 1))
-    lost[state.MISSED_S], lost[state.SPEED], lost[state.NOISE], lost[state.LAST_SPREAD] = 3.0, 2.0, 0.02, 1e-6
-    lost[state.LAST_VELOCITY] = [[speed], [0.0]]
+    lost = np.zeros((len(tracker.no_tracks()), 1))
+    lost[tracker.MISSED_S], lost[tracker.SPEED], lost[tracker.NOISE], lost[tracker.LAST_SPREAD] = 3.0, 2.0, 0.02, 1e-6
+    lost[tracker.LAST_VELOCITY] = [[speed], [0.0]]
     new = np.zeros((len(lost), 2))
-    new[state.FIRST] = [[0.0, 3 * speed], [0.0, 0.0]]
+    new[tracker.FIRST] = [[0.0, 3 * speed], [0.0, 0.0]]
     i, j = continuations(lost, new)
     assert (i.tolist(), j.tolist()) == ([0], [0 if which == "stayed" else 1])
 
@@ -115,14 +115,14 @@ def test_what_is_slow_may_have_stood_still(speed, which):
 def test_lost_tracks_are_remembered_until_their_time_is_over():
     lost = LostTracks(2.0)
     lost.wait(1.0)
-    table = np.zeros((len(state.no_tracks()), 2))
-    table[state.MISSED_S], table[state.ID] = [0.5, 1.0], [4, 7]
+    table = np.zeros((len(tracker.no_tracks()), 2))
+    table[tracker.MISSED_S], table[tracker.ID] = [0.5, 1.0], [4, 7]
     lost.add(table)
     lost.wait(1.0)
-    assert lost.table[state.ID].tolist() == [4, 7]  # 2 s is not over yet
+    assert lost.table[tracker.ID].tolist() == [4, 7]  # 2 s is not over yet
     lost.wait(0.25)
-    assert lost.table[state.ID].tolist() == [4]
-    assert lost.table[state.MISSED_S].tolist() == [1.75]
+    assert lost.table[tracker.ID].tolist() == [4]
+    assert lost.table[tracker.MISSED_S].tolist() == [1.75]
 
 
 def test_a_track_that_still_coasts_may_be_continued_too_and_lost_ones_stay_lost():

@@ -16,9 +16,8 @@ from mcaptrack.geometry.boxes import columns_to_boxes, iou
 from mcaptrack.notices import collected
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import KnnDetector, MedianDetector
-from mcaptrack.transforms.detect.median_background import Background
-from mcaptrack.transforms.detect.people import Separator
-from mcaptrack.transforms.detect.person_model import Learner, Person, closed
+from mcaptrack.transforms.detect.median import Background
+from mcaptrack.transforms.detect.people import Learner, Person, Separator, closed
 from tests.drawn import HEIGHT, WIDTH, figure, film, walk
 from tests.worlds import ns, small_scene
 

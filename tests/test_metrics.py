@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from mcaptrack.evaluation import metrics
-from mcaptrack.evaluation.metrics import Matchup, clear, combine, distances, metres_to_similarity, score, summary
+from mcaptrack.evaluation.metrics import Matchup, combine, distances, metres_to_similarity, score, summary
 from mcaptrack.evaluation.metrics.displacement import combine_displacements, displacement
 from mcaptrack.evaluation.metrics.matchup import SparseTables
 from mcaptrack.geometry.boxes import iou
@@ -106,7 +106,7 @@ def test_the_two_evaluators_differ_where_they_are_known_to():
 def test_people_of_other_parts_of_a_sequence_are_in_no_count():
     """The ids of a matchup may be those of a whole sequence, of which it has a part."""
     first = np.array([0])
-    found = clear(Matchup((first,), (first,), (np.ones((1, 1)),), 0.5, n_ground_truth=3, n_tracks=2))
+    found = metrics.clear(Matchup((first,), (first,), (np.ones((1, 1)),), 0.5, n_ground_truth=3, n_tracks=2))
     assert [int(found[name]) for name in ("MT", "PT", "ML", "GT")] == [1, 0, 0, 1]
 
 

@@ -13,11 +13,10 @@ from mcaptrack.geometry.assignment import assign_by_gain, assign_pairs_by_gain
 from mcaptrack.notices import collected
 from mcaptrack.transforms import PROFILES, Sample
 from mcaptrack.transforms.retrack import identity_swaps, linking
-from mcaptrack.transforms.retrack.cut_links import CutTracks, find_candidates, link_pieces
+from mcaptrack.transforms.retrack.assignments import Tracks
 from mcaptrack.transforms.retrack.identity_swaps import compatible, find_swaps, resolve_swaps, swapped_by_pace
-from mcaptrack.transforms.retrack.joins import Cuts
 from mcaptrack.transforms.retrack.likelihood import InputNoise, LikelihoodPass
-from mcaptrack.transforms.retrack.linking import link_tracks
+from mcaptrack.transforms.retrack.linking import Cuts, CutTracks, TrackEnds, find_candidates, link_pieces, link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
 from mcaptrack.transforms.retrack.online_tracker import Association, OnlineTracker
 from tests.memory import held
@@ -36,7 +35,7 @@ Paths = dict[int, dict[int, tuple[float, float]]]
 def models(rng: np.random.Generator) -> tuple[MotionModel, Motion]:
     """The same model of motion for both implementations."""
     numbers = (rng.uniform(0.03, 0.4), rng.uniform(0.5, 2.0), rng.uniform(0.05, 0.3), rng.choice([0.0, 0.1]))
-    return MotionModel(*numbers), Motion(*numbers, 0.4)
+    return MotionModel(*numbers, 0.4), Motion(*numbers, 0.4)
 
 
 def walk_of(rng: np.random.Generator, start: np.ndarray, speed: np.ndarray, steps: int, noise_m: float) -> np.ndarray:
@@ -49,11 +48,17 @@ def with_gaps(rng: np.random.Generator, first: int, places: np.ndarray, share: f
     return {first + k: tuple(places[k].tolist()) for k in sorted(kept)}
 
 
+def tracks_of(step, track, source, xy=None) -> Tracks:
+    """Samples that are assigned to tracks; nothing is seen of them."""
+    places = np.zeros((len(step), 2)) if xy is None else xy
+    return Tracks(step, track, source, np.arange(len(step)), places, np.full(len(step), -1))
+
+
 def laid_out(paths: Paths, noise_m: float):
     """The same paths as trajectories of the package, and the row of each position."""
     assigned = [(step, name, *place) for name, path in paths.items() for step, place in path.items()]
     step, name, x, y = (np.array(column) for column in zip(*assigned, strict=True))
-    _, at, out = to_trajectories(step, name, np.stack([x, y], axis=-1), noise_m)
+    _, at, out = to_trajectories(step, name, np.stack([x, y], axis=-1))
     return out, at
 
 
@@ -82,7 +87,7 @@ def test_filtered_and_smoothed_states_equal_the_reference(seed):
     model, motion = models(rng)
     paths = scattered(rng, 4)
     out, _ = laid_out(paths, model.noise_m)
-    found = smooth(model, out, 0.4)
+    found = smooth(model, out)
     wanted = (motion.filtered, motion.backwards, motion.smoothed)
     for states, other in zip(found, wanted, strict=True):
         theirs = [state for path in paths.values() for state in dict(sorted(other(path).items())).values()]
@@ -98,8 +103,7 @@ def test_links_equal_the_reference(seed):
     paths = scattered(rng, int(rng.integers(1, 10)))
     most_s, least = float(rng.choice([1.2, 6.0, 20.0])), float(rng.choice([0.1, 0.5, 0.9]))
     out, _ = laid_out(paths, model.noise_m)
-    forward, backward, _ = smooth(model, out, 0.4)
-    found = link_tracks(model, out, forward, backward, 0.4, most_s, least)
+    found = link_tracks(TrackEnds.of(model, out), most_s, least)
     names = sorted(paths)
     assert {names[i]: names[j] for i, j in enumerate(found.tolist()) if j >= 0} == links(motion, paths, most_s, least)
 
@@ -122,26 +126,24 @@ def test_links_of_tracks_that_were_cut_equal_the_reference(seed):
     ids = {name: {step: int(rng.integers(3)) + 5 * (step // 12) for step in path} for name, path in paths.items()}
     most_s, least = float(rng.choice([1.2, 6.0, 20.0])), float(rng.choice([0.1, 0.5, 0.9]))
     out, _ = laid_out(paths, model.noise_m)
-    forward, backward, _ = smooth(model, out, 0.4)
     rows = [(step, name, ids[name][step]) for name, path in paths.items() for step in path]
     step, track, source = np.array(rows)[rng.permutation(len(rows))].T
     sides = np.array(given_cuts).reshape(-1, 3)
-    pieces = CutTracks.of(step, track, source, Cuts(*sides[:, :2].astype(int).T, sides[:, 2]))
-    found = link_pieces(model, out, forward, backward, 0.4, most_s, least, pieces)
+    pieces = CutTracks.of(tracks_of(step, track, source), Cuts(*sides[:, :2].astype(int).T, sides[:, 2]))
+    found = link_pieces(TrackEnds.of(model, out), most_s, least, pieces)
     wanted = cut_links.links(motion, paths, ids, most_s, least, given_cuts)
     assert {names[i]: names[j] for i, j in enumerate(found.tolist()) if j >= 0} == wanted
 
 
 def cut_at(paths: Paths, ids: dict[int, int], cuts: list[tuple[int, int, float]]):
     """What the links of such tracks are decided by; each has one input id."""
-    model = MotionModel(0.1, 1.0, 0.1, 0.0)
+    model = MotionModel(0.1, 1.0, 0.1, 0.0, 0.4)
     out, _ = laid_out(paths, 0.1)
-    forward, backward, _ = smooth(model, out, 0.4)
     step, track = np.array([(step, name) for name, path in paths.items() for step in path]).T
     sides = np.array(cuts).reshape(-1, 3)
     source = np.array([ids.get(name, name) for name in track.tolist()])
-    pieces = CutTracks.of(step, track, source, Cuts(*sides[:, :2].astype(int).T, sides[:, 2]))
-    return model, out, forward, backward, 0.4, pieces
+    pieces = CutTracks.of(tracks_of(step, track, source), Cuts(*sides[:, :2].astype(int).T, sides[:, 2]))
+    return TrackEnds.of(model, out), pieces
 
 
 def straight(first: int, aside_m: float) -> dict[int, tuple[float, float]]:
@@ -154,8 +156,8 @@ def straight(first: int, aside_m: float) -> dict[int, tuple[float, float]]:
 def test_pieces_with_one_input_id_may_be_linked_within_6_s_however_they_move(since, source, may_be):
     """Cut at step 14, a track goes on as another piece, and its input id is seen again later, 12 m aside."""
     paths = {1: straight(0, 0.0), 2: straight(15, 0.5), 3: straight(since, -12.0)}
-    *given_all, pieces = cut_at(paths, {1: 5, 3: source}, [(1, 2, 0.1)])
-    found = find_candidates(*given_all, 20.0, pieces)
+    ends, pieces = cut_at(paths, {1: 5, 3: source}, [(1, 2, 0.1)])
+    found = find_candidates(ends, 20.0, pieces)
     pairs = set(zip(found.ends.tolist(), found.begins.tolist(), strict=True))
     assert (0, 1) in pairs
     assert ((0, 2) in pairs) == may_be
@@ -167,12 +169,11 @@ def test_links_are_the_same_without_a_table_of_all_pairs_and_in_batches_of_any_s
     rng = np.random.default_rng(seed)
     model, _ = models(rng)
     out, _ = laid_out(scattered(rng, 14), model.noise_m)
-    forward, backward, _ = smooth(model, out, 0.4)
-    whole = link_tracks(model, out, forward, backward, 0.4, 20.0, 0.1)
+    whole = link_tracks(TrackEnds.of(model, out), 20.0, 0.1)
     for name, value in (("_TABLE_CELLS", 1), ("_BATCH", int(rng.integers(1, 9)))):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(linking, name, value)
-            assert link_tracks(model, out, forward, backward, 0.4, 20.0, 0.1).tolist() == whole.tolist()
+            assert link_tracks(TrackEnds.of(model, out), 20.0, 0.1).tolist() == whole.tolist()
 
 
 @given(seed=SEEDS)
@@ -202,14 +203,14 @@ def test_links_of_thousands_of_broken_tracks_take_memory_for_the_candidates_alon
 def test_swaps_equal_the_reference(seed):
     """Relative positions of two people, with random swaps and random costs of a swap."""
     rng = np.random.default_rng(seed)
-    _, motion = models(rng)
+    model, motion = models(rng)
     count, steps = int(rng.integers(1, 4)), int(rng.integers(1, 40))
     apart, cost = np.empty((count, steps, 2)), rng.uniform(0, 9, (count, steps))
     for one in range(count):
         apart[one] = walk_of(rng, rng.normal(0, 1.5, 2), rng.normal(0, 0.5, 2), steps, motion.noise_m)
         apart[one, rng.integers(0, steps) :] *= rng.choice([-1, 1])
         apart[one, rng.random(steps) < 0.2] = np.nan
-    course, gain = find_swaps(apart, cost, 0.4, motion.noise_m, motion.speed_m_per_s)
+    course, gain = find_swaps(model, apart, cost)
     for one in range(count):
         seen = [None if np.isnan(at[0]) else at for at in apart[one]]
         each = [course_of(seen, cost[one].tolist(), motion, drift) for drift in DRIFTS]
@@ -242,7 +243,7 @@ def test_decisions_at_encounters_equal_the_reference(seed):
             ids[name] = {step: name if step < first[0] + when else said for step in paths[name]}
     out, at = laid_out(paths, model.noise_m)
     source = np.array([ids[name][step] for name, path in paths.items() for step in path])
-    owner, decided = resolve_swaps(model, out, at, source, 0.4)
+    owner, decided = resolve_swaps(model, out, at, source)
     wanted, count = exchanged(motion, paths, ids)
     assert decided == count
     names = sorted(paths)

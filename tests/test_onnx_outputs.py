@@ -11,7 +11,7 @@ from mcaptrack import networks, notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import OnnxDetector
-from mcaptrack.transforms.detect.onnx import outputs
+from mcaptrack.transforms.detect.onnx import layouts
 from tests.onnx_graphs import INT64, cells, giving, value
 
 SIZE = (160, 128)
@@ -245,7 +245,7 @@ def test_channels_last_are_refused(shape, tmp_path):
     ],
 )
 def test_a_score_at_the_bound_is_enough_and_one_below_it_is_not(read, given):
-    reader = getattr(outputs, f"read_{read}")
+    reader = getattr(layouts, f"read_{read}")
     for least, count in ((0.5, 1), (0.5 + 1e-6, 0)):
         (found,) = reader(given, SIZE, least)
         assert (len(found.xyxy), found.score.tolist()) == (count, [0.5] * count)
@@ -256,20 +256,20 @@ def test_a_score_at_the_bound_is_enough_and_one_below_it_is_not(read, given):
 def test_a_score_of_nanodet_at_the_bound_is_enough():
     rows = np.zeros((1, len(PLACES), 2 + 32))
     rows[0, 3, 1] = 0.5
-    assert [len(outputs.read_nanodet({"o": rows}, SIZE, least)[0].xyxy) for least in (0.5, 0.500001)] == [1, 0]
+    assert [len(layouts.read_nanodet({"o": rows}, SIZE, least)[0].xyxy) for least in (0.5, 0.500001)] == [1, 0]
 
 
 @pytest.mark.parametrize(("value", "fits"), [(-0.0009, True), (1.0009, True), (-0.001, False), (1.001, False)])
 def test_likelihoods_may_be_rounded(value: float, fits: bool):
     if fits:
-        assert outputs.likelihoods(np.array([0.5, value])).tolist() == [0.5, value]
-        (found,) = outputs.read_detr(
+        assert layouts.likelihoods(np.array([0.5, value])).tolist() == [0.5, value]
+        (found,) = layouts.read_detr(
             {"labels": LABELS, "boxes": CORNERS[None], "scores": np.array([[value, 0.9]])}, SIZE, -1
         )
         assert found.score[0] == float(value > 0)
         return
-    with pytest.raises(outputs.MisreadError, match="no likelihoods"):
-        outputs.likelihoods(np.array([0.5, value]))
+    with pytest.raises(layouts.MisreadError, match="no likelihoods"):
+        layouts.likelihoods(np.array([0.5, value]))
 
 
 @pytest.mark.parametrize(
@@ -291,7 +291,7 @@ def test_only_sure_boxes_are_evidence(boxes, labels, words, score):
         "scores": np.full((1, len(boxes)), score),
     }
     if words and score == 0.4:
-        with pytest.raises(outputs.MisreadError, match=words):
-            outputs.read_detr(given, SIZE, 0.1)
+        with pytest.raises(layouts.MisreadError, match=words):
+            layouts.read_detr(given, SIZE, 0.1)
     else:
-        assert len(outputs.read_detr(given, SIZE, 0.1)[0].xyxy) == len(boxes)
+        assert len(layouts.read_detr(given, SIZE, 0.1)[0].xyxy) == len(boxes)

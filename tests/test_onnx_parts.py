@@ -10,11 +10,10 @@ import pytest
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.networks import graph
-from mcaptrack.transforms.detect.onnx import outputs
+from mcaptrack.transforms.detect.onnx import layouts
 from mcaptrack.transforms.detect.onnx.detector import Contest, refuse_if_misread
-from mcaptrack.transforms.detect.onnx.layouts import LAYOUTS
+from mcaptrack.transforms.detect.onnx.layouts import LAYOUTS, MisreadError
 from mcaptrack.transforms.detect.onnx.nms import Boxes
-from mcaptrack.transforms.detect.onnx.outputs import MisreadError
 from tests.onnx_graphs import FLOAT, INT64, model, node, tensor, value
 
 WIDE, HIGH = 96, 68  # the height fits no stride
@@ -33,9 +32,9 @@ def places(*strides: int) -> list[tuple[int, int, int]]:
 
 @pytest.mark.parametrize("strides", [(8, 16, 32), (8, 16, 32, 64), (32,)])
 def test_cells_are_numbered_row_by_row_and_stride_by_stride(strides):
-    numbers, steps = outputs.grid(SIZE, strides)
+    numbers, steps = layouts.grid(SIZE, strides)
     assert [(*map(int, cell), int(step)) for cell, step in zip(numbers, steps, strict=True)] == places(*strides)
-    assert outputs.cells(SIZE, strides) == len(places(*strides))
+    assert layouts.cells(SIZE, strides) == len(places(*strides))
 
 
 @pytest.mark.parametrize(("strides", "offset"), [((8, 16, 32), 0.5), ((8, 16, 32, 64), 0.0)])
@@ -51,7 +50,7 @@ def test_a_box_of_nanodet_reaches_from_its_cell(strides, offset):
             bins[side, [math.floor(reach), math.ceil(reach)]] = 4
         rows[0, number, 2:] = bins.ravel()
         rows[0, number, 1] = 0.75
-        (found,) = outputs.read_nanodet({"out": rows}, SIZE, 0.3)
+        (found,) = layouts.read_nanodet({"out": rows}, SIZE, 0.3)
         column, row, stride = cells[number]
         x, y = (column + offset) * stride, (row + offset) * stride
         wanted = [x - stride, y, x + 7 * stride, y + 3.5 * stride]
@@ -64,7 +63,7 @@ def test_a_box_of_yolox_lies_in_its_cell():
     rows = np.zeros((1, len(cells), 7))
     for number, score in ((0, 0.5), (9, 0.19), (30, 0.25), (len(cells) - 1, 1.0)):
         rows[0, number] = 0.25, 0.75, math.log(2), 0, score, 0.5, 0.9
-    (found,) = outputs.read_yolox({"out": rows}, SIZE, 0.2)
+    (found,) = layouts.read_yolox({"out": rows}, SIZE, 0.2)
     for box, number in zip(found.xyxy, (0, 30, len(cells) - 1), strict=True):
         column, row, stride = cells[number]
         x, y = (column + 0.25) * stride, (row + 0.75) * stride
@@ -72,7 +71,7 @@ def test_a_box_of_yolox_lies_in_its_cell():
     np.testing.assert_allclose(found.score, [0.45, 0.225, 0.9])
     assert found.label.tolist() == [1, 1, 1]
     rows[0, 0, 2] = 80
-    (found,) = outputs.read_yolox({"out": rows}, SIZE, 0.25)
+    (found,) = layouts.read_yolox({"out": rows}, SIZE, 0.25)
     assert found.xyxy[0, 2] - found.xyxy[0, 0] == pytest.approx(8 * math.exp(15))
 
 
@@ -104,7 +103,7 @@ DETR = {"labels": array(2, 5, kind="i8"), "boxes": array(2, 5, 4), "scores": arr
     ],
 )
 def test_outputs_of_detr_have_these_shapes(given, fits):
-    found = outputs.detr_parts(given)
+    found = layouts.detr_parts(given)
     assert (found is not None) == fits
     if found is not None:
         labels, boxes, scores = found
@@ -129,7 +128,7 @@ def test_outputs_of_detr_have_these_shapes(given, fits):
     ],
 )
 def test_outputs_of_rfdetr_have_these_shapes(given, boxes):
-    found = outputs.rfdetr_parts(given)
+    found = layouts.rfdetr_parts(given)
     assert (found is not None) == bool(boxes)
     assert not boxes or found[0] is given[boxes]
 
@@ -154,8 +153,8 @@ COUNT = len(places(8, 16, 32))
     ],
 )
 def test_the_shape_of_one_output_tells_how_boxes_are_arranged(shape, kind):
-    assert outputs.ultralytics_kind({"out": array(*shape)}, SIZE) == kind
-    assert outputs.ultralytics_kind({"out": array(*shape), "more": array(1)}, SIZE) is None
+    assert layouts.ultralytics_kind({"out": array(*shape)}, SIZE) == kind
+    assert layouts.ultralytics_kind({"out": array(*shape), "more": array(1)}, SIZE) is None
 
 
 # The graph

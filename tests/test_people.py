@@ -8,12 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from mcaptrack.transforms.detect.median_background import Background, Sampler
-from mcaptrack.transforms.detect.people import Separator, _joined_parts
-from mcaptrack.transforms.detect.person_model import (
+from mcaptrack.transforms.detect.median import Background, Sampler
+from mcaptrack.transforms.detect.people import (
     Learner,
     Person,
+    Separator,
     _fit_height,
+    _joined_parts,
     region_boxes,
     regions,
     typical_heights,

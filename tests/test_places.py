@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mcaptrack.transforms import PROFILES
-from mcaptrack.transforms.retrack.shown_tracks import PlaceOdds
+from mcaptrack.transforms.retrack.online_tracker import PlaceOdds
 from tests.worlds import places, walk
 
 Positions = dict[int, tuple[float, float]]

@@ -21,7 +21,7 @@ from mcaptrack.transforms.retrack.false_tracks import FEATURES, features, log_od
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
 from mcaptrack.transforms.retrack.methods import KeptIds
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories, smooth
-from mcaptrack.transforms.retrack.shown_tracks import GrowingHull
+from mcaptrack.transforms.retrack.online_tracker import GrowingHull
 from tests.commands import call
 from tests.references.false_tracks import log_odds_in_log as in_log
 from tests.references.false_tracks import person_features
@@ -278,7 +278,7 @@ def test_tracks_in_metres_keep_what_they_are_under_numbers_of_their_own(part_row
     kept = KeptIds(Retrack(predictor="cv", noise_m=0.5), Movers(unit_m=2.0), collect(TRACKS, frames))
     assert kept.noise_m == 0.25
     assert kept.steps == steps
-    out = [(online.rows["source_id"].tolist(), online.rows["track_id"].tolist()) for online, _ in kept.outputs()]
+    out = [(online.rows["source_id"].tolist(), online.rows["track_id"].tolist()) for online in kept.outputs()[0]]
     assert out == [([4, 9], [1, 2]), ([4, 9], [1, 2]), ([7], [3]), ([7, 9], [3, 2])]
     step, track, source, row = kept.assignments.of(kept.samples, kept.steps)
     assert step.tolist() == [0, 0, 1, 1, 3, 4, 4]

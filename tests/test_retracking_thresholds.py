@@ -16,7 +16,7 @@ from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES
 from mcaptrack.transforms.retrack.false_tracks import FEATURES, features
 from mcaptrack.transforms.retrack.identity_swaps import find_encounters, resolve_swaps
-from mcaptrack.transforms.retrack.linking import candidates, link_tracks
+from mcaptrack.transforms.retrack.linking import TrackEnds, candidates, link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
 from tests.references.false_tracks import person_features
 from tests.references.offline import Motion, Path, encounters, exchanged, links
@@ -25,7 +25,7 @@ from tests.tiers import one_in
 from tests.worlds import walk
 
 NUMBERS = (0.2, 1.75, 0.12, 0.08)
-MODEL, MOTION = MotionModel(*NUMBERS), Motion(*NUMBERS, 0.4)
+MODEL, MOTION = MotionModel(*NUMBERS, 0.4), Motion(*NUMBERS, 0.4)
 FEW = replace(
     PROFILES["default"],
     predictor="cv",
@@ -109,7 +109,7 @@ def laid_out(paths: dict[int, Path]):
         np.array(column)
         for column in zip(*((s, n, *at) for n, path in paths.items() for s, at in path.items()), strict=True)
     )
-    _, at, out = to_trajectories(step, name, np.stack([x, y], axis=-1), MODEL.noise_m)
+    _, at, out = to_trajectories(step, name, np.stack([x, y], axis=-1))
     return out, at
 
 
@@ -130,8 +130,7 @@ def test_the_largest_sideways_distance_of_a_link(speed, gap, others, least):
 
     def ours(aside_m: float) -> bool:
         out, _ = laid_out(paths(aside_m))
-        forward, backward, _ = smooth(MODEL, out, 0.4)
-        return link_tracks(MODEL, out, forward, backward, 0.4, 20.0, least)[-2] == 2 * others + 1
+        return link_tracks(TrackEnds.of(MODEL, out), 20.0, least)[-2] == 2 * others + 1
 
     def reference(aside_m: float) -> bool:
         return links(MOTION, paths(aside_m), 20.0, least).get(90) == 91
@@ -145,8 +144,8 @@ def test_the_largest_sideways_distance_of_a_link(speed, gap, others, least):
 def feature(name: str, paths: dict[int, Path]) -> tuple[float, float]:
     """A feature of the second of two tracks: of the package, and of the reference."""
     out, _ = laid_out(paths)
-    _, _, smoothed = smooth(MODEL, out, 0.4)
-    return float(features(MODEL, out, smoothed, 0.4)[1, FEATURES.index(name)]), person_features(MOTION, paths)[2][name]
+    _, _, smoothed = smooth(MODEL, out)
+    return float(features(MODEL, out, smoothed)[1, FEATURES.index(name)]), person_features(MOTION, paths)[2][name]
 
 
 @pytest.mark.parametrize(("name", "limit_m"), [("duplicate", 1.2), ("beside", 1.8)])
@@ -192,7 +191,7 @@ def crossing(beside_m: float, gap: int, shift: int, named: str) -> tuple[dict[in
 def ours_exchanged(paths: dict[int, Path], ids: dict[int, dict[int, int]]) -> bool:
     out, at = laid_out(paths)
     source = np.array([ids[track][step] for track, path in paths.items() for step in path])
-    return resolve_swaps(MODEL, out, at, source, 0.4)[1] > 0
+    return resolve_swaps(MODEL, out, at, source)[1] > 0
 
 
 @pytest.mark.parametrize(
@@ -276,7 +275,7 @@ def test_a_swap_at_the_last_step_of_both_is_undone():
         for track, left in ((3, 0.0), (5, 1.5))
     }
     out, at = laid_out(paths)
-    owner, changed = resolve_swaps(MODEL, out, at, np.repeat([3, 5], 40), 0.4)
+    owner, changed = resolve_swaps(MODEL, out, at, np.repeat([3, 5], 40))
     assert changed == 1
     assert owner.tolist() == [0] * 39 + [1] + [1] * 39 + [0]
 
@@ -300,7 +299,7 @@ def test_the_input_id_0_counts_like_any_other():
 def test_a_link_leads_forward_in_time_and_no_farther_than_its_limits(gap, aside_m, is_candidate):
     """Up to 20 s, which are 50 steps, and 1 m and 2.5 m for each second, which is 3 m in two steps."""
     out, _ = laid_out({1: line(0, 15, (0, 0), (0, 0)), 2: line(14 + gap, 15, (0, aside_m), (0, 0))})
-    forward, backward, _ = smooth(MODEL, out, 0.4)
-    i, j, gap_s = candidates(out, forward, backward, 0.4, 20.0)
+    ends = TrackEnds.of(MODEL, out)
+    i, j = candidates(ends, 20.0)
     assert list(zip(i.tolist(), j.tolist(), strict=True)) == [(0, 1)] * is_candidate
-    assert gap_s.tolist() == pytest.approx([0.4 * gap] * is_candidate)
+    assert ends.gaps(i, j).seconds.tolist() == pytest.approx([0.4 * gap] * is_candidate)

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import mcaptrack
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, aligned, averages, evaluate
-from mcaptrack.evaluation.by_class import of_class
+from mcaptrack.evaluation.aligned import of_class
 from mcaptrack.evaluation.event_text import PEOPLE, log_messages, nouns_of
 from mcaptrack.evaluation.events import EventOptions, default_rule, find_events
 from mcaptrack.evaluation.metrics import ScoredMatchup, average_over_recalls, metres_to_similarity

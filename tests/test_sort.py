@@ -15,7 +15,7 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.transforms import TRACKERS
 from mcaptrack.transforms.sort import Sort
-from mcaptrack.transforms.sort.state import distance_pairs
+from mcaptrack.transforms.sort.tracker import distance_pairs
 from tests.references.sort import Box, ReferenceByteTrack, ReferenceOcSort, ReferenceSort
 from tests.worlds import boxes_at, ids, ns
 

@@ -7,7 +7,7 @@ import pytest
 
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
-from mcaptrack.transforms.detect.registration import Registration, Steadiness
+from mcaptrack.transforms.detect.background import Registration, Steadiness
 from tests.worlds import ns
 
 

@@ -20,7 +20,6 @@ from mcaptrack.predictors.tail_calibration import (
     TailCalibration,
     correct,
     counts_of,
-    fit_mixture,
     follow,
     level_counts,
     table_of,
@@ -31,6 +30,7 @@ from mcaptrack.transforms import PROFILES, forecasts
 from mcaptrack.transforms.motion_limits import LIMITS
 from mcaptrack.transforms.predict import Predict
 from tests.worlds import ns, tracks_at
+from tools.regression import fit_mixture
 
 STEP_NS = 400_000_000
 

@@ -11,8 +11,8 @@ import pytest
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import TRACKS, Frame, framing
 from mcaptrack.schema.frame_columns import collect
-from mcaptrack.transforms.retrack.offline_rows import TrackRows, move_rows, moved_to, rows_by_step
-from mcaptrack.transforms.retrack.samples import LogSamples
+from mcaptrack.transforms.retrack.assignments import LogSamples
+from mcaptrack.transforms.retrack.offline import TrackRows, move_rows, moved_to, rows_by_step
 from mcaptrack.transforms.to_video_rate import linked_tracks, mended_ends, to_video_rate
 from tests.worlds import ns
 

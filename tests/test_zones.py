@@ -16,8 +16,14 @@ from hypothesis import strategies as st
 import mcaptrack
 from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.zone_places import ground_height_m, place_zone, positions_of
-from mcaptrack.evaluation.zones import ZoneOptions, find_zone_events, zone_totals
+from mcaptrack.evaluation.zones import (
+    ZoneOptions,
+    find_zone_events,
+    ground_height_m,
+    place_zone,
+    positions_of,
+    zone_totals,
+)
 from mcaptrack.geometry.pinhole import Lens
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.geometry.zones import Paths, Shape, crossings, visits

@@ -37,12 +37,12 @@ from mcaptrack.evaluation.metrics import combine, score, summary
 from mcaptrack.geometry.assignment import assign, solve
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES, Sample
-from mcaptrack.transforms.retrack import cut_links, false_tracks, joins, linking, offline
-from mcaptrack.transforms.retrack.false_tracks import probability
-from mcaptrack.transforms.retrack.joins import Joins, Tracked, find_joins, tracked_of
+from mcaptrack.transforms.retrack import false_tracks, linking, offline
+from mcaptrack.transforms.retrack.assignments import Tracks
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
+from mcaptrack.transforms.retrack.linking import Joins, find_joins, tracked_of
 from mcaptrack.transforms.retrack.motion_model import Trajectories
-from mcaptrack.transforms.retrack.weights import WEIGHTS
+from mcaptrack.transforms.retrack.weights import WEIGHTS, Logistic, probability
 
 DEFAULT = PROFILES["default"]
 Found = TypeVar("Found")
@@ -82,6 +82,7 @@ def prepare(truth: np.ndarray, made: np.ndarray) -> Run:
     run = LikelihoodPass(DEFAULT)
     for frame in samples:
         run.step(frame)
+    run.finish()
     times = np.array([frame.t_ns for frame in samples])
     return Run(
         true, samples, (DEFAULT, motion_model(DEFAULT, run.noise_m), run.assignments, run.samples, run.steps, times)
@@ -169,10 +170,11 @@ class Pairs:
 
 def pairs_of(run: Run) -> Pairs:
     """The candidate links of a scene."""
-    model, paths, forward, backward, step_s = reached("link_pieces", FITTED, *run.args[1:])[:5]
-    i, j, gap_s = linking.candidates(paths, forward, backward, step_s, MAX_GAP_S)
-    first, last = paths.first[:-1], paths.first[1:] - 1
-    found = linking.features(model, forward.take(last[i]), backward.take(first[j]), gap_s)
+    sides = reached("link_pieces", FITTED, *run.args[1:])[0]
+    paths = sides.trajectories
+    i, j = linking.candidates(sides, MAX_GAP_S)
+    gaps = sides.gaps(i, j)
+    gap_s, found = gaps.seconds, linking.features(sides.model, gaps)
     owner = owners_of(run, paths)
     ends, begins = usual(owner, paths, -1), usual(owner, paths, 1)
     same = np.flatnonzero((ends[i] >= 0) & (ends[i] == begins[j]))
@@ -180,7 +182,7 @@ def pairs_of(run: Run) -> Pairs:
     _, at = np.unique(i[nearest], return_index=True)  # later returns are links of later tracks
     right = np.zeros(len(i))
     right[nearest[at]] = 1
-    return Pairs(len(first), i, j, found, right)
+    return Pairs(len(sides.begins), i, j, found, right)
 
 
 class People(NamedTuple):
@@ -196,12 +198,12 @@ class People(NamedTuple):
 
 def people_of(run: Run) -> People:
     """The tracks of a scene."""
-    model, paths, smoothed, step_s, log = reached("log_odds_in_log", FITTED, *run.args[1:])
+    model, paths, smoothed, log = reached("log_odds_in_log", FITTED, *run.args[1:])
     observed = np.isfinite(paths.xy_m[:, 0])
     count = np.add.reduceat(observed.astype(float), paths.first[:-1])
     own = np.add.reduceat((owners_of(run, paths) >= 0).astype(float), paths.first[:-1])
-    found = false_tracks.features(model, paths, smoothed, step_s)
-    throughout = false_tracks.stand_throughout(paths, smoothed, found, log, step_s)
+    found = false_tracks.features(model, paths, smoothed)
+    throughout = false_tracks.stand_throughout(paths, smoothed, found, log, model.step_s)
     return People(found, own / count, count, throughout)
 
 
@@ -212,13 +214,13 @@ class Judged(NamedTuple):
     are_right: np.ndarray
 
 
-def judged_joins(run: Run, tracked: Tracked, found: Joins, xy_m: np.ndarray) -> tuple[Judged, np.ndarray]:
+def judged_joins(run: Run, tracked: Tracks, found: Joins) -> tuple[Judged, np.ndarray]:
     """Joins compared with who was there, and the true id of each assignment (C,), or -1.
 
     Joins of two false tracks are neither right nor wrong.
     """
     _, track, count = np.unique(tracked.track, return_inverse=True, return_counts=True)
-    owner = owners(run, tracked.step, xy_m, count[track])
+    owner = owners(run, tracked.step, tracked.xy_m, count[track])
 
     def who(at: int, way: int) -> int:
         near = slice(at, at + ROWS) if way > 0 else slice(max(at - ROWS + 1, 0), at + 1)
@@ -234,16 +236,15 @@ def judged_joins(run: Run, tracked: Tracked, found: Joins, xy_m: np.ndarray) -> 
 
 def cuts_of(run: Run) -> Judged:
     """The joins of the online tracks of a scene."""
-    model, step, track, source, xy_m, step_s = reached("cut_joins", *run.args)[:6]
-    order = np.lexsort((step, track))
-    tracked = tracked_of(model, step[order], track[order], source[order], xy_m[order], step_s)
-    return judged_joins(run, tracked, find_joins(tracked, model, step_s), xy_m[order])[0]
+    model, tracks = reached("cut_joins", *run.args)[:2]
+    tracks = tracks.take(tracks.order)
+    return judged_joins(run, tracks, find_joins(tracked_of(model, tracks), model))[0]
 
 
 def relinks_of(run: Run) -> Judged:
     """The candidate links at the cuts of a scene: right are those that are nearest in time from both sides."""
-    given = reached("link_pieces", *run.args)
-    found, paths = cut_links.find_candidates(*given[:6], given[7]), given[1]
+    sides, max_gap_s, _, pieces, _ = reached("link_pieces", *run.args)
+    found, paths = linking.find_candidates(sides, max_gap_s, pieces), sides.trajectories
     owner = owners_of(run, paths)
     ends, begins = usual(owner, paths, -1)[found.ends], usual(owner, paths, 1)[found.begins]
     same = np.flatnonzero((ends >= 0) & (ends == begins))
@@ -257,10 +258,10 @@ def relinks_of(run: Run) -> Judged:
 
 def decisions_of(run: Run) -> tuple[Judged, Judged]:
     """The joins of the offline tracks of a scene, and which tracks are people."""
-    decided, model, samples, _, step_s = reached("decision_rows", *run.args)
-    xy_m = np.stack([samples.column(name)[decided.sample] for name in ("x_m", "y_m")], axis=-1)
-    made, owner = judged_joins(run, decided.tracked, offline.find_kept_joins(decided, model, step_s), xy_m)
-    _, track, count = np.unique(decided.tracked.track, return_inverse=True, return_counts=True)
+    decided, model, _, _ = reached("decision_rows", *run.args)
+    tracks = decided.tracked.tracks
+    made, owner = judged_joins(run, tracks, offline.find_kept_joins(decided, model))
+    _, track, count = np.unique(tracks.track, return_inverse=True, return_counts=True)
     return made, Judged(decided.log_odds[:, None], np.bincount(track, owner >= 0) * 2 >= count)
 
 
@@ -280,10 +281,10 @@ def fit_judged(names: tuple[str, ...], parts: Iterable[Judged]) -> dict[str, Any
 
 def fit_cuts(scenes: list[Run]) -> dict[str, Any]:
     """The weights of joins that may be cut, then of links at cuts."""
-    cuts = fit_judged(joins.FEATURES, told(cuts_of, scenes, "joins that may be cut"))
-    install(joins, "CUTS_", cuts)
-    relinks = fit_judged(cut_links.FEATURES, told(relinks_of, scenes, "links at cuts"))
-    install(cut_links, "RELINKS_", relinks)
+    cuts = fit_judged(linking.JOIN_FEATURES, told(cuts_of, scenes, "joins that may be cut"))
+    install(linking, "_CUTS", cuts)
+    relinks = fit_judged(linking.RELINK_FEATURES, told(relinks_of, scenes, "links at cuts"))
+    install(linking, "_RELINKS", relinks)
     return {"cuts": cuts, "relinks": relinks}
 
 
@@ -291,7 +292,7 @@ def fit_decisions(scenes: list[Run]) -> dict[str, Any]:
     """The weights of joins that are made, and of tracks."""
     of_joins, of_people = zip(*told(decisions_of, scenes, "decisions"), strict=True)
     return {
-        "joins": fit_judged(joins.FEATURES, of_joins),
+        "joins": fit_judged(linking.JOIN_FEATURES, of_joins),
         "decided": fit_judged(("log odds",), of_people),
     }
 
@@ -337,10 +338,9 @@ def named(names: tuple[str, ...], weights: np.ndarray) -> dict[str, float]:
     return dict(zip(names, np.round(weights, 3).tolist(), strict=True))
 
 
-def install(module: Any, prefix: str, fitted: dict[str, Any]) -> None:
-    """Let a module decide by these weights, in this process; ``prefix`` is that of its names for them."""
-    setattr(module, f"_{prefix}WEIGHTS", np.array(list(fitted["weights"].values())))
-    setattr(module, f"_{prefix}BIAS", fitted["bias"])
+def install(module: Any, name: str, fitted: dict[str, Any]) -> None:
+    """Let a module decide by these weights, in this process; ``name`` is that of its regression."""
+    setattr(module, name, Logistic(np.array(list(fitted["weights"].values())), fitted["bias"], fitted))
 
 
 def held(seeds: list[int], steps: int) -> None:
@@ -359,8 +359,8 @@ def held(seeds: list[int], steps: int) -> None:
         row = summary(combine(side))
         print(f"{name:12}{100 * row['IDF1']:.1f} / {100 * row['MOTA']:.1f} / {row['IDSW']}")
     made, people = ([np.concatenate(both) for both in zip(*one, strict=True)] for one in zip(*outcomes, strict=True))
-    show_reliability("joins", offline.join_probability(made[0]), made[1])
-    is_person = offline.person_probability(people[0][:, 0])
+    show_reliability("joins", offline.JOINS.probability(made[0]), made[1])
+    is_person = offline.PERSON.probability(people[0])
     is_right = np.where(is_person >= 0.5, people[1], ~people[1])
     show_reliability("people and false tracks", np.maximum(is_person, 1 - is_person), is_right)
 
@@ -377,18 +377,18 @@ def main() -> None:
     if given.held:
         held(seeds, given.steps)
         return
-    joins._CUTS_BIAS = np.inf  # links don't depend on what is cut
+    linking._CUTS = linking._CUTS._replace(bias=np.inf)  # links don't depend on what is cut
     scenes = list(runs(seeds, given.steps))
     pairs = list(told(pairs_of, scenes, "links"))
     links = fit_links(pairs)
-    install(linking, "", links)
+    install(linking, "_LINKS", links)
     linking._PRIOR, linking._MIN_LOG_ODDS = links["usual"], links["least"]
     linking._BY_GAP = np.array(links["usual by gap"])
     others = list(runs(JUDGED, JUDGED_STEPS))
     cuts = fit_cuts(others)
     more = [*scenes, *runs(MORE, given.steps)]
     people = fit_people(list(told(people_of, more, "people")))
-    install(false_tracks, "", people)
+    install(false_tracks, "_PEOPLE", people)
     false_tracks._THROUGHOUT = people["stands throughout"]
     for name in ("mean", "spread"):
         setattr(false_tracks, f"_{name.upper()}", np.array(list(people[name].values())))

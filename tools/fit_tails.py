@@ -22,16 +22,16 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 from corruptions import CORRUPTIONS, STEP_S, Corruption, corrupt
+from regression import fit_mixture
 from reproduce import on_clock
 
 from mcaptrack import __version__
-from mcaptrack.evaluation.metrics.displacement import TAU_M2
-from mcaptrack.evaluation.metrics.pairing import Forecasts, Positions, pair_forecasts
+from mcaptrack.evaluation.metrics.displacement import TAU_M2, Forecasts, Positions, pair_forecasts
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories
 from mcaptrack.geometry.mixtures import Tails, mahalanobis_squared
 from mcaptrack.predictors import NAMES, Forecast, PeopleSeen, Predictor, make, predict_among
-from mcaptrack.predictors.tail_calibration import TABLES, counts_of, fit_mixture
+from mcaptrack.predictors.tail_calibration import TABLES, counts_of
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.framing import join_frames
 from mcaptrack.training.walks import walks
@@ -111,7 +111,7 @@ def distances(true: Positions, samples: list[Frame]) -> Iterator[tuple[str, np.n
     kept = run._forecasts._predictor = _Kept(run._forecasts._predictor)
     for frame in samples:
         run.step(frame)
-    online = [tracks for tracks, _ in run.outputs()]
+    online = list(run.outputs()[0])
     joined = join_frames(TRACKS, online)
     step = np.rint((joined.row_ns - start) / (STEP_S * NS_PER_S)).astype(int)
     after = step, joined.rows["track_id"].astype(int), np.concatenate(kept.pasts), ~joined.rows["observed"]

@@ -20,12 +20,13 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
+from regression import fit_mixture
 from traffic import CLASSES, Faults, draw_traffic
 
 from mcaptrack import __version__
 from mcaptrack.geometry.mixtures import Tails, mahalanobis_squared, mass_within
 from mcaptrack.predictors import vehicle_tails as shipped
-from mcaptrack.predictors.tail_calibration import counts_of, fit_mixture
+from mcaptrack.predictors.tail_calibration import counts_of
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.schema.predictions import tails_of
 from mcaptrack.transforms import GroundTracker, Retrack, Sample

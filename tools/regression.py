@@ -1,4 +1,4 @@
-"""Logistic regressions of `fit_retrack.py`: how they are fitted, and how reliable their probabilities are.
+"""Fits of `fit_retrack.py` and `fit_tails.py`: logistic regressions and how reliable they are, and mixtures.
 
 Letters: N members, F features, D decisions.
 """
@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from mcaptrack.transforms.retrack.false_tracks import probability
+from mcaptrack.geometry.arrays import Floats
+from mcaptrack.geometry.mixtures import Tails
+from mcaptrack.predictors.tail_calibration import CENTRES, LEAST_WIDE, MOST_WIDE
+from mcaptrack.transforms.retrack.weights import probability
 
 #: How strongly weights are drawn to 0, and how strongly those that groups have of their own (shares of right links).
 RIDGE, OWN_RIDGE = 1e-5, 1e-4
@@ -59,3 +62,21 @@ def show_reliability(name: str, likely: np.ndarray, right: np.ndarray) -> None:
         here = place == one
         said, were = (100 * values[here].mean() for values in (likely, right))
         print(f"  {one / 10:.1f} to {one / 10 + 0.1:.1f}: {here.sum():6}, said {said:.1f} %, right {were:.1f} %")
+
+
+def fit_mixture(counts: Floats, start: Tails, iterations: int) -> Tails:
+    """The mixtures (T,) under which counts (T, B) of half the squared distances are likeliest.
+
+    By expectation and maximisation, ``iterations`` times from ``start``.
+    """
+    weight, narrow, wide = (part[:, None] for part in start)
+    total = counts.sum(axis=1, keepdims=True)
+    for _ in range(iterations):
+        of_narrow = (1 - weight) / narrow * np.exp(-CENTRES / narrow)
+        two = weight / wide * np.exp(-CENTRES / wide)
+        of_wide = counts * two / np.maximum(of_narrow + two, 1e-300)
+        sums = of_wide.sum(axis=1, keepdims=True)
+        wide = (of_wide @ CENTRES)[:, None] / np.maximum(sums, 1e-9)
+        narrow = ((counts - of_wide) @ CENTRES)[:, None] / np.maximum(total - sums, 1e-9)
+        weight = np.clip(sums / total, LEAST_WIDE, MOST_WIDE)
+    return Tails(weight[:, 0], narrow[:, 0], wide[:, 0])

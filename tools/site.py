@@ -139,12 +139,11 @@ def predictors() -> str:
 
 def metrics() -> str:
     """The metrics, and what they are computed from."""
-    from importlib import import_module
-
     from mcaptrack.evaluation import metrics
+    from mcaptrack.evaluation.metrics import displacement
 
     parts = [_references(metrics, metrics.__all__)]
-    for module in (metrics, *(import_module(f"{metrics.__name__}.{name}") for name in ("clear", "displacement"))):
+    for module in (metrics, displacement):
         own = [each for each, found in vars(module).items() if getattr(found, "__module__", "") == module.__name__]
         parts.append(_references(module, [each for each in own if not each.startswith("_")], set(metrics.__all__)))
     return "\n\n".join(parts)

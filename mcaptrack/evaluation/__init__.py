@@ -29,10 +29,13 @@ from mcaptrack.evaluation.aligned import (
     compare_rows,
     explain_no_match,
     has_positions,
+    ids_of_class,
+    of_class,
     refuse_sides_without,
+    share_classes,
     sides_without,
+    with_ids,
 )
-from mcaptrack.evaluation.by_class import ids_of_class, of_class, share_classes, with_ids
 from mcaptrack.evaluation.forecasts import FORECAST_INPUTS, score_forecasts
 from mcaptrack.evaluation.metrics import Rules, Score, ScoredMatchup, average_over_recalls
 from mcaptrack.evaluation.metrics.displacement import Displacement, combine_displacements
@@ -67,7 +70,7 @@ class EvaluateOptions:
     min_iou : float
         The least overlap of a match, for the similarities that are overlaps.
     rules : {"trackeval", "motmetrics"}
-        Rules of CLEAR, see `mcaptrack.evaluation.metrics.clear.clear`.
+        Rules of CLEAR, see `mcaptrack.evaluation.metrics`.
     topics : tuple of str
         The channels to score. Empty: all tracks of the camera.
     """
@@ -290,20 +293,21 @@ def combined(results: Sequence[EvaluationRow]) -> list[EvaluationRow]:
         key = (row.group or row.tracks, row.mode, row.similarity, row.gate, row.rules, row.of_class)
         groups.setdefault(key, []).append(row)
     out = []
-    for (tracks, mode, similarity, gate, rules, one_class), members in groups.items():
+    for members in groups.values():
+        first = members[0]
         forecasts = [member.displacement for member in members if member.displacement is not None]
         scored = [part for member in members for part in member.scored] if all(m.scored for m in members) else []
         out.append(
             EvaluationRow(
                 COMBINED,
-                tracks,
-                mode,
-                similarity,
-                gate,
-                rules,
+                first.group or first.tracks,
+                first.mode,
+                first.similarity,
+                first.gate,
+                first.rules,
                 metrics.combine([member.score for member in members]),
                 combine_displacements(forecasts) if len(forecasts) == len(members) else None,
-                of_class=one_class,
+                of_class=first.of_class,
                 is_3d=all(member.is_3d for member in members),
                 scored=tuple(scored),
             )
@@ -339,22 +343,11 @@ def _score(
             scored = {name: scored_matchups(part) for name, part in compared.items()} if is_averaged else {}
             if gate == gates[-1] and whole.hota["HOTA_TP"][0] == 0:
                 notes += explain_no_match(sequence.name, candidate.name, ground_truth, tracks, similarity)
-            results += [
-                EvaluationRow(
-                    sequence.name,
-                    candidate.name,
-                    candidate.mode,
-                    similarity,
-                    gate,
-                    options.rules,
-                    score,
-                    group=candidate.group,
-                    of_class=name,
-                    is_3d=is_3d,
-                    scored=scored.get(name, ()),
-                )
-                for name, score in ((None, whole), *scores.items())
-            ]
+            key = sequence.name, candidate.name, candidate.mode, similarity, gate, options.rules
+            for name, score in ((None, whole), *scores.items()):
+                row = EvaluationRow(*key, score, group=candidate.group, of_class=name, is_3d=is_3d)
+                row.scored = scored.get(name, ())
+                results.append(row)
     if is_3d and results and not any(row.averages or row.scored for row in results):
         notes.append(f"{sequence.name}: {candidate.name} has no scores; there is no AMOTA and no sAMOTA")
     if not results:

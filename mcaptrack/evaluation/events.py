@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from mcaptrack.evaluation.aligned import (
     GATE_3D_M,
     GATE_M,
     IOU_THRESHOLD,
-    LocatedRows,
     RowComparison,
     align,
     are_3d,
@@ -29,10 +28,10 @@ from mcaptrack.evaluation.aligned import (
     has_positions,
     have_same_times,
     refuse_sides_without,
+    share_classes,
     sides_without,
 )
-from mcaptrack.evaluation.by_class import share_classes
-from mcaptrack.evaluation.metrics.clear import is_switch, matches
+from mcaptrack.evaluation.metrics import is_switch, matches
 from mcaptrack.evaluation.metrics.matchup import RowPairs
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
@@ -276,7 +275,8 @@ def find_events(
     lifecycle = lifecycle_of(tracks)
     parts = [lifecycle.births(), lifecycle.ends(), lifecycle.repairs()]
     if comparison:
-        parts += [_switches(comparison), _misses(comparison), _false_tracks(comparison)]
+        parts += [_switches(comparison)]
+        parts += [_unmatched(comparison, kind) for kind in (EventKind.MISS, EventKind.FALSE_TRACK)]
     events, events_ns = _in_order(parts)
     counts = _counts(t_ns, tracks, events, events_ns, comparison)
     numbers = [index.get(at, 0) for at in t_ns.tolist()]
@@ -354,60 +354,17 @@ def _switches(comparison: _Comparison) -> tuple[Ints, Rows]:
     )
 
 
-def _misses(comparison: _Comparison) -> tuple[Ints, Rows]:
-    """Periods in which a person has no track; ``previous_id`` is the person's last track."""
-    pairs, (_, ground_truth, tracks) = comparison.matches, comparison.compared
-    t_ns, places, periods = _periods(ground_truth, pairs.row, comparison.t_ns)
-    previous = _before(pairs.person, pairs.frame, pairs.track, periods.slot, periods.frame, tracks.ids)
-    return t_ns, event_rows(
-        EventKind.MISS, places, truth_id=places["track_id"], previous_id=previous, **periods.columns()
-    )
-
-
-def _false_tracks(comparison: _Comparison) -> tuple[Ints, Rows]:
-    """Periods in which a track matches no person; ``previous_id`` is the person of its last match."""
-    pairs, (_, ground_truth, tracks) = comparison.matches, comparison.compared
-    t_ns, places, periods = _periods(tracks, pairs.column, comparison.t_ns)
-    order = np.lexsort((pairs.frame, pairs.track))
-    previous = _before(
-        pairs.track[order], pairs.frame[order], pairs.person[order], periods.slot, periods.frame, ground_truth.ids
-    )
-    return t_ns, event_rows(
-        EventKind.FALSE_TRACK, places, track_id=places["track_id"], previous_id=previous, **periods.columns()
-    )
-
-
-def _before(mine: Ints, frame: Ints, other: Ints, slot: Ints, at: Ints, names: Ints) -> Ints:
-    """The id with which each of ``slot`` (R,) was matched last before the frame ``at``; -1 for none.
-
-    Matches are ``mine`` with ``other`` (P,), ordered by ``mine`` and ``frame``.
-    """
-    out = np.full(len(slot), NO_ID)
-    if len(mine):
-        width = int(max(frame.max(), at.max(initial=0))) + 1
-        place = np.searchsorted(mine * width + frame, slot * width + at) - 1
-        has_match = (place >= 0) & (mine[place] == slot)
-        out[has_match] = names[other[place[has_match]]]
-    return out
-
-
-class _Periods(NamedTuple):
-    """Periods without a match: index of the id, first frame, number of unmatched frames, duration in s (R,)."""
-
-    slot: Ints
-    frame: Ints
-    frames: Ints
-    duration_s: Floats
-
-    def columns(self) -> dict[str, Ints | Floats]:
-        return {"frames": self.frames, "duration_s": self.duration_s}
-
-
-def _periods(side: LocatedRows, matched: Ints, frame_ns: Ints) -> tuple[Ints, Rows, _Periods]:
-    """Periods in which an id has no match, with time and row of their beginning.
+def _unmatched(comparison: _Comparison, kind: Literal[EventKind.MISS, EventKind.FALSE_TRACK]) -> tuple[Ints, Rows]:
+    """Periods in which a person has no track, or a track matches no person; ``previous_id`` is that of the last match.
 
     Matches shorter than ``MAX_PAUSE_S`` do not end a period.
     """
+    pairs, frame_ns, (_, ground_truth, tracks) = comparison.matches, comparison.t_ns, comparison.compared
+    side, other, name = ground_truth, tracks, "truth_id"
+    mine, theirs, matched = pairs.person, pairs.track, pairs.row
+    if kind is EventKind.FALSE_TRACK:
+        side, other, name = tracks, ground_truth, "track_id"
+        mine, theirs, matched = pairs.track, pairs.person, pairs.column
     unmatched = np.ones(len(side.rows), bool)
     unmatched[matched] = False
     at = group_index(np.diff(side.ends))[unmatched]
@@ -419,7 +376,16 @@ def _periods(side: LocatedRows, matched: Ints, frame_ns: Ints) -> tuple[Ints, Ro
     start = np.flatnonzero(run_starts(slot, times=t_ns, max_gap=pause))
     end = np.append(start[1:], len(slot)) if len(start) else start
     lasts = (t_ns[end - 1] - t_ns[start] + interval) / NS_PER_S
-    return t_ns[start], rows[start], _Periods(slot[start], at[start], end - start, lasts)
+    previous = np.full(len(start), NO_ID)
+    if len(mine):
+        by_mine = np.lexsort((pairs.frame, mine))
+        width = int(max(pairs.frame.max(), at.max(initial=0))) + 1
+        before = np.searchsorted((mine * width + pairs.frame)[by_mine], slot[start] * width + at[start]) - 1
+        match = by_mine[before]
+        has_match = (before >= 0) & (mine[match] == slot[start])
+        previous[has_match] = other.ids[theirs[match[has_match]]]
+    periods = {name: rows["track_id"][start], "previous_id": previous, "frames": end - start, "duration_s": lasts}
+    return t_ns[start], event_rows(kind, rows[start], **periods)
 
 
 def _counts(t_ns: Ints, tracks: Sequence[Frame], events: Rows, events_ns: Ints, comparison: _Comparison | None) -> Rows:

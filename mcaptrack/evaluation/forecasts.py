@@ -21,11 +21,14 @@ from mcaptrack.evaluation.metrics.displacement import (
     RELIABILITY_LEVELS,
     TAU_M2,
     Displacement,
+    Forecasts,
+    PairedForecasts,
+    Positions,
     displacement,
     forecast_errors,
+    pair_forecasts,
 )
-from mcaptrack.evaluation.metrics.pairing import Forecasts, PairedForecasts, Positions, pair_forecasts
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.histories import Holt
 from mcaptrack.geometry.mixtures import Tails, squared_radius
@@ -386,8 +389,7 @@ class SmoothedHistories:
         history = self._begin(xy_m)
         _, now, before = np.intersect1d(ids, self._ids, return_indices=True)
         if steps == 1 and len(now):
-            kept = SmoothedHistory(*(values[before] for values in self._history))
-            kept.append(self._holt, xy_m[now], np.ones(len(now), np.int64))
+            kept = taken(self._history, before).extended(self._holt, xy_m[now], np.ones(len(now), np.int64))
             for values, kept_values in zip(history, kept, strict=True):
                 values[now] = kept_values
         self._ids, self._history = ids.astype(np.int64), history

@@ -13,11 +13,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.aligned import align, compare_rows, sides_without
-from mcaptrack.evaluation.by_class import share_classes
+from mcaptrack.evaluation.aligned import align, compare_rows, share_classes, sides_without
 from mcaptrack.evaluation.events import MatchRule
-from mcaptrack.evaluation.metrics import best_tracks
-from mcaptrack.evaluation.metrics.clear import is_switch, matches
+from mcaptrack.evaluation.metrics import best_tracks, is_switch, matches
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.assignment import LARGE_TABLE
 from mcaptrack.schema import Frame

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Final, Literal, Protocol, get_type_hints
+from typing import Any, Final, Literal, get_type_hints
 
 import numpy as np
 
@@ -225,12 +225,6 @@ class _Study:
                 raise McaptrackError(f"{self._path} can't be written: {error.strerror}") from None
 
 
-class _Proposer(Protocol):
-    def ask(self, number: int) -> dict[str, Any]: ...
-
-    def tell(self, trial: Trial) -> None: ...
-
-
 class _Random:
     """Proposes random values; trial n of a seed is always the same."""
 
@@ -277,7 +271,7 @@ class _Optuna:
             )
 
 
-def _proposer(ranges: Mapping[str, Range], metric: str, seed: int, done: Sequence[Trial]) -> _Proposer:
+def _proposer(ranges: Mapping[str, Range], metric: str, seed: int, done: Sequence[Trial]) -> _Random | _Optuna:
     try:
         return _Optuna(ranges, metric, seed, done)
     except ImportError:

@@ -1,6 +1,9 @@
-"""Names for array types, one for each kind of element, used in annotations everywhere."""
+"""Names for array types, one for each kind of element, used in annotations everywhere; and records of arrays."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,3 +20,16 @@ Bools = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 #: Raw bytes.
 Bytes = NDArray[np.uint8]
+#: A named tuple of arrays of one length, or of such tuples.
+Record = TypeVar("Record", bound=tuple[Any, ...])
+
+
+def taken(record: Record, which: Bools | Ints | slice) -> Record:
+    """Some members of all arrays of a record."""
+    return type(record)(*(taken(part, which) if isinstance(part, tuple) else part[which] for part in record))
+
+
+def joined(records: Sequence[Record]) -> Record:
+    """Several records end to end."""
+    columns = zip(*records, strict=True)
+    return type(records[0])(*(joined(of) if isinstance(of[0], tuple) else np.concatenate(of) for of in columns))

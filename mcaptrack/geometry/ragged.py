@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,37 @@ def ragged_range(starts: ArrayLike, counts: ArrayLike, step: int = 1) -> Ints:
     before = np.cumsum(sizes) - sizes
     offset = np.asarray(starts, np.int64) - step * before
     return np.repeat(np.broadcast_to(offset, sizes.shape), sizes) + step * np.arange(int(sizes.sum()))
+
+
+def batches(counts: Ints, size: int) -> list[slice]:
+    """Consecutive groups (G,) that have about ``size`` members together: all at once would take much memory.
+
+    Examples
+    --------
+    >>> batches(np.array([2, 1, 3]), 3)
+    [slice(0, 1, None), slice(1, 2, None), slice(2, 3, None)]
+    """
+    starts = np.flatnonzero(run_starts(np.cumsum(counts) // size))
+    return [slice(low, high) for low, high in pairwise([*starts.tolist(), len(counts)])]
+
+
+def find_rows(have: tuple[Ints, ...], wanted: tuple[Ints, ...]) -> Ints:
+    """The row of ``have`` (N,) with the same keys as each of ``wanted`` (M,), the first of several; -1 for none.
+
+    Examples
+    --------
+    >>> find_rows((np.array([3, 3, 5]), np.array([0, 1, 0])), (np.array([5, 3, 4]), np.array([0, 1, 1]))).tolist()
+    [2, 1, -1]
+    """
+    count = len(have[0])
+    key = np.zeros(count + len(wanted[0]), np.int64)
+    for pair in zip(have, wanted, strict=True):
+        names, number = np.unique(np.concatenate(pair), return_inverse=True)
+        key = key * len(names) + number
+    order = np.argsort(key[:count], kind="stable")
+    place = np.searchsorted(key[:count][order], key[count:])
+    row = np.append(order, -1)[place]
+    return np.where((row >= 0) & (key[row] == key[count:]), row, -1)
 
 
 def run_starts(*keys: NDArray[Any], times: Ints | None = None, max_gap: int = 0) -> Bools:

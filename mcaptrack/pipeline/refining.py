@@ -26,7 +26,7 @@ from mcaptrack.geometry.ground_correction import (
     vote,
 )
 from mcaptrack.geometry.plane import GroundPlane
-from mcaptrack.transforms.fuse.grouping import Places, group, means
+from mcaptrack.transforms.fuse import Places, group, means
 
 #: A camera with fewer comparisons, or with comparisons in fewer frames, is left as it is.
 LEAST_PAIRS: Final = 60

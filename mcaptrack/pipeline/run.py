@@ -57,7 +57,7 @@ from mcaptrack.transforms import FULL, STAGES, Sample, Transform
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.motion_limits import ClassNames, unknown_limits
 from mcaptrack.transforms.protocol import ModelCard, traits_of
-from mcaptrack.transforms.retrack.offline_rows import settle_classes
+from mcaptrack.transforms.retrack.offline import settle_classes
 from mcaptrack.transforms.to_video_rate import linked_tracks, to_video_rate
 
 Progress = Callable[[str, int, int], None]

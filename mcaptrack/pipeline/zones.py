@@ -19,8 +19,17 @@ from typing import Any, Final, NamedTuple
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation.event_text import SUFFIX
-from mcaptrack.evaluation.zone_places import PlacedZone, ground_height_m, place_zone, positions_of
-from mcaptrack.evaluation.zones import ZoneOptions, ZoneTotals, find_zone_events, zone_messages, zone_totals
+from mcaptrack.evaluation.zones import (
+    PlacedZone,
+    ZoneOptions,
+    ZoneTotals,
+    find_zone_events,
+    ground_height_m,
+    place_zone,
+    positions_of,
+    zone_messages,
+    zone_totals,
+)
 from mcaptrack.foxglove import views
 from mcaptrack.foxglove.views import zones as drawn_zones
 from mcaptrack.foxglove.views.image import PictureTimes

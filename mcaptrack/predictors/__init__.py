@@ -3,7 +3,7 @@
 Predictors are found by name (see ``mcaptrack.registry``). An entry is a class or a function; it is called with
 ``steps``, ``step_s`` and its own parameters, and returns a ``forecast.Predictor``. If it has a parameter ``file``, the
 name ``NAME:FILE`` gives it. A predictor with other steps than requested, such as a network, is resampled
-(``own_clock.OnClock``). To add a built-in predictor: a function in ``built_in``, and a line in ``registry.BUILT_IN``.
+(``OnClock``). To add a built-in predictor: a function in ``built_in``, and a line in ``registry.BUILT_IN``.
 """
 
 from __future__ import annotations

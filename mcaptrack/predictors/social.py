@@ -166,22 +166,19 @@ class Social(Network):
         )
         hidden = len(self.weights.tensors.get("own.bias", ()))
         _ = self._red
+
+        def layer(name: str, outputs: int | None, inputs: int | None) -> tuple[Floats, Floats]:
+            return np.ascontiguousarray(get(f"{name}.weight", outputs, inputs).T), get(f"{name}.bias", outputs)
+
         return (
-            np.ascontiguousarray(get("own.weight", hidden, OWN_FEATURES + state).T),
-            get("own.bias", hidden),
-            np.ascontiguousarray(get("pair.weight", hidden, PAIR_FEATURES).T),
-            get("pair.bias", hidden),
-            np.ascontiguousarray(get("both.weight", hidden, hidden).T),
-            get("both.bias", hidden),
+            *layer("own", hidden, OWN_FEATURES + state),
+            *layer("pair", hidden, PAIR_FEATURES),
+            *layer("both", hidden, hidden),
             np.ascontiguousarray(get("both.own", hidden, hidden).T),
-            np.ascontiguousarray(get("attention.weight", 3, hidden).T),
-            get("attention.bias", 3),
-            np.ascontiguousarray(get("alone.weight", 3, hidden).T),
-            get("alone.bias", 3),
-            np.ascontiguousarray(get("dense.weight", None, 3 * hidden).T),
-            get("dense.bias", None),
-            np.ascontiguousarray(get("head.weight", steps * OUTPUTS, None).T),
-            get("head.bias", steps * OUTPUTS),
+            *layer("attention", 3, hidden),
+            *layer("alone", 3, hidden),
+            *layer("dense", None, 3 * hidden),
+            *layer("head", steps * OUTPUTS, None),
         )
 
     def see(self, xy_m: Floats, valid: Bools) -> Seen:
@@ -209,10 +206,8 @@ class Social(Network):
         """
         if people is None:
             people = PeopleSeen.alone(xy_m, valid)
-        own, own_bias, pair, pair_bias, both, both_bias, of_own, attend, attend_bias, alone, alone_bias = self._layers[
-            :11
-        ]
-        dense, dense_bias, head, head_bias = self._layers[11:]
+        own, own_bias, pair, pair_bias, both, both_bias, of_own, *others = self._layers
+        attend, attend_bias, alone, alone_bias, dense, dense_bias, head, head_bias = others
         everyone = self.see(people.xy_m, people.valid)
         track, other = pairs_of(people, everyone.xy_m[:, -1])
         tracks = everyone.chosen(people.row)

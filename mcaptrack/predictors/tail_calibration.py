@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, joined, taken
 from mcaptrack.geometry.mixtures import Tails, half_radius, mahalanobis_squared, squared_radius
 from mcaptrack.notices import warn
 from mcaptrack.predictors.forecast import Forecast, Predictor
@@ -51,12 +51,6 @@ class _Issued(NamedTuple):
     cov: Floats
     fit: Ints
 
-    def copied(self, which: slice) -> _Issued:
-        """A part in arrays of its own, so that the larger ones can be freed."""
-        step, ids, is_seen, past, mean, cov, fit = self
-        numbers = step[which].copy(), ids[which].copy(), is_seen[which].copy()
-        return _Issued(*numbers, past[which].copy(), mean[which].copy(), cov[which].copy(), fit[which].copy())
-
 
 class _Compared(NamedTuple):
     """Comparisons in the order of time, (M,): times in steps, steps ahead from 0, fits, and errors.
@@ -69,11 +63,6 @@ class _Compared(NamedTuple):
     fit: Ints
     half: Floats
     size_m2: Floats
-
-    def chosen(self, which: Bools) -> _Compared:
-        """Some of them."""
-        step, ahead, fit, half, size_m2 = self
-        return _Compared(step[which], ahead[which], fit[which], half[which], size_m2[which])
 
 
 # Corrects mixtures by what their ellipses have held in a log.
@@ -116,13 +105,13 @@ _MIDDLE, _OUTER = 0.5, 0.9
 TABLES: Final = Path(__file__).parent / "trained" / "tails.json"
 #: Edges and centres of bins of half the squared Mahalanobis distance, in which comparisons are counted.
 _EDGES: Final = np.geomspace(1e-4, 1e4, 49)
-_CENTRES: Final = np.sqrt(_EDGES[1:] * _EDGES[:-1])
-BINS: Final = len(_CENTRES)
+CENTRES: Final = np.sqrt(_EDGES[1:] * _EDGES[:-1])
+BINS: Final = len(CENTRES)
 #: Counts (T, B) times this are their sums, and those of half the squared distances.
-_SUMS: Final = np.stack([np.ones(BINS), _CENTRES], axis=1)
+_SUMS: Final = np.stack([np.ones(BINS), CENTRES], axis=1)
 #: So many independent comparisons count as much as the table, for the size of errors at all steps together; as much as
 #: the size at all steps, for that at one step; and as much as the table, for the share of large errors.
-_TAILS_ALL_STEPS, _ONE_STEP, _WEIGHT = 1.0, 4.0, 20.0
+_TOGETHER, _ONE_STEP, _WEIGHT = 1.0, 4.0, 20.0
 #: Large errors are rare and their size varies: for it the table counts so many times as much.
 _LARGE: Final = 20.0
 #: This share of the forecasts of tracks that are no longer observed is taken to have large errors, as in the table:
@@ -131,7 +120,7 @@ _LOST: Final = 0.005
 #: Errors of measured positions are no smaller than this share of the least ones of true positions.
 _LEAST_MEASURED: Final = 0.1
 #: Limits of the weight of the wide part.
-_LEAST_WIDE, _TAILS_MOST_WIDE = 0.02, 0.6
+LEAST_WIDE, MOST_WIDE = 0.02, 0.6
 
 
 class TailTable(NamedTuple):
@@ -168,27 +157,9 @@ def table_of(name: str) -> TailTable | None:
     return None if table is None else TailTable(**{key: np.array(table[key], np.float64) for key in TailTable._fields})
 
 
-def fit_mixture(counts: Floats, start: Tails, iterations: int) -> Tails:
-    """The mixtures (T,) under which counts (T, B) of half the squared distances are likeliest.
-
-    By expectation and maximisation, ``iterations`` times from ``start``.
-    """
-    weight, narrow, wide = (part[:, None] for part in start)
-    total = counts.sum(axis=1, keepdims=True)
-    for _ in range(iterations):
-        of_narrow = (1 - weight) / narrow * np.exp(-_CENTRES / narrow)
-        two = weight / wide * np.exp(-_CENTRES / wide)
-        of_wide = counts * two / np.maximum(of_narrow + two, 1e-300)
-        sums = of_wide.sum(axis=1, keepdims=True)
-        wide = (of_wide @ _CENTRES)[:, None] / np.maximum(sums, 1e-9)
-        narrow = ((counts - of_wide) @ _CENTRES)[:, None] / np.maximum(total - sums, 1e-9)
-        weight = np.clip(sums / total, _LEAST_WIDE, _TAILS_MOST_WIDE)
-    return Tails(weight[:, 0], narrow[:, 0], wide[:, 0])
-
-
 def counts_of(step: Ints, half_squared: Floats, steps: int) -> Floats:
     """The number (T, B) of half squared distances (M,) of each step (M,), the first of which is 0, in each bin."""
-    column = np.clip(np.searchsorted(_EDGES, half_squared) - 1, 0, len(_CENTRES) - 1)
+    column = np.clip(np.searchsorted(_EDGES, half_squared) - 1, 0, len(CENTRES) - 1)
     flat = np.bincount(step * BINS + column, minlength=steps * BINS)
     return np.asarray(flat.reshape(steps, BINS), np.float64)
 
@@ -234,17 +205,17 @@ def follow(table: Tails, before: Tails, learned: Learned, iterations: int) -> Ta
     least, least_seen = np.maximum(learned.least, 1e-4), learned.least_measured
     for _ in range(iterations):
         seen = np.maximum(scale + learned.noise, least_seen)
-        density = np.exp(-_CENTRES / seen[..., None]) * (share / seen)[..., None]
+        density = np.exp(-CENTRES / seen[..., None]) * (share / seen)[..., None]
         of_wide = (learned.counts * (density[1] / np.maximum(density[0] + density[1], 1e-300))) @ _SUMS
         sums, total = np.stack([all_sums - of_wide, of_wide], axis=1).transpose(2, 1, 0)
         change = np.log(np.maximum(total / np.maximum(sums, 1e-9) - learned.noise, least) / scales) * (sums > 1e-6)
         mass, said = sums + lost, sums * change
-        shared = said.sum(axis=1, keepdims=True) / (trust * _TAILS_ALL_STEPS + mass.sum(axis=1, keepdims=True))
+        shared = said.sum(axis=1, keepdims=True) / (trust * _TOGETHER + mass.sum(axis=1, keepdims=True))
         scale = scales * np.exp((trust * _ONE_STEP * shared + said) / (trust * _ONE_STEP + mass))
         many, few = mass
         odds = (_WEIGHT * mean + few.sum()) / (_WEIGHT * (1 - mean) + many.sum()) * ((1 - mean) / mean)
         share[1] = (_WEIGHT / (1 + odds_of_table / odds) + few) / (_WEIGHT + few + many)
-        share[1] = np.minimum(np.maximum(share[1], _LEAST_WIDE), _TAILS_MOST_WIDE)
+        share[1] = np.minimum(np.maximum(share[1], LEAST_WIDE), MOST_WIDE)
         share[0] = 1 - share[1]
         np.maximum(scale, learned.least, out=scale)
         np.maximum(scale[1], scale[0], out=scale[1])
@@ -410,7 +381,7 @@ class TailCalibration:
 
     def _learn(self, refits: Ints) -> None:
         """Fit mixtures again at some steps (R,), each by what became known since the fit before."""
-        issued = _Issued(*(np.concatenate(parts) for parts in zip(*self._issued, strict=True)))
+        issued = joined(self._issued)
         compared, lost = self._compare(issued, refits)
         passed = np.diff(refits, prepend=self._fitted_at)
         kept = np.exp(-passed * self._step_s / _MEMORY_S)
@@ -444,7 +415,7 @@ class TailCalibration:
 
         self._fitted_at = int(refits[-1])
         left = int(np.searchsorted(issued.step, self._fitted_at - self._steps, "right"))
-        self._issued = [issued.copied(slice(left, None))]
+        self._issued = [taken(issued, np.arange(left, len(issued.step)))]
 
     def _compare(self, issued: _Issued, refits: Ints) -> tuple[_Compared, Floats]:
         """Compare forecasts with where their tracks are observed after the last fit, up to the last of ``refits``.
@@ -470,7 +441,8 @@ class TailCalibration:
         with np.errstate(invalid="ignore", divide="ignore"):
             half = mahalanobis_squared(off, cov) / 2
             size_m2 = np.sqrt(cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] ** 2)
-        return _Compared(issued.step[row], ahead, issued.fit[source], half, size_m2).chosen(np.isfinite(half)), lost
+        compared = _Compared(issued.step[row], ahead, issued.fit[source], half, size_m2)
+        return taken(compared, np.isfinite(half)), lost
 
     def _drop_fits(self) -> None:
         """Drop the fits that no forecast has any more."""

@@ -22,7 +22,6 @@ entry: a line in ``BUILT_IN``.
 
 from __future__ import annotations
 
-import difflib
 import signal
 import sys
 from collections.abc import Iterator, Mapping
@@ -37,7 +36,7 @@ from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
 
 from mcaptrack import __version__
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, did_you_mean
 from mcaptrack.registry.guard import Guard, contained_import
 
 Kind = Literal["detector", "tracker", "predictor", "retracker", "fuser"]
@@ -54,9 +53,9 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "median": "mcaptrack.transforms.detect.median:MedianDetector",
             "knn": "mcaptrack.transforms.detect.background:KnnDetector",
             "onnx": "mcaptrack.transforms.detect.onnx.detector:OnnxDetector",
-            "yolox-nano": "mcaptrack.transforms.detect.onnx.catalogued:YoloxNano",
-            "yolox-tiny": "mcaptrack.transforms.detect.onnx.catalogued:YoloxTiny",
-            "yolox-s": "mcaptrack.transforms.detect.onnx.catalogued:YoloxS",
+            "yolox-nano": "mcaptrack.transforms.detect.onnx.detector:YoloxNano",
+            "yolox-tiny": "mcaptrack.transforms.detect.onnx.detector:YoloxTiny",
+            "yolox-s": "mcaptrack.transforms.detect.onnx.detector:YoloxS",
         },
         "tracker": {
             "sort": "mcaptrack.transforms.sort:Sort",
@@ -78,7 +77,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "consistency": "mcaptrack.transforms.retrack:RetrackByConsistency",
         },
         "fuser": {
-            "feet": "mcaptrack.transforms.fuse.fuser:FootFuser",
+            "feet": "mcaptrack.transforms.fuse:FootFuser",
         },
     }
 )
@@ -364,11 +363,9 @@ def _working_folder() -> Iterator[None]:
 def _unknown(kind: Kind, name: str) -> str:
     all_names, unreadable = names(kind), list[str]()
     entry_points(_group(kind), unreadable)
-    close = difflib.get_close_matches(name, all_names, 1)
-    meant = f"did you mean {close[0]}? " if close else ""
     choices = f"there are {', '.join(all_names)}" if all_names else f"no {kind} is built in or installed"
     return (
-        f"no {kind} is called {name}; {meant}{choices}; an installed package gives more by its entry points in "
-        f"{_OWN}.{kind}s, and module:Class names any class"
+        f"no {kind} is called {name}; {did_you_mean(name, all_names)}{choices}; an installed package gives more by its "
+        f"entry points in {_OWN}.{kind}s, and module:Class names any class"
         + (f". The entry points of {', '.join(unreadable)} can't be read" if unreadable else "")
     )

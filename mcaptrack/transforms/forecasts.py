@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
 from mcaptrack.geometry.clocks import steps_passed
 from mcaptrack.geometry.histories import Histories
 from mcaptrack.geometry.mixtures import Tails, normal_tails
@@ -57,12 +57,6 @@ class _Predicted(NamedTuple):
     def is_vehicle(self) -> Bools:
         """Which tracks were measured in metres, and are of a class that moves otherwise than people."""
         return np.asarray(self.has_velocity & (self.unit_m != 1))
-
-    def take(self, which: Ints) -> _Predicted:
-        """Some of them."""
-        (mean, cov), has_velocity, unit_m, noise_m, kinds = self
-        forecast = Forecast(mean[which], cov[which])
-        return _Predicted(forecast, has_velocity[which], unit_m[which], noise_m[which], kinds[which])
 
 
 class Forecaster:
@@ -177,7 +171,7 @@ class Forecaster:
             forecast, tails = self._of_vehicles(forecasts, rows, past)
         elif has_vehicle.any():
             here = has_vehicle.nonzero()[0]
-            part, shapes = self._of_vehicles(forecasts.take(here), rows.take(here), past[here])
+            part, shapes = self._of_vehicles(taken(forecasts, here), rows.take(here), past[here])
             forecast.mean[here], forecast.cov[here] = part
             if shapes is not None:
                 tails = normal_tails(forecast.mean.shape[:2])

@@ -13,7 +13,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.schema import CAMERA_MOTION, VIDEO, Frame, Schema
 from mcaptrack.schema.camera_motion import pose_to_rows
-from mcaptrack.transforms.protocol import check_options, context, option
+from mcaptrack.transforms.protocol import context, option, parameters
 
 #: Warn from this share of lost pictures on.
 _LEAST_LOST: Final = 0.02
@@ -22,11 +22,17 @@ _LEAST_DIVIDED, _LEAST_EXAMINED = 0.4, 4
 
 
 @dataclass(frozen=True, kw_only=True)
+@parameters
 class EstimateMotion:
     """Estimate how the camera moves, from picture to picture.
 
     Reads video, writes camera motion: one row per picture, with the transform from the picture before, the one to a
     reference picture, and whether the camera is still, shaking or moving. Trackers move their predictions by it.
+
+    Parameters
+    ----------
+    mask_boxes : bool
+        Look for features outside of detected boxes, because people move by themselves.
 
     Examples
     --------
@@ -41,15 +47,12 @@ class EstimateMotion:
     [0, -3, -3, -3]
     """
 
-    mask_boxes: bool = option(True, "look for features outside of detected boxes, because people move by themselves")
+    mask_boxes: bool = option(True)
     known_boxes: Mapping[int, Floats] = context(dict, is_recorded=False)
 
     reads: ClassVar[Schema] = VIDEO
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": CAMERA_MOTION})
     latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": 0.0})
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
         camera, boxes = MotionEstimator(), self.known_boxes if self.mask_boxes else {}

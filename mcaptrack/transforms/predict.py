@@ -16,7 +16,7 @@ from mcaptrack.registry import Entry
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.forecasts import ADAPT_HELP, Forecaster, PastPositions
 from mcaptrack.transforms.motion_limits import LIMITS_HELP, LIMITS_PATTERN, ClassNames, read_limits
-from mcaptrack.transforms.protocol import check_options, context, is_option_type, option
+from mcaptrack.transforms.protocol import check_options, context, is_option_type, option, parameters
 
 # The own parameters of predictors of other packages: those beside the number and the length of steps.
 
@@ -63,10 +63,22 @@ def own_options(predictor: Callable[..., Any]) -> list[OwnOption]:
 
 
 @dataclass(frozen=True, kw_only=True)
+@parameters
 class Predict:
     """Predict where tracked people go.
 
     Reads samples, writes predictions: one row per track and future step, for tracks with enough past positions.
+
+    Parameters
+    ----------
+    predictor : str
+        Predictor: cv, holt-cv, kalman, red, social, which looks at other people, or lstm, which is less exact
+        than cv; with other weights red:FILE, social:FILE, lstm:FILE, onnx:FILE; one of an installed package; or
+        module:Class.
+    horizon_s : float
+        How far ahead to predict, in seconds.
+    min_history : int
+        Number of positions, the current one included, that a prediction needs.
 
     Examples
     --------
@@ -81,17 +93,9 @@ class Predict:
     [2.0, 2.4, 2.8]
     """
 
-    predictor: PredictorName = option(
-        "red",
-        "predictor: cv, holt-cv, kalman, red, social, which looks at other people, or lstm, which is less exact than "
-        "cv; with other weights red:FILE, social:FILE, lstm:FILE, onnx:FILE; one of an installed package; or "
-        "module:Class",
-        kind="predictor",
-    )
-    horizon_s: float = option(4.8, "how far ahead to predict, in seconds", least=0.1, most=60.0)
-    min_history: int = option(
-        4, "number of positions, the current one included, that a prediction needs", least=1, most=100
-    )
+    predictor: PredictorName = option("red", kind="predictor")
+    horizon_s: float = option(4.8, least=0.1, most=60.0)
+    min_history: int = option(4, least=1, most=100)
     adapt: bool = option(True, ADAPT_HELP)
     class_limits: str = option("", LIMITS_HELP, pattern=LIMITS_PATTERN)
     rate_hz: float = context(lambda: 2.5)

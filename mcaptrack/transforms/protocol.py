@@ -25,18 +25,33 @@ All transforms obey these laws; ``mcaptrack.testing.check_transform`` tests them
 
 from __future__ import annotations
 
+import inspect
 import math
+import re
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from functools import cache
 from types import MappingProxyType, UnionType
-from typing import Any, ClassVar, Final, Literal, NamedTuple, Protocol, get_args, get_origin, get_type_hints
+from typing import (
+    Any,
+    ClassVar,
+    Final,
+    Literal,
+    NamedTuple,
+    Protocol,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.ranges import limits
 from mcaptrack.registry import KINDS, Kind
 from mcaptrack.schema import Frame, Schema
+
+T = TypeVar("T")
 
 
 class WithOptions(Protocol):
@@ -168,7 +183,7 @@ LARGEST: Final = 1e6
 
 def option(
     default: Any,
-    help: str,  # noqa: A002
+    help: str = "",  # noqa: A002
     *,
     least: float = -math.inf,
     most: float | None = None,
@@ -185,7 +200,7 @@ def option(
     default
         Its default value.
     help : str
-        What it means, in lower case and without a full stop.
+        What it means, in lower case and without a full stop; ``parameters`` takes it from the docstring instead.
     least, most : float
         The range of a number. With ``least`` alone, ``most`` is ``LARGEST``, so that times in nanoseconds and counts of
         steps fit 64 bits.
@@ -221,9 +236,26 @@ def option(
     return field(default=default, metadata=about)
 
 
-def setting(default: Any, help: str, **about: Any) -> Any:  # noqa: A002
+def setting(default: Any, help: str = "", **about: Any) -> Any:  # noqa: A002
     """Declare a parameter as ``option`` does that only ``--set`` sets: the command has no option of its own for it."""
     return option(default, help, flag=False, **about)
+
+
+def parameters(cls: type[T]) -> type[T]:
+    """Take the help of parameters from the section Parameters of the docstring, as commands are declared; objects check
+    their values. This is for a class that becomes a dataclass.
+    """
+    _, *sections = re.split(r"^(\w+)\n-+\n", inspect.cleandoc(cls.__doc__ or ""), flags=re.M)
+    text = dict(zip(sections[::2], sections[1::2], strict=True)).get("Parameters", "")
+    for name, lines in re.findall(r"^(\w+) : .+\n((?: +.+\n?)+)", text, flags=re.M):
+        meaning = " ".join(lines.split()).removesuffix(".")
+        if not meaning[1:2].isupper():  # an abbreviation
+            meaning = meaning[:1].lower() + meaning[1:]
+        declared = vars(cls)[name]
+        setattr(cls, name, field(default=declared.default, metadata={**declared.metadata, "help": meaning}))
+    if not hasattr(cls, "__post_init__"):
+        cls.__post_init__ = check_options  # type: ignore[attr-defined]
+    return cls
 
 
 def context(factory: Callable[[], Any], *, is_recorded: bool = True) -> Any:

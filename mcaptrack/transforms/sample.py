@@ -22,14 +22,22 @@ from mcaptrack.schema import TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_numbers, frame_times, split_rows
 from mcaptrack.schema.resampling import resample_parts
-from mcaptrack.transforms.protocol import check_options, context, option
+from mcaptrack.transforms.protocol import context, option, parameters
 
 
 @dataclass(frozen=True, kw_only=True)
+@parameters
 class Sample:
     """Resample tracks to a fixed rate, in metres on the ground.
 
     Reads tracks, writes tracks: one row per person and sample time; ``observed`` is false where a gap was interpolated.
+
+    Parameters
+    ----------
+    rate_hz : float
+        Samples per second.
+    max_gap_s : float
+        Gaps in a track of up to this many seconds are interpolated.
 
     Examples
     --------
@@ -46,16 +54,13 @@ class Sample:
     [True, True, False, False, True, True]
     """
 
-    rate_hz: float = option(2.5, "samples per second", least=0.1, most=1000.0)
-    max_gap_s: float = option(2.0, "gaps in a track of up to this many seconds are interpolated", least=0.0)
+    rate_hz: float = option(2.5, least=0.1, most=1000.0)
+    max_gap_s: float = option(2.0, least=0.0)
     start_ns: int | None = context(lambda: None)
     ground_planes: Planes = context(tuple)
 
     reads: ClassVar[Schema] = TRACKS
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": TRACKS})
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     @property
     def latency_s(self) -> MappingProxyType[str, float]:

@@ -6,7 +6,6 @@ To add a stage: its transform, and a ``Stage`` in ``STAGES``. To add a transform
 
 from __future__ import annotations
 
-import difflib
 import inspect
 from collections.abc import Mapping
 from contextlib import nullcontext
@@ -16,7 +15,7 @@ from pkgutil import resolve_name
 from types import MappingProxyType
 from typing import Any, Final, Literal
 
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, did_you_mean
 from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, entry_of, find
 from mcaptrack.schema import (
     APPEARANCE,
@@ -209,10 +208,10 @@ class Stage:
         names, is_own = [f.name for f in fields(cls) if f.init], self.is_built_in(cls)
         for name in parameters:
             if name not in names:
-                close = difflib.get_close_matches(name, names, 1)
-                meant = f"did you mean {close[0]}? " if close else ""
                 what = entry if self.kind else self.name
-                raise McaptrackError(f"{what} has no parameter {name}; {meant}there are {', '.join(names) or 'none'}")
+                raise McaptrackError(
+                    f"{what} has no parameter {name}; {did_you_mean(name, names)}there are {', '.join(names) or 'none'}"
+                )
         if (file := self.split(chosen)[1]) is not None and parameters.setdefault(_FILE, file) != file:
             raise McaptrackError(f"{chosen} and `{_FILE}={parameters[_FILE]}` are two files; give one")
         with nullcontext() if is_own else blamed(entry, "could not be made"):

@@ -15,7 +15,7 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.geometry.plane import Planes, plane_at
-from mcaptrack.geometry.ragged import run_ends, run_starts
+from mcaptrack.geometry.ragged import find_rows, run_ends, run_starts
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns, collect
 from mcaptrack.schema.framing import (
@@ -235,12 +235,8 @@ def _part(
     order = order[run_starts(at[order], ids[order])]
     boxes, at, ids = boxes.take(order), at[order], ids[order]
 
-    names = np.unique(np.concatenate([base["track_id"], ids]))
-    width = len(names) + 1
-    have = base_at * width + np.searchsorted(names, base["track_id"])
-    want = at * width + np.searchsorted(names, ids)
-    place = np.minimum(np.searchsorted(have, want), max(len(have) - 1, 0))  # base is ordered by time and id
-    inside = have[place] == want if len(have) else np.zeros(len(want), bool)
+    place = find_rows((base_at, base["track_id"]), (at, ids))
+    inside = place >= 0
     for name in columns:
         base[name][place[inside]] = boxes[name][inside]
     base["source_id"][place[inside]] = boxes["track_id"][inside]

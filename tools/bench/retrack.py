@@ -27,7 +27,7 @@ def online(samples: list[Frame]) -> None:
     run = LikelihoodPass(Retrack())
     for frame in samples:
         run.step(frame)
-    for _ in run.outputs():
+    for _ in zip(*run.outputs(), strict=True):
         pass
 
 

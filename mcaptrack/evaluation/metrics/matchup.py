@@ -14,9 +14,9 @@ from typing import NamedTuple, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.geometry.arrays import Floats, Indices
+from mcaptrack.geometry.arrays import Floats, Indices, joined, taken
 from mcaptrack.geometry.assignment import LARGE_TABLE, assign_pairs_by_gain, solve
-from mcaptrack.geometry.ragged import cross_pairs
+from mcaptrack.geometry.ragged import cross_pairs, find_rows
 
 
 class RowPairs(NamedTuple):
@@ -35,8 +35,7 @@ class RowPairs(NamedTuple):
 
     def where(self, kept: NDArray[np.bool_] | Indices) -> RowPairs:
         """A selection of the pairs."""
-        frame, row, column, person, track, similarity = self
-        return RowPairs(frame[kept], row[kept], column[kept], person[kept], track[kept], similarity[kept])
+        return taken(self, kept)
 
     def contested(self) -> NDArray[np.bool_]:
         """Whether a pair (P,) shares its row or its column with another pair."""
@@ -121,11 +120,8 @@ class SparseTables(Sequence[Floats]):
         """The similarities of some pairs of a frame."""
         if not self.is_large(number):
             return self[number][rows, columns]
-        width = int(self._column_ends[number + 1] - self._column_ends[number])
         known_rows, known_columns, similarity = self.pairs_of(number)
-        stored, wanted = known_rows * width + known_columns, rows * width + columns
-        at = np.minimum(stored.searchsorted(wanted), max(len(stored) - 1, 0))
-        return np.where(stored[at] == wanted, similarity[at], 0.0) if len(stored) else np.zeros(len(rows))
+        return np.append(similarity, 0.0)[find_rows((known_rows, known_columns), (rows, columns))]
 
     def of_columns(self, kept: NDArray[np.bool_]) -> SparseTables:
         """The tables with some of the columns of all frames (C,)."""
@@ -251,7 +247,7 @@ class Matchup:
         row = (np.cumsum(people) - people)[frame] + rows
         column = (np.cumsum(tracks) - tracks)[frame] + columns
         assigned = RowPairs(frame, row, column, self.all_ground_truth[row], self.all_tracks[column], similarity)
-        return RowPairs(*(np.concatenate(both) for both in zip(easy, assigned, strict=True)))
+        return joined([easy, assigned])
 
 
 def _joined(ids: Sequence[Indices]) -> Indices:

@@ -1,9 +1,8 @@
 """Pictures -> detections.
 
-``background`` and ``median`` have the motion detectors, for cameras that stand still or nearly. ``registration``
-registers pictures of a shaking camera, ``median_background`` compares a picture with its background,
-``person_model`` learns how people look, ``people`` separates those who are one region, ``steadiness`` warns where the
-camera moves. ``onnx`` has learned detectors.
+``background`` and ``median`` have the motion detectors, for cameras that stand still or nearly; ``background`` also
+registers the pictures of a shaking camera. ``people`` learns how people look and separates those who are one region.
+``onnx`` has learned detectors.
 """
 
 from __future__ import annotations

@@ -1,29 +1,22 @@
 """Appearance: whether two parts of tracks look like one person, as a log likelihood ratio that the log itself gives.
 
 It is one more likelihood beside that of motion, where tracks are linked, cut and exchanged offline. In a log in which
-it doesn't tell people apart, as in pictures of people in uniforms, it isn't used (see ``appearance_calibration``).
+it doesn't tell people apart, as in pictures of people in uniforms, it isn't used (see ``AppearanceCalibration``).
 
 Letters: C assignments, S descriptors, D bytes of one, E pairs of tracks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.ragged import run_starts
-from mcaptrack.transforms.retrack.appearance_calibration import (
-    BATCH,
-    WINDOW,
-    WITHIN_S,
-    AppearanceCalibration,
-    calibrate,
-    usual_distance,
-)
+from mcaptrack.geometry.ragged import find_rows, group_index, ragged_range, run_starts
+from mcaptrack.transforms.retrack.assignments import Tracks
 
 #: The log likelihood ratio that the end of one track and the beginning of another are one person, for pairs of tracks
 #: (E,) that are numbered by ascending id.
@@ -46,51 +39,292 @@ class Descriptors(NamedTuple):
 
     def find(self, t_ns: Ints, track_id: Ints) -> Ints:
         """The descriptor of each sample (C,), or -1."""
-        if len(self.t_ns) == 0:
-            return np.full(len(t_ns), -1)
-        times, ids = np.unique(self.t_ns), np.unique(self.track_id)
-        have = np.searchsorted(times, self.t_ns) * len(ids) + np.searchsorted(ids, self.track_id)
-        at = np.minimum(np.searchsorted(times, t_ns), len(times) - 1)
-        who = np.minimum(np.searchsorted(ids, track_id), len(ids) - 1)
-        want = at * len(ids) + who
-        row = np.minimum(np.searchsorted(have, want), len(have) - 1)
-        is_stored = (have[row] == want) & (times[at] == t_ns) & (ids[who] == track_id)
-        return np.where(is_stored, row, -1)
+        return find_rows((self.t_ns, self.track_id), (t_ns, track_id))
 
-    def tracks_of(self, t_ns: Ints, track_id: Ints, track: Ints) -> Ints:
-        """The ``track`` of each descriptor (S,), or -1, by those of samples (C,)."""
-        row = self.find(t_ns, track_id)
-        out = np.full(len(self.t_ns), -1)
-        out[row[row >= 0]] = track[row >= 0]
-        return out
+
+# Log likelihood ratios of distances between descriptors, calibrated in the log itself.
+#
+# Two pictures of a person differ, by light, pose and background, and more so after a longer time; two people may be
+# dressed alike. How much either is the case differs from log to log. So distances are compared with those that the
+# log is known to have: within one input track over a gap of about that length (one person, nearly always), and
+# between input tracks that are there at one time (two people). Nothing is fitted on other recordings.
+#
+# Letters: C samples, S descriptors, D bytes of one, B blocks of consecutive descriptors of a track, P pairs of
+# these.
+
+
+#: Log likelihood ratios are no larger than this, and this share of comparisons is of something else than two people:
+#: of a pole before one of them, or of the person beside. So looking different says less than looking alike.
+MOST: Final = 3.0
+_OTHERWISE: Final = 0.1
+#: From this separation on, less its standard error, appearance is used.
+LEAST_SEPARATION: Final = 0.6
+#: The number of descriptors that are compared on either side of a gap, those within so many seconds of the nearest, and
+#: the quantile of the distances between them that is taken for theirs.
+WINDOW: Final = 8
+WITHIN_S: Final = 5.0
+_QUANTILE: Final = 0.25
+#: Gaps from each of these on, in seconds, are compared with each other; longer ones than the last aren't looked at.
+_LAGS_S: Final = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 16.0])
+_LONGEST_S: Final = 24.0
+#: The number of tracks that have to be seen before and after gaps of a length; else what people differ by then is
+#: what they differ by after shorter gaps, times a factor.
+_MIN_TRACKS: Final = 3
+_LONGER: Final = 1.4
+#: The least that a person differs by after a gap, as a share of the noise of descriptors.
+_LEAST_DRIFT: Final = 0.1
+#: Two people are compared if one could have walked to where the other is: those are who may be confused.
+_REACH_M, _SPEED_M_PER_S = 1.0, 2.5
+#: Standard deviation of bias and slope before any pair was seen.
+_PRIOR_SD: Final = 2.0
+#: The width of bins of log ratios of distances, and their number to either side of 0.
+_BIN, _BINS = 0.05, 200
+#: Longer logs are calibrated by so many blocks, of so many stretches of this length in seconds.
+_MAX_BLOCKS, _STRETCHES, _STRETCH_S = 800, 8, 40.0
+#: Pairs of blocks that are computed with at once.
+BATCH: Final = 10_000
+
+
+class AppearanceCalibration(NamedTuple):
+    """The meaning of distances between descriptors in one log.
+
+    ``noise`` is the variance of single descriptors, summed over their values; ``drift`` what a person changes over gaps
+    of each class of ``_LAGS_S``. ``bias`` and ``slope`` make log odds of how much larger a distance is than that.
+    ``separation`` is the probability that two people differ more than one does, with its standard ``error``, and
+    ``tracks`` how many tracks were seen before and after a gap.
+    """
+
+    noise: float
+    drift: Floats
+    bias: float
+    slope: float
+    separation: float
+    error: float
+    tracks: int
+
+    def excess(self, distance: Floats, gap_s: Floats) -> Floats:
+        """The logarithms of squared distances (P,), relative to those of one person."""
+        drift = self.drift[np.searchsorted(_LAGS_S, gap_s, "right") - 1]
+        return np.asarray(np.log(np.maximum(distance, 1e-9) / (self.noise + drift)))
+
+    def log_ratio(self, distance: Floats, gap_s: Floats) -> Floats:
+        """The log likelihood ratio (P,) of one person against two."""
+        ratio = np.clip(self.bias - self.slope * self.excess(distance, gap_s), -MOST, MOST)
+        return np.asarray(np.log((1 - _OTHERWISE) * np.exp(ratio) + _OTHERWISE))
+
+    def facts(self) -> dict[str, str]:
+        """Facts for the provenance."""
+        is_used = "used" if self.tells_apart else "not used"
+        return {"appearance": is_used, "separation": f"{self.separation:.3f}", "tracks": str(self.tracks)}
+
+    @property
+    def tells_apart(self) -> bool:
+        """Whether people look different enough for appearance to be used."""
+        return self.separation - self.error >= LEAST_SEPARATION and self.slope > 0
+
+
+def usual_distance(values: NDArray[np.uint8], mine: Ints, is_one: Bools, other: Ints, is_other: Bools) -> Floats:
+    """A low quantile of the squared distances of some descriptors to others, (E,): rows of ``values``, (E, WINDOW).
+
+    A pole before a person changes one descriptor, and a mean with it; most pairs stay as they are.
+    """
+    a, b = values[mine] / np.float32(255), values[other] / np.float32(255)
+    squared = np.square(a).sum(2)[:, :, None] + np.square(b).sum(2)[:, None] - 2 * (a @ b.swapaxes(1, 2))
+    squared = np.where(is_one[:, :, None] & is_other[:, None], squared, np.inf).reshape(
+        len(mine), mine.shape[1] * other.shape[1]
+    )
+    squared.sort(axis=1)
+    count = is_one.sum(axis=1) * is_other.sum(axis=1)
+    at = np.floor(_QUANTILE * np.maximum(count - 1, 0)).astype(np.int64)
+    distances = squared[np.arange(len(mine)), at]
+    return np.where(np.isfinite(distances), np.maximum(distances, 0), 0).astype(np.float64)
+
+
+class _Blocks(NamedTuple):
+    """Up to ``WINDOW`` consecutive descriptors of one input track: rows of values (B, WINDOW), which there are, the
+    first and the last step and position; the number of the track, and when it begins and ends.
+    """
+
+    which: Ints
+    has: Bools
+    first: Ints
+    last: Ints
+    from_m: Floats
+    to_m: Floats
+    track: Ints
+    begins: Ints
+    ends: Ints
+
+
+def calibrate(values: NDArray[np.uint8], tracks: Tracks, step_s: float) -> AppearanceCalibration | None:
+    """Measure how descriptors, rows of ``values`` (S, D), tell the input tracks of samples (C,) apart.
+
+    None if no two tracks that are there at one time were seen before and after a gap.
+    """
+    tracks = tracks.take(tracks.look >= 0)
+    tracks = tracks.take(np.lexsort((tracks.step, tracks.source)))
+    if len(tracks.look) < 2:
+        return None
+    blocks, noise = _blocks(values, tracks, step_s)
+    which, has = blocks.which, blocks.has
+    parts = [
+        (part, usual_distance(values, which[part.before], has[part.before], which[part.after], has[part.after]))
+        for part in _pairs(blocks, step_s)
+    ]
+    if not parts:
+        return None
+    pairs = _Pairs(*(np.concatenate([getattr(part, name) for part, _ in parts]) for name in _Pairs._fields))
+    distance = np.concatenate([distances for _, distances in parts])
+    lag = np.searchsorted(_LAGS_S, pairs.gap_s, "right") - 1
+    is_same = blocks.track[pairs.before] == blocks.track[pairs.after]
+    count = len(np.unique(blocks.track[pairs.before[is_same]]))
+    if count < 2 or is_same.all():  # nothing to compare with
+        return None
+    drift = _drift(distance - noise, lag, blocks.track[pairs.before], is_same, noise)
+    calibration = AppearanceCalibration(noise, drift, 0.0, 0.0, 0.5, 0.5, count)
+    excess = calibration.excess(distance, pairs.gap_s)
+    low = np.minimum(blocks.track[pairs.before], blocks.track[pairs.after])
+    high = np.maximum(blocks.track[pairs.before], blocks.track[pairs.after])
+    _, who, often = np.unique(low * (high.max() + 1) + high, return_inverse=True, return_counts=True)
+    weight = 1 / often[who]
+    bias, slope, separation = _fit(excess, is_same, weight)
+    # that of the rank sum of as many independent members
+    error = np.sqrt((1 / weight[is_same].sum() + 1 / weight[~is_same].sum()) / 12)
+    return calibration._replace(bias=bias, slope=max(slope, 0.0), separation=separation, error=float(error))
+
+
+class _Pairs(NamedTuple):
+    """Pairs of blocks (P,) and the seconds between them."""
+
+    before: Ints
+    after: Ints
+    gap_s: Floats
+
+
+def _blocks(values: NDArray[np.uint8], tracks: Tracks, step_s: float) -> tuple[_Blocks, float]:
+    """The blocks of descriptors, ordered by track, then step, and the squared distance of those within one."""
+    which, step, source, xy_m = tracks.look, tracks.step, tracks.source, tracks.xy_m
+    starts = run_starts(source)
+    begin = np.flatnonzero(starts)
+    track = np.cumsum(starts) - 1
+    within = np.arange(len(source)) - begin[track]
+    first = np.flatnonzero(within % WINDOW == 0)
+    count = np.diff(np.append(first, len(source)))
+    last = first + count - 1
+    places = first[:, None] + np.arange(WINDOW)
+    has = places <= last[:, None]
+    members = which[np.minimum(places, last[:, None])]
+    two = np.flatnonzero(within % WINDOW > 0)
+    step_of = np.square((values[which[two]] / np.float32(255)) - (values[which[two - 1]] / np.float32(255))).sum(axis=1)
+    noise = max(float(np.median(step_of)) if len(two) else 1.0, 1e-6)
+    lives = step[begin], step[np.append(begin[1:], len(source)) - 1]
+    blocks = _Blocks(
+        members,
+        has,
+        step[first],
+        step[last],
+        xy_m[first],
+        xy_m[last],
+        track[first],
+        *(of[track[first]] for of in lives),
+    )
+    return _fewer(blocks, step_s), noise
+
+
+def _fewer(blocks: _Blocks, step_s: float) -> _Blocks:
+    """Blocks of some stretches of a long log."""
+    if len(blocks.first) <= _MAX_BLOCKS:
+        return blocks
+    long = max(round(_STRETCH_S / step_s), 1)
+    begins = np.linspace(blocks.first.min(), max(blocks.last.max() - long, blocks.first.min()), _STRETCHES)
+    stretch = np.searchsorted(begins, blocks.first, "right") - 1
+    inside = np.flatnonzero(blocks.last <= begins[stretch] + long)
+    inside = inside[np.lexsort((inside, stretch[inside]))]
+    starts = run_starts(stretch[inside])
+    number = np.arange(len(inside)) - np.flatnonzero(starts)[np.cumsum(starts) - 1]
+    kept = np.sort(inside[number < _MAX_BLOCKS // _STRETCHES])
+    return _Blocks(*(values[kept] for values in blocks))
+
+
+def _pairs(blocks: _Blocks, step_s: float) -> Iterator[_Pairs]:
+    """Pairs of successive blocks: of one track, or of two tracks that exist at the same time within reach."""
+    order = np.argsort(blocks.first, kind="stable")
+    begins = blocks.first[order]
+    low = np.searchsorted(begins, blocks.last, "right")
+    many = np.searchsorted(begins, blocks.last + round(_LONGEST_S / step_s), "right") - low
+    part = np.cumsum(many) // BATCH
+    for number in np.unique(part).tolist():
+        own = np.flatnonzero(part == number)
+        before = own[group_index(many[own])]
+        after = order[ragged_range(low[own], many[own])]
+        gap_s = np.asarray((blocks.first[after] - blocks.last[before]) * step_s, np.float64)
+        way = blocks.from_m[after] - blocks.to_m[before]
+        meet = np.minimum(blocks.ends[before], blocks.ends[after]) > np.maximum(
+            blocks.begins[before], blocks.begins[after]
+        )
+        meet &= np.hypot(way[:, 0], way[:, 1]) <= _REACH_M + _SPEED_M_PER_S * gap_s
+        kept = meet | (blocks.track[before] == blocks.track[after])
+        yield _Pairs(before[kept], after[kept], gap_s[kept])
+
+
+def _drift(beyond: Floats, lag: Ints, track: Ints, is_same: Bools, noise: float) -> Floats:
+    """The change of one person over gaps of each class, from squared distances beyond noise (P,); never less later."""
+    drift: list[float] = []
+    for each in range(len(_LAGS_S)):
+        those = np.flatnonzero(is_same & (lag == each))
+        least = drift[-1] if drift else _LEAST_DRIFT * noise
+        if len(np.unique(track[those])) >= _MIN_TRACKS:
+            drift.append(max(float(np.median(beyond[those])), least))
+        else:
+            drift.append(least * _LONGER if drift else noise)
+    return np.array(drift)
+
+
+def _fit(excess: Floats, is_same: Bools, weight: Floats) -> tuple[float, float, float]:
+    """Bias and slope of the log odds that pairs (P,) are of one person, where as many are of one as of two; and the
+    probability that a pair of two exceeds one of one.
+
+    A logistic regression on histograms. Pairs of one track, or of the same two tracks, count for one together, because
+    they say the same; and those of two people together for as many as those of one.
+    """
+    place = np.clip(np.rint(excess / _BIN).astype(np.int64) + _BINS, 0, 2 * _BINS)
+    same, different = (np.bincount(place[of], weight[of], 2 * _BINS + 1) for of in (is_same, ~is_same))
+    total = min(float(same.sum()), float(different.sum()))
+    same, different = same * total / same.sum(), different * total / different.sum()
+    below = np.cumsum(same) - same / 2
+    separation = float((below * different).sum() / total**2)
+    x = np.stack([np.ones(2 * _BINS + 1), -_BIN * (np.arange(2 * _BINS + 1) - _BINS)], axis=1)
+    estimate = np.zeros(2)
+    for _ in range(50):
+        is_one = 1 / (1 + np.exp(-np.clip(x @ estimate, -30, 30)))
+        slope = x.T @ (same - (same + different) * is_one) - estimate / _PRIOR_SD**2
+        curve = (x * ((same + different) * is_one * (1 - is_one))[:, None]).T @ x + np.eye(2) / _PRIOR_SD**2
+        change = np.linalg.solve(curve, slope)
+        estimate = estimate + change
+        if np.abs(change).max() < 1e-9:
+            break
+    return float(estimate[0]), float(estimate[1]), separation
 
 
 class Appearance(NamedTuple):
-    """The appearance of assignments: the row of ``descriptors`` of each (C,), or -1, and what distances mean."""
+    """The looks of tracks, and the meaning of distances between ``descriptors``. Steps have ``step_s`` seconds."""
 
     descriptors: Descriptors
-    sample: Ints
     calibration: AppearanceCalibration
+    step_s: float
 
     @classmethod
-    def of(
-        cls, descriptors: Descriptors | None, t_ns: Ints, step: Ints, source: Ints, xy_m: Floats, step_s: float
-    ) -> Appearance | None:
-        """The appearance of assignments (C,) of samples of input tracks (``source``); None if none was seen."""
-        if descriptors is None or len(descriptors.t_ns) == 0 or len(t_ns) == 0:
+    def of(cls, descriptors: Descriptors | None, tracks: Tracks, step_s: float) -> Appearance | None:
+        """The appearance of tracks with these descriptors; None if none was seen."""
+        if descriptors is None or len(descriptors.t_ns) == 0 or len(tracks.look) == 0:
             return None
-        sample = descriptors.find(t_ns, source)
-        which = np.where((sample >= 0) & descriptors.is_clear[sample], sample, -1)
-        calibration = calibrate(descriptors.values, which, step, source, xy_m, step_s)
-        return None if calibration is None else cls(descriptors, sample, calibration)
+        which = np.where((tracks.look >= 0) & descriptors.is_clear[tracks.look], tracks.look, -1)
+        calibration = calibrate(descriptors.values, tracks._replace(look=which), step_s)
+        return None if calibration is None else cls(descriptors, calibration, step_s)
 
-    def take(self, order: Ints) -> Appearance:
-        """The appearance of these assignments, in this order."""
-        return self._replace(sample=self.sample[order])
-
-    def between(self, step: Ints, track: Ints, step_s: float) -> Sides:
-        """Compare parts of tracks (C,); assignments are the same as in ``of``."""
-        return Sides(self, step, track, step_s)
+    def between(self, tracks: Tracks) -> Sides:
+        """Compare parts of tracks."""
+        return Sides(self, tracks)
 
 
 class Sides:
@@ -99,21 +333,21 @@ class Sides:
     Tracks are numbered by ascending id.
     """
 
-    def __init__(self, appearance: Appearance, step: Ints, track: Ints, step_s: float) -> None:
-        descriptors = appearance.descriptors
-        order = np.lexsort((step, track))
+    def __init__(self, appearance: Appearance, tracks: Tracks) -> None:
+        descriptors, order = appearance.descriptors, tracks.order
+        step, starts = tracks.step[order], run_starts(tracks.track[order])
         self._place = np.empty_like(order)
         self._place[order] = np.arange(len(order))
-        self._calibration, self._values, self._step_s = appearance.calibration, descriptors.values, step_s
-        starts = run_starts(track[order])
+        self._calibration, self._values = appearance.calibration, descriptors.values
+        self._step_s = appearance.step_s
         self._starts = np.append(np.flatnonzero(starts), len(order))
         self._number = np.cumsum(starts) - 1  # of the track of each assignment
         self._first_step, self._steps = int(step.min(initial=0)), int(np.ptp(step)) + 2 if len(step) else 2
-        self._when = self._number * self._steps + step[order] - self._first_step
-        sample = appearance.sample[order]
+        self._when = self._number * self._steps + step - self._first_step
+        sample = tracks.look[order]
         is_seen = (sample >= 0) & descriptors.is_clear[sample]
         self._at_border = (sample >= 0) & descriptors.at_border[sample]
-        self._seen, self._which = step[order][is_seen], sample[is_seen]
+        self._seen, self._which = step[is_seen], sample[is_seen]
         self._known = np.append(0, np.cumsum(is_seen))  # the number of descriptors before each assignment
 
     def of_tracks(self, end: Ints, begin: Ints) -> Floats:

@@ -2,20 +2,104 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from functools import cached_property
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mcaptrack.geometry.arrays import Bools, Ints
-from mcaptrack.geometry.ragged import group_index
-from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
+from mcaptrack.geometry.clocks import steps_passed
+from mcaptrack.geometry.ragged import find_rows, group_index
+from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.classes import first_classes
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.framing import frame_numbers, has_any, joined_parts, row_ends, spans_of, split_rows, unique_values
 from mcaptrack.transforms.motion_limits import ClassNames, limits_by_class, units_m
-from mcaptrack.transforms.retrack.samples import LogSamples
+
+
+class Tracks(NamedTuple):
+    """Samples that are assigned to tracks, (C,) each: step, track, input id, sample, position (C, 2) in units, and the
+    descriptor of what is seen of it, or -1.
+    """
+
+    step: Ints
+    track: Ints
+    source: Ints
+    sample: Ints
+    xy_m: Floats
+    look: Ints
+
+    def take(self, which: Ints | Bools) -> Tracks:
+        """Some of the assignments, in this order."""
+        return taken(self, which)
+
+    @property
+    def order(self) -> Ints:
+        """The order by track, then step."""
+        return np.lexsort((self.step, self.track))
+
+
+# The samples that are re-tracked: the columns that are computed with in memory, whole rows in a temporary file.
+#
+# A person who is seen for an hour has 9,000 samples at 2.5 Hz. What re-tracking may hold for each of them, from the
+# first step to the last, are numbers: the columns below (33 bytes), assignments, the states of its filters, and
+# what is seen of it (74 bytes, see ``appearance``). Rows of tracks (153 bytes) and of predictions (840 bytes for
+# each sample) are made part by part, and kept as ``FrameColumns``, most of which is not in memory. Letters: N
+# samples, F frames.
+
+
+#: The columns of samples that are held in memory.
+HELD: Final = ("track_id", "class_id", "x_m", "y_m", "score", "observed")
+
+
+class LogSamples:
+    """The samples of one log: ``add`` each frame, then read them."""
+
+    def __init__(self) -> None:
+        self._collector = FrameCollector(TRACKS)
+        self._held = {name: bytearray() for name in HELD}
+        self._counts = array("q")
+
+    def add(self, frame: Frame) -> None:
+        """Add the samples of a frame."""
+        for name, held in self._held.items():
+            held.extend(frame.rows[name].tobytes())
+        self._counts.append(len(frame.rows))
+        self._collector.append(frame)
+
+    def extend(self, t_ns: Ints, numbers: Ints, ends: Ints, rows: Rows) -> None:
+        """Add the samples of F frames at once; the arguments are those of ``FrameCollector.extend``."""
+        for name, held in self._held.items():
+            held.extend(rows[name].tobytes())
+        self._counts.extend(np.diff(ends).tolist())
+        self._collector.extend(t_ns, numbers, ends, rows)
+
+    def __len__(self) -> int:
+        return len(self._held["observed"])
+
+    @property
+    def counts(self) -> Ints:
+        """The number of samples of each frame, (F,)."""
+        return np.array(self._counts, np.int64)
+
+    def column(self, name: str) -> NDArray[Any]:
+        """A column of all samples, (N,). One that isn't ``HELD`` is read from the file."""
+        if name in self._held:
+            return np.frombuffer(bytes(self._held[name]), TRACKS.dtype[name])
+        parts = [part.rows[name].copy() for _, _, part in joined_parts(TRACKS, self._frames)]
+        return np.concatenate([np.empty(0, TRACKS.dtype[name]), *parts])
+
+    @cached_property
+    def _frames(self) -> FrameColumns:
+        return self._collector.done()
+
+    def take(self, places: Ints) -> Rows:
+        """The rows of samples, as many as there are ``places``; nothing can be added any more."""
+        return self._frames.take(places)
 
 
 @dataclass
@@ -42,7 +126,8 @@ class Assignments:
         ``samples`` are those of all ``steps``. A track has one sample a step.
         """
         step, track, source = (np.frombuffer(bytes(h), np.int64) for h in (self._steps, self._tracks, self._sources))
-        row = _find(samples.column("track_id"), np.repeat(np.array(steps, np.int64), samples.counts), source, step)
+        have = samples.column("track_id"), np.repeat(np.array(steps, np.int64), samples.counts)
+        row = find_rows(have, (source, step))
         kept = np.flatnonzero((row >= 0) & self._is_confirmed(step, track))
         return step[kept], track[kept], source[kept], row[kept]
 
@@ -56,25 +141,38 @@ class Assignments:
         return step <= until[track]
 
 
-def _find(ids: Ints, steps: Ints, wanted_ids: Ints, wanted_steps: Ints) -> Ints:
-    """The row with each wanted id and step; -1 where there is none."""
-    if len(ids) == 0:
-        return np.full(len(wanted_ids), -1)
-    names = np.unique(ids)
-    low = min(int(steps.min()), int(wanted_steps.min(initial=0)))
-    high = int(max(steps.max(), wanted_steps.max(initial=0)))
-    width = high - low + 1
+class OnlinePass:
+    """Online re-tracking of one log: ``step`` for each frame, ``finish``, then ``outputs``.
 
-    def key(id_: Ints, step: Ints) -> Ints:
-        return np.searchsorted(names, id_) * width + (step - low)
+    It leaves for ``offline`` which track had which sample, the samples, the steps, and the noise of measured positions.
+    It may hold for the whole log what ``LogSamples`` says, and no rows.
+    """
 
-    have = key(ids, steps)
-    order = np.argsort(have, kind="stable")
-    want = key(wanted_ids, wanted_steps)
-    at = np.minimum(np.searchsorted(have[order], want), len(have) - 1)
-    rows = order[at]
-    is_there = np.isin(wanted_ids, names) & (have[rows] == want)
-    return np.where(is_there, rows, -1)
+    noise_m: float
+
+    def __init__(self, rate_hz: float, bridged_s: float) -> None:
+        self.assignments, self.samples = Assignments(), LogSamples()
+        self.steps: list[int] = []
+        self._rate_hz, self._bridged_s = rate_hz, bridged_s
+        self._last_ns: int | None = None
+
+    def advance(self, t_ns: int) -> int:
+        """Add the step of a time; returns by how many steps time advances."""
+        last_ns, self._last_ns = self._last_ns, t_ns
+        passed = 1 if last_ns is None else steps_passed(t_ns - last_ns, self._rate_hz, self._bridged_s)
+        self.steps.append(self.steps[-1] + passed if self.steps else 0)
+        return passed
+
+    def step(self, frame: Frame) -> None:
+        """One step: association, update, birth and termination of tracks."""
+        raise NotImplementedError
+
+    def finish(self) -> None:
+        """No more steps come."""
+
+    def outputs(self) -> tuple[FrameColumns, FrameColumns]:
+        """The online tracks and their predictions, from the past alone, a frame for each step."""
+        raise NotImplementedError
 
 
 # Re-tracking of each class by itself: links, swaps and gaps never join tracks of different classes.

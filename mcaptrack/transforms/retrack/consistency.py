@@ -9,21 +9,19 @@ Letters: K tracks, N observations, L past positions, T predicted steps.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields
-from typing import Any, Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.arrays import Bools, Floats, Indices, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Indices, Ints, joined, taken
 from mcaptrack.geometry.assignment import assign
-from mcaptrack.geometry.clocks import steps_passed
 from mcaptrack.geometry.histories import Histories, Holt, rebuild_positions
 from mcaptrack.predictors import Forecast, Predictor, make, predict_together
-from mcaptrack.schema import Frame
+from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
+from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.predictions import forecast_to_rows
-from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, Movers
+from mcaptrack.transforms.retrack.assignments import PEOPLE, Movers, OnlinePass
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
 from mcaptrack.transforms.retrack.options import (
     ConsistencyOptions,
@@ -31,7 +29,6 @@ from mcaptrack.transforms.retrack.options import (
     position_distances,
     prediction_distances,
 )
-from mcaptrack.transforms.retrack.samples import LogSamples, OnlineOutputs
 
 #: Cost of a pair with priority: lower than any sum of other costs.
 _PRIORITY_COST: Final = -100.0
@@ -42,23 +39,18 @@ _PRIORITY_COST: Final = -100.0
 # Letters: K tracks, N observations, L past positions that the predictor looks at.
 
 
-@dataclass
-class SmoothedHistory:
+class SmoothedHistory(NamedTuple):
     """The smoothed histories of K tracks, of constant size whatever their age.
 
     ``last_m`` (K, 2) is the last observed position. ``level`` and ``trend`` (K, 2) are those of Holt's smoothing,
-    ``displacements`` (K, L - 1, 2) the last smoothed displacements, of which the last ``count`` (K,) exist.
+    ``displacements`` (K, L - 1, 2) the last smoothed displacements, of which the last ``known`` (K,) exist.
     """
 
     last_m: Floats
     level: Floats
     trend: Floats
     displacements: Floats
-    count: Ints
-
-    def __iter__(self) -> Iterator[Any]:
-        """The arrays, in their order."""
-        return (getattr(self, field.name) for field in fields(self))
+    known: Ints
 
     @classmethod
     def of_observations(cls, holt: Holt, past_m: Floats, valid: Bools) -> SmoothedHistory:
@@ -73,36 +65,36 @@ class SmoothedHistory:
         )
         for step in range(1, length):
             usable = valid[:, step] & valid[:, step - 1]
-            history._smooth(holt, usable, past_m[:, step] - past_m[:, step - 1])
+            history = history._smoothed(holt, usable, past_m[:, step] - past_m[:, step - 1])
         return history
 
-    def append(self, holt: Holt, xy_m: Floats, steps: Ints) -> None:
-        """Append observations at ``xy_m`` (K, 2), ``steps`` (K,) after the last ones; interpolate gaps linearly."""
-        displacement = (xy_m - self.last_m) / steps[:, None]
+    def extended(self, holt: Holt, xy_m: Floats, steps: Ints) -> SmoothedHistory:
+        """With observations at ``xy_m`` (K, 2), ``steps`` (K,) after the last ones; gaps are interpolated linearly."""
+        displacement, history = (xy_m - self.last_m) / steps[:, None], self
         for done in range(int(steps.max(initial=0))):
-            self._smooth(holt, steps > done, displacement)
-        self.last_m = xy_m
+            history = history._smoothed(holt, steps > done, displacement)
+        return history._replace(last_m=xy_m)
 
-    def _smooth(self, holt: Holt, which: Bools, displacement: Floats) -> None:
+    def _smoothed(self, holt: Holt, which: Bools, displacement: Floats) -> SmoothedHistory:
         """Eq. 3 of the paper: smooth one more displacement (K, 2) of some tracks (K,)."""
-        started = (self.count > 0)[:, None]
+        started = (self.known > 0)[:, None]
         first, flat = holt.start(displacement)
         level, trend = holt.step(self.level, self.trend, displacement)
-        self.level = np.where(which[:, None], np.where(started, level, first), self.level)
-        self.trend = np.where(which[:, None], np.where(started, trend, flat), self.trend)
-        shifted = np.concatenate([self.displacements[:, 1:], self.level[:, None]], axis=1)
-        self.displacements = np.where(which[:, None, None], shifted, self.displacements)
-        self.count = np.where(which, np.minimum(self.count + 1, self.displacements.shape[1]), self.count)
+        level = np.where(which[:, None], np.where(started, level, first), self.level)
+        trend = np.where(which[:, None], np.where(started, trend, flat), self.trend)
+        shifted = np.concatenate([self.displacements[:, 1:], level[:, None]], axis=1)
+        displacements = np.where(which[:, None, None], shifted, self.displacements)
+        known = np.where(which, np.minimum(self.known + 1, displacements.shape[1]), self.known)
+        return SmoothedHistory(self.last_m, level, trend, displacements, known)
 
     def positions(self) -> tuple[Floats, Bools]:
         """Past positions (K, L, 2), rebuilt from the smoothed displacements, and which of them are known (K, L)."""
         length = self.displacements.shape[1] + 1
-        valid = np.arange(length) >= length - 1 - self.count[:, None]
+        valid = np.arange(length) >= length - 1 - self.known[:, None]
         return rebuild_positions(self.last_m, self.displacements), valid
 
 
-@dataclass
-class ActiveTracks:
+class ActiveTracks(NamedTuple):
     """K active tracks: step of the last match, number of matches in a row (``hits``), input id of the last one.
 
     ``prediction`` is that made at the last match.
@@ -124,28 +116,9 @@ class ActiveTracks:
         prediction = Forecast(np.empty((0, horizon, 2)), np.empty((0, horizon, 2, 2)))
         return cls(nothing, nothing, nothing, nothing, history, prediction)
 
-    def __getitem__(self, which: Ints | Bools) -> ActiveTracks:
-        history = SmoothedHistory(*(values[which] for values in self.history))
-        prediction = Forecast(self.prediction.mean[which], self.prediction.cov[which])
-        return ActiveTracks(
-            self.ids[which], self.last_step[which], self.hits[which], self.source[which], history, prediction
-        )
 
-    def __add__(self, other: ActiveTracks) -> ActiveTracks:
-        history = SmoothedHistory(*(np.concatenate(pair) for pair in zip(self.history, other.history, strict=True)))
-        prediction = Forecast(*(np.concatenate(pair) for pair in zip(self.prediction, other.prediction, strict=True)))
-        return ActiveTracks(
-            np.concatenate([self.ids, other.ids]),
-            np.concatenate([self.last_step, other.last_step]),
-            np.concatenate([self.hits, other.hits]),
-            np.concatenate([self.source, other.source]),
-            history,
-            prediction,
-        )
-
-
-class ConsistencyPass:
-    """Algorithm 1 over one log: ``step`` for each frame, then ``outputs``."""
+class ConsistencyPass(OnlinePass):
+    """Algorithm 1 over one log."""
 
     def __init__(self, options: ConsistencyOptions, movers: Movers = PEOPLE) -> None:
         horizon = max(1, round(options.horizon_s * options.rate_hz))
@@ -155,28 +128,21 @@ class ConsistencyPass:
                 f'"{options.distance}" compares predictions of one time made at different steps, which takes '
                 f'{2 / options.rate_hz:g} s at least; the distance "now" needs one step'
             )
+        super().__init__(options.rate_hz, options.bridged_s)
         self._options = options
         self._predictor: Predictor = make(options.predictor, horizon, 1 / options.rate_hz)
         self._holt = Holt(options.alpha, options.beta)
         self._length = max(self._predictor.past, options.min_history, 2)
         self._histories = Histories(self._length)
         self._tracks = ActiveTracks.none(self._length, horizon)
-        self.assignments = Assignments()
-        self.samples = LogSamples()
-        self.steps: list[int] = []
         self.noise_m = DEFAULT_NOISE_M if options.noise_m is None else options.noise_m
-        self._outputs = OnlineOutputs()
+        self._online = FrameCollector(TRACKS), FrameCollector(PREDICTIONS)
         self._next_id = 1
-        self._last_ns: int | None = None
 
     def step(self, frame: Frame) -> None:
         """One step: associate, update, age, start and terminate tracks."""
-        passed = 1
-        if self._last_ns is not None:
-            passed = steps_passed(frame.t_ns - self._last_ns, self._options.rate_hz, self._options.bridged_s)
-        self._last_ns = frame.t_ns
-        step = self.steps[-1] + passed if self.steps else 0
-        self.steps.append(step)
+        passed = self.advance(frame.t_ns)
+        step = self.steps[-1]
         self.samples.add(frame)
 
         sources = frame.rows["track_id"]
@@ -198,14 +164,14 @@ class ConsistencyPass:
         new = np.setdiff1d(np.arange(len(row_at)), observation)
         raw = Forecast(predictions.mean[new], predictions.cov[new])
         self._start(step, past[new], valid[new], raw, sources[row_at[new]])
-        online = self._online(frame, np.concatenate([row_at[observation], row_at[new]]), track, len(new))
+        online = self._shown(frame, np.concatenate([row_at[observation], row_at[new]]), track, len(new))
         is_over = (step - self._tracks.last_step) / self._options.rate_hz > self._options.max_age_s + 1e-9
-        self._tracks = self._tracks[~is_over]
-        self._outputs.add(*online)
+        self._tracks = taken(self._tracks, ~is_over)
+        for collector, rows in zip(self._online, online, strict=True):
+            collector.append(rows)
 
-    def outputs(self) -> Iterator[tuple[Frame, Frame]]:
-        """For each step the online tracks and their predictions, from the past alone."""
-        return iter(self._outputs)
+    def outputs(self) -> tuple[FrameColumns, FrameColumns]:
+        return self._online[0].done(), self._online[1].done()
 
     def _match(self, step: int, xy_m: Floats, predictions: Forecast, sources: Ints) -> tuple[Indices, Indices]:
         """Data association: pairs of tracks and observations within the gates (line 4 of Algorithm 1)."""
@@ -228,15 +194,14 @@ class ConsistencyPass:
     def _update(self, step: int, track: Indices, xy_m: Floats, sources: Ints) -> None:
         """Lines 5 to 12: matched tracks are smoothed and predict again; the others age (coasting)."""
         tracks = self._tracks
-        history = tracks[track].history
-        history.append(self._holt, xy_m, step - tracks.last_step[track])
+        history = taken(tracks.history, track).extended(self._holt, xy_m, step - tracks.last_step[track])
         prediction = predict_together(self._predictor, *history.positions())
-        for name, value in vars(history).items():
-            getattr(tracks.history, name)[track] = value
+        for values, new in zip(tracks.history, history, strict=True):
+            values[track] = new
         tracks.prediction.mean[track], tracks.prediction.cov[track] = prediction
         is_missed = np.ones(len(tracks.ids), bool)
         is_missed[track] = False
-        tracks.hits = np.where(is_missed, 0, tracks.hits + 1)
+        tracks.hits[:] = np.where(is_missed, 0, tracks.hits + 1)
         tracks.last_step[track], tracks.source[track] = step, sources
 
     def _start(self, step: int, past: Floats, valid: Bools, raw: Forecast, sources: Ints) -> None:
@@ -247,7 +212,8 @@ class ConsistencyPass:
         history = SmoothedHistory.of_observations(self._holt, past, valid)
         prediction = raw if self._options.birth == "raw" else predict_together(self._predictor, *history.positions())
         hits = np.zeros(count, np.int64)
-        self._tracks = self._tracks + ActiveTracks(ids, np.full(count, step), hits, sources.copy(), history, prediction)
+        new = ActiveTracks(ids, np.full(count, step), hits, sources.copy(), history, prediction)
+        self._tracks = joined([self._tracks, new])
         self.assignments.add(step, ids, sources)
         if self._options.trim_ends:
             self.assignments.confirm(step, ids)
@@ -255,7 +221,7 @@ class ConsistencyPass:
             track, back = np.nonzero(valid[:, :-1][:, ::-1][:, : max(self._options.min_history, 4) - 1])
             self.assignments.add(step - 1 - back, ids[track], sources[track])
 
-    def _online(self, frame: Frame, row_at: Indices, track: Indices, started: int) -> tuple[Frame, Frame]:
+    def _shown(self, frame: Frame, row_at: Indices, track: Indices, started: int) -> tuple[Frame, Frame]:
         """The tracks of this step with enough matches, where they were observed, and their predictions."""
         total = len(self._tracks.ids)
         at = np.concatenate([track, np.arange(total - started, total)])
@@ -266,6 +232,6 @@ class ConsistencyPass:
         rows = frame.rows[row_at].copy()
         rows["source_id"] = rows["track_id"]
         rows["track_id"] = self._tracks.ids[at]
-        prediction = Forecast(self._tracks.prediction.mean[at], self._tracks.prediction.cov[at])
+        prediction = taken(self._tracks.prediction, at)
         predictions = forecast_to_rows(rows["track_id"], prediction, self._predictor.step_s)
         return Frame(frame.t_ns, frame.index, rows), Frame(frame.t_ns, frame.index, predictions)

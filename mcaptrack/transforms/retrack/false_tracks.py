@@ -13,7 +13,7 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.neighbours import near_pairs
 from mcaptrack.geometry.ragged import group_index, run_starts
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
-from mcaptrack.transforms.retrack.weights import weights_of
+from mcaptrack.transforms.retrack.weights import Logistic, probability
 
 # The features that tell people from false tracks: how long, where and how regularly a track was seen.
 #
@@ -60,7 +60,7 @@ _MISSED_S, _BORDER_SHARE, _SHORTEST_S = 2.0, 0.1, 10.0
 _DOUBLE: Final = 1.0
 
 
-def features(model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float) -> Floats:
+def features(model: MotionModel, trajectories: Trajectories, smoothed: State) -> Floats:
     """The features that distinguish people from false tracks, (K, F): see ``FEATURES``."""
     first, last = trajectories.first[:-1], trajectories.first[1:] - 1
     length = last - first + 1
@@ -74,7 +74,7 @@ def features(model: MotionModel, trajectories: Trajectories, smoothed: State, st
     mean_speed = np.add.reduceat(speed, first) / length
     return np.column_stack(
         [
-            np.log(length * step_s),
+            np.log(length * model.step_s),
             np.log(count),
             np.log(extent + 0.3),
             np.log(mean_speed + 0.1),
@@ -189,12 +189,11 @@ def _rare_gaps(trajectories: Trajectories, goes: Bools) -> Floats:
     return np.asarray(total / np.maximum(count, 1))
 
 
-#: Weight of each feature as a log odds ratio, and the log odds without any; means and spreads of features.
-_WEIGHTS, _FITTED = weights_of("people", FEATURES)
-_BIAS: Final = float(_FITTED["bias"])
-_MEAN, _SPREAD = (np.array([_FITTED[what][name] for name in FEATURES]) for what in ("mean", "spread"))
+#: Whether a track is a person; means and spreads of features.
+_PEOPLE: Final = Logistic.of("people", FEATURES)
+_MEAN, _SPREAD = (np.array([_PEOPLE.numbers[what][name] for name in FEATURES]) for what in ("mean", "spread"))
 #: What is added to the log odds of tracks that stand for the whole log.
-_THROUGHOUT: Final = float(_FITTED["stands throughout"])
+_THROUGHOUT: Final = float(_PEOPLE.numbers["stands throughout"])
 #: How strongly weights stay as they were fitted while they follow a log, and how much each step of a track counts
 #: against that, up to so many steps. (Chosen on synthetic scenes and crowds.)
 _STAYS: Final = 30.0
@@ -206,14 +205,7 @@ _LOW: Final = 0.6
 _ENOUGH: Final = 10
 
 
-def probability(log_odds: Floats) -> Floats:
-    """Log odds as probabilities."""
-    return np.asarray(1 / (1 + np.exp(-log_odds)))
-
-
-def log_odds_in_log(
-    model: MotionModel, trajectories: Trajectories, smoothed: State, step_s: float, log: tuple[int, int]
-) -> Floats:
+def log_odds_in_log(model: MotionModel, trajectories: Trajectories, smoothed: State, log: tuple[int, int]) -> Floats:
     """The log odds that each track is a person, (K,), by weights that follow the log.
 
     ``log`` are the first and last step of the log.
@@ -225,13 +217,13 @@ def log_odds_in_log(
     """
     from scipy.optimize import minimize
 
-    values = features(model, trajectories, smoothed, step_s)
+    values = features(model, trajectories, smoothed)
     standard = (values - _MEAN) / _SPREAD
     columns = np.column_stack([standard, np.ones(len(standard))])
     # not a feature: its weight doesn't follow the log, and is no reason to think less of others who stand
-    extra = _THROUGHOUT * stand_throughout(trajectories, smoothed, values, log, step_s)
+    extra = _THROUGHOUT * stand_throughout(trajectories, smoothed, values, log, model.step_s)
     counts = _EACH_STEP * np.minimum(np.diff(trajectories.first), _MOST_STEPS)
-    fitted = np.append(_WEIGHTS * _SPREAD, _BIAS + _WEIGHTS @ _MEAN)
+    fitted = np.append(_PEOPLE.weights * _SPREAD, _PEOPLE.bias + _PEOPLE.weights @ _MEAN)
 
     def loss(weights: Floats) -> tuple[float, Floats]:
         value, off = columns @ weights + extra, weights - fitted

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
 from mcaptrack.geometry.neighbours import near_pairs
 from mcaptrack.geometry.ragged import group_index, run_ends, run_starts
 from mcaptrack.notices import warn
@@ -142,14 +142,24 @@ def _solved(limits: csr_array, gain: Floats) -> Bools:
 _MOST: Final = 3.0
 
 
-def swapped_by_pace(
-    trajectories: Trajectories, pair: Ints, meet: Ints, part_ways: Ints, step_s: float, noise_m: float
-) -> Floats:
+class Encounters(NamedTuple):
+    """Encounters (C,) of tracks ``i`` and ``j``: their first and last steps, and those at which both are near."""
+
+    i: Ints
+    j: Ints
+    low: Ints
+    high: Ints
+    meet: Ints
+    part_ways: Ints
+
+
+def swapped_by_pace(model: MotionModel, trajectories: Trajectories, pair: Ints, meet: Ints, part_ways: Ints) -> Floats:
     """The log likelihood ratio (C,) that two tracks are swapped after an encounter, by their paces before and after it.
 
     ``pair`` (2, C) are the tracks, which are near each other from the steps ``meet`` (C,) to ``part_ways`` (C,). It is
     0 where one of the four paces isn't known.
     """
+    step_s, noise_m = model.step_s, model.noise_m
     span = round(_MOST_S / step_s)
     came, came_s = _paces(trajectories, pair, meet - span, meet, step_s)
     left, left_s = _paces(trajectories, pair, part_ways, part_ways + span, step_s)
@@ -182,7 +192,6 @@ def resolve_swaps(
     trajectories: Trajectories,
     row: Ints,
     source: Ints,
-    step_s: float,
     examined: Bools | None = None,
     seen: Sides | None = None,
 ) -> tuple[Ints, int]:
@@ -195,13 +204,13 @@ def resolve_swaps(
     track = group_index(np.diff(trajectories.first))
     input_id = np.full(len(track), -1)
     input_id[row] = source
-    i, j, low, high, meet, part_ways = find_encounters(trajectories)
-    if len(i) == 0:
+    encounters = find_encounters(trajectories)
+    if len(encounters.i) == 0:
         return track, 0
     if examined is not None:
-        touched = examined[i] | examined[j]
-        i, j, low, high, meet, part_ways = (of[touched] for of in (i, j, low, high, meet, part_ways))
-    evidence = swapped_by_pace(trajectories, np.stack([i, j]), meet, part_ways, step_s, model.noise_m)
+        encounters = taken(encounters, examined[encounters.i] | examined[encounters.j])
+    i, j, low, high, meet, part_ways = encounters
+    evidence = swapped_by_pace(model, trajectories, np.stack([i, j]), meet, part_ways)
     if seen is not None:
         evidence += seen.of_swaps(i, j, meet, part_ways)
     begin = trajectories.first[:-1] - trajectories.step[trajectories.first[:-1]]
@@ -215,8 +224,7 @@ def resolve_swaps(
         relative = np.where(inside[..., None], trajectories.xy_m[row_i] - trajectories.xy_m[row_j], np.nan)
         id_i, id_j = np.where(inside, input_id[row_i], -1), np.where(inside, input_id[row_j], -1)
         cost = np.maximum(_SWAP_COST + _SAME_ID_COST * _continuity(id_i, id_j), _LEAST_COST)
-        noise = model.noise_m, model.speed_m_per_s
-        paths, gain[part] = find_swaps(relative, cost, step_s, *noise, evidence[part])
+        paths, gain[part] = find_swaps(model, relative, cost, evidence[part])
         for at, path, length in zip(part.tolist(), paths, (high - low)[part].tolist(), strict=True):
             if gain[at] >= _MIN_GAIN:
                 swaps[at] = _Swaps(int(i[at]), int(j[at]), int(low[at]), path[: length + 1].copy())
@@ -265,10 +273,8 @@ def _batches(length: Ints) -> Iterator[Ints]:
         first = last
 
 
-def find_encounters(trajectories: Trajectories) -> tuple[Ints, Ints, Ints, Ints, Ints, Ints]:
-    """Pairs of tracks that come near each other, the first and last step of each encounter, and those at which both
-    are near, (C,) each.
-    """
+def find_encounters(trajectories: Trajectories) -> Encounters:
+    """Find where tracks come near each other."""
     first = trajectories.first
     count = len(first) - 1
     track = group_index(np.diff(first))
@@ -285,7 +291,7 @@ def find_encounters(trajectories: Trajectories) -> tuple[Ints, Ints, Ints, Ints,
     track_begins, track_ends = trajectories.step[first[:-1]], trajectories.step[first[1:] - 1]
     low = np.maximum(when[begin] - _MARGIN, np.maximum(track_begins[i], track_begins[j]))
     high = np.minimum(when[end] + _MARGIN, np.minimum(track_ends[i], track_ends[j]))
-    return i, j, low, high, when[begin], when[end]
+    return Encounters(i, j, low, high, when[begin], when[end])
 
 
 def _continuity(id_i: Ints, id_j: Ints) -> Floats:
@@ -302,12 +308,7 @@ def _continuity(id_i: Ints, id_j: Ints) -> Floats:
 
 
 def find_swaps(
-    relative_m: Floats,
-    swap_cost: Floats,
-    step_s: float,
-    noise_m: float,
-    speed_m_per_s: float,
-    evidence: Floats | None = None,
+    model: MotionModel, relative_m: Floats, swap_cost: Floats, evidence: Floats | None = None
 ) -> tuple[Bools, Floats]:
     """At which steps of encounters the identities are swapped, (C, T), and how much more likely that is than no swap.
 
@@ -317,10 +318,9 @@ def find_swaps(
     else is known. The gain (C,) is a difference of log likelihoods.
     """
     swapped = np.zeros(len(relative_m)) if evidence is None else evidence
-    inputs = relative_m, swap_cost, step_s, noise_m, speed_m_per_s, swapped
-    models = (_viterbi(*inputs, drift**2) for drift in DRIFTS_M_PER_S)
-    best, best_gain, likelihood = next(models)
-    for path, gain, total in models:
+    by_drift = (_viterbi(model, relative_m, swap_cost, swapped, drift**2) for drift in DRIFTS_M_PER_S)
+    best, best_gain, likelihood = next(by_drift)
+    for path, gain, total in by_drift:
         better = total > likelihood
         likelihood = np.where(better, total, likelihood)
         best = np.where(better[:, None], path, best)
@@ -329,19 +329,13 @@ def find_swaps(
 
 
 def _viterbi(
-    relative_m: Floats,
-    swap_cost: Floats,
-    step_s: float,
-    noise_m: float,
-    speed_m_per_s: float,
-    is_swapped: Floats,
-    power: float,
+    model: MotionModel, relative_m: Floats, swap_cost: Floats, is_swapped: Floats, power: float
 ) -> tuple[Bools, Floats, Floats]:
     """Swaps (C, T), their gain (C,) and log likelihood (C,) for one drift of the relative velocity."""
     count, steps = relative_m.shape[:2]
-    r = 2 * noise_m**2
+    r, step_s = 2 * model.noise_m**2, model.step_s
     mean = np.zeros((count, 3, 4))  # hypotheses: as labelled, swapped, and never swapped at all
-    cov = np.tile([r, 0.0, 2 * speed_m_per_s**2], (count, 3, 1))
+    cov = np.tile([r, 0.0, 2 * model.speed_m_per_s**2], (count, 3, 1))
     total = np.tile([0.0, -np.inf, 0.0], (count, 1))
     came_swapped = np.zeros((steps, count, 2), bool)  # whether the best predecessor has the other labels
     started = np.zeros(count, bool)

@@ -26,8 +26,8 @@ from mcaptrack.schema import TRACKS, Rows
 from mcaptrack.schema.frame_columns import FrameColumns
 from mcaptrack.schema.framing import joined_parts
 from mcaptrack.schema.resampling import LINEAR
-from mcaptrack.transforms.retrack.appearance import Appearance, Descriptors, Evidence
-from mcaptrack.transforms.retrack.appearance_calibration import AppearanceCalibration
+from mcaptrack.transforms.retrack.appearance import Appearance, AppearanceCalibration, Descriptors, Evidence
+from mcaptrack.transforms.retrack.assignments import Tracks
 
 #: The longest gap of a link, and the mean one: how often gaps are as long falls off exponentially. In seconds.
 MAX_GAP_S: Final = 4.0
@@ -203,10 +203,13 @@ def _appearance(
     source = np.repeat(tracks.ids, np.diff(tracks.first))
     middle_px = tracks.boxes[:, :2] + tracks.boxes[:, 2:] / 2
     xy_m = middle_px * (_PERSON_M / np.median(tracks.boxes[:, 3])) if len(step) else middle_px
-    seen = Appearance.of(looks, times_ns[tracks.frame], step, source, xy_m, 1 / rate_hz)
+    boxes = np.arange(len(step))
+    look = np.full(len(step), -1) if looks is None else looks.find(times_ns[tracks.frame], source)
+    samples = Tracks(step, source, source, boxes, xy_m, look)
+    seen = Appearance.of(looks, samples, 1 / rate_hz)
     if seen is None or not seen.calibration.tells_apart:
         return seen and seen.calibration, None
-    return seen.calibration, seen.between(step, source, 1 / rate_hz).of_tracks
+    return seen.calibration, seen.between(samples).of_tracks
 
 
 def _links(

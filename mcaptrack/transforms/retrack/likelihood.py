@@ -5,28 +5,24 @@ Letters: R rows of online tracks, L past positions.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.clocks import steps_passed
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, joined, taken
 from mcaptrack.geometry.ragged import group_index
 from mcaptrack.predictors import Forecast, PeopleSeen, Predictor, make, predict_among, uses_people
 from mcaptrack.predictors.position_noise import PAST, PositionNoise
 from mcaptrack.predictors.tail_calibration import TailCalibration
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
+from mcaptrack.schema.framing import JoinedFrames, mapped_rows
 from mcaptrack.schema.predictions import forecast_to_rows
-from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, Movers
+from mcaptrack.transforms.retrack.assignments import PEOPLE, Movers, OnlinePass
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M, MotionModel, State, StateRows
-from mcaptrack.transforms.retrack.offline_rows import move_rows
-from mcaptrack.transforms.retrack.online_links import OnlineLinks
-from mcaptrack.transforms.retrack.online_tracker import HITS, IDS, Association, OnlineTracker
+from mcaptrack.transforms.retrack.offline import move_rows
+from mcaptrack.transforms.retrack.online_tracker import HITS, IDS, Association, OnlineLinks, OnlineTracker, ShownTracks
 from mcaptrack.transforms.retrack.options import LikelihoodOptions, RetrackOptions
-from mcaptrack.transforms.retrack.samples import LogSamples
-from mcaptrack.transforms.retrack.shown_tracks import ShownTracks
 
 #: So many frames are read at once, and online tracks written, or fewer with so many samples.
 _STEPS, _SAMPLES = 256, 2**14
@@ -131,10 +127,6 @@ class Unpredicted(NamedTuple):
     coasts: Bools
     step: Ints
 
-    def part(self, which: slice | Ints) -> Unpredicted:
-        ids, past, is_known, coasts, step = self
-        return Unpredicted(ids[which], past[which], is_known[which], coasts[which], step[which])
-
 
 class _Predicted(NamedTuple):
     """Predictions as the predictor made them: ids, past positions, whether tracks coast, means and covariances."""
@@ -145,12 +137,6 @@ class _Predicted(NamedTuple):
     mean: Floats
     cov: Floats
 
-    def part(self, which: slice) -> _Predicted:
-        return _Predicted(self.ids[which], self.past[which], self.coasts[which], self.mean[which], self.cov[which])
-
-    def copied(self) -> _Predicted:
-        return _Predicted(self.ids.copy(), self.past.copy(), self.coasts.copy(), self.mean.copy(), self.cov.copy())
-
 
 class OnlineForecasts:
     """Predictions of tracks, frame by frame, made for ``_BATCH`` tracks at once."""
@@ -159,9 +145,9 @@ class OnlineForecasts:
         self._name, self._predictor, self._unit_m = name, predictor, unit_m
         self._calibration = TailCalibration.of(name, predictor, adapt)
         self._out = FrameCollector(PREDICTIONS)
-        self._waiting: list[Unpredicted] = []
         nothing = np.empty((0, predictor.steps, 2, 2))
         ids, past, coasts = np.empty(0, np.int64), np.empty((0, predictor.past, 2)), np.empty(0, bool)
+        self._waiting = [Unpredicted(ids, past, np.isfinite(past[..., 0]), coasts, ids)]
         self._left = _Predicted(ids, past, coasts, nothing[..., 0], nothing)  # of a frame that is not complete
         self._frames: list[tuple[int, int, int, int]] = []  # time, number, step and tracks of frames in neither
 
@@ -180,34 +166,30 @@ class OnlineForecasts:
 
     def _predict(self, least: int) -> None:
         """Predict in batches, as long as at least so many tracks wait, and write the frames that are complete."""
-        waiting = Unpredicted(*(np.concatenate(parts) for parts in zip(*self._waiting, strict=True)))
+        waiting = joined(self._waiting)
         done = 0
         while len(waiting.ids) - done >= least:
             end = done + _BATCH
             if uses_people(self._predictor):  # whole steps, because their tracks are predicted together
                 end = int(np.searchsorted(waiting.step, waiting.step[min(end, len(waiting.ids)) - 1], "right"))
-            ids, past, is_known, coasts, steps = waiting.part(slice(done, end))
+            ids, past, is_known, coasts, steps = taken(waiting, slice(done, end))
             units = past / self._unit_m
             people = PeopleSeen(units, is_known, steps, np.arange(len(ids)))
             mean, cov = predict_among(self._predictor, units, is_known, people)
             self._write(_Predicted(ids, past, coasts, mean * self._unit_m, cov * self._unit_m**2))
             done += len(ids)
-        self._waiting = [waiting.part(slice(done, None))]
-        self._write(self._left.part(slice(0)))  # frames without tracks
+        self._waiting = [taken(waiting, slice(done, None))]
+        self._write(taken(self._left, slice(0)))  # frames without tracks
 
     def _write(self, new: _Predicted) -> None:
         """Write the frames that are complete with these predictions."""
-        waiting = (
-            new
-            if new is self._left
-            else _Predicted(*(np.concatenate(both) for both in zip(self._left, new, strict=True)))
-        )
+        waiting = joined([self._left, new])
         ends = np.cumsum([0, *(count for *_, count in self._frames)])
         count = int(np.searchsorted(ends, len(waiting.ids), "right")) - 1
-        self._left = waiting.part(slice(ends[count], None)).copied()  # so that the larger arrays are not held
+        self._left = taken(waiting, np.arange(ends[count], len(waiting.ids)))  # so that the larger arrays are not held
         if not count:
             return
-        ids, past, coasts, mean, cov = waiting.part(slice(ends[count]))
+        ids, past, coasts, mean, cov = taken(waiting, slice(ends[count]))
         tails = None
         if self._calibration is not None:  # by the predictions of the steps before
             step = np.repeat([step for _, _, step, _ in self._frames[:count]], np.diff(ends[: count + 1]))
@@ -218,14 +200,15 @@ class OnlineForecasts:
         self._frames = self._frames[count:]
 
 
-class LikelihoodPass:
-    """Online tracking over one log: ``step`` for each frame, then ``outputs``.
+class LikelihoodPass(OnlinePass):
+    """Online tracking over one log.
 
     Frames are read some at once (``_track``), and rows of online tracks are made of as many (``_write``), because one
     frame has few of them. What later steps need is kept: the last sample of each track, and its past positions.
     """
 
     def __init__(self, options: LikelihoodOptions, movers: Movers = PEOPLE) -> None:
+        super().__init__(options.rate_hz, options.bridged_s)
         rate, self._options, self._unit_m = options.rate_hz, options, movers.unit_m
         confirm_hits = self._confirm_hits = round(options.confirm_s * rate) + 1
         max_age = max(1, round(options.max_age_s * rate))
@@ -238,18 +221,13 @@ class LikelihoodPass:
                 merge_distance_m=options.merge_distance_m / movers.unit_m,
                 merge_timeout_s=options.merge_timeout_s,
             ),
-            step_s=1 / rate,
             max_age=max_age,
             confirm_hits=confirm_hits,
             max_age_tentative=min(confirm_hits, max_age),
             estimate_noise=options.noise_m is None,
         )
         self._shown = ShownTracks(confirm_hits, round(options.coast_s * rate), max_age, options.adapt_online)
-        self._links = OnlineLinks(self._tracker.model, 1 / rate, options.link_s, options.link_confidence, confirm_hits)
-        self._assignments = Assignments()
-        self._samples = LogSamples()
-        self.steps: list[int] = []
-        self._last_ns = 0
+        self._links = OnlineLinks(self._tracker.model, options.link_s, options.link_confidence, confirm_hits)
         self._frames: list[Frame] = []  # those that are not read yet, and their number of samples
         self._unread = 0
         # what is known of earlier ones: tracks and their last samples
@@ -263,55 +241,34 @@ class LikelihoodPass:
         self._input = InputNoise(1 / rate) if options.noise_m is None else None
         self._written = 0
 
-    @property
-    def noise_m(self) -> float:
-        """The noise of measured positions: as given, or as estimated so far; in the unit of the objects."""
-        self._track()
-        return self._tracker.noise_m
-
-    @property
-    def assignments(self) -> Assignments:
-        """Which track had which sample so far."""
-        self._track()
-        return self._assignments
-
-    @property
-    def samples(self) -> LogSamples:
-        """The samples so far."""
-        self._track()
-        return self._samples
-
     def step(self, frame: Frame) -> None:
-        """One step: association, update, birth and termination of tracks."""
-        passed = 1
-        if self.steps:
-            passed = steps_passed(frame.t_ns - self._last_ns, self._options.rate_hz, self._options.bridged_s)
-        self.steps.append(self.steps[-1] + passed if self.steps else 0)
-        self._last_ns = frame.t_ns
+        self.advance(frame.t_ns)
         self._frames.append(frame)
         self._unread += len(frame.rows)
         if len(self._frames) >= _STEPS or self._unread >= _SAMPLES:
             self._track()
 
-    def outputs(self) -> Iterator[tuple[Frame, Frame]]:
-        """For each step the online tracks and their predictions, from the past alone."""
-        if not self.steps:
-            return
+    def finish(self) -> None:
+        self._track()
+        self.noise_m = self._tracker.noise_m
+
+    def outputs(self) -> tuple[FrameColumns, FrameColumns]:
         self._track()
         online, predictions = self._online.done(), self._forecasts.done()
         # All at once, because the last digits of a product of matrices depend on their size.
         nothing = np.empty(0, np.int64), np.empty((0, 2)), np.empty(0, np.int64)
         places, xy_m, t_ns = (np.concatenate(parts) for parts in zip(nothing, *self._coasting, strict=True))
         coasting = move_rows(online.take(places), xy_m, self._options.ground_planes, t_ns)
-        bounds = np.searchsorted(places, online.ends).tolist()
-        edges = zip(online.ends.tolist(), bounds[:-1], bounds[1:], strict=False)
-        for (start, low, high), tracks, forecast in zip(edges, online, predictions, strict=True):
-            if low == high:
-                yield tracks, forecast
-                continue
-            rows = tracks.rows.copy()
-            rows[places[low:high] - start] = coasting[low:high]
-            yield tracks._replace(rows=rows), forecast
+        done = 0
+
+        def moved(part: JoinedFrames) -> Rows:
+            nonlocal done
+            here = slice(*np.searchsorted(places, [done, done + len(part.rows)]))
+            part.rows[places[here] - done] = coasting[here]
+            done += len(part.rows)
+            return part.rows
+
+        return (mapped_rows(TRACKS, online, moved) if len(places) else online), predictions
 
     def _track(self) -> None:
         """Track through the frames that are not read yet, and write these steps."""
@@ -321,7 +278,7 @@ class LikelihoodPass:
         t_ns, numbers = (np.array(values, np.int64) for values in zip(*(frame[:2] for frame in frames), strict=True))
         ends = np.cumsum([0, *(len(frame.rows) for frame in frames)])
         samples = TRACKS.joined([frame.rows for frame in frames])
-        self._samples.extend(t_ns, numbers, ends, samples)
+        self.samples.extend(t_ns, numbers, ends, samples)
         steps = np.array(self.steps[-len(frames) :], np.int64)
         before = self.steps[-len(frames) - 1] if len(self.steps) > len(frames) else steps[0] - 1
         # observations of each step, ordered by their input ids
@@ -343,7 +300,7 @@ class LikelihoodPass:
         tick = group_index([len(result.row) for result in results])
         has = row >= 0
         row[has] = observed[bounds[tick[has]] + row[has]]
-        self._assignments.add(steps[tick[has]], tracks[IDS, has], samples["track_id"][row[has]])
+        self.assignments.add(steps[tick[has]], tracks[IDS, has], samples["track_id"][row[has]])
         self._write(_Read(t_ns, numbers, steps, passed, samples), tick, row, tracks, StateRows(mean, cov))
 
     def _write(self, read: _Read, tick: Ints, row: Ints, tracks: Ints, state: StateRows) -> None:
@@ -386,7 +343,7 @@ class LikelihoodPass:
         ticks = np.arange(len(steps) + 1)
         self._online.extend(read.t_ns, read.numbers, np.searchsorted(tick[shown], ticks), rows)
         confirmed = np.flatnonzero(tracks[HITS, shown] >= self._confirm_hits)  # before, little is known of velocities
-        waiting = Unpredicted(names[shown], past, is_known, coasts, steps[tick[shown]]).part(confirmed)
+        waiting = taken(Unpredicted(names[shown], past, is_known, coasts, steps[tick[shown]]), confirmed)
         self._forecasts.add(read.t_ns, read.numbers, steps, np.searchsorted(tick[shown[confirmed]], ticks), waiting)
         self._written += len(rows)
         is_last = tick == len(steps) - 1
@@ -407,5 +364,5 @@ def motion_model(options: RetrackOptions, noise_m: float, movers: Movers = PEOPL
     """The motion model of the options, with this noise of measured positions."""
     noise_m, speed_m_per_s = max(noise_m, _MIN_SPREAD), max(options.speed_m_per_s, _MIN_SPREAD)
     if movers.drift_m_per_s is not None:
-        return MotionModel(noise_m, speed_m_per_s, movers.drift_m_per_s / movers.unit_m, 0.0)
-    return MotionModel(noise_m, speed_m_per_s, options.drift_m_per_s, options.drift_ratio)
+        return MotionModel(noise_m, speed_m_per_s, movers.drift_m_per_s / movers.unit_m, 0.0, 1 / options.rate_hz)
+    return MotionModel(noise_m, speed_m_per_s, options.drift_m_per_s, options.drift_ratio, 1 / options.rate_hz)

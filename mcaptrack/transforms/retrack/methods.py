@@ -6,22 +6,22 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import repeat
 from types import MappingProxyType
-from typing import ClassVar, Final, Protocol, TypeAlias, TypeVar
+from typing import ClassVar, Final, TypeAlias, TypeVar
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Ints
-from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.predictors import warn_if_weak
 from mcaptrack.schema import APPEARANCE, DECISIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns, collect
 from mcaptrack.schema.framing import joined_parts
 from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.protocol import ModelCard
-from mcaptrack.transforms.retrack.appearance_calibration import AppearanceCalibration
+from mcaptrack.transforms.retrack.appearance import AppearanceCalibration
 from mcaptrack.transforms.retrack.assignments import (
-    Assignments,
     Movers,
+    OnlinePass,
     join_classes,
     movers_of,
     split_classes,
@@ -31,43 +31,10 @@ from mcaptrack.transforms.retrack.consistency import ConsistencyPass
 from mcaptrack.transforms.retrack.in_pictures import link_in_picture
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
-from mcaptrack.transforms.retrack.offline import Offline, appearance_rows, offline_tracks
+from mcaptrack.transforms.retrack.offline import appearance_rows, offline_tracks
 from mcaptrack.transforms.retrack.options import ConsistencyOptions, LikelihoodOptions, RetrackOptions
-from mcaptrack.transforms.retrack.samples import LogSamples
 
 Options = TypeVar("Options", bound=RetrackOptions)
-
-
-class OnlinePass(Protocol):
-    """Online re-tracking of one log: ``step`` for each frame, then ``outputs``; and what it leaves for ``offline``.
-
-    It may hold for the whole log what the module ``samples`` says, and no rows.
-    """
-
-    steps: list[int]
-
-    @property
-    def assignments(self) -> Assignments:
-        """Which track had which sample so far."""
-        ...
-
-    @property
-    def samples(self) -> LogSamples:
-        """The samples so far."""
-        ...
-
-    @property
-    def noise_m(self) -> float:
-        """The noise of measured positions."""
-        ...
-
-    def step(self, frame: Frame) -> None:
-        """One step."""
-        ...
-
-    def outputs(self) -> Iterator[tuple[Frame, Frame]]:
-        """For each step the online tracks and their predictions."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,7 +98,7 @@ Retracking: TypeAlias = Retrack | RetrackByConsistency
 # tracks.
 
 
-class KeptIds:
+class KeptIds(OnlinePass):
     """Online re-tracking that keeps the ids of the input.
 
     Parameters
@@ -143,11 +110,8 @@ class KeptIds:
     """
 
     def __init__(self, options: RetrackOptions, movers: Movers, frames: FrameColumns) -> None:
-        self._options = options
+        super().__init__(options.rate_hz, LAST_NS / NS_PER_S)
         self.noise_m = (DEFAULT_NOISE_M if options.noise_m is None else options.noise_m) / movers.unit_m
-        self.assignments = Assignments()
-        self.samples = LogSamples()
-        self.steps: list[int] = []
         self._number: dict[int, int] = {}
         self._forecaster = Forecaster(
             options.predictor,
@@ -163,12 +127,9 @@ class KeptIds:
     def _read(self, frames: FrameColumns) -> FrameColumns:
         """The online tracks: frames with the samples under numbers of their own."""
         out = FrameCollector(TRACKS)
-        last_ns: int | None = None
         for low, high, joined in joined_parts(TRACKS, frames):
             for t_ns in joined.t_ns.tolist():
-                passed = 1 if last_ns is None else round((t_ns - last_ns) * self._options.rate_hz / NS_PER_S)
-                self.steps.append(self.steps[-1] + max(1, passed) if self.steps else 0)
-                last_ns = t_ns
+                self.advance(t_ns)
             rows = joined.rows.take(np.lexsort((joined.rows["track_id"], joined.frame)))
             numbers = frames.numbers[low:high]
             self.samples.extend(joined.t_ns, numbers, joined.ends, rows)
@@ -187,13 +148,8 @@ class KeptIds:
             self._number.setdefault(number, len(self._number) + 1)
         return np.array([self._number[number] for number in ids.tolist()], np.int64)[which]
 
-    def predictions(self) -> FrameColumns:
-        """The predictions of the online tracks, from the past alone."""
-        return self._forecaster.predict_all(self.online)
-
-    def outputs(self) -> Iterator[tuple[Frame, Frame]]:
-        """For each step the online tracks and their predictions."""
-        return zip(self.online, self.predictions(), strict=True)
+    def outputs(self) -> tuple[FrameColumns, FrameColumns]:
+        return self.online, self._forecaster.predict_all(self.online)
 
 
 def _retrack(
@@ -211,18 +167,14 @@ def _retrack(
         yield from _keep_ids(options, frames, calibrations)
         return
     frames = collect(TRACKS, frames)
-    parts = [frames] if options.across_classes else split_classes(frames)
+    classes = [frames] if options.across_classes else split_classes(frames)
     score = usual_score(frames)
-
-    def passes(part: FrameColumns) -> tuple[OnlinePass | KeptIds, Offline]:
-        run, offline = _passes(options, new_pass, part, score)
-        calibrations.extend([] if offline.calibration is None else [offline.calibration])
-        return run, offline
-
-    if len(parts) == 1:
-        yield from _frame_by_frame(options, frames, *passes(frames))
-    else:
-        yield from join_classes([_whole(options, part, *passes(part)) for part in parts])
+    outputs = [_retracked(options, new_pass, part, score, calibrations) for part in classes]
+    if len(classes) > 1:
+        yield from join_classes([list(map(collect, options.writes.values(), part)) for part in outputs])
+        return
+    for parts in zip(*outputs[0], strict=True):
+        yield tuple(frame._replace(rows=frame.rows.copy()) for frame in parts)  # what is kept can't be written to
 
 
 def _keep_ids(
@@ -249,46 +201,25 @@ def _keep_ids(
     forecaster.warn()
 
 
-def _passes(
-    options: Options, new_pass: Callable[[Options, Movers], OnlinePass], frames: FrameColumns, score: float
-) -> tuple[OnlinePass | KeptIds, Offline]:
-    """Re-track frames without regard to classes; ``score`` is the usual one of the log."""
+def _retracked(
+    options: Options,
+    new_pass: Callable[[Options, Movers], OnlinePass],
+    frames: FrameColumns,
+    score: float,
+    seen: list[AppearanceCalibration],
+) -> list[Iterable[Frame]]:
+    """The outputs of re-tracking without regard to classes; ``score`` is the usual one of the log."""
     movers = movers_of(frames, options.class_names, score, options.class_limits)
-    run: OnlinePass | KeptIds
-    if movers.on_ground:
-        run = KeptIds(options, movers, frames)
-    else:
-        run = new_pass(options, movers)
-        for frame in frames:
-            run.step(frame)
+    run = KeptIds(options, movers, frames) if movers.on_ground else new_pass(options, movers)
+    for frame in () if movers.on_ground else frames:
+        run.step(frame)
+    run.finish()
     model = motion_model(options, run.noise_m, movers)
-    return run, offline_tracks(options, model, run.assignments, run.samples, run.steps, frames.t_ns, movers)
-
-
-def _frame_by_frame(
-    options: Options, frames: FrameColumns, run: OnlinePass | KeptIds, offline: Offline
-) -> Iterator[tuple[Frame, ...]]:
-    """The outputs of re-tracking for each frame."""
-    further = zip(offline.decisions, offline.looks, strict=True)
-    for frame, rows, causal, others in zip(frames, offline.tracks, run.outputs(), further, strict=True):
-        # copies, because what is kept can't be written to
-        outputs = rows, *(part.rows.copy() for part in causal), *others
-        yield tuple(frame._replace(rows=output) for output in outputs[: len(options.writes)])
-
-
-def _whole(options: Options, frames: FrameColumns, run: OnlinePass | KeptIds, offline: Offline) -> list[FrameColumns]:
-    """The outputs of re-tracking, each with all of its frames."""
-    collectors = [FrameCollector(schema) for schema in options.writes.values()]
-    if not isinstance(run, KeptIds):
-        for outputs in _frame_by_frame(options, frames, run, offline):
-            for collector, frame in zip(collectors, outputs, strict=True):
-                collector.append(frame)
-        return [collector.done() for collector in collectors]
-    offline_rows = zip(offline.tracks, offline.decisions, offline.looks, strict=True)
-    for frame, all_rows in zip(frames, offline_rows, strict=True):
-        for collector, rows in zip((collectors[0], *collectors[3:]), all_rows, strict=False):
-            collector.append(frame._replace(rows=rows))
-    return [collectors[0].done(), run.online, run.predictions(), *(collector.done() for collector in collectors[3:])]
+    offline = offline_tracks(options, model, run.assignments, run.samples, run.steps, frames.t_ns, movers)
+    seen.extend([] if offline.calibration is None else [offline.calibration])
+    times = frames.t_ns.tolist(), frames.numbers.tolist()
+    tracks, decisions, looks = (map(Frame, *times, rows) for rows in (offline.tracks, offline.decisions, offline.looks))
+    return [tracks, *run.outputs(), decisions, looks][: len(options.writes)]
 
 
 _PAPER: Final = RetrackByConsistency(

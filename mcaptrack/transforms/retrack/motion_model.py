@@ -38,13 +38,14 @@ class MotionModel:
 
     ``noise_m`` is the standard deviation of a measured position, ``speed_m_per_s`` that of the velocity of a new track
     (both per axis). ``drift_m_per_s`` is how much velocities change within a second at rest, in m/s, and
-    ``drift_ratio`` how much more with speed, as a share of it.
+    ``drift_ratio`` how much more with speed, as a share of it. Steps have ``step_s`` seconds.
     """
 
     noise_m: float
     speed_m_per_s: float
     drift_m_per_s: float
     drift_ratio: float
+    step_s: float
 
     def initial(self, xy_m: Floats, noise_m: float) -> StateRows:
         """States of tracks that were measured once, at (2, K), with this noise."""
@@ -74,10 +75,10 @@ class StateRows(NamedTuple):
         return StateRows(self.mean[:, which], self.cov[:, which])
 
 
-def update(state: StateRows, xy_m: Floats, noise_m: Floats) -> None:
-    """Update states with measurements at (2, K) with noise (K,), in place."""
+def update(state: StateRows, xy_m: Floats, noise_m: Floats | float) -> None:
+    """Update states with measurements at (2, K) with noise, (K,) or one for all, in place."""
     mean, (p, c, v) = state
-    s = p + noise_m**2
+    s = p + noise_m * noise_m
     off = xy_m - mean[:2]
     of_place, of_velocity = p / s, c / s
     mean[:2] += of_place * off
@@ -90,17 +91,15 @@ def update(state: StateRows, xy_m: Floats, noise_m: Floats) -> None:
 class Trajectories(NamedTuple):
     """Tracks laid end to end: one row for every step from a track's first to its last, also inside gaps.
 
-    ``first`` (K + 1,) is the row where each track begins. ``step`` (N,); ``xy_m`` (N, 2), NaN inside gaps;
-    ``noise_m`` (N,).
+    ``first`` (K + 1,) is the row where each track begins. ``step`` (N,); ``xy_m`` (N, 2), NaN inside gaps.
     """
 
     first: Ints
     step: Ints
     xy_m: Floats
-    noise_m: Floats
 
 
-def to_trajectories(step: Ints, track: Ints, xy_m: Floats, noise_m: float) -> tuple[Ints, Ints, Trajectories]:
+def to_trajectories(step: Ints, track: Ints, xy_m: Floats) -> tuple[Ints, Ints, Trajectories]:
     """Assignments (C,) of positions to tracks, as trajectories.
 
     Returns the ids of the tracks (K,), the row of each assignment (C,), and the trajectories.
@@ -111,11 +110,10 @@ def to_trajectories(step: Ints, track: Ints, xy_m: Floats, noise_m: float) -> tu
     np.maximum.at(high, which, step)
     length = high - low + 1
     first = np.concatenate([[0], np.cumsum(length)])
-    total = int(first[-1])
     row = first[which] + step - low[which]
-    places = np.full((total, 2), np.nan)
+    places = np.full((int(first[-1]), 2), np.nan)
     places[row] = xy_m
-    return ids, row, Trajectories(first, ragged_range(low, length), places, np.full(total, noise_m))
+    return ids, row, Trajectories(first, ragged_range(low, length), places)
 
 
 class _Steps(NamedTuple):
@@ -144,31 +142,30 @@ class _Steps(NamedTuple):
         return cls(forward, first[1:][order][place] - 1 - step, [0, *np.cumsum(alive).tolist()])
 
 
-def filtered(model: MotionModel, trajectories: Trajectories, step_s: float) -> tuple[State, State]:
-    """The state of every row from past and present, and from present and future."""
-    return _filtered(model, trajectories, _Steps.of(trajectories.first), step_s)
+def filtered(model: MotionModel, trajectories: Trajectories, steps: _Steps | None = None) -> tuple[State, State]:
+    """The state of every row from past and present, and from present and future.
+
+    The filters run over all tracks at once, forward and backward together.
+    """
+    steps = steps or _Steps.of(trajectories.first)
+    rows = np.stack([steps.forward, steps.backward], axis=-1).reshape(-1)
+    both = _filter(model, trajectories.xy_m.T.take(rows, axis=1), [2 * bound for bound in steps.bounds])
+    forward = _states(both.take(slice(0, None, 2)), steps.forward)
+    backward = _states(both.take(slice(1, None, 2)), steps.backward)
+    backward.mean[:, 2:] *= -1
+    return forward, backward
 
 
-def smooth(model: MotionModel, trajectories: Trajectories, step_s: float) -> tuple[State, State, State]:
+def smooth(model: MotionModel, trajectories: Trajectories) -> tuple[State, State, State]:
     """The state of every row: from past and present, from present and future, and from all (RTS smoother).
 
     Source: Rauch, Tung, Striebel 1965.
     """
     steps = _Steps.of(trajectories.first)
-    forward, backward = _filtered(model, trajectories, steps, step_s)
+    forward, backward = filtered(model, trajectories, steps)
     smoothed = StateRows(*(np.ascontiguousarray(part[steps.backward].T) for part in forward))
-    _smooth_back(model, smoothed, steps.bounds, step_s)
+    _smooth_back(model, smoothed, steps.bounds)
     return forward, backward, _states(smoothed, steps.backward)
-
-
-def _filtered(model: MotionModel, trajectories: Trajectories, steps: _Steps, step_s: float) -> tuple[State, State]:
-    """As ``filtered``; the filters run over all tracks at once, forward and backward together."""
-    rows = np.stack([steps.forward, steps.backward], axis=-1).reshape(-1)
-    both = _filter(model, trajectories, rows, [2 * bound for bound in steps.bounds], step_s)
-    forward = _states(both.take(slice(0, None, 2)), steps.forward)
-    backward = _states(both.take(slice(1, None, 2)), steps.backward)
-    backward.mean[:, 2:] *= -1
-    return forward, backward
 
 
 def _states(rows: StateRows, place: Ints) -> State:
@@ -179,9 +176,9 @@ def _states(rows: StateRows, place: Ints) -> State:
     return out
 
 
-def _smooth_back(model: MotionModel, states: StateRows, bounds: Sequence[int], step_s: float) -> None:
+def _smooth_back(model: MotionModel, states: StateRows, bounds: Sequence[int]) -> None:
     """Smooth the states of forward filters (N,), in place. They are laid step by step, from the last one back."""
-    ahead = StateRows(np.empty_like(states.mean), np.empty_like(states.cov))
+    ahead, step_s = StateRows(np.empty_like(states.mean), np.empty_like(states.cov)), model.step_s
     model.predict(states, step_s, ahead)
     p, c, v = states.cov
     # gain = P F' / P', per axis: two rows of two
@@ -212,28 +209,26 @@ def _by_length(first: Ints) -> tuple[Ints, Ints]:
     return order, alive
 
 
-def _filter(
-    model: MotionModel, trajectories: Trajectories, rows: Ints, bounds: Sequence[int], step_s: float
-) -> StateRows:
-    """The states (M,) of filters that read ``rows`` (M,) of trajectories, step by step as ``bounds`` says."""
-    xy_m, noise_m = trajectories.xy_m.T.take(rows, axis=1), trajectories.noise_m[rows]
-    out = StateRows(np.empty((4, len(rows))), np.empty((3, len(rows))))
-    if not len(rows):
+def _filter(model: MotionModel, xy_m: Floats, bounds: Sequence[int]) -> StateRows:
+    """The states (M,) of filters that read positions (2, M), NaN inside gaps, step by step as ``bounds`` says."""
+    count = xy_m.shape[1]
+    out = StateRows(np.empty((4, count)), np.empty((3, count)))
+    if not count:
         return out
     start = slice(bounds[0], bounds[1])
     for part, values in zip(out, model.initial(xy_m[:, start], model.noise_m), strict=True):
         part[:, start] = values
-    out.cov[0, start] = noise_m[start] ** 2
+    out.cov[0, start] = model.noise_m * model.noise_m
     is_measured = np.isfinite(xy_m[0])
     is_whole = np.logical_and.reduceat(is_measured, bounds[:-1]).tolist()
     for before, low, high, whole in zip(bounds, bounds[1:], bounds[2:], is_whole[1:], strict=False):
         now, here = out.take(slice(low, high)), slice(low, high)
-        model.predict(out.take(slice(before, before + high - low)), step_s, now)
+        model.predict(out.take(slice(before, before + high - low)), model.step_s, now)
         if whole:
-            update(now, xy_m[:, here], noise_m[here])
+            update(now, xy_m[:, here], model.noise_m)
             continue
         (which,) = is_measured[here].nonzero()
         some = now.take(which)
-        update(some, xy_m[:, here][:, which], noise_m[here][which])
+        update(some, xy_m[:, here][:, which], model.noise_m)
         now.mean[:, which], now.cov[:, which] = some
     return out

@@ -7,28 +7,42 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from itertools import pairwise, repeat
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from mcaptrack.geometry.angles import wrapped
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.colour_histograms import BINS, mean_shares
-from mcaptrack.geometry.ragged import group_index, run_ends, run_starts
-from mcaptrack.schema import APPEARANCE, DECISIONS, BodyPart, DecisionKind, Rows
-from mcaptrack.transforms.retrack.appearance import Appearance, Descriptors
-from mcaptrack.transforms.retrack.appearance_calibration import AppearanceCalibration
-from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, Movers
-from mcaptrack.transforms.retrack.cut_links import CutTracks, link_pieces
-from mcaptrack.transforms.retrack.false_tracks import log_odds_in_log, probability, scored_log_odds
+from mcaptrack.geometry.plane import Planes
+from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
+from mcaptrack.notices import warn
+from mcaptrack.schema import APPEARANCE, DECISIONS, TRACKS, BodyPart, DecisionKind, Frame, Rows
+from mcaptrack.schema.classes import first_classes, majority
+from mcaptrack.schema.framing import JoinedFrames, joined_parts, mapped_rows, spans_of
+from mcaptrack.schema.resampling import ANGLES, LINEAR
+from mcaptrack.transforms.retrack.appearance import Appearance, AppearanceCalibration, Descriptors
+from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, LogSamples, Movers, Tracks
+from mcaptrack.transforms.retrack.false_tracks import log_odds_in_log, scored_log_odds
 from mcaptrack.transforms.retrack.identity_swaps import resolve_swaps
-from mcaptrack.transforms.retrack.joins import FEATURES, Joins, Tracked, cut_joins, find_joins, with_appearance
-from mcaptrack.transforms.retrack.linking import link_tracks
-from mcaptrack.transforms.retrack.motion_model import MotionModel, State, filtered, smooth, to_trajectories
-from mcaptrack.transforms.retrack.offline_rows import Moved, TrackRows, moved_to, rows_by_step
+from mcaptrack.transforms.retrack.linking import (
+    JOIN_FEATURES,
+    CutTracks,
+    Joins,
+    Tracked,
+    TrackEnds,
+    cut_joins,
+    find_joins,
+    link_pieces,
+    link_tracks,
+    with_appearance,
+)
+from mcaptrack.transforms.retrack.motion_model import MotionModel, State, smooth, to_trajectories
 from mcaptrack.transforms.retrack.options import RetrackOptions
-from mcaptrack.transforms.retrack.samples import LogSamples
-from mcaptrack.transforms.retrack.weights import weights_of
+from mcaptrack.transforms.retrack.weights import Logistic, probability
 
 #: Links of tracks in metres miss by at most so much, and so much more for each second of the gap.
 MAX_MISFIT: Final = (0.6, 0.2)
@@ -54,26 +68,27 @@ class Offline(NamedTuple):
 # Letters: C assignments (a track has a sample at a step), N samples.
 
 
-def fix_tracks(step: Ints, track: Ints, source: Ints, fixed: Collection[int]) -> Ints:
-    """The track of each assignment (C,) after all samples of a fixed input id have one track, and no other fixed one.
+def fix_tracks(tracks: Tracks, fixed: Collection[int]) -> Tracks:
+    """Tracks in which all samples of a fixed input id have one track, and no other fixed one.
 
     Parameters
     ----------
-    step, track, source : (C,) of int
-        The step of each assignment, the track that it has now, and the input id of its sample.
+    tracks : Tracks
+        The tracks so far.
     fixed : collection of int
         Input ids of corrected tracks.
 
     Returns
     -------
-    (C,) of int
+    Tracks
         What a track has before the first sample of a fixed id, or after its last one, stays with it: a person who was
         followed into the corrected part keeps the id. All else keeps its track, or gets a new one where a fixed id has
         taken it.
     """
+    step, track, source = tracks[:3]
     is_fixed = np.isin(source, np.array(sorted(fixed), np.int64))
     if not is_fixed.any():
-        return track
+        return tracks
     out = np.full(len(track), -1, np.int64)
     following = int(track.max()) + 1
     ends: dict[int, tuple[int, int]] = {}
@@ -104,9 +119,7 @@ def fix_tracks(step: Ints, track: Ints, source: Ints, fixed: Collection[int]) ->
             else:
                 out[run] = rest if name in taken else name
                 following = rest + 1
-    untouched = out < 0
-    out[untouched] = track[untouched]
-    return out
+    return tracks._replace(track=np.where(out < 0, track, out))
 
 
 def _runs(is_fixed: Bools) -> list[tuple[int, int]]:
@@ -125,71 +138,55 @@ def _runs(is_fixed: Bools) -> list[tuple[int, int]]:
 # Letters: C assignments, K tracks, J joins, D decisions.
 
 
-_JOINS_WEIGHTS, _JOINS_FITTED = weights_of("joins", FEATURES)
-_JOINS_BIAS: Final = float(_JOINS_FITTED["bias"])
+JOINS: Final = Logistic.of("joins", JOIN_FEATURES)
 #: The log odds that a track is a person, from those of the test of false tracks: that one weighs rows, not tracks.
-_PERSON_WEIGHTS, _PERSON_FITTED = weights_of("decided", ("log odds",))
-_PERSON_BIAS: Final = float(_PERSON_FITTED["bias"])
+PERSON: Final = Logistic.of("decided", ("log odds",))
 _NO_ID: Final = -1
 
 
 class Decided(NamedTuple):
     """The tracks of a log as they were decided, including those that are left out as false.
 
-    ``sample`` (C,) is the sample of each assignment. ``log_odds`` (K,) that tracks are people, of the test of false
-    tracks, and which were ``kept`` (K,), are ordered by id. ``appearance`` is that of the assignments, None where it
-    isn't used.
+    ``log_odds`` (K,) that tracks are people, of the test of false tracks, and which were ``kept`` (K,), are ordered by
+    id. ``appearance`` is None where it isn't used.
     """
 
     tracked: Tracked
-    sample: Ints
     log_odds: Floats
     kept: Bools
     appearance: Appearance | None = None
 
 
-def decision_rows(
-    decided: Decided, model: MotionModel, samples: LogSamples, steps: Sequence[int], step_s: float
-) -> Iterator[Rows]:
+def decision_rows(decided: Decided, model: MotionModel, samples: LogSamples, steps: Sequence[int]) -> Iterator[Rows]:
     """The decisions at each of ``steps``: rows of Decisions, ordered by kind and track."""
-    parts = _joined(decided, find_kept_joins(decided, model, step_s), step_s), _persons(decided, step_s)
+    parts = _joined(decided, find_kept_joins(decided, model), model.step_s), _persons(decided, model.step_s)
     at, rows = np.concatenate([places for places, _ in parts]), DECISIONS.joined([rows for _, rows in parts])
-    places = samples.take(decided.sample[at])
+    places = samples.take(decided.tracked.tracks.sample[at])
     rows["x_m"], rows["y_m"] = places["x_m"], places["y_m"]
     rows["x_px"], rows["y_px"] = places["x_px"] + places["w_px"] / 2, places["y_px"] + places["h_px"] / 2
-    step = decided.tracked.step[at]
+    step = decided.tracked.tracks.step[at]
     order = np.lexsort((rows["source_id"], rows["track_id"], rows["kind"], step))
     ends = np.append(0, np.searchsorted(step[order], steps, "right")).tolist()
     rows = DECISIONS.check(rows.take(order))
     yield from (rows[low:high] for low, high in pairwise(ends))
 
 
-def find_kept_joins(decided: Decided, model: MotionModel, step_s: float) -> Joins:
+def find_kept_joins(decided: Decided, model: MotionModel) -> Joins:
     """The joins of the tracks that were kept."""
-    joins = find_joins(decided.tracked, model, step_s)
-    number = np.cumsum(run_starts(decided.tracked.track)) - 1
+    joins = find_joins(decided.tracked, model)
+    number = np.cumsum(run_starts(decided.tracked.tracks.track)) - 1
     kept = decided.kept[number[joins.after]]
     return Joins(*(values[kept] for values in joins))
 
 
-def join_probability(features: Floats) -> Floats:
-    """The probability (J,) that joins with these features (J, F) are right."""
-    return probability(features @ _JOINS_WEIGHTS + _JOINS_BIAS)
-
-
-def person_probability(log_odds: Floats) -> Floats:
-    """The probability (K,) that tracks with these log odds, of the test of false tracks, are people."""
-    return probability(log_odds * _PERSON_WEIGHTS[0] + _PERSON_BIAS)
-
-
 def _joined(decided: Decided, joins: Joins, step_s: float) -> tuple[Ints, Rows]:
     """The assignment of each join (J,), and its row."""
-    step, track, source = decided.tracked[:3]
+    step, track, source = decided.tracked.tracks[:3]
     rows = DECISIONS.empty(len(joins.after))
     rows["kind"], rows["track_id"] = DecisionKind.JOINED, track[joins.after]
     rows["previous_id"], rows["source_id"] = source[joins.before], source[joins.after]
-    by_motion = join_probability(joins.features)
-    rows["probability"] = with_appearance(by_motion, joins, decided.tracked, decided.appearance, step_s)
+    by_motion = JOINS.probability(joins.features)
+    rows["probability"] = with_appearance(by_motion, joins, decided.tracked.tracks, decided.appearance)
     rows["alternative_id"] = np.where(joins.alternative >= 0, source[joins.alternative], _NO_ID)
     rows["duration_s"] = (step[joins.after] - step[joins.before]) * step_s
     return joins.after, rows
@@ -197,7 +194,7 @@ def _joined(decided: Decided, joins: Joins, step_s: float) -> tuple[Ints, Rows]:
 
 def _persons(decided: Decided, step_s: float) -> tuple[Ints, Rows]:
     """The first assignment of each track (K,), and the row that says whether it is a person."""
-    step, track, source = decided.tracked[:3]
+    step, track, source = decided.tracked.tracks[:3]
     starts = run_starts(track)
     first, last = np.flatnonzero(starts), np.flatnonzero(run_ends(starts))
     rows = DECISIONS.empty(len(first))
@@ -205,7 +202,7 @@ def _persons(decided: Decided, step_s: float) -> tuple[Ints, Rows]:
     rows["track_id"] = np.where(decided.kept, track[first], _NO_ID)
     rows["previous_id"] = rows["alternative_id"] = _NO_ID
     rows["source_id"] = _usual(track, source)
-    is_person = person_probability(decided.log_odds)
+    is_person = PERSON.probability(decided.log_odds[:, None])
     rows["probability"] = np.where(decided.kept, is_person, 1 - is_person)
     rows["duration_s"] = (step[last] - step[first]) * step_s
     rows["frames"] = last - first + 1
@@ -258,6 +255,191 @@ def appearance_rows(descriptors: Descriptors, track: Ints, times_ns: Ints) -> It
     yield from (rows[low:high] for low, high in pairwise(ends))
 
 
+# Rows of offline tracks: described by a few numbers each while tracks are decided about, then made part by part.
+#
+# Letters: C assignments, R rows, N samples.
+
+
+class TrackRows(NamedTuple):
+    """Rows (R,) that are interpolated between samples.
+
+    Attributes
+    ----------
+    track, step : (R,) of int
+    before, after : (R,) of int
+        The samples of the track before and after the row; both are the row's own where it has one.
+    share : (R,) of float
+        How far the row is on the way between the two, from 0 to 1.
+    """
+
+    track: Ints
+    step: Ints
+    before: Ints
+    after: Ints
+    share: Floats
+
+    @classmethod
+    def of(cls, step: Ints, track: Ints, sample: Ints) -> TrackRows:
+        """A row for every step of every track from its first to its last; assignments (C,) are by track, then step."""
+        is_last = run_ends(run_starts(track))
+        count = np.where(is_last, 1, np.append(step[1:], 0)[: len(step)] - step)
+        before, within = group_index(count), ragged_range(0, count)
+        after = np.where(within > 0, before + 1, before)
+        return cls(track[before], step[before] + within, sample[before], sample[after], within / count[before])
+
+    @property
+    def is_sample(self) -> Bools:
+        """Whether each row is a sample, (R,), and not between two."""
+        return np.asarray(self.share == 0)
+
+    def between(self, values: NDArray[Any]) -> NDArray[Any]:
+        """A column of the samples (N,), linearly interpolated, (R,)."""
+        out = values[self.before]
+        out += self.share * (values[self.after] - out)
+        return out
+
+    def take(self, which: Bools | Ints | slice) -> TrackRows:
+        """Some of the rows."""
+        return TrackRows(self.track[which], self.step[which], self.before[which], self.after[which], self.share[which])
+
+
+class Moved(NamedTuple):
+    """Where smoothing moves rows (R,) to: positions (R, 2) in m, and what is added to x_px and y_px, (R, 2), if any."""
+
+    xy_m: Floats
+    shift_px: Floats | None
+
+    def take(self, which: Ints) -> Moved:
+        """The movements of some of the rows."""
+        return Moved(self.xy_m[which], None if self.shift_px is None else self.shift_px[which])
+
+
+def moved_to(xy_m: Floats, rows: TrackRows, samples: LogSamples, planes: Planes, t_ns: Ints) -> Moved:
+    """Move rows (R,) to positions (R, 2) in m, and their boxes with them if there is a ground plane at their times."""
+    if not planes:
+        return Moved(xy_m, None)
+    from_m, size = (
+        np.stack([rows.between(samples.column(name)) for name in names], axis=-1)
+        for names in (("x_m", "y_m"), ("w_px", "h_px"))
+    )
+    return Moved(xy_m, _shift(from_m, xy_m, size, planes, t_ns))
+
+
+def move_rows(rows: Rows, xy_m: Floats, planes: Planes, t_ns: Ints) -> Rows:
+    """Move rows (R,) to other positions (R, 2), and their boxes with them if there is a ground plane at their times."""
+    out = rows.copy()
+    if planes:
+        from_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
+        _add(out, _shift(from_m, xy_m, columns_to_boxes(rows)[:, 2:], planes, t_ns))
+    out["x_m"], out["y_m"] = xy_m.T
+    return out
+
+
+def _shift(from_m: Floats, to_m: Floats, size_px: Floats, planes: Planes, t_ns: Ints) -> Floats:
+    """The distance in px by which boxes of this size move between positions in m; all of them (R, 2)."""
+    out = np.zeros((len(from_m), 2))
+    which = np.maximum(np.searchsorted([since_ns for since_ns, _ in planes], t_ns, side="right") - 1, 0)
+    for number in np.unique(which).tolist():
+        plane, here = planes[number][1], which == number
+        size = size_px[here]
+        shift = plane.standing_boxes(to_m[here], size) - plane.standing_boxes(from_m[here], size)
+        out[here] = np.where(np.isfinite(shift), shift, 0.0)[:, :2]
+    return out
+
+
+def _add(rows: Rows, shift_px: Floats) -> None:
+    rows["x_px"] += shift_px[:, 0]
+    rows["y_px"] += shift_px[:, 1]
+
+
+# The class of a track, where its rows are of several: that of most of them.
+#
+# Letters: N rows, K tracks.
+
+
+def settle_classes(frames: Sequence[Frame]) -> Sequence[Frame]:
+    """Give each track one class, that of most of its rows; of several, the one that it had first.
+
+    Warns of the tracks that have rows of several classes. Frames are unchanged if there are none.
+    """
+    pairs = np.empty((2, 0), np.int64)
+    for _, _, joined in joined_parts(TRACKS, frames):
+        those = np.stack([joined.rows["track_id"].astype(np.int64), joined.rows["class_id"].astype(np.int64)])
+        pairs = np.unique(np.concatenate([pairs, those], axis=1), axis=1)
+    ids, count = np.unique(pairs[0], return_counts=True)
+    if not (count > 1).any():
+        return frames
+    changed = ids[count > 1]
+    parts = [
+        joined.rows[["track_id", "class_id"]][np.isin(joined.rows["track_id"], changed)]
+        for _, _, joined in joined_parts(TRACKS, frames)
+    ]
+    rows = np.concatenate(parts)
+    track = np.searchsorted(changed, rows["track_id"])
+    class_id = majority(track, rows["class_id"], len(changed))
+
+    def settled(joined: JoinedFrames) -> Rows:
+        place = np.minimum(np.searchsorted(changed, joined.rows["track_id"]), len(changed) - 1)
+        mine = changed[place] == joined.rows["track_id"]
+        joined.rows["class_id"][mine] = class_id[place[mine]]
+        return joined.rows
+
+    warn(
+        f"{len(changed)} of {len(ids)} tracks have detections of several classes; each has the class of most of its "
+        "detections",
+        "classes",
+    )
+    return mapped_rows(TRACKS, frames, settled)
+
+
+def vote(rows: Rows) -> tuple[int, int]:
+    """Give each track the class of most of its rows (N,), in place; rows are ordered by time.
+
+    Returns the number of tracks that had several classes, and of all tracks.
+    """
+    ids, track = np.unique(rows["track_id"], return_inverse=True)
+    changed = rows["class_id"] != first_classes(track, rows["class_id"], len(ids))[track]
+    if changed.any():
+        rows["class_id"] = majority(track, rows["class_id"], len(ids))[track]
+    return len(np.unique(track[changed])), len(ids)
+
+
+def rows_by_step(rows: TrackRows, samples: LogSamples, moved: Moved | None, steps: Sequence[int]) -> Iterator[Rows]:
+    """The rows of tracks at each of ``steps``, ordered by id; each track has the class of most of its rows."""
+    order = np.lexsort((rows.track, rows.step))
+    rows, moved = rows.take(order), moved and moved.take(order)
+    ends = np.append(0, np.searchsorted(rows.step, steps, "right"))
+    votes = np.empty(len(order), [("track_id", np.int64), ("class_id", np.uint32)])
+    votes["track_id"], votes["class_id"] = rows.track, samples.column("class_id")[rows.before]
+    vote(votes)
+    for low, high in spans_of(ends):
+        here = slice(ends[low], ends[high])
+        part = _rows(rows.take(here), samples)
+        part["class_id"] = votes["class_id"][here]
+        if moved is not None:
+            part["x_m"], part["y_m"] = moved.xy_m[here].T
+            if moved.shift_px is not None:
+                _add(part, moved.shift_px[here])
+        bounds = (ends[low : high + 1] - ends[low]).tolist()
+        yield from (part[start:end] for start, end in pairwise(bounds))
+
+
+def _rows(which: TrackRows, samples: LogSamples) -> Rows:
+    """Rows (R,) of tracks."""
+    before, is_sample = samples.take(which.before), which.is_sample
+    after, rows = before.copy(), before.copy()
+    after[~is_sample] = samples.take(which.after[~is_sample])
+    for name in LINEAR:
+        rows[name] += which.share * (after[name] - before[name])
+    for name in ANGLES:
+        step_rad = wrapped(after[name] - before[name])
+        rows[name] = np.where(is_sample, rows[name], wrapped(rows[name] + which.share * step_rad))
+    rows["source_id"] = np.where(is_sample, rows["track_id"], -1)
+    rows["observed"] &= is_sample
+    rows["track_id"] = which.track
+    return rows
+
+
 def offline_tracks(
     options: RetrackOptions,
     model: MotionModel,
@@ -274,36 +456,31 @@ def offline_tracks(
     as in the authors' program.
     """
     step, track, source, sample = assignments.of(samples, steps)
-    if not options.shares_samples:
-        _, kept = np.unique(sample, return_index=True)
-        step, track, source, sample = step[kept], track[kept], source[kept], sample[kept]
     xy = np.stack([samples.column(name)[sample] for name in ("x_m", "y_m")], axis=-1) / movers.unit_m
-    step_s = 1 / options.rate_hz
+    descriptors = options.stored_looks if options.looks is None else options.looks
     seen_ns = times_ns[np.searchsorted(steps, step)]
-    seen = Appearance.of(options.looks, seen_ns, step, source, xy, step_s)
+    look = np.full(len(step), -1) if descriptors is None else descriptors.find(seen_ns, source)
+    tracks = Tracks(step, track, source, sample, xy, look)
+    if not options.shares_samples:
+        tracks = tracks.take(np.unique(sample, return_index=True)[1])
+    seen = Appearance.of(options.looks, tracks, model.step_s)
     appearance = seen if seen and seen.calibration.tells_apart else None
-    if options.link_s > 0 and len(track):
-        pieces: CutTracks | None = None
-        if not movers.on_ground:
-            track, cuts = cut_joins(model, step, track, source, xy, step_s, options.link_confidence, appearance)
-            pieces = CutTracks.of(step, track, source, cuts)
-        track = _linked(options, model, step, track, xy, step_s, movers, pieces, appearance)
-    if options.resolve_swaps and len(track) and not movers.on_ground:
-        track = _without_swaps(model, step, track, source, xy, step_s, appearance)
-    track = fix_tracks(step, track, source, options.fixed_ids)
-    kept_tracks = np.unique(track[np.isin(source, np.array(options.fixed_ids, np.int64))])
-    order = np.lexsort((step, track))
-    step, track, source, sample = step[order], track[order], source[order], sample[order]
-    rows = TrackRows.of(step, track, sample)
-    is_kept = np.isin(rows.step, np.array(steps, np.int64))  # inside gaps of the log there are no frames
+    if options.link_s > 0 and len(tracks.step):
+        tracks = _linked(options, model, tracks, movers, appearance)
+    if options.resolve_swaps and len(tracks.step) and not movers.on_ground:
+        tracks = _without_swaps(model, tracks, appearance)
+    tracks = fix_tracks(tracks, options.fixed_ids)
+    tracks = tracks.take(tracks.order)
+    rows = TrackRows.of(tracks.step, tracks.track, tracks.sample)
     is_decided = DECISIONS in options.writes.values()
     moved: Moved | None = None
     states: tuple[State, State] | None = None
-    ids = np.unique(track)
+    ids, of = np.unique(tracks.track, return_inverse=True)
+    is_fixed = np.isin(ids, tracks.track[np.isin(tracks.source, np.array(options.fixed_ids, np.int64))])
     odds = np.full(len(ids), np.inf)
-    if len(step) and (options.smooth or options.track_confidence > 0 or is_decided):
-        _, row, trajectories = to_trajectories(step, track, xy[order], model.noise_m)
-        forward, backward, smoothed = smooth(model, trajectories, step_s)
+    if len(ids) and (options.smooth or options.track_confidence > 0 or is_decided):
+        _, row, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
+        forward, backward, smoothed = smooth(model, trajectories)
         states = forward.take(row), backward.take(row)
         if options.smooth:  # rows and trajectories are both ordered by track, then by step
             when = times_ns[np.minimum(np.searchsorted(steps, rows.step), len(times_ns) - 1)]
@@ -315,77 +492,63 @@ def offline_tracks(
                 rows.between(samples.column("score")),
                 samples.column("observed")[rows.before] & rows.is_sample,
                 movers.usual_score,
-                step_s,
+                model.step_s,
             )
         else:
-            odds = log_odds_in_log(model, trajectories, smoothed, step_s, (steps[0], steps[-1]))
-    is_sure = probability(odds) >= options.track_confidence
-    is_fixed = np.isin(ids, kept_tracks)
+            odds = log_odds_in_log(model, trajectories, smoothed, (steps[0], steps[-1]))
     min_track_s = options.min_track_s * (_CONFIRMED_SHARE if movers.on_ground else 1.0)
-    length = np.bincount(np.searchsorted(ids, rows.track), minlength=len(ids))
-    keeps = is_fixed | (is_sure & (length >= round(min_track_s * options.rate_hz) + 1))
-    left = np.flatnonzero(is_kept & keeps[np.searchsorted(ids, rows.track)])
+    of_row = np.searchsorted(ids, rows.track)
+    is_long = np.bincount(of_row, minlength=len(ids)) >= round(min_track_s * options.rate_hz) + 1
+    keeps = is_fixed | ((probability(odds) >= options.track_confidence) & is_long)
+    has_frame = np.isin(rows.step, np.array(steps, np.int64))  # inside gaps of the log there are none
+    left = np.flatnonzero(keeps[of_row] & has_frame)
     decisions: Iterator[Rows] = repeat(DECISIONS.empty(), len(steps))
     if is_decided and states is not None:
-        tracked = Tracked(step, track, source, *states)
-        ordered = None if appearance is None else appearance.take(order)
-        decided = Decided(tracked, sample, np.where(is_fixed, np.inf, odds), keeps, ordered)
-        decisions = decision_rows(decided, model, samples, steps, step_s)
+        decided = Decided(Tracked(tracks, *states), np.where(is_fixed, np.inf, odds), keeps, appearance)
+        decisions = decision_rows(decided, model, samples, steps)
     by_step = rows_by_step(rows.take(left), samples, moved and moved.take(left), steps)
     looks: Iterator[Rows] = repeat(APPEARANCE.empty(), len(steps))
     if (stored := options.stored_looks) is not None:
-        kept = np.flatnonzero(keeps[np.searchsorted(ids, track)])
-        seen_ns = times_ns[np.searchsorted(steps, step[kept])]
-        looks = appearance_rows(stored, stored.tracks_of(seen_ns, source[kept], track[kept]), times_ns)
+        kept = tracks.take(keeps[of] & (tracks.look >= 0))
+        track_of = np.full(len(stored.t_ns), -1)
+        track_of[kept.look] = kept.track
+        looks = appearance_rows(stored, track_of, times_ns)
     return Offline(by_step, decisions, looks, seen and seen.calibration)
 
 
-def _without_swaps(
-    model: MotionModel,
-    step: Ints,
-    track: Ints,
-    source: Ints,
-    xy: Floats,
-    step_s: float,
-    appearance: Appearance | None = None,
-) -> Ints:
-    """The track of each assignment (C,) after undoing swaps of tracks that met."""
+def _without_swaps(model: MotionModel, tracks: Tracks, appearance: Appearance | None) -> Tracks:
+    """Undo swaps of tracks that met."""
     examined: Ints | None = None  # tracks that were changed: the encounters of all others stay as they are
     for _ in range(_ROUNDS):
-        ids, row, trajectories = to_trajectories(step, track, xy, model.noise_m)
+        ids, row, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
         which = None if examined is None else np.isin(ids, examined)
-        seen = None if appearance is None else appearance.between(step, track, step_s)
-        owner, changed = resolve_swaps(model, trajectories, row, source, step_s, which, seen)
-        track = ids[owner[row]]
+        seen = None if appearance is None else appearance.between(tracks)
+        owner, changed = resolve_swaps(model, trajectories, row, tracks.source, which, seen)
+        tracks = tracks._replace(track=ids[owner[row]])
         if not changed:
             break
         own = group_index(np.diff(trajectories.first))
         examined = ids[np.unique(own[owner != own])]
-    return track
+    return tracks
 
 
 def _linked(
-    options: RetrackOptions,
-    model: MotionModel,
-    step: Ints,
-    track: Ints,
-    xy: Floats,
-    step_s: float,
-    movers: Movers,
-    pieces: CutTracks | None,
-    appearance: Appearance | None = None,
-) -> Ints:
-    """The track of each assignment (C,) after linking tracks of the same person."""
-    ids, _, trajectories = to_trajectories(step, track, xy, model.noise_m)
-    forward, backward = filtered(model, trajectories, step_s)
-    limits = options.link_s / movers.unit_m, options.link_confidence
-    seen = None if appearance is None else appearance.between(step, track, step_s).of_tracks
+    options: RetrackOptions, model: MotionModel, tracks: Tracks, movers: Movers, appearance: Appearance | None
+) -> Tracks:
+    """Link tracks of the same person; in pictures they are cut first where they seem to be of two."""
+    pieces: CutTracks | None = None
+    if not movers.on_ground:
+        tracks, cuts = cut_joins(model, tracks, options.link_confidence, appearance)
+        pieces = CutTracks.of(tracks, cuts)
+    ids, _, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
+    ends, limits = TrackEnds.of(model, trajectories), (options.link_s / movers.unit_m, options.link_confidence)
+    seen = None if appearance is None else appearance.between(tracks).of_tracks
     if pieces is None:
-        continued_by = link_tracks(model, trajectories, forward, backward, step_s, *limits, MAX_MISFIT, seen)
+        continued_by = link_tracks(ends, *limits, MAX_MISFIT, seen)
     else:
-        continued_by = link_pieces(model, trajectories, forward, backward, step_s, *limits, pieces, seen)
+        continued_by = link_pieces(ends, *limits, pieces, seen)
     root = np.arange(len(ids))
-    order = np.argsort(trajectories.step[trajectories.first[:-1]], kind="stable")  # a continuation begins later
+    order = np.argsort(ends.begins, kind="stable")  # a continuation begins later
     for earlier in order[continued_by[order] >= 0].tolist():
         root[continued_by[earlier]] = root[earlier]
-    return np.asarray(ids[root][np.searchsorted(ids, track)])
+    return tracks._replace(track=np.asarray(ids[root][np.searchsorted(ids, tracks.track)]))

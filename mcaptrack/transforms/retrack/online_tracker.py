@@ -11,15 +11,19 @@ number of operations on arrays. Letters: K tracks, N observations of one step, P
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from itertools import pairwise
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, joined, taken
 from mcaptrack.geometry.assignment import LARGE_TABLE, assign_by_gain, assign_pairs_by_gain
 from mcaptrack.geometry.neighbours import Pairing, near_pairs
-from mcaptrack.transforms.retrack.motion_model import MotionModel, StateRows, update
+from mcaptrack.geometry.ragged import run_ends, run_starts
+from mcaptrack.transforms.retrack import linking
+from mcaptrack.transforms.retrack.motion_model import MotionModel, State, StateRows, update
 
 #: Limits of the estimated noise of measured positions, in metres.
 NOISE_M: Final = (0.03, 0.8)
@@ -31,6 +35,215 @@ _CIRCLE: Final = -2 * np.log(_OUTSIDE)
 #: The rows of the whole numbers of tracks: id, input id of the last observation (-1: of a merged detection), number of
 #: observations, steps since the last one, and steps for which the track is merged into the detection of another one.
 IDS, SOURCE, HITS, MISSED, MERGED = range(5)
+
+
+# Online links: which new track continues a lost one, decided when the new one is first written, or before.
+#
+# A track that is lost for longer than its filter can bridge terminates, and the same person comes back as a new
+# track. Where that is likely, the new one is written under the id of the lost one, and if it is likelier than not,
+# it is written at once: a person who was confirmed needs no more proof. Links are judged by motion as they are
+# offline, but from the past alone: by the state of the lost track when it was last observed, that of the new one
+# now, and by how many earlier links of this log seem right. Offline re-tracking doesn't depend on these links.
+#
+# Letters: R tracks alive at the steps of some frames, end to end; F frames; K tracks; L lost and N new ones; E
+# links.
+
+
+#: So many of the last links say how many are right. That is estimated again when their number has grown by this share,
+#: because it takes longer than a decision.
+_LINKS: Final = 500
+_GROWS: Final = 0.1
+_NEVER: Final = np.iinfo(np.int64).max
+#: The number of pairs that are examined at once.
+_BATCH: Final = 200_000
+
+
+class _Known(NamedTuple):
+    """Tracks (K,): ids, the steps at which they began, were last observed and are over, the number of observations, and
+    the state at the last one.
+    """
+
+    ids: Ints
+    began: Ints
+    last: Ints
+    over: Ints
+    hits: Ints
+    state: State
+
+
+_NONE: Final = np.empty(0, np.int64)
+_NO_TRACKS: Final = _Known(_NONE, _NONE, _NONE, _NONE, _NONE, State(np.empty((0, 4)), np.empty((0, 3))))
+
+
+class _Links(NamedTuple):
+    """Candidate links (E,): from a lost track to a new one, by index, the seconds between them, and their log odds."""
+
+    lost: Ints
+    new: Ints
+    gap_s: Floats
+    log_odds: Floats
+
+
+_NO_LINKS: Final = _Links(_NONE, _NONE, np.empty(0), np.empty(0))
+
+
+class OnlineLinks:
+    """Which tracks are written under which ids: called with the steps of a log, some at a time.
+
+    Parameters
+    ----------
+    model : MotionModel
+        How people move.
+    max_gap_s : float
+        Links are made over gaps of at most so many seconds; 0 for none.
+    min_confidence : float
+        The least probability of a link. As offline, odds of a third of this are enough, but not for a track to be
+        written sooner.
+    confirm_hits : int
+        Only tracks with so many observations are continued by one that is not written otherwise.
+    """
+
+    def __init__(self, model: MotionModel, max_gap_s: float, min_confidence: float, confirm_hits: int) -> None:
+        self._model, self._step_s, self._max_gap_s = model, model.step_s, max_gap_s
+        self._confirm_hits = confirm_hits
+        self._sure = float(np.log(min_confidence / (1 - min_confidence)))
+        self._least = self._sure + float(np.log(linking.ENOUGH))
+        self._names: dict[int, int] = {}  # the ids under which tracks are written, of those that were
+        self._alive, self._lost = (
+            _NO_TRACKS,
+            _NO_TRACKS,
+        )  # lost ones are over, were written, and are continued by no other
+        self._links: deque[tuple[float, float]] = deque(maxlen=_LINKS)  # log odds and seconds
+        self._link_count, self._estimated = 0, 0
+        self._shifts = linking.prior_shifts(np.empty(0), np.empty(0))
+
+    def __call__(
+        self, steps: Ints, tick: Ints, tracks: Ints, state: State, is_observed: Bools, is_written: Bools
+    ) -> tuple[Ints, Bools]:
+        """The ids under which the tracks alive at each of F steps are written, (R,), and whether they are, (R,).
+
+        ``steps`` (F,) are the numbers of the steps, ``tick`` (R,) the index of the step of each track, rising;
+        ``tracks`` (5, R) and ``state`` (R,) are as in ``Step``. ``is_written`` (R,) says which are written in any case.
+        Nothing is known at a step that was not known then.
+        """
+        if self._max_gap_s <= 0:
+            return np.asarray(tracks[IDS]), is_written
+        alive, which = self._known(steps, tick, tracks, state, is_observed)
+        count = len(tick)
+        first = np.full(len(alive.ids), count)  # the row from which on a track is written in any case
+        written = np.flatnonzero(is_written)
+        np.minimum.at(first, which[written], written)
+        rows = np.flatnonzero(
+            (is_written | is_observed) & (np.arange(count) <= first[which]) & ~self._are_named(alive.ids)[which]
+        )
+        of = which[rows]
+        new = taken(alive, of)._replace(last=steps[tick[rows]], hits=tracks[HITS, rows], state=state.take(rows))
+        over = np.flatnonzero(alive.over < _NEVER)
+        lost = joined([self._lost, taken(alive, over)])
+        # a lost track was written before it was over; or else it has to continue another one
+        was_written = np.append(np.ones(len(self._lost.ids), bool), first[over] < count)
+        order = np.argsort(lost.ids)  # however many steps are read at once, links of equal odds are chosen by ids
+        lost, was_written = taken(lost, order), was_written[order]
+        is_first = rows == first[of]
+        links = self._candidates(lost, new, is_first)
+        since = np.full(len(alive.ids), count)  # those that continue another one are written whenever they are observed
+        since[[self._names.get(track, track) != track for track in alive.ids.tolist()]] = 0
+        used = np.zeros(len(lost.ids), bool)
+        for at_once in np.split(np.arange(len(links.new)), np.flatnonzero(np.diff(tick[rows[links.new]])) + 1):
+            may_be = ~used[links.lost[at_once]] & (since[of[links.new[at_once]]] == count)
+            may_be &= was_written[links.lost[at_once]] | self._are_named(lost.ids[links.lost[at_once]])
+            edges = taken(links, at_once[may_be])
+            chosen = self._decide(edges, is_first[edges.new])
+            for ended, other in zip(edges.lost[chosen].tolist(), edges.new[chosen].tolist(), strict=True):
+                self._names[int(new.ids[other])] = self._names.get(int(lost.ids[ended]), int(lost.ids[ended]))
+                used[ended], since[of[other]] = True, rows[other]
+        for track in alive.ids[first < count].tolist():
+            self._names.setdefault(track, track)
+        reached = lost.last >= steps[-1] - self._max_gap_s / self._step_s
+        self._lost = taken(lost, reached & ~used & self._are_named(lost.ids))
+        self._alive = taken(alive, alive.over == _NEVER)
+        names = np.array([self._names.get(track, track) for track in alive.ids.tolist()], np.int64)
+        kept = {*self._alive.ids.tolist(), *self._lost.ids.tolist()}
+        self._names = {track: name for track, name in self._names.items() if track in kept}
+        return np.asarray(names[which]), is_written | (is_observed & (np.arange(count) >= since[which]))
+
+    def _are_named(self, ids: Ints) -> Bools:
+        return np.array([track in self._names for track in ids.tolist()], bool)
+
+    def _candidates(self, lost: _Known, new: _Known, is_written: Bools) -> _Links:
+        """The links with a chance from lost tracks (L,) to new ones (N,), ordered by these, at the steps ``new.last``.
+
+        Those that are not ``is_written`` (N,) may continue only tracks that were confirmed.
+        """
+        parts = [_NO_LINKS]
+        each = max(1, _BATCH // max(len(lost.ids), 1))
+        for low in range(0, len(new.ids), each):
+            part = slice(low, low + each)
+            gaps_s = (new.last[part, None] - lost.last) * self._step_s
+            fits = (lost.over <= new.last[part, None]) & (gaps_s <= self._max_gap_s)
+            fits &= (lost.last < new.began[part, None]) & (is_written[part, None] | (lost.hits >= self._confirm_hits))
+            row, candidate = np.nonzero(fits)
+            row, gap_s = row + low, np.asarray(gaps_s[row, candidate], np.float64)
+            gaps = linking.Gaps(lost.state.take(candidate), new.state.take(row), gap_s)
+            is_near = linking.are_in_reach(gaps)
+            candidate, row, gaps = candidate[is_near], row[is_near], taken(gaps, is_near)
+            before, after, gap_s = gaps
+            # nothing is known of the velocity of what was observed once: it may be that of the lost one
+            single = new.hits[row] == 1
+            after.mean[single, 2:], after.cov[single, 2] = before.mean[single, 2:], before.cov[single, 2]
+            log_odds = linking.log_odds(linking.features(self._model, gaps))
+            parts.append(taken(_Links(candidate, row, gap_s, log_odds), linking.has_chance(log_odds)))
+        return joined(parts)
+
+    def _decide(self, links: _Links, is_written: Bools) -> Bools:
+        """Which of the links (E,) at one step are made, to tracks that are written in any case or not."""
+        is_made = np.zeros(len(links.new), bool)
+        if not len(is_made):
+            return is_made
+        ends, begins = (np.unique(side, return_inverse=True)[1] for side in (links.lost, links.new))
+        best = linking.best_links(ends, begins, links.log_odds, len(is_made))
+        shifted = links.log_odds[best] + self._shifts[linking.gap_classes(links.gap_s[best])]
+        is_right = shifted > np.where(is_written[best], self._least, self._sure)
+        # one that is not written yet is judged again at the next step: it counts once it is
+        counts = best[is_written[best] | is_right]
+        self._learn(links.log_odds[counts], links.gap_s[counts])
+        is_made[best[is_right]] = True
+        return is_made
+
+    def _known(self, steps: Ints, tick: Ints, tracks: Ints, state: State, is_observed: Bools) -> tuple[_Known, Ints]:
+        """All tracks as known at the last step or when they were over, (K,), and the one that each row (R,) is of."""
+        before = self._alive
+        names, which = np.unique(np.concatenate([before.ids, tracks[IDS]]), return_inverse=True)
+        had, which = which[: len(before.ids)], which[len(before.ids) :]
+        ends = np.full(len(names), -1)
+        ends[which] = tick  # rising, so the last one stays
+        last_row = np.full(len(names), -1)
+        seen = np.flatnonzero(is_observed)
+        last_row[which[seen]] = seen
+        began = np.full(len(names), _NEVER)
+        np.minimum.at(began, which, steps[tick])
+        began[had] = before.began
+        (last, hits), mean, cov = (
+            np.zeros((2, len(names)), np.int64),
+            np.zeros((len(names), 4)),
+            np.zeros((len(names), 3)),
+        )
+        earlier, now = (before.last, before.hits, *before.state), (steps[tick], tracks[HITS], *state)
+        is_seen = last_row >= 0
+        for values, was, is_now in zip((last, hits, mean, cov), earlier, now, strict=True):
+            values[had] = was
+            values[is_seen] = is_now[last_row[is_seen]]
+        return _Known(names, began, last, np.append(steps, _NEVER)[ends + 1], hits, State(mean, cov)), which
+
+    def _learn(self, log_odds: Floats, gap_s: Floats) -> None:
+        """Learn from the best links so far how many are right after gaps of what length."""
+        self._links.extend(zip(log_odds.tolist(), gap_s.tolist(), strict=True))
+        self._link_count += len(log_odds)
+        if self._link_count > self._estimated + min(_GROWS * self._estimated, _GROWS * _LINKS):
+            self._estimated = self._link_count
+            self._shifts = linking.prior_shifts(*np.array(self._links).T)
+
+
 _NOTHING: Final = np.empty(0, np.intp), np.empty(0, np.intp)
 
 
@@ -84,7 +297,6 @@ class OnlineTracker:
 
     model: MotionModel
     association: Association
-    step_s: float
     max_age: int
     confirm_hits: int
     max_age_tentative: int
@@ -112,7 +324,7 @@ class OnlineTracker:
             kept = (~is_over).nonzero()[0]
             self.tracks, self.state = self.tracks[:, kept], self.state.take(kept)
         if self.tracks.shape[1]:
-            self.model.predict(self.state, passed * self.step_s, self.state)
+            self.model.predict(self.state, passed * self.model.step_s, self.state)
         track, row = self._assigned(xy_m, source)
         observed = xy_m[:, row]
         occluded, occluder = self._merged_detections(track, observed)
@@ -141,7 +353,7 @@ class OnlineTracker:
         """
         tracks, (p, _, _) = self.tracks, self.state.cov
         is_confirmed = tracks[HITS] >= self.confirm_hits
-        is_lost = is_confirmed & (tracks[MERGED] * self.step_s < self.association.merge_timeout_s)
+        is_lost = is_confirmed & (tracks[MERGED] * self.model.step_s < self.association.merge_timeout_s)
         is_lost[track] = False
         lost = is_lost.nonzero()[0]
         if len(lost) == 0:
@@ -261,3 +473,309 @@ def _squared(off: Floats) -> Floats:
     off *= off
     out: Floats = off[0] + off[1]
     return out
+
+
+# Which online tracks are written, step by step, by what the log says so far of how long tracks last.
+#
+# A track is confirmed once it was observed for a while, because false detections flicker. But if all tracks of a
+# tracker follow people, this delay hides people; and if many are false, even those that were confirmed are soon
+# over. Both are seen in the log: for each number of observations, how many of the tracks so far were observed again
+# (the estimator of E. L. Kaplan and P. Meier, 1958, which also counts tracks that are not over yet). A track that
+# lasts with a probability of at least a half is written from its first observation.
+#
+# A track that is lost is written for a while, because most come back. Those that don't have left, or were false.
+# Which is likelier is learned in the same way, for each number of steps without an observation, for tracks that
+# have not lasted yet, and for those that would be outside of the area in which tracks were seen so far: most of
+# these have left it. It also depends on where the track was lost (``PlacesOfLosses``).
+#
+# Letters: F steps, R tracks of all steps, end to end; H levels of observations, the last one of tracks that have
+# lasted; A levels of steps without an observation.
+
+
+#: A track has lasted once it was observed for so many times as long as its confirmation takes.
+_LASTING: Final = 3
+#: Before anything is known: the probability that a track lasts, and that a lost one comes back; and for how many tracks
+#: this counts at each number of observations and steps.
+_LASTS, _RETURNS, _WEIGHT = 0.6, 0.8, 2.0
+#: Numbers of observations, and of steps without one, are counted in at most so many levels.
+_LEVELS: Final = 200
+
+
+# Where lost tracks come back and where they don't, as far as the log has shown.
+#
+# People go out at some places, and are missed for a moment at others. Whether a lost track comes back is told by
+# what became of those that were lost nearby, compared with the whole log. (Where a track began tells less of
+# whether it will last: people who are soon occluded look like false detections.)
+#
+# Letters: F steps; R tracks alive at these steps, end to end.
+
+
+Place: TypeAlias = tuple[float, float]
+
+#: Places are as near as this to be one.
+_NEAR_M: Final = 2.0
+#: Each place counts as if so many tracks like all others had been there before.
+_USUAL: Final = 8.0
+#: So many of the last tracks count.
+_LAST: Final = 2000
+#: What happens to tracks, in the order in which it is looked at within a step.
+_OVER, _BACK, _LOST = range(3)
+
+
+class PlaceOdds:
+    """The odds that something turns out well at places, compared with everywhere."""
+
+    def __init__(self) -> None:
+        self._xy_m = np.empty((2, _LAST))
+        self._is_good = np.zeros(_LAST, bool)
+        self._count = 0
+
+    def add(self, place: Place, is_good: bool) -> None:
+        """Count what became of something that was at a place."""
+        at = self._count % _LAST
+        self._xy_m[:, at], self._is_good[at] = place, is_good
+        self._count += 1
+
+    def ratio(self, place: Place) -> float:
+        """The odds that something at a place turns out well, as a ratio to those everywhere."""
+        count = min(self._count, _LAST)
+        is_good = self._is_good[:count]
+        share = (int(is_good.sum()) + 1) / (count + 2)
+        (x, y), (x_m, y_m) = place, self._xy_m[:, :count]
+        near = is_good[(x_m - x) ** 2 + (y_m - y) ** 2 <= _NEAR_M**2]
+        good = int(near.sum())
+        return (good / share + _USUAL) / ((len(near) - good) / (1 - share) + _USUAL)
+
+
+class PlacesOfLosses:
+    """Where tracks were lost, and what became of them: called with the steps of a log, some at a time."""
+
+    def __init__(self) -> None:
+        self._odds = PlaceOdds()
+        self._lost: dict[int, tuple[Place, float]] = {}  # where each lost track was lost, and the ratio there
+
+    def __call__(self, passed: Ints, tick: Ints, ids: Ints, is_observed: Bools, xy_m: Floats) -> Floats:
+        """The odds that lost tracks (R,) come back, as ratios to those of the whole log; 1 for others.
+
+        ``passed`` (F,) is by how many steps time advanced, ``tick`` (R,) the index of the step of each track, rising,
+        and ``xy_m`` (2, R) where it is. Nothing is known at a step that was not known then.
+        """
+        order = np.lexsort((tick, ids))
+        ids, tick, missed = ids[order], tick[order], ~is_observed[order]
+        starts = run_starts(ids)
+        first, last = np.flatnonzero(starts), np.flatnonzero(run_ends(starts))
+        names = ids[first].tolist()
+        for name in self._lost.keys() - set(names):
+            self._end(name, is_told=bool(passed[0] == 1))
+        was_missed = np.append(False, missed[:-1])[: len(ids)]
+        was_missed[first] = [name in self._lost for name in names]
+        happened = (
+            last[missed[last] & (tick[last] < len(passed) - 1)],
+            np.flatnonzero(was_missed & ~missed),
+            np.flatnonzero(missed & ~was_missed),
+        )
+        row, what = np.concatenate(happened), np.repeat(range(len(happened)), [len(rows) for rows in happened])
+        when = tick[row] + (what == _OVER)
+        x_m, y_m = xy_m[:, order[row]].tolist()
+        ratio = np.ones(len(ids))  # at the row from which on it holds
+        ratio[first] = [self._lost[name][1] if name in self._lost else 1.0 for name in names]
+        events = zip(when.tolist(), what.tolist(), row.tolist(), ids[row].tolist(), x_m, y_m, strict=True)
+        for step, event, at, name, x, y in sorted(events):
+            if event == _OVER:
+                self._end(name, is_told=bool(passed[step] == 1))
+            elif event == _BACK:
+                self._odds.add(self._lost.pop(name)[0], True)
+                ratio[at] = 1.0
+            else:
+                ratio[at] = self._odds.ratio((x, y))
+                self._lost[name] = (x, y), float(ratio[at])
+        changes = np.union1d(first, row[what != _OVER])
+        out = np.empty(len(order))
+        out[order] = np.repeat(ratio[changes], np.diff(np.append(changes, len(order))))
+        return out
+
+    def _end(self, name: int, is_told: bool) -> None:
+        """A lost track is over; a gap of the log ends tracks without telling anything of them."""
+        place, _ = self._lost.pop(name)
+        if is_told:
+            self._odds.add(place, False)
+
+
+# Convex hulls that grow. Letters: N points, V vertices.
+
+
+#: Points so little outside are taken for inside, in units of length.
+_SLACK: Final = 1e-6
+
+
+@dataclass
+class GrowingHull:
+    """The convex hull of all points so far.
+
+    Attributes
+    ----------
+    vertices : (V, 2) of float
+        Its vertices, anticlockwise; fewer than three if no area was seen yet, which has no inside.
+
+    Examples
+    --------
+    >>> hull = GrowingHull()
+    >>> hull.add(np.array([[0.0, 4.0, 4.0, 0.0, 2.0], [0.0, 0.0, 4.0, 4.0, 2.0]]))
+    >>> hull.vertices.tolist()
+    [[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]]
+    >>> hull.holds(np.array([[1.0, 5.0], [1.0, 1.0]])).tolist()
+    [True, False]
+    """
+
+    vertices: Floats = field(default_factory=lambda: np.empty((0, 2)))
+    _normals: Floats = field(init=False, default_factory=lambda: np.empty((0, 2)))
+    _limits: Floats = field(init=False, default_factory=lambda: np.empty((0, 1)))
+
+    def holds(self, xy: Floats) -> Bools:
+        """Which points (2, N) are inside, (N,); those that are NaN are not."""
+        if not len(self._normals):
+            return np.zeros(xy.shape[1], bool)
+        return np.asarray((self._normals @ xy <= self._limits).all(axis=0))
+
+    def add(self, xy: Floats) -> None:
+        """Add points (2, N); those that are NaN are left out."""
+        new = xy[:, np.isfinite(xy).all(axis=0) & ~self.holds(xy)]
+        if not new.shape[1]:
+            return
+        points = sorted({(x, y) for x, y in [*self.vertices.tolist(), *new.T.tolist()]})
+        ring = [*_chain(points), *_chain(points[::-1])]
+        self.vertices = np.array(ring)
+        if len(ring) > 2:
+            edges = np.roll(self.vertices, -1, axis=0) - self.vertices
+            outwards = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
+            self._normals = outwards / np.hypot(*outwards.T)[:, None]
+            self._limits = (self._normals * self.vertices).sum(axis=1)[:, None] + _SLACK
+
+
+def _chain(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """One side of the hull of sorted points, without the last one (A. M. Andrew, 1979)."""
+    out: list[tuple[float, float]] = []
+    for x, y in points:
+        while len(out) > 1:
+            (ax, ay), (bx, by) = out[-2:]
+            if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0:
+                break
+            out.pop()
+        out.append((x, y))
+    return out[:-1] if len(out) > 1 else out
+
+
+class ShownTracks:
+    """Which tracks are written: called with the steps of a log, some at a time.
+
+    Parameters
+    ----------
+    confirm_hits : int
+        A track with so many observations is written in any case.
+    coast : int
+        A lost track is written for at most so many steps.
+    max_age : int
+        Tracks terminate after so many steps without an observation.
+    adapts : bool
+        Whether it follows the log. Otherwise tracks are written once they are confirmed, and if they are lost once they
+        were observed half as often again.
+    """
+
+    def __init__(self, confirm_hits: int, coast: int, max_age: int, adapts: bool) -> None:
+        self._adapts = adapts
+        self._confirm_hits, self._coast, self._max_age = confirm_hits, coast, max_age
+        self._lasting = _LASTING * (confirm_hits - 1) + 1
+        self._levels, self._ages = min(self._lasting, _LEVELS), min(max_age, _LEVELS)
+        self._seen = GrowingHull()
+        self._places = PlacesOfLosses()
+        # By level of observations: tracks that reached the next one or terminated, and those that terminated. By inside
+        # and outside and level of steps without an observation: tracks that went on from there, and that came back.
+        self._counts = np.zeros((2, self._levels + 1))
+        self._returns = np.zeros((2, 2, self._ages + 1))
+        self._prior = _WEIGHT * (1 - _LASTS ** (1 / max(self._levels - 1, 1)))
+        self._prior_returns = _WEIGHT * (1 - (1 - _RETURNS) ** (1 / self._ages))
+        #: Of the last step: id, levels of observations and of steps without one, and whether outside, (4, K).
+        self._last: Ints = np.empty((4, 0), np.int64)
+
+    def __call__(self, passed: Ints, tick: Ints, is_observed: Bools, tracks: Ints, xy_m: Floats) -> Bools:
+        """Which of the tracks alive at each of F steps are written, (R,).
+
+        ``passed`` (F,) is by how many steps time advanced, ``tick`` (R,) the number of the step of each row, rising;
+        ``tracks`` (5, R) and ``xy_m`` (2, R) are as in ``Step``. Nothing is known at a step that was not known then.
+        """
+        is_confirmed, may_coast = tracks[HITS] >= self._confirm_hits, tracks[MISSED] <= self._coast
+        if not self._adapts:
+            is_old = tracks[HITS] * 2 >= self._confirm_hits * 3
+            return np.asarray(np.where(is_observed, is_confirmed, may_coast & is_old))
+        outside = ~self._inside(len(passed), tick, is_observed & is_confirmed, xy_m)
+        level, next_level = (self._level(tracks[HITS] + more) for more in (0, 1))
+        age = np.where(is_observed, 0, -(-np.minimum(tracks[MISSED], self._max_age) * self._ages // self._max_age))
+        lasts, returns = self._learn(passed, tick, np.stack([tracks[IDS], level, age, outside]))
+        lasting, where = level >= self._levels, outside.astype(np.intp)
+        ratio = self._places(passed, tick, tracks[IDS], is_observed, xy_m)
+        early = lasts[tick, level] >= 0.5
+        comes_back = _at_odds(returns[tick, where, age], ratio) * lasts[tick, next_level] >= 0.5
+        stays = may_coast & ((lasting & ~outside) | comes_back)
+        return np.asarray(np.where(is_observed, early | is_confirmed, stays))
+
+    def _level(self, hits: Ints) -> Ints:
+        return -(-np.minimum(hits, self._lasting) * self._levels // self._lasting)
+
+    def _inside(self, count: int, tick: Ints, is_sure: Bools, xy_m: Floats) -> Bools:
+        """Which tracks (R,) are in the area in which others, or they themselves, were seen before."""
+        bounds = np.searchsorted(tick, np.arange(count + 1)).tolist()
+        inside = np.zeros(len(tick), bool)
+        for low, high in pairwise(bounds):
+            here = xy_m[:, low:high]
+            inside[low:high] = self._seen.holds(here)
+            if (is_sure[low:high] & ~inside[low:high]).any():
+                self._seen.add(here[:, is_sure[low:high]])
+        return inside
+
+    def _learn(self, passed: Ints, tick: Ints, now: Ints) -> tuple[Floats, Floats]:
+        """Learn from what became of tracks, of which ``now`` (4, R) is known at each step.
+
+        Returns the probability that a track lasts at each step by its level of observations, (F, H + 1), and that a
+        lost one comes back, by whether it is outside and the level of steps without an observation, (F, 2, A + 1).
+        """
+        count, levels = len(passed), self._levels + 1
+        all_, at = np.concatenate([self._last, now], axis=1), np.append(np.full(self._last.shape[1], -1), tick)
+        order = np.lexsort((at, all_[0]))
+        (ids, level, age, outside), at = all_[:, order], at[order]
+        goes_on = np.append(ids[1:] == ids[:-1], False)[: len(ids)]
+        is_judged = goes_on | (at < count - 1)  # what became of those of the last step is not known yet
+        then = np.minimum(at + 1, count - 1)
+        is_judged &= passed[then] == 1  # a gap of the log ends tracks, and says nothing about them
+        next_level, next_age = (np.append(values[1:], 0)[: len(ids)] for values in (level, age))
+        lasting, back = level >= self._levels, goes_on & (next_age == 0)
+        is_new = is_judged & ~lasting & (~goes_on | (next_level > level))
+        is_lost = is_judged & (age > 0) & (~lasting | (outside > 0)) & (~goes_on | back | (next_age > age))
+        place = then * levels + level
+        counts = np.stack([_counted(place[which], count, (levels,)) for which in (is_new, is_new & ~goes_on)])
+        shape = 2, self._ages + 1
+        place = (then * 2 + outside) * shape[1] + age
+        returns = np.stack([_counted(place[which], count, shape) for which in (is_lost, is_lost & back)])
+        counts[:, 0] += self._counts
+        returns[:, 0] += self._returns
+        counts, returns = counts.cumsum(axis=1), returns.cumsum(axis=1)
+        self._counts, self._returns, self._last = counts[:, -1], returns[:, -1], now[:, tick == count - 1]
+        survives: Floats = 1 - (counts[1] + self._prior) / (counts[0] + _WEIGHT)
+        survives[:, -1] = 1.0
+        stays_lost: Floats = 1 - (returns[1] + self._prior_returns) / (returns[0] + _WEIGHT)
+        return _from_here_on(survives), 1 - _from_here_on(stays_lost)
+
+
+def _at_odds(probability: Floats, ratio: Floats) -> Floats:
+    """Probabilities (R,) with odds multiplied by ``ratio`` (R,)."""
+    return np.asarray(probability * ratio / (1 - probability + probability * ratio))
+
+
+def _counted(place: Ints, count: int, shape: tuple[int, ...]) -> Floats:
+    """Count each of the places of ``count`` tables, laid end to end."""
+    size = count * int(np.prod(shape))
+    return np.bincount(place, minlength=size).reshape(count, *shape).astype(np.float64)
+
+
+def _from_here_on(survives: Floats) -> Floats:
+    """The products of the last elements along the last axis, from each of them on."""
+    return np.asarray(np.cumprod(survives[..., ::-1], axis=-1)[..., ::-1], np.float64)

@@ -22,7 +22,7 @@ from mcaptrack.schema import APPEARANCE, DECISIONS, PREDICTIONS, TRACKS, Frame, 
 from mcaptrack.schema.framing import join_frames
 from mcaptrack.transforms.forecasts import ADAPT_HELP
 from mcaptrack.transforms.motion_limits import LIMITS_HELP, LIMITS_PATTERN, ClassNames, read_limits
-from mcaptrack.transforms.protocol import check_options, context, option, setting
+from mcaptrack.transforms.protocol import check_options, context, option, parameters, setting
 from mcaptrack.transforms.retrack.appearance import Descriptors
 
 # Headings of the options in the help.
@@ -47,97 +47,76 @@ def longest_track_s(frames: Sequence[Frame]) -> float:
 
 
 @dataclass(frozen=True, kw_only=True)
+@parameters
 class RetrackOptions:
-    """The options that the methods of re-tracking share: input, outputs, and all that is done offline."""
+    """The options that the methods of re-tracking share: input, outputs, and all that is done offline.
 
-    predictor: PredictorName = option(
-        "kalman",
-        "predictor: cv, holt-cv, kalman, red, social, which looks at other people, or lstm, which is less exact than "
-        "cv; red:FILE, social:FILE, lstm:FILE, onnx:FILE; one of an installed package, or module:Class",
-        kind="predictor",
-        theme=_PREDICTIONS,
-    )
-    horizon_s: float = option(4.8, "how far ahead to predict, in seconds", least=0.1, most=60.0, theme=_PREDICTIONS)
-    min_history: int = setting(
-        2,
-        "number of positions, the current one included, that a prediction needs",
-        least=1,
-        most=100,
-        theme=_PREDICTIONS,
-    )
-    noise_m: float | None = option(
-        None,
-        "noise of measured positions: standard deviation per axis in metres; if not given it is estimated from the "
-        "input (likelihood) or 0.2 (consistency)",
-        least=0.0,
-        theme=_MOTION,
-    )
-    speed_m_per_s: float = setting(
-        1.75,
-        "expected speed of tracks without a history: standard deviation per axis in metres per second",
-        least=0.0,
-        theme=_MOTION,
-    )
-    drift_m_per_s: float = setting(
-        0.12, "how much velocities change within a second, in metres per second", least=0.0, theme=_MOTION
-    )
-    drift_ratio: float = setting(
-        0.08, "how much velocities change within a second, as a share of the speed", least=0.0, theme=_MOTION
-    )
-    same_id_bonus: float = setting(
-        12.0,
-        "how much a pair gains if the observation has the input id that the track had last, in squared standard "
-        "deviations (likelihood) or standard deviations (consistency); the paper ignores input ids",
-        least=0.0,
-        theme=_ASSOCIATION,
-    )
-    max_age_s: float = option(
-        2.0,
-        "a track terminates after this many seconds without an observation (t_max in the paper)",
-        least=0.0,
-        theme=_LIFE,
-    )
-    interpolated: bool = setting(False, "use interpolated samples as observations, too", theme=_ASSOCIATION)
-    min_track_s: float = setting(
-        2.0, "leave out tracks that last less than this many seconds (probation)", least=0.0, theme=_LIFE
-    )
-    link_s: float = option(
-        20.0,
-        "link the end of a track with the beginning of another up to this many seconds later, by likelihood also "
-        "online, from the past alone; 0 for never",
-        least=0.0,
-        theme=_OFFLINE,
-    )
-    link_confidence: float = setting(
-        0.5,
-        "link two tracks if they are one person with at least this probability; with a ground plane people are linked "
-        "from a third of these odds on, and from an eleventh where a track was cut, because a person goes on there",
-        least=0.01,
-        most=0.99,
-        theme=_OFFLINE,
-    )
-    resolve_swaps: bool = setting(
-        True,
-        "decide again which track is which where two tracks met, from what was before and after (identity switches)",
-        theme=_OFFLINE,
-    )
-    track_confidence: float = setting(
-        0.5,
-        "leave out tracks that are a person with less than this probability (false tracks)",
-        least=0.0,
-        most=1.0,
-        theme=_OFFLINE,
-    )
-    across_classes: bool = option(
-        False,
-        "a track may continue with one of another class; offline it then has the class of most of its samples",
-        theme=_ASSOCIATION,
-    )
+    Parameters
+    ----------
+    predictor : str
+        Predictor: cv, holt-cv, kalman, red, social, which looks at other people, or lstm, which is less exact
+        than cv; red:FILE, social:FILE, lstm:FILE, onnx:FILE; one of an installed package, or module:Class.
+    horizon_s : float
+        How far ahead to predict, in seconds.
+    min_history : int
+        Number of positions, the current one included, that a prediction needs.
+    noise_m : float or None
+        Noise of measured positions: standard deviation per axis in metres; if not given it is estimated from
+        the input (likelihood) or 0.2 (consistency).
+    speed_m_per_s : float
+        Expected speed of tracks without a history: standard deviation per axis in metres per second.
+    drift_m_per_s : float
+        How much velocities change within a second, in metres per second.
+    drift_ratio : float
+        How much velocities change within a second, as a share of the speed.
+    same_id_bonus : float
+        How much a pair gains if the observation has the input id that the track had last, in squared standard
+        deviations (likelihood) or standard deviations (consistency); the paper ignores input ids.
+    max_age_s : float
+        A track terminates after this many seconds without an observation (t_max in the paper).
+    interpolated : bool
+        Use interpolated samples as observations, too.
+    min_track_s : float
+        Leave out tracks that last less than this many seconds (probation).
+    link_s : float
+        Link the end of a track with the beginning of another up to this many seconds later, by likelihood also
+        online, from the past alone; 0 for never.
+    link_confidence : float
+        Link two tracks if they are one person with at least this probability; with a ground plane people are
+        linked from a third of these odds on, and from an eleventh where a track was cut, because a person goes
+        on there.
+    resolve_swaps : bool
+        Decide again which track is which where two tracks met, from what was before and after (identity
+        switches).
+    track_confidence : float
+        Leave out tracks that are a person with less than this probability (false tracks).
+    across_classes : bool
+        A track may continue with one of another class; offline it then has the class of most of its samples.
+    smooth : bool
+        Smooth positions by past and future.
+    side_view : bool
+        Re-track also where no ground plane is known and the camera looks along the ground.
+    """
+
+    predictor: PredictorName = option("kalman", kind="predictor", theme=_PREDICTIONS)
+    horizon_s: float = option(4.8, least=0.1, most=60.0, theme=_PREDICTIONS)
+    min_history: int = setting(2, least=1, most=100, theme=_PREDICTIONS)
+    noise_m: float | None = option(None, least=0.0, theme=_MOTION)
+    speed_m_per_s: float = setting(1.75, least=0.0, theme=_MOTION)
+    drift_m_per_s: float = setting(0.12, least=0.0, theme=_MOTION)
+    drift_ratio: float = setting(0.08, least=0.0, theme=_MOTION)
+    same_id_bonus: float = setting(12.0, least=0.0, theme=_ASSOCIATION)
+    max_age_s: float = option(2.0, least=0.0, theme=_LIFE)
+    interpolated: bool = setting(False, theme=_ASSOCIATION)
+    min_track_s: float = setting(2.0, least=0.0, theme=_LIFE)
+    link_s: float = option(20.0, least=0.0, theme=_OFFLINE)
+    link_confidence: float = setting(0.5, least=0.01, most=0.99, theme=_OFFLINE)
+    resolve_swaps: bool = setting(True, theme=_OFFLINE)
+    track_confidence: float = setting(0.5, least=0.0, most=1.0, theme=_OFFLINE)
+    across_classes: bool = option(False, theme=_ASSOCIATION)
     class_limits: str = option("", LIMITS_HELP, pattern=LIMITS_PATTERN, theme=_MOTION)
-    smooth: bool = option(True, "smooth positions by past and future", theme=_OFFLINE)
-    side_view: bool = option(
-        False, "re-track also where no ground plane is known and the camera looks along the ground", theme=_ASSOCIATION
-    )
+    smooth: bool = option(True, theme=_OFFLINE)
+    side_view: bool = option(False, theme=_ASSOCIATION)
     rate_hz: float = context(lambda: 2.5)
     ground_planes: Planes = context(tuple)
     class_names: ClassNames = context(tuple, is_recorded=False)
@@ -149,6 +128,15 @@ class RetrackOptions:
         {"": TRACKS, "online": TRACKS, "predictions": PREDICTIONS}
     )
     latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": float("inf"), "online": 0.0, "predictions": 0.0})
+
+    # What methods do differently: whether tracks that are left unchanged are linked over gaps in the picture; whether
+    # ellipses of predictions follow the log; whether a sample that was assigned to two tracks stays with both; the
+    # descriptors of samples, if appearance is compared, and if it is stored.
+    links_in_picture: ClassVar[bool] = False
+    follows_log: ClassVar[bool] = True
+    shares_samples: ClassVar[bool] = False
+    looks: ClassVar[Descriptors | None] = None
+    stored_looks: ClassVar[Descriptors | None] = None
 
     @property
     def bridged_s(self) -> float:
@@ -163,31 +151,6 @@ class RetrackOptions:
     def leaves_unchanged(self) -> bool:
         """Whether boxes keep their tracks, because positions in metres are too wrong to repair these."""
         return self.poor_scale and not self.side_view
-
-    @property
-    def links_in_picture(self) -> bool:
-        """Whether tracks that are left unchanged are linked over gaps in the picture."""
-        return False
-
-    @property
-    def follows_log(self) -> bool:
-        """Whether the ellipses of predictions follow the log."""
-        return True
-
-    @property
-    def shares_samples(self) -> bool:
-        """Whether a sample that was assigned to two tracks stays with both."""
-        return False
-
-    @property
-    def looks(self) -> Descriptors | None:
-        """The descriptors of samples; None if appearance is not compared."""
-        return None
-
-    @property
-    def stored_looks(self) -> Descriptors | None:
-        """The descriptors of samples; None if appearance is not stored."""
-        return None
 
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
         """Why no rows came of frames, for a warning."""
@@ -213,8 +176,31 @@ class _OfOutputs(Generic[Value]):
 
 
 @dataclass(frozen=True, kw_only=True)
+@parameters
 class LikelihoodOptions(RetrackOptions):
-    """The options of re-tracking by likelihood."""
+    """The options of re-tracking by likelihood.
+
+    Parameters
+    ----------
+    merge_distance_m : float
+        Two tracks may be merged into one detection that lies between them (occlusion), this many metres from
+        both; 0 for never.
+    merge_timeout_s : float
+        Longest time that tracks stay merged into one detection, in seconds.
+    confirm_s : float
+        Online, a track is confirmed once it was observed for this many seconds: predicted, and written if it
+        was not before.
+    coast_s : float
+        Online, a track is written for up to this many seconds without an observation.
+    adapt_online : bool
+        Online, follow the log so far: write new tracks at once if most tracks last, and lost ones only as long
+        as it is likely that they come back.
+    appearance : bool or None
+        Compare the colours of what people wear before and after gaps and encounters; by default where the log
+        has pictures that tell people apart.
+    store_appearance : bool
+        Also write the mean colours of each track, as histograms of the upper body and of the legs.
+    """
 
     writes: ClassVar[Mapping[str, Schema]] = _OfOutputs(  # type: ignore[assignment]
         {**RetrackOptions.writes, "decisions": DECISIONS, APPEARANCE_OUTPUT: APPEARANCE}
@@ -224,59 +210,29 @@ class LikelihoodOptions(RetrackOptions):
     )
 
     @property
-    def links_in_picture(self) -> bool:
+    def links_in_picture(self) -> bool:  # type: ignore[override]
         return self.link_s > 0 or self.store_appearance
 
     @property
-    def follows_log(self) -> bool:
+    def follows_log(self) -> bool:  # type: ignore[override]
         return self.adapt
 
-    merge_distance_m: float = setting(
-        1.0,
-        "two tracks may be merged into one detection that lies between them (occlusion), this many metres from both; 0 "
-        "for never",
-        least=0.0,
-        theme=_ASSOCIATION,
-    )
-    merge_timeout_s: float = setting(
-        3.0, "longest time that tracks stay merged into one detection, in seconds", least=0.0, theme=_ASSOCIATION
-    )
-    confirm_s: float = setting(
-        1.2,
-        "online, a track is confirmed once it was observed for this many seconds: predicted, and written if it was "
-        "not before",
-        least=0.0,
-        theme=_LIFE,
-    )
-    coast_s: float = setting(
-        1.2, "online, a track is written for up to this many seconds without an observation", least=0.0, theme=_LIFE
-    )
-    adapt_online: bool = setting(
-        True,
-        "online, follow the log so far: write new tracks at once if most tracks last, and lost ones only as long as it "
-        "is likely that they come back",
-        theme=_LIFE,
-    )
+    merge_distance_m: float = setting(1.0, least=0.0, theme=_ASSOCIATION)
+    merge_timeout_s: float = setting(3.0, least=0.0, theme=_ASSOCIATION)
+    confirm_s: float = setting(1.2, least=0.0, theme=_LIFE)
+    coast_s: float = setting(1.2, least=0.0, theme=_LIFE)
+    adapt_online: bool = setting(True, theme=_LIFE)
     adapt: bool = setting(True, ADAPT_HELP, theme=_PREDICTIONS)
-    appearance: bool | None = option(
-        None,
-        "compare the colours of what people wear before and after gaps and encounters; by default where the log has "
-        "pictures that tell people apart",
-        theme=_OFFLINE,
-    )
-    store_appearance: bool = option(
-        False,
-        "also write the mean colours of each track, as histograms of the upper body and of the legs",
-        theme=_OFFLINE,
-    )
+    appearance: bool | None = option(None, theme=_OFFLINE)
+    store_appearance: bool = option(False, theme=_OFFLINE)
     descriptors: Descriptors | None = context(lambda: None, is_recorded=False)
 
     @property
-    def looks(self) -> Descriptors | None:
+    def looks(self) -> Descriptors | None:  # type: ignore[override]
         return None if self.appearance is False else self.descriptors
 
     @property
-    def stored_looks(self) -> Descriptors | None:
+    def stored_looks(self) -> Descriptors | None:  # type: ignore[override]
         return self.descriptors if self.store_appearance else None
 
 
@@ -357,58 +313,53 @@ def position_distances(tracks: Forecast, age: Ints, xy_m: Floats, noise_m: float
 
 
 @dataclass(frozen=True, kw_only=True)
+@parameters
 class ConsistencyOptions(RetrackOptions):
-    """The options of re-tracking by prediction consistency (Algorithm 1 of the paper)."""
+    """The options of re-tracking by prediction consistency (Algorithm 1 of the paper).
 
-    distance: Distance = setting(
-        "mean",
-        "how a track and an observation are compared: mean, max or first distance between their predicted steps, or "
-        "that between expected and measured position (now)",
-        theme=_ASSOCIATION,
-    )
-    max_distance: float = setting(
-        3.0,
-        "gate: pairs further apart, in standard deviations of their predictions (d_min in the paper), are not matched",
-        least=0.0,
-        theme=_ASSOCIATION,
-    )
-    gate_m: float | None = setting(
-        3.0,
-        "gate: a track is not matched further than this from its predicted current position, in metres",
-        least=0.0,
-        theme=_ASSOCIATION,
-    )
-    priority_distance: float = setting(
-        0.0,
-        "pairs nearer than this, in standard deviations, are matched before all others; 0 for never",
-        least=0.0,
-        theme=_ASSOCIATION,
-    )
-    covariance: Covariance = setting(
-        "predictor", "covariance of predictions: the predictor's, or the paper's (u - t) sigma^2", theme=_PREDICTIONS
-    )
-    sigma_m: float = setting(1.0, "sigma of the paper's covariance, in metres", least=1e-6, theme=_PREDICTIONS)
-    alpha: float = setting(
-        1.0, "smoothing of displacements (Eq. 3 of the paper); 1 for none", least=0.0, most=1.0, theme=_PREDICTIONS
-    )
-    beta: float = setting(
-        0.0, "smoothing of the trend of displacements (Eq. 3 of the paper)", least=0.0, most=1.0, theme=_PREDICTIONS
-    )
-    birth: Literal["raw", "smoothed"] = setting(
-        "raw", "what a new track predicts from: its past as observed, or smoothed", theme=_PREDICTIONS
-    )
-    min_hits: int = setting(
-        1, "online, a track is written from this many matches in a row", least=0, most=1000, theme=_LIFE
-    )
-    trim_ends: bool = setting(
-        False, "offline, leave out what a track matched after its last min_hits matches in a row", theme=_LIFE
-    )
-    backfill: Literal["none", "unclaimed", "all"] = setting(
-        "unclaimed",
-        "whether a new track gets the past of its first observation: not at all, what no other track has, or all",
-        theme=_OFFLINE,
-    )
+    Parameters
+    ----------
+    distance : str
+        How a track and an observation are compared: mean, max or first distance between their predicted steps,
+        or that between expected and measured position (now).
+    max_distance : float
+        Gate: pairs further apart, in standard deviations of their predictions (d_min in the paper), are not
+        matched.
+    gate_m : float or None
+        Gate: a track is not matched further than this from its predicted current position, in metres.
+    priority_distance : float
+        Pairs nearer than this, in standard deviations, are matched before all others; 0 for never.
+    covariance : str
+        Covariance of predictions: the predictor's, or the paper's (u - t) sigma^2.
+    sigma_m : float
+        Sigma of the paper's covariance, in metres.
+    alpha : float
+        Smoothing of displacements (Eq. 3 of the paper); 1 for none.
+    beta : float
+        Smoothing of the trend of displacements (Eq. 3 of the paper).
+    birth : str
+        What a new track predicts from: its past as observed, or smoothed.
+    min_hits : int
+        Online, a track is written from this many matches in a row.
+    trim_ends : bool
+        Offline, leave out what a track matched after its last min_hits matches in a row.
+    backfill : str
+        Whether a new track gets the past of its first observation: not at all, what no other track has, or all.
+    """
+
+    distance: Distance = setting("mean", theme=_ASSOCIATION)
+    max_distance: float = setting(3.0, least=0.0, theme=_ASSOCIATION)
+    gate_m: float | None = setting(3.0, least=0.0, theme=_ASSOCIATION)
+    priority_distance: float = setting(0.0, least=0.0, theme=_ASSOCIATION)
+    covariance: Covariance = setting("predictor", theme=_PREDICTIONS)
+    sigma_m: float = setting(1.0, least=1e-6, theme=_PREDICTIONS)
+    alpha: float = setting(1.0, least=0.0, most=1.0, theme=_PREDICTIONS)
+    beta: float = setting(0.0, least=0.0, most=1.0, theme=_PREDICTIONS)
+    birth: Literal["raw", "smoothed"] = setting("raw", theme=_PREDICTIONS)
+    min_hits: int = setting(1, least=0, most=1000, theme=_LIFE)
+    trim_ends: bool = setting(False, theme=_LIFE)
+    backfill: Literal["none", "unclaimed", "all"] = setting("unclaimed", theme=_OFFLINE)
 
     @property
-    def shares_samples(self) -> bool:
+    def shares_samples(self) -> bool:  # type: ignore[override]
         return self.backfill == "all"

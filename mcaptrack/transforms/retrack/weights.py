@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,28 @@ WEIGHTS: Final = Path(__file__).with_name("weights.json")
 _FILE: Final[Mapping[str, Any]] = json.loads(WEIGHTS.read_text(encoding="utf-8"))
 
 
-def weights_of(model: str, features: Sequence[str]) -> tuple[Floats, Mapping[str, Any]]:
-    """The weight of each of the features (F,) of a model as a log odds ratio, and its other numbers by name."""
-    entry = _FILE[model]
-    return np.array([entry["weights"][name] for name in features]), entry
+class Logistic(NamedTuple):
+    """A logistic regression: weights of features (F,) as log odds ratios, the log odds without any, other numbers."""
+
+    weights: Floats
+    bias: float
+    numbers: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, model: str, features: Sequence[str]) -> Logistic:
+        """The model of this name in the file, for features in this order."""
+        entry = _FILE[model]
+        return cls(np.array([entry["weights"][name] for name in features]), float(entry["bias"]), entry)
+
+    def log_odds(self, features: Floats) -> Floats:
+        """The log odds (N,) of what has these features (N, F)."""
+        return np.asarray(features @ self.weights + self.bias)
+
+    def probability(self, features: Floats) -> Floats:
+        """The probability (N,) of what has these features (N, F)."""
+        return probability(self.log_odds(features))
+
+
+def probability(log_odds: Floats) -> Floats:
+    """Log odds as probabilities."""
+    return np.asarray(1 / (1 + np.exp(-log_odds)))

@@ -1,7 +1,6 @@
 """Detections -> tracks: SORT and two trackers derived from it, written from their papers.
 
-They share their parameters and the lifecycle of tracks (``tracker``), the state of tracks (``state``) and the candidate
-pairs of detections and tracks (``association``). They differ in how they associate.
+They share their parameters, and the state and the lifecycle of tracks (``tracker``). They differ in how they associate.
 """
 
 from __future__ import annotations

@@ -7,17 +7,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Indices
-from mcaptrack.transforms.protocol import setting
-from mcaptrack.transforms.sort.state import SINCE_UPDATE, Measurements, associate
-from mcaptrack.transforms.sort.tracker import AssociationInput, Sort
+from mcaptrack.transforms.protocol import parameters, setting
+from mcaptrack.transforms.sort.tracker import SINCE_UPDATE, AssociationInput, Measurements, Sort, associate
 
 
 @dataclass(frozen=True, kw_only=True)
+@parameters
 class ByteTrack(Sort):
     """ByteTrack: association in two steps.
 
     Detections with a high score are matched with all tracks first, then those with a low score with the remaining
     tracks that were detected in the previous frame: people who are partly hidden score low, but stand where predicted.
+
+    Parameters
+    ----------
+    high_score : float
+        Detections with at least this score, or without a score, are matched first.
+    new_score : float
+        Detections with at least this score may begin a track.
+    low_min_iou : float
+        Least overlap (IoU) for detections with a low score, which are matched second.
 
     Examples
     --------
@@ -36,17 +45,9 @@ class ByteTrack(Sort):
     Y. Zhang et al., "ByteTrack: Multi-Object Tracking by Associating Every Detection Box", ECCV 2022.
     """
 
-    high_score: float = setting(
-        0.5, "detections with at least this score, or without a score, are matched first", search=(0.2, 0.9)
-    )
-    new_score: float = setting(0.6, "detections with at least this score may begin a track", search=(0.2, 0.9))
-    low_min_iou: float = setting(
-        0.5,
-        "least overlap (IoU) for detections with a low score, which are matched second",
-        least=0.0,
-        most=1.0,
-        search=(0.2, 0.8),
-    )
+    high_score: float = setting(0.5, search=(0.2, 0.9))
+    new_score: float = setting(0.6, search=(0.2, 0.9))
+    low_min_iou: float = setting(0.5, least=0.0, most=1.0, search=(0.2, 0.8))
 
     def _associate(self, step: AssociationInput) -> tuple[Indices, Indices]:
         pairs, min_similarity = self._candidate_pairs(step, self.min_iou)

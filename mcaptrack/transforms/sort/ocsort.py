@@ -18,9 +18,17 @@ import numpy as np
 from mcaptrack.geometry import kalman
 from mcaptrack.geometry.affine import move_boxes, move_points
 from mcaptrack.geometry.arrays import Floats, Indices
-from mcaptrack.transforms.protocol import setting
-from mcaptrack.transforms.sort.state import SHARED_ROWS, CandidatePairs, Measurements, Tracks, associate, iou_pairs
-from mcaptrack.transforms.sort.tracker import AssociationInput, Sort
+from mcaptrack.transforms.protocol import parameters, setting
+from mcaptrack.transforms.sort.tracker import (
+    SHARED_ROWS,
+    AssociationInput,
+    BoxTracks,
+    CandidatePairs,
+    Measurements,
+    Sort,
+    associate,
+    iou_pairs,
+)
 
 # Rows of the table below the shared ones: corners of the last detection; state of the filter after it; frames since
 # then; and centres of the detections in the last frames, oldest first, NaN where the track was missed.
@@ -31,11 +39,23 @@ _CENTRES: Final = _FRAMES_SINCE + 1
 
 
 @dataclass(frozen=True, kw_only=True)
+@parameters
 class OcSort(Sort):
     """OC-SORT: observations count for more than the filter.
 
     Matches that keep a track's direction of motion are preferred, lost tracks are matched once more by their last
     detection, and a track that is found again has its filter recomputed over the gap.
+
+    Parameters
+    ----------
+    inertia : float
+        Weight of the direction of motion, beside overlap.
+    direction_frames : int
+        Number of frames over which the direction of motion is measured.
+    recover : bool
+        Match lost tracks once more by their last detection.
+    reupdate : bool
+        Recompute the filter over the gap when a track is found again.
 
     Examples
     --------
@@ -54,15 +74,13 @@ class OcSort(Sort):
     J. Cao et al., "Observation-Centric SORT: Rethinking SORT for Robust Multi-Object Tracking", CVPR 2023.
     """
 
-    inertia: float = setting(0.2, "weight of the direction of motion, beside overlap", least=0.0, search=(0.0, 0.6))
-    direction_frames: int = setting(
-        3, "number of frames over which the direction of motion is measured", least=2, most=100, search=(2, 10)
-    )
-    recover: bool = setting(True, "match lost tracks once more by their last detection")
-    reupdate: bool = setting(True, "recompute the filter over the gap when a track is found again")
+    inertia: float = setting(0.2, least=0.0, search=(0.0, 0.6))
+    direction_frames: int = setting(3, least=2, most=100, search=(2, 10))
+    recover: bool = setting(True)
+    reupdate: bool = setting(True)
 
-    def _empty_tracks(self) -> Tracks:
-        return Tracks(_CENTRES - SHARED_ROWS + 2 * (self.direction_frames + 1))
+    def _empty_tracks(self) -> BoxTracks:
+        return BoxTracks(_CENTRES - SHARED_ROWS + 2 * (self.direction_frames + 1))
 
     def _associate(self, step: AssociationInput) -> tuple[Indices, Indices]:
         table = step.tracks.table
@@ -117,7 +135,7 @@ class OcSort(Sort):
         pairs = CandidatePairs(detections[near.detection], tracks[near.track], near.similarity, shape)
         return self._of_same_class(step, pairs)
 
-    def _move(self, tracks: Tracks, motion: Floats) -> None:
+    def _move(self, tracks: BoxTracks, motion: Floats) -> None:
         super()._move(tracks, motion)
         table = tracks.table
         kalman.move(table[_LAST_STATE], motion)
@@ -127,12 +145,12 @@ class OcSort(Sort):
         for row in range(_CENTRES, len(table), 2):
             table[row : row + 2] = move_points(motion, table[row : row + 2].T).T
 
-    def _initiate(self, tracks: Tracks, first_id: int, detections: Measurements) -> None:
+    def _initiate(self, tracks: BoxTracks, first_id: int, detections: Measurements) -> None:
         tracks.initiate(first_id, detections)
         new = np.arange(len(tracks) - len(detections), len(tracks))
         self._store(tracks, new, detections)
 
-    def _update(self, tracks: Tracks, at: Indices, detections: Measurements, hit: float, frames: int) -> None:
+    def _update(self, tracks: BoxTracks, at: Indices, detections: Measurements, hit: float, frames: int) -> None:
         frames_since = tracks.table[_FRAMES_SINCE, at]
         lost = np.flatnonzero(frames_since > frames) if self.reupdate else at[:0]
         if len(lost):
@@ -141,7 +159,7 @@ class OcSort(Sort):
         self._store(tracks, at, detections)
 
     @staticmethod
-    def _store(tracks: Tracks, at: Indices, detections: Measurements) -> None:
+    def _store(tracks: BoxTracks, at: Indices, detections: Measurements) -> None:
         table = tracks.table
         table[_LAST_BOX, at] = detections.corners
         table[_LAST_STATE, at] = table[: kalman.STATE_ROWS, at]

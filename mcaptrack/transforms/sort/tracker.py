@@ -12,41 +12,248 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice, pairwise
 from types import MappingProxyType
-from typing import ClassVar, Final, NamedTuple
+from typing import ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mcaptrack.choices import CameraMotionUse
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry import kalman
 from mcaptrack.geometry.affine import IDENTITY
 from mcaptrack.geometry.arrays import Bools, Floats, Indices
+from mcaptrack.geometry.assignment import max_weight_matching, one_to_one
+from mcaptrack.geometry.boxes import columns_to_boxes, overlapping
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.clocks import NS_PER_S, FrameClock
+from mcaptrack.geometry.neighbours import Pairing
 from mcaptrack.geometry.plane import GroundPlane, Planes, moved_planes, plane_at
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
-from mcaptrack.transforms.protocol import check_options, context, option, setting
-from mcaptrack.transforms.sort.state import (
-    CLASS,
-    HIT_STREAK,
-    SHARED_ROWS,
-    SINCE_UPDATE,
-    CandidatePairs,
-    Cost,
-    Measurements,
-    Tracks,
-    associate,
-    distance_pairs,
-    frames_to_measurements,
-    iou_pairs,
-    tracks_to_frames,
-)
+from mcaptrack.schema.framing import join_frames
+from mcaptrack.transforms.protocol import context, option, parameters, setting
 
 #: Number of frames that are converted at once.
 _BLOCK_FRAMES = 64
 #: Number of classes that a warning lists at most.
 _MAX_LISTED = 20
+
+
+# Detections and tracks as arrays: frames to measurements, the table of tracks, and tracks to frames.
+#
+# Several frames are converted at once, because the overhead of NumPy calls is per call.
+#
+# Letters: N detections in a frame, K tracks, F frames.
+
+
+#: Rows of the table of tracks, below those of the filter: score and class of the last detection; time since it (0 if it
+#: is in this frame); how long the track has been detected without a miss; track id. ``tracker`` says the unit of time.
+SCORE, CLASS, SINCE_UPDATE, HIT_STREAK, ID = range(kalman.STATE_ROWS, kalman.STATE_ROWS + 5)
+#: Number of rows that all trackers have; a tracker may add its own below.
+SHARED_ROWS: Final = ID + 1
+#: Limits of boxes, so that areas and aspect ratios are finite.
+_MIN_PX: Final = 1e-4
+_MAX_PX: Final = 1e12
+
+
+@dataclass(slots=True)
+class Measurements:
+    """Detections of a frame, one column each: left, top, right, bottom; the filter's measurement; score and class."""
+
+    columns: Floats
+
+    def __len__(self) -> int:
+        return int(self.columns.shape[1])
+
+    @property
+    def corners(self) -> Floats:
+        """Left, top, right, bottom (4, N)."""
+        return self.columns[:4]
+
+    @property
+    def measured(self) -> Floats:
+        """Measurements of the filter: centre, area and aspect ratio (4, N)."""
+        return self.columns[4:8]
+
+    @property
+    def score(self) -> Floats:
+        """Scores (N,), NaN where the detector gives none."""
+        row: Floats = self.columns[8]
+        return row
+
+    @property
+    def class_id(self) -> Floats:
+        """Classes (N,)."""
+        row: Floats = self.columns[9]
+        return row
+
+    def take(self, at: Indices) -> Measurements:
+        """The detections with these indices, in this order."""
+        return Measurements(self.columns.take(at, axis=1))
+
+
+def frames_to_measurements(
+    frames: Sequence[Frame], min_score: float | None, class_id: int | None
+) -> tuple[Floats, NDArray[np.int64]]:
+    """The detections of F frames with at least this score, or none, and of this class; degenerate boxes are left out.
+
+    Returns the columns of ``Measurements`` for all frames, and the ends of each frame's columns (F + 1,), from 0.
+    """
+    joined = join_frames(DETECTIONS, frames)
+    rows, ends = joined.rows, joined.ends
+    boxes = columns_to_boxes(rows)
+    kept = (boxes[:, 2:] > _MIN_PX).all(axis=1) & (np.abs(boxes) < _MAX_PX).all(axis=1)
+    if min_score is not None:
+        kept &= ~(rows["score"] < min_score)
+    if class_id is not None:
+        kept &= rows["class_id"] == class_id
+    if not kept.all():
+        ends = np.concatenate([[0], kept.cumsum()])[ends]
+        rows, boxes = rows[kept], boxes[kept]
+    boxes = boxes.T
+    columns = np.concatenate(
+        [boxes[:2], boxes[:2] + boxes[2:], kalman.measure(boxes), [rows["score"]], [rows["class_id"]]]
+    )
+    return columns, ends
+
+
+class BoxTracks:
+    """K tracks, one column of ``table`` each: the filter's state, the rows named above, then ``extra_rows``."""
+
+    def __init__(self, extra_rows: int = 0) -> None:
+        self.table: Floats = np.empty((SHARED_ROWS + extra_rows, 0))
+
+    def __len__(self) -> int:
+        return int(self.table.shape[1])
+
+    @property
+    def state(self) -> Floats:
+        """The states of the filters (17, K); writing to it writes to the tracks."""
+        return self.table[: kalman.STATE_ROWS]
+
+    def keep(self, kept: Bools) -> None:
+        """Terminate all other tracks."""
+        self.table = self.table.compress(kept, axis=1)  # rows stay whole in memory, unlike with [:, kept]
+
+    def initiate(self, first_id: int, detections: Measurements) -> None:
+        """Start a track at each of these detections, with ids from ``first_id``."""
+        new = np.empty((len(self.table), len(detections)))
+        kalman.start(new[: kalman.STATE_ROWS], detections.measured)
+        new[SCORE : CLASS + 1] = detections.columns[8:]
+        new[SINCE_UPDATE : HIT_STREAK + 1] = 0.0
+        new[ID] = range(first_id, first_id + len(detections))
+        new[SHARED_ROWS:] = np.nan
+        self.table = np.concatenate([self.table, new], axis=1)
+
+    def update(self, at: Indices, detections: Measurements, hit: float) -> None:
+        """Correct track ``at[i]`` with detection i (N,); its hit streak grows by ``hit``."""
+        table = self.table.take(at, axis=1)
+        kalman.correct(table[: kalman.STATE_ROWS], detections.measured)
+        table[SCORE : CLASS + 1] = detections.columns[8:]
+        table[SINCE_UPDATE] = 0.0
+        table[HIT_STREAK] += hit
+        self.table[:, at] = table
+
+
+def tracks_to_frames(frames: Sequence[Frame], table: Floats, ends: Sequence[int], planes: Planes) -> list[Frame]:
+    """Rows of F frames from columns of a table, of which ``ends`` (F + 1,) are the ends of each frame's columns."""
+    boxes = kalman.corners(table)
+    boxes[2:] -= boxes[:2]
+    rows = TRACKS.empty(table.shape[1])
+    rows["track_id"] = table[ID]
+    rows["x_px"], rows["y_px"], rows["w_px"], rows["h_px"] = boxes
+    rows["x_m"] = rows["y_m"] = np.nan
+    rows["score"] = table[SCORE]
+    rows["observed"] = True
+    rows["source_id"] = -1
+    rows["class_id"] = table[CLASS]
+    spans = list(pairwise(ends))
+    if planes:
+        for frame, (low, high) in zip(frames, spans, strict=True):
+            plane = plane_at(planes, frame.t_ns)
+            if plane is not None and low < high:
+                rows["x_m"][low:high], rows["y_m"][low:high] = plane.boxes_to_metres(boxes[:, low:high].T).T
+    return [Frame(frame.t_ns, frame.index, rows[low:high]) for frame, (low, high) in zip(frames, spans, strict=True)]
+
+
+# Candidate pairs of detections and tracks, and their assignment. Letters: N detections, K tracks, P pairs.
+
+
+Cost = Literal["iou", "pixels", "metres"]
+
+
+class CandidatePairs(NamedTuple):
+    """Pairs that pass the gate: detection (P,), track (P,), similarity (P,) in (0, 1]; ``shape`` is (N, K).
+
+    ``class_id`` (P,) are their classes, None if all are associated together.
+    """
+
+    detection: Indices
+    track: Indices
+    similarity: Floats
+    shape: tuple[int, int]
+    class_id: Floats | None = None
+
+    def select(self, kept: Bools | Indices) -> CandidatePairs:
+        """Some of the pairs."""
+        of = None if self.class_id is None else self.class_id[kept]
+        return CandidatePairs(self.detection[kept], self.track[kept], self.similarity[kept], self.shape, of)
+
+
+def iou_pairs(boxes: Floats, predicted: Floats, area: Floats, predicted_area: Floats) -> CandidatePairs:
+    """Pairs of detected boxes (4, N) and predicted ones (4, K) that overlap; their similarity is IoU.
+
+    Boxes are left, top, right, bottom; areas are (N,) and (K,).
+    """
+    return CandidatePairs(*overlapping(boxes, predicted, area, predicted_area), (boxes.shape[1], predicted.shape[1]))
+
+
+def distance_pairs(boxes: Floats, predicted: Floats, gate: float, plane: GroundPlane | None) -> CandidatePairs:
+    """Pairs by the distance of centres in pixels or, given a plane, of positions on the ground in metres.
+
+    Similarity is 1 at distance 0 and falls to 0 at the gate; gating excludes pairs beyond it.
+    """
+    here, predicted_at = (_positions(corners, plane) for corners in (boxes, predicted))
+    pairs = Pairing(here, predicted_at, np.full(here.shape[1], gate))
+    distance = np.hypot(*(pairs.of_first(here) - pairs.of_second(predicted_at)))
+    is_near = distance < gate  # NaN, above the horizon, is beyond every gate
+    return CandidatePairs(*pairs.chosen(is_near), 1 - distance[is_near] / gate, pairs.shape)
+
+
+def _positions(corners: Floats, plane: GroundPlane | None) -> Floats:
+    if plane is None:
+        return (corners[:2] + corners[2:]) / 2
+    return plane.boxes_to_metres(np.concatenate([corners[:2], corners[2:] - corners[:2]]).T).T
+
+
+def associate(pairs: CandidatePairs, min_similarity: float) -> tuple[Indices, Indices]:
+    """Assign detections to tracks; returns the detections and the tracks of pairs of at least ``min_similarity``.
+
+    If no detection and no track is in two pairs, these are the assignment. Otherwise the assignment with the largest
+    total similarity is taken, and pairs below ``min_similarity`` are removed afterwards, as in the original program.
+
+    Each class is associated by itself, as if there were no others.
+    """
+    if not len(pairs.detection):
+        return pairs.detection, pairs.track
+    if pairs.class_id is not None:
+        alone = pairs._replace(class_id=None)
+        by_class = [
+            associate(alone.select(pairs.class_id == kind), min_similarity) for kind in np.unique(pairs.class_id)
+        ]
+        detections, tracks = zip(*by_class, strict=True)
+        return np.concatenate(detections), np.concatenate(tracks)
+    above = pairs.similarity > min_similarity
+    count = np.count_nonzero(above)
+    if count:
+        near = pairs if count == len(above) else pairs.select(above)
+        if one_to_one(near.detection, near.track):
+            return near.detection, near.track
+    (detection, track), similarity = max_weight_matching((pairs.detection, pairs.track), pairs.similarity, pairs.shape)
+    if count == len(above):
+        return detection, track
+    enough = similarity >= min_similarity
+    return detection[enough], track[enough]
 
 
 class AssociationInput(NamedTuple):
@@ -55,7 +262,7 @@ class AssociationInput(NamedTuple):
     Attributes
     ----------
     detections : Measurements
-    tracks : Tracks
+    tracks : BoxTracks
         After the prediction of the filters.
     predicted : (4, K) of float, in px
         Predicted boxes of the tracks: left, top, right, bottom.
@@ -70,7 +277,7 @@ class AssociationInput(NamedTuple):
     """
 
     detections: Measurements
-    tracks: Tracks
+    tracks: BoxTracks
     predicted: Floats
     age: float
     frames: int
@@ -87,11 +294,40 @@ _LIFE: Final = "Begin and end of tracks"
 
 
 @dataclass(frozen=True, kw_only=True)
+@parameters
 class Sort:
     """Track detections over time.
 
     Reads detections, writes tracks: one row per frame for each person who is tracked and detected in it. SORT matches
     detections with the positions that Kalman filters predict for the tracks.
+
+    Parameters
+    ----------
+    max_age_s : float
+        A track ends after this many seconds without a detection.
+    max_age_frames : int or None
+        A track ends after this many frames without a detection, instead of --max-age-s.
+    min_hits_s : float
+        A track is written once it was detected without a break for this many seconds.
+    min_hits_frames : int or None
+        A track is written once it was detected in this many frames in a row, instead of --min-hits-s.
+    cost : str
+        How detections and tracks are compared: overlap of boxes (iou), or distance in pixels or in metres.
+    min_iou : float
+        Least overlap (IoU) of a detection with a track's predicted box.
+    max_distance_px : float
+        With cost pixels: largest distance of a box's centre from the predicted one, in pixels.
+    max_distance_m : float
+        With cost metres: largest distance on the ground from the predicted position, in metres.
+    min_score : float or None
+        Ignore detections with a lower score.
+    class_id : int or None
+        Ignore detections of other classes.
+    across_classes : bool
+        A track may continue with a detection of another class; it then has the class of most of its detections.
+    camera_motion : str
+        Move predictions with the camera: if it moves or has cuts (auto), also if it only shakes (on), or never
+        (off).
 
     Examples
     --------
@@ -110,73 +346,24 @@ class Sort:
     A. Bewley et al., "Simple Online and Realtime Tracking", ICIP 2016.
     """
 
-    max_age_s: float = option(
-        1.4, "a track ends after this many seconds without a detection", least=0.0, search=(0.2, 4.0), theme=_LIFE
-    )
-    max_age_frames: int | None = setting(
-        None, "a track ends after this many frames without a detection, instead of --max-age-s", least=0, theme=_LIFE
-    )
-    min_hits_s: float = option(
-        0.3,
-        "a track is written once it was detected without a break for this many seconds",
-        least=0.0,
-        search=(0.0, 1.0),
-        theme=_LIFE,
-    )
-    min_hits_frames: int | None = option(
-        None,
-        "a track is written once it was detected in this many frames in a row, instead of --min-hits-s",
-        least=0,
-        theme=_LIFE,
-    )
-    cost: Cost = setting(
-        "iou",
-        "how detections and tracks are compared: overlap of boxes (iou), or distance in pixels or in metres",
-        theme=_ASSOCIATION,
-    )
-    min_iou: float = option(
-        0.2,
-        "least overlap (IoU) of a detection with a track's predicted box",
-        least=0.0,
-        most=1.0,
-        search=(0.05, 0.6),
-        theme=_ASSOCIATION,
-    )
-    max_distance_px: float = setting(
-        60.0,
-        "with cost pixels: largest distance of a box's centre from the predicted one, in pixels",
-        least=0.0,
-        theme=_ASSOCIATION,
-    )
-    max_distance_m: float = setting(
-        1.0,
-        "with cost metres: largest distance on the ground from the predicted position, in metres",
-        least=0.0,
-        theme=_ASSOCIATION,
-    )
-    min_score: float | None = option(None, "ignore detections with a lower score", theme=_DETECTIONS)
-    class_id: int | None = setting(
-        None, "ignore detections of other classes", least=0, most=2**31 - 1, theme=_DETECTIONS
-    )
-    across_classes: bool = option(
-        False,
-        "a track may continue with a detection of another class; it then has the class of most of its detections",
-        theme=_DETECTIONS,
-    )
-    camera_motion: CameraMotionUse = option(
-        "auto",
-        "move predictions with the camera: if it moves or has cuts (auto), also if it only shakes (on), or never (off)",
-        theme=_ASSOCIATION,
-    )
+    max_age_s: float = option(1.4, least=0.0, search=(0.2, 4.0), theme=_LIFE)
+    max_age_frames: int | None = setting(None, least=0, theme=_LIFE)
+    min_hits_s: float = option(0.3, least=0.0, search=(0.0, 1.0), theme=_LIFE)
+    min_hits_frames: int | None = option(None, least=0, theme=_LIFE)
+    cost: Cost = setting("iou", theme=_ASSOCIATION)
+    min_iou: float = option(0.2, least=0.0, most=1.0, search=(0.05, 0.6), theme=_ASSOCIATION)
+    max_distance_px: float = setting(60.0, least=0.0, theme=_ASSOCIATION)
+    max_distance_m: float = setting(1.0, least=0.0, theme=_ASSOCIATION)
+    min_score: float | None = option(None, theme=_DETECTIONS)
+    class_id: int | None = setting(None, least=0, most=2**31 - 1, theme=_DETECTIONS)
+    across_classes: bool = option(False, theme=_DETECTIONS)
+    camera_motion: CameraMotionUse = option("auto", theme=_ASSOCIATION)
     ground_planes: Planes = context(tuple)
     camera_path: CameraPath | None = context(lambda: None, is_recorded=False)
 
     reads: ClassVar[Schema] = DETECTIONS
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": TRACKS})
     latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": 0.0})
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
         run, report = _Run(self, self._empty_tracks()), _FilterReport(self)
@@ -242,7 +429,7 @@ class Sort:
         for _ in range(frames if len(tracks) else 0):  # predict through missing frames, too
             kalman.predict(tracks.state)
 
-    def _compensate(self, tracks: Tracks, motion: Floats | None) -> None:
+    def _compensate(self, tracks: BoxTracks, motion: Floats | None) -> None:
         """Move predictions (2, 3) with the camera. At a cut, where there is no motion, all tracks end."""
         if motion is None:
             tracks.keep(np.zeros(len(tracks), bool))
@@ -271,10 +458,10 @@ class Sort:
 
     # What derived trackers override.
 
-    def _empty_tracks(self) -> Tracks:
-        return Tracks()
+    def _empty_tracks(self) -> BoxTracks:
+        return BoxTracks()
 
-    def _move(self, tracks: Tracks, motion: Floats) -> None:
+    def _move(self, tracks: BoxTracks, motion: Floats) -> None:
         """Move all that is remembered of tracks by the motion (2, 3) of the camera."""
         kalman.move(tracks.state, motion)
 
@@ -286,11 +473,11 @@ class Sort:
         """Mask the detections that may start a track if they are assigned to none. Returns a new array."""
         return np.ones(len(detections), bool)
 
-    def _initiate(self, tracks: Tracks, first_id: int, detections: Measurements) -> None:
+    def _initiate(self, tracks: BoxTracks, first_id: int, detections: Measurements) -> None:
         """Start a track at each of these detections."""
         tracks.initiate(first_id, detections)
 
-    def _update(self, tracks: Tracks, at: Indices, detections: Measurements, hit: float, frames: int) -> None:
+    def _update(self, tracks: BoxTracks, at: Indices, detections: Measurements, hit: float, frames: int) -> None:
         """Correct track ``at[i]`` with detection i, ``frames`` after the previous frame."""
         tracks.update(at, detections, hit)
 
@@ -340,7 +527,7 @@ class _Run:
     true while the log is shorter than ``min_hits``: all detected tracks are written then.
     """
 
-    def __init__(self, options: Sort, tracks: Tracks) -> None:
+    def __init__(self, options: Sort, tracks: BoxTracks) -> None:
         self.tracks, self.clock, self.next_id = tracks, FrameClock(), 1
         self.age = self.frame_age = self.max_age = self.hit = self.min_hits = 0.0
         self.is_starting = True

@@ -1,9 +1,8 @@
 """Learned detectors: networks in ONNX format, run by ONNX Runtime.
 
-``detector`` is the transform; ``session`` opens and runs the network, ``graph`` reads its file, ``layouts`` knows what
-families of networks take and give, ``convention`` tells the family, ``placing`` puts pictures and tiles into the input,
-``nms`` suppresses boxes of the same object, and ``classes`` names classes. ``catalogue`` says where weights come from,
-and ``catalogued`` has their detectors.
+``detector`` is the transform, with those of the catalogue; ``session`` opens and runs the network, and says where
+weights come from; ``layouts`` knows what families of networks take and give; ``nms`` puts pictures and tiles into the
+input, and suppresses boxes of the same object.
 """
 
 from __future__ import annotations

@@ -7,7 +7,6 @@ Letters: N boxes.
 
 from __future__ import annotations
 
-import difflib
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -22,7 +21,7 @@ from typing import ClassVar, Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, did_you_mean
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.boxes import parse_size
 from mcaptrack.networks import Device, NetworkFile, NetworkLimits, digest_of, read_file
@@ -31,16 +30,17 @@ from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.schema.classes import PEOPLE, PERSON
 from mcaptrack.transforms.detect.onnx.layouts import (
     LAYOUTS,
+    SURE,
     Layout,
+    MisreadError,
     NetworkSignature,
     class_count,
     possible,
     recognised,
 )
 from mcaptrack.transforms.detect.onnx.nms import Boxes, Size, Tile, join_tiles, place, suppress, tiles_of
-from mcaptrack.transforms.detect.onnx.outputs import SURE, MisreadError
-from mcaptrack.transforms.detect.onnx.session import DetectorNetwork, workers
-from mcaptrack.transforms.protocol import Colour, ModelCard, Suited, check_options, option, setting
+from mcaptrack.transforms.detect.onnx.session import DetectorNetwork, check, find, stored, workers
+from mcaptrack.transforms.protocol import Colour, ModelCard, Suited, check_options, option, parameters, setting
 
 LayoutChoice = Literal["auto", "yolox", "yolox-legacy", "nanodet", "rtdetr", "dfine", "rfdetr", "ultralytics"]
 
@@ -129,9 +129,9 @@ def wanted(names: Mapping[int, str], classes: str, where: str) -> list[int]:
         if not indices and word.isdecimal() and int(word) in names:
             indices = [int(word)]
         if not indices:
-            close = difflib.get_close_matches(word, by_name, 1)
-            meant = f"did you mean {close[0]}? " if close else ""
-            raise McaptrackError(f"{where} has no class {word!r}; {meant}`classes=` takes {_known(names)}")
+            raise McaptrackError(
+                f"{where} has no class {word!r}; {did_you_mean(word, by_name)}`classes=` takes {_known(names)}"
+            )
         out.update(indices)
     if not out:
         raise McaptrackError(f"`classes=` names none; {where} has {_known(names)}")
@@ -155,10 +155,35 @@ def _people(names: Mapping[int, str]) -> int | None:
 
 
 @dataclass(frozen=True, kw_only=True)
+@parameters
 class OnnxDetector:
     """With `--detector onnx:FILE` a network in ONNX format finds objects in each picture.
 
     Reads video, writes detections: one box for each object of the chosen classes.
+
+    Parameters
+    ----------
+    file : str
+        ONNX file of the network; `onnx:FILE` names it, too.
+    layout : str
+        Family of the network, which says what it takes and gives; `auto` tells it by names, shapes and a trial.
+    input_size : str
+        Width and height of the network's input, as in 960x736, or `picture` for about those of the picture;
+        otherwise the network's own.
+    device : str
+        Where the network runs; `auto` takes a GPU if ONNX Runtime can use one.
+    max_memory_mb : int
+        Most memory that the network may take, in MB.
+    tiles : str
+        Columns and rows of tiles that each picture is cut into, as in 3x2, for small objects.
+    overlap : float
+        How much of its width or height a tile shares with the next one.
+    classes : str
+        Classes to detect, by name or index with commas between them; `all` for every one.
+    min_score : float
+        Boxes with a lower score are left out.
+    max_iou : float
+        Boxes of one class that overlap more are one object.
 
     Examples
     --------
@@ -169,44 +194,16 @@ class OnnxDetector:
     []
     """
 
-    file: str = option("", "ONNX file of the network; `onnx:FILE` names it, too", theme=NETWORK)
-    layout: LayoutChoice = option(
-        "auto",
-        "family of the network, which says what it takes and gives; `auto` tells it by names, shapes and a trial",
-        theme=NETWORK,
-    )
-    input_size: str = option(
-        "",
-        "width and height of the network's input, as in 960x736, or `picture` for about those of the picture; "
-        "otherwise the network's own",
-        theme=NETWORK,
-    )
-    device: Device = option(
-        "auto", "where the network runs; `auto` takes a GPU if ONNX Runtime can use one", theme=NETWORK
-    )
-    max_memory_mb: int = option(
-        1000, "most memory that the network may take, in MB", least=10, most=1_000_000, theme=NETWORK
-    )
-    tiles: str = option(
-        "1x1", "columns and rows of tiles that each picture is cut into, as in 3x2, for small objects", theme=_BOXES
-    )
-    overlap: float = setting(
-        0.2, "how much of its width or height a tile shares with the next one", least=0.0, most=0.5, theme=_BOXES
-    )
-    classes: str = option(
-        "person", "classes to detect, by name or index with commas between them; `all` for every one", theme=_BOXES
-    )
-    min_score: float = option(
-        0.1, "boxes with a lower score are left out", least=0.0, most=1.0, search=(0.05, 0.6), theme=_BOXES
-    )
-    max_iou: float = setting(
-        0.45,
-        "boxes of one class that overlap more are one object",
-        least=0.0,
-        most=1.0,
-        search=(0.3, 0.8),
-        theme=_BOXES,
-    )
+    file: str = option("", theme=NETWORK)
+    layout: LayoutChoice = option("auto", theme=NETWORK)
+    input_size: str = option("", theme=NETWORK)
+    device: Device = option("auto", theme=NETWORK)
+    max_memory_mb: int = option(1000, least=10, most=1_000_000, theme=NETWORK)
+    tiles: str = option("1x1", theme=_BOXES)
+    overlap: float = setting(0.2, least=0.0, most=0.5, theme=_BOXES)
+    classes: str = option("person", theme=_BOXES)
+    min_score: float = option(0.1, least=0.0, most=1.0, search=(0.05, 0.6), theme=_BOXES)
+    max_iou: float = setting(0.45, least=0.0, most=1.0, search=(0.3, 0.8), theme=_BOXES)
 
     reads: ClassVar[Schema] = VIDEO
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType({"": DETECTIONS})
@@ -329,14 +326,14 @@ class Contest:
         if not any(layout.name in boxes for layout in self.layouts):
             why = "; ".join(f"read as {layout.name}, {results[layout.name]}" for layout in self.layouts)
             raise McaptrackError(f"{self._path} fits no layout: {why}")
-        self._keep([layout for layout in self.layouts if layout.name in boxes])
+        self.layouts = [layout for layout in self.layouts if layout.name in boxes]
         for layout in self.layouts:
             self._sums[layout.name] += evidence(boxes[layout.name])
         ordered = sorted(self.layouts, key=lambda layout: -self._sums[layout.name])
         best, second = (self._sums[layout.name] for layout in (ordered * 2)[:2])
         self._pictures += best > 0
         if len(ordered) == 1 or (best > 0 and best >= _CLEAR * second):
-            self._keep(ordered[:1])
+            self.layouts = ordered[:1]
         elif self._pictures >= _PATIENCE:
             raise McaptrackError(self._unclear())
 
@@ -344,10 +341,7 @@ class Contest:
         """Settle on what is left, after the last picture. Raises McaptrackError if it can't be told."""
         if not self.is_settled and self._pictures:
             raise McaptrackError(self._unclear())
-        self._keep(self.layouts[:1])
-
-    def _keep(self, layouts: list[Layout]) -> None:
-        self.layouts = layouts
+        self.layouts = self.layouts[:1]
 
     def _unclear(self) -> str:
         names = " and ".join(layout.name for layout in self.layouts)
@@ -584,3 +578,84 @@ def size_for(width: int, height: int) -> Size:
     scale = min(2.0, sqrt(_LEAST_PIXELS / pixels)) if pixels < _LEAST_PIXELS else min(1.0, sqrt(_MOST_PIXELS / pixels))
     wide, high = (max(32, -(-round(side * scale) // 32) * 32) for side in (width, height))
     return wide, high
+
+
+# The detectors of the catalogue, each with the settings that suit it.
+
+
+@dataclass(frozen=True, kw_only=True)
+@parameters
+class CataloguedDetector(OnnxDetector):
+    """Base of the detectors of the catalogue: YOLOX, with an input of about the size of the picture.
+
+    Parameters
+    ----------
+    layout : str
+        Family of the network.
+    input_size : str
+        Width and height of the network's input, as in 416x416, or `picture` for about those of the picture.
+    """
+
+    layout: LayoutChoice = option("yolox", theme=NETWORK)
+    input_size: str = option("picture", theme=NETWORK)
+
+    #: False boxes score up to 0.6 and begin no tracks, so that those that begin need no confirmation.
+    suits: ClassVar[Mapping[str, Suited]] = MappingProxyType(
+        {
+            "tracker": OnnxDetector.suits["tracker"]._replace(
+                parameters=MappingProxyType({"new_score": 0.7, "min_hits_frames": 1})
+            )
+        }
+    )
+    #: Its name in the catalogue.
+    model: ClassVar[str]
+
+    def weights(self) -> Path:
+        """The file of the network. Raises McaptrackError if it was not fetched."""
+        return super().weights() if self.file else stored(find(self.model))
+
+    def check_weights(self, sha256: str, size: int) -> None:
+        """Raise McaptrackError if a file with this digest and size, in bytes, is not that of the catalogue."""
+        check(find(self.model), sha256, size, self.weights())
+
+    def weights_sha256(self) -> str:
+        """The digest of the network's file."""
+        return find(self.model).sha256
+
+
+@dataclass(frozen=True, kw_only=True)
+class YoloxNano(CataloguedDetector):
+    """With `--detector yolox-nano` a small network finds people and other objects in each picture.
+
+    Reads video, writes detections. `mcaptrack models get yolox-nano` fetches its weights once.
+
+    References
+    ----------
+    .. [1] Z. Ge, S. Liu, F. Wang, Z. Li, J. Sun: YOLOX: Exceeding YOLO Series in 2021. arXiv:2107.08430.
+    """
+
+    model: ClassVar[str] = "yolox-nano"
+
+
+@dataclass(frozen=True, kw_only=True)
+class YoloxTiny(CataloguedDetector):
+    """With `--detector yolox-tiny` a larger network does the same more slowly.
+
+    References
+    ----------
+    .. [1] Z. Ge, S. Liu, F. Wang, Z. Li, J. Sun: YOLOX: Exceeding YOLO Series in 2021. arXiv:2107.08430.
+    """
+
+    model: ClassVar[str] = "yolox-tiny"
+
+
+@dataclass(frozen=True, kw_only=True)
+class YoloxS(CataloguedDetector):
+    """With `--detector yolox-s` a network for GPUs does the same.
+
+    References
+    ----------
+    .. [1] Z. Ge, S. Liu, F. Wang, Z. Li, J. Sun: YOLOX: Exceeding YOLO Series in 2021. arXiv:2107.08430.
+    """
+
+    model: ClassVar[str] = "yolox-s"

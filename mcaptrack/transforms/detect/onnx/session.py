@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +13,10 @@ from numpy.typing import NDArray
 
 from mcaptrack import environment
 from mcaptrack.environment import threads
-from mcaptrack.errors import McaptrackError, call
+from mcaptrack.errors import McaptrackError, call, did_you_mean
 from mcaptrack.networks import Device, NetworkFile, NetworkLimitError, NetworkLimits, OnnxNetwork, Value
-from mcaptrack.transforms.detect.onnx.layouts import NetworkSignature
+from mcaptrack.transforms.detect.onnx.layouts import NetworkSignature, Outputs
 from mcaptrack.transforms.detect.onnx.nms import Size
-from mcaptrack.transforms.detect.onnx.outputs import Outputs
 
 #: What the sides of an input are multiples of, unless a network was made for another size.
 _STEP: Final = 32
@@ -125,9 +123,9 @@ CATALOGUE: Final[Mapping[str, Model]] = MappingProxyType({model.name: model for 
 def find(name: str) -> Model:
     """Return the model of this name. Raises McaptrackError if there is none."""
     if name not in CATALOGUE:
-        close = difflib.get_close_matches(name, CATALOGUE, 1)
-        meant = f"did you mean {close[0]}? " if close else ""
-        raise McaptrackError(f"there is no model {name}; {meant}there are {', '.join(CATALOGUE)}")
+        raise McaptrackError(
+            f"there is no model {name}; {did_you_mean(name, CATALOGUE)}there are {', '.join(CATALOGUE)}"
+        )
     return CATALOGUE[name]
 
 
