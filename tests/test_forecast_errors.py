@@ -218,7 +218,7 @@ def test_pairs_are_those_of_least_total_distance(seed, people, tracks):
     given_all = positions(truth), positions(seen), made
     found = pair_forecasts(*given_all)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mcaptrack.evaluation.metrics.pairing._PAIRS_AT_ONCE", 12)
+        patch.setattr("mcaptrack.evaluation.metrics.displacement._PAIRS_AT_ONCE", 12)
         for one, other in zip(pair_forecasts(*given_all), found, strict=True):
             np.testing.assert_array_equal(one, other)
 

@@ -263,9 +263,9 @@ def test_paces_equal_the_reference_and_exchanging_the_tracks_changes_nothing(see
     paths = {name: with_gaps(rng, start, places) for name, start, places in zip((3, 8), starts, walk, strict=True)}
     met, parted = np.sort(rng.integers(20, 60, 2)).tolist()
     out, _ = laid_out(paths, model.noise_m)
-    given_all = np.array([met]), np.array([parted]), 0.4, model.noise_m
-    found = swapped_by_pace(out, np.array([[0], [1]]), *given_all)
-    assert found.tolist() == swapped_by_pace(out, np.array([[1], [0]]), *given_all).tolist()
+    times = np.array([met]), np.array([parted])
+    found = swapped_by_pace(model, out, np.array([[0], [1]]), *times)
+    assert found.tolist() == swapped_by_pace(model, out, np.array([[1], [0]]), *times).tolist()
     assert found[0] == pytest.approx(by_pace(motion, paths[3], paths[8], met, parted), abs=1e-9)
 
 
@@ -405,6 +405,7 @@ def test_people_merged_into_one_detection_are_not_taken_for_noise():
     run = LikelihoodPass(PROFILES["default"])
     for (frame,) in Sample(start_ns=round(clock[0] * STEP_S * 1e9))(on_clock(rows, clock)):
         run.step(frame)
+    run.finish()
     assert run.noise_m < 0.5
 
 
@@ -421,9 +422,8 @@ def test_ids_of_any_size_give_the_same_limit():
 def test_the_estimate_keeps_the_limit_at_once():
     """Forty people jump about by metres: all of them are outside of their circles at the same step."""
     tracker = OnlineTracker(
-        model=MotionModel(0.2, 1.5, 0.12, 0.08),
+        model=MotionModel(0.2, 1.5, 0.12, 0.08, STEP_S),
         association=Association(same_id=12.0, same_id_crowded=4.0, merge_distance_m=0.0, merge_timeout_s=0.0),
-        step_s=STEP_S,
         max_age=5,
         confirm_hits=2,
         max_age_tentative=2,

@@ -115,6 +115,7 @@ def test_the_estimated_noise_has_limits(spread_m, found_m):
     run = LikelihoodPass(DEFAULT)
     for frame in walk(lambda n: {k: tuple([0.0, 900.0 * k] + rng.normal(0, spread_m, 2)) for k in range(9)}, 250):
         run.step(frame)
+    run.finish()
     assert run.noise_m == pytest.approx(found_m)
 
 
@@ -138,13 +139,14 @@ def made(path) -> dict[str, object]:
     return dict(said.parameters)
 
 
-def test_a_profile_names_its_method_and_distance_implies_it(walked):
+def test_a_profile_names_its_method_and_options_of_another_are_refused(walked):
     assert call("retrack", "a.mcap", "--profile", "authors").code == 0
     assert made(walked / "a.mcap")["retracker"] == "consistency"
     result = call("retrack", "a.mcap", "--set", "distance=now")
-    assert result.code == 0
-    assert "--retracker consistency" in result.err
-    assert (made(walked / "a.mcap")["retracker"], made(walked / "a.mcap")["distance"]) == ("consistency", "now")
+    assert (result.code, result.err) == (
+        1,
+        "mcaptrack: --set distance is an option of consistency, not of likelihood\n",
+    )
     result = call("retrack", "a.mcap", "--profile", "authors", "--retracker", "likelihood")
     assert (result.code, result.err) == (
         1,
@@ -338,13 +340,13 @@ def with_companions(rng: np.random.Generator, count: int) -> Paths:
     return paths
 
 
-def drawn(seed: int, most: int) -> tuple[Paths, Motion, tuple[MotionModel, Trajectories, State, float]]:
+def drawn(seed: int, most: int) -> tuple[Paths, Motion, tuple[MotionModel, Trajectories, State]]:
     """Up to so many tracks and more beside them, the reference's model of motion, and all that the package is given."""
     rng = np.random.default_rng(seed)
     model, motion = models(rng)
     paths = with_companions(rng, int(rng.integers(1, most + 1)))
     out, _ = laid_out(paths, model.noise_m)
-    return paths, motion, (model, out, smooth(model, out, 0.4)[2], 0.4)
+    return paths, motion, (model, out, smooth(model, out)[2])
 
 
 @given(seed=SEEDS)
@@ -386,7 +388,7 @@ def test_who_stands_for_the_whole_log_by_hand(begins, ends, wide_m, missed, stan
     steps = [step for step in range(begins, ends + 1) if not 10 < step <= 10 + missed]
     paths = {1: {s: (side, side) if s % 4 > 1 else (0.0, 0.0) for s in steps}}
     out, _ = laid_out(paths, 1e-3)
-    smoothed = smooth(MotionModel(1e-3, 1.0, 100.0, 0.0), out, 0.4)[2]  # it follows the positions
+    smoothed = smooth(MotionModel(1e-3, 1.0, 100.0, 0.0, 0.4), out)[2]  # it follows the positions
     assert stand_throughout(out, smoothed, np.zeros((1, len(FEATURES))), (0, 39), 0.4).tolist() == [stands]
 
 
@@ -396,7 +398,7 @@ def test_who_stands_for_the_whole_log_by_hand(begins, ends, wide_m, missed, stan
 )
 def test_two_seconds_of_a_long_log_ten_of_a_short_one_and_doubles(begins, last, in_step, stands):
     out, _ = laid_out({1: dict.fromkeys(range(begins, last + 1), (0.0, 0.0))}, 0.1)
-    smoothed = smooth(MotionModel(0.1, 1.0, 0.1, 0.1), out, 0.4)[2]
+    smoothed = smooth(MotionModel(0.1, 1.0, 0.1, 0.1, 0.4), out)[2]
     found = np.where(np.array(FEATURES) == "in step", in_step, 0.0)[None]
     assert stand_throughout(out, smoothed, found, (0, last), 0.4).tolist() == [stands]
 
