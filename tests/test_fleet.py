@@ -18,9 +18,8 @@ import pytest
 import mcaptrack
 from mcaptrack import environment, fleet
 from mcaptrack.errors import McaptrackError
-from mcaptrack.fleet import child, claims, digests
-from mcaptrack.fleet.claims import Claims, claim_name
-from mcaptrack.fleet.ledger import Ledger
+from mcaptrack.fleet import child, digests, ledger
+from mcaptrack.fleet.ledger import Claims, Ledger, claim_name
 from mcaptrack.log import read
 from tests import fleet_tasks
 from tests.awaiting import until
@@ -303,7 +302,7 @@ class TestClaims:
         path = tmp_path / claim_name("x")
         path.write_text(json.dumps({"host": "other", "pid": os.getpid(), "started": "1"}))
         assert not Claims().take("x", tmp_path).is_mine
-        os.utime(path, (0, time.time() - claims.STALE_S - 1))
+        os.utime(path, (0, time.time() - ledger.STALE_S - 1))
         assert Claims().take("x", tmp_path).is_mine
 
     def test_life_is_shown_and_only_own_claims_are_given_up(self, tmp_path, monkeypatch):
@@ -313,7 +312,7 @@ class TestClaims:
         os.utime(path, (0, 0))
         mine.beat()
         assert path.stat().st_mtime == 0
-        monkeypatch.setattr(claims, "BEAT_S", 0.0)
+        monkeypatch.setattr(ledger, "BEAT_S", 0.0)
         mine.beat()
         assert path.stat().st_mtime > 1e9
         path.write_text(json.dumps({"host": "other", "pid": 1, "started": None}))
@@ -330,7 +329,7 @@ class TestClaims:
         def full(*_):
             raise OSError(errno.ENOSPC, "no space left")
 
-        monkeypatch.setattr(claims.os, "write", full)
+        monkeypatch.setattr(ledger.os, "write", full)
         assert Claims().take("x", tmp_path) == (True, "")
         assert not path.exists()
 

@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
 from mcaptrack.foxglove import ANNOTATIONS, IMAGE, LOG, SCENE, TRANSFORM, VIDEO
-from mcaptrack.foxglove.ros_batches import Batches
+from mcaptrack.foxglove.ros import Batches
 
 ros = importlib.import_module("mcaptrack.foxglove.ros")
 EVERY = pytest.mark.parametrize("name", [ANNOTATIONS, IMAGE, LOG, SCENE, TRANSFORM, VIDEO])
@@ -145,7 +145,7 @@ def test_parts_of_one_form_are_converted_at_once_as_they_are_one_by_one(name):
     wanted = []
     for message in messages:
         out = bytearray()
-        ros._appender(made.DESCRIPTOR)(message, out)
+        ros._append(message, out)
         wanted.append(bytes(out))
     payloads = [message.SerializeToString() for message in messages]
     assert len(messages) > 5

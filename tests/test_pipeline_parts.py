@@ -20,6 +20,7 @@ from mcaptrack.pipeline import drawing
 from mcaptrack.pipeline import write as writing
 from mcaptrack.pipeline.checks import _lacks
 from mcaptrack.pipeline.plan import check_spaces
+from mcaptrack.pipeline.scene_views import SceneOnPictures
 from mcaptrack.schema import DECISIONS, DETECTIONS, FORECAST_SCORES, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, INGEST, VIEW, Provenance, digest
@@ -616,7 +617,9 @@ def views_of(
         f"/camera/{name}": drawing.ChannelToDraw(schema, frames[schema], f"of {name}", made_by)
         for name, (schema, made_by) in names.items()
     }
-    drawn = drawing.ViewFactory("/camera", ns_, ns_, [(0, PLANE)])
+    drawn = drawing.ViewFactory(
+        "/camera", ns_, ns_, [(0, PLANE)], None, ["camera/ground"], {}, SceneOnPictures((), (), ())
+    )
     found = [*drawn.views(shown, 3), *drawn.views(shown, 3)]
     kinds = {"foxglove.ImageAnnotations": "image", "foxglove.SceneUpdate": "scene", "foxglove.FrameTransform": "frame"}
     twice = [view.topic for view in found].count("/camera/view/tf")

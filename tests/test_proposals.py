@@ -181,7 +181,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "api/scoring.py:_smoothed:run": lambda s: s.without("/camera/predictions*").says("evaluate", "LOG", "--smoothed"),
     "cli/running.py:_next:run": lambda s: s.says("fuse", "LOG"),
     "pipeline/following.py:_check_camera:run": Scene.followed,
-    "pipeline/gathering.py:warn_disagreeing:calibrate": Scene.with_a_plane_off,
+    "pipeline/fusing.py:warn_disagreeing:calibrate": Scene.with_a_plane_off,
     "pipeline/fusing.py:_lack:detect": lambda s: s.without("/camera/[!vg]*").says("fuse", "LOG"),
     "api/running.py:warn_stale:run": lambda s: s.says("detect", "LOG", "--detector", "knn"),
     "api/ingesting.py:_changes:run": lambda s: s.says("ingest", "truth.txt", "--as", "corrections", "--into", "LOG"),

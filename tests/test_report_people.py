@@ -27,9 +27,8 @@ from mcaptrack.viewing.report import LogReport, gather, page
 from mcaptrack.viewing.report import _comparison as comparison
 from mcaptrack.viewing.report.charts import Line
 from mcaptrack.viewing.report.contents import TrackSet
-from mcaptrack.viewing.report.doubts import find_doubts
-from mcaptrack.viewing.report.identity_events import summarize_events
-from mcaptrack.viewing.report.identity_timeline import counts_over_time, identity_timeline, mean_numbers, pieces
+from mcaptrack.viewing.report.figures import counts_over_time, identity_timeline, mean_numbers, pieces
+from mcaptrack.viewing.report.identity_events import find_doubts, summarize_events
 from tests.worlds import crossing_tracks, ns, tracks_at, write_eventful
 
 
@@ -242,7 +241,7 @@ def test_all_logs_together_have_the_people_of_all(told):
 
 def test_those_who_stay_longest_have_a_bar(told, monkeypatch):
     """Person 50 leaves half way; there is room for one."""
-    monkeypatch.setattr(import_module("mcaptrack.viewing.report.identity_timeline"), "_MOST", 1)
+    monkeypatch.setattr(import_module("mcaptrack.viewing.report.figures"), "_MOST", 1)
     truth = told.track_sets["truth"]
     half = truth.frames[len(truth.frames) // 2].t_ns
     kept = [

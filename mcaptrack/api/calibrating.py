@@ -15,8 +15,7 @@ from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.api.running import Where, change, warn_stale
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice
-from mcaptrack.pipeline.calibrating import CorrectedPlanes, calibrate_cameras, changes_of, write_changes
-from mcaptrack.pipeline.refining import Refined
+from mcaptrack.pipeline.calibrating import CorrectedPlanes, Refined, calibrate_cameras, changes_of, write_changes
 from mcaptrack.schema.provenance import REFINE
 from mcaptrack.sources.fixed_frame import BoxesRead
 

@@ -21,7 +21,7 @@ from mcaptrack.fleet.digests import digest_of_settings
 from mcaptrack.fleet.expansion import NamedLog, find_logs, outputs_in
 from mcaptrack.fleet.ledger import Ledger
 from mcaptrack.fleet.results import FleetResult, FleetStatus, LogOutcome, Running, Watch
-from mcaptrack.fleet.running import Crew, Fleet, QueuedLog, location_of
+from mcaptrack.fleet.running import Fleet, QueuedLog, location_of
 from mcaptrack.fleet.worker import Reply, Request
 from mcaptrack.location import Location, Url
 
@@ -139,19 +139,20 @@ def run(
         _make_folder(output.parent)
     limits = WorkerLimits(min(jobs or 1, len(named_logs)), os.getcwd(), timeout_s, memory_in_bytes(memory_limit))
 
-    def hear(outcome: LogOutcome[T]) -> None:
-        if on_outcome is not None:
-            on_outcome(outcome)
-
     def watch(status: FleetStatus) -> None:
         if progress is not None:
             progress("logs", status.logs - status.left, status.logs)
         if on_status is not None:
             on_status(status)
 
-    crew = _crew(scheduler, limits, jobs)
-    fleet = Fleet(function, keywords, work, crew, entries, tries, keep_going, hear, watch, on_note or (lambda _: None))
-    return fleet.run()
+    if scheduler is None:
+        crew: Processes | Cluster = Processes(limits)
+    else:
+        from mcaptrack.fleet.cluster import Cluster
+
+        crew = Cluster(scheduler, limits, jobs)
+    hear, say = on_outcome or (lambda _: None), on_note or (lambda _: None)
+    return Fleet(function, keywords, work, crew, entries, tries, keep_going, hear, watch, say).run()
 
 
 def _claimed_in(log: Location, otherwise: Path | None) -> Path | None:
@@ -216,14 +217,6 @@ class Processes:
         self._threads.shutdown(wait=True, cancel_futures=True)
         for child in self._children:
             child.close(grace_s)
-
-
-def _crew(scheduler: str | None, limits: WorkerLimits, jobs: int | None) -> Crew:
-    if scheduler is None:
-        return Processes(limits)
-    from mcaptrack.fleet.cluster import Cluster
-
-    return Cluster(scheduler, limits, jobs)
 
 
 def _named(logs: Any) -> list[NamedLog]:

@@ -12,19 +12,22 @@ from datetime import UTC, datetime
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from time import monotonic
-from typing import Any, Final, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from mcaptrack import __version__
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import place_of
-from mcaptrack.fleet import claims
+from mcaptrack.fleet import ledger
 from mcaptrack.fleet.child import StoppedError
-from mcaptrack.fleet.claims import Claims
 from mcaptrack.fleet.digests import digest_of_log
-from mcaptrack.fleet.ledger import Ledger
-from mcaptrack.fleet.results import AGAIN, GOOD, FleetResult, FleetStatus, LogOutcome, Running, Watch
+from mcaptrack.fleet.ledger import Claims, Ledger
+from mcaptrack.fleet.results import AGAIN, GOOD, FleetResult, FleetStatus, LogOutcome, Watch
 from mcaptrack.fleet.worker import Reply, Request
 from mcaptrack.location import Location
+
+if TYPE_CHECKING:
+    from mcaptrack.fleet import Processes
+    from mcaptrack.fleet.cluster import Cluster
 
 T = TypeVar("T")
 #: Seconds between two looks at everything, and at logs that another fleet works on.
@@ -32,26 +35,6 @@ _TICK_S: Final = 0.25
 _WAIT_S: Final = 1.0
 #: Seconds that workers get to end in order.
 _GRACE_S: Final = 3.0
-
-
-class Crew(Protocol):
-    """Workers somewhere."""
-
-    @property
-    def places(self) -> int:
-        """The number of logs that they can be busy with."""
-
-    def start(self, request: Request, then: Callable[[Future[Reply]], None]) -> None:
-        """Begin with a log; ``then`` is called in another thread when it has ended."""
-
-    def running(self) -> tuple[Running, ...]:
-        """Return the logs that workers are busy with."""
-
-    def lost(self) -> str:
-        """Return why no log can be processed any more; "" if all is well."""
-
-    def stop(self, grace_s: float) -> None:
-        """End all workers, after ``grace_s`` seconds whatever they do."""
 
 
 @dataclass
@@ -75,7 +58,7 @@ class Fleet(Generic[T]):
         function: Callable[..., T],
         options: Mapping[str, Any],
         logs: Sequence[QueuedLog],
-        crew: Crew,
+        crew: Processes | Cluster,
         ledger: Ledger | None,
         tries: int,
         keep_going: bool,
@@ -125,7 +108,7 @@ class Fleet(Generic[T]):
             if work.claims_in is not None:
                 folders.setdefault(work.claims_in, set()).add(work.location)
         for folder, locations in folders.items():
-            claims.sweep(folder, locations)
+            ledger.sweep(folder, locations)
 
     def _fill(self) -> None:
         """Give logs to free workers; those that another fleet works on are put off."""
@@ -145,8 +128,7 @@ class Fleet(Generic[T]):
 
     def _claim(self, work: QueuedLog) -> bool:
         """Claim a log. Returns False if it is not to be processed now: it is done, or another fleet has it."""
-        if self._ledger is not None and self._ledger.is_done(work.location, digest_of_log(work.log)):
-            self._end(work, LogOutcome(work.log, "skipped"))
+        if self._is_done(work):
             return False
         taken = self._claims.take(work.location, work.claims_in)
         if not taken.is_mine:
@@ -157,10 +139,16 @@ class Fleet(Generic[T]):
             self._say(taken.note)
         if self._ledger is not None:
             self._ledger.refresh()  # another fleet may have finished it between the two looks
-            if self._ledger.is_done(work.location, digest_of_log(work.log)):
-                self._claims.release(work.location)
-                self._end(work, LogOutcome(work.log, "skipped"))
-                return False
+        if self._is_done(work):
+            self._claims.release(work.location)
+            return False
+        return True
+
+    def _is_done(self, work: QueuedLog) -> bool:
+        """Whether the ledger says that a log is done; then it is skipped."""
+        if self._ledger is None or not self._ledger.is_done(work.location, digest_of_log(work.log)):
+            return False
+        self._end(work, LogOutcome(work.log, "skipped"))
         return True
 
     def _receive(self) -> None:
@@ -183,6 +171,7 @@ class Fleet(Generic[T]):
                 return
             reply = Reply("killed", error=f"{work.log}: the cluster gave it up")
         del self._busy[work.number]
+        used: dict[str, Any] = {name: getattr(reply, name) for name in ("seconds", "cpu_seconds", "peak_bytes")}
         if self._ledger is not None:
             self._ledger.append(
                 location=work.location,
@@ -190,9 +179,7 @@ class Fleet(Generic[T]):
                 digest=reply.digest,
                 attempt=work.tries,
                 ended=datetime.now(UTC).isoformat(timespec="milliseconds"),
-                seconds=reply.seconds,
-                cpu_seconds=reply.cpu_seconds,
-                peak_bytes=reply.peak_bytes,
+                **used,
                 warnings=[{"code": warning.code, "message": warning.message} for warning in reply.warnings],
                 error=reply.error or None,
                 detail=reply.detail or None,
@@ -211,19 +198,10 @@ class Fleet(Generic[T]):
         self._end(
             work,
             LogOutcome(
-                log=work.log,
-                state=reply.state,
-                result=result,
-                error=error,
-                detail=reply.detail,
-                tries=work.tries,
-                seconds=reply.seconds,
-                cpu_seconds=reply.cpu_seconds,
-                peak_bytes=reply.peak_bytes,
-                warnings=reply.warnings,
-                printed=reply.printed,
+                work.log, reply.state, result, error, reply.detail, work.tries, **used,
+                warnings=reply.warnings, printed=reply.printed,
             ),
-        )
+        )  # fmt: skip
         if reply.state not in GOOD and not self._keep_going:
             self._stopped = f"{work.log} failed"
 

@@ -248,7 +248,7 @@ def _scan(buffer: ByteSource) -> Index:
         elif record.opcode == Opcode.METADATA:
             index.metadata.append(metadata_entry(buffer, record, record.start))
     index.loose = {channel: np.array(entries, "<u8").reshape(-1, 2) for channel, entries in loose.items()}
-    _count(index, index.loose)
+    count_messages(index, index.loose)
     missing = set(index.counts) - set(index.channels)
     if missing:
         raise Damaged(f"there are messages of channel {min(missing)}, which has no channel record")
@@ -257,7 +257,12 @@ def _scan(buffer: ByteSource) -> Index:
     return index
 
 
-def _count(index: Index, entries_of: Mapping[int, Entries]) -> None:
+def edges_of(entries_of: Mapping[int, Entries]) -> list[int]:
+    """The first and the last time of the messages of each channel."""
+    return [int(edge) for entries in entries_of.values() for edge in (entries[:, 0].min(), entries[:, 0].max())]
+
+
+def count_messages(index: Index, entries_of: Mapping[int, Entries]) -> None:
     """Add messages to the counts by channel and to the time span."""
     for channel, entries in entries_of.items():
         first_ns, last_ns = int(entries[:, 0].min()), int(entries[:, 0].max())
@@ -274,9 +279,9 @@ def _scan_chunk(index: Index, buffer: Bytes, record: Record) -> None:
         if inner.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             add_summary_record(index, content, inner)
     entries = scan_entries(content)
-    _count(index, entries)
+    count_messages(index, entries)
     index.entries[record.start] = entries
-    edges = [int(edge) for listed in entries.values() for edge in (listed[:, 0].min(), listed[:, 0].max())]
+    edges = edges_of(entries)
     index.chunks.append(
         ChunkIndexRecord(
             min(edges, default=head.start_ns),  # the head of the chunk may be wrong

@@ -77,8 +77,7 @@ class MessageBatches:
         index, (first, last), listed = self._index, self._span, 0
         for row in index.chunks.rows_with([channel_id]).tolist():
             chunk = index.chunks[row]
-            is_before = first is not None and chunk.end_ns < first
-            if is_before or (last is not None and chunk.start_ns >= last):
+            if not overlaps(chunk, self._span):
                 continue
             at = chunk.message_index_offsets[channel_id]
             entries = read_index_entries(source, at, channel_id) if at else index.entries[chunk.offset][channel_id]
@@ -177,6 +176,12 @@ class MessageBatches:
             last = max(last, (until, max(group)))
         if group:
             yield [self[member] for member in sorted(group)]
+
+
+def overlaps(chunk: ChunkIndexRecord, span: Span) -> bool:
+    """Whether a chunk may have messages in a span of times."""
+    first, last = span
+    return (first is None or chunk.end_ns >= first) and (last is None or chunk.start_ns < last)
 
 
 def to_int64(t_ns: Times) -> Ints:

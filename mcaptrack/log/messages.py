@@ -29,7 +29,7 @@ from mcaptrack.log.chunks import (
     open_chunk_with_checksum,
 )
 from mcaptrack.log.index import Index
-from mcaptrack.log.located import MessageBatch, MessageBatches, Span, to_int64
+from mcaptrack.log.located import MessageBatch, MessageBatches, Span, overlaps, to_int64
 from mcaptrack.log.records import (
     BLOCK,
     CHUNK_HEAD_BYTES,
@@ -161,6 +161,15 @@ def _take(total: hashlib._Hash, buffer: Bytes, start: int, end: int) -> None:
         total.update(buffer[at : min(at + BLOCK, end)])
 
 
+def _in_order_of_time(channel: ChannelRows) -> ChannelRows:
+    """Put messages, and their rows, in the order of their times."""
+    rows, t_ns, sequence, counts = channel
+    order = np.argsort(t_ns, kind="stable")
+    if (np.diff(order) != 1).any():
+        rows = rows[ragged_range((np.cumsum(counts) - counts)[order], counts[order])]
+    return ChannelRows(rows, t_ns[order], sequence[order], counts[order])
+
+
 class Messages:
     """The messages of a log. All methods raise Damaged where the bytes contradict the index.
 
@@ -243,46 +252,38 @@ class Messages:
         sequence, counts = np.empty_like(t_ns), np.empty_like(t_ns)
         rows, done, taken = schema.empty(), 0, 0
         for batch in batches:
-            content, offset = self._open(batch)
-            message_heads = message_heads_at(content, batch.channel, batch.t_ns, offset)
-            decoded = reader.decode_at(np.frombuffer(content, np.uint8), message_heads.start, message_heads.end)
+            decoded = self._decoded(batch, reader)
             if decoded is None:
                 return None
-            part, counts_of = decoded
-            until = done + len(batch.t_ns)
-            sequence[done:until], counts[done:until] = message_heads.head["sequence"], counts_of
+            part, until = decoded[0], done + len(batch.t_ns)
+            sequence[done:until], counts[done:until] = decoded[1:]
             if taken + len(part) > len(rows):  # room for the rest, if it has as many rows a message as so far
                 share = (len(t_ns) - done) / max(until - done, 1)
                 rows = schema.codec.longer(rows, taken, taken + int(len(part) * share * 1.02) + 1)
             schema.codec.put(rows, taken, part)
             done, taken = until, taken + len(part)
-        rows = rows[:taken]
-        order = np.argsort(t_ns, kind="stable")
-        if (np.diff(order) != 1).any():
-            rows = rows[ragged_range((np.cumsum(counts) - counts)[order], counts[order])]
-        rows.flags.writeable = False
-        return ChannelRows(rows, t_ns[order], sequence[order], counts[order])
+        out = _in_order_of_time(ChannelRows(rows[:taken], t_ns, sequence, counts))
+        out.rows.flags.writeable = False
+        return out
 
     def parts(self, channels: Sequence[int], schema: Schema, reader: RowReader) -> Iterator[ChannelRows | None]:
         """Yield the rows that ``columns`` returns, chunk by chunk; None where a message has another layout."""
         for group in self._located(channels, (None, None)).in_order():
             t_ns = to_int64(np.concatenate([batch.t_ns for batch in group]))
-            rows, sequence, counts = [], [], []
-            for batch in group:
-                content, offset = self._open(batch)
-                message_heads = message_heads_at(content, batch.channel, batch.t_ns, offset)
-                decoded = reader.decode_at(np.frombuffer(content, np.uint8), message_heads.start, message_heads.end)
-                if decoded is None:
-                    yield None
-                    return
-                rows.append(decoded[0])
-                counts.append(decoded[1])
-                sequence.append(message_heads.head["sequence"].astype(np.int64))
-            members, numbers, sizes = schema.joined(rows), np.concatenate(sequence), np.concatenate(counts)
-            order = np.argsort(t_ns, kind="stable")
-            if (np.diff(order) != 1).any():
-                members = members[ragged_range((np.cumsum(sizes) - sizes)[order], sizes[order])]
-            yield ChannelRows(members, t_ns[order], numbers[order], sizes[order])
+            decoded = [part for batch in group if (part := self._decoded(batch, reader)) is not None]
+            if len(decoded) < len(group):
+                yield None
+                return
+            rows, sequence, counts = zip(*decoded, strict=True)
+            members = schema.joined(rows)
+            yield _in_order_of_time(ChannelRows(members, t_ns, np.concatenate(sequence), np.concatenate(counts)))
+
+    def _decoded(self, batch: MessageBatch, reader: RowReader) -> tuple[Rows, Ints, Ints] | None:
+        """The rows of a batch, and sequence number and number of rows of each message; None for another layout."""
+        content, offset = self._open(batch)
+        heads = message_heads_at(content, batch.channel, batch.t_ns, offset)
+        decoded = reader.decode_at(np.frombuffer(content, np.uint8), heads.start, heads.end)
+        return None if decoded is None else (decoded[0], heads.head["sequence"].astype(np.int64), decoded[1])
 
     def fingerprint(self, channel_id: int | None = None) -> str:
         """The fingerprint of a channel, or of the whole log; computed once."""
@@ -309,11 +310,9 @@ class Messages:
         """
         if not self.source.is_remote:
             return MessageBatches(self.source, self.index, channels, span)
-        first, last = span
         indexes, wholes = [], []
         for chunk in self.index.chunks.with_channels(channels):
-            is_before = first is not None and chunk.end_ns < first
-            if is_before or (last is not None and chunk.start_ns >= last):
+            if not overlaps(chunk, span):
                 continue
             end = chunk.offset + chunk.length  # its message indexes follow
             indexes.append((end, end + chunk.message_index_length))

@@ -20,7 +20,7 @@ from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, first_stage, main_topic, superseded
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, planes_to_json, read_planes, warn_unused
 from mcaptrack.pipeline.rebuild import MissingPluginError, OlderVersionError, differing, fuser_of, rebuild
-from mcaptrack.pipeline.write import Made, digest_of
+from mcaptrack.pipeline.write import RunState, digest_of
 from mcaptrack.schema import DETECTIONS, SIGHTINGS, TRACKS, VIDEO, Frame
 from mcaptrack.schema.framing import joined_parts
 from mcaptrack.schema.provenance import FUSE, Provenance, frame_id_of
@@ -133,23 +133,8 @@ def spaces_of_boxes(opened: log.Log, topic: str) -> frozenset[Space]:
 
 
 def tracker_of(space: str) -> str:
-    """Return the name of the first tracker of a space. Raises McaptrackError if there is none."""
-    names = _trackers_of(space)
-    if not names:
-        raise McaptrackError(f"no tracker takes {_BOXES[space]}; `tracker=` names one of your own")
-    return names[0]
-
-
-def _trackers_of(space: str) -> list[str]:
-    return [name for name, cls in STAGES["track"].built_in().items() if traits_of(cls).space == space]
-
-
-def suited_tracker(opened: log.Log, stage: Stage, source: str) -> str:
-    """Return the tracker for boxes that the default one can't take; "" for others, and for other stages."""
-    if stage.default.reads is not DETECTIONS:
-        return ""
-    spaces, default = spaces_of_boxes(opened, source), traits_of(STAGES["track"].default).space
-    return tracker_of(next(iter(sorted(spaces)))) if spaces and default not in spaces else ""
+    """Return the name of the first built-in tracker of a space."""
+    return next(name for name, cls in STAGES["track"].built_in().items() if traits_of(cls).space == space)
 
 
 def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: str = "") -> None:
@@ -168,10 +153,10 @@ def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: st
         spaces, space = spaces_of_boxes(opened, job.source), traits_of(job.transform).space
         if spaces and space not in spaces:
             has = " and ".join(_BOXES[name_of_space] for name_of_space in sorted(spaces))
-            name, others = STAGES["track"].choice(job.transform), _trackers_of(next(iter(sorted(spaces))))
-            other = f"`tracker={others[0]!r}` takes these" if others else "no built-in one takes these"
+            name, other = STAGES["track"].choice(job.transform), tracker_of(min(spaces))
             raise McaptrackError(
-                f"{opened.path}: {job.source} has {has}, and the tracker {name} takes {_BOXES[space]}; " + other
+                f"{opened.path}: {job.source} has {has}, and the tracker {name} takes {_BOXES[space]}; "
+                f"`tracker={other!r}` takes these"
             )
 
 
@@ -179,25 +164,7 @@ def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: st
 
 
 #: The stage that takes corrections.
-_STAGE: Final = "sample"
-
-
-def are_new(opened: log.Log, prefix: str, how: Provenance) -> bool:
-    """Whether samples were made before their tracks had corrections."""
-    corrections = (
-        corrections_of(opened, camera_at(opened, prefix).prefix, how.input) if how.transform == _STAGE else None
-    )
-    return corrections is not None and corrections not in how.references
-
-
-def corrected_input(
-    opened: log.Log, prefix: str, job: Job, frames: Sequence[Frame]
-) -> tuple[Sequence[Frame], Mapping[str, str]]:
-    """Return the input of a job, corrected if it is sampled, and the digests of the corrections by topic."""
-    topic = corrections_of(opened, prefix, job.source) if job.stage == _STAGE else None
-    if topic is None:
-        return frames, {}
-    return with_corrections(frames, opened.frame_columns(topic, TRACKS)), {topic: digest_of(opened, topic)}
+CORRECTED_IN: Final = "sample"
 
 
 def corrected_tracks(opened: log.Log, prefix: str, source: str, tracks: Sequence[Frame]) -> Sequence[Frame]:
@@ -214,7 +181,7 @@ def without_filled_in(opened: log.Log, prefix: str, source: str, frames: Sequenc
 
 def is_of_corrections(opened: log.Log, prefix: str, provenance: Provenance) -> bool:
     """Whether samples are out of date because corrections of their tracks are new, changed or gone."""
-    if provenance.transform != _STAGE:
+    if provenance.transform != CORRECTED_IN:
         return False
     ending = f"/{CORRECTED}"
     then = {topic: digest for topic, digest in provenance.references.items() if topic.endswith(ending)}
@@ -222,14 +189,13 @@ def is_of_corrections(opened: log.Log, prefix: str, provenance: Provenance) -> b
     return then != ({} if corrections is None else {corrections: digest_of(opened, corrections)})
 
 
-def fixed_in(opened: log.Log, prefix: str, source: str, results: Mapping[str, Made]) -> tuple[int, ...]:
+def fixed_in(state: RunState, source: str) -> tuple[int, ...]:
     """The ids of corrected tracks in the samples at ``source``; () if they were made without corrections."""
-    how = results[source].provenance if source in results else provenance_of(opened, source)
-    topic = corrections_of(opened, prefix, how.input) if how and how.transform == _STAGE else None
+    how = state.provenance(source)
+    topic = corrections_of(state.opened, state.prefix, how.input) if how and how.transform == CORRECTED_IN else None
     if how is None or topic is None or topic not in how.references:
         return ()
-    tracks = results[how.input].frames if how.input in results else opened.frame_columns(how.input, TRACKS)
-    return fixed_ids(tracks, opened.frame_columns(topic, TRACKS))
+    return fixed_ids(state.frames(how.input), state.opened.frame_columns(topic, TRACKS))
 
 
 def is_stale(opened: log.Log, topic: str) -> bool:
@@ -242,23 +208,24 @@ def is_stale(opened: log.Log, topic: str) -> bool:
         planes = read_planes(opened, prefix)
         if planes_to_json(planes or ()) != provenance.parameters["ground_planes"]:
             return True
-    if motion.is_motion_new(opened, prefix, provenance) or are_new(opened, prefix, provenance):
+    if motion.is_motion_new(opened, prefix, provenance) or is_of_corrections(opened, prefix, provenance):
         return True
-    if _has_other_planes(opened, provenance):
-        return True
+    planes_used = [name for name in provenance.references if provenance.transform == FUSE and is_plane(name)]
+    if any(camera_at(opened, name_above(name)).ground_plane != name for name in planes_used):
+        return True  # a plane was corrected, or its correction is gone
     if any((name in opened.channels) != bool(then) for name, then in provenance.references.items()):
         return True
-    for name, then in provenance.made_from().items():
-        now = provenance_of(opened, name)
-        if now and now.digest and now.digest != then:
-            return True
-    return False
+    now = {name: how for name in provenance.made_from() if (how := provenance_of(opened, name)) and how.digest}
+    return any(how.digest != provenance.made_from()[name] for name, how in now.items())
 
 
-def _has_other_planes(opened: log.Log, provenance: Provenance) -> bool:
-    """Return whether a camera of a scene has a corrected ground plane, or has none any more."""
-    planes = [name for name in provenance.references if provenance.transform == FUSE and is_plane(name)]
-    return any(camera_at(opened, name_above(name)).ground_plane != name for name in planes)
+def is_outdated(state: RunState, topics: Sequence[str]) -> bool:
+    """Return whether one of these topics is missing, or an input of the first one has changed since, also in a run."""
+    if not all(topic in state.opened.channels for topic in topics) or is_stale(state.opened, topics[0]):
+        return True
+    provenance = provenance_of(state.opened, topics[0])
+    then = provenance.made_from() if provenance else {}
+    return not then or any(name in state.results and state.digest(name) != digest for name, digest in then.items())
 
 
 class _Planner:
@@ -329,8 +296,13 @@ class _Planner:
 
     def suited_tracker(self, stage: str, source: str) -> str:
         """Return the tracker for boxes that the default one can't take; "" for others, and for other stages."""
-        if name := suited_tracker(self._opened, STAGES[stage], source):
-            self._notes.append(f"{source} has boxes in space: tracking by {name}")
+        if STAGES[stage].default.reads is not DETECTIONS:
+            return ""
+        spaces = spaces_of_boxes(self._opened, source)
+        if not spaces or traits_of(STAGES["track"].default).space in spaces:
+            return ""
+        name = tracker_of(min(spaces))
+        self._notes.append(f"{source} has boxes in space: tracking by {name}")
         return name
 
     def ensure(self, topic: str) -> bool:

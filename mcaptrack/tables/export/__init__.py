@@ -24,20 +24,6 @@ from mcaptrack.tables import TABLES, Format
 from mcaptrack.tables.export.contents import LogTables, file_name, recording_key, recording_name, topic_folder
 from mcaptrack.tables.export.ownership import claimed, owner_words, refuse_tables_of_another
 
-__all__ = [
-    "TOPICS",
-    "Exported",
-    "LogTables",
-    "current_file",
-    "default_folder",
-    "export",
-    "main_file",
-    "recording_key",
-    "recording_name",
-    "refuse_tables_of_another",
-    "topic_folder",
-]
-
 #: The folder of the tables of single channels.
 TOPICS: Final = "topics"
 

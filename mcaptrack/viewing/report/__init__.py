@@ -24,20 +24,13 @@ from mcaptrack.evaluation.people import Intervals
 from mcaptrack.foxglove.palette import COUNT as COLOURS
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.viewing.report import figures, sections
-from mcaptrack.viewing.report.charts import Axis, pairs_chart, ranges_chart, round_most
+from mcaptrack.viewing.report.charts import Axis, figure, pairs_chart, ranges_chart, round_most
 from mcaptrack.viewing.report.contents import LogReport, gather
+from mcaptrack.viewing.report.figures import identity_timeline, people_over_time
 from mcaptrack.viewing.report.fleet_page import fleet_data, fleet_page
 from mcaptrack.viewing.report.formatting import NONE, counted, number, percent, render
 from mcaptrack.viewing.report.headline import BeforeAfter
-from mcaptrack.viewing.report.identity_timeline import identity_timeline, people_over_time
-from mcaptrack.viewing.report.summary import (
-    before_after,
-    change_text,
-    combined_results,
-    intervals_of,
-    summarize,
-    verdict,
-)
+from mcaptrack.viewing.report.summary import change_text, combined_results, intervals_of, summarize, verdict
 
 __all__ = ["ELEMENT", "LogReport", "data", "draw", "fleet_data", "fleet_page", "gather", "page"]
 
@@ -168,8 +161,7 @@ def _hex(rgba: Sequence[float]) -> str:
 
 
 def _in_short(report: LogReport) -> str:
-    scores = before_after(report, report.results) if report.results else None
-    if scores is not None:
+    if (scores := report.headline) is not None:
         return " → ".join(number(int(value)) for value in scores.values("IDSW")) + " switches"
     tracks = next((row for row in report.data["tracks"] if row["role"] in ("tracks", "offline")), None)
     return f"{counted(tracks['tracks'], 'track')}, no ground truth" if tracks else "no tracks"
@@ -177,12 +169,12 @@ def _in_short(report: LogReport) -> str:
 
 def _comparison(reports: Sequence[LogReport]) -> dict[str, Any]:
     """Scores by log, and of all logs together."""
-    pairs = [(report, before_after(report, report.results) if report.results else None) for report in reports]
+    pairs = [(report, report.headline) for report in reports]
     sure = [intervals_of([report]) for report in reports]
     rows = [_comparison_row(report.file, scores, sides) for (report, scores), sides in zip(pairs, sure, strict=True)]
     together = combined_results(reports)
     if together:
-        whole = before_after(next(report for report in reports if report.results), together)
+        whole = next(report for report in reports if report.results).compared_in(together)
         rows.append(_comparison_row("", whole, intervals_of(reports)))
     columns = ["log", "within", "change of IDF1 (95 %)", "re-tracking is", *_COMPARED]
     charts = []
@@ -195,7 +187,7 @@ def _comparison(reports: Sequence[LogReport]) -> dict[str, Any]:
         if values:
             axis = Axis(label, 1.0 if is_share else round_most([np.array([v[1:] for v in values]).ravel()]), is_share)
             chart = pairs_chart(f"{label} by log", values, axis, ("tracked", "re-tracked"))  # type: ignore[arg-type]
-            charts.append({"chart": chart, "title": label, "caption": ""})
+            charts.append(figure(chart, label, ""))
     ranges = [
         (report.name, sides.idf1)
         for report, sides in zip(reports, sure, strict=True)
@@ -207,7 +199,7 @@ def _comparison(reports: Sequence[LogReport]) -> dict[str, Any]:
             title, ranges, Axis("identities kept (IDF1), %", 1.0, percent=True), ("tracked", "re-tracked")
         )
         caption = "Logs with bars that overlap may only have other people in them. Bars: bootstrap over people."
-        charts.append({"chart": chart, "title": "Intervals.", "caption": caption})
+        charts.append(figure(chart, "Intervals.", caption))
     return {"columns": columns, "rows": rows, "figures": charts}
 
 

@@ -11,12 +11,7 @@ from mcaptrack.evaluation import EvaluationRow, combined, set_means
 from mcaptrack.evaluation.people import Intervals, intervals
 from mcaptrack.viewing.report.contents import LogReport
 from mcaptrack.viewing.report.formatting import NONE, counted, number, percent, short, times
-from mcaptrack.viewing.report.headline import BEFORE, BeforeAfter, compared, rule_text
-
-
-def before_after(report: LogReport, results: Sequence[EvaluationRow]) -> BeforeAfter | None:
-    """The scores that the summary compares: before and after re-tracking, at the prediction rate if possible."""
-    return compared({role: track_set.topic for role, track_set in report.track_sets.items()}, results)
+from mcaptrack.viewing.report.headline import BEFORE, BeforeAfter, rule_text
 
 
 def combined_results(reports: Sequence[LogReport]) -> list[EvaluationRow]:
@@ -57,7 +52,7 @@ def verdict(intervals_: Intervals | None) -> str:
 def summarize(reports: Sequence[LogReport]) -> dict[str, Any]:
     """The text and the tiles of the summary."""
     scored = [report for report in reports if report.results]
-    scores = before_after(scored[0], combined_results(reports) or scored[0].results) if scored else None
+    scores = scored[0].compared_in(combined_results(reports) or scored[0].results) if scored else None
     if scores is None:
         return {"text": _without_ground_truth(reports), "tiles": []}
     text = _with_ground_truth(reports, scored, scores)
