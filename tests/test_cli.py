@@ -261,7 +261,7 @@ class TestErrors:
             code, out, err = call("track", "a.mcap", *words, folder=place)
             assert (code, out) == (2, "")
             assert err.startswith(f"mcaptrack: {said}")
-            assert err.endswith(" `mcaptrack track --help` lists the options\n")
+            assert err.endswith(" `mcaptrack track --help-all` lists the options\n")
 
     def test_a_stage_that_cannot_run_is_not_announced(self, place):
         printed("ingest", "good.txt", "--as", "truth", "--fps", "10", "-o", place / "labels.mcap", folder=place)

@@ -342,7 +342,7 @@ def assert_exists(line: str) -> None:
         assert words[1] in ("--help", "--version"), line
         return
     command = COMMANDS[words[1]]
-    known = {name for one in command.params for name in (*one.opts, *one.secondary_opts)} | {"--help"}
+    known = {name for one in command.params for name in (*one.opts, *one.secondary_opts)} | {"--help", "--help-all"}
     for word in words[2:]:
         if word.startswith("-") and not re.fullmatch(r"-\d.*", word):
             assert word.partition("=")[0] in known, line

@@ -56,7 +56,7 @@ class TestHelp:
     @pytest.mark.parametrize("width", one_in(2, ["80", "120"]))
     def test_names_of_options_are_not_cut_at_any_width(self, command, width, monkeypatch):
         monkeypatch.setenv("COLUMNS", width)
-        words = set(call(command, "--help").out.split())
+        words = set(call(command, "--help-all").out.split())
         assert {name for option in shown(command) for name in (*option.opts, *option.secondary_opts)} <= words
 
     @EVERY_COMMAND
@@ -75,7 +75,7 @@ class TestHelp:
 
     def test_parameters_of_transforms_are_shown_with_their_defaults(self, monkeypatch):
         monkeypatch.setenv("COLUMNS", "160")
-        words = call("track", "--help").out
+        words = call("track", "--help-all").out
         for option, default in (("--max-age-s", "1.4"), ("--min-iou", "0.2"), ("--min-hits-frames", "none")):
             assert option in words
             assert f"[default: ({default})]" in words
@@ -102,9 +102,22 @@ class TestHelp:
         choices = {"detector", "tracker", "retracker", "predictor", "output", "topic", "force", "truth", "profile"}
         if len(own) > 9:
             assert choices & set(own) <= set(first)
-            words = call(command, "--help").out
+            words = call(command, "--help-all").out
             names = [max(option.opts, key=len) for option in shown(command)]
             assert words.index(FIRST_PANEL) < min(words.index(f" {name} ") for name in names[len(first) :])
+
+    @EVERY_COMMAND
+    def test_the_short_help_has_those_alone_and_names_the_rest(self, command, monkeypatch):
+        monkeypatch.setenv("COLUMNS", "80")
+        text, everything = call(command, "--help").out, call(command, "--help-all").out
+        assert len(text.splitlines()) <= 80  # two screens of 40 lines
+        names = {max(option.opts, key=len): option.rich_help_panel for option in shown(command)}
+        listed, every = (set(re.findall(r"^│ +(?:\* +)?(--[\w-]+)", page, re.MULTILINE)) for page in (text, everything))
+        assert every - {"--help", "--help-all"} == names.keys()
+        last = LAST_PANELS[1:] if not COMMANDS[command].most_used else {*names.values()} - {FIRST_PANEL}
+        assert listed == {name for name in names if names[name] not in last}
+        told = " ".join(text.partition("--help-all shows all options, also: ")[2].split())
+        assert [panel for panel in names.values() if panel in last and panel.partition(" (")[0] not in told] == []
 
     def test_common_options_are_the_same_in_all_commands(self):
         def common(command: str) -> list[tuple[list[str], str]]:
@@ -196,7 +209,7 @@ class TestWrongUsage:
     def test_an_unknown_option_is_refused(self, command):
         words = self.refused(command, "a", "--verbos")
         assert "--verbose" in words
-        assert f"`mcaptrack {command} --help`" in words
+        assert f"`mcaptrack {command} --help-all`" in words
 
     @EVERY_COMMAND
     def test_a_wrong_and_a_missing_value_are_refused(self, command):

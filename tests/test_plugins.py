@@ -460,8 +460,8 @@ def test_the_help_lists_the_options_of_the_one_that_is_named(place, monkeypatch)
         ("track", ["--tracker", "single"], ["single: All boxes are one track.", "--track-id"], []),
         ("predict", ["--predictor", "spread"], ["The error, in metres.", "--sigma-m"], ["--weights", "--past"]),
     ):
-        assert own[1] not in call(command, "--help").out
-        said = call(command, *words, "--help").out
+        assert own[1] not in call(command, "--help-all").out
+        said = call(command, *words, "--help-all").out
         assert f"Options of {words[1]} alone" in said
         assert [part for part in own if part not in said] == [part for part in others if part in said] == []
 

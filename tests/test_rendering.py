@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
 from mcaptrack import foxglove, log
@@ -24,6 +26,7 @@ from mcaptrack.viewing import from_above
 from mcaptrack.viewing.from_above import Sight
 from mcaptrack.viewing.rendering import draw
 from tests.commands import call, printed
+from tests.robots import write_log
 
 GREY = np.full((100, 200, 3), 100, np.uint8)
 
@@ -243,3 +246,26 @@ def test_re_tracked_people_are_drawn_at_the_rate_of_the_video(finished):
         assert find_views(opened, "/camera", ["/camera/retracks"]).views == ["/camera/retracks/full/view/image"]
         with pytest.raises(McaptrackError, match="has no channel /camera/unknown/view/image"):
             find_views(opened, "/camera", ["/camera/unknown"])
+
+
+def test_a_log_with_pictures_that_cannot_be_decoded_is_processed_and_drawn_without_them(tmp_path):
+    whole, path, output = tmp_path / "whole.mcap", tmp_path / "eye.mcap", tmp_path / "eye.mp4"
+    write_log(whole, "/eye/image")
+    with whole.open("rb") as source, path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2", library="theirs")
+        for number, (schema, channel, message) in enumerate(make_reader(source).iter_messages()):
+            if number == 0:
+                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channel_id = writer.register_channel(channel.topic, channel.message_encoding, schema_id)
+            data = message.data[:60] + b"\x55" * (len(message.data) - 60) if number in (7, 20) else message.data
+            writer.add_message(channel_id, message.log_time, data, message.publish_time)
+        writer.finish()
+    left_out = "2 of 50 pictures"
+    assert f"{left_out} can't be decoded and are left out, the first: " in call("run", str(path), "--no-tables").err
+    with log.read(path) as opened:
+        assert opened.channel("/eye/detections").messages == 48
+    assert f"{left_out} of /eye/image can't be decoded and are left out" in call("render", str(path)).err
+    assert len(clip(output)) == 48
+    heat_map = call("render", str(path), "--heatmap", "-o", str(tmp_path / "heat.png"))
+    assert (heat_map.code, " pictures of /eye/image can't be decoded" in heat_map.err) == (0, True)

@@ -155,7 +155,7 @@ def test_a_run_across_classes_tracks_and_retracks_so_until_told_otherwise(passed
     assert any("with another `across_classes=` or `frame=`" in note for note in result.notes)
     assert parameters() == [True, True]
     assert mcaptrack.run(path, **quick).stages == ()
-    assert "--across-classes" in done("run", "--help").out
+    assert "--across-classes" in done("run", "--help-all").out
     done("run", path, "--within-classes", "--no-events", "--no-tables", "--in-place", "-q")
     assert parameters() == [False, False]
     with log.read(path) as opened:

@@ -124,7 +124,7 @@ def test_pictures_of_which_many_in_a_row_are_damaged_are_not_tried_to_the_end(th
         yield
 
     monkeypatch.setattr(Pictures, "frames", frames)
-    monkeypatch.setattr("mcaptrack.pipeline.pictures._MOST_IN_A_ROW", 2)
+    monkeypatch.setattr("mcaptrack.sources.pictures._MOST_IN_A_ROW", 2)
     with log.Log(there) as opened, collected() as warnings:
         samples = opened.frame_columns("/camera/samples", TRACKS)
         assert with_descriptors(Retrack(), opened, "/camera", samples).descriptors is None

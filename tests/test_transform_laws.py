@@ -15,7 +15,16 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO
 from mcaptrack.testing import LAWS, sample_frames
-from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS, KnnDetector, RetrackByConsistency, Transform
+from mcaptrack.transforms import (
+    FUSION,
+    PROFILES,
+    STAGES,
+    TRACKERS,
+    TRANSFORMS,
+    KnnDetector,
+    RetrackByConsistency,
+    Transform,
+)
 from mcaptrack.transforms.protocol import bare_type
 from tests.tiers import one_in
 
@@ -136,3 +145,12 @@ def test_each_output_has_a_latency_and_what_is_online_has_none():
     for profile in PROFILES.values():
         wanted = {"": float("inf"), "online": 0.0, "predictions": 0.0, "decisions": float("inf")}
         assert profile.latency_s == {name: wanted[name] for name in profile.writes}
+
+
+@pytest.mark.parametrize("stage", [*STAGES.values(), FUSION], ids=lambda stage: stage.name)
+def test_the_transforms_of_a_stage_read_and_write_what_it_declares(stage):
+    for kind in stage.built_in().values():
+        assert kind.reads is stage.reads
+        assert stage.writes.items() >= kind.writes.items()
+    assert dict(stage.default.writes) == dict(stage.writes)
+    assert next(iter(stage.built_in().values())) is stage.default

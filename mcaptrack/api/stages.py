@@ -86,7 +86,7 @@ def detect(
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
     **options
-        Options of the detector; `mcaptrack detect --help` lists them.
+        Options of the detector; `mcaptrack detect --help-all` lists them.
 
     Returns
     -------
@@ -170,7 +170,7 @@ def motion(
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
     **options
-        Options such as ``mask_boxes``; `mcaptrack motion --help` lists them.
+        Options such as ``mask_boxes``; `mcaptrack motion --help-all` lists them.
 
     Returns
     -------
@@ -256,7 +256,7 @@ def track(
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
     **options
-        Options of the tracker, such as ``max_age_s``; `mcaptrack track --help` lists them.
+        Options of the tracker, such as ``max_age_s``; `mcaptrack track --help-all` lists them.
 
     Returns
     -------
@@ -340,7 +340,7 @@ def sample(
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
     **options
-        Options such as ``rate_hz``; `mcaptrack sample --help` lists them.
+        Options such as ``rate_hz``; `mcaptrack sample --help-all` lists them.
 
     Returns
     -------
@@ -422,7 +422,7 @@ def predict(
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
     **options
-        Options such as ``horizon_s``; `mcaptrack predict --help` lists them.
+        Options such as ``horizon_s``; `mcaptrack predict --help-all` lists them.
 
     Returns
     -------
@@ -511,7 +511,7 @@ def retrack(
     progress : callable, optional
         Called as ``progress(stage, done, total)``.
     **options
-        Options that differ from the profile; `mcaptrack retrack --help` lists them.
+        Options that differ from the profile; `mcaptrack retrack --help-all` lists them.
 
     Returns
     -------

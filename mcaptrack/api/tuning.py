@@ -165,7 +165,7 @@ def tune(
     ('track',)
 
     """
-    has_tracker = STAGES[stage].default.reads is DETECTIONS
+    has_tracker = STAGES[stage].reads is DETECTIONS
     if tracker is not None and not has_tracker:
         raise McaptrackError(f"the stage {stage} has no tracker; leave `tracker=` out")
     base = transform_of(stage, tracker, {})

@@ -95,7 +95,7 @@ def _read_member(value: str, kind: Any) -> Any:
 
 def is_open(stage: Stage, values: Mapping[str, Any]) -> bool:
     """Return whether the boxes of a log decide which tracker runs, because the user named none."""
-    is_tracker = stage.default.reads is DETECTIONS
+    is_tracker = stage.reads is DETECTIONS
     return is_tracker and values["tracker"] == stage.entry(stage.default).name and not is_on_command_line("tracker")
 
 

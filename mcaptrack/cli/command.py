@@ -6,6 +6,7 @@ import difflib
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from copy import copy
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
@@ -40,7 +41,7 @@ def usage_in_one_line(command: str = "") -> Iterator[None]:
         text = " ".join(error.format_message().replace("Value error, ", "").rstrip(".").split())
         if hasattr(error, "possibilities"):
             text = _unknown_option(error)
-        page = " ".join(filter(None, ["mcaptrack", command, "--help"]))
+        page = f"mcaptrack {command} {ALL}" if command else "mcaptrack --help"
         end = "" if text.endswith("?") else ";"
         refuse_usage(f"{text[:1].lower()}{text[1:]}{end} `{page}` lists the {'options' if command else 'commands'}")
 
@@ -86,6 +87,8 @@ def _options_of(command: Any) -> list[str]:
 FIRST_PANEL: Final = "Most used"
 MORE_PANEL: Final = "More options"
 LAST_PANELS: Final = ("Input and output", "Many logs", "Options of all commands")
+#: The option that shows all options; ``--help`` shows those that most people need.
+ALL: Final = "--help-all"
 
 #: The options of a command that come first, in order, by the names of its parameters. Commands with few have none.
 MOST_USED: Final[Mapping[str, tuple[str, ...]]] = {
@@ -140,6 +143,8 @@ class Command(TyperCommand):
         self.most_used: tuple[str, ...] = getattr(arguments["callback"], "most_used", ()) or MOST_USED.get(name, ())
         arrange(self.most_used, self.params)
         self.settable: tuple[str, ...] = getattr(arguments["callback"], "settable", ())
+        self._is_short = False
+        self._help_all: Any = None
         parameters: dict[str, Any] = {parameter.name or "": parameter for parameter in self.params}
         for parameter in parameters.values():
             parameter.process_value = _refusing_empty(parameter.process_value)
@@ -151,7 +156,34 @@ class Command(TyperCommand):
         option = super().get_help_option(ctx)
         if option is not None:
             option.rich_help_panel = LAST_PANELS[-1]
+            option.help = "Show the options that most people need, and exit."
         return option
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the parameters, with ``--help-all``; while the short help is printed, only those that stand in it."""
+        if self._help_all is None:
+            self._help_all = copy(self.get_help_option(ctx))
+            self._help_all.name, self._help_all.opts, self._help_all.callback = "help_all", [ALL], _show_all
+            self._help_all.help = "Show all options, by theme, and exit."
+        parameters = [*super().get_params(ctx), self._help_all]
+        return list(filter(self._is_in_short_help, parameters)) if self._is_short else parameters
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Print the help: with ``--help-all`` of all options, otherwise of those that most people need."""
+        left_out = [] if ctx.meta.get(ALL) else [o for o in self.get_params(ctx) if not self._is_in_short_help(o)]
+        if left_out:
+            panels = dict.fromkeys(re.sub(r" \(.*", "", option.rich_help_panel) for option in left_out)
+            self._is_short, self.epilog = True, f"`{ALL}` shows all options, also: {', '.join(panels)}."
+        try:
+            super().format_help(ctx, formatter)
+        finally:
+            self._is_short, self.epilog = False, None
+
+    def _is_in_short_help(self, parameter: Any) -> bool:
+        if parameter.param_type_name != "option":
+            return True
+        panel = parameter.rich_help_panel
+        return panel == FIRST_PANEL if self.most_used else panel not in LAST_PANELS[1:]
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the command line; whatever is wrong with it ends the command in one line."""
@@ -185,6 +217,13 @@ class Command(TyperCommand):
                 text = " ".join(map(str, value)) if setting.many else str(value)
                 parts.append(f"{setting.name}={text} ({where or 'command line'})")
         return f"options: {', '.join(parts)}"
+
+
+def _show_all(ctx: Any, _: Any, is_asked: bool) -> None:
+    if is_asked and not ctx.resilient_parsing:
+        ctx.meta[ALL] = True
+        typer.echo(ctx.get_help(), color=ctx.color)
+        ctx.exit()
 
 
 def _refusing_empty(process: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:

@@ -17,6 +17,7 @@ from typing import Any, Final
 import typer
 
 from mcaptrack.cli import common
+from mcaptrack.cli.command import ALL
 from mcaptrack.cli.config import ConfigFile, read_files
 from mcaptrack.cli.stages import stage_command
 from mcaptrack.cli.text import say, stdout_to_stderr
@@ -26,7 +27,7 @@ from mcaptrack.notices import listening
 from mcaptrack.registry import BUILT_IN, names
 from mcaptrack.transforms import STAGES, Stage, Transform
 
-_HELP: Final = ("--help", "-h")
+_HELP: Final = ("--help", "-h", ALL)
 
 
 def commands_with_plugins(commands: Mapping[str, Any], arguments: Sequence[str]) -> dict[str, Any]:

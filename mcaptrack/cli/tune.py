@@ -115,7 +115,7 @@ def tune(
     import mcaptrack
 
     ranges = dict(map(_range, search or ()))
-    is_tracker = STAGES[stage].default.reads is DETECTIONS
+    is_tracker = STAGES[stage].reads is DETECTIONS
     which = tracker.replace(":", ".") if is_tracker else stage
     with common.Talk(quiet, verbose).open() as talk:
         read_toml(output)  # a file that can't be edited is refused before the search

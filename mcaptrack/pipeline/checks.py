@@ -210,7 +210,7 @@ def first_stage(opened: log.Log, source: str) -> str:
     """Return the first stage of a run that begins with this topic. Raises McaptrackError if no stage reads it."""
     channel = opened.channel(source)
     for stage in STAGES.values():
-        if stage.default.reads in (VIDEO, DETECTIONS) and fits(channel, stage.default.reads)[1]:
+        if stage.reads in (VIDEO, DETECTIONS) and fits(channel, stage.reads)[1]:
             return stage.name
     wanted = ", ".join((*foreign.PICTURES_READ, DETECTIONS.name, *foreign.BOXES_READ))
     raise McaptrackError(

@@ -305,7 +305,7 @@ def _gives_ids(job: Job) -> bool:
 
 def _is_tracker(provenance: Provenance) -> bool:
     """Return whether a stage made tracks of detections."""
-    return provenance.transform in STAGES and STAGES[provenance.transform].default.reads is DETECTIONS
+    return provenance.transform in STAGES and STAGES[provenance.transform].reads is DETECTIONS
 
 
 def _start_ns(opened: log.Log, prefix: str) -> int:

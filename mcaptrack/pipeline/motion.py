@@ -68,7 +68,7 @@ def _needs_still_camera(opened: log.Log, boxes: str, jobs: Sequence[Job]) -> boo
 def detects_motion(provenance: Provenance | None) -> bool:
     """Whether a channel has the boxes of a detector that needs a still camera."""
     stage = STAGES.get(provenance.transform) if provenance and "transform" not in provenance.plugins else None
-    if provenance is None or stage is None or stage.default.reads is not VIDEO:
+    if provenance is None or stage is None or stage.reads is not VIDEO:
         return False
     name = provenance.parameters.get("detector", "")
     return traits_of(stage.built_in().get(str(name), stage.default)).needs_still_camera
@@ -125,7 +125,7 @@ def moves(state: RunState) -> bool:
 def _boxes(state: RunState) -> SideInputs:
     """The boxes of people, by the time of their picture."""
     opened = state.opened
-    usual = f"{state.prefix}/{next(s.output_topic for s in STAGES.values() if s.default.writes[''] is DETECTIONS)}"
+    usual = f"{state.prefix}/{next(s.output_topic for s in STAGES.values() if s.writes[''] is DETECTIONS)}"
     is_usual = usual in state.results or usual in opened.channels
     topic = usual if is_usual else camera_at(opened, state.prefix).boxes
     if topic is None or _needs_still_camera(opened, topic, ()):

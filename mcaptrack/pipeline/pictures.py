@@ -7,7 +7,6 @@ Pictures that take more than ``MAX_BYTES`` together, or more room than there is,
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextvars import copy_context
 from dataclasses import replace
@@ -156,12 +155,12 @@ def _put(item: Frame | BaseException | None, queue: Queue[Frame | BaseException 
 
 
 def pictures_of(
-    opened: log.Log, job: Job, stamps: list[int], damaged: list[int]
+    opened: log.Log, job: Job, stamps: list[int], damaged: list[int], unreadable: list[McaptrackError]
 ) -> tuple[Callable[[], str], Iterable[Frame]]:
     """Return the digest (once they were read) and the pictures for a job, decoded in its transform's colour format.
 
     They are decoded in a thread. The capture time of each in ns is appended to ``stamps``, the numbers of damaged ones
-    to ``damaged``.
+    of videos to ``damaged``, the errors of images that are left out to ``unreadable``.
     """
     import hashlib
 
@@ -181,7 +180,7 @@ def pictures_of(
 
     def decoded() -> Iterator[Frame]:
         is_first = not stamps
-        return decode(encoded(is_first), damaged=damaged if is_first else None)
+        return decode(encoded(is_first), None, damaged if is_first else None, unreadable if is_first else [])
 
     return total.hexdigest, Ahead(KeptPictures(decoded, max_bytes))
 
@@ -195,8 +194,6 @@ def pictures_of(
 STAGE: Final = "appearance"
 #: The picture that shows a sample is at most this far away: people have hardly moved.
 _NEAR_NS: Final = NS_PER_S // 10
-#: After so many pictures in a row that can't be decoded, it is taken that none can be.
-_MOST_IN_A_ROW: Final = 20
 
 
 def with_descriptors(
@@ -279,7 +276,7 @@ def _described(
     """Yield the descriptors of each frame with a picture; errors of pictures are added to ``damaged``."""
     shown = np.flatnonzero(nearest >= 0)  # in order of time, as pictures are
     wanted, of_picture = np.unique(nearest[shown], return_index=True)
-    decoded = _decodable(pictures, wanted.tolist(), damaged)
+    decoded = pictures.readable(wanted.tolist(), damaged)
     place = dict(zip(wanted.tolist(), shown[of_picture].tolist(), strict=True))
     for done, picture in enumerate(decoded):
         progress(done + 1, len(wanted))
@@ -296,22 +293,3 @@ def _described(
             values[clear] = describe(picture.rows, boxes[clear])
             yield Descriptors(np.full(len(ids), frame.t_ns), ids, values, clear, at_border(boxes, width, height))
             at += 1
-
-
-def _decodable(pictures: Pictures, wanted: list[int], damaged: list[McaptrackError]) -> Iterator[Frame]:
-    """Yield the ``wanted`` pictures that can be decoded; the errors of others are added to ``damaged``.
-
-    Raises McaptrackError if many in a row can't be.
-    """
-    done, in_a_row = 0, 0
-    while done < len(wanted):
-        try:
-            for picture in pictures.frames(wanted[done:]):
-                done, in_a_row = bisect_right(wanted, picture.index), 0
-                yield picture
-            return
-        except McaptrackError as error:
-            if in_a_row == _MOST_IN_A_ROW:
-                raise
-            damaged.append(error)
-            done, in_a_row = done + 1, in_a_row + 1

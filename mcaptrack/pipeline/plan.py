@@ -283,7 +283,7 @@ class _Planner:
         if stage in self._sources or usual in self._opened.channels:
             return self._sources.get(stage, usual)
         camera = camera_at(self._opened, self._prefix)
-        reads = STAGES[stage].default.reads
+        reads = STAGES[stage].reads
         if reads is VIDEO and camera.pictures:
             self._notes.append(f"{usual} is missing: taking the pictures of {camera.pictures}")
             if camera.boxes:
@@ -296,7 +296,7 @@ class _Planner:
 
     def suited_tracker(self, stage: str, source: str) -> str:
         """Return the tracker for boxes that the default one can't take; "" for others, and for other stages."""
-        if STAGES[stage].default.reads is not DETECTIONS:
+        if STAGES[stage].reads is not DETECTIONS:
             return ""
         spaces = spaces_of_boxes(self._opened, source)
         if not spaces or traits_of(STAGES["track"].default).space in spaces:
@@ -515,7 +515,7 @@ class _Planner:
 
     def _given_pictures(self) -> str:
         """The topic of the pictures that a run begins with, if it was told which."""
-        return next((topic for name, topic in self._sources.items() if STAGES[name].default.reads is VIDEO), "")
+        return next((topic for name, topic in self._sources.items() if STAGES[name].reads is VIDEO), "")
 
     def _with_choice(self, transform: Any) -> Any:
         """Return a transform with those of the shared options that it has."""

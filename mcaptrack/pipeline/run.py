@@ -154,7 +154,7 @@ class Report:
 
 
 #: The stages with results in metres: all except those that read pictures.
-_IN_METRES: Final = {name for name, stage in STAGES.items() if stage.default.reads is not VIDEO}
+_IN_METRES: Final = {name for name, stage in STAGES.items() if stage.reads is not VIDEO}
 #: The memory that a run needs, in bytes: whatever its length, and for each second that a person is seen (re-tracking
 #: has all samples in memory).
 _BASE, _A_PERSON_SECOND = 400_000_000, 3_000
@@ -369,8 +369,8 @@ class _Repeatable:
 
 class _Input(NamedTuple):
     """The input of a job: a stream of frames, all frames if they are rows (else empty), and, after the stream was read,
-    the digest and the number of its messages; the names of its classes, the frame of its metres, and the numbers of
-    damaged pictures.
+    the digest and the number of its messages; the names of its classes, the frame of its metres, the numbers of
+    damaged pictures, and the errors of images that are left out.
     """
 
     stream: Iterable[Frame]
@@ -380,6 +380,7 @@ class _Input(NamedTuple):
     classes: Mapping[str, str] = {}
     frame_id: str = ""
     damaged: Sequence[int] = ()
+    unreadable: Sequence[McaptrackError] = ()
 
     def corrected(self, opened: log.Log, prefix: str, job: Job) -> tuple[_Input, Mapping[str, str]]:
         """Return tracks with the corrections of people, and the digests of these by topic."""
@@ -519,12 +520,18 @@ def _run_job(
     except McaptrackError as error:
         where = "" if str(opened.path) in str(error) else f"{opened.path}: {job.source}: "
         raise type(error)(f"{where}{error}") from None
-    left_out = job_input.messages() - max(taken)
+    left_out = job_input.messages() - max(taken) - len(job_input.unreadable)
     if transform.reads is VIDEO and left_out > 0:
         warn(
             f"{job.source}: {left_out} of {job_input.messages()} messages were left out: a video has to begin with a "
             "key picture that has its parameter sets",
             "left-out",
+        )
+    if job_input.unreadable:
+        warn(
+            f"{job.source}: {len(job_input.unreadable)} of {job_input.messages()} pictures can't be decoded and are "
+            f"left out, the first: {job_input.unreadable[0]}",
+            "lost",
         )
     if job_input.damaged:
         warn(
@@ -604,12 +611,12 @@ def _input(
     opened, results = state.opened, state.results
     if job.source not in results and job.transform.reads is VIDEO:
         seen = stamps.setdefault(job.source, [])
-        damaged: list[int] = []
-        digest, pictures = pictures_of(opened, job, seen, damaged)
+        damaged, unreadable = list[int](), list[McaptrackError]()
+        digest, pictures = pictures_of(opened, job, seen, damaged, unreadable)
         steps = opened.channel(job.source).messages * traits_of(job.transform).passes
         numbers = count(1)
         each = _Repeatable(lambda: _counted(watch.each("decode", pictures), numbers, steps, job.stage, progress))
-        return _Input(each, [], digest, lambda: len(seen), damaged=damaged)
+        return _Input(each, [], digest, lambda: len(seen), damaged=damaged, unreadable=unreadable)
     if job.source in results:
         frames, how = results[job.source].frames, results[job.source].provenance
         of_rows, names, frame_id = how.digest, class_names(how.to_metadata()), how.frame_id

@@ -35,7 +35,7 @@ def motion_topic(prefix: str) -> str:
 
 def tracks_topic(prefix: str) -> str:
     """The usual topic of the tracks of a camera."""
-    return f"{prefix}/{next(stage.output_topic for stage in STAGES.values() if stage.default.reads is DETECTIONS)}"
+    return f"{prefix}/{next(stage.output_topic for stage in STAGES.values() if stage.reads is DETECTIONS)}"
 
 
 def path_of(

@@ -8,6 +8,7 @@ Letters: M messages.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Container, Iterable, Iterator
 from typing import Final, Protocol
 
@@ -17,6 +18,7 @@ from mcaptrack import log
 from mcaptrack.errors import DamagedError, McaptrackError
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.log.journal import recover_command
+from mcaptrack.notices import warn
 from mcaptrack.schema import Frame
 from mcaptrack.sources import foreign
 from mcaptrack.sources.video import EncodedPicture, decode_bgr, decode_gray, read_head
@@ -29,6 +31,8 @@ _NEAR: Final = 64
 _BLOCK: Final = 128
 #: The number of earlier groups of pictures to try for a picture that decoding from its own key picture doesn't show.
 _BACK: Final = 2
+#: After so many pictures in a row that can't be decoded, it is taken that none can be.
+_MOST_IN_A_ROW: Final = 20
 
 
 def size_of_pictures(opened: log.Log, topic: str) -> tuple[int, int] | None:
@@ -107,6 +111,33 @@ class Pictures:
                 if has_picture and number in missing and entered is not None:
                     yield self._from_before(number, start, pixels)
             wanted = wanted[len(fed) :]
+
+    def readable(self, numbers: Iterable[int], damaged: list[McaptrackError] | None = None) -> Iterator[Frame]:
+        """Yield the pictures with these numbers, as ``frames``, without those that are damaged or can't be decoded.
+
+        Their errors are added to ``damaged``, or without it said in one warning. Raises McaptrackError if many in a row
+        can't be decoded, or none can.
+        """
+        wanted, errors = sorted(set(numbers)), list[McaptrackError]()
+        done, in_a_row, yielded = 0, 0, 0
+        while done < len(wanted):
+            try:
+                for frame in self.frames(wanted[done:]):
+                    done, in_a_row, yielded = bisect_right(wanted, frame.index), 0, yielded + 1
+                    yield frame
+                break
+            except McaptrackError as error:
+                errors.append(error)
+                done, in_a_row = done + 1, in_a_row + 1
+                if in_a_row > _MOST_IN_A_ROW:
+                    raise
+        if errors and not yielded:
+            raise errors[0]
+        if damaged is not None:
+            damaged.extend(errors)
+        elif errors:
+            left_out = f"{len(errors)} of {len(wanted)} pictures of {self._topic} can't be decoded and are left out"
+            warn(f"{self._opened.path}: {left_out}, the first: {errors[0]}", "lost")
 
     def _entry(self, number: int) -> int | None:
         """Return the message at which decoding of a picture begins: its key picture, or the parameter sets of that.

@@ -1,24 +1,31 @@
 """Transforms: frames of one channel in, frames of other channels out.
 
-``protocol`` has the interface of transforms and their laws, ``stages`` the stages of the pipeline and their transforms.
-``mcaptrack.registry`` finds transforms by name.
+``protocol`` has the interface of transforms and their laws, ``stages`` the stages of the pipeline and their transforms,
+which are imported when they are first used. ``mcaptrack.registry`` finds transforms by name.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
-from typing import Final
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
 
-from mcaptrack.transforms.detect import KnnDetector, MedianDetector, OnnxDetector
-from mcaptrack.transforms.ground import GroundTracker
-from mcaptrack.transforms.motion import EstimateMotion
-from mcaptrack.transforms.predict import Predict
 from mcaptrack.transforms.protocol import Transform
-from mcaptrack.transforms.retrack import PROFILES, Retrack, RetrackByConsistency
-from mcaptrack.transforms.sample import Sample
-from mcaptrack.transforms.sort import ByteTrack, OcSort, Sort
 from mcaptrack.transforms.stages import FULL, FUSION, STAGES, Stage
+
+if TYPE_CHECKING:
+    from mcaptrack.transforms.detect import KnnDetector, MedianDetector, OnnxDetector
+    from mcaptrack.transforms.ground import GroundTracker
+    from mcaptrack.transforms.motion import EstimateMotion
+    from mcaptrack.transforms.predict import Predict
+    from mcaptrack.transforms.retrack import PROFILES, Retrack, RetrackByConsistency
+    from mcaptrack.transforms.sample import Sample
+    from mcaptrack.transforms.sort import ByteTrack, OcSort, Sort
+
+    #: The default transform of each stage.
+    TRANSFORMS: Mapping[str, type[Transform]]
+    #: The built-in trackers of boxes in pictures, by name.
+    TRACKERS: Mapping[str, type[Transform]]
 
 __all__ = [
     "FULL",
@@ -43,11 +50,24 @@ __all__ = [
     "Transform",
 ]
 
-#: The default transform of each stage.
-TRANSFORMS: Final[Mapping[str, type[Transform]]] = MappingProxyType(
-    {name: stage.default for name, stage in STAGES.items()}
-)
-#: The built-in trackers of boxes in pictures, by name.
-TRACKERS: Final[Mapping[str, type[Transform]]] = MappingProxyType(
-    {name: kind for name, kind in STAGES["track"].built_in().items() if kind is not GroundTracker}
-)
+_ROOMS: Final = {
+    "detect": ("KnnDetector", "MedianDetector", "OnnxDetector"),
+    "ground": ("GroundTracker",),
+    "motion": ("EstimateMotion",),
+    "predict": ("Predict",),
+    "retrack": ("PROFILES", "Retrack", "RetrackByConsistency"),
+    "sample": ("Sample",),
+    "sort": ("ByteTrack", "OcSort", "Sort"),
+}
+_ROOM_OF: Final = {name: room for room, names in _ROOMS.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a transform when it is first used: what only asks for topics of stages loads none."""
+    if name in _ROOM_OF:
+        return getattr(import_module(f"{__name__}.{_ROOM_OF[name]}"), name)
+    if name == "TRANSFORMS":
+        return {name: stage.default for name, stage in STAGES.items()}
+    if name == "TRACKERS":
+        return {name: kind for name, kind in STAGES["track"].built_in().items() if name != "ground"}
+    raise AttributeError(f"module {__name__} has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""The stages of the pipeline: the transforms of each, and the topics that it reads and writes.
+"""The stages of the pipeline: what each reads and writes, and the places of its transforms, imported when used.
 
 To add a stage: its transform, and a ``Stage`` in ``STAGES``. To add a transform to a stage with a kind: a line in
 ``mcaptrack.registry.BUILT_IN``. Options, help, provenance and the tests of the laws follow from these.
@@ -8,23 +8,29 @@ from __future__ import annotations
 
 import difflib
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cached_property
+from pkgutil import resolve_name
 from types import MappingProxyType
 from typing import Any, Final, Literal
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, entry_of, find
-from mcaptrack.schema import SCHEMAS
-from mcaptrack.transforms.detect import MedianDetector
-from mcaptrack.transforms.fuse import FootFuser
-from mcaptrack.transforms.motion import EstimateMotion
-from mcaptrack.transforms.predict import Predict, predict_with
+from mcaptrack.schema import (
+    APPEARANCE,
+    CAMERA_MOTION,
+    DECISIONS,
+    DETECTIONS,
+    PREDICTIONS,
+    SCHEMAS,
+    SIGHTINGS,
+    TRACKS,
+    VIDEO,
+    Schema,
+)
 from mcaptrack.transforms.protocol import Transform, check_options, option_problem, trait_problem
-from mcaptrack.transforms.retrack import PROFILES, Retrack
-from mcaptrack.transforms.sample import Sample
-from mcaptrack.transforms.sort import Sort
 
 #: Suffix of the topic of tracks at the video's rate (``Stage.at_video_rate``).
 FULL: Final = "/full"
@@ -42,8 +48,12 @@ class Stage:
     ----------
     name : str
         Name of the stage and of its command.
-    default : type[Transform]
-        Its default transform.
+    reads : Schema
+        The schema of its input.
+    writes : Mapping[str, Schema]
+        The schemas of its outputs, by the last part of their topics; "" for the main one.
+    place : str
+        Module and class of its default transform, as in ``mcaptrack.transforms.sort:Sort``.
     input_topic, output_topic : str
         Topics below the name of a camera, as in ``tracks``: what it reads, and its main output.
     rows : str
@@ -54,8 +64,9 @@ class Stage:
     parameter : Kind or ""
         The parameter of its transform that names an entry of the registry, such as its predictor; ``run`` has an option
         of the same name.
-    variant : Callable or None
-        Returns the transform with the options of the entry that ``parameter`` names.
+    variant_place : str
+        Module and name of a function that returns the transform with the options of the entry that ``parameter``
+        names; "" without one.
     on_demand : bool
         Whether it runs only if another stage is better with its output.
     needs_scale : bool
@@ -64,8 +75,8 @@ class Stage:
         Whether its tracks are repaired ones, which are scored and drawn as such.
     at_video_rate : bool
         Whether its tracks are also written at the video's rate, below ``FULL``.
-    profiles : Mapping[str, Transform]
-        Values of all parameters by the name of the profile.
+    profiles_place : str
+        Module and name of a mapping of transforms by the name of the profile that they are; "" without profiles.
     modes : Mapping[str, tuple[str, ...]]
         Outputs to write, by the name of the mode; empty for all.
     beside : tuple[str, ...]
@@ -75,25 +86,39 @@ class Stage:
     """
 
     name: str
-    default: type[Transform]
+    reads: Schema
+    writes: Mapping[str, Schema]
+    place: str
     input_topic: str
     output_topic: str
     rows: str
     kind: Kind | None = None
     parameter: Kind | Literal[""] = ""
-    variant: Callable[[str], type[Transform]] | None = None
+    variant_place: str = ""
     on_demand: bool = False
     needs_scale: bool = False
     repairs_tracks: bool = False
     at_video_rate: bool = False
-    profiles: Mapping[str, Transform] = field(default_factory=dict)
+    profiles_place: str = ""
     modes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     beside: tuple[str, ...] = ()
     implied: Mapping[str, str] = field(default_factory=dict)
 
+    @cached_property
+    def default(self) -> type[Transform]:
+        """Its default transform."""
+        cls: type[Transform] = resolve_name(self.place)
+        return cls
+
+    @cached_property
+    def profiles(self) -> Mapping[str, Transform]:
+        """Values of all parameters by the name of the profile."""
+        profiles: Mapping[str, Transform] = resolve_name(self.profiles_place) if self.profiles_place else {}
+        return profiles
+
     def outputs(self, target: str) -> tuple[str, ...]:
         """The topics that the stage writes if its main output is ``target``."""
-        topics = tuple(f"{target}/{suffix}".rstrip("/") for suffix in self.default.writes)
+        topics = tuple(f"{target}/{suffix}".rstrip("/") for suffix in self.writes)
         return (*topics, target + FULL) if self.at_video_rate else topics
 
     def built_in(self) -> dict[str, type[Transform]]:
@@ -136,7 +161,10 @@ class Stage:
 
     def with_part(self, cls: type[Transform], name: object) -> type[Transform]:
         """A transform of this stage with the options of the entry that ``parameter`` names, if it has own ones."""
-        return self.variant(name) if self.variant and cls is self.default and isinstance(name, str) else cls
+        if not self.variant_place or cls is not self.default or not isinstance(name, str):
+            return cls
+        variant: type[Transform] = resolve_name(self.variant_place)(name)
+        return variant
 
     @property
     def option(self) -> Kind | Literal[""]:
@@ -197,7 +225,7 @@ class Stage:
 
     def _check(self, entry: Entry) -> None:
         """Raise McaptrackError if a class of another package can't be a transform of this stage."""
-        cls, wanted = entry.cls, self.default
+        cls, wanted = entry.cls, self
         if not inspect.isclass(cls) or not is_dataclass(cls):
             raise McaptrackError(
                 f"{entry} is no dataclass; the fields of a transform are its parameters: write "
@@ -253,15 +281,19 @@ def _base(cls: type[Transform]) -> type[Transform]:
 _STAGES: Final = (
     Stage(
         name="detect",
-        default=MedianDetector,
+        place="mcaptrack.transforms.detect.median:MedianDetector",
         kind="detector",
+        reads=VIDEO,
+        writes={"": DETECTIONS},
         input_topic="video",
         output_topic="detections",
         rows="boxes",
     ),
     Stage(
         name="motion",
-        default=EstimateMotion,
+        place="mcaptrack.transforms.motion:EstimateMotion",
+        reads=VIDEO,
+        writes={"": CAMERA_MOTION},
         input_topic="video",
         output_topic="motion",
         rows="camera motion",
@@ -269,35 +301,54 @@ _STAGES: Final = (
     ),
     Stage(
         name="track",
-        default=Sort,
+        place="mcaptrack.transforms.sort:Sort",
         kind="tracker",
+        reads=DETECTIONS,
+        writes={"": TRACKS},
         input_topic="detections",
         output_topic="tracks",
         rows="tracks",
         needs_scale=True,
     ),
     Stage(
-        name="sample", default=Sample, input_topic="tracks", output_topic="samples", rows="samples", needs_scale=True
+        name="sample",
+        place="mcaptrack.transforms.sample:Sample",
+        reads=TRACKS,
+        writes={"": TRACKS},
+        input_topic="tracks",
+        output_topic="samples",
+        rows="samples",
+        needs_scale=True,
     ),
     Stage(
         name="predict",
-        default=Predict,
+        place="mcaptrack.transforms.predict:Predict",
+        reads=TRACKS,
+        writes={"": PREDICTIONS},
         input_topic="samples",
         output_topic="predictions",
         rows="forecasts",
         parameter="predictor",
-        variant=predict_with,
+        variant_place="mcaptrack.transforms.predict:predict_with",
     ),
     Stage(
         name="retrack",
-        default=Retrack,
+        place="mcaptrack.transforms.retrack:Retrack",
         kind="retracker",
+        reads=TRACKS,
+        writes={
+            "": TRACKS,
+            "online": TRACKS,
+            "predictions": PREDICTIONS,
+            "decisions": DECISIONS,
+            "appearance": APPEARANCE,
+        },
         input_topic="samples",
         output_topic="retracks",
         rows="re-tracked tracks",
         repairs_tracks=True,
         at_video_rate=True,
-        profiles=PROFILES,
+        profiles_place="mcaptrack.transforms.retrack:PROFILES",
         modes=MappingProxyType(
             {"both": (), "offline": ("", "decisions", "appearance"), "online": ("online", "predictions")}
         ),
@@ -311,8 +362,10 @@ STAGES: Final[Mapping[str, Stage]] = MappingProxyType({stage.name: stage for sta
 #: The fusion of several cameras: not a stage of one camera, but its transforms are found and checked like those of one.
 FUSION: Final = Stage(
     name="fuse",
-    default=FootFuser,
+    place="mcaptrack.transforms.fuse:FootFuser",
     kind="fuser",
+    reads=SIGHTINGS,
+    writes={"": DETECTIONS, "sightings": SIGHTINGS},
     input_topic="detections/sightings",
     output_topic="detections",
     rows="detections",

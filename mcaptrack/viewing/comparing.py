@@ -85,7 +85,7 @@ _FIRST_TRACKER: Final = next(iter(_TRACKERS))
 def tracker_name(provenance: Provenance | None) -> str:
     """Return the name of the tracker of a channel, by how it was made."""
     stage = STAGES.get(provenance.transform) if provenance else None
-    if provenance is None or stage is None or stage.default.reads is not DETECTIONS:
+    if provenance is None or stage is None or stage.reads is not DETECTIONS:
         return "tracks as given"
     return _TRACKERS.get(str(provenance.parameters.get(stage.option, _FIRST_TRACKER)), "tracker")
 
@@ -184,7 +184,7 @@ def _on_pictures(
     span = int(pictures.t_ns[numbers[0]]), int(pictures.t_ns[numbers[-1]]) + 1
     drawn = views_at(opened, [panel.view for panel in panels], span)
     width = 0
-    for frame in pictures.frames(numbers.tolist()):
+    for frame in pictures.readable(numbers.tolist()):
         whole = np.asarray(frame.rows, np.uint8)
         width = width or _panel_width(options, whole.shape[1], len(panels))
         plain, scale = scaled(whole, width), width / whole.shape[1]

@@ -306,7 +306,7 @@ def _scene(pictures: Pictures, width_px: int | None) -> Image:
     """The scene without people who move."""
     count = len(pictures.t_ns)
     numbers = np.unique(np.linspace(0, count - 1, min(count, _PICTURES)).round().astype(int)).tolist()
-    seen = [np.asarray(frame.rows, np.uint8) for frame in pictures.frames(numbers)]
+    seen = [np.asarray(frame.rows, np.uint8) for frame in pictures.readable(numbers)]
     alike = [image for image in seen if image.shape == seen[0].shape]
     return scaled(np.median(np.stack(alike), axis=0).astype(np.uint8), width_px)
 

@@ -94,7 +94,7 @@ def render(
     def drawn() -> Iterator[tuple[int, Image]]:
         span = int(chosen[0]), int(chosen[-1]) + 1
         views = views_at(opened, view_topics, span)
-        for done, frame in enumerate(pictures.frames(numbers.tolist()), 1):
+        for done, frame in enumerate(pictures.readable(numbers.tolist()), 1):
             whole = np.asarray(frame.rows, np.uint8)
             if hidden is not None:
                 whole, _ = hide(whole, hidden.at(frame.index))

@@ -47,8 +47,15 @@ class EncodedPicture(NamedTuple):
         return self.where or f"frame {self.index}"
 
 
+#: After so many images that can't be decoded, and none that can, it is taken that none can.
+_MOST_UNREADABLE: Final = 20
+
+
 def decode_gray(
-    pictures: Iterable[EncodedPicture], wanted: Container[int] | None = None, damaged: list[int] | None = None
+    pictures: Iterable[EncodedPicture],
+    wanted: Container[int] | None = None,
+    damaged: list[int] | None = None,
+    unreadable: list[McaptrackError] | None = None,
 ) -> Iterator[Frame]:
     """Decode pictures to gray.
 
@@ -60,6 +67,8 @@ def decode_gray(
         Indexes of the pictures to yield; others are decoded only if later ones depend on them.
     damaged : list of int, optional
         Indexes of damaged pictures of videos are added: what can't be decoded there is taken from other pictures.
+    unreadable : list of McaptrackError, optional
+        The errors of images, each of which stands for itself, that can't be decoded are added, and these left out.
 
     Yields
     ------
@@ -69,16 +78,19 @@ def decode_gray(
     Raises
     ------
     McaptrackError
-        For a format that can't be decoded, and for damaged pictures.
+        For a format that can't be decoded, and for damaged pictures; with ``unreadable`` if no image can be decoded.
     """
-    return _decoded(pictures, raw_gray, _luma, wanted, damaged, is_grey=True)
+    return _decoded(pictures, raw_gray, _luma, wanted, damaged, unreadable, is_grey=True)
 
 
 def decode_bgr(
-    pictures: Iterable[EncodedPicture], wanted: Container[int] | None = None, damaged: list[int] | None = None
+    pictures: Iterable[EncodedPicture],
+    wanted: Container[int] | None = None,
+    damaged: list[int] | None = None,
+    unreadable: list[McaptrackError] | None = None,
 ) -> Iterator[Frame]:
     """Decode pictures to BGR: as ``decode_gray``, but ``rows`` is (height, width, 3) uint8 (blue, green, red)."""
-    return _decoded(pictures, raw_bgr, _bgr_of_frame(), wanted, damaged, is_grey=False)
+    return _decoded(pictures, raw_bgr, _bgr_of_frame(), wanted, damaged, unreadable, is_grey=False)
 
 
 def _decoded(
@@ -87,28 +99,42 @@ def _decoded(
     of_frame: Callable[[Any], Image],
     wanted: Container[int] | None,
     damaged: list[int] | None,
+    unreadable: list[McaptrackError] | None,
     is_grey: bool,
 ) -> Iterator[Frame]:
     decoder: _VideoDecoder | None = None
+    is_any_readable = False
     for picture in pictures:
         if picture.is_video:
             decoder = decoder or _VideoDecoder(picture.format, of_frame, wanted, [] if damaged is None else damaged)
             yield from decoder.decode(picture)
         elif wanted is not None and picture.index not in wanted:
             continue
-        elif picture.layout:
-            width, height, *_ = picture.layout
-            if width * height <= len(picture.data):
-                check_size(width, height, picture.name)
-            try:
-                pixels = of_pixels(picture.format, picture.data, picture.layout)
-            except McaptrackError as error:
-                raise McaptrackError(f"{picture.name}: {error}") from None
-            yield Frame(picture.t_ns, picture.index, pixels)
         else:
-            yield Frame(picture.t_ns, picture.index, _still(picture, is_grey))
+            try:
+                pixels = _raw(picture, of_pixels) if picture.layout else _still(picture, is_grey)
+            except McaptrackError as error:
+                if unreadable is None or (len(unreadable) == _MOST_UNREADABLE and not is_any_readable):
+                    raise
+                unreadable.append(error)
+                continue
+            is_any_readable = True
+            yield Frame(picture.t_ns, picture.index, pixels)
     if decoder:
         yield from decoder.flush()
+    elif unreadable and not is_any_readable:
+        raise unreadable[0]
+
+
+def _raw(picture: EncodedPicture, of_pixels: Callable[[str, bytes, PixelLayout], Image]) -> Image:
+    assert picture.layout
+    width, height, *_ = picture.layout
+    if width * height <= len(picture.data):
+        check_size(width, height, picture.name)
+    try:
+        return of_pixels(picture.format, picture.data, picture.layout)
+    except McaptrackError as error:
+        raise McaptrackError(f"{picture.name}: {error}") from None
 
 
 def _still(picture: EncodedPicture, is_grey: bool) -> Image:

@@ -376,7 +376,7 @@ class PictureSource:
         span = int(chosen[0]), int(chosen[-1]) + 1
         views = [message_at(view.messages(self.t_ns, span), view.read) for view in self._views]
         if self._pictures is not None:
-            for frame in self._pictures.frames(numbers.tolist()):
+            for frame in self._pictures.readable(numbers.tolist()):
                 image = np.asarray(frame.rows, np.uint8)
                 yield frame.index, (image.shape[1], image.shape[0]), image, [view(frame.t_ns) for view in views]
             return

@@ -181,7 +181,7 @@ def add_thumbnails(events: Sequence[IdentityEvent], tracks: Sequence[Frame], pic
         for at_ns, place, is_after in ((before_ns, old, False), (event.t_ns, new, True)):
             number = max(int(np.searchsorted(pictures.t_ns, at_ns, "right")) - 1, 0)
             wanted.setdefault(number, []).append((event, is_after, place[1] if place else None, region))
-    for frame in pictures.frames(wanted):
+    for frame in pictures.readable(wanted):
         image = np.asarray(frame.rows, np.uint8)
         for event, is_after, row, region in wanted[frame.index]:
             thumbnail = _crop(image, region, (frame.t_ns - start_ns) / NS_PER_S, row, _label(event.row, is_after))

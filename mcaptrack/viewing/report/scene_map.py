@@ -69,7 +69,7 @@ def background_picture(pictures: Pictures, is_still: bool = True) -> SceneBackgr
     numbers = np.unique(np.linspace(0, count - 1, min(count, _PICTURES)).round().astype(int)).tolist() if count else []
     seen: list[Image] = []
     scale = 1.0
-    for frame in pictures.frames(numbers):
+    for frame in pictures.readable(numbers):
         high, wide = frame.rows.shape[:2]
         scale = min(1.0, _WIDTH_PX / wide) if not seen else scale
         size = (max(1, round(wide * scale)), max(1, round(high * scale)))

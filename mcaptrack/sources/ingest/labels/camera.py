@@ -128,7 +128,7 @@ def detections_topic(opened: log.Log, prefix: str) -> str:
     channel = opened.channels.get(f"{prefix}/detections")
     provenance = Provenance.from_metadata(channel.metadata) if channel else None
     stage = STAGES.get(provenance.transform) if provenance else None
-    is_of_pictures = stage is not None and stage.default.reads is VIDEO
+    is_of_pictures = stage is not None and stage.reads is VIDEO
     return channel.topic if channel and channel.messages and is_of_pictures else ""
 
 
