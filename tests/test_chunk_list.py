@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from mcaptrack import log
-from mcaptrack.log.chunk_list import ChunkList
+from mcaptrack.log.index import ChunkList
 from mcaptrack.log.messages import Checksums, fingerprint
 from mcaptrack.log.records import ChunkIndexRecord
 from mcaptrack.log.writer import LogWriter

@@ -69,7 +69,7 @@ LIMITS = {
         "MAX_NS": 9_223_372_036_854_775_807,
         "LOG_MAX_NS": 18_446_744_073_709_551_615,
     },
-    "mcaptrack.schema.cdr": {"_LONGEST_TOPIC": 247, "_MAX_DEFINITION": MIB},
+    "mcaptrack.schema.encodings": {"_LONGEST_TOPIC": 247, "_MAX_DEFINITION": MIB},
     "mcaptrack.tables.messages": {"_EXACT": 2**53, "_MAX_INT": 2**63, "_MAX_UINT": 2**64},
     "mcaptrack.networks.graph": {"_MAX_NAMES": 100_000},
     "mcaptrack.predictors.checked": {"_MOST": 10_000, "_LARGEST": 1e15},

@@ -200,7 +200,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "evaluate", "LOG", "--truth", "truth.txt"
     ),
     "log/journal.py:recover_command:recover": Scene.damaged,
-    "log/snapshot.py:reporting_bad_times:drop": Scene.late,
+    "log/reader.py:reporting_bad_times:drop": Scene.late,
     "log/recording_files.py:refuse_non_mcap:ingest": Scene.bag,
     "transforms/detect/onnx/session.py:check:get_model": Scene.with_other_weights,
     "transforms/detect/onnx/session.py:stored:get_model": lambda s: s.says("detect", "LOG", "--detector", "yolox-nano"),
