@@ -18,7 +18,7 @@ import pytest
 import mcaptrack
 from mcaptrack import environment, fleet
 from mcaptrack.errors import McaptrackError
-from mcaptrack.fleet import child, digests, ledger
+from mcaptrack.fleet import child, ledger
 from mcaptrack.fleet.ledger import Claims, Ledger, claim_name
 from mcaptrack.log import read
 from tests import fleet_tasks
@@ -344,12 +344,12 @@ def test_settings_are_the_same_in_every_process_and_differ_with_every_value(tmp_
     script = "from tests.test_fleet import digests; from pathlib import Path; import sys; " + (
         "print(digests.digest_of_settings({'set': {'y', 'x'}, 'a': [1.5, None], 'b': 1, 'path': Path(sys.argv[1])}))"
     )
-    found = digests.digest_of_settings(given)
+    found = ledger.digest_of_settings(given)
     again = subprocess.run([sys.executable, "-c", script, file], capture_output=True, text=True, check=True)
     assert again.stdout.strip() == found
-    assert len({found, *(digests.digest_of_settings(given | {key: 7}) for key in given)}) == 5
+    assert len({found, *(ledger.digest_of_settings(given | {key: 7}) for key in given)}) == 5
     file.write_text("2")
-    assert digests.digest_of_settings(given) != found
+    assert ledger.digest_of_settings(given) != found
 
 
 def test_a_function_of_a_script_is_refused():

@@ -238,7 +238,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "zones", "draw", "LOG"
     ),
     "viewing/report/contents.py:_score:ingest": lambda s: s.without("/camera/truth*").page(),
-    "viewing/report/summary.py:_without_ground_truth:run": lambda s: s.ingested("clip.mp4").page(),
+    "viewing/report/__init__.py:_without_ground_truth:run": lambda s: s.ingested("clip.mp4").page(),
     "viewing/report/sections.py:scores:run": lambda s: s.ingested("clip.mp4").page(),
     "viewing/report/sections.py:forecasts:predict": lambda s: s.without("*predictions*").page(),
     "tables/compared.py:_read:ingest": lambda s: s.timed("tracks.csv").says(

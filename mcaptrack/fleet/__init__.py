@@ -25,9 +25,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import place_of
 from mcaptrack.fleet import ledger
 from mcaptrack.fleet.child import Child, StoppedError, WorkerLimits, memory_in_bytes
-from mcaptrack.fleet.digests import digest_of_log, digest_of_settings
 from mcaptrack.fleet.expansion import NamedLog, find_logs, outputs_in
-from mcaptrack.fleet.ledger import Claims, Ledger
+from mcaptrack.fleet.ledger import Claims, Ledger, digest_of_log, digest_of_settings
 from mcaptrack.fleet.results import AGAIN, GOOD, FleetResult, FleetStatus, LogOutcome, Running, Watch
 from mcaptrack.fleet.worker import Reply, Request
 from mcaptrack.location import Location, Url
