@@ -21,6 +21,7 @@ from mcaptrack.foxglove.messages import ANNOTATIONS, message_class
 from mcaptrack.foxglove.palette import ink
 from mcaptrack.geometry.arrays import Bytes, Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.schema.codec import varint
 
 #: Coordinates are multiples of a quarter of a pixel: numbers with few digits take few bytes of a compressed log.
 PER_PX: Final = 4
@@ -87,15 +88,6 @@ class _Whole(NamedTuple):
 
 #: The timestamp of a message; its columns are filled by ``stamps``.
 STAMP: Final = {"seconds": _Whole("seconds"), "nanos": _Whole("nanos")}
-
-
-def varint(value: int) -> bytes:
-    """A whole number as a protobuf varint, 7 bits a byte."""
-    out = bytearray()
-    while value > 0x7F:
-        out.append(value & 0x7F | 0x80)
-        value >>= 7
-    return bytes([*out, value])
 
 
 def whole_numbers(values: Ints) -> Bytes:

@@ -26,12 +26,13 @@ from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job, read_named_frames
 from mcaptrack.pipeline.plan import is_stale
-from mcaptrack.pipeline.planes import picture_size, read_planes
+from mcaptrack.pipeline.planes import read_planes
 from mcaptrack.pipeline.write import digest_of
 from mcaptrack.schema import APPEARANCE, DECISIONS, DETECTIONS, PREDICTIONS, TRACKS, VIDEO, Frame, Rows, Schema
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_numbers, frame_times, unique_values
 from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.calibrations import picture_size
 from mcaptrack.sources.cameras import camera_at, cameras, provenance_of
 from mcaptrack.transforms import STAGES, Transform
 

@@ -38,10 +38,9 @@ from mcaptrack.schema.framing import JoinedFrames, filtered_rows, has_any, join_
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.sources import foreign
-from mcaptrack.sources.calibrations import holds_calibrations, see_ground
+from mcaptrack.sources.calibrations import holds_calibrations, picture_size, see_ground
 from mcaptrack.sources.camera_motion import planes_in
 from mcaptrack.sources.cameras import camera_at, lineage, provenance_of
-from mcaptrack.sources.pictures import size_of_pictures
 from mcaptrack.transforms import STAGES, Transform
 
 _ASSUME, _ESTIMATE, _CALIBRATE = "assume-ground-plane", "estimate-ground-plane", "calibrate-ground-plane"
@@ -303,14 +302,6 @@ _LEAST_INSIDE: Final = 0.5
 #: Boxes are taken to be in pixels of the pictures if no more than this share of those that were detected is outside:
 #: other software may have seen larger pictures than those in the log.
 _MOST_OUTSIDE: Final = 0.05
-
-
-def picture_size(opened: log.Log, topic: str | None) -> PictureSize:
-    """Return the size of the pictures of a channel; None if there are none that can be decoded."""
-    try:
-        return size_of_pictures(opened, topic) if topic else None
-    except McaptrackError:
-        return None
 
 
 def without_unseen(channels: Channels, picture_size: Callable[[], PictureSize]) -> Channels:

@@ -32,7 +32,6 @@ from mcaptrack.pipeline.planes import (
     Channels,
     PlaneChoice,
     is_poor,
-    picture_size,
     plane_in_words,
     planes_for,
     read_planes,
@@ -50,6 +49,7 @@ from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_times, row_ends, unique_values
 from mcaptrack.schema.provenance import CLOCK, FUSE, VIEW, Provenance
+from mcaptrack.sources.calibrations import picture_size
 from mcaptrack.sources.camera_motion import tracks_topic
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.corrections import corrections_of, with_corrections

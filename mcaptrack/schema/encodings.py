@@ -55,15 +55,7 @@ class RowReader(Protocol):
 
 
 #: Kinds of columns -> types of ROS.
-_TYPES: Final = {
-    "double": "float64",
-    "float": "float32",
-    "fixed64": "uint64",
-    "fixed32": "uint32",
-    "bool": "bool",
-    "sfixed32": "int32",
-    "sfixed64": "int64",
-}
+_TYPES: Final = {kind: np.dtype(form).name for kind, (form, *_) in KINDS.items()}
 #: The formats of all types of ROS with a fixed width.
 _FORMATS: Final = {kind: np.dtype(KINDS[column][0]) for column, kind in _TYPES.items()} | {
     "bool": np.dtype("u1"),

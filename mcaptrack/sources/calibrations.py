@@ -134,7 +134,7 @@ def see_ground(opened: log.Log, camera: Camera, frame: str = "", ground_frame: s
         return None
     log_ns, stamp_ns, frame_id = _headers(opened, sources)
     topic = find_calibration(opened, sources[0], frame_id)
-    size = _picture_size(opened, camera.pictures)
+    size = picture_size(opened, camera.pictures)
     calibrations = read_calibrations(opened, topic, is_rectified_topic(sources[0]))
     fitted = [(since_ns, _fitted(calibration, size, topic)) for since_ns, calibration in calibrations]
     eye = fitted[0][1].frame_id or frame_id
@@ -164,7 +164,7 @@ def moving_camera(opened: log.Log, topic: str, frame: str) -> MovingCamera:
     log_ns, stamp_ns, frame_id = _headers(opened, [topic])
     source = find_calibration(opened, topic, frame_id)
     calibrations = read_calibrations(opened, source, is_rectified_topic(topic))
-    size = _picture_size(opened, topic)
+    size = picture_size(opened, topic)
     fitted = [(since_ns, _fitted(calibration, size, source)) for since_ns, calibration in calibrations]
     first = fitted[0][1]
     poses = poses_at(opened, topic, first.frame_id or frame_id, frame, stamp_ns, log_ns)
@@ -270,7 +270,7 @@ def _headers(opened: log.Log, topics: Sequence[str]) -> tuple[Ints, Ints, str]:
     return log_ns, stamp_ns, frame_id
 
 
-def _picture_size(opened: log.Log, topic: str | None) -> tuple[int, int] | None:
+def picture_size(opened: log.Log, topic: str | None) -> tuple[int, int] | None:
     """Return width and height of the pictures of a channel; None if there are none that can be decoded."""
     try:
         return size_of_pictures(opened, topic) if topic else None
