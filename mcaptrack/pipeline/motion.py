@@ -91,8 +91,9 @@ def _path(state: RunState, job: Job) -> SideInputs:
         if getattr(job.transform, "camera_motion", "") == "on":
             warn(f"the motion of the camera is not known: {topic} needs pictures of it in the log", "option-not-used")
         return SideInputs({}, {})
+    frames = state.frames(topic, CAMERA_MOTION)
     try:
-        path = frames_to_path(state.frames(topic, CAMERA_MOTION))
+        path = frames_to_path(frames)
     except McaptrackError as error:
         raise McaptrackError(f"{state.opened.path}: {topic}: {error}") from None
     return SideInputs({"camera_path": path}, {topic: state.digest(topic)})
@@ -116,8 +117,9 @@ def _of_run(state: RunState) -> tuple[dict[str, Provenance], dict[str, Sequence[
 def moves(state: RunState) -> bool:
     """Whether the camera is known to move, or its pictures to have cuts."""
     topic = motion_topic(state.prefix)
+    frames = state.frames(topic, CAMERA_MOTION)
     try:
-        return state.holds(topic, CAMERA_MOTION) and frames_to_path(state.frames(topic, CAMERA_MOTION)).matters
+        return state.holds(topic, CAMERA_MOTION) and frames_to_path(frames).matters
     except McaptrackError:
         return False
 
