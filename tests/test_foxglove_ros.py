@@ -152,7 +152,7 @@ def test_parts_of_one_form_are_converted_at_once_as_they_are_one_by_one(name):
     assert batches.convert(payloads) == wanted
     assert batches.convert(payloads[::-1]) == wanted[::-1]
     empty = bytearray()
-    ros._appender(made.DESCRIPTOR)(made(), empty)
+    ros._append(made(), empty)
     assert batches.convert([b""]) == [bytes(empty)]
 
 

@@ -488,7 +488,8 @@ def _people(opened: log.Log, topic: str) -> tuple[Schema, Ints, Ints, Ints, Floa
 def _boxes(rows: Rows) -> Floats:
     """The boxes (N, 4) of rows in pixels, NaN where they have no extent."""
     boxes = columns_to_boxes(rows)
-    return np.where((boxes[:, 2:] > 0).all(axis=1)[:, None], boxes, np.nan)
+    boxes[~(boxes[:, 2:] > 0).all(axis=1)] = np.nan
+    return boxes
 
 
 def _has_pixels(schema: Schema, frames: Sequence[Frame]) -> bool:
