@@ -12,7 +12,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.events import EventOptions
 from mcaptrack.pipeline import events
 from mcaptrack.pipeline.checks import describe_origin
-from mcaptrack.pipeline.write import Made, _floor_m
+from mcaptrack.pipeline.write import Made, RunState, _floor_m
 from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind, Frame
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance
 from tests.worlds import walk
@@ -88,7 +88,7 @@ def test_the_usual_tracks_and_those_with_events_are_watched(tmp_path):
         usual = ["/camera/tracks", "/camera/retracks"]
         assert events._default_topics(opened, "/camera", {}) == [*usual, "/camera/other", "/camera/zebra"]
         wrong = Made(COUNTS, [], Provenance("x", {}))
-        assert events._default_topics(opened, "/camera", {"/camera/tracks": wrong}) == [
+        assert events._default_topics(RunState(opened, "/camera", {"/camera/tracks": wrong})) == [
             "/camera/retracks",
             "/camera/other",
             "/camera/zebra",

@@ -341,8 +341,8 @@ def test_settings_are_the_same_in_every_process_and_differ_with_every_value(tmp_
     file = tmp_path / "plane.txt"
     file.write_text("1")
     given = {"b": 1, "a": (1.5, None), "path": file, "set": {"x", "y"}}
-    script = "from tests.test_fleet import digests; from pathlib import Path; import sys; " + (
-        "print(digests.digest_of_settings({'set': {'y', 'x'}, 'a': [1.5, None], 'b': 1, 'path': Path(sys.argv[1])}))"
+    script = "from mcaptrack.fleet import ledger; from pathlib import Path; import sys; " + (
+        "print(ledger.digest_of_settings({'set': {'y', 'x'}, 'a': [1.5, None], 'b': 1, 'path': Path(sys.argv[1])}))"
     )
     found = ledger.digest_of_settings(given)
     again = subprocess.run([sys.executable, "-c", script, file], capture_output=True, text=True, check=True)
