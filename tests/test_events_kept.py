@@ -86,7 +86,7 @@ def test_the_usual_tracks_and_those_with_events_are_watched(tmp_path):
     ]
     with log.read(written(tmp_path / "a.mcap", *some, *beside)) as opened:
         usual = ["/camera/tracks", "/camera/retracks"]
-        assert events._default_topics(opened, "/camera", {}) == [*usual, "/camera/other", "/camera/zebra"]
+        assert events._default_topics(RunState(opened, "/camera", {})) == [*usual, "/camera/other", "/camera/zebra"]
         wrong = Made(COUNTS, [], Provenance("x", {}))
         assert events._default_topics(RunState(opened, "/camera", {"/camera/tracks": wrong})) == [
             "/camera/retracks",
@@ -94,7 +94,7 @@ def test_the_usual_tracks_and_those_with_events_are_watched(tmp_path):
             "/camera/zebra",
         ]
     with log.read(written(tmp_path / "b.mcap", some[-1], encoding="json")) as opened:
-        assert events._default_topics(opened, "/camera", {}) == []
+        assert events._default_topics(RunState(opened, "/camera", {})) == []
 
 
 #: What the provenance of events says, and the options that they are made again with.
