@@ -1,4 +1,4 @@
-"""What fleets share: the ledger, JSON lines, one for each log and try; and claims, which keep a log for one of them."""
+"""The ledger of a fleet, JSON lines for each log and try; and claims, which keep other fleets away from a log."""
 
 from __future__ import annotations
 
