@@ -14,7 +14,7 @@ import mcaptrack
 from mcaptrack import tables
 from mcaptrack.errors import McaptrackError
 from mcaptrack.tables import catalogue
-from mcaptrack.viewing.report import ELEMENT, fleet_data, fleet_page
+from mcaptrack.viewing.report import ELEMENT, fleet, fleet_data, fleet_page
 from tests.commands import call, done
 from tests.logs import some_log
 from tests.test_report import _ELEMENTS, _NASTY, Reader
@@ -55,7 +55,7 @@ def test_totals_by_hand():
         row("b", IDF1=0.6, IDSW=0, warnings=2),
         row("c", IDF1=None, IDSW=None, tracks=None, messages=0, duration_s=0.0, versions=None),
     ]
-    found = fleet_page.summary(rows)
+    found = fleet.summary(rows)
     assert found.pop("hours") == pytest.approx(2 / 60)
     assert found.pop("median_IDF1") == pytest.approx(0.7)
     assert found == {
@@ -79,21 +79,21 @@ def test_the_worst_logs_come_first_and_those_without_a_value_not_at_all():
         row("long", IDSW=10, duration_s=3600.0, warnings=3),
         row("no time", IDSW=10, duration_s=0.0),
     ]
-    found = {name: [one["recording"] for one in some] for name, some in fleet_page.worst(rows).items()}
+    found = {name: [one["recording"] for one in some] for name, some in fleet.worst(rows).items()}
     assert found["IDF1"] == ["low", "long", "no time", "often"]
     assert found["IDSW"] == ["often", "long"]
     assert found["warnings"] == ["long", "often"]
-    assert len(fleet_page.worst([row(f"{n}") for n in range(99)])["IDF1"]) == 20
+    assert len(fleet.worst([row(f"{n}") for n in range(99)])["IDF1"]) == 20
 
 
 def test_a_log_far_from_the_others_is_an_outlier():
     usual = [row(f"log{n}", tracks=5 + n % 3) for n in range(12)]
-    assert fleet_page.outliers(usual) == []
-    found = fleet_page.outliers([*usual, row("many", tracks=500)])
+    assert fleet.outliers(usual) == []
+    found = fleet.outliers([*usual, row("many", tracks=500)])
     assert [(one["row"]["recording"], one["measure"]) for one in found] == [("many", "tracks by time")]
     assert (found[0]["value"], found[0]["median"]) == (pytest.approx(500 * 60), pytest.approx(6 * 60))
-    assert {one["measure"] for one in fleet_page.outliers([*usual, row("short", duration_s=0.6)])} >= {"duration"}
-    assert fleet_page.outliers([*usual[:6], row("many", tracks=500)]) == [], "fewer than eight say nothing"
+    assert {one["measure"] for one in fleet.outliers([*usual, row("short", duration_s=0.6)])} >= {"duration"}
+    assert fleet.outliers([*usual[:6], row("many", tracks=500)]) == [], "fewer than eight say nothing"
 
 
 def test_trends_are_those_of_days_and_logs_without_a_date_are_left_out():
@@ -103,22 +103,22 @@ def test_trends_are_those_of_days_and_logs_without_a_date_are_left_out():
         for n in range(4)
         for k in range(3)
     ]
-    found = fleet_page.trends([*rows, row("clock from 0", start_t_ns=5 * 10**9), row("none", start_t_ns=None)])
+    found = fleet.trends([*rows, row("clock from 0", start_t_ns=5 * 10**9), row("none", start_t_ns=None)])
     assert found["first"] == "2026-11-01"
     assert (found["bin"], found["logs"]) == ("day", [3, 3, 3, 3])
     assert found["days"] == [0.5, 1.5, 2.5, 3.5]
     assert found["IDF1"]["median"] == pytest.approx([0.9, 0.8, 0.7, 0.6])
     assert found["IDSW"]["median"] == pytest.approx([0, 3600, 7200, 10_800])
-    assert fleet_page.trends(rows[:6]) is None or fleet_page.trends(rows[:6])["bin"] == "hour"
-    years = fleet_page.trends([row(f"{n}", start_t_ns=n * 365 * day) for n in range(40, 70)])
+    assert fleet.trends(rows[:6]) is None or fleet.trends(rows[:6])["bin"] == "hour"
+    years = fleet.trends([row(f"{n}", start_t_ns=n * 365 * day) for n in range(40, 70)])
     assert len(years["days"]) == 30
-    assert fleet_page.trends([row("a"), row("b")]) is None
+    assert fleet.trends([row("a"), row("b")]) is None
 
 
 def test_warnings_are_counted_by_code():
     said = json.dumps([{"code": "clock", "message": "late"}, {"code": "clock", "message": "later"}])
     other = json.dumps([{"code": "held-back", "message": "x"}, {"code": "clock", "message": "y"}])
-    found = fleet_page.warnings_by_code(
+    found = fleet.warnings_by_code(
         [row("a", warning_texts=said), row("b", warning_texts=other), row("c"), row("d", warning_texts="no json")]
     )
     assert [(one["code"], one["logs"], one["message"]) for one in found] == [

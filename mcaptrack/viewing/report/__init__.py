@@ -29,7 +29,7 @@ from mcaptrack.viewing.report import figures, sections
 from mcaptrack.viewing.report.charts import Axis, figure, pairs_chart, ranges_chart, round_most
 from mcaptrack.viewing.report.contents import LogReport, gather
 from mcaptrack.viewing.report.figures import identity_timeline, people_over_time
-from mcaptrack.viewing.report.fleet_page import fleet_data, fleet_page
+from mcaptrack.viewing.report.fleet import fleet_data, fleet_page
 from mcaptrack.viewing.report.formatting import NONE, counted, number, percent, render, short, times
 from mcaptrack.viewing.report.headline import BEFORE, BeforeAfter, rule_text
 
