@@ -1,4 +1,4 @@
-"""The page about thousands of logs: what is computed of them, and the page as text, with links to those of single logs."""
+"""The page about thousands of logs: what is computed of them, and the page with links to those of single logs."""
 
 from __future__ import annotations
 
